@@ -1,0 +1,6 @@
+"""The camera: where each view lies on the slit, how its lenslet projects, how the sweep bends time, what it measures."""
+
+from tofclip.camera.model import Camera
+from tofclip.camera.sweep import PolynomialSweep, ProjectiveSweep, SkewSweep, Sweep
+
+__all__ = ["Camera", "PolynomialSweep", "ProjectiveSweep", "SkewSweep", "Sweep"]

@@ -1,0 +1,218 @@
+"""The camera model: calibration in, forward operator out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from tofclip.camera.sweep import FloatArray, Sweep, sweep_from_record
+from tofclip.errors import CalibrationError
+from tofclip.operators.projection import LineProjection
+from tofclip.storage import Field, Record
+
+DEFAULT_FOCAL_LENGTH_PX = 560.0
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A row of cylindrical lenslets in front of a line sensor.
+
+    Scene point (X, Y), in pixels from the optical axis of view k, falls on slit column
+    ``centres_px[k] + X - Y * tan(angles[k]) + s * view_positions[k]`` where s is the shear in pixels per view step.
+
+    Parameters
+    ----------
+    centres_px : (views,) array
+        0-based slit column of each view's optical axis; real numbers.
+    angles : (views,) array
+        Angle of each view's line response from the vertical, rad. Its sign mirrors the picture: images cannot settle
+        it, the calibration has to say it.
+    image_shape : (int, int)
+        Rows and columns of the recovered picture. Its optical axis is pixel ``(rows // 2, columns // 2)``.
+    slit_width_px : int
+        Number of columns of the streak image.
+    gains : (views,) array, optional
+        Relative brightness of the views.
+    view_positions : (views,) array, optional
+        Position u_k of each view in view steps, relative to the reference view; defaults to whole steps with 0 at
+        the middle view.
+    sweep : Sweep, optional
+        How the raw streak image has to be rectified. None: it has to be estimated from the data.
+    dead_columns : (slit_width_px,) bool array, optional
+        Slit columns that never carry a signal.
+    time_zero : float
+        Reading of the streak's time axis at which light of range 0 would arrive, s.
+    pulse_fwhm : float
+        Full width at half maximum of the instrument's response to a short pulse, s.
+    focal_length_px : float
+        Distance from the lenslet to the picture in image pixels, which turns pixels into directions.
+    centre_uncertainty_px, angle_uncertainty : (views,) array, optional
+        One standard deviation of the calibration.
+
+    Raises
+    ------
+    CalibrationError
+        Arrays disagree in length, a number is not finite, a centre lies off the slit, or a gain is not positive.
+    """
+
+    centres_px: FloatArray
+    angles: FloatArray
+    image_shape: tuple[int, int]
+    slit_width_px: int
+    gains: FloatArray = field(default_factory=lambda: np.empty(0))
+    view_positions: FloatArray = field(default_factory=lambda: np.empty(0))
+    sweep: Sweep | None = None
+    dead_columns: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
+    time_zero: float = 0.0
+    pulse_fwhm: float = 60e-12
+    focal_length_px: float = DEFAULT_FOCAL_LENGTH_PX
+    centre_uncertainty_px: FloatArray = field(default_factory=lambda: np.empty(0))
+    angle_uncertainty: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        views = np.size(self.centres_px)
+        steps = np.arange(views, dtype=np.float64) - views // 2
+        self._set("centres_px", self.centres_px)
+        self._set("angles", self.angles)
+        self._set("gains", self.gains if np.size(self.gains) else np.ones(views))
+        self._set("view_positions", self.view_positions if np.size(self.view_positions) else steps)
+        for name in ("centre_uncertainty_px", "angle_uncertainty"):
+            known = getattr(self, name)
+            self._set(name, known if np.size(known) else np.full(views, np.nan))
+        dead = np.asarray(self.dead_columns, dtype=bool)
+        if dead.size == 0:
+            dead = np.zeros(self.slit_width_px, dtype=bool)
+        object.__setattr__(self, "dead_columns", dead)
+        object.__setattr__(self, "image_shape", (int(self.image_shape[0]), int(self.image_shape[1])))
+        self._validate()
+
+    def _set(self, name: str, value: Any) -> None:
+        array = np.array(value, dtype=np.float64)
+        array.flags.writeable = False
+        object.__setattr__(self, name, array)
+
+    def _validate(self) -> None:
+        views = self.centres_px.size
+        if views == 0:
+            raise CalibrationError("a camera needs at least one view")
+        for name in ("centres_px", "angles", "gains", "view_positions"):
+            values = getattr(self, name)
+            if values.shape != (views,):
+                raise CalibrationError(f"{name} must have {views} entries, got {values.shape}")
+            if not np.all(np.isfinite(values)):
+                raise CalibrationError(f"{name} must be finite, got {values}")
+        if min(self.image_shape) < 1 or self.slit_width_px < 1:
+            raise CalibrationError(
+                f"picture {self.image_shape} and slit {self.slit_width_px} must not be empty"
+            )
+        off = (self.centres_px < 0) | (self.centres_px > self.slit_width_px - 1)
+        if np.any(off):
+            raise CalibrationError(
+                f"slit centre {self.centres_px[off][0]:.1f} px lies off the sensor "
+                f"(columns 0..{self.slit_width_px - 1})"
+            )
+        if np.any(self.gains <= 0):
+            raise CalibrationError(f"view gains must be positive, got {self.gains}")
+        if np.any(np.abs(self.angles) >= np.pi / 2):
+            raise CalibrationError("line angles must lie within 90 degrees of the vertical")
+        if self.dead_columns.shape != (self.slit_width_px,):
+            raise CalibrationError(
+                f"dead_columns must have {self.slit_width_px} entries, got {self.dead_columns.shape}"
+            )
+        if self.pulse_fwhm <= 0 or self.focal_length_px <= 0:
+            raise CalibrationError("pulse width and focal length must be positive")
+
+    @property
+    def views(self) -> int:
+        """Number of views."""
+        return int(self.centres_px.size)
+
+    @property
+    def optical_axis_px(self) -> tuple[int, int]:
+        """(row, column) of the optical axis in the recovered picture."""
+        return self.image_shape[0] // 2, self.image_shape[1] // 2
+
+    def operator(self, shear: float = 0.0, dtype: DTypeLike = np.float32) -> LineProjection:
+        """Return F(d), which maps a picture refocused at `shear` onto the slit (supplement Eq. 21).
+
+        Because a line integral turns a 2D shift into a 1D one, refocusing only moves the views on the slit.
+
+        Parameters
+        ----------
+        shear : float
+            Pixels per view step; negative for objects nearer than the calibrated depth (SPEC: ``s = -a/d``).
+        dtype : dtype
+            float32 or float64.
+        """
+        return LineProjection(
+            self.image_shape,
+            self.slit_width_px,
+            self.centres_px + shear * self.view_positions,
+            self.angles,
+            self.gains,
+            dtype,
+        )
+
+    def replace(self, **changes: Any) -> Camera:
+        """Return a copy with some entries changed, validated afresh."""
+        return replace(self, **changes)
+
+    def to_record(self) -> Record:
+        """Return everything that has to be stored."""
+        per_view = ("view",)
+        fields = {
+            "centres": Field(self.centres_px, "px", per_view),
+            "angles": Field(self.angles, "rad", per_view),
+            "gains": Field(self.gains, "", per_view),
+            "view_positions": Field(self.view_positions, "view step", per_view),
+            "centre_uncertainty": Field(self.centre_uncertainty_px, "px", per_view),
+            "angle_uncertainty": Field(self.angle_uncertainty, "rad", per_view),
+            "dead_columns": Field(self.dead_columns.astype(np.uint8), "", ("column",)),
+            "image_shape": Field(np.array(self.image_shape, dtype=np.int64), "px", ("yx",)),
+        }
+        attributes = {
+            "slit_width_px": self.slit_width_px,
+            "time_zero_s": self.time_zero,
+            "pulse_fwhm_s": self.pulse_fwhm,
+            "focal_length_px": self.focal_length_px,
+        }
+        children = {} if self.sweep is None else {"sweep": self.sweep.to_record()}
+        return Record("camera", fields, attributes, children)
+
+    @classmethod
+    def from_record(cls, record: Record) -> Camera:
+        """Rebuild a camera from its stored numbers."""
+        rows, columns = record.array("image_shape", np.int64, 1, "px")
+        return cls(
+            centres_px=record.array("centres", np.float64, 1, "px"),
+            angles=record.array("angles", np.float64, 1, "rad"),
+            image_shape=(int(rows), int(columns)),
+            slit_width_px=int(record.attribute("slit_width_px")),
+            gains=record.array("gains", np.float64, 1),
+            view_positions=record.array("view_positions", np.float64, 1, "view step"),
+            sweep=sweep_from_record(record.children["sweep"])
+            if "sweep" in record.children
+            else None,
+            dead_columns=record.array("dead_columns", np.uint8, 1).astype(bool),
+            time_zero=float(record.attribute("time_zero_s")),
+            pulse_fwhm=float(record.attribute("pulse_fwhm_s")),
+            focal_length_px=float(record.attribute("focal_length_px")),
+            centre_uncertainty_px=record.array("centre_uncertainty", np.float64, 1, "px"),
+            angle_uncertainty=record.array("angle_uncertainty", np.float64, 1, "rad"),
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the camera to an HDF5 file, whole or not at all."""
+        self.to_record().save(path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Camera:
+        """Read a camera from its own file or from a streak or frames file that carries one."""
+        record = Record.load(path, "camera", "streak", "frames")
+        if record.kind == "camera":
+            return cls.from_record(record)
+        return cls.from_record(record.child("camera", "camera"))

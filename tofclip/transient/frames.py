@@ -1,0 +1,95 @@
+"""Recovered transient frames: one picture per instant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.camera import Camera
+from tofclip.errors import InputError, ShapeError
+from tofclip.storage import Field, Record, Scalar
+
+
+@dataclass(frozen=True)
+class Frames:
+    """A transient cube with its axes and the camera that saw it.
+
+    Parameters
+    ----------
+    values : (time, y, x) array
+        Brightness in counts, float32, y pointing down.
+    times : (time,) array
+        Time of flight of each frame, s, strictly increasing: the camera's time zero is already taken off.
+    camera : Camera
+        The camera, with the gains and the sweep that were used for this shot.
+    figures : mapping
+        Scalars of the recovery, such as ``relative_residual``.
+    attachments : mapping of str to Record
+        What travelled along with the streak image.
+    provenance : mapping
+        How they came about.
+    """
+
+    values: NDArray[np.float32]
+    times: NDArray[np.float64]
+    camera: Camera
+    figures: Mapping[str, Scalar] = field(default_factory=dict)
+    attachments: Mapping[str, Record] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        times = np.asarray(self.times, dtype=np.float64)
+        object.__setattr__(self, "times", times)
+        expected = (times.size, *self.camera.image_shape)
+        if np.shape(self.values) != expected:
+            raise ShapeError("frames", f"(time, y, x) = {expected}", np.shape(self.values))
+        if times.size == 0 or not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
+            raise InputError("frame times must be finite and increase")
+        if not np.all(np.isfinite(self.values)):
+            raise InputError("frames must not hold NaN or infinity")
+
+    @property
+    def bin_width(self) -> float:
+        """Mean time between frames, s."""
+        if self.times.size == 1:
+            raise InputError("a single frame has no bin width")
+        return float((self.times[-1] - self.times[0]) / (self.times.size - 1))
+
+    def to_record(self) -> Record:
+        """Return everything that has to be stored."""
+        return Record(
+            "frames",
+            {
+                "values": Field(self.values, "count", ("time", "y", "x")),
+                "times": Field(self.times, "s", ("time",)),
+            },
+            self.figures,
+            {**self.attachments, "camera": self.camera.to_record()},
+            self.provenance,
+        )
+
+    @classmethod
+    def from_record(cls, record: Record) -> Frames:
+        """Rebuild frames from what was stored."""
+        return cls(
+            values=record.array("values", np.float32, 3, "count"),
+            times=record.array("times", np.float64, 1, "s"),
+            camera=Camera.from_record(record.child("camera", "camera")),
+            figures=record.attributes,
+            attachments={k: v for k, v in record.children.items() if k != "camera"},
+            provenance=record.provenance,
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the frames, their camera and attachments to one HDF5 file, whole or not at all."""
+        self.to_record().save(path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Frames:
+        """Read frames that `save` wrote."""
+        return cls.from_record(Record.load(path, "frames"))

@@ -1,0 +1,136 @@
+"""A raw streak image: rows are instants, columns are slit pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.camera import Camera
+from tofclip.errors import InputError, MissingTimeAxisError, ShapeError
+from tofclip.storage import Field, Record
+
+
+@dataclass(frozen=True)
+class Streak:
+    """A streak image with whatever its file said about it.
+
+    Parameters
+    ----------
+    counts : (rows, columns) array
+        Sensor readings, kept as float32. May hold negative values (background already subtracted).
+    row_times : (rows,) array or None
+        Instant of each row, s, strictly increasing, not necessarily evenly spaced. None where the file has no time axis.
+    saturated : (rows, columns) bool array or None
+        Pixels that reached the sensor's limit.
+    metadata : mapping of str to str
+        The file's own text, key by key.
+    camera : Camera or None
+        The camera that took it, where the file carries one.
+    attachments : mapping of str to Record
+        Further records that belong to the shot and travel on to its frames unchanged, such as a relay wall.
+    source : str
+        Where it came from, for messages.
+    provenance : mapping
+        How it came about.
+
+    Raises
+    ------
+    InputError
+        Not a 2D array, empty, holding NaN or infinity, all zero, or with a time axis that does not increase.
+    """
+
+    counts: NDArray[np.float32]
+    row_times: NDArray[np.float64] | None = None
+    saturated: NDArray[np.bool_] | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    camera: Camera | None = None
+    attachments: Mapping[str, Record] = field(default_factory=dict)
+    source: str = "streak image"
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        counts = np.ascontiguousarray(self.counts, dtype=np.float32)
+        object.__setattr__(self, "counts", counts)
+        if counts.ndim != 2 or counts.size == 0:
+            raise ShapeError(f"{self.source}: a streak image", "(rows, columns)", counts.shape)
+        bad = counts.size - int(np.count_nonzero(np.isfinite(counts)))
+        if bad:
+            raise InputError(
+                f"{self.source}: {bad} pixels are NaN or infinite; replace them or mark them as saturated"
+            )
+        if not np.any(counts):
+            raise InputError(f"{self.source}: every pixel is zero; was the shutter closed?")
+        if self.saturated is not None and self.saturated.shape != counts.shape:
+            raise ShapeError("saturated", counts.shape, self.saturated.shape)
+        if self.row_times is not None:
+            object.__setattr__(self, "row_times", self._checked_times(self.row_times))
+
+    def _checked_times(self, times: Any) -> NDArray[np.float64]:
+        checked = np.asarray(times, dtype=np.float64)
+        if checked.shape != (self.counts.shape[0],):
+            raise ShapeError(
+                f"{self.source}: the time axis", (self.counts.shape[0],), checked.shape
+            )
+        if not np.all(np.isfinite(checked)) or np.any(np.diff(checked) <= 0):
+            raise InputError(f"{self.source}: the time axis must be finite and increase row by row")
+        return checked
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Instant of each row, s; raises `MissingTimeAxisError` where none is known."""
+        if self.row_times is None:
+            raise MissingTimeAxisError(
+                f"{self.source} has no time axis: give the duration of a row (--bin-width-ps, or bin_width in seconds)"
+            )
+        return self.row_times
+
+    def with_bin_width(self, bin_width: float) -> Streak:
+        """Return the same picture with evenly spaced rows of `bin_width` seconds, the first at 0."""
+        if not (np.isfinite(bin_width) and bin_width > 0):
+            raise InputError(f"bin width must be a positive number of seconds, got {bin_width}")
+        return replace(self, row_times=np.arange(self.counts.shape[0]) * float(bin_width))
+
+    def to_record(self) -> Record:
+        """Return everything that has to be stored."""
+        fields = {"counts": Field(self.counts, "count", ("time", "column"))}
+        if self.row_times is not None:
+            fields["row_times"] = Field(self.row_times, "s", ("time",))
+        if self.saturated is not None:
+            fields["saturated"] = Field(self.saturated.astype(np.uint8), "", ("time", "column"))
+        children = dict(self.attachments)
+        if self.camera is not None:
+            children["camera"] = self.camera.to_record()
+        children["metadata"] = Record("metadata", attributes=dict(self.metadata))
+        return Record("streak", fields, {}, children, self.provenance)
+
+    @classmethod
+    def from_record(cls, record: Record) -> Streak:
+        """Rebuild a streak image from what was stored."""
+        attachments = dict(record.children)
+        camera = attachments.pop("camera", None)
+        metadata = attachments.pop("metadata", None)
+        has_times, has_mask = "row_times" in record.fields, "saturated" in record.fields
+        return cls(
+            counts=record.array("counts", np.float32, 2, "count"),
+            row_times=record.array("row_times", np.float64, 1, "s") if has_times else None,
+            saturated=record.array("saturated", np.uint8, 2).astype(bool) if has_mask else None,
+            metadata={k: str(v) for k, v in metadata.attributes.items()} if metadata else {},
+            camera=Camera.from_record(camera) if camera else None,
+            attachments=attachments,
+            source=record.origin or "streak image",
+            provenance=record.provenance,
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the streak image, its camera and its attachments to one HDF5 file, whole or not at all."""
+        self.to_record().save(path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Streak:
+        """Read a streak image that `save` wrote."""
+        return cls.from_record(Record.load(path, "streak"))
