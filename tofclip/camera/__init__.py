@@ -1,4 +1,4 @@
-"""The camera: where each view lies on the slit, how its lenslet projects, how the sweep bends time, what it measures."""
+"""The camera: where each view lies on the slit, how its lenslet projects, how the sweep bends time."""
 
 from tofclip.camera.model import Camera
 from tofclip.camera.sweep import PolynomialSweep, ProjectiveSweep, SkewSweep, Sweep

@@ -101,30 +101,28 @@ class Camera:
             raise CalibrationError("a camera needs at least one view")
         for name in ("centres_px", "angles", "gains", "view_positions"):
             values = getattr(self, name)
-            if values.shape != (views,):
-                raise CalibrationError(f"{name} must have {views} entries, got {values.shape}")
-            if not np.all(np.isfinite(values)):
-                raise CalibrationError(f"{name} must be finite, got {values}")
+            if values.shape != (views,) or not np.all(np.isfinite(values)):
+                raise CalibrationError(f"{name} must be {views} finite numbers, got {values}")
         if min(self.image_shape) < 1 or self.slit_width_px < 1:
+            raise CalibrationError(f"picture {self.image_shape} and slit {self.slit_width_px} must not be empty")
+        off = self.centres_px[(self.centres_px < 0) | (self.centres_px > self.slit_width_px - 1)]
+        if off.size:
             raise CalibrationError(
-                f"picture {self.image_shape} and slit {self.slit_width_px} must not be empty"
+                f"slit centre {off[0]:.1f} px lies off the sensor (columns 0..{self.slit_width_px - 1})"
             )
-        off = (self.centres_px < 0) | (self.centres_px > self.slit_width_px - 1)
-        if np.any(off):
-            raise CalibrationError(
-                f"slit centre {self.centres_px[off][0]:.1f} px lies off the sensor "
-                f"(columns 0..{self.slit_width_px - 1})"
-            )
-        if np.any(self.gains <= 0):
-            raise CalibrationError(f"view gains must be positive, got {self.gains}")
-        if np.any(np.abs(self.angles) >= np.pi / 2):
-            raise CalibrationError("line angles must lie within 90 degrees of the vertical")
         if self.dead_columns.shape != (self.slit_width_px,):
             raise CalibrationError(
                 f"dead_columns must have {self.slit_width_px} entries, got {self.dead_columns.shape}"
             )
-        if self.pulse_fwhm <= 0 or self.focal_length_px <= 0:
-            raise CalibrationError("pulse width and focal length must be positive")
+        self._validate_ranges()
+
+    def _validate_ranges(self) -> None:
+        if np.any(self.gains <= 0):
+            raise CalibrationError(f"view gains must be positive, got {self.gains}")
+        if np.any(np.abs(self.angles) >= np.pi / 2):
+            raise CalibrationError("line angles must lie within 90 degrees of the vertical")
+        if not (self.pulse_fwhm > 0 and self.focal_length_px > 0 and np.isfinite(self.time_zero)):
+            raise CalibrationError("pulse width and focal length must be positive, time zero finite")
 
     @property
     def views(self) -> int:
@@ -194,9 +192,7 @@ class Camera:
             slit_width_px=int(record.attribute("slit_width_px")),
             gains=record.array("gains", np.float64, 1),
             view_positions=record.array("view_positions", np.float64, 1, "view step"),
-            sweep=sweep_from_record(record.children["sweep"])
-            if "sweep" in record.children
-            else None,
+            sweep=sweep_from_record(record.children["sweep"]) if "sweep" in record.children else None,
             dead_columns=record.array("dead_columns", np.uint8, 1).astype(bool),
             time_zero=float(record.attribute("time_zero_s")),
             pulse_fwhm=float(record.attribute("pulse_fwhm_s")),

@@ -56,9 +56,7 @@ class SkewSweep:
         for name in ("centres_px", "offsets_bin", "stretches"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         if not self.centres_px.shape == self.offsets_bin.shape == self.stretches.shape:
-            raise ShapeError(
-                "sweep skew", "(views,) in all three arrays", self.offsets_bin.shape
-            )
+            raise ShapeError("sweep skew", "(views,) in all three arrays", self.offsets_bin.shape)
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
         offset = _interpolate_and_extend(column, self.centres_px, self.offsets_bin)
@@ -188,9 +186,7 @@ def _quadratic(c: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
     return value
 
 
-def _interpolate_and_extend(
-    position: FloatArray, knots: FloatArray, values: FloatArray
-) -> FloatArray:
+def _interpolate_and_extend(position: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:
     """Piecewise linear interpolation whose end pieces go on beyond the outer knots."""
     if knots.size == 1:
         return np.full(np.shape(position), values[0])

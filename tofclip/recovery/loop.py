@@ -1,0 +1,122 @@
+"""The loop around a solver: how long it runs, what it remembers, and why it stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import InputError
+
+Progress = Callable[[int], None]
+"""Called with the number of frame iterations just done; may raise to interrupt."""
+
+
+def silent(_: int) -> None:
+    """Report nothing."""
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """When a block of frames is done.
+
+    Parameters
+    ----------
+    iterations : int
+        At most so many.
+    tolerance : float
+        Stop as soon as the block's objective changes by less than this fraction in an iteration in which no frame's
+        step was refused. 0 runs all iterations.
+    """
+
+    iterations: int
+    tolerance: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise InputError(f"at least one iteration is needed, got {self.iterations}")
+        if not (np.isfinite(self.tolerance) and self.tolerance >= 0):
+            raise InputError(f"tolerance must be finite and not negative, got {self.tolerance}")
+
+
+class IterativeSolver(Protocol):
+    """What the loop needs to know of a solver."""
+
+    objective: NDArray[np.float64]
+    refused: NDArray[np.bool_]
+
+    def step(self) -> None:
+        """Advance by one iteration."""
+        ...
+
+
+@dataclass(frozen=True)
+class History:
+    """What a run left behind.
+
+    Parameters
+    ----------
+    objective : (iterations + 1,) array
+        Sum over the frames before the first and after every iteration.
+    converged : bool
+        Whether the tolerance ended it.
+    """
+
+    objective: NDArray[np.float64]
+    converged: bool
+
+    @property
+    def iterations(self) -> int:
+        """Iterations done."""
+        return self.objective.size - 1
+
+
+def iterate(solver: IterativeSolver, stopping: Stopping, progress: Progress, frames: int) -> History:
+    """Run `solver` until `stopping` says that it is done."""
+    objective = [float(solver.objective.sum())]
+    converged = False
+    for done in range(stopping.iterations):
+        solver.step()
+        objective.append(float(solver.objective.sum()))
+        change = objective[-2] - objective[-1]
+        converged = not solver.refused.any() and change < stopping.tolerance * objective[-1]
+        if converged:
+            progress(frames * (stopping.iterations - done))
+            break
+        progress(frames)
+    return History(np.array(objective), converged)
+
+
+@dataclass(frozen=True)
+class Result:
+    """Recovered pictures and how they came about.
+
+    Parameters
+    ----------
+    frames : (frames, rows, columns) array
+    iterations : int
+        Of the block that took most; 0 for direct methods.
+    objective : (iterations + 1,) array
+        Sum over all frames; blocks that stopped early count with their last value. Empty for direct methods.
+    stopped_because : str
+        ``"converged"``, ``"iteration limit"`` or ``"direct method"``.
+    """
+
+    frames: NDArray[Any]
+    iterations: int = 0
+    objective: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    stopped_because: str = "direct method"
+
+    @classmethod
+    def of_blocks(cls, frames: NDArray[Any], histories: list[History]) -> Result:
+        """Join the histories of all blocks."""
+        longest = max(history.iterations for history in histories)
+        total = np.zeros(longest + 1)
+        for history in histories:
+            kept_on = np.full(longest - history.iterations, history.objective[-1])
+            total += np.concatenate([history.objective, kept_on])
+        converged = all(history.converged for history in histories)
+        return cls(frames, longest, total, "converged" if converged else "iteration limit")

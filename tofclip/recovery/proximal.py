@@ -1,0 +1,85 @@
+"""Regularisers with their proximal gradient steps."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import InputError
+
+Array = NDArray[Any]
+
+
+class Regulariser(Protocol):
+    """A penalty R(h) whose proximal map is known, on a block of (rows, columns, LANES) pictures."""
+
+    def descend(self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float) -> Array:
+        """Overwrite `previous` with ``prox_{step R}(z - step * gradient)``, a proximal gradient step.
+
+        ``z = current + momentum * (current - previous)`` is the extrapolated point and `gradient` belongs to it.
+        `gradient` may be overwritten as well. Returns R of the result for each frame, (LANES,) float64.
+        """
+        ...
+
+
+class NonnegativeSparsity:
+    """``weight * sum(h)`` for h >= 0, infinite otherwise: the l1 norm of a nonnegative picture.
+
+    Parameters
+    ----------
+    weight : float
+        In the unit of ``A'f``.
+    """
+
+    def __init__(self, weight: float) -> None:
+        self.weight = _checked(weight)
+
+    def descend(self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float) -> Array:
+        from tofclip.recovery.kernels import nonnegative_shrinkage
+
+        number = current.dtype.type
+        total = np.empty(current.shape[-1])
+        nonnegative_shrinkage(current, previous, momentum, gradient, number(step), number(step * self.weight), total)
+        return self.weight * total
+
+
+class NonnegativeTotalVariation:
+    """``weight * TV(h)`` for h >= 0, infinite otherwise; TV is the isotropic total variation of each frame.
+
+    The proximal map has no closed form. Its dual is kept from one call to the next (warm start), so that a few sweeps
+    a call follow the solver's own convergence. One instance therefore belongs to one block.
+
+    Parameters
+    ----------
+    weight : float
+        In the unit of ``A'f``.
+    sweeps : int
+        Dual sweeps in a call. With 2 the objective reached after 30 to 100 iterations is within 1e-3 of that with 10.
+    """
+
+    def __init__(self, weight: float, sweeps: int = 2) -> None:
+        self.weight = _checked(weight)
+        self.sweeps = sweeps
+        self._dual: Array | None = None
+
+    def descend(self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float) -> Array:
+        from tofclip.recovery import kernels
+
+        if self._dual is None:
+            self._dual = np.zeros((2, *current.shape), current.dtype)
+        number = current.dtype.type
+        weight = number(step * self.weight)
+        kernels.gradient_step(current, previous, momentum, gradient, number(step))
+        if weight > 0:
+            kernels.total_variation_dual_sweeps(gradient, self._dual, weight, self.sweeps, previous)
+        total = np.empty(current.shape[-1])
+        kernels.total_variation_primal(gradient, self._dual, weight, previous, total)
+        return self.weight * total
+
+
+def _checked(weight: float) -> float:
+    if not (np.isfinite(weight) and weight >= 0):
+        raise InputError(f"a regularisation weight must be finite and not negative, got {weight}")
+    return float(weight)
