@@ -1,1 +1,7 @@
-"""."""
+"""How a camera's numbers are found: from pictures of a point source, and from the shot itself."""
+
+from tofclip.calibration.focus_pictures import FocusCalibration, calibrate
+from tofclip.calibration.registration import Registration, register
+from tofclip.calibration.skew import SkewEstimate, estimate_skew
+
+__all__ = ["FocusCalibration", "Registration", "SkewEstimate", "calibrate", "estimate_skew", "register"]

@@ -1,6 +1,16 @@
 """The camera: where each view lies on the slit, how its lenslet projects, how the sweep bends time."""
 
+from tofclip.camera.measurement import Measurement, dark_level, measure
 from tofclip.camera.model import Camera
 from tofclip.camera.sweep import PolynomialSweep, ProjectiveSweep, SkewSweep, Sweep
 
-__all__ = ["Camera", "PolynomialSweep", "ProjectiveSweep", "SkewSweep", "Sweep"]
+__all__ = [
+    "Camera",
+    "Measurement",
+    "PolynomialSweep",
+    "ProjectiveSweep",
+    "SkewSweep",
+    "Sweep",
+    "dark_level",
+    "measure",
+]

@@ -1,0 +1,166 @@
+"""From a streak image and a camera to transient frames: the main path, as a paragraph."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from tofclip.calibration.registration import register, registration_work
+from tofclip.calibration.skew import estimate_skew
+from tofclip.camera import Camera, measure
+from tofclip.errors import InputError
+from tofclip.recovery import (
+    Adjoint,
+    LinearInverse,
+    Method,
+    Progress,
+    Sparse,
+    TotalVariation,
+    relative_residual,
+    silent,
+)
+from tofclip.storage import Scalar
+from tofclip.transient import Frames, Streak
+
+METHODS: dict[str, Callable[..., Method]] = {
+    "tv": TotalVariation,
+    "l1": Sparse,
+    "linear": LinearInverse,
+    "adjoint": Adjoint,
+}
+
+
+def method_named(name: str, **settings: Any) -> Method:
+    """Make a recovery method by its short name, with settings of its own where given.
+
+    Parameters
+    ----------
+    name : str
+        ``"tv"``, ``"l1"``, ``"linear"`` or ``"adjoint"``.
+    **settings
+        Passed on, such as ``iterations`` and ``weight`` of the iterative methods.
+    """
+    if name not in METHODS:
+        raise InputError(f"unknown method '{name}'; choose one of {', '.join(METHODS)}")
+    try:
+        return METHODS[name](**settings)
+    except TypeError as fault:
+        raise InputError(f"method '{name}' does not take {', '.join(settings)}") from fault
+
+
+@dataclass(frozen=True)
+class Task:
+    """A recovery that is about to run, so that a progress bar can know its length.
+
+    Parameters
+    ----------
+    streak : Streak
+    camera : Camera
+    method : Method
+    """
+
+    streak: Streak
+    camera: Camera
+    method: Method
+
+    @property
+    def work(self) -> int:
+        """Frame iterations that will be reported at most."""
+        own = self.method.work(self.streak.counts.shape[0])
+        return own + (registration_work() if self.camera.sweep is None else 0)
+
+    def run(self, progress: Progress = silent) -> Frames:
+        """Recover; see `recover`."""
+        started = time.perf_counter()
+        camera = self.camera
+        if camera.sweep is None:
+            camera = fitted_to_shot(self.streak, camera, progress)
+        measurement = measure(self.streak.counts, self.streak.saturated, camera)
+        operator = camera.operator()
+        solving = time.perf_counter()
+        result = self.method.recover(operator, measurement.readings, measurement.good, progress)
+        solved = time.perf_counter()
+        figures: dict[str, Scalar] = {
+            "method": self.method.name,
+            "iterations": result.iterations,
+            "stopped_because": result.stopped_because,
+            "relative_residual": relative_residual(operator, result.frames, measurement.readings, measurement.good),
+            "seconds": time.perf_counter() - started,
+            "frames_per_second": result.frames.shape[0] / (solved - solving),
+        }
+        return Frames(
+            values=result.frames,
+            times=self.streak.times - camera.time_zero,
+            camera=camera,
+            figures=figures,
+            attachments=self.streak.attachments,
+            provenance=self.streak.provenance,
+        )
+
+
+def recover(
+    streak: Streak,
+    camera: Camera | None = None,
+    method: str | Method = "tv",
+    progress: Progress = silent,
+) -> Frames:
+    """Recover every transient frame of a streak image.
+
+    A camera without a sweep has it estimated from the shot (`estimate_skew`), refined together with the views' gains
+    and centres (`register`); the frames carry the camera that was used.
+
+    Parameters
+    ----------
+    streak : Streak
+        With a time axis.
+    camera : Camera, optional
+        Defaults to the one that the streak image carries.
+    method : str or Method
+        ``"tv"`` (default), ``"l1"``, ``"linear"``, ``"adjoint"``, or a configured `tofclip.recovery` method.
+    progress : callable
+        Called with the number of frame iterations just done.
+
+    Returns
+    -------
+    Frames
+        ``(time, y, x)`` in counts, with time of flight in seconds.
+
+    Raises
+    ------
+    MissingTimeAxisError
+        The streak image does not say how long a row lasts.
+    CalibrationError
+        The camera does not belong to the streak image.
+    InputError
+        There is no camera, no light, or no such method.
+    """
+    return prepare(streak, camera, method).run(progress)
+
+
+def prepare(streak: Streak, camera: Camera | None = None, method: str | Method = "tv") -> Task:
+    """Check what `recover` needs before any work is done; arguments as there."""
+    camera = camera or streak.camera
+    if camera is None:
+        raise InputError(f"{streak.source} carries no camera: give one (--camera camera.h5, made by calibrate)")
+    _ = streak.times  # a missing axis is refused before minutes of work
+    return Task(streak, camera, method_named(method) if isinstance(method, str) else method)
+
+
+def fitted_to_shot(streak: Streak, camera: Camera, progress: Progress = silent) -> Camera:
+    """Return `camera` with sweep, gains and centres found from the shot itself."""
+    skew = estimate_skew(streak.counts, camera)
+    coarse = replace(camera, sweep=skew.sweep)
+    return register(streak.counts, streak.saturated, coarse, progress).camera
+
+
+def time_shift_bins(camera: Camera) -> list[float]:
+    """Rows by which each view is late at the first row, relative to the reference view."""
+    if camera.sweep is None:
+        return [0.0] * camera.views
+    rows, _ = camera.sweep.raw_position(np.zeros(camera.views), camera.centres_px)
+    reference = int(np.argmin(np.abs(camera.view_positions)))
+    return [float(row) for row in rows - rows[reference]]
