@@ -78,9 +78,7 @@ class Record:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     origin: str = ""
 
-    def array(
-        self, name: str, dtype: DTypeLike, dimensions: int, units: str = ""
-    ) -> NDArray[Any]:
+    def array(self, name: str, dtype: DTypeLike, dimensions: int, units: str = "") -> NDArray[Any]:
         """Return field `name` as a checked array.
 
         Raises
@@ -97,9 +95,7 @@ class Record:
                 f"field '{name}' must have {dimensions} dimensions, found shape {found.values.shape}",
             )
         if found.units != units:
-            raise FileFormatError(
-                self.origin, f"field '{name}' must be in '{units}', found '{found.units}'"
-            )
+            raise FileFormatError(self.origin, f"field '{name}' must be in '{units}', found '{found.units}'")
         if not np.can_cast(found.values.dtype, dtype, casting="same_kind"):
             raise FileFormatError(
                 self.origin,
@@ -147,9 +143,7 @@ class Record:
         if kinds and found.kind not in kinds:
             wanted = " or ".join(kinds)
             raise FileFormatError(path, f"holds a {found.kind} record, expected {wanted}")
-        return cls(
-            found.kind, found.fields, found.attributes, found.children, provenance, str(path)
-        )
+        return cls(found.kind, found.fields, found.attributes, found.children, provenance, str(path))
 
 
 @contextlib.contextmanager
@@ -167,14 +161,12 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
                 raise FileFormatError(path, "is an HDF5 file, but not one of tofclip's")
             version = int(file.attrs.get("format_version", 0))
             if version > FORMAT_VERSION:
-                raise FileFormatError(
-                    path, f"has format version {version}; this program reads {FORMAT_VERSION}"
-                )
+                raise FileFormatError(path, f"has format version {version}; this program reads {FORMAT_VERSION}")
             yield file
     except (OSError, KeyError, RuntimeError) as fault:
         if isinstance(fault, StorageError):
             raise
-        raise FileFormatError(path, f"is damaged or incomplete ({_one_line(fault)})") from fault
+        raise FileFormatError(path, f"is damaged or incomplete ({one_line(fault)})") from fault
 
 
 @contextlib.contextmanager
@@ -186,9 +178,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """
     target = Path(path)
     try:
-        handle, name = tempfile.mkstemp(
-            prefix=f".{target.name}.", suffix=target.suffix, dir=target.parent or "."
-        )
+        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=target.suffix, dir=target.parent or ".")
         os.close(handle)
     except OSError as fault:
         raise StorageError(f"{target}: cannot be written: {_reason(fault)}") from fault
@@ -226,11 +216,7 @@ def provenance(settings: Mapping[str, Any], *inputs: str | Path) -> dict[str, An
         "software": f"{FORMAT_NAME} {__version__}",
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "settings": dict(settings),
-        "inputs": [
-            {"name": Path(path).name, "sha256": sha256_of(path)}
-            for path in inputs
-            if Path(path).is_file()
-        ],
+        "inputs": [{"name": Path(path).name, "sha256": sha256_of(path)} for path in inputs if Path(path).is_file()],
     }
 
 
@@ -274,13 +260,9 @@ def _read_group(group: h5py.Group, origin: str) -> Record:
         else:
             children[name] = _read_group(item, origin)
     attributes = {
-        name.removeprefix("value."): _plain(value)
-        for name, value in group.attrs.items()
-        if name.startswith("value.")
+        name.removeprefix("value."): _plain(value) for name, value in group.attrs.items() if name.startswith("value.")
     }
-    return Record(
-        str(group.attrs.get("kind", "")), fields, attributes, children, origin=origin
-    )
+    return Record(str(group.attrs.get("kind", "")), fields, attributes, children, origin=origin)
 
 
 def _plain(value: Any) -> Scalar:
@@ -316,8 +298,9 @@ def _reason(fault: Exception) -> str:
         return "the folder does not exist; create it first"
     if isinstance(fault, PermissionError):
         return "writing is not permitted there"
-    return _one_line(fault)
+    return one_line(fault)
 
 
-def _one_line(fault: BaseException) -> str:
+def one_line(fault: BaseException) -> str:
+    """Return an exception's message without line breaks, or its name where it has none."""
     return " ".join(str(fault).split()) or type(fault).__name__

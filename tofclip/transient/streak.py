@@ -60,9 +60,7 @@ class Streak:
             raise ShapeError(f"{self.source}: a streak image", "(rows, columns)", counts.shape)
         bad = counts.size - int(np.count_nonzero(np.isfinite(counts)))
         if bad:
-            raise InputError(
-                f"{self.source}: {bad} pixels are NaN or infinite; replace them or mark them as saturated"
-            )
+            raise InputError(f"{self.source}: {bad} pixels are NaN or infinite; replace them or mark them as saturated")
         if not np.any(counts):
             raise InputError(f"{self.source}: every pixel is zero; was the shutter closed?")
         if self.saturated is not None and self.saturated.shape != counts.shape:
@@ -73,9 +71,7 @@ class Streak:
     def _checked_times(self, times: Any) -> NDArray[np.float64]:
         checked = np.asarray(times, dtype=np.float64)
         if checked.shape != (self.counts.shape[0],):
-            raise ShapeError(
-                f"{self.source}: the time axis", (self.counts.shape[0],), checked.shape
-            )
+            raise ShapeError(f"{self.source}: the time axis", (self.counts.shape[0],), checked.shape)
         if not np.all(np.isfinite(checked)) or np.any(np.diff(checked) <= 0):
             raise InputError(f"{self.source}: the time axis must be finite and increase row by row")
         return checked

@@ -1,0 +1,71 @@
+"""Read a streak image, whichever program wrote it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from tofclip.errors import FileFormatError
+from tofclip.io.lift import read_lift
+from tofclip.io.tiff import read_tiff
+from tofclip.storage import provenance, reading
+from tofclip.transient import Streak
+
+# A file is known by its first bytes: suffixes get lost and lie.
+READERS: dict[bytes, Callable[[str | Path], Streak]] = {
+    b"II*\0": read_tiff,
+    b"MM\0*": read_tiff,
+    b"PK\x03\x04": read_lift,
+    b"\x89HDF\r\n\x1a\n": Streak.load,
+}
+
+
+def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
+    """Read a streak image: rows are instants, columns are slit pixels.
+
+    The format is recognised by content: a TIFF of Hamamatsu's HPD-TA with its text and time axis, any other grey
+    TIFF (no time axis), a LIFT archive (``.npz``) with its camera, or a streak image of our own (HDF5).
+
+    Parameters
+    ----------
+    path : path-like
+    bin_width : float, optional
+        Duration of a row, s. Overrides the file's own time axis: rows are then evenly spaced, the first at 0.
+
+    Returns
+    -------
+    Streak
+        Raw counts as the file has them: no background or offset is taken off. `Streak.times` raises
+        `MissingTimeAxisError` where neither the file nor `bin_width` gives a time axis.
+
+    Raises
+    ------
+    StorageError
+        The file is absent or may not be read.
+    FileFormatError
+        It is empty, truncated, damaged or of another format.
+    InputError
+        Its pixels hold NaN, are all zero, all saturated, or negative where counts cannot be.
+    """
+    streak = _reader_of(path)(path)
+    if bin_width is not None:
+        streak = streak.with_bin_width(bin_width)
+    history = provenance({"bin_width_s": bin_width}, path)
+    if streak.provenance:
+        history["earlier"] = dict(streak.provenance)
+    return replace(streak, provenance=history)
+
+
+def _reader_of(path: str | Path) -> Callable[[str | Path], Streak]:
+    with reading(path), open(path, "rb") as file:
+        start = file.read(8)
+    if not start:
+        raise FileFormatError(path, "is empty")
+    for signature, reader in READERS.items():
+        if start.startswith(signature):
+            return reader
+    raise FileFormatError(
+        path, f"is no TIFF, LIFT archive (.npz) or HDF5 streak image ({os.path.getsize(path)} bytes of something else)"
+    )
