@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofclip.camera import Camera, SkewSweep, dark_level, measure
+from tofclip.errors import CalibrationError, InputError
+
+WIDTH, ROWS = 61, 80
+
+
+def camera(**changes: object) -> Camera:
+    settings = {"centres_px": [15.0, 45.0], "angles": [0.1, 0.2], "image_shape": (9, 9), "slit_width_px": WIDTH}
+    return Camera(**{**settings, **changes})
+
+
+def streak(dark: float = 100.0) -> np.ndarray:
+    counts = np.full((ROWS, WIDTH), dark, np.float32)
+    counts[30:50] += np.random.default_rng(0).random((20, WIDTH)).astype(np.float32) * 500
+    return counts
+
+
+def test_the_dark_level_comes_off_and_time_becomes_the_last_axis():
+    counts = streak()
+    measured = measure(counts, None, camera())
+    np.testing.assert_allclose(measured.readings, (counts - 100).T)
+    assert measured.good.all()
+
+
+def test_noise_about_the_dark_level_stays_centred():
+    rng = np.random.default_rng(1)
+    counts = (streak() + 8 * rng.standard_normal((ROWS, WIDTH))).astype(np.float32)
+    # The quietest 4 of 60 dark rows: the median of their 244 pixels scatters by 8 * 1.25 / sqrt(244) = 0.64, and
+    # choosing the quietest rows pulls it down by less than two standard errors of a row's mean (2.0).
+    assert dark_level(counts) == pytest.approx(100, abs=4)
+    assert measure(counts, None, camera()).readings.min() < 0
+
+
+def test_a_given_dark_level_is_used():
+    counts = streak()
+    np.testing.assert_allclose(measure(counts, None, camera(), dark=90.0).readings, (counts - 90).T)
+
+
+def test_a_skew_is_undone():
+    rows = np.arange(ROWS, dtype=float)[:, np.newaxis]
+    column = np.arange(WIDTH)[np.newaxis]
+    late = 4.0 * (column - 15) / 30  # 0 rows at the first view's centre, 4 at the second's
+    counts = np.exp(-((rows - 40 - late) ** 2) / (2 * 6.0**2)).astype(np.float32)
+    sweep = SkewSweep([15.0, 45.0], [0.0, 4.0], [0.0, 0.0])
+    measured = measure(counts, None, camera(sweep=sweep), dark=0.0)
+    expected = np.exp(-((rows - 40) ** 2) / (2 * 6.0**2)).T
+    inside = measured.good
+    # Linear interpolation of a Gaussian is off by at most max|f''| / 8 = 1 / (8 * 36).
+    np.testing.assert_allclose(measured.readings[inside], np.broadcast_to(expected, (WIDTH, ROWS))[inside], atol=1 / 288)
+    assert not inside[-1, -6:].any()  # the late view's last instants lie beyond the picture
+    assert inside[15].all()
+
+
+def test_what_touches_a_saturated_pixel_is_masked():
+    saturated = np.zeros((ROWS, WIDTH), bool)
+    saturated[40, 20] = True
+    plain = measure(streak(), saturated, camera())
+    assert np.argwhere(~plain.good).tolist() == [[20, 40]]
+    sweep = SkewSweep([15.0, 45.0], [0.5, 0.5], [0.0, 0.0])
+    shifted = measure(streak(), saturated, camera(sweep=sweep))
+    assert np.argwhere(~shifted.good[:, :-1]).tolist() == [[20, 39], [20, 40]]
+
+
+def test_dead_columns_are_masked():
+    dead = np.arange(WIDTH) == 33
+    measured = measure(streak(), None, camera(dead_columns=dead))
+    np.testing.assert_array_equal(~measured.good, np.repeat(dead[:, np.newaxis], ROWS, axis=1))
+
+
+def test_what_cannot_be_measured_is_refused():
+    with pytest.raises(CalibrationError, match="61 columns but the camera's slit has 64"):
+        measure(streak(), None, camera(slit_width_px=64))
+    with pytest.raises(InputError, match="no reading can be trusted"):
+        measure(streak(), np.ones((ROWS, WIDTH), bool), camera())
+    with pytest.raises(InputError, match="dark level"):
+        measure(np.full((ROWS, WIDTH), 7, np.float32), None, camera())

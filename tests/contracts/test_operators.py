@@ -1,0 +1,171 @@
+"""The contract of linear operators: every operator of the package is listed here and passes all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from tofclip.errors import InputError, ShapeError, TofclipError
+from tofclip.operators import Diagonal, LinearOperator, LineProjection, SparseMatrix, Stack
+
+CENTRES = [6.3, 19.0, 31.8]
+ANGLES = np.deg2rad([-41.0, 0.7, 35.0])
+
+
+def line_projection(dtype: type) -> LinearOperator:
+    return LineProjection((11, 13), 37, CENTRES, ANGLES, [0.9, 1.0, 1.2], dtype)
+
+
+def sparse_matrix(dtype: type) -> LinearOperator:
+    import scipy.sparse
+
+    matrix = scipy.sparse.random_array((15, 21), density=0.2, rng=np.random.default_rng(3), dtype=dtype)
+    return SparseMatrix(matrix.tocsr(), (3, 7), (15,))
+
+
+def many_tiles(dtype: type) -> LinearOperator:
+    """A picture too large for one cache tile, so that the product has to add up several."""
+    return LineProjection((97, 103), 131, [64.2], np.deg2rad([20.0]), [1.0], dtype)
+
+
+def diagonal(dtype: type) -> LinearOperator:
+    return Diagonal(np.random.default_rng(5).standard_normal((5, 7)), dtype)
+
+
+def composition(dtype: type) -> LinearOperator:
+    return Diagonal(np.linspace(0, 2, 37), dtype) @ line_projection(dtype)
+
+
+def stack(dtype: type) -> LinearOperator:
+    other = LineProjection((11, 13), 20, [9.5], [0.2], [1.0], dtype)
+    return Stack([line_projection(dtype), other])
+
+
+def adjoint(dtype: type) -> LinearOperator:
+    return line_projection(dtype).H
+
+
+def normal(dtype: type) -> LinearOperator:
+    operator = line_projection(dtype)
+    return operator.H @ operator
+
+
+BUILDERS: list[Callable[[type], LinearOperator]] = [
+    line_projection,
+    sparse_matrix,
+    many_tiles,
+    diagonal,
+    composition,
+    stack,
+    adjoint,
+    normal,
+]
+BATCHES = [(), (1,), (3,), (32,), (33,)]
+
+every_operator = pytest.mark.parametrize("build", BUILDERS, ids=lambda build: build.__name__)
+both_types = pytest.mark.parametrize("dtype", [np.float32, np.float64])
+every_batch = pytest.mark.parametrize("batch", BATCHES, ids=str)
+
+
+def tolerance(dtype: type) -> float:
+    """The project's bound for a matched adjoint: 1e-5 in float32, 1e-12 in float64."""
+    return 1e-5 if dtype == np.float32 else 1e-12
+
+
+def random_pair(operator: LinearOperator, batch: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    # Positive numbers: their products do not cancel, so that the relative bound means something.
+    rng = np.random.default_rng(0)
+    return rng.random((*operator.shape_in, *batch)), rng.random((*operator.shape_out, *batch))
+
+
+@every_operator
+@both_types
+@every_batch
+def test_adjoint_matches_forward(build, dtype, batch):
+    operator = build(dtype)
+    x, y = random_pair(operator, batch)
+    forward, backward = np.vdot(operator(x), y), np.vdot(x, operator.adjoint(y))
+    scale = np.linalg.norm(operator(x)) * np.linalg.norm(y)
+    assert abs(forward - backward) <= tolerance(dtype) * scale, f"adjoint is off by a factor {backward / forward}"
+
+
+@every_operator
+@both_types
+def test_linear(build, dtype):
+    operator = build(dtype)
+    a, _ = random_pair(operator, (3,))
+    b = a[::-1] ** 2
+    whole = operator(2.5 * a - 1.5 * b)
+    parts = 2.5 * operator(a) - 1.5 * operator(b)
+    assert np.linalg.norm(whole - parts) <= 10 * tolerance(dtype) * np.linalg.norm(operator(a) + operator(b))
+
+
+@every_operator
+@both_types
+@every_batch
+def test_result_has_the_stated_shape_and_type(build, dtype, batch):
+    operator = build(dtype)
+    x, y = random_pair(operator, batch)
+    assert operator(x).shape == (*operator.shape_out, *batch)
+    assert operator.adjoint(y).shape == (*operator.shape_in, *batch)
+    assert operator(x).dtype == operator.adjoint(y).dtype == operator.dtype == dtype
+
+
+@every_operator
+@both_types
+def test_every_frame_of_a_batch_is_treated_alone(build, dtype):
+    operator = build(dtype)
+    x, y = random_pair(operator, (35,))
+    for frame in (0, 31, 32, 34):
+        np.testing.assert_allclose(operator(x)[..., frame], operator(x[..., frame]), rtol=tolerance(dtype))
+        np.testing.assert_allclose(operator.adjoint(y)[..., frame], operator.adjoint(y[..., frame]), rtol=tolerance(dtype))
+
+
+@every_operator
+def test_refuses_every_other_shape(build):
+    operator = build(np.float32)
+    wrong = [(), (4,), operator.shape_in[:-1], (*operator.shape_in, 2, 2), (operator.shape_in[0] + 1, *operator.shape_in[1:])]
+    for shape in wrong:
+        with pytest.raises(ShapeError, match="must have shape"):
+            operator(np.zeros(shape))
+    with pytest.raises(ShapeError, match="must have shape"):
+        operator.adjoint(np.zeros((operator.shape_out[0] + 1, *operator.shape_out[1:])))
+    with pytest.raises(InputError, match="must be real"):
+        operator(np.zeros(operator.shape_in, complex))
+
+
+@every_operator
+def test_leaves_its_input_alone(build):
+    operator = build(np.float32)
+    x, y = (array.astype(np.float32) for array in random_pair(operator, (32,)))
+    x_before, y_before = x.copy(), y.copy()
+    operator(x)
+    operator.adjoint(y)
+    np.testing.assert_array_equal(x, x_before)
+    np.testing.assert_array_equal(y, y_before)
+
+
+def test_the_adjoint_of_the_adjoint_is_the_operator():
+    operator = line_projection(np.float32)
+    assert operator.H.H is operator
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: line_projection(np.float32) @ line_projection(np.float32),
+        lambda: Diagonal(np.ones(37), np.float64) @ line_projection(np.float32),
+        lambda: Stack([]),
+        lambda: Stack([line_projection(np.float32), diagonal(np.float32)]),
+        lambda: Stack([line_projection(np.float32), line_projection(np.float64)]),
+        lambda: Diagonal([1.0, np.nan]),
+        lambda: Diagonal(np.ones(3), np.int64),
+        lambda: LineProjection((3, 3), 9, [1.0, 2.0], [0.0], [1.0]),
+        lambda: LineProjection((0, 3), 9, [1.0], [0.0], [1.0]),
+    ],
+)
+def test_operators_that_do_not_fit_are_refused(build):
+    with pytest.raises(TofclipError):
+        build()
