@@ -1,0 +1,166 @@
+"""Point clouds: where in space each return came from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import FileFormatError, InputError, ShapeError
+from tofclip.lidar import export
+from tofclip.lidar.geometry import ray_directions
+from tofclip.lidar.returns import Returns
+from tofclip.storage import Field, Record
+
+UNITS = {
+    "x": "m",
+    "y": "m",
+    "z": "m",
+    "intensity": "count",
+    "confidence": "m",
+    "range": "m",
+    "return_number": "",
+    "time": "s",
+}
+"""The columns of a point cloud, in the order in which files hold them."""
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Points in the reference view's frame: x right, y down, z forward, origin at the reference lenslet.
+
+    Parameters
+    ----------
+    xyz : (n, 3) float32 array
+        Positions, m.
+    intensity : (n,) float32 array
+        Counts, referred to a range of 1 m: proportional to reflectance.
+    confidence : (n,) float32 array
+        Expected standard deviation of the range, m; smaller is surer.
+    range : (n,) float32 array
+        Distance from the origin, m.
+    return_number : (n,) uint8 array
+        1 for the nearest return of a pixel.
+    time : (n,) float32 array
+        Time of flight there and back, s.
+    provenance : mapping
+        How it came about; kept in HDF5 files only.
+
+    Raises
+    ------
+    ShapeError, InputError
+        Columns of different length, or positions that are not finite.
+    """
+
+    xyz: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    range: NDArray[np.float32]
+    return_number: NDArray[np.uint8]
+    time: NDArray[np.float32]
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        xyz = np.ascontiguousarray(self.xyz, dtype=np.float32)
+        if xyz.ndim != 2 or xyz.shape[1] != 3:
+            raise ShapeError("the positions of a point cloud", "(points, 3)", xyz.shape)
+        if not np.all(np.isfinite(xyz)):
+            raise InputError("the positions of a point cloud must be finite")
+        object.__setattr__(self, "xyz", xyz)
+        for name in ("intensity", "confidence", "range", "return_number", "time"):
+            dtype = np.uint8 if name == "return_number" else np.float32
+            column = np.ascontiguousarray(getattr(self, name), dtype=dtype)
+            if column.shape != (xyz.shape[0],):
+                raise ShapeError(f"{name} of a point cloud", (xyz.shape[0],), column.shape)
+            object.__setattr__(self, name, column)
+
+    def __len__(self) -> int:
+        return int(self.xyz.shape[0])
+
+    def save(self, path: str | Path) -> None:
+        """Write the points to a file whose suffix says the format, whole or not at all.
+
+        Parameters
+        ----------
+        path : path-like
+            ``.ply`` and ``.pcd`` (binary, little endian), ``.csv``, ``.npz``, or ``.h5`` (with provenance).
+
+        Raises
+        ------
+        InputError
+            Another suffix.
+        StorageError
+            The file could not be written; what was there before is left as it was.
+        """
+        if Path(path).suffix.lower() == ".h5":
+            self.to_record().save(path)
+        else:
+            export.write(path, self._columns())
+
+    @classmethod
+    def load(cls, path: str | Path) -> PointCloud:
+        """Read a point cloud that `save` wrote, in any of its formats.
+
+        Raises
+        ------
+        InputError, StorageError, FileFormatError
+            A suffix of no known format, a file that cannot be read, or one that is damaged or lacks a column.
+        """
+        if Path(path).suffix.lower() == ".h5":
+            return cls.from_record(Record.load(path, "cloud"))
+        values = export.read(path)
+        missing = [name for name in UNITS if name not in values]
+        if missing:
+            raise FileFormatError(path, f"has no column '{missing[0]}': it was not written by tofclip")
+        positions = np.stack([values.pop(axis) for axis in "xyz"], axis=-1)
+        properties: dict[str, Any] = {name: values[name] for name in UNITS if name not in "xyz"}
+        return cls(xyz=positions, **properties)
+
+    def to_record(self) -> Record:
+        """Return everything that has to be stored."""
+        fields = {"xyz": Field(self.xyz, "m", ("point", "xyz"))}
+        for name in UNITS:
+            if name not in "xyz":
+                fields[name] = Field(getattr(self, name), UNITS[name], ("point",))
+        return Record("cloud", fields, provenance=self.provenance)
+
+    @classmethod
+    def from_record(cls, record: Record) -> PointCloud:
+        """Rebuild a point cloud from what was stored."""
+        columns: dict[str, Any] = {
+            name: record.array(name, np.uint8 if name == "return_number" else np.float32, 1, UNITS[name])
+            for name in UNITS
+            if name not in "xyz"
+        }
+        return cls(xyz=record.array("xyz", np.float32, 2, "m"), provenance=record.provenance, **columns)
+
+    def _columns(self) -> list[export.Column]:
+        values = dict(zip("xyz", self.xyz.T, strict=True))
+        return [
+            export.Column(name, unit, values[name] if name in values else getattr(self, name))
+            for name, unit in UNITS.items()
+        ]
+
+
+def point_cloud(returns: Returns) -> PointCloud:
+    """Place every return in space: its range along the direction in which its pixel looks.
+
+    Parameters
+    ----------
+    returns : Returns
+        Radial distances with their camera.
+    """
+    directions = ray_directions(returns.camera, returns.y, returns.x)
+    return PointCloud(
+        xyz=(directions * returns.range[:, np.newaxis]).astype(np.float32),
+        intensity=returns.intensity,
+        confidence=returns.confidence,
+        range=returns.range.astype(np.float32),
+        return_number=returns.return_number,
+        time=returns.time.astype(np.float32),
+        provenance=returns.provenance,
+    )
