@@ -1,0 +1,202 @@
+"""The virtual pulse of phasor-field imaging, and the few frequencies of a capture that it lets pass.
+
+Liu et al., "Non-line-of-sight imaging using phasor-field virtual wave optics", Nature 572, 620-623 (2019).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.time_axis import TimeAxis
+from tofclip.errors import InputError
+
+ENVELOPE_HALF_WIDTHS = 3.0
+"""The pulse's cycles fill its Gaussian envelope from -3 to +3 standard deviations."""
+
+BAND_EDGE = 0.01
+"""Frequencies at which the pulse's spectrum is weaker than this, relative to its peak, are left out."""
+
+TAIL_WIDTHS = 4.0
+"""Room for the pulse before and after the record, in standard deviations of its envelope."""
+
+SAMPLES_PER_WAVELENGTH = 64
+"""Samples of a filtered signal per carrier wavelength: linear interpolation then errs by 1e-3 rms for 3 cycles."""
+
+
+@dataclass(frozen=True)
+class VirtualPulse:
+    """A carrier of a given wavelength under a Gaussian envelope.
+
+    The envelope over path length L is ``exp(-L^2 / (2 * sigma^2))`` with ``6 * sigma = cycles * wavelength``: 99.7 % of
+    it lie within the cycles.
+
+    Parameters
+    ----------
+    wavelength : float
+        Carrier wavelength in path length, m. About twice the size of the finest detail that is resolved; at least
+        twice the spacing of the wall points.
+    cycles : float
+        Length of the pulse in wavelengths.
+    """
+
+    wavelength: float
+    cycles: float = 3.0
+
+    def __post_init__(self) -> None:
+        for name in ("wavelength", "cycles"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"{name} of the virtual pulse must be a positive number, got {value}")
+
+    @property
+    def wavenumber(self) -> float:
+        """Wavenumber of the carrier, rad/m."""
+        return 2 * np.pi / self.wavelength
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the envelope, m of path."""
+        return self.cycles * self.wavelength / (2 * ENVELOPE_HALF_WIDTHS)
+
+    def spectrum(self, wavenumbers: Any) -> NDArray[np.float64]:
+        """Strength of the pulse at wavenumbers in rad/m, 1 at the carrier."""
+        detuning = (np.asarray(wavenumbers, dtype=np.float64) - self.wavenumber) * self.sigma
+        return np.exp(-(detuning**2) / 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Waveforms:
+    """Band-limited complex signals, finely sampled over path length.
+
+    Parameters
+    ----------
+    values : (points, samples) complex array
+        The first and the last sample are 0, so that holding them means silence outside.
+    start : float
+        Path length of sample 0, m.
+    spacing : float
+        Path between samples, m.
+    """
+
+    values: NDArray[Any]
+    start: float
+    spacing: float
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """The frequencies at which a virtual pulse sees a capture.
+
+    They are harmonics of a period that holds the whole record and the pulse before and after it, so that no signal
+    wraps around.
+
+    Parameters
+    ----------
+    pulse : VirtualPulse
+    axis : TimeAxis
+        Time axis of the capture.
+
+    Raises
+    ------
+    InputError
+        The pulse is too short for the time bins: no frequency is left, or its carrier itself is lost.
+    """
+
+    pulse: VirtualPulse
+    axis: TimeAxis
+
+    def __post_init__(self) -> None:
+        shortest = 2 * self.axis.spacing
+        if self.pulse.wavelength <= shortest or self.harmonics.size == 0:
+            raise InputError(
+                f"empty band: time bins of {self.axis.spacing:.4g} m of path cannot carry a wavelength of "
+                f"{self.pulse.wavelength:.4g} m; use more than {shortest:.4g} m"
+            )
+
+    @cached_property
+    def tail_bins(self) -> int:
+        """Bins of silence before and after the record, which the pulse spreads into."""
+        return int(np.ceil(TAIL_WIDTHS * self.pulse.sigma / self.axis.spacing)) + 1
+
+    @cached_property
+    def period_bins(self) -> int:
+        """Length of the Fourier transform, bins."""
+        from scipy.fft import next_fast_len
+
+        return int(next_fast_len(self.axis.bins + 2 * self.tail_bins, real=True))
+
+    @cached_property
+    def harmonics(self) -> NDArray[np.int64]:
+        """Indices of the band's frequencies in the transform, without 0 and without the Nyquist frequency."""
+        indices = np.arange(1, (self.period_bins + 1) // 2)
+        return indices[self.pulse.spectrum(indices * self._fundamental) >= BAND_EDGE]
+
+    @property
+    def _fundamental(self) -> float:
+        return 2 * np.pi / (self.period_bins * self.axis.spacing)
+
+    @property
+    def wavenumbers(self) -> NDArray[np.float64]:
+        """The band's wavenumbers k, rad/m, evenly spaced, shape (frequencies,)."""
+        return self._fundamental * self.harmonics.astype(np.float64)
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """The pulse's weights G_k, shape (frequencies,).
+
+        Scaled so that a signal ``cos(k * L)`` of the carrier gives phasors that add up to ``exp(1j * k * L)``.
+        """
+        return self.pulse.spectrum(self.wavenumbers) * (2 / self.period_bins)
+
+    def phasors(self, traces: NDArray[Any]) -> NDArray[Any]:
+        """Return ``P_k = G_k * sum_i H_i * exp(-1j * k * L_i)`` of every signal.
+
+        Parameters
+        ----------
+        traces : (points, t) float32 or float64 array
+
+        Returns
+        -------
+        (points, frequencies) complex64 or complex128 array
+        """
+        from scipy.fft import rfft
+
+        spectrum = rfft(traces, self.period_bins, axis=1)[:, self.harmonics]
+        weights = self.weights * np.exp(-1j * self.wavenumbers * self.axis.start)
+        filtered: NDArray[Any] = spectrum * weights.astype(spectrum.dtype)
+        return filtered
+
+    def waveforms(self, phasors: NDArray[Any]) -> Waveforms:
+        """Return ``sum_k P_k * exp(1j * k * L)`` on an axis of path lengths L fine enough for linear interpolation."""
+        # So few frequencies are summed faster by one matrix product than by a Fourier transform padded with zeros.
+        values = phasors @ self._carriers.astype(phasors.dtype)
+        return Waveforms(values, float(self._sample_paths[0]), self._sample_spacing)
+
+    @property
+    def samples(self) -> int:
+        """Length of the waveforms."""
+        return self._sample_paths.size
+
+    @cached_property
+    def _sample_spacing(self) -> float:
+        factor = max(1, int(np.ceil(SAMPLES_PER_WAVELENGTH * self.axis.spacing / self.pulse.wavelength)))
+        return self.axis.spacing / factor
+
+    @cached_property
+    def _sample_paths(self) -> NDArray[np.float64]:
+        """Path lengths of the record and of the pulse's tails before and after it, m."""
+        tail = self.tail_bins * self.axis.spacing
+        count = round((self.axis.bins * self.axis.spacing + 2 * tail) / self._sample_spacing)
+        return self.axis.start - tail + self._sample_spacing * np.arange(count, dtype=np.float64)
+
+    @cached_property
+    def _carriers(self) -> NDArray[np.complex128]:
+        """``exp(1j * k * L)``, shape (frequencies, samples), 0 at both ends."""
+        carriers: NDArray[np.complex128] = np.exp(1j * np.outer(self.wavenumbers, self._sample_paths))
+        carriers[:, [0, -1]] = 0
+        return carriers

@@ -1,0 +1,167 @@
+"""A capture: transients on a relay wall, with the geometry that they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.time_axis import TimeAxis
+from tofclip.errors import InputError, ShapeError
+from tofclip.storage import Field, Record
+
+if TYPE_CHECKING:
+    from tofclip.transient import Frames
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """What a detector saw at points of a relay wall while the laser lit one spot, or each point itself.
+
+    Parameters
+    ----------
+    signal : (t, ...) array
+        Brightness per time bin and wall point, kept as float32. May be negative (background taken off).
+    wall : (..., 3) array
+        Wall points, m. Points with a NaN coordinate are left out, whatever their signal holds.
+    laser : (3,) or (..., 3) array
+        The laser spot on the wall, m; or one spot per wall point, equal to the wall for a confocal scan.
+    bin_width : float
+        Duration of a time bin, s.
+    start : float
+        Length of the path laser spot -> hidden point -> wall point that bin 0 holds, m.
+    provenance : mapping
+        How it came about.
+
+    Raises
+    ------
+    ShapeError, InputError
+        Shapes disagree, a used signal is not finite, no wall point is left, or the time axis is unusable.
+    """
+
+    signal: NDArray[np.float32]
+    wall: FloatArray
+    laser: FloatArray
+    bin_width: float
+    start: float = 0.0
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "signal", _real(self.signal, np.float32, "signal"))
+        object.__setattr__(self, "wall", _real(self.wall, np.float64, "wall"))
+        object.__setattr__(self, "laser", _real(self.laser, np.float64, "laser"))
+        object.__setattr__(self, "bin_width", float(self.bin_width))
+        object.__setattr__(self, "start", float(self.start))
+        self._validate()
+
+    def _validate(self) -> None:
+        if self.wall.ndim == 0 or self.wall.shape[-1] != 3:
+            raise ShapeError("wall", "(..., 3)", self.wall.shape)
+        if self.signal.ndim != self.wall.ndim or self.signal.shape[1:] != self.wall.shape[:-1]:
+            expected = ("t", *self.wall.shape[:-1])
+            raise ShapeError("signal", f"{expected} like the wall", self.signal.shape)
+        if self.laser.shape not in ((3,), self.wall.shape):
+            raise ShapeError("laser", f"(3,) or the wall's {self.wall.shape}", self.laser.shape)
+        if self.laser.shape == (3,) and not np.all(np.isfinite(self.laser)):
+            raise InputError(f"the laser spot must be finite, got {self.laser}")
+        TimeAxis(self.signal.shape[0], self.bin_width, self.start)
+        if not np.any(self.valid):
+            raise InputError("every wall point is NaN: nothing is left to image with")
+        bad = int(np.count_nonzero(~np.isfinite(self.signal[:, self.valid])))
+        if bad:
+            raise InputError(
+                f"{bad} samples of the signal are NaN or infinite; set them to 0, or their wall points to NaN"
+            )
+
+    @property
+    def axis(self) -> TimeAxis:
+        """The time axis."""
+        return TimeAxis(self.signal.shape[0], self.bin_width, self.start)
+
+    @cached_property
+    def valid(self) -> NDArray[np.bool_]:
+        """Wall points whose position, and whose own laser spot, is known; shape (...)."""
+        return np.asarray(np.isfinite(self.wall).all(axis=-1) & np.isfinite(self.laser).all(axis=-1))
+
+    @cached_property
+    def points(self) -> FloatArray:
+        """Valid wall points in C order, m, shape (points, 3)."""
+        return self.wall[self.valid]
+
+    @cached_property
+    def lasers(self) -> FloatArray:
+        """Laser spots, m: shape (1, 3) if it stands still, else (points, 3) in the order of `points`."""
+        return self.laser[np.newaxis] if self.laser.shape == (3,) else self.laser[self.valid]
+
+    def traces(self, selection: slice = slice(None)) -> NDArray[np.float32]:
+        """Signals of some valid wall points, in the order of `points`, shape (points, t)."""
+        columns = np.flatnonzero(self.valid)[selection]
+        by_point = self.signal.reshape(self.signal.shape[0], -1)[:, columns].T
+        return np.ascontiguousarray(by_point)
+
+    @classmethod
+    def from_frames(cls, frames: Frames) -> Capture:
+        """Take the wall's part out of recovered frames and remove each wall point's way to the camera.
+
+        The frames must carry a record ``"relay_wall"``: fields ``wall`` (rows, columns, 3), ``camera`` (3,) and
+        ``laser`` (3,) in m; attributes ``row_offset`` and ``column_offset``, the pixel that saw the first wall point,
+        and ``receive_delay_bins``, the number of bins that the record began after light of path 0.
+
+        Coordinates stay as they are in the record.
+
+        Raises
+        ------
+        InputError
+            The frames carry no relay wall, the wall does not fit into the picture, or the frames are not evenly
+            spaced in time.
+        """
+        from nlos.unwarp import captured_wall
+
+        return captured_wall(frames)
+
+    def to_record(self) -> Record:
+        """Return everything that has to be stored."""
+        names = ("row", "column") if self.wall.ndim == 3 else tuple(f"wall_{i}" for i in range(self.wall.ndim - 1))
+        fields = {
+            "signal": Field(self.signal, "count", ("time", *names)),
+            "wall": Field(self.wall, "m", (*names, "xyz")),
+            "laser": Field(self.laser, "m", ("xyz",) if self.laser.ndim == 1 else (*names, "xyz")),
+        }
+        attributes = {"bin_width_s": self.bin_width, "start_m": self.start}
+        return Record("capture", fields, attributes, provenance=self.provenance)
+
+    @classmethod
+    def from_record(cls, record: Record) -> Capture:
+        """Rebuild a capture from what was stored."""
+        dimensions = {name: entry.values.ndim for name, entry in record.fields.items()}
+        return cls(
+            signal=record.array("signal", np.float32, dimensions.get("signal", 0), "count"),
+            wall=record.array("wall", np.float64, dimensions.get("wall", 0), "m"),
+            laser=record.array("laser", np.float64, dimensions.get("laser", 0), "m"),
+            bin_width=float(record.attribute("bin_width_s")),
+            start=float(record.attribute("start_m")),
+            provenance=record.provenance,
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the capture to an HDF5 file, whole or not at all."""
+        self.to_record().save(path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Capture:
+        """Read a capture that `save` wrote."""
+        return cls.from_record(Record.load(path, "capture"))
+
+
+def _real(values: Any, dtype: type, name: str) -> NDArray[Any]:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiub":
+        raise InputError(f"{name} must hold real numbers, got {array.dtype}")
+    return np.ascontiguousarray(array, dtype=dtype)

@@ -1,0 +1,68 @@
+"""The definition of the phasor-field image, summed term by term in float64: slow, and what other methods answer to."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.band import Band, VirtualPulse
+from nlos.capture import Capture
+from nlos.geometry import Grid
+from nlos.method import common_support
+from nlos.volume import Volume
+
+TERMS_AT_A_TIME = 1 << 20
+"""Distances held at a time, 8 MB of each kind, whatever the sizes of wall and volume."""
+
+
+def exact_phasor_field(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Volume:
+    """Sum ``P_k(r_p) * exp(1j * k * (|r_L - r| + |r - r_p|)) / |r - r_p|`` over the band and the wall.
+
+    Costs one complex exponential per voxel, wall point and frequency, plus one each.
+
+    Parameters
+    ----------
+    capture : Capture
+    grid : Grid
+    pulse : VirtualPulse
+
+    Returns
+    -------
+    Volume
+        The complex field, complex128.
+
+    Raises
+    ------
+    InputError
+        An empty band, a single wall point, a grid behind the wall, or one that is too large.
+    """
+    band = Band(pulse, capture.axis)
+    common_support(capture, grid).require()
+    phasors = band.phasors(capture.traces().astype(np.float64))
+    z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
+    voxels = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+    field = np.empty(len(voxels), np.complex128)
+    count = max(1, TERMS_AT_A_TIME // len(capture.points))
+    for first in range(0, len(voxels), count):
+        some = slice(first, first + count)
+        field[some] = _sum_over_wall(capture, voxels[some], band.wavenumbers, phasors)
+    return Volume(field.reshape(grid.shape), grid, capture.provenance)
+
+
+def _sum_over_wall(
+    capture: Capture,
+    voxels: NDArray[np.float64],
+    wavenumbers: NDArray[np.float64],
+    phasors: NDArray[np.complex128],
+) -> NDArray[np.complex128]:
+    last_leg = _distances(voxels, capture.points)
+    path = last_leg + _distances(voxels, capture.lasers)
+    field = np.zeros(len(voxels), np.complex128)
+    for k, at_k in zip(wavenumbers, phasors.T, strict=True):
+        field += (np.exp(1j * k * path) / last_leg) @ at_k
+    return field
+
+
+def _distances(voxels: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    distances: NDArray[np.float64] = np.linalg.norm(voxels[:, np.newaxis] - points, axis=-1)
+    return distances

@@ -1,0 +1,123 @@
+"""The grid of voxels on which a hidden scene is imaged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import InputError, ShapeError
+
+if TYPE_CHECKING:
+    from nlos.capture import Capture
+
+FloatArray = NDArray[np.float64]
+
+DEEPEST_WALL_WIDTHS = 2.0
+"""Beyond this many wall widths the picture is coarser than a quarter of its distance to any use."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Voxel centres, the product of three axes.
+
+    Parameters
+    ----------
+    x, y, z : (n,) array
+        Coordinates in m, strictly increasing; x to the right, y down, z from the wall into the hidden scene.
+
+    Raises
+    ------
+    ShapeError, InputError
+        An axis is empty or not one-dimensional, holds NaN or infinity, or does not increase.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "z"):
+            object.__setattr__(self, name, _axis(getattr(self, name), name))
+
+    @classmethod
+    def box(cls, x: Sequence[float], y: Sequence[float], z: Sequence[float], voxel: float | Sequence[float]) -> Grid:
+        """Fill a box with voxels.
+
+        Parameters
+        ----------
+        x, y, z : (float, float)
+            First and last voxel centre along each axis, m.
+        voxel : float or (float, float, float)
+            Distance of neighbouring centres, m, for all axes or for x, y and z. It is met exactly: where a side is no
+            multiple of it, the voxels are centred in the box and the outer ones lie inside.
+        """
+        sizes = np.broadcast_to(np.asarray(voxel, dtype=np.float64), (3,))
+        if not np.all(np.isfinite(sizes) & (sizes > 0)):
+            raise InputError(f"the voxel size must be a positive number of metres, got {voxel}")
+        sides = {"x": x, "y": y, "z": z}
+        return cls(*(_filled(name, sides[name], size) for name, size in zip("xyz", sizes, strict=True)))
+
+    @classmethod
+    def in_front_of(cls, capture: Capture, voxel: float, near: float | None = None, far: float | None = None) -> Grid:
+        """Fill the space in front of a capture's wall, as wide and as high as the wall.
+
+        Parameters
+        ----------
+        capture : Capture
+        voxel : float
+            Distance of neighbouring voxel centres, m.
+        near, far : float, optional
+            First and last z, m. They default to one voxel in front of the foremost wall point, and to the depth that
+            light reaches and returns from within the record, at most two wall widths.
+        """
+        low, high = capture.points.min(axis=0), capture.points.max(axis=0)
+        width = float(max(high[0] - low[0], high[1] - low[1]))
+        if near is None:
+            near = float(high[2]) + voxel
+        if far is None:
+            reach = capture.axis.paths[-1] / 2
+            far = float(low[2] + high[2]) / 2 + float(min(reach, DEEPEST_WALL_WIDTHS * width))
+        if far < near:
+            raise InputError(
+                f"no room for a hidden scene: z would run from {near:.3g} to {far:.3g} m; does the record "
+                f"(paths up to {capture.axis.paths[-1]:.3g} m) start at the right time?"
+            )
+        return cls.box((low[0], high[0]), (low[1], high[1]), (near, far), voxel)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Voxels along (z, y, x)."""
+        return self.z.size, self.y.size, self.x.size
+
+    @property
+    def size(self) -> int:
+        """Number of voxels."""
+        return self.z.size * self.y.size * self.x.size
+
+    def nearest(self, point: Sequence[float]) -> tuple[int, int, int]:
+        """Index (z, y, x) of the voxel nearest to a point (x, y, z) in m."""
+        x, y, z = (int(np.argmin(np.abs(a - p))) for a, p in zip((self.x, self.y, self.z), point, strict=True))
+        return z, y, x
+
+
+def _axis(values: Any, name: str) -> FloatArray:
+    axis = np.array(values, dtype=np.float64)
+    if axis.ndim != 1 or axis.size == 0:
+        raise ShapeError(f"grid axis {name}", "(n,) with n >= 1", axis.shape)
+    if not np.all(np.isfinite(axis)) or np.any(np.diff(axis) <= 0):
+        raise InputError(f"grid axis {name} must be finite and strictly increasing")
+    axis.flags.writeable = False
+    return axis
+
+
+def _filled(name: str, side: Sequence[float], voxel: float) -> FloatArray:
+    first, last = (float(end) for end in side)
+    if not (np.isfinite(first) and np.isfinite(last) and first <= last):
+        raise InputError(f"side {name} of the box must run from a smaller to a larger number, got {first}, {last}")
+    # A side that is a whole number of voxels up to rounding keeps its outer voxel.
+    steps = int(np.floor((last - first) / voxel + 1e-6))
+    return (first + last) / 2 + voxel * (np.arange(steps + 1, dtype=np.float64) - steps / 2)

@@ -1,0 +1,76 @@
+"""What every reconstruction method offers, and how it says that it cannot treat an input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from nlos.capture import Capture
+from nlos.geometry import Grid
+from nlos.volume import Volume
+from tofclip.errors import InputError
+
+Progress = Callable[[int], None]
+"""Called with the number of look-ups just done; may raise to interrupt."""
+
+MEMORY_LIMIT_BYTES = 8 << 30
+"""Larger volumes are refused before anything is allocated."""
+
+VOXEL_BYTES = 12
+"""A complex64 sum and its float32 magnitude."""
+
+
+def silent(_: int) -> None:
+    """Report nothing."""
+
+
+@dataclass(frozen=True)
+class Support:
+    """Whether a method can treat an input: true if there is no reason against it.
+
+    Parameters
+    ----------
+    reason : str
+        Why not, as one clause that says what to do; empty if it can.
+    """
+
+    reason: str = ""
+
+    def __bool__(self) -> bool:
+        return not self.reason
+
+    def require(self) -> None:
+        """Raise the reason, if there is one, as `InputError`."""
+        if self.reason:
+            raise InputError(self.reason)
+
+
+class Reconstructor(Protocol):
+    """One method of imaging a hidden scene."""
+
+    def supports(self, capture: Capture, grid: Grid) -> Support:
+        """Say whether the method can image `capture` on `grid`, and if not, why."""
+        ...
+
+    def reconstruct(self, capture: Capture, grid: Grid) -> Volume:
+        """Image the hidden scene."""
+        ...
+
+
+def common_support(capture: Capture, grid: Grid) -> Support:
+    """Check what no method can do without: several wall points, a grid that is not behind them, and memory."""
+    if len(capture.points) == 1:
+        return Support("one wall point cannot locate anything: a capture needs several")
+    hindmost = float(capture.points[:, 2].min())
+    if grid.z[0] < hindmost:
+        return Support(
+            f"the grid begins at z = {grid.z[0]:.4g} m, behind the hindmost wall point at {hindmost:.4g} m: the hidden "
+            "scene lies at larger z than the wall (if yours faces -z, negate x and z of all coordinates)"
+        )
+    if grid.size * VOXEL_BYTES > MEMORY_LIMIT_BYTES:
+        return Support(
+            f"{grid.size} voxels need {grid.size * VOXEL_BYTES / 2**30:.1f} GiB, more than the "
+            f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: use larger voxels or a smaller box"
+        )
+    return Support()

@@ -1,0 +1,120 @@
+"""The picture of a volume: three views and a depth map, with axes in metres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.volume import Volume
+from tofclip.errors import InputError
+from tofclip.storage import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+FORMATS = (".png", ".pdf", ".svg")
+DEPTH_THRESHOLD = 0.4
+"""The depth map shows columns whose brightest voxel has at least this share of the volume's brightest."""
+
+COLOURS = "inferno"
+DEPTH_COLOURS = "viridis"
+WIDTH_INCHES = 13.0
+DOTS_PER_INCH = 110
+SLIMMEST, WIDEST = 0.3, 2.0
+"""Bounds of a panel's side relative to the scene's width, so that flat and deep boxes stay legible."""
+
+
+def save_picture(volume: Volume, path: str | Path) -> None:
+    """Draw front, side and top view (brightest voxel along the line of sight) and a depth map into a file.
+
+    The front view looks along +z from the wall into the scene, x to the right and y down. Beside it, the side view
+    shares y and has the wall at its left edge; below it, the top view shares x and has the wall at its upper edge.
+
+    Parameters
+    ----------
+    volume : Volume
+    path : path-like
+        Ends in .png, .pdf or .svg.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in FORMATS:
+        raise InputError(f"{target}: a picture's name must end in {', '.join(FORMATS)}")
+    figure = _draw_figure(volume)
+    with atomic_path(target) as temporary:
+        figure.savefig(temporary, format=target.suffix[1:].lower())
+
+
+def _draw_figure(volume: Volume) -> Figure:
+    # A bare figure draws with Agg and leaves the caller's pyplot alone.
+    from matplotlib.figure import Figure
+
+    width, height, depth = _panel_sides(volume)
+    columns, rows = [width, depth, width], [height, depth]
+    size = (WIDTH_INCHES, WIDTH_INCHES * sum(rows) / sum(columns) + 0.5)
+    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
+    panels = figure.add_gridspec(2, 3, width_ratios=columns, height_ratios=rows)
+    front, side, top = (figure.add_subplot(panels[place]) for place in ((0, 0), (0, 1), (1, 0)))
+    drawn = _draw_views(volume, front, side, top)
+    figure.colorbar(drawn, ax=top, label="relative brightness", location="bottom", shrink=0.8)
+    depth_map = figure.add_subplot(panels[0, 2])
+    drawn = _draw_depth(volume, depth_map)
+    figure.colorbar(drawn, ax=depth_map, label="z from the wall (m)", location="bottom", shrink=0.8)
+    return figure
+
+
+def _panel_sides(volume: Volume) -> NDArray[np.float64]:
+    """Width, height and depth of the panels, relative to the width."""
+    edges = [_edges(axis) for axis in (volume.grid.x, volume.grid.y, volume.grid.z)]
+    lengths = np.array([last - first for first, last in edges])
+    return np.asarray(np.clip(lengths / lengths[0], SLIMMEST, WIDEST))
+
+
+def _draw_views(volume: Volume, front: Axes, side: Axes, top: Axes) -> AxesImage:
+    x, y, z = volume.grid.x, volume.grid.y, volume.grid.z
+    magnitude = volume.magnitude
+    magnitude = magnitude / (magnitude.max() or 1.0)
+    front.set_title("front: from the wall, along +z")
+    side.set_title("side: wall at the left")
+    top.set_title("top: wall at the upper edge")
+    _draw(side, magnitude.max(axis=2).T, (z, y), ("z (m)", "y (m), down"))
+    _draw(top, magnitude.max(axis=1), (x, z), ("x (m)", "z (m)"))
+    return _draw(front, magnitude.max(axis=0), (x, y), ("x (m)", "y (m), down"))
+
+
+def _draw_depth(volume: Volume, axes: Axes) -> AxesImage:
+    projection = volume.maximum_projection()
+    weak = projection.brightness < DEPTH_THRESHOLD * projection.brightness.max()
+    depth = np.where(weak, np.nan, projection.depth)
+    axes.set_title(f"depth, where above {DEPTH_THRESHOLD:.0%} of the brightest")
+    drawn = _draw(axes, depth, (volume.grid.x, volume.grid.y), ("x (m)", "y (m), down"), None)
+    drawn.set_cmap(DEPTH_COLOURS)
+    return drawn
+
+
+def _draw(
+    axes: Axes,
+    picture: NDArray[Any],
+    coordinates: tuple[NDArray[np.float64], NDArray[np.float64]],
+    labels: tuple[str, str],
+    brightest: float | None = 1.0,
+) -> AxesImage:
+    """Draw a picture (rows, columns) with the first coordinate to the right and the second downwards."""
+    left, right = _edges(coordinates[0])
+    upper, lower = _edges(coordinates[1])
+    extent = (left, right, lower, upper)
+    lowest = None if brightest is None else 0.0
+    drawn = axes.imshow(picture, COLOURS, vmin=lowest, vmax=brightest, extent=extent, interpolation="nearest")
+    axes.set_xlabel(labels[0])
+    axes.set_ylabel(labels[1])
+    return drawn
+
+
+def _edges(axis: NDArray[np.float64]) -> tuple[float, float]:
+    """Outer edges of the first and the last voxel, m; a single voxel gets 1 mm."""
+    half = (axis[-1] - axis[0]) / (2 * (axis.size - 1)) if axis.size > 1 else 0.5e-3
+    return float(axis[0] - half), float(axis[-1] + half)

@@ -1,0 +1,102 @@
+"""From frames of a camera that looks at the relay wall to a capture: taking off the ways between wall and camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.capture import Capture
+from nlos.kernels import delayed_reading
+from tofclip.errors import InputError, ShapeError
+from tofclip.storage import Record
+from tofclip.transient import Frames
+from tofclip.units import SPEED_OF_LIGHT
+
+ATTACHMENT = "relay_wall"
+EVEN_STEPS = 1e-3
+"""Steps of a time axis may differ from their mean by this fraction; over 1000 bins that stays below one bin."""
+
+
+def captured_wall(frames: Frames) -> Capture:
+    """Do what `Capture.from_frames` describes."""
+    record = frames.attachments.get(ATTACHMENT)
+    if record is None:
+        raise InputError(
+            "these frames carry no relay wall: recover them from a streak image converted with its wall's geometry"
+        )
+    wall = record.array("wall", np.float64, 3, "m")
+    camera = record.array("camera", np.float64, 1, "m")
+    laser = record.array("laser", np.float64, 1, "m")
+    bin_width = _even_bin_width(frames)
+    seen = _window(frames.values, record, wall.shape)
+    delay = float(record.attribute("receive_delay_bins"))
+    return Capture(
+        signal=unwarp(seen, wall, camera, laser, bin_width),
+        wall=wall,
+        laser=laser,
+        bin_width=bin_width,
+        start=SPEED_OF_LIGHT * (float(frames.times[0]) + delay * bin_width),
+        provenance=frames.provenance,
+    )
+
+
+def unwarp(signal: Any, wall: Any, camera: Any, laser: Any, bin_width: float) -> NDArray[np.float32]:
+    """Shift every wall point's signal earlier by ``(|r_p - camera| - |laser - camera|) / c``.
+
+    Afterwards light of one path laser spot -> hidden point -> wall point stands in the same bin for all wall points.
+    Between bins the signal is interpolated linearly; before the first and after the last bin it is 0.
+
+    Parameters
+    ----------
+    signal : (t, ...) array
+        As the camera saw it.
+    wall : (..., 3) array
+        Wall points, m; the signal of a point with NaN becomes 0.
+    camera, laser : (3,) array
+        Position of the camera and of the laser spot on the wall, m.
+    bin_width : float
+        Duration of a time bin, s.
+
+    Returns
+    -------
+    (t, ...) float32 array
+    """
+    signal, wall = np.asarray(signal, dtype=np.float32), np.asarray(wall, dtype=np.float64)
+    camera, laser = np.asarray(camera, dtype=np.float64), np.asarray(laser, dtype=np.float64)
+    if signal.shape[1:] != wall.shape[:-1] or wall.shape[-1:] != (3,):
+        raise ShapeError("wall", (*signal.shape[1:], 3), wall.shape)
+    for name, place in (("camera", camera), ("laser", laser)):
+        if place.shape != (3,) or not np.all(np.isfinite(place)):
+            raise InputError(f"the {name} position must be three finite numbers, got {place}")
+    return_leg = np.linalg.norm(wall - camera, axis=-1) - np.linalg.norm(laser - camera)
+    late_bins = return_leg / (SPEED_OF_LIGHT * bin_width)
+    # A shift by the whole record reads nothing but zeros.
+    late_bins = np.nan_to_num(late_bins, nan=signal.shape[0] + 1.0)
+    flat = np.ascontiguousarray(signal.reshape(signal.shape[0], -1))
+    shifted: NDArray[np.float32] = delayed_reading(flat, late_bins.ravel()).reshape(signal.shape)
+    return shifted
+
+
+def _even_bin_width(frames: Frames) -> float:
+    bin_width = frames.bin_width
+    steps = np.diff(frames.times)
+    if np.max(np.abs(steps - bin_width)) > EVEN_STEPS * bin_width:
+        raise InputError(
+            f"the frames are {steps.min():.3e} to {steps.max():.3e} s apart; imaging around a corner needs evenly "
+            "spaced ones: recover with one bin width (--bin-width-ps)"
+        )
+    return bin_width
+
+
+def _window(values: NDArray[np.float32], record: Record, wall_shape: tuple[int, ...]) -> NDArray[np.float32]:
+    row, column = int(record.attribute("row_offset")), int(record.attribute("column_offset"))
+    rows, columns = wall_shape[:2]
+    fits = row >= 0 and column >= 0 and row + rows <= values.shape[1] and column + columns <= values.shape[2]
+    if not fits:
+        raise InputError(
+            f"a wall of {rows} x {columns} points from pixel ({row}, {column}) on does not fit into frames of "
+            f"{values.shape[1]} x {values.shape[2]} pixels"
+        )
+    return values[:, row : row + rows, column : column + columns]

@@ -1,0 +1,124 @@
+"""The imaged hidden scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.geometry import Grid
+from tofclip.errors import InputError, ShapeError
+from tofclip.storage import Field, Record
+
+AXES = ("z", "y", "x")
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """The brightest voxel along every line of sight in z.
+
+    Parameters
+    ----------
+    brightness : (y, x) float array
+    depth : (y, x) float array
+        z of that voxel, m.
+    """
+
+    brightness: NDArray[Any]
+    depth: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Brightness, or complex phasor field, on a grid of voxels.
+
+    Pictures of it look along +z, from the relay wall into the hidden scene, x to the right and y down.
+
+    What is left and what is right follows from the capture's coordinates alone. If +z leaves the wall on the room's
+    side (and x, y, z are right-handed, y down), the picture is what someone standing at the wall sees. If the
+    coordinates are those of a camera facing the wall (x right and y down in its picture, z into the wall, as in the
+    LIFT captures), the volume is the scene's mirror image behind the wall, and the picture is what that camera would
+    see if the wall were a mirror: the camera's left stays left, and writing that faces the wall appears reversed.
+
+    Parameters
+    ----------
+    values : (z, y, x) array
+        Real or complex; float32 or complex64 unless given in double precision.
+    grid : Grid
+    provenance : mapping
+        How it came about.
+
+    Raises
+    ------
+    ShapeError, InputError
+        Values and grid disagree, or a value is not a finite number.
+    """
+
+    values: NDArray[Any]
+    grid: Grid
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        values = np.asarray(self.values)
+        if values.dtype.kind not in "fc":
+            values = values.astype(np.float32)
+        if values.shape != self.grid.shape:
+            raise ShapeError("volume", f"(z, y, x) = {self.grid.shape}", values.shape)
+        if not np.all(np.isfinite(values)):
+            raise InputError("a volume must not hold NaN or infinity")
+        object.__setattr__(self, "values", np.ascontiguousarray(values))
+
+    @property
+    def magnitude(self) -> NDArray[Any]:
+        """Brightness, real and not negative, shape (z, y, x)."""
+        return np.asarray(np.abs(self.values))
+
+    def brightest(self) -> tuple[float, float, float]:
+        """Position (x, y, z) of the brightest voxel, m."""
+        z, y, x = np.unravel_index(int(np.argmax(self.magnitude)), self.grid.shape)
+        return float(self.grid.x[x]), float(self.grid.y[y]), float(self.grid.z[z])
+
+    def maximum_projection(self) -> Projection:
+        """Project along z: the largest brightness of every column (y, x), and the depth where it stands."""
+        magnitude = self.magnitude
+        return Projection(magnitude.max(axis=0), self.grid.z[magnitude.argmax(axis=0)])
+
+    def threshold(self, fraction: float) -> Volume:
+        """Return the volume with every voxel set to 0 that is weaker than `fraction` (0..1) of the brightest."""
+        if not 0 <= fraction <= 1:
+            raise InputError(f"a threshold is a fraction between 0 and 1, got {fraction}")
+        magnitude = self.magnitude
+        kept = np.where(magnitude >= fraction * magnitude.max(), self.values, 0)
+        return Volume(kept.astype(self.values.dtype), self.grid, self.provenance)
+
+    def save_picture(self, path: str | Path) -> None:
+        """Draw front view, depth map, top and side view with axes in metres; PNG, PDF or SVG by the file's name."""
+        from nlos.picture import save_picture
+
+        save_picture(self, path)
+
+    def to_record(self) -> Record:
+        """Return everything that has to be stored."""
+        axes = {name: Field(getattr(self.grid, name), "m", (name,)) for name in AXES}
+        return Record("volume", {"values": Field(self.values, "", AXES), **axes}, provenance=self.provenance)
+
+    @classmethod
+    def from_record(cls, record: Record) -> Volume:
+        """Rebuild a volume from what was stored."""
+        stored = record.fields["values"].values.dtype if "values" in record.fields else np.dtype(np.float32)
+        values = record.array("values", stored if stored.kind in "fc" else np.float32, 3)
+        x, y, z = (record.array(name, np.float64, 1, "m") for name in "xyz")
+        return cls(values, Grid(x, y, z), record.provenance)
+
+    def save(self, path: str | Path) -> None:
+        """Write the volume to an HDF5 file, whole or not at all."""
+        self.to_record().save(path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Volume:
+        """Read a volume that `save` wrote."""
+        return cls.from_record(Record.load(path, "volume"))
