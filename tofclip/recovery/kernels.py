@@ -12,6 +12,8 @@ from numba import njit
 
 from tofclip.arrays import LANES
 
+TILE = 32
+
 compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy")
 
 
@@ -44,6 +46,20 @@ def gradient_step(current, previous, momentum, gradient, step):
                 here = current[row, column, lane]
                 point = here + momentum[lane] * (here - previous[row, column, lane])
                 gradient[row, column, lane] = point - step * gradient[row, column, lane]
+
+
+@compiled
+def lanes_to_frames(block, frames):
+    """``frames[lane, pixel] = block[pixel, lane]`` for as many lanes as there are frames; contiguous 2D arrays.
+
+    Tile by tile, so that both sides move whole cache lines: several times faster than a strided copy.
+    """
+    pixels = block.shape[0]
+    for first in range(0, pixels, TILE):
+        last = min(first + TILE, pixels)
+        for lane in range(frames.shape[0]):
+            for pixel in range(first, last):
+                frames[lane, pixel] = block[pixel, lane]
 
 
 @compiled

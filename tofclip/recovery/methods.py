@@ -272,7 +272,10 @@ def _full_block(values: Array, piece: slice) -> Array:
 
 def _write_frames(block: Array, frames: Array, piece: slice) -> None:
     """Put a (rows, columns, LANES) block where its frames belong."""
-    frames[piece] = np.moveaxis(block[..., : piece.stop - piece.start], -1, 0)
+    from tofclip.recovery.kernels import lanes_to_frames
+
+    target = frames[piece].reshape(piece.stop - piece.start, -1)
+    lanes_to_frames(block.reshape(-1, block.shape[-1]), target)
 
 
 def _largest_back_projection(operator: LinearOperator, readings: Array, good: Mask) -> float:

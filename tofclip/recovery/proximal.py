@@ -48,18 +48,19 @@ class NonnegativeSparsity:
 class NonnegativeTotalVariation:
     """``weight * TV(h)`` for h >= 0, infinite otherwise; TV is the isotropic total variation of each frame.
 
-    The proximal map has no closed form. Its dual is kept from one call to the next (warm start), so that a few sweeps
-    a call follow the solver's own convergence. One instance therefore belongs to one block.
+    The proximal map has no closed form. Its dual is kept from one call to the next (warm start), so that even a
+    single sweep a call follows the solver's own convergence. One instance therefore belongs to one block.
 
     Parameters
     ----------
     weight : float
         In the unit of ``A'f``.
     sweeps : int
-        Dual sweeps in a call. With 2 the objective reached after 30 to 100 iterations is within 1e-3 of that with 10.
+        Dual sweeps in a call. On the clip scene's shot one sweep ends 1.4 % above the objective of ten after 60
+        iterations and 0.4 % after 200; the time of further sweeps is better spent on further iterations.
     """
 
-    def __init__(self, weight: float, sweeps: int = 2) -> None:
+    def __init__(self, weight: float, sweeps: int = 1) -> None:
         self.weight = _checked(weight)
         self.sweeps = sweeps
         self._dual: Array | None = None
