@@ -122,7 +122,7 @@ def depth(
     pixel, time, signal, deviation = _listed(*_search(frames, pulse, detection))
     distance = SPEED_OF_LIGHT * time / 2
     intensity = signal * (distance / REFERENCE_RANGE) ** 2
-    kept = (time > 0) & detection.significant(pixel, intensity)
+    kept = (time > 0) & detection.significant(pixel, time, intensity, pulse.fwhm)
     y, x = np.divmod(pixel[kept], camera.image_shape[1])
     return Returns(
         y=y.astype(np.int32),

@@ -1,0 +1,114 @@
+"""From a scene to the expected streak image, ray by ray.
+
+Nothing here uses the projection operator that recovery inverts: rays are cast from each lenslet, and each ray's light
+is put on the slit where the ray falls and when it arrives.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from tofclip.camera import Camera
+from tofclip.simulate.instrument import Instrument
+from tofclip.simulate.scene import NO_PLATE, Scene
+from tofclip.units import SPEED_OF_LIGHT
+
+FloatArray = NDArray[np.float64]
+
+FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
+REACH_SIGMAS = 5.0  # a Gaussian leaves 6e-7 of its energy outside
+
+
+class RayBundle(NamedTuple):
+    """The light that one view receives.
+
+    Attributes
+    ----------
+    x, y : (n,) array
+        Where the rays fall in the view's picture, pixels from its optical axis.
+    time : (n,) array
+        Arrival, s after time zero.
+    brightness : (n,) array
+        Arbitrary units, the same for all views; proportional to reflectance / range^2.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    time: FloatArray
+    brightness: FloatArray
+
+
+def view_rays(scene: Scene, instrument: Instrument, position: float) -> RayBundle:
+    """Cast the rays of the view at `position` view steps; those that bring no light are left out."""
+    x, y = instrument.pixel_grid()
+    hits = scene.look(instrument.viewpoint(position), instrument.directions(x, y, position))
+    bright = (hits.plate != NO_PLATE) & (hits.reflectance > 0)
+    share = 1 / instrument.rays_per_pixel_side**2
+    return RayBundle(
+        x[bright],
+        y[bright],
+        2 * hits.path[bright] / SPEED_OF_LIGHT,
+        share * hits.reflectance[bright] / hits.distance[bright] ** 2,
+    )
+
+
+def streak_of_rays(rays: RayBundle, view: int, instrument: Instrument) -> FloatArray:
+    """Put one view's light on the streak image: (rows, columns), in the units of the rays' brightness."""
+    camera, detector = instrument.camera, instrument.detector
+    slit = camera.centres_px[view] + rays.x - rays.y * np.tan(camera.angles[view])
+    row = (rays.time + camera.time_zero) / detector.bin_width
+    row, slit, stretch = _swept(camera, row, slit)
+    first_column, light = _share_columns(slit, camera.gains[view] * rays.brightness, instrument.rays_per_pixel_side)
+    first_row, pulse = share_rows(row, stretch * pulse_sigma_bins(instrument))
+    rows = first_row[:, np.newaxis, np.newaxis] + np.arange(pulse.shape[1])[:, np.newaxis]
+    columns = first_column[:, np.newaxis, np.newaxis] + np.arange(2)
+    amount = pulse[:, :, np.newaxis] * light[:, np.newaxis, :]
+    shape = (detector.rows, camera.slit_width_px)
+    on_screen = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
+    pixel = rows * shape[1] + columns
+    return gathered(pixel[on_screen], amount[on_screen], shape)
+
+
+def _swept(camera: Camera, row: FloatArray, slit: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Raw row and column of rectified positions, and how many raw rows a rectified one takes there."""
+    if camera.sweep is None:
+        return row, slit, np.ones_like(row)
+    raw_row, raw_column = camera.sweep.raw_position(row, slit)
+    stretch = camera.sweep.raw_position(row + 0.5, slit)[0] - camera.sweep.raw_position(row - 0.5, slit)[0]
+    return raw_row, raw_column, stretch
+
+
+def _share_columns(position: FloatArray, light: FloatArray, side: int) -> tuple[NDArray[np.intp], FloatArray]:
+    """Split each ray, 1/side of a pixel wide, exactly between the one or two slit pixels that it covers.
+
+    Slit pixel j reaches from j - 1/2 to j + 1/2. Returns the left pixel and the light on it and on the next.
+    """
+    left_edge = position - 0.5 / side
+    first = np.floor(left_edge + 0.5)
+    on_next = np.clip((left_edge + 1 / side - (first + 0.5)) * side, 0.0, 1.0)
+    return first.astype(np.intp), np.stack([light * (1 - on_next), light * on_next], axis=-1)
+
+
+def gathered(cell: NDArray[np.intp], amount: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    """Add each amount to its cell, numbered in raster order, of an array of `shape`."""
+    total: Any = np.bincount(cell, amount, minlength=int(np.prod(shape)))
+    return np.asarray(total, dtype=np.float64).reshape(shape)
+
+
+def pulse_sigma_bins(instrument: Instrument) -> float:
+    """Standard deviation of the Gaussian pulse in rows of the rectified streak image."""
+    return float(instrument.camera.pulse_fwhm / FWHM_PER_SIGMA / instrument.detector.bin_width)
+
+
+def share_rows(row: FloatArray, sigma: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+    """Share of a Gaussian pulse around `row` that falls on each row: first row (n,) and shares (n, reach)."""
+    if row.size == 0:
+        return np.zeros(0, dtype=np.intp), np.zeros((0, 1))
+    half = int(np.ceil(REACH_SIGMAS * sigma.max() + 0.5))
+    first = np.round(row).astype(np.intp) - half
+    edges = first[:, np.newaxis] + np.arange(2 * half + 2) - 0.5
+    return first, np.diff(ndtr((edges - row[:, np.newaxis]) / sigma[:, np.newaxis]), axis=1)

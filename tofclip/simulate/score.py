@@ -1,0 +1,52 @@
+"""How well returns agree with the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+
+from tofclip.errors import InputError, ShapeError
+from tofclip.lidar import Returns
+from tofclip.simulate.truth import Truth
+from tofclip.units import SPEED_OF_LIGHT
+
+
+def score(returns: Returns, truth: Truth) -> dict[str, float]:
+    """Compare each target pixel's most intense return with the true range.
+
+    Parameters
+    ----------
+    returns : Returns
+    truth : Truth
+
+    Returns
+    -------
+    dict
+        ``median_depth_error_m``: median absolute range error of the target pixels that have a return;
+        ``share_within_one_bin``: share of all target pixels whose return is within ``c * bin_width / 2`` of the
+        truth, so that a missing return counts against it;
+        ``share_with_return``: share of the target pixels that have a return;
+        ``false_return_share``: share of all returns that lie more than a pixel away from anything in the scene;
+        ``bin_m``: ``c * bin_width / 2``.
+
+    Raises
+    ------
+    ShapeError, InputError
+        Another picture size, or no target pixel with a return.
+    """
+    distance = returns.image("range")
+    if distance.shape != truth.range.shape:
+        raise ShapeError("the returns' picture", truth.range.shape, distance.shape)
+    error = np.abs(distance - truth.range)[truth.target]
+    found = np.isfinite(error)
+    if not found.any():
+        raise InputError("no target pixel of the truth has a return")
+    bin_m = SPEED_OF_LIGHT * truth.bin_width / 2
+    near_anything = binary_dilation(np.isfinite(truth.range), np.ones((3, 3)))
+    return {
+        "median_depth_error_m": float(np.median(error[found])),
+        "share_within_one_bin": float(np.mean(error <= bin_m)),
+        "share_with_return": float(np.mean(found)),
+        "false_return_share": float(np.mean(~near_anything[returns.y, returns.x])),
+        "bin_m": bin_m,
+    }

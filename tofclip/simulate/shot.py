@@ -1,0 +1,78 @@
+"""One simulated shot: the streak image with everything that is known about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.camera import Camera
+from tofclip.errors import InputError
+from tofclip.simulate.instrument import Instrument
+from tofclip.simulate.render import streak_of_rays, view_rays
+from tofclip.simulate.scene import Scene
+from tofclip.simulate.truth import Truth
+from tofclip.storage import provenance
+from tofclip.transient import Streak
+
+
+@dataclass(frozen=True)
+class SimulatedShot:
+    """A streak image and the truth behind it.
+
+    Parameters
+    ----------
+    streak : Streak
+        Readings in photons with noise, background and saturation; carries the true camera.
+    camera : Camera
+        The true camera, with the gains and the sweep that made the picture.
+    truth : Truth
+        What the reference view sees.
+    signal : (rows, columns) float32 array
+        Expected signal of each streak pixel without background, photons.
+    exposure : float
+        Photons for reflectance 1 at 1 m that fills a picture pixel, in a view of gain 1.
+    """
+
+    streak: Streak
+    camera: Camera
+    truth: Truth
+    signal: NDArray[np.float32]
+    exposure: float
+
+
+def simulate(scene: Scene, instrument: Instrument, seed: int) -> SimulatedShot:
+    """Take one shot of `scene`.
+
+    Parameters
+    ----------
+    scene : Scene
+    instrument : Instrument
+    seed : int
+        Of the photon noise; the same seed gives the same shot.
+
+    Raises
+    ------
+    InputError
+        No light of the scene reaches the streak image.
+    """
+    camera, detector = instrument.camera, instrument.detector
+    light = np.zeros((detector.rows, camera.slit_width_px))
+    for view, position in enumerate(camera.view_positions):
+        light += streak_of_rays(view_rays(scene, instrument, float(position)), view, instrument)
+    if not light.any():
+        raise InputError(
+            "no light of the scene reaches the streak image: check positions, number of rows and time zero"
+        )
+    exposure = detector.peak_photons / float(light.max())
+    counts, saturated = detector.expose(exposure * light, np.random.default_rng(seed))
+    streak = Streak(
+        counts,
+        detector.row_times,
+        saturated,
+        camera=camera,
+        source="simulated streak image",
+        provenance=provenance({"seed": seed, "peak_photons": detector.peak_photons, "exposure": exposure}),
+    )
+    return SimulatedShot(streak, camera, Truth.of(scene, instrument), (exposure * light).astype(np.float32), exposure)
