@@ -51,7 +51,9 @@ def test_a_skew_is_undone():
     expected = np.exp(-((rows - 40) ** 2) / (2 * 6.0**2)).T
     inside = measured.good
     # Linear interpolation of a Gaussian is off by at most max|f''| / 8 = 1 / (8 * 36).
-    np.testing.assert_allclose(measured.readings[inside], np.broadcast_to(expected, (WIDTH, ROWS))[inside], atol=1 / 288)
+    np.testing.assert_allclose(
+        measured.readings[inside], np.broadcast_to(expected, (WIDTH, ROWS))[inside], atol=1 / 288
+    )
     assert not inside[-1, -6:].any()  # the late view's last instants lie beyond the picture
     assert inside[15].all()
 

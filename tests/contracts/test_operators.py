@@ -120,13 +120,21 @@ def test_every_frame_of_a_batch_is_treated_alone(build, dtype):
     x, y = random_pair(operator, (35,))
     for frame in (0, 31, 32, 34):
         np.testing.assert_allclose(operator(x)[..., frame], operator(x[..., frame]), rtol=tolerance(dtype))
-        np.testing.assert_allclose(operator.adjoint(y)[..., frame], operator.adjoint(y[..., frame]), rtol=tolerance(dtype))
+        np.testing.assert_allclose(
+            operator.adjoint(y)[..., frame], operator.adjoint(y[..., frame]), rtol=tolerance(dtype)
+        )
 
 
 @every_operator
 def test_refuses_every_other_shape(build):
     operator = build(np.float32)
-    wrong = [(), (4,), operator.shape_in[:-1], (*operator.shape_in, 2, 2), (operator.shape_in[0] + 1, *operator.shape_in[1:])]
+    wrong = [
+        (),
+        (4,),
+        operator.shape_in[:-1],
+        (*operator.shape_in, 2, 2),
+        (operator.shape_in[0] + 1, *operator.shape_in[1:]),
+    ]
     for shape in wrong:
         with pytest.raises(ShapeError, match="must have shape"):
             operator(np.zeros(shape))

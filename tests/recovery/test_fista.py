@@ -45,7 +45,9 @@ def test_without_a_weight_it_solves_nonnegative_least_squares():
     truth = np.maximum(np.random.default_rng(1).standard_normal((12, 11)), 0)
     readings = operator(truth) + 0.1 * np.random.default_rng(2).standard_normal(40)
     _, expected = scipy.optimize.nnls(operator.matrix.toarray(), readings)
-    solver = Fista(operator, LeastSquares(_lanes(readings)), NonnegativeSparsity(0), 1 / squared_norm(operator, 99), LANES)
+    solver = Fista(
+        operator, LeastSquares(_lanes(readings)), NonnegativeSparsity(0), 1 / squared_norm(operator, 99), LANES
+    )
     iterate(solver, Stopping(4000), silent, LANES)
     assert np.sqrt(2 * solver.objective[0]) == pytest.approx(expected, rel=1e-6)
 
@@ -57,7 +59,9 @@ def test_optimality_of_sparse_solutions():
     truth[3:5, 4:8] = [[1, 2, 1, 3], [2, 2, 1, 1]]
     readings = operator(truth)
     weight = 0.02
-    solver = Fista(operator, LeastSquares(_lanes(readings)), NonnegativeSparsity(weight), 1 / squared_norm(operator, 99), LANES)
+    solver = Fista(
+        operator, LeastSquares(_lanes(readings)), NonnegativeSparsity(weight), 1 / squared_norm(operator, 99), LANES
+    )
     iterate(solver, Stopping(6000), silent, LANES)
     picture = solver.current[..., 0]
     pull = operator.adjoint(readings - operator(picture))

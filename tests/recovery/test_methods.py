@@ -45,9 +45,7 @@ def test_linear_inverse_leaves_dead_readings_out(operator):
 def test_a_prepared_inverse_serves_many_shots(operator):
     readings = np.random.default_rng(2).random((40, 40))
     prepared = LinearInverse().prepare(operator)
-    np.testing.assert_array_equal(
-        prepared.recover(readings).frames, LinearInverse().recover(operator, readings).frames
-    )
+    np.testing.assert_array_equal(prepared.recover(readings).frames, LinearInverse().recover(operator, readings).frames)
 
 
 def test_adjoint_is_the_adjoint(operator):

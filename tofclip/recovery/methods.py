@@ -120,7 +120,7 @@ class Sparse(_ProximalMethod):
 class TotalVariation(_ProximalMethod):
     """Nonnegative pictures with sharp borders between even surfaces (isotropic total variation)."""
 
-    weight: float = 2e-3
+    weight: float = 1e-3
     iterations: int = 60
     name = "tv"
 
