@@ -11,6 +11,7 @@ import contextlib
 import datetime
 import errno
 import hashlib
+import io
 import json
 import os
 import tempfile
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 FORMAT_NAME = "tofclip"
 FORMAT_VERSION = 1
+# The layouts of HDF5 1.10 carry checksums; a damaged file of the older ones can hang the library.
+LIBRARY_VERSIONS = ("v110", "v110")
 CHUNK_CUBE = (64, 32, 32)
 COMPRESS_FROM_BYTES = 1 << 16
 
@@ -128,18 +131,22 @@ class Record:
         """
         import h5py
 
-        with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-            file.attrs["format"] = FORMAT_NAME
-            file.attrs["format_version"] = FORMAT_VERSION
-            file.attrs["provenance"] = json.dumps(dict(self.provenance), default=str)
-            _write_group(file, self)
+        with atomic_path(path) as temporary:
+            # HDF5 crashes the process when the disk fills up under it: it writes to memory, and Python to the disk.
+            image = io.BytesIO()
+            with h5py.File(image, "w", libver=LIBRARY_VERSIONS) as file:
+                _write_attribute(file, "format", FORMAT_NAME)
+                _write_attribute(file, "format_version", FORMAT_VERSION)
+                _write_attribute(file, "provenance", json.dumps(dict(self.provenance), default=str))
+                _write_group(file, self)
+            temporary.write_bytes(image.getbuffer())
 
     @classmethod
     def load(cls, path: str | Path, *kinds: str) -> Record:
         """Read a record, refusing any other kind than those named (none named: any kind)."""
         with opened(path) as file:
             found = _read_group(file, str(path))
-            provenance = _parse_provenance(file.attrs.get("provenance", "{}"), path)
+            provenance = _parse_provenance(_text(file, "provenance"), path)
         if kinds and found.kind not in kinds:
             wanted = " or ".join(kinds)
             raise FileFormatError(path, f"holds a {found.kind} record, expected {wanted}")
@@ -157,7 +164,7 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
             raise FileFormatError(path, problem)
     try:
         with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT_NAME:
+            if _text(file, "format") != FORMAT_NAME:
                 raise FileFormatError(path, "is an HDF5 file, but not one of tofclip's")
             version = int(file.attrs.get("format_version", 0))
             if version > FORMAT_VERSION:
@@ -187,8 +194,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield temporary
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, target)
-    except (OSError, RuntimeError) as fault:
-        if isinstance(fault, StorageError) or not _is_storage_fault(fault):
+    except OSError as fault:
+        if isinstance(fault, StorageError):
             raise
         raise StorageError(f"{target}: cannot be written: {_reason(fault)}") from fault
     finally:
@@ -227,24 +234,44 @@ def sha256_of(path: str | Path) -> str:
 
 
 def _write_group(group: h5py.Group, record: Record) -> None:
-    group.attrs["kind"] = record.kind
+    _write_attribute(group, "kind", record.kind)
     for name, value in record.attributes.items():
-        group.attrs[f"value.{name}"] = value
+        _write_attribute(group, f"value.{name}", value)
     for name, entry in record.fields.items():
         dataset = group.create_dataset(name, data=entry.values, **_storage_options(entry.values))
-        dataset.attrs["units"] = entry.units
-        dataset.attrs["axes"] = ",".join(entry.axes)
+        _write_attribute(dataset, "units", entry.units)
+        _write_attribute(dataset, "axes", ",".join(entry.axes))
     for name, child in record.children.items():
         _write_group(group.create_group(name), child)
 
 
+def _write_attribute(item: h5py.Group | h5py.Dataset, name: str, value: Scalar) -> None:
+    import h5py
+
+    if isinstance(value, str):
+        # Of fixed length, because strings of variable length lie in a heap without checksums.
+        length = max(1, len(value.encode()))
+        item.attrs.create(name, value.encode(), dtype=h5py.string_dtype("utf-8", length))
+    else:
+        item.attrs[name] = value
+
+
 def _storage_options(values: NDArray[Any]) -> dict[str, Any]:
-    if values.nbytes < COMPRESS_FROM_BYTES:
+    """Checksums for every array, compression for the large ones."""
+    if values.size == 0 or values.ndim == 0:
         return {}
+    if values.nbytes < COMPRESS_FROM_BYTES:
+        return {"chunks": values.shape, "fletcher32": True}
     chunks: tuple[int, ...] | bool = True
     if values.ndim == len(CHUNK_CUBE):
         chunks = tuple(min(c, n) for c, n in zip(CHUNK_CUBE, values.shape, strict=True))
-    return {"chunks": chunks, "compression": "gzip", "compression_opts": 4, "shuffle": True}
+    return {
+        "chunks": chunks,
+        "compression": "gzip",
+        "compression_opts": 4,
+        "shuffle": True,
+        "fletcher32": True,
+    }
 
 
 def _read_group(group: h5py.Group, origin: str) -> Record:
@@ -254,21 +281,27 @@ def _read_group(group: h5py.Group, origin: str) -> Record:
     children: dict[str, Record] = {}
     for name, item in group.items():
         if isinstance(item, h5py.Dataset):
-            axes = str(item.attrs.get("axes", ""))
-            names = tuple(axes.split(",")) if axes else ()
-            fields[name] = Field(item[()], str(item.attrs.get("units", "")), names)
-        else:
+            axes = _text(item, "axes")
+            fields[name] = Field(item[()], _text(item, "units"), tuple(axes.split(",")) if axes else ())
+        elif isinstance(item, h5py.Group):
             children[name] = _read_group(item, origin)
+        else:
+            raise FileFormatError(origin, f"is damaged: '{name}' cannot be read")
     attributes = {
         name.removeprefix("value."): _plain(value) for name, value in group.attrs.items() if name.startswith("value.")
     }
-    return Record(str(group.attrs.get("kind", "")), fields, attributes, children, origin=origin)
+    return Record(_text(group, "kind"), fields, attributes, children, origin=origin)
+
+
+def _text(item: h5py.Group | h5py.Dataset, name: str) -> str:
+    return str(_plain(item.attrs.get(name, "")))
 
 
 def _plain(value: Any) -> Scalar:
     """Turn an HDF5 attribute into a Python scalar."""
-    plain: Scalar = value.item() if isinstance(value, np.generic) else value
-    return plain
+    plain = value.item() if isinstance(value, np.generic) else value
+    text_or_number: Scalar = plain.decode() if isinstance(plain, bytes) else plain
+    return text_or_number
 
 
 def _parse_provenance(text: str, path: str | Path) -> dict[str, Any]:
@@ -285,17 +318,15 @@ def _umask() -> int:
     return mask
 
 
-def _is_storage_fault(fault: Exception) -> bool:
-    # h5py reports a full disk as a RuntimeError or an OSError without errno, whose text holds the system's words.
-    return isinstance(fault, OSError) or os.strerror(errno.ENOSPC).lower() in str(fault).lower()
-
-
-def _reason(fault: Exception) -> str:
-    text = str(fault).lower()
-    if getattr(fault, "errno", None) == errno.ENOSPC or os.strerror(errno.ENOSPC).lower() in text:
+def _reason(fault: OSError) -> str:
+    if fault.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return "the disk is full; free some space or choose another folder with --out"
     if isinstance(fault, FileNotFoundError):
         return "the folder does not exist; create it first"
+    if isinstance(fault, NotADirectoryError):
+        return "its folder is a file"
+    if isinstance(fault, IsADirectoryError):
+        return "it is a folder; name a file"
     if isinstance(fault, PermissionError):
         return "writing is not permitted there"
     return one_line(fault)

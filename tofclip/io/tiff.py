@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 MAX_PIXELS = 1 << 28
 """A damaged header may claim any size; no streak camera has a sensor larger than this."""
+
+QUIET = logging.NullHandler()
 
 
 def read_tiff(path: str | Path) -> Streak:
@@ -51,6 +54,8 @@ def _decode(path: str | Path) -> tuple[NDArray[Any], str, str]:
     """Return pixels, image description and date of the only picture in the file."""
     import tifffile
 
+    # Without a handler its complaints go to standard error, ahead of the one line that we raise.
+    logging.getLogger("tifffile").addHandler(QUIET)
     with reading(path), open(path, "rb") as file:
         try:
             with tifffile.TiffFile(file) as tiff:
