@@ -10,7 +10,7 @@ TRUTH = np.array([[0.0, 1.0], [2.0, 3.0]])
 
 
 def test_values_by_hand():
-    estimate = TRUTH + [[1.0, 0.0], [0.0, 0.0]]
+    estimate = TRUTH + np.array([[1.0, 0.0], [0.0, 0.0]])
     assert nmse(estimate, TRUTH) == pytest.approx(1 / 5)  # variance sum: 2 * (1.5^2 + 0.5^2) = 5
     assert nmse_energy(estimate, TRUTH) == pytest.approx(1 / 14)
     assert nmse(TRUTH, TRUTH) == 0

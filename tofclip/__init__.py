@@ -10,6 +10,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from tofclip.version import __version__
+
 if TYPE_CHECKING:
     from tofclip.camera import Camera
     from tofclip.errors import TofclipError
@@ -19,14 +21,13 @@ if TYPE_CHECKING:
     from tofclip.reconstruct import recover
     from tofclip.transient import Frames, Streak
 
-__version__ = "0.1.0"
-
 __all__ = [
     "Camera",
     "Frames",
     "PointCloud",
     "Streak",
     "TofclipError",
+    "__version__",
     "depth",
     "nmse",
     "point_cloud",

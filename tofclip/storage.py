@@ -217,7 +217,7 @@ def reading(path: str | Path) -> Iterator[None]:
 
 def provenance(settings: Mapping[str, Any], *inputs: str | Path) -> dict[str, Any]:
     """Describe how a result came about: program version, time, settings, and a hash of every input file."""
-    from tofclip import __version__
+    from tofclip.version import __version__
 
     return {
         "software": f"{FORMAT_NAME} {__version__}",

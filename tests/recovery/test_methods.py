@@ -92,7 +92,7 @@ def test_unusable_readings_are_refused(operator, method):
 
 @pytest.mark.parametrize("method", METHODS[:2], ids=lambda method: method.name)
 def test_darkness_is_refused(operator, method):
-    with pytest.raises(InputError, match="nothing|positive"):
+    with pytest.raises(InputError, match=r"nothing|positive"):
         method.recover(operator, -np.ones((40, 2)))
     with pytest.raises(ShapeError, match="mask"):
         method.recover(operator, np.ones((40, 2)), np.ones((40, 3), bool))
