@@ -13,16 +13,19 @@ CONVERGED_BINS = 1e-4
 
 
 @njit(nogil=True, cache=True)
-def find_returns(traces, times, filters, pulse, limits, found, counts):
+def find_returns(traces, times, sharp, matched, pulse, limits, found, counts):
     """Find the returns of each trace.
+
+    Candidates are the peaks of the trace under a sharp filter, which still shows two returns where the matched filter
+    would merge them; whether one counts, the matched filter decides, and once more the fit.
 
     Parameters
     ----------
     traces : (pixels, bins) float32 array
     times : (bins,) float64 array
         Instant of each bin, increasing.
-    filters : (width, bins) float32 array
-        Row w holds the unit-energy filter's weight of bin ``j + w - width // 2`` for a return at bin j.
+    sharp, matched : (width, bins) float32 array
+        Filters of unit energy: row w holds the weight of bin ``j + w - width // 2`` for a return at bin j.
     pulse : tuple
         Samples, slopes, spacing, origin, first and last instant that matter: see `Pulse`.
     limits : (float, float)
@@ -32,32 +35,38 @@ def find_returns(traces, times, filters, pulse, limits, found, counts):
     counts : (pixels,) int64 array, overwritten
         Number of returns of each pixel.
     """
-    bins = times.size
-    score = np.empty(bins, np.float32)
+    score = np.empty(times.size, np.float32)
     peaks = np.empty(found.shape[1], np.int64)
     estimate = np.empty((found.shape[1], 2))
-    filter_sums = np.zeros(bins, np.float32)
-    for w in range(filters.shape[0]):
-        filter_sums += filters[w]
     for pixel in range(traces.shape[0]):
         trace = traces[pixel]
-        correlate(trace, filters, score)
+        correlate(trace, sharp, score)
         number = strongest_peaks(score, times, limits[0], peaks)
         background, noise = quiet_level(trace, times, peaks[:number], pulse)
         kept = 0
         for k in range(number):
-            signal = score[peaks[k]] - background * filter_sums[peaks[k]]
-            if signal > limits[1] * noise and signal > 0:
+            if response(trace, matched, background, peaks[k]) > limits[1] * noise:
                 estimate[kept, 0] = times[peaks[k]]
                 estimate[kept, 1] = max(trace[peaks[k]] - background, 0.0)
                 kept += 1
         refine(trace, times, background, pulse, estimate[:kept])
-        counts[pixel] = describe(trace, times, background, noise, pulse, estimate[:kept], found[pixel])
+        least = limits[1] * noise
+        counts[pixel] = describe(trace, times, background, noise, pulse, estimate[:kept], least, found[pixel])
+
+
+@njit(nogil=True, cache=True)
+def response(trace, filters, background, j):
+    """Response of a filter at bin j to what exceeds the background; never below zero."""
+    total, half = 0.0, filters.shape[0] // 2
+    for w in range(filters.shape[0]):
+        if 0 <= j + w - half < trace.size:
+            total += filters[w, j] * (trace[j + w - half] - background)
+    return max(total, 0.0)
 
 
 @njit(nogil=True, cache=True, fastmath=True)
 def correlate(trace, filters, score):
-    """Matched filter: ``score[j] = sum_w filters[w, j] * trace[j + w - width // 2]``."""
+    """Filter a trace: ``score[j] = sum_w filters[w, j] * trace[j + w - width // 2]``."""
     score[:] = 0
     bins, half = trace.size, filters.shape[0] // 2
     for w in range(filters.shape[0]):
@@ -208,37 +217,45 @@ def gauss_newton_step(trace, times, background, pulse, estimate, k):
 
 
 @njit(nogil=True, cache=True)
-def describe(trace, times, background, noise, pulse, estimate, found):
-    """Write instant, sum and standard deviation of every return that lies on the time axis; return their number."""
+def describe(trace, times, background, noise, pulse, estimate, least, found):
+    """Write instant, sum and standard deviation of every return that proves itself; return their number.
+
+    It has to lie on the time axis and to respond, height times root of the pulse's energy, by more than `least`.
+    """
     number = 0
     for k in range(estimate.shape[0]):
         arrival, height = estimate[k, 0], estimate[k, 1]
         if height <= 0 or arrival < times[0] or arrival > times[-1]:
             continue
-        found[number, 0] = arrival
-        found[number, 1], found[number, 2] = sum_and_deviation(trace, times, background, noise, pulse, estimate, k)
+        first, last = window(times, arrival, pulse)
+        pp = pd = dd = 0.0
+        for i in range(first, last):
+            p, d = pulse_at(times[i] - arrival, pulse)
+            pp += p * p
+            pd += p * d
+            dd += d * d
+        if height * np.sqrt(pp) <= least or pp * dd <= pd * pd:
+            continue
+        total, deviation = sum_and_deviation(trace, times, background, noise, pulse, estimate, k, (pp, pd, dd))
+        found[number, 0], found[number, 1], found[number, 2] = arrival, total, deviation
         number += 1
     return number
 
 
 @njit(nogil=True, cache=True)
-def sum_and_deviation(trace, times, background, noise, pulse, estimate, k):
+def sum_and_deviation(trace, times, background, noise, pulse, estimate, k, products):
     """Sum of return k over its bins, and the standard deviation of its arrival.
 
     The variance of a bin is taken as ``noise^2 + dispersion * brightness`` (quasi-Poisson). The dispersion is what
     makes the expected sum of squared residuals, ``sum_i variance_i (1 - h_i)`` with the fit's leverages h, equal to
-    the one found; the variances are then carried through the least-squares fit.
+    the one found; the variances are then carried through the least-squares fit. `products` holds the sums of squared
+    pulse, pulse times slope, and squared slope.
     """
     arrival, height = estimate[k, 0], estimate[k, 1]
-    first, last = window(times, arrival, pulse)
-    pp = pd = dd = 0.0
-    for i in range(first, last):
-        p, d = pulse_at(times[i] - arrival, pulse)
-        pp += p * p
-        pd += p * d
-        dd += d * d
+    pp, pd, dd = products
     across_energy = dd - pd * pd / pp
     total = misfit = unfitted = weighted = 0.0
+    first, last = window(times, arrival, pulse)
     for i in range(first, last):
         p, d = pulse_at(times[i] - arrival, pulse)
         across = d - p * pd / pp  # the part of the slope that a change of height cannot mimic

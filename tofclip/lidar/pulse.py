@@ -58,6 +58,10 @@ class Pulse:
         widths = np.arange(-half, half + 1) / SAMPLES_PER_WIDTH
         return cls(np.exp2(-((2 * widths) ** 2)), fwhm / SAMPLES_PER_WIDTH, float(half))
 
+    def compressed(self, factor: float) -> Pulse:
+        """Return the same shape, `factor` times shorter."""
+        return Pulse(self.samples, self.spacing / factor, self.origin)
+
     def __call__(self, time: ArrayLike) -> NDArray[np.float64]:
         """Brightness at `time`, s, after the arrival; the peak is 1."""
         position = np.asarray(time, dtype=np.float64) / self.spacing + self.origin

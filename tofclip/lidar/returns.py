@@ -2,7 +2,7 @@
 
 A recovered frame is no photon count: it went through an inverse problem, whose errors are spread over pixels and bins
 and are nearly even in time. For such errors the least-squares fit of the pulse is the maximum-likelihood estimate, so
-candidates come from the matched filter and are refined by Gauss-Newton steps of that fit, below a bin. For bare
+candidates are judged by the matched filter and refined by Gauss-Newton steps of that fit, below a bin. For bare
 photon counts that estimate is unbiased too, but the log-matched filter would be the sharper one.
 """
 
@@ -25,6 +25,7 @@ from tofclip.units import SPEED_OF_LIGHT
 
 REFERENCE_RANGE = 1.0  # m; an intensity is what the same surface would send back from here
 PIXELS_PER_BLOCK = 128  # their traces fit the second-level cache
+SHARPENING = 2.0  # of the filter that looks for candidates; it costs a tenth of the matched filter's sensitivity
 SHORTEST_PULSE_BINS = 2.0  # anything shorter falls between the samples
 
 
@@ -145,27 +146,31 @@ def _search(frames: Frames, pulse: Pulse, detection: Detection) -> tuple[NDArray
     pixels = traces.shape[1]
     found = np.empty((pixels, detection.most_returns, 3))
     counts = np.empty(pixels, np.int64)
-    filters = _matched_filters(frames.times, pulse)
+    sharp, matched = (_filters(frames.times, shape) for shape in (pulse.compressed(SHARPENING), pulse))
     shape = (pulse.samples, pulse.slope, pulse.spacing, pulse.origin, *pulse.support)
     limits = (pulse.fwhm, float(detection.signal_to_noise))
 
     def work(piece: slice) -> None:
         block = np.ascontiguousarray(traces[:, piece].T)
-        find_returns(block, frames.times, filters, shape, limits, found[piece], counts[piece])
+        find_returns(block, frames.times, sharp, matched, shape, limits, found[piece], counts[piece])
 
     run_blocks(work, pixels, PIXELS_PER_BLOCK)
     return found, counts
 
 
-def _matched_filters(times: NDArray[np.float64], pulse: Pulse) -> NDArray[np.float32]:
-    """Unit-energy filter for a return at each bin, (width, bins); the time axis may be uneven."""
+def _filters(times: NDArray[np.float64], pulse: Pulse) -> NDArray[np.float32]:
+    """Unit-energy filter for a return at each bin, (width, bins); the time axis may be uneven.
+
+    Where the axis cuts off most of the pulse the energy stays below one: little would be known of such a return.
+    """
     before, after = pulse.support
     half = int(np.ceil(max(-before, after) / np.diff(times).min()))
     filters = np.zeros((2 * half + 1, times.size))
     for row, shift in enumerate(range(-half, half + 1)):
         here = np.arange(max(0, -shift), min(times.size, times.size - shift))
         filters[row, here] = pulse(times[here + shift] - times[here])
-    filters /= np.sqrt(np.sum(filters**2, axis=0))
+    energy = np.sum(filters**2, axis=0)
+    filters /= np.sqrt(np.maximum(energy, np.median(energy) / 2))
     return filters.astype(np.float32)
 
 

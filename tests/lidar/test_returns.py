@@ -1,0 +1,290 @@
+"""Returns found in traces whose arrivals, strengths and noise are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tofclip.camera import Camera
+from tofclip.errors import InputError, ShapeError
+from tofclip.lidar import Detection, Pulse, Returns, depth
+from tofclip.transient import Frames
+from tofclip.units import SPEED_OF_LIGHT
+
+BIN = 20e-12
+FWHM = 60e-12
+START = 10e-9
+BIN_M = SPEED_OF_LIGHT * BIN / 2
+EVERYTHING = Detection(share_of_scene=0, share_of_instant=0, share_of_pixel=0)
+
+
+def camera(rows: int = 1, columns: int = 1) -> Camera:
+    return Camera(np.array([20.0]), np.array([0.1]), (rows, columns), 41, pulse_fwhm=FWHM)
+
+
+def even_times(bins: int) -> np.ndarray:
+    return START + BIN * np.arange(bins)
+
+
+def gaussian(times: np.ndarray, arrivals: np.ndarray, heights: np.ndarray | float) -> np.ndarray:
+    """(time, ...) traces of one return each, written out independently of the package's pulse."""
+    late = (times.reshape(-1, *[1] * np.ndim(arrivals)) - arrivals) / FWHM
+    return heights * np.exp(-4 * np.log(2) * late**2)
+
+
+def frames_of(values: np.ndarray, times: np.ndarray) -> Frames:
+    """One row of pixels; `values` is (time, pixel)."""
+    return Frames(values[:, np.newaxis, :].astype(np.float32), times, camera(1, values.shape[1]))
+
+
+def range_of(time: np.ndarray | float) -> np.ndarray | float:
+    return SPEED_OF_LIGHT * time / 2
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    position=st.floats(8.0, 51.0),
+    height=st.floats(1e-2, 1e6),
+    unevenness=st.floats(0.0, 0.1),
+    seed=st.integers(0, 1000),
+)
+def test_a_single_pulse_is_located_far_below_a_bin(position, height, unevenness, seed):
+    widths = BIN * (1 + unevenness * np.random.default_rng(seed).uniform(-1, 1, 60))
+    times = START + np.cumsum(widths)
+    arrival = np.interp(position, np.arange(60), times)
+    returns = depth(frames_of(gaussian(times, np.array([arrival]), height), times))
+    assert len(returns) == 1
+    # float32 traces and the linear pulse table leave 1e-4 bin; 2e-3 bin (6 um) is asked for
+    assert returns.range[0] == pytest.approx(range_of(arrival), abs=2e-3 * BIN_M)
+    assert returns.time[0] == pytest.approx(arrival, abs=2e-3 * BIN)
+
+
+def test_range_is_half_the_way_and_time_is_kept():
+    times = even_times(200)
+    returns = depth(frames_of(gaussian(times, np.array([START + 1e-9]), 10.0), times))
+    assert returns.range[0] == pytest.approx(299_792_458.0 * 11e-9 / 2, abs=1e-5)
+
+
+def test_background_neither_shifts_nor_brightens_a_return():
+    times = even_times(200)
+    arrivals = START + BIN * np.array([60.3, 90.7])
+    clean = depth(frames_of(gaussian(times, arrivals, 100.0), times))
+    lifted = depth(frames_of(gaussian(times, arrivals, 100.0) + np.array([30.0, 400.0]), times))
+    # the pulse's tail, below 1 % of its peak, counts as background; float32 keeps 3e-5 of 500
+    np.testing.assert_allclose(lifted.range, clean.range, atol=1e-3 * BIN_M)
+    np.testing.assert_allclose(lifted.intensity, clean.intensity, rtol=1e-3)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    widths_apart=st.floats(1.3, 6.0),
+    ratio=st.floats(0.7, 1.4),
+    position=st.floats(40.0, 41.0),
+    number=st.integers(0, 3),
+)
+def test_two_returns_of_similar_strength_are_told_apart(widths_apart, ratio, position, number):
+    times = even_times(120)
+    first = START + position * BIN
+    arrivals = np.array([first, first + widths_apart * FWHM])
+    trace = gaussian(times, arrivals, np.array([100.0, 100.0 * ratio])).sum(axis=1)
+    values = np.zeros((120, 4))
+    values[:, number] = trace
+    returns = depth(frames_of(values, times))
+    assert returns.x.tolist() == [number, number]
+    assert returns.return_number.tolist() == [1, 2]
+    # eight rounds of taking turns leave 2 % of a bin at the closest distance
+    np.testing.assert_allclose(returns.time, arrivals, atol=0.03 * BIN)
+    strength = returns.intensity / returns.range**2
+    assert strength[1] / strength[0] == pytest.approx(ratio, rel=0.03)
+
+
+def test_two_returns_within_a_pulse_width_are_one():
+    times = even_times(120)
+    arrivals = START + BIN * np.array([40.0, 42.0])
+    returns = depth(frames_of(gaussian(times, arrivals, 100.0).sum(axis=1, keepdims=True), times))
+    assert len(returns) == 1
+    assert returns.time[0] == pytest.approx(arrivals.mean(), abs=0.1 * BIN)
+
+
+def test_a_faint_echo_505_rows_later_is_left_out_and_found_when_asked_for():
+    times = even_times(700)
+    trace = gaussian(times, START + BIN * np.array([100.0, 605.0]), np.array([1000.0, 20.0])).sum(axis=1, keepdims=True)
+    assert depth(frames_of(trace, times)).return_number.tolist() == [1]
+    both = depth(frames_of(trace, times), detection=EVERYTHING)
+    assert both.return_number.tolist() == [1, 2]
+    assert both.time[1] - both.time[0] == pytest.approx(505 * BIN, abs=0.01 * BIN)
+
+
+def test_faint_light_beside_a_bright_object_of_the_same_instant_is_left_out():
+    times = even_times(200)
+    arrivals = START + BIN * np.array([80.0, 80.5, 150.0])
+    values = gaussian(times, arrivals, np.array([1000.0, 80.0, 80.0]))
+    assert depth(frames_of(values, times)).x.tolist() == [0, 2]
+    assert depth(frames_of(values, times), detection=EVERYTHING).x.tolist() == [0, 1, 2]
+
+
+def test_what_is_far_weaker_than_the_scene_is_left_out():
+    times = even_times(200)
+    values = gaussian(times, START + BIN * np.array([80.0, 150.0]), np.array([1000.0, 20.0]))
+    assert depth(frames_of(values, times)).x.tolist() == [0]
+
+
+def test_pixels_without_signal_have_no_return():
+    times = even_times(100)
+    values = np.zeros((100, 5))
+    values[:, 2] = gaussian(times, np.array(START + 50 * BIN), 10.0)
+    returns = depth(frames_of(values, times))
+    assert returns.x.tolist() == [2]
+    assert len(depth(frames_of(np.zeros((100, 3)), times))) == 0
+
+
+def test_noise_alone_hardly_ever_makes_a_return():
+    noise = np.random.default_rng(0).normal(20.0, 3.0, (500, 400))
+    returns = depth(frames_of(noise, even_times(500)), detection=EVERYTHING)
+    # the best of about 170 independent bins exceeds 5 sigma once in 20 000 pixels; the noise level itself is
+    # uncertain by a few percent, so 1 % is asked for
+    assert len(returns) <= 4
+
+
+def test_intensity_undoes_the_falloff_with_range():
+    times = START + BIN * np.arange(900)
+    arrivals = np.array([START + 100.2 * BIN, START + 800.6 * BIN])
+    heights = 500.0 / range_of(arrivals) ** 2
+    returns = depth(frames_of(gaussian(times, arrivals, heights), times))
+    pulse_bins = FWHM / BIN * np.sqrt(np.pi / (4 * np.log(2)))
+    # the tails beyond 1 % of the peak, 0.2 % of the energy, are not counted
+    np.testing.assert_allclose(returns.intensity, 500.0 * pulse_bins, rtol=4e-3)
+
+
+@pytest.mark.parametrize(("height", "background"), [(50.0, 1.0), (1000.0, 5.0)])
+def test_confidence_is_the_standard_deviation_of_the_range(height, background):
+    random = np.random.default_rng(3)
+    times = even_times(300)
+    arrivals = START + BIN * random.uniform(100, 200, 3000)
+    counts = random.poisson(gaussian(times, arrivals, height) + background)
+    returns = depth(frames_of(counts, times))
+    first = returns.image("range")[0]
+    errors = first - range_of(arrivals)
+    predicted = returns.image("confidence")[0]
+    assert np.isfinite(errors).all()
+    assert abs(errors.mean()) < 5 * errors.std() / np.sqrt(errors.size)
+    # 3000 trials know a standard deviation to 1.3 %; the rest is the quasi-Poisson model's
+    assert np.sqrt(np.mean(predicted**2)) == pytest.approx(errors.std(), rel=0.08)
+
+
+def test_range_precision_is_near_the_photon_limit():
+    random = np.random.default_rng(4)
+    times = even_times(300)
+    arrivals = START + BIN * random.uniform(100, 200, 3000)
+    signal = gaussian(times, arrivals, 200.0)
+    slope = signal * 8 * np.log(2) * (times[:, np.newaxis] - arrivals) / FWHM**2
+    bound = range_of(np.mean(1 / np.sqrt(np.sum(slope**2 / (signal + 1.0), axis=0))))
+    returns = depth(frames_of(random.poisson(signal + 1.0), times))
+    errors = returns.image("range")[0] - range_of(arrivals)
+    # even weights instead of Poisson ones cost a fifth for a Gaussian pulse
+    assert bound < errors.std() < 1.3 * bound
+
+
+def test_a_pulse_cut_off_by_the_time_axis_is_no_return():
+    times = even_times(60)
+    arrivals = np.array([START - 1.5 * BIN, START + 61.0 * BIN])
+    assert len(depth(frames_of(gaussian(times, arrivals, 100.0), times))) == 0
+
+
+def test_light_from_before_time_zero_is_no_return():
+    times = BIN * (np.arange(60) - 30)
+    returns = depth(frames_of(gaussian(times, BIN * np.array([-10.0, 10.0]), 100.0), times))
+    assert returns.x.tolist() == [1]
+
+
+def test_only_the_strongest_returns_are_kept_nearest_first():
+    times = even_times(400)
+    arrivals = START + BIN * np.array([50.0, 120.0, 200.0, 300.0])
+    trace = gaussian(times, arrivals, np.array([100.0, 40.0, 300.0, 200.0])).sum(axis=1, keepdims=True)
+    returns = depth(frames_of(trace, times), detection=replace(EVERYTHING, most_returns=3))
+    np.testing.assert_allclose(returns.time, arrivals[[0, 2, 3]], atol=0.01 * BIN)
+    assert returns.return_number.tolist() == [1, 2, 3]
+
+
+def test_returns_come_in_raster_order_and_make_pictures():
+    times = even_times(150)
+    values = np.zeros((150, 2, 3))
+    values[:, 0, 2] = gaussian(times, np.array(START + 40 * BIN), 100.0)
+    values[:, 1, 0] = gaussian(times, np.array(START + 60 * BIN), 90.0)
+    values[:, 1, 0] += gaussian(times, np.array(START + 90 * BIN), 120.0)
+    returns = depth(Frames(values.astype(np.float32), times, camera(2, 3)))
+    assert list(zip(returns.y.tolist(), returns.x.tolist(), returns.return_number.tolist(), strict=True)) == [
+        (0, 2, 1),
+        (1, 0, 1),
+        (1, 0, 2),
+    ]
+    picture = returns.image("time")
+    assert np.isnan(picture).sum() == 4
+    assert picture[1, 0] == pytest.approx(START + 90 * BIN, abs=0.01 * BIN)  # the more intense of the two
+    assert picture[0, 2] == pytest.approx(START + 40 * BIN, abs=0.01 * BIN)
+
+
+def test_another_pulse_shape_finds_its_own_arrivals():
+    spacing = 1e-12
+    late = np.arange(400) * spacing
+    shape = (1 - np.exp(-late / 15e-12)) * np.exp(-late / 60e-12)  # arrives at once, decays slowly
+    pulse = Pulse(shape, spacing, origin=0.0)
+    times = even_times(200)
+    arrival = START + 80.37 * BIN
+    returns = depth(frames_of(50 * pulse(times - arrival)[:, np.newaxis], times), pulse=pulse)
+    assert len(returns) == 1
+    assert returns.time[0] == pytest.approx(arrival, abs=0.05 * BIN)  # the kink at its start is 1 ps wide
+
+
+def test_a_pulse_shorter_than_a_bin_still_gives_a_range():
+    times = even_times(50)
+    values = np.zeros((50, 1))
+    values[20, 0] = 100.0
+    short = camera().replace(pulse_fwhm=1e-12)
+    returns = depth(frames_of(values, times), short)
+    assert returns.time[0] == pytest.approx(times[20], abs=1e-3 * BIN)
+
+
+def test_the_result_does_not_depend_on_the_number_of_threads(monkeypatch):
+    random = np.random.default_rng(5)
+    times = even_times(80)
+    frames = frames_of(random.poisson(gaussian(times, START + BIN * random.uniform(20, 60, 700), 50.0) + 1.0), times)
+    found: list[Returns] = []
+    for threads in ("1", "2"):
+        monkeypatch.setenv("TOFCLIP_THREADS", threads)
+        found.append(depth(frames))
+    np.testing.assert_array_equal(found[0].range, found[1].range)
+    np.testing.assert_array_equal(found[0].confidence, found[1].confidence)
+
+
+def test_unusable_input_is_refused():
+    times = even_times(10)
+    frames = frames_of(np.ones((10, 2)), times)
+    with pytest.raises(ShapeError, match="frames must have shape"):
+        depth(frames, camera(3, 3))
+    with pytest.raises(InputError, match="at least three frames"):
+        depth(frames_of(np.ones((2, 1)), even_times(2)))
+    with pytest.raises(InputError, match="no property 'colour'"):
+        depth(frames).image("colour")
+    with pytest.raises(ShapeError, match="time of the returns"):
+        replace(depth(frames), time=np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"signal_to_noise": -1.0}, "must not be negative"),
+        ({"signal_to_noise": float("nan")}, "must not be negative"),
+        ({"share_of_scene": 1.5}, "between 0 and 1"),
+        ({"share_of_instant": -0.1}, "between 0 and 1"),
+        ({"share_of_pixel": float("nan")}, "between 0 and 1"),
+        ({"most_returns": 0}, "1 to 255"),
+    ],
+)
+def test_unusable_limits_are_refused(wrong, words):
+    with pytest.raises(InputError, match=words):
+        Detection(**wrong)
