@@ -7,13 +7,13 @@ where in the *raw* image each rectified pixel lies, so that the raw image is sam
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.errors import FileFormatError, ShapeError
+from tofclip.errors import CalibrationError, FileFormatError, ShapeError
 from tofclip.storage import Field, Record
 
 FloatArray = NDArray[np.float64]
@@ -55,8 +55,12 @@ class SkewSweep:
     def __post_init__(self) -> None:
         for name in ("centres_px", "offsets_bin", "stretches"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+        if self.centres_px.size == 0 or self.centres_px.ndim != 1:
+            raise ShapeError("sweep centres", "(views,)", self.centres_px.shape)
         if not self.centres_px.shape == self.offsets_bin.shape == self.stretches.shape:
             raise ShapeError("sweep skew", "(views,) in all three arrays", self.offsets_bin.shape)
+        if not np.all(np.diff(self.centres_px) > 0):
+            raise CalibrationError(f"sweep centres must increase, got {self.centres_px}")
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
         offset = _interpolate_and_extend(column, self.centres_px, self.offsets_bin)
@@ -102,6 +106,16 @@ class PolynomialSweep:
     rectified_scale: FloatArray
     raw_origin: FloatArray
     raw_scale: FloatArray
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            values = np.asarray(getattr(self, field.name), dtype=np.float64)
+            object.__setattr__(self, field.name, values)
+            expected = (6,) if field.name.endswith("coefficients") else (2,)
+            if values.shape != expected:
+                raise ShapeError(f"polynomial sweep's {field.name}", expected, values.shape)
+        if not (np.all(self.rectified_scale) and np.all(self.raw_scale)):
+            raise CalibrationError("a polynomial sweep's scales must not be zero")
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
         x = (np.asarray(column) - self.rectified_origin[0]) / self.rectified_scale[0]

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from tofclip.camera import Camera, PolynomialSweep, ProjectiveSweep, SkewSweep, Sweep
-from tofclip.errors import FileFormatError, InputError
+from tofclip.errors import CalibrationError, FileFormatError, InputError
 from tofclip.io.archive import Archive
 from tofclip.io.relay_wall import read_relay_wall
 from tofclip.transient import Streak
@@ -39,7 +39,11 @@ def read_lift(path: str | Path) -> Streak:
     counts = archive.array("streak_raw", None, None)
     if np.any(counts < 0):
         raise InputError(f"{path}: streak_raw holds negative readings; a LIFT archive is clipped at zero")
-    camera, metadata, attachments = _camera(archive, counts.shape), archive.scalars(), {}
+    try:
+        camera = _camera(archive, counts.shape)
+    except CalibrationError as fault:
+        raise CalibrationError(f"{path}: {fault}") from fault
+    metadata, attachments = archive.scalars(), {}
     if "wall_grid_m" in archive:
         wall = read_relay_wall(archive, camera.image_shape)
         attachments["relay_wall"] = wall.to_record()
@@ -63,7 +67,7 @@ def _camera(archive: Archive, shape: tuple[int, ...]) -> Camera:
         image_shape=(_image_width_px(archive),) * 2,
         slit_width_px=shape[1],
         # A single row is a line taken in focus mode: nothing was swept, so that there is nothing to rectify.
-        sweep=_sweep(archive) if shape[0] > 1 else SkewSweep(centres_px, 0 * centres_px, 0 * centres_px),
+        sweep=_sweep(archive) if shape[0] > 1 else SkewSweep(*np.zeros((3, 1))),
     )
 
 
