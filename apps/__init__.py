@@ -1,1 +1,1 @@
-"""."""
+"""What people run: the console program `tofclip` and the pictures that it draws."""

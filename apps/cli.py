@@ -1,0 +1,121 @@
+"""The console program `tofclip`: one verb, one small module in `apps.verbs`.
+
+Nothing heavy is imported before a verb runs, so that help appears at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from apps.verbs import calibrate, cloud, convert, demo, info, nlos, recover
+from tofclip import __version__
+from tofclip.errors import TofclipError
+
+FAULTY_INPUT = 2
+DEFECT = 1
+INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+READER_GONE = 141  # 128 + SIGPIPE
+
+DEBUG_FLAG = "--debug"
+EPILOG = f"Add {DEBUG_FLAG} anywhere to see where an error came from."
+
+MAP = f"""\
+tofclip {__version__}: 3D from streak images, through occluders and around corners
+
+                        four focus pictures
+                                |
+                            calibrate
+                                |
+                            camera.h5
+                                |
+  raw streak image ---------> recover --> frames.h5 --+--> cloud ------------> scene.ply
+  (.tif, .npz, .h5)                                   |
+                                                      +--> nlos reconstruct -> volume.h5
+
+  demo               all of it on a simulated scene, no files needed: start here
+  calibrate          find a camera's views in four pictures of a point source
+  recover            streak image to one picture per instant
+  cloud              recovered frames to a point cloud
+  nlos reconstruct   recovered frames of a wall to the scene hidden around the corner
+  convert            any readable streak image to this program's own HDF5
+  info               what a file holds
+
+  tofclip VERB --help explains a verb. Exit status: 0 done, 2 unusable input, 130 interrupted."""
+
+app = typer.Typer(name="tofclip", add_completion=False, pretty_exceptions_enable=False, epilog=EPILOG)
+app.command(epilog=EPILOG)(demo.demo)
+app.command(epilog=EPILOG)(calibrate.calibrate)
+app.command(epilog=EPILOG)(recover.recover)
+app.command(epilog=EPILOG)(cloud.cloud)
+app.add_typer(nlos.app, name="nlos")
+app.command(epilog=EPILOG)(convert.convert)
+app.command(epilog=EPILOG)(info.info)
+
+
+@app.callback(invoke_without_command=True)
+def _without_verb(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
+) -> None:
+    """From raw streak images to transient frames, point clouds and scenes around corners."""
+    if version:
+        print(__version__)
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        print(MAP)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program and return its exit status.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Defaults to the command line's.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = DEBUG_FLAG in words
+    try:
+        status = app([word for word in words if word != DEBUG_FLAG], prog_name="tofclip", standalone_mode=False)
+        sys.stdout.flush()
+    except Exception as fault:
+        if debug:
+            traceback.print_exc()
+        return _report(fault)
+    except KeyboardInterrupt:
+        status = INTERRUPTED
+    except SystemExit:
+        status = READER_GONE  # typer's answer to a broken pipe, and to nothing else in this mode
+    if status == INTERRUPTED:
+        print("tofclip: interrupted; no unfinished file was left behind", file=sys.stderr)
+    return int(status or 0)
+
+
+def _report(fault: Exception) -> int:
+    """Print one line about an error and return the exit status."""
+    if isinstance(fault, BrokenPipeError):
+        # Python flushes once more at exit; let that go nowhere instead of failing again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return READER_GONE
+    if isinstance(fault, typer.TyperException):
+        print(f"tofclip: error: {_one_line(fault.format_message()).rstrip(".")} (see --help)", file=sys.stderr)
+        return FAULTY_INPUT
+    if isinstance(fault, TofclipError):
+        print(f"tofclip: error: {_one_line(str(fault))}", file=sys.stderr)
+        return FAULTY_INPUT
+    kind = type(fault).__name__
+    print(
+        f"tofclip: error: unforeseen {kind}: {_one_line(str(fault))} ({DEBUG_FLAG} shows where; please report it)",
+        file=sys.stderr,
+    )
+    return DEFECT
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

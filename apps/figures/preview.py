@@ -1,0 +1,171 @@
+"""A shot and its recovered frames at a glance: streak image, brightness, distance, and the strongest frames."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apps.figures.style import DEPTH, SMALL, colour_bar, draw, label, page
+from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from tofclip.transient import Frames, Streak
+
+COLUMNS = 4
+MOST_MOMENTS = 3 * COLUMNS
+OVERVIEW_INCHES, LINE_INCHES = 4.2, 2.45
+CLOSEST_PEAKS_BIN = 12
+FAINTEST_PEAK = 0.01  # of the highest
+CROP_SHARE = 0.35  # of a frame's brightest pixel: what is dimmer is mostly artefacts
+CROP_MARGIN_PX = 8
+BRIGHTEST = 99.5  # percent: a glint does not darken the rest
+LIT = 0.2  # pixels that are lighter decide about the scale of distances
+BRIGHT_AREA = 95.0  # percent: colours need light to be told apart
+GAMMA = 0.6  # far objects stay visible beside near ones
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Frames that are shown as one picture: the first, the last, and the one that names them."""
+
+    frame: int
+    first: int
+    last: int
+
+
+def preview_figure(streak: Streak, frames: Frames) -> Figure:
+    """Draw a recovery.
+
+    Brightness is multiplied by range squared, so that near and far surfaces of one kind look alike; frames of a relay
+    wall, whose light took three bounces, are drawn as they are.
+    """
+    moments = telling_moments(frames)
+    lines = math.ceil(len(moments) / COLUMNS)
+    figure = page(12, OVERVIEW_INCHES + LINE_INCHES * lines)
+    parts: Any = figure.subfigures(2, 1, height_ratios=(OVERVIEW_INCHES, LINE_INCHES * lines))
+    overview, strip = parts
+    left, middle, right = overview.subplots(1, 3)
+    brightness = frames.values * _compensation(frames)[:, np.newaxis, np.newaxis]
+    _draw_streak(left, streak)
+    draw(middle, _toned(brightness.sum(axis=0)))
+    label(middle, "summed brightness" + _compensated(frames), "x (px)", "y (px), down")
+    _draw_distance(right, brightness, frames)
+    _draw_moments(strip.subplots(lines, COLUMNS, sharex=True, sharey=True).ravel(), brightness, moments, frames)
+    return figure
+
+
+def telling_moments(frames: Frames) -> list[Moment]:
+    """Choose what to show: where most light comes back, in order of time.
+
+    Objects at separate ranges make separate peaks of the summed brightness times range squared; each is taken from half
+    its height to half its height. Light that comes without a pause is cut into even shares instead.
+    """
+    energy = frames.values.sum(axis=(1, 2), dtype=np.float64) * _compensation(frames)
+    peaks = _peaks(energy)
+    return peaks if len(peaks) >= COLUMNS else _even_shares(energy)
+
+
+def _peaks(energy: NDArray[np.float64]) -> list[Moment]:
+    from scipy.ndimage import gaussian_filter1d
+    from scipy.signal import find_peaks
+
+    smooth = np.pad(gaussian_filter1d(energy, 1.5), 1)  # padded: the first and the last frame can be peaks
+    peaks, found = find_peaks(
+        smooth, distance=CLOSEST_PEAKS_BIN, prominence=FAINTEST_PEAK * smooth.max(), width=0, rel_height=0.5
+    )
+    chosen = np.sort(np.argsort(found["prominences"])[::-1][:MOST_MOMENTS])
+    edges = np.rint([found["left_ips"], found["right_ips"]]).astype(int).clip(1, energy.size) - 1
+    return [Moment(int(peaks[i]) - 1, int(edges[0, i]), int(edges[1, i])) for i in chosen]
+
+
+def _even_shares(energy: NDArray[np.float64]) -> list[Moment]:
+    share = np.cumsum(energy) / (energy.sum() or 1.0)
+    cuts = np.searchsorted(share, np.linspace(0.01, 0.99, MOST_MOMENTS + 1)).clip(0, energy.size - 1)
+    pairs = zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True)
+    return [Moment((first + last) // 2, first, max(first, last - 1)) for first, last in pairs]
+
+
+def _ranges(frames: Frames) -> NDArray[np.float64]:
+    return frames.times * SPEED_OF_LIGHT / 2
+
+
+def _sees_relay_wall(frames: Frames) -> bool:
+    return "relay_wall" in frames.attachments
+
+
+def _compensation(frames: Frames) -> NDArray[np.float32]:
+    """Factor of each frame that undoes the fall-off with range; 1 where it does not apply."""
+    if _sees_relay_wall(frames):
+        return np.ones(frames.times.size, np.float32)
+    return np.maximum(_ranges(frames), 0).astype(np.float32) ** 2
+
+
+def _compensated(frames: Frames) -> str:
+    return "" if _sees_relay_wall(frames) else " \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}"
+
+
+def _toned(picture: NDArray[Any], brightest: float = BRIGHTEST) -> NDArray[Any]:
+    """Scale a picture to 0..1 for the eye, with the percentile `brightest` at 1."""
+    top = np.percentile(picture, brightest) or picture.max() or 1.0
+    toned: NDArray[Any] = np.clip(picture / top, 0, 1) ** GAMMA
+    return toned
+
+
+def _draw_streak(axes: Axes, streak: Streak) -> None:
+    from tofclip.camera import dark_level
+
+    time = streak.times / NANOSECOND
+    extent = (-0.5, streak.counts.shape[1] - 0.5, float(time[-1]), float(time[0]))
+    draw(axes, _toned(np.maximum(streak.counts - dark_level(streak.counts), 0)), extent, aspect="auto")
+    label(axes, "streak image as measured", "slit column (px)", "time axis (ns)")
+
+
+def _draw_distance(axes: Axes, brightness: NDArray[Any], frames: Frames) -> None:
+    """Colour says when each pixel was brightest, lightness how bright it was."""
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    light = _toned(brightness.max(axis=0), BRIGHT_AREA)
+    scale, meaning = (frames.times / NANOSECOND, "time of flight (ns)")
+    if not _sees_relay_wall(frames):
+        scale, meaning = _ranges(frames), "range (m)"
+    distance = scale[brightness.argmax(axis=0)]
+    lit = distance[light > LIT] if np.any(light > LIT) else distance
+    mapped = ScalarMappable(Normalize(*np.percentile(lit, (1, 99))), colormaps[DEPTH])
+    draw(axes, mapped.to_rgba(distance)[..., :3] * light[..., np.newaxis])
+    label(axes, "distance of the brightest return", "x (px)", "y (px), down")
+    colour_bar(axes, mapped, meaning)
+
+
+def _draw_moments(panels: Any, brightness: NDArray[Any], moments: list[Moment], frames: Frames) -> None:
+    """One averaged picture for each moment, scaled to its own brightness."""
+    pictures = [brightness[moment.first : moment.last + 1].mean(axis=0) for moment in moments]
+    rows, columns = _lit_part(pictures)
+    extent = (columns.start - 0.5, columns.stop - 0.5, rows.stop - 0.5, rows.start - 0.5)
+    for axes, moment, picture in zip(panels, moments, pictures, strict=False):
+        draw(axes, picture[rows, columns], extent, vmin=0)
+        where = f"{frames.times[moment.frame] / NANOSECOND:.2f} ns"
+        if not _sees_relay_wall(frames):
+            where = f"{_ranges(frames)[moment.frame]:.2f} m"
+        label(axes, f"{where}  (frames {moment.first} to {moment.last})", "", "")
+    for axes in panels[len(moments) :]:
+        axes.set_axis_off()
+    panels[0].figure.suptitle("frames, each scaled to its own brightness; x and y in px", fontsize=SMALL + 2)
+
+
+def _lit_part(pictures: list[NDArray[Any]]) -> tuple[slice, slice]:
+    """Rows and columns that hold everything bright in any picture, with a margin."""
+    bright = np.any([picture > CROP_SHARE * picture.max() for picture in pictures], axis=0)
+    sides = []
+    for lit in (bright.any(axis=1), bright.any(axis=0)):
+        first, last = np.flatnonzero(lit)[[0, -1]].tolist()
+        sides.append(slice(max(0, first - CROP_MARGIN_PX), min(lit.size, last + CROP_MARGIN_PX + 1)))
+    return sides[0], sides[1]

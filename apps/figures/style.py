@@ -1,0 +1,66 @@
+"""What all pictures have in common: sizes, colours, labelled axes, and writing that is all or nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from tofclip.storage import atomic_path
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.image import AxesImage
+
+BRIGHTNESS = "inferno"
+DEPTH = "viridis"
+NOTHING = "#20242c"  # where a picture has no value
+LINE = "#3dd6c8"  # drawn over a brightness map
+SMALL = 8
+DOTS_PER_INCH = 100
+
+
+def page(width: float, height: float) -> Figure:
+    """Make an empty figure, in inches. It draws with Agg: no display is needed and pyplot is left alone."""
+    return Figure(figsize=(width, height), dpi=DOTS_PER_INCH, layout="constrained")
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure in the format that the name's ending says, whole or not at all."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary)
+
+
+def draw(
+    axes: Axes, picture: NDArray[Any], extent: tuple[float, float, float, float] | None = None, **look: Any
+) -> AxesImage:
+    """Draw a picture without smoothing over its pixels.
+
+    Parameters
+    ----------
+    axes : Axes
+    picture : (rows, columns) or (rows, columns, 3) array
+    extent : (left, right, bottom, top), optional
+        Outer edges in the axes' units; pixel numbers where absent.
+    **look
+        Further settings of ``imshow``.
+    """
+    axes.set_facecolor(NOTHING)
+    return axes.imshow(picture, extent=extent, **{"cmap": BRIGHTNESS, "interpolation": "nearest", **look})
+
+
+def label(axes: Axes, title: str, x: str, y: str) -> None:
+    """Say what a picture shows and what its axes are."""
+    axes.set_title(title, fontsize=SMALL + 2)
+    axes.set_xlabel(x, fontsize=SMALL)
+    axes.set_ylabel(y, fontsize=SMALL)
+    axes.tick_params(labelsize=SMALL)
+
+
+def colour_bar(axes: Axes, mapped: Any, meaning: str) -> None:
+    """Put a labelled colour scale beside a picture."""
+    bar = axes.figure.colorbar(mapped, ax=axes, shrink=0.9)
+    bar.set_label(meaning, fontsize=SMALL)
+    bar.ax.tick_params(labelsize=SMALL)

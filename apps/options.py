@@ -1,0 +1,23 @@
+"""Options that several verbs share, so that they are spelt and explained alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object of figures and nothing else.")]
+TimeZero = Annotated[
+    float | None,
+    typer.Option(
+        "--time-zero-ns",
+        metavar="NS",
+        help="Reading of the time axis at which light of range 0 would arrive, in ns; e.g. -10.784.",
+        show_default="the camera's",
+    ),
+]
+Picture = Annotated[
+    Path | None,
+    typer.Option("--preview", metavar="PNG", help="Where the picture goes.", show_default="beside --out, .png"),
+]

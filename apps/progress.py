@@ -1,0 +1,62 @@
+"""A progress bar where somebody is watching, and a quick end of the work when they press Ctrl-C."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from types import FrameType
+
+Advance = Callable[[int], None]
+
+
+@contextlib.contextmanager
+def progress(title: str, total: int) -> Iterator[Advance]:
+    """Yield a function to call with the amount of work just done, from any thread.
+
+    The bar is drawn on standard error, and only on a terminal. After Ctrl-C the function raises in every thread that
+    calls it, so that none goes on computing for nothing.
+    """
+    with _interruption() as interrupted, _bar(title, total) as draw:
+
+        def advance(amount: int) -> None:
+            if interrupted.is_set():
+                raise KeyboardInterrupt
+            draw(amount)
+
+        yield advance
+
+
+@contextlib.contextmanager
+def _bar(title: str, total: int) -> Iterator[Advance]:
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(None), TaskProgressColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as drawn:
+        task = drawn.add_task(title, total=total)
+        yield lambda amount: drawn.advance(task, amount)
+
+
+@contextlib.contextmanager
+def _interruption() -> Iterator[threading.Event]:
+    """Yield an event that Ctrl-C sets before it raises `KeyboardInterrupt` in the main thread."""
+    interrupted = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield interrupted
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        interrupted.set()
+        signal.default_int_handler(number, frame)
+
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,64 @@
+"""`tofclip calibrate`: four focus-mode pictures of a point source to a camera file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from apps.options import AsJson, Picture, TimeZero
+from tofclip.units import NANOSECOND
+
+if TYPE_CHECKING:
+    from tofclip.calibration import FocusCalibration
+
+
+def calibrate(
+    line: Annotated[Path, typer.Option(metavar="TIF", help="Point source, slit open: a line for each lenslet.")],
+    line_background: Annotated[Path, typer.Option(metavar="TIF", help="The same without the source.")],
+    dot: Annotated[Path, typer.Option(metavar="TIF", help="Point source, slit closed: a dot for each lenslet.")],
+    dot_background: Annotated[Path, typer.Option(metavar="TIF", help="The same without the source.")],
+    out: Annotated[Path, typer.Option(metavar="H5", help="The camera file to write.")],
+    time_zero_ns: TimeZero = None,
+    preview: Picture = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find every view's slit centre and line angle, with uncertainties and a picture of the fits over the data."""
+    from apps.figures.calibration import calibration_figure
+    from apps.figures.style import save
+    from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
+    from tofclip.calibration import calibrate as fit
+    from tofclip.io import read_streak
+
+    pictures = (line, line_background, dot, dot_background)
+    preview = preview or out.with_suffix(".png")
+    require_writable(out, *RECORD_SUFFIXES, inputs=pictures)
+    require_writable(preview, *PICTURE_SUFFIXES, inputs=pictures)
+    lines, no_lines, dots, no_dots = (read_streak(path).counts for path in pictures)
+    found = fit(lines, no_lines, dots, no_dots)
+    camera = found.camera(time_zero=(time_zero_ns or 0.0) * NANOSECOND)
+    camera.save(out)
+    save(calibration_figure(found), preview)
+    _report(found, as_json, [out, preview])
+
+
+def _report(found: FocusCalibration, as_json: bool, written: list[Path]) -> None:
+    import numpy as np
+
+    from apps.report import report
+
+    figures: dict[str, Any] = {
+        "angles_deg": np.rad2deg(found.angles),
+        "centres_px": found.centres_px,
+        "centre_uncertainty_px": found.centre_uncertainty_px,
+    }
+    if as_json:
+        report(figures, as_json)
+        return
+    print("view   centre (px)        angle (deg)")
+    angle_uncertainty = np.rad2deg(found.angle_uncertainty)
+    rows = zip(*figures.values(), angle_uncertainty, strict=True)
+    for view, (angle, centre, centre_error, angle_error) in enumerate(rows):
+        print(f"{view:4d}   {centre:8.2f} +- {centre_error:4.2f}   {angle:7.2f} +- {angle_error:4.2f}")
+    report({}, as_json, written)

@@ -1,0 +1,50 @@
+"""`tofclip cloud`: recovered frames to a point cloud."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from apps.options import AsJson
+
+if TYPE_CHECKING:
+    from tofclip.lidar import PointCloud, Returns
+
+FORMATS = (".ply", ".pcd", ".csv", ".npz", ".h5")
+
+
+def cloud(
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="Recovered frames (HDF5).")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Ends in .ply, .pcd, .csv, .npz or .h5.")],
+    as_json: AsJson = False,
+) -> None:
+    """Find each pixel's returns and place them in space: x right, y down, z forward, in metres."""
+    from apps.files import history, require_writable
+    from tofclip.errors import InputError
+    from tofclip.lidar import depth, point_cloud
+    from tofclip.transient import Frames
+
+    require_writable(out, *FORMATS, inputs=(frames,))
+    recovered = Frames.load(frames)
+    returns = depth(recovered)
+    if len(returns) == 0:
+        raise InputError(f"{frames}: no return stands out of the background, so there is no point to write")
+    past = history({"verb": "cloud"}, frames, earlier=recovered.provenance)
+    points = replace(point_cloud(returns), provenance=past)
+    points.save(out)
+    _report(points, returns, as_json, out)
+
+
+def _report(points: PointCloud, returns: Returns, as_json: bool, out: Path) -> None:
+    from apps.report import report
+
+    rows, columns = returns.camera.image_shape
+    figures = {
+        "points": len(points),
+        "range_m": [points.range.min(), points.range.max()],
+        "returns_per_pixel_mean": len(points) / (rows * columns),
+    }
+    report(figures, as_json, [out])

@@ -1,0 +1,112 @@
+"""`tofclip info`: what a file holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from apps.options import AsJson
+
+if TYPE_CHECKING:
+    from tofclip.storage import Field, Record
+
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+FEW = 9  # numbers that are shown one by one
+TABLE_SUFFIXES = (".ply", ".pcd", ".csv", ".npz")
+
+
+def info(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Any file of ours, or a streak image of others.")],
+    as_json: AsJson = False,
+) -> None:
+    """Say what kind of thing a file holds: shapes, axes, units, text, and how it came about."""
+    from apps.report import plainly, report
+
+    found = plainly({"file": file, **_described(_record_in(file))})
+    if as_json:
+        report(found, as_json)
+    else:
+        print("\n".join(_outline(found)))
+
+
+def _record_in(file: Path) -> Record:
+    """Read our own records as they are, streak images and point clouds of other formats through their readers."""
+    from tofclip.errors import FileFormatError
+    from tofclip.io import read_streak
+    from tofclip.lidar import PointCloud
+    from tofclip.storage import Record, reading
+
+    with reading(file), open(file, "rb") as opened:
+        start = opened.read(len(HDF5_SIGNATURE))
+    if start == HDF5_SIGNATURE:
+        return Record.load(file)
+    if file.suffix.lower() not in TABLE_SUFFIXES:
+        return read_streak(file).to_record()
+    try:
+        return PointCloud.load(file).to_record()
+    except FileFormatError:
+        if file.suffix.lower() != ".npz":
+            raise
+    return read_streak(file).to_record()  # an archive that is no point cloud may be a LIFT shot
+
+
+def _described(record: Record) -> dict[str, Any]:
+    found: dict[str, Any] = {"kind": record.kind}
+    if record.attributes:
+        found["attributes"] = record.attributes
+    if record.fields:
+        found["fields"] = {name: _field(entry) for name, entry in record.fields.items()}
+    if record.children:
+        found["children"] = {name: _described(child) for name, child in record.children.items()}
+    if record.provenance:
+        found["provenance"] = record.provenance
+    return found
+
+
+def _field(entry: Field) -> dict[str, Any]:
+    import numpy as np
+
+    values = entry.values
+    known = {"shape": values.shape, "type": str(values.dtype), "units": entry.units, "axes": entry.axes}
+    if values.dtype.kind not in "uif":
+        return known
+    if values.size <= FEW:
+        return {**known, "values": values}
+    finite = values[np.isfinite(values)]
+    return {**known, "range": [finite.min(), finite.max()] if finite.size else [None, None]}
+
+
+def _outline(found: Mapping[str, Any], depth: int = 0) -> Iterator[str]:
+    """Indent a tree; what has no branches of its own stays on one line."""
+    for name, value in found.items():
+        lead = f"{'  ' * depth}{name}:"
+        if isinstance(value, Mapping) and "shape" in value:
+            yield f"{lead} {_field_in_words(value)}"
+        elif isinstance(value, Mapping):
+            yield lead
+            yield from _outline(value, depth + 1)
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            yield lead
+            for number, entry in enumerate(value, start=1):
+                yield from _outline({f"{number}": entry}, depth + 1)
+        else:
+            yield f"{lead} {value}"
+
+
+def _field_in_words(known: Mapping[str, Any]) -> str:
+    shape = " x ".join(map(str, known["shape"])) or "single value"
+    axes = f" ({', '.join(known['axes'])})" if known["axes"] else ""
+    if "values" in known:
+        return f"{shape}{axes} {known['type']}, {_in_brief(known['values'])} {known['units']}".rstrip()
+    least, most = known.get("range", (None, None))
+    spread = "" if least is None else f", {least:.6g} .. {most:.6g}"
+    return f"{shape}{axes} {known['type']}{spread} {known['units']}".rstrip()
+
+
+def _in_brief(values: Any) -> str:
+    if isinstance(values, list) and any(value is not None for value in values):
+        return f"[{', '.join(map(_in_brief, values))}]"
+    return f"{values:.6g}" if isinstance(values, int | float) else "unknown"

@@ -1,0 +1,90 @@
+"""`tofclip nlos reconstruct`: what a relay wall shows of the scene around the corner."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from apps.options import AsJson
+from tofclip.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from nlos import Capture
+
+METHODS = ("backprojection",)
+
+app = typer.Typer(help="Image the scene hidden around a corner.", no_args_is_help=True)
+
+
+@app.callback()
+def _keep_the_verb() -> None:
+    """Image the scene hidden around a corner."""
+
+
+@app.command()
+def reconstruct(
+    source: Annotated[Path, typer.Argument(metavar="FILE", help="Recovered frames of a relay wall, or a capture.")],
+    out: Annotated[Path, typer.Option(metavar="H5", help="The volume to write.")],
+    png: Annotated[Path | None, typer.Option(metavar="PNG", help="Picture of the volume, three views.")] = None,
+    method: Annotated[str, typer.Option(metavar="NAME", help="backprojection.")] = "backprojection",
+    wavelength_mm: Annotated[float, typer.Option(metavar="MM", help="Carrier of the virtual pulse.")] = 48.0,
+    cycles: Annotated[float, typer.Option(metavar="N", help="Length of the virtual pulse in wavelengths.")] = 3.0,
+    voxel_mm: Annotated[float, typer.Option(metavar="MM", help="Distance of neighbouring voxels.")] = 6.0,
+    near_m: Annotated[
+        float | None, typer.Option(metavar="M", help="First depth.", show_default="just before the wall")
+    ] = None,
+    far_m: Annotated[
+        float | None, typer.Option(metavar="M", help="Last depth.", show_default="as far as the record reaches")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Image the hidden scene from the transients on a relay wall."""
+    from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, history, require_writable
+    from apps.progress import progress
+    from apps.report import report
+    from nlos import Backprojection, Grid
+    from tofclip.errors import InputError
+
+    if method not in METHODS:
+        raise InputError(f"unknown method '{method}'; choose one of {', '.join(METHODS)}")
+    require_writable(out, *RECORD_SUFFIXES, inputs=(source,))
+    if png is not None:
+        require_writable(png, *PICTURE_SUFFIXES, inputs=(source,))
+    imaging = Backprojection(wavelength=wavelength_mm * MILLIMETRE, cycles=cycles)
+    capture = _capture(source)
+    grid = Grid.in_front_of(capture, voxel_mm * MILLIMETRE, near_m, far_m)
+    imaging.supports(capture, grid).require()
+    started = time.perf_counter()
+    with progress("imaging", imaging.lookups(capture, grid)) as advance:
+        volume = imaging.reconstruct(capture, grid, advance)
+    seconds = time.perf_counter() - started
+    settings = {"verb": "nlos reconstruct", "method": repr(imaging), "voxel_mm": voxel_mm}
+    replace(volume, provenance=history(settings, source, earlier=capture.provenance)).save(out)
+    if png is not None:
+        volume.save_picture(png)
+    x, y, z = volume.brightest()
+    figures = {
+        "method": method,
+        "voxels": list(grid.shape),
+        "wall_points": len(capture.points),
+        "seconds": seconds,
+        "lookups_per_second": imaging.lookups(capture, grid) / seconds,
+        "peak_m": {"x": x, "y": y, "z": z},
+    }
+    report(figures, as_json, [out] if png is None else [out, png])
+
+
+def _capture(source: Path) -> Capture:
+    """Read a capture, or take one out of recovered frames."""
+    from nlos import Capture
+    from tofclip.storage import Record
+    from tofclip.transient import Frames
+
+    record = Record.load(source, "frames", "capture")
+    if record.kind == "capture":
+        return Capture.from_record(record)
+    return Capture.from_frames(Frames.from_record(record))

@@ -1,0 +1,104 @@
+"""`tofclip recover`: a streak image to one picture per instant."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from apps.options import AsJson, Picture, TimeZero
+from tofclip.units import NANOSECOND, PICOSECOND
+
+if TYPE_CHECKING:
+    from tofclip.reconstruct import Task
+    from tofclip.recovery import Method
+    from tofclip.transient import Frames
+
+
+def recover(
+    streak: Annotated[Path, typer.Argument(metavar="STREAK", help="HPD-TA TIFF, LIFT archive or our HDF5.")],
+    out: Annotated[Path, typer.Option(metavar="H5", help="The frames to write.")],
+    camera: Annotated[
+        Path | None, typer.Option(metavar="H5", help="Made by calibrate.", show_default="the one inside STREAK")
+    ] = None,
+    bin_width_ps: Annotated[
+        float | None,
+        typer.Option(metavar="PS", help="Duration of a row in ps; overrides the file's own time axis."),
+    ] = None,
+    time_zero_ns: TimeZero = None,
+    method: Annotated[str, typer.Option(metavar="NAME", help="tv, l1, linear or adjoint.")] = "tv",
+    iterations: Annotated[
+        int | None, typer.Option(metavar="N", help="At most so many, for tv and l1.", show_default="the method's")
+    ] = None,
+    preview: Picture = None,
+    as_json: AsJson = False,
+) -> None:
+    """Recover every transient frame of a raw streak image.
+
+    Where the camera's sweep is not known, skew, gains and centres are found from the shot itself.
+    """
+    from apps.figures.preview import preview_figure
+    from apps.figures.style import save
+    from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
+    from apps.progress import progress
+    from tofclip.reconstruct import method_named
+
+    inputs = (streak,) if camera is None else (streak, camera)
+    preview = preview or out.with_suffix(".png")
+    require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
+    require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
+    chosen = method_named(method) if iterations is None else method_named(method, iterations=iterations)
+    task = _prepared(streak, camera, bin_width_ps, time_zero_ns, chosen)
+    with progress("recovering", task.work) as advance:
+        frames = _with_history(task.run(advance), task, inputs)
+    frames.save(out)
+    save(preview_figure(task.streak, frames), preview)
+    _report(frames, as_json, [out, preview])
+
+
+def _prepared(
+    streak: Path, camera: Path | None, bin_width_ps: float | None, time_zero_ns: float | None, method: Method
+) -> Task:
+    """Read the inputs and check them against each other."""
+    from tofclip.camera import Camera
+    from tofclip.io import read_streak
+    from tofclip.reconstruct import prepare
+
+    known = None if camera is None else Camera.load(camera)
+    shot = read_streak(streak, None if bin_width_ps is None else bin_width_ps * PICOSECOND)
+    task = prepare(shot, known, method)
+    if time_zero_ns is None:
+        return task
+    return replace(task, camera=task.camera.replace(time_zero=time_zero_ns * NANOSECOND))
+
+
+def _with_history(frames: Frames, task: Task, inputs: tuple[Path, ...]) -> Frames:
+    from apps.files import history
+
+    settings = {"verb": "recover", "method": repr(task.method), "time_zero_s": task.camera.time_zero}
+    return replace(frames, provenance=history(settings, *inputs, earlier=frames.provenance))
+
+
+def _report(frames: Frames, as_json: bool, written: list[Path]) -> None:
+    from apps.report import report
+    from tofclip.reconstruct import time_shift_bins
+
+    known = frames.figures
+    report(
+        {
+            "frames": frames.values.shape[0],
+            "image_shape": frames.camera.image_shape,
+            "method": known["method"],
+            "iterations": known["iterations"],
+            "relative_residual": known["relative_residual"],
+            "seconds": known["seconds"],
+            "frames_per_second": known["frames_per_second"],
+            "view_gains": frames.camera.gains,
+            "time_shift_bins": time_shift_bins(frames.camera),
+            "stopped_because": known["stopped_because"],
+        },
+        as_json,
+        written,
+    )
