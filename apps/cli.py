@@ -104,7 +104,7 @@ def _report(fault: Exception) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return READER_GONE
     if isinstance(fault, typer.TyperException):
-        print(f"tofclip: error: {_one_line(fault.format_message()).rstrip(".")} (see --help)", file=sys.stderr)
+        print(f"tofclip: error: {_one_line(fault.format_message()).rstrip('.')} (see --help)", file=sys.stderr)
         return FAULTY_INPUT
     if isinstance(fault, TofclipError):
         print(f"tofclip: error: {_one_line(str(fault))}", file=sys.stderr)

@@ -17,12 +17,14 @@ if TYPE_CHECKING:
 
 METHODS = ("backprojection",)
 
-app = typer.Typer(help="Image the scene hidden around a corner.", no_args_is_help=True)
+app = typer.Typer()
 
 
-@app.callback()
-def _keep_the_verb() -> None:
+@app.callback(invoke_without_command=True)
+def _without_verb(context: typer.Context) -> None:
     """Image the scene hidden around a corner."""
+    if context.invoked_subcommand is None:
+        print(context.get_help())
 
 
 @app.command()
