@@ -137,8 +137,9 @@ def quiet_level(trace, times, peaks, pulse):
     total = square = 0.0
     for i in range(trace.size):
         if free[i]:
-            total += trace[i]
-            square += trace[i] * trace[i]
+            value = float(trace[i])  # float32 squares would drown a small noise on a high background
+            total += value
+            square += value * value
     mean = total / left
     return mean, np.sqrt(max(square / left - mean * mean, 0.0))
 
