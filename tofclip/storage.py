@@ -28,6 +28,7 @@ from tofclip.errors import FileFormatError, StorageError
 if TYPE_CHECKING:
     import h5py
 
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
 FORMAT_NAME = "tofclip"
 FORMAT_VERSION = 1
 # The layouts of HDF5 1.10 carry checksums; a damaged file of the older ones can hang the library.
@@ -158,10 +159,10 @@ def opened(path: str | Path) -> Iterator[h5py.File]:
     """Open one of our HDF5 files for reading; anything else is a clear error."""
     import h5py
 
-    with reading(path):
-        if not h5py.is_hdf5(path):
-            problem = "is empty" if os.path.getsize(path) == 0 else "is not an HDF5 file"
-            raise FileFormatError(path, problem)
+    with reading(path), open(path, "rb") as raw:
+        start = raw.read(len(SIGNATURE))
+    if start != SIGNATURE:
+        raise FileFormatError(path, "is not an HDF5 file" if start else "is empty")
     try:
         with h5py.File(path, "r") as file:
             if _text(file, "format") != FORMAT_NAME:

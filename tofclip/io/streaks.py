@@ -10,7 +10,7 @@ from pathlib import Path
 from tofclip.errors import FileFormatError
 from tofclip.io.lift import read_lift
 from tofclip.io.tiff import read_tiff
-from tofclip.storage import provenance, reading
+from tofclip.storage import SIGNATURE, provenance, reading
 from tofclip.transient import Streak
 
 # A file is known by its first bytes: suffixes get lost and lie.
@@ -18,7 +18,7 @@ READERS: dict[bytes, Callable[[str | Path], Streak]] = {
     b"II*\0": read_tiff,
     b"MM\0*": read_tiff,
     b"PK\x03\x04": read_lift,
-    b"\x89HDF\r\n\x1a\n": Streak.load,
+    SIGNATURE: Streak.load,
 }
 
 

@@ -1,0 +1,260 @@
+"""Records survive their file; damaged files and full disks are named; writing is all or nothing."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import hypothesis.extra.numpy as hnp
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tofclip.errors import FileFormatError, StorageError
+from tofclip.storage import Field, Record, atomic_path, provenance
+
+names = st.from_regex(r"[a-z][a-z_]{0,8}", fullmatch=True)
+words = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=20)
+scalars = st.one_of(words, st.booleans(), st.integers(-(2**62), 2**62), st.floats(allow_nan=False))
+dtypes = st.sampled_from(["float32", "float64", "int64", "uint8", "bool", "complex64"])
+arrays = dtypes.flatmap(lambda d: hnp.arrays(d, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5)))
+fields = st.builds(Field, arrays, st.sampled_from(["", "s", "m", "px"]), st.lists(names, max_size=3).map(tuple))
+attributes = st.dictionaries(words, scalars, max_size=4)
+leaves = st.builds(Record, words, st.dictionaries(names, fields, max_size=3), attributes)
+# Fields and children share one group of the file, hence the upper-case names of the children.
+records = st.builds(
+    Record,
+    words,
+    st.dictionaries(names, fields, max_size=3),
+    attributes,
+    st.dictionaries(names.map(str.upper), leaves, max_size=2),
+    st.dictionaries(words, st.recursive(scalars, lambda s: st.lists(s, max_size=3), max_leaves=5), max_size=3),
+)
+
+
+@pytest.fixture
+def record() -> Record:
+    counts = np.random.default_rng(1).random((40, 30))
+    return Record("streak", {"counts": Field(counts, "count", ("time", "column"))}, {"gain": 2.5, "name": "a"})
+
+
+def assert_same(got: Record, expected: Record) -> None:
+    assert (got.kind, dict(got.attributes)) == (expected.kind, dict(expected.attributes))
+    assert got.fields.keys() == expected.fields.keys()
+    for name, entry in expected.fields.items():
+        stored = got.fields[name]
+        np.testing.assert_array_equal(stored.values, entry.values)
+        assert (stored.values.dtype, stored.units, stored.axes) == (entry.values.dtype, entry.units, entry.axes)
+    assert got.children.keys() == expected.children.keys()
+    for name, child in expected.children.items():
+        assert_same(got.children[name], child)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(expected=records)
+def test_a_record_survives_its_file(expected: Record, tmp_path: Path) -> None:
+    expected.save(tmp_path / "record.h5")
+    got = Record.load(tmp_path / "record.h5")
+    assert_same(got, expected)
+    assert got.provenance == expected.provenance
+    assert got.origin == str(tmp_path / "record.h5")
+
+
+@pytest.mark.parametrize("shape", [(300, 200), (70, 40, 50)])
+def test_large_arrays_are_compressed_without_loss(shape: tuple[int, ...], tmp_path: Path) -> None:
+    values = np.zeros(shape, np.float32)
+    values[::7] = np.random.default_rng(0).random(values[::7].shape)
+    Record("frames", {"values": Field(values)}).save(tmp_path / "a.h5")
+    np.testing.assert_array_equal(Record.load(tmp_path / "a.h5").fields["values"].values, values)
+    assert (tmp_path / "a.h5").stat().st_size < values.nbytes / 2
+
+
+def test_text_longer_than_an_hdf5_attribute_survives(tmp_path: Path) -> None:
+    long = "é" * 70_000
+    Record("x", attributes={"long": long}, provenance={"history": long}).save(tmp_path / "a.h5")
+    got = Record.load(tmp_path / "a.h5")
+    assert got.attributes["long"] == got.provenance["history"] == long
+
+
+def test_no_damaged_byte_goes_unnoticed(record: Record, tmp_path: Path) -> None:
+    """HDF5 reads some damaged files for ever and others as if nothing were wrong; checksums prevent both."""
+    path = tmp_path / "a.h5"
+    record.save(path)
+    whole = path.read_bytes()
+    for position in np.random.default_rng(2).integers(0, len(whole), 150):
+        damaged = bytearray(whole)
+        damaged[position] ^= 0x41
+        path.write_bytes(damaged)
+        with pytest.raises(FileFormatError, match=r"a\.h5"):
+            Record.load(path)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.999])
+def test_a_truncated_file_is_refused(record: Record, share: float, tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    record.save(path)
+    os.truncate(path, int(path.stat().st_size * share))
+    with pytest.raises(FileFormatError, match=r"a\.h5: is (damaged|not an HDF5)"):
+        Record.load(path)
+
+
+def test_what_is_no_record_is_named(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="no such file"):
+        Record.load(tmp_path / "absent.h5")
+    with pytest.raises(StorageError, match="is a folder"):
+        Record.load(tmp_path)
+    empty = tmp_path / "empty.h5"
+    empty.touch()
+    with pytest.raises(FileFormatError, match="is empty"):
+        Record.load(empty)
+    text = tmp_path / "text.h5"
+    text.write_text("not HDF5")
+    with pytest.raises(FileFormatError, match="is not an HDF5 file"):
+        Record.load(text)
+    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+        file["data"] = [1.0]
+    with pytest.raises(FileFormatError, match="not one of tofclip's"):
+        Record.load(tmp_path / "foreign.h5")
+
+
+def test_a_newer_format_is_refused(record: Record, tmp_path: Path) -> None:
+    record.save(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file.attrs["format_version"] = 99
+    with pytest.raises(FileFormatError, match="format version 99"):
+        Record.load(tmp_path / "a.h5")
+
+
+def test_a_record_of_another_kind_is_refused(record: Record, tmp_path: Path) -> None:
+    record.save(tmp_path / "a.h5")
+    assert Record.load(tmp_path / "a.h5", "frames", "streak").kind == "streak"
+    with pytest.raises(FileFormatError, match="holds a streak record, expected camera or frames"):
+        Record.load(tmp_path / "a.h5", "camera", "frames")
+
+
+def test_array_checks_name_dimensions_units_and_type(record: Record) -> None:
+    counts = record.array("counts", np.float32, 2, "count")
+    assert counts.dtype == np.float32
+    for problem, arguments in {
+        "no field 'times'": ("times", np.float32, 1),
+        "must have 3 dimensions": ("counts", np.float32, 3, "count"),
+        "must be in 's', found 'count'": ("counts", np.float32, 2, "s"),
+        "must convert to int32, found float64": ("counts", np.int32, 2, "count"),
+    }.items():
+        with pytest.raises(FileFormatError, match=problem):
+            record.array(*arguments)
+
+
+def test_attributes_and_children_are_checked(record: Record) -> None:
+    parent = Record("frames", children={"shot": record})
+    assert record.attribute("gain") == 2.5
+    assert record.attribute("absent", 7) == 7
+    assert parent.child("shot", "streak") is record
+    with pytest.raises(FileFormatError, match="no attribute 'absent'"):
+        record.attribute("absent")
+    for name, kind in (("shot", "camera"), ("camera", "camera")):
+        with pytest.raises(FileFormatError, match=f"carries no camera '{name}'"):
+            parent.child(name, kind)
+
+
+@pytest.mark.parametrize("fault", [ValueError, KeyboardInterrupt, OSError])
+def test_an_interrupted_write_leaves_the_old_file(fault: type[BaseException], tmp_path: Path) -> None:
+    target = tmp_path / "scene.ply"
+    target.write_text("old")
+
+    def write() -> None:
+        with atomic_path(target) as temporary:
+            temporary.write_text("half")
+            raise fault("stop")
+
+    with pytest.raises(StorageError if fault is OSError else fault, match="stop"):
+        write()
+    assert target.read_text() == "old"
+    assert os.listdir(tmp_path) == ["scene.ply"]
+
+
+def test_atomic_path_replaces_the_file_at_the_end_only(tmp_path: Path) -> None:
+    target = tmp_path / "scene.ply"
+    target.write_text("old")
+    with atomic_path(target) as temporary:
+        temporary.write_text("new")
+        assert target.read_text() == "old"
+        assert temporary.suffix == ".ply"
+        assert temporary.parent == tmp_path
+    assert target.read_text() == "new"
+    assert os.listdir(tmp_path) == ["scene.ply"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="file modes")
+def test_a_written_file_has_the_usual_mode(tmp_path: Path) -> None:
+    (tmp_path / "usual").touch()
+    with atomic_path(tmp_path / "a") as temporary:
+        temporary.touch()
+    assert (tmp_path / "a").stat().st_mode == (tmp_path / "usual").stat().st_mode
+
+
+def test_unwritable_places_are_named(record: Record, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(StorageError, match="the folder does not exist"):
+        record.save(tmp_path / "absent" / "a.h5")
+    with pytest.raises(StorageError, match="its folder is a file"):
+        record.save(tmp_path / "file" / "a.h5")
+    with pytest.raises(StorageError, match="it is a folder"):
+        record.save(tmp_path / "folder")
+    assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
+
+
+def test_forbidden_places_are_named(record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("tempfile.mkstemp", refuse)
+    with pytest.raises(StorageError, match=r"a\.h5: cannot be written: writing is not permitted there"):
+        record.save(tmp_path / "a.h5")
+    monkeypatch.setattr("builtins.open", refuse)
+    with pytest.raises(StorageError, match=r"a\.h5: reading is not permitted"):
+        Record.load(tmp_path / "a.h5")
+
+
+FULL_DISK = """
+import resource, sys
+import h5py, numpy as np
+from tofclip.errors import StorageError
+from tofclip.storage import Field, Record
+
+record = Record("frames", {"values": Field(np.random.default_rng(0).random((60, 50, 50)))})
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+try:
+    record.save(sys.argv[1])
+except StorageError as fault:
+    print(fault)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a limit on the size of files")
+def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path) -> None:
+    """A limit on file size stands for the full disk: the write fails half way. HDF5 itself would crash."""
+    target = tmp_path / "frames.h5"
+    target.write_text("old")
+    child = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, str(target)], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (child.returncode, child.stderr) == (0, "")
+    assert child.stdout.startswith(f"{target}: cannot be written: the disk is full")
+    assert target.read_text() == "old"
+    assert os.listdir(tmp_path) == ["frames.h5"]
+
+
+def test_provenance_names_the_inputs(tmp_path: Path) -> None:
+    (tmp_path / "in.tif").write_bytes(b"pixels")
+    found = provenance({"iterations": 3}, tmp_path / "in.tif", tmp_path / "absent")
+    assert found["settings"] == {"iterations": 3}
+    assert found["inputs"] == [{"name": "in.tif", "sha256": hashlib.sha256(b"pixels").hexdigest()}]
+    assert found["software"].startswith("tofclip ")
+    assert found["created"].endswith("+00:00")
