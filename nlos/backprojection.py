@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -10,17 +11,19 @@ from numpy.typing import NDArray
 
 from nlos.band import Band, VirtualPulse, Waveforms
 from nlos.capture import Capture
-from nlos.geometry import Grid
-from nlos.kernels import BRICK_Z, add_backprojection
+from nlos.geometry import FloatArray, Grid
+from nlos.kernels import add_backprojection
 from nlos.method import Progress, Support, common_support, silent
 from nlos.volume import Volume
+from tofclip.arrays import blocks, run_blocks
 from tofclip.errors import InputError
 
 TABLE_BYTES = 32 << 20
 """Filtered signals held at a time; the captures of this world have up to 64 MB raw."""
 
-LOOKUPS_PER_CALL = 250_000_000
-"""About a quarter of a second of work: as long as an interruption has to wait for a compiled loop."""
+BRICK_Z, BRICK_Y, BRICK_X = 8, 8, 128
+"""Voxels treated together: few enough for the cache, rows along x long enough for vector registers, and at a batch of
+wall points some 30 ms of work, which is how long an interruption waits."""
 
 
 @dataclass(frozen=True)
@@ -93,46 +96,46 @@ class Backprojection:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in the signal."""
         self.supports(capture, grid).require()
         total = np.zeros(grid.shape, np.complex64)
-        band = Band(self.pulse, capture.axis)
-        axes = [axis.astype(np.float32) for axis in (grid.x, grid.y, grid.z)]
-        for selection, waveforms in _in_batches(capture, band):
-            wall, lasers = _geometry(capture, selection)
-            for planes in _slabs(grid, len(wall)):
-                _add(waveforms, wall, lasers, [*axes[:2], axes[2][planes]], total[planes])
-                progress(len(wall) * total[planes].size)
+        for batch in _batches(capture, Band(self.pulse, capture.axis)):
+            _backproject(batch, grid, total, progress)
         settings = {"method": "backprojection", "wavelength_m": self.wavelength, "cycles": self.cycles}
         return Volume(total, grid, {**capture.provenance, "imaging": settings})
 
 
-def _in_batches(capture: Capture, band: Band) -> Iterator[tuple[slice, Waveforms]]:
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """Some wall points with their filtered signals, as the compiled loop takes them."""
+
+    waveforms: Waveforms
+    wall: NDArray[np.float32]
+    lasers: NDArray[np.float32]
+
+    def add_to(self, field: NDArray[np.complex64], x: FloatArray, y: FloatArray, z: FloatArray) -> None:
+        """Add what these wall points contribute to a brick of voxels."""
+        values = self.waveforms.values.view(np.float32)
+        start, spacing = np.float32(self.waveforms.start), np.float32(self.waveforms.spacing)
+        axes = (axis.astype(np.float32) for axis in (x, y, z))
+        add_backprojection(values, start, spacing, self.wall, self.lasers, *axes, field)
+
+
+def _batches(capture: Capture, band: Band) -> Iterator[_Batch]:
     """Filter as many wall points at a time as fit into the table."""
-    points = len(capture.points)
-    batch = max(1, TABLE_BYTES // (band.samples * np.dtype(np.complex64).itemsize))
-    for first in range(0, points, batch):
-        selection = slice(first, min(first + batch, points))
-        yield selection, band.waveforms(band.phasors(capture.traces(selection)))
+    count = max(1, TABLE_BYTES // (band.samples * np.dtype(np.complex64).itemsize))
+    for some in blocks(len(capture.points), count):
+        lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[some]
+        waveforms = band.waveforms(band.phasors(capture.traces(some)))
+        yield _Batch(waveforms, capture.points[some].astype(np.float32), lasers.astype(np.float32))
 
 
-def _geometry(capture: Capture, selection: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[selection]
-    return capture.points[selection].astype(np.float32), lasers.astype(np.float32)
+def _backproject(batch: _Batch, grid: Grid, total: NDArray[np.complex64], progress: Progress) -> None:
+    """Add a batch of wall points to the whole volume, brick by brick, on all threads."""
+    bricks = list(
+        itertools.product(blocks(grid.z.size, BRICK_Z), blocks(grid.y.size, BRICK_Y), blocks(grid.x.size, BRICK_X))
+    )
 
+    def work(turn: slice) -> None:
+        for z, y, x in bricks[turn]:
+            batch.add_to(total[z, y, x], grid.x[x], grid.y[y], grid.z[z])
+            progress(len(batch.wall) * total[z, y, x].size)
 
-def _slabs(grid: Grid, points: int) -> Iterator[slice]:
-    """Cut the volume into layers of whole bricks that take about `LOOKUPS_PER_CALL` each."""
-    layers = LOOKUPS_PER_CALL // (points * grid.y.size * grid.x.size)
-    thickness = max(1, layers // BRICK_Z) * BRICK_Z
-    for first in range(0, grid.z.size, thickness):
-        yield slice(first, min(first + thickness, grid.z.size))
-
-
-def _add(
-    waveforms: Waveforms,
-    wall: NDArray[np.float32],
-    lasers: NDArray[np.float32],
-    axes: list[NDArray[np.float32]],
-    total: NDArray[np.complex64],
-) -> None:
-    interleaved = waveforms.values.view(np.float32)
-    start, spacing = np.float32(waveforms.start), np.float32(waveforms.spacing)
-    add_backprojection(interleaved, start, spacing, wall, lasers, *axes, total)
+    run_blocks(work, len(bricks), size=1)

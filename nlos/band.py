@@ -41,7 +41,8 @@ class VirtualPulse:
         Carrier wavelength in path length, m. About twice the size of the finest detail that is resolved; at least
         twice the spacing of the wall points.
     cycles : float
-        Length of the pulse in wavelengths.
+        Length of the pulse in wavelengths. With fewer than 3 the spectrum reaches down to frequency 0, where it has to
+        be cut, and the pulse rings.
     """
 
     wavelength: float
@@ -76,7 +77,7 @@ class Waveforms:
     Parameters
     ----------
     values : (points, samples) complex array
-        The first and the last sample are 0, so that holding them means silence outside.
+        The first and the last two samples are 0, so that holding them means silence outside.
     start : float
         Path length of sample 0, m.
     spacing : float
@@ -196,7 +197,10 @@ class Band:
 
     @cached_property
     def _carriers(self) -> NDArray[np.complex128]:
-        """``exp(1j * k * L)``, shape (frequencies, samples), 0 at both ends."""
+        """``exp(1j * k * L)``, shape (frequencies, samples).
+
+        They are 0 at the first and the last two samples: a path outside is clamped there, and reads silence.
+        """
         carriers: NDArray[np.complex128] = np.exp(1j * np.outer(self.wavenumbers, self._sample_paths))
-        carriers[:, [0, -1]] = 0
+        carriers[:, [0, -2, -1]] = 0
         return carriers

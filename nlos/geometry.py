@@ -13,11 +13,12 @@ from tofclip.errors import InputError, ShapeError
 
 if TYPE_CHECKING:
     from nlos.capture import Capture
+    from nlos.volume import Volume
 
 FloatArray = NDArray[np.float64]
 
 DEEPEST_WALL_WIDTHS = 2.0
-"""Beyond this many wall widths the picture is coarser than a quarter of its distance to any use."""
+"""Deeper than this a wall is too narrow an aperture to resolve much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +89,28 @@ class Grid:
             )
         return cls.box((low[0], high[0]), (low[1], high[1]), (near, far), voxel)
 
+    @classmethod
+    def around(cls, volume: Volume, voxel: float, fraction: float = 0.1) -> Grid:
+        """Fill the smallest box that holds everything bright in a coarse volume, with one of its voxels to spare.
+
+        Imaging coarsely first and then here finely costs a small part of imaging everything finely.
+
+        Parameters
+        ----------
+        volume : Volume
+            At least one voxel per half wavelength, or small objects may slip through.
+        voxel : float
+            Distance of neighbouring voxel centres, m.
+        fraction : float
+            What counts as bright, relative to the brightest voxel.
+        """
+        indices = np.nonzero(volume.threshold(fraction).values)
+        if indices[0].size == 0:
+            raise InputError("the volume is dark everywhere: there is nothing to look at more closely")
+        axes = (volume.grid.z, volume.grid.y, volume.grid.x)
+        z, y, x = (_widened(axis, bright) for axis, bright in zip(axes, indices, strict=True))
+        return cls.box(x, y, z, voxel)
+
     @property
     def shape(self) -> tuple[int, int, int]:
         """Voxels along (z, y, x)."""
@@ -112,6 +135,11 @@ def _axis(values: Any, name: str) -> FloatArray:
         raise InputError(f"grid axis {name} must be finite and strictly increasing")
     axis.flags.writeable = False
     return axis
+
+
+def _widened(axis: FloatArray, indices: NDArray[np.intp]) -> tuple[float, float]:
+    """Range of the axis that holds the indexed entries and, where there is one, the next on either side."""
+    return float(axis[max(indices.min() - 1, 0)]), float(axis[min(indices.max() + 1, axis.size - 1)])
 
 
 def _filled(name: str, side: Sequence[float], voxel: float) -> FloatArray:

@@ -5,26 +5,21 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
-# Only multiply-add contraction is let loose: values at the ends of the tables must stay exact zeros.
-_compiled = njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-_parallel = njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy", parallel=True)
-
-BRICK_Z, BRICK_Y, BRICK_X = 8, 8, 128
-"""Voxels treated together. Their paths to one wall point span a short piece of its signal, which stays in the first
-cache level while the brick's sums stay in the second; rows along x are long enough to fill vector registers."""
+# Only the fusing of multiply and add is let loose: exact zeros at the ends of the waveforms have to stay exact.
+compiled = njit(nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
 
 NEAREST = 1e-3
 """Distance in m below which the weight 1 / distance stops growing, for voxels that touch the wall."""
 
 
-@_parallel
+@compiled
 def delayed_reading(signal, late_bins):
     """Read column p of `signal` (t, points) `late_bins[p]` bins later, linearly interpolated, 0 outside the record."""
     bins, points = signal.shape
     result = np.zeros_like(signal)
-    for i in prange(bins):
+    for i in range(bins):
         for p in range(points):
             position = i + late_bins[p]
             if 0 <= position <= bins - 1:
@@ -34,46 +29,26 @@ def delayed_reading(signal, late_bins):
     return result
 
 
-@_parallel
+@compiled
 def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, field):
     """Add every wall point's waveform, read at each voxel's path and divided by the last leg, to `field`.
+
+    Meant for a brick of voxels so small that their paths to a wall point span a short piece of its waveform, which
+    then stays in the first cache level while the voxels' sums stay in the second.
 
     Parameters
     ----------
     waveforms : (points, 2 * samples) float32 array
-        Real and imaginary parts in turns; first and last sample 0.
+        Real and imaginary parts in turns; the first and the last two samples are 0.
     start, spacing : float32
         Path length of the first sample and path between samples, m.
     wall : (points, 3) float32 array
     lasers : (1, 3) or (points, 3) float32 array
         One laser spot for all wall points or one for each.
     x, y, z : float32 array
-        Axes of the grid.
+        Axes of the brick.
     field : (z, y, x) complex64 array
     """
-    bricks_z = (z.size + BRICK_Z - 1) // BRICK_Z
-    bricks_y = (y.size + BRICK_Y - 1) // BRICK_Y
-    bricks_x = (x.size + BRICK_X - 1) // BRICK_X
-    for brick in prange(bricks_z * bricks_y * bricks_x):
-        z0 = brick // (bricks_y * bricks_x) * BRICK_Z
-        y0 = brick // bricks_x % bricks_y * BRICK_Y
-        x0 = brick % bricks_x * BRICK_X
-        _add_brick(
-            waveforms,
-            start,
-            spacing,
-            wall,
-            lasers,
-            x[x0 : x0 + BRICK_X],
-            y[y0 : y0 + BRICK_Y],
-            z[z0 : z0 + BRICK_Z],
-            field[z0 : z0 + BRICK_Z, y0 : y0 + BRICK_Y, x0 : x0 + BRICK_X],
-        )
-
-
-@_compiled
-def _add_brick(waveforms, start, spacing, wall, lasers, x, y, z, field):
-    """Do what `add_backprojection` says for the voxels of one brick."""
     per_metre = np.float32(1) / spacing
     # Of every voxel: real and imaginary part of the sample before its path, then of the one after.
     sums = np.zeros((z.size, y.size, 4 * x.size), np.float32)
@@ -95,7 +70,7 @@ def _add_brick(waveforms, start, spacing, wall, lasers, x, y, z, field):
                 field[iz, iy, ix] += complex(row[ix, 0, 0] + row[ix, 1, 0], row[ix, 0, 1] + row[ix, 1, 1])
 
 
-@_compiled
+@compiled
 def _outward_samples(laser, start, per_metre, x, y, z, outward):
     """Distance from the laser spot to every voxel, less `start`, in samples."""
     for iz in range(z.size):
@@ -105,7 +80,7 @@ def _outward_samples(laser, start, per_metre, x, y, z, outward):
                 outward[iz, iy, ix] = (math.sqrt((x[ix] - laser[0]) ** 2 + across) - start) * per_metre
 
 
-@_compiled
+@compiled
 def _find_samples(x, wall_x, across, outward, per_metre, last, sample, before, after):
     """Where a row of voxels reads a waveform: index of the sample before, and the weights of it and of the next."""
     across = max(across, np.float32(NEAREST * NEAREST))
@@ -119,7 +94,7 @@ def _find_samples(x, wall_x, across, outward, per_metre, last, sample, before, a
         before[ix] = weight - after[ix]
 
 
-@_compiled
+@compiled
 def _add_samples(waveform, sample, before, after, sums):
     """Add two neighbouring complex samples per voxel: four adjacent numbers, one vector load, one multiply-add."""
     for ix in range(sample.size):

@@ -52,6 +52,7 @@ def save_picture(volume: Volume, path: str | Path) -> None:
 def _draw_figure(volume: Volume) -> Figure:
     # A bare figure draws with Agg and leaves the caller's pyplot alone.
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     width, height, depth = _panel_sides(volume)
     columns, rows = [width, depth, width], [height, depth]
@@ -63,7 +64,7 @@ def _draw_figure(volume: Volume) -> Figure:
     figure.colorbar(drawn, ax=top, label="relative brightness", location="bottom", shrink=0.8)
     depth_map = figure.add_subplot(panels[0, 2])
     drawn = _draw_depth(volume, depth_map)
-    figure.colorbar(drawn, ax=depth_map, label="z from the wall (m)", location="bottom", shrink=0.8)
+    figure.colorbar(drawn, ax=depth_map, label="z (m)", location="bottom", shrink=0.8, ticks=MaxNLocator(4))
     return figure
 
 
@@ -90,7 +91,7 @@ def _draw_depth(volume: Volume, axes: Axes) -> AxesImage:
     projection = volume.maximum_projection()
     weak = projection.brightness < DEPTH_THRESHOLD * projection.brightness.max()
     depth = np.where(weak, np.nan, projection.depth)
-    axes.set_title(f"depth, where above {DEPTH_THRESHOLD:.0%} of the brightest")
+    axes.set_title(f"depth (above {DEPTH_THRESHOLD:.0%} brightness)")
     drawn = _draw(axes, depth, (volume.grid.x, volume.grid.y), ("x (m)", "y (m), down"), None)
     drawn.set_cmap(DEPTH_COLOURS)
     return drawn

@@ -1,0 +1,217 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from relay_walls import AXIS, HIDDEN, JITTER, curved_wall, lasers_for, planar_wall
+
+import nlos.backprojection
+from nlos import Backprojection, Capture, Grid
+from nlos.band import Band
+from nlos.exact import exact_phasor_field
+from nlos.method import Support
+from nlos.simulate import PointScene
+from nlos.time_axis import TimeAxis
+from tofclip.errors import InputError
+
+METHOD = Backprojection(wavelength=0.125, cycles=3)
+# Odd sizes, none of them a multiple of the brick, and HIDDEN among the voxels.
+GRID = Grid.box((-0.25, 0.35), (-0.4, 0.2), (0.45, 0.8), 0.05)
+
+
+def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+
+
+@pytest.mark.parametrize("wall", [planar_wall(), curved_wall()], ids=["planar", "curved"])
+@pytest.mark.parametrize("laser", ["single", "confocal", "paired"])
+def test_a_hidden_point_comes_back_where_it_is(wall: np.ndarray, laser: str) -> None:
+    capture = PointScene([HIDDEN]).seen_from(wall, lasers_for(wall)[laser], AXIS, JITTER)
+    volume = METHOD.reconstruct(capture, GRID)
+    assert volume.values.dtype == np.float32
+    assert volume.values.shape == (GRID.z.size, GRID.y.size, GRID.x.size)
+    z, y, x = np.unravel_index(volume.values.argmax(), volume.values.shape)
+    assert (GRID.x[x], GRID.y[y], GRID.z[z]) == pytest.approx(HIDDEN)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    x=st.floats(-0.4, 0.4),
+    y=st.floats(-0.35, 0.35),
+    z=st.floats(0.4, 0.9),
+    confocal=st.booleans(),
+)
+def test_any_hidden_point_is_found_to_the_voxel(x: float, y: float, z: float, confocal: bool) -> None:
+    wall = curved_wall()
+    axis = TimeAxis(500, AXIS.bin_width, 0.4)  # long enough for every path
+    capture = PointScene([[x, y, z]]).seen_from(wall, wall if confocal else [0.12, 0.05, 0.01], axis, JITTER)
+    around = Grid(x + 0.04 * np.arange(-3, 4), y + 0.04 * np.arange(-3, 4), z + 0.03 * np.arange(-3, 4))
+    # Voxels of a third and a quarter of a wavelength: neighbours are clearly weaker.
+    assert METHOD.reconstruct(capture, around).brightest() == pytest.approx((x, y, z))
+
+
+@pytest.mark.parametrize("laser", ["single", "confocal", "paired"])
+@pytest.mark.parametrize("cycles", [3, 5])
+def test_it_equals_the_exact_sum_over_frequencies(laser: str, cycles: float) -> None:
+    wall = curved_wall(9, 12)
+    scene = PointScene([HIDDEN, (-0.2, 0.1, 0.75)], [1.0, 0.6])
+    capture = scene.seen_from(wall, lasers_for(wall)[laser], AXIS, JITTER)
+    method = replace(METHOD, cycles=cycles)
+    found = method.phasor_field(capture, GRID).values
+    exact = exact_phasor_field(capture, GRID, method.pulse).values
+    assert found.dtype == np.complex64
+    assert exact.dtype == np.complex128
+    # Linear interpolation of 64 samples per wavelength: phase step 0.1, error 0.1^2 * 0.09 at the carrier and some
+    # twice that over the band; measured 5e-4 to 7e-4. float32 phases add 1e-5.
+    assert relative_error(found, exact) < 1.2e-3
+
+
+def test_the_exact_sum_is_its_own_definition() -> None:
+    wall = curved_wall(3, 3)
+    capture = PointScene([HIDDEN]).seen_from(wall, [0.1, 0.0, 0.0], AXIS, JITTER)
+    voxel = np.array([0.1, -0.1, 0.6])
+    grid = Grid([voxel[0]], [voxel[1]], [voxel[2]])
+    found = exact_phasor_field(capture, grid, METHOD.pulse).values[0, 0, 0]
+    band, expected = Band(METHOD.pulse, AXIS), 0.0j
+    for point, trace in zip(capture.points, capture.traces().astype(np.float64), strict=True):
+        last_leg = np.linalg.norm(point - voxel)
+        path = last_leg + np.linalg.norm(capture.laser - voxel)
+        for k, weight in zip(band.wavenumbers, band.weights, strict=True):
+            phasor = weight * np.sum(trace * np.exp(-1j * k * AXIS.paths))
+            expected += phasor * np.exp(1j * k * path) / last_leg
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+def test_it_is_linear_in_the_signal(capture: Capture) -> None:
+    random = np.random.default_rng(4)
+    first = replace(capture, signal=random.normal(size=capture.signal.shape))
+    second = replace(capture, signal=random.normal(size=capture.signal.shape))
+    both = replace(capture, signal=2 * first.signal - 3 * second.signal)
+    fields = [METHOD.phasor_field(some, GRID).values for some in (first, second, both)]
+    # Rounding of float32 sums over 357 wall points.
+    assert relative_error(fields[2], 2 * fields[0] - 3 * fields[1]) < 1e-5
+
+
+def test_signals_in_double_precision_give_the_same_picture(capture: Capture) -> None:
+    double = replace(capture, signal=capture.signal.astype(np.float64))
+    assert np.array_equal(METHOD.reconstruct(double, GRID).values, METHOD.reconstruct(capture, GRID).values)
+
+
+def test_masked_wall_points_do_not_matter(capture: Capture) -> None:
+    wall, signal = capture.wall.copy(), capture.signal.copy()
+    wall[3, 5] = wall[0, 0, 1] = np.nan
+    signal[:, 3, 5] = 1e6
+    masked = METHOD.phasor_field(replace(capture, wall=wall, signal=signal), GRID).values
+    kept = np.ones(wall.shape[:2], bool)
+    kept[3, 5] = kept[0, 0] = False
+    listed = replace(capture, wall=capture.wall[kept], signal=capture.signal[:, kept])
+    assert np.array_equal(masked, METHOD.phasor_field(listed, GRID).values)
+
+
+def test_the_order_and_shape_of_wall_points_do_not_matter(capture: Capture) -> None:
+    shuffled = np.random.default_rng(5).permutation(len(capture.points))
+    scattered = replace(capture, wall=capture.points[shuffled], signal=capture.traces().T[:, shuffled])
+    # Sums of float32 in another order.
+    found = METHOD.phasor_field(scattered, GRID).values
+    assert relative_error(found, METHOD.phasor_field(capture, GRID).values) < 1e-5
+
+
+def test_the_volume_may_be_cut_into_pieces(capture: Capture) -> None:
+    whole = METHOD.phasor_field(capture, GRID).values
+    for z in range(GRID.z.size):
+        plane = METHOD.phasor_field(capture, Grid(GRID.x, GRID.y, GRID.z[z : z + 1])).values
+        assert np.array_equal(plane[0], whole[z])
+
+
+def test_small_batches_of_wall_points_add_up(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = METHOD.phasor_field(capture, GRID).values
+    monkeypatch.setattr(nlos.backprojection, "TABLE_BYTES", 1)
+    for laser in (capture.laser, capture.wall):
+        same_spot = replace(capture, laser=laser)
+        one_by_one = METHOD.phasor_field(same_spot, GRID).values
+        monkeypatch.setattr(nlos.backprojection, "TABLE_BYTES", 1 << 25)
+        assert relative_error(one_by_one, METHOD.phasor_field(same_spot, GRID).values) < 1e-5
+        monkeypatch.setattr(nlos.backprojection, "TABLE_BYTES", 1)
+    assert np.any(whole)
+
+
+def test_voxels_that_no_recorded_light_can_come_from_stay_dark(capture: Capture) -> None:
+    far = Grid.box((-0.2, 0.2), (-0.2, 0.2), (5.0, 5.2), 0.1)
+    assert np.all(METHOD.reconstruct(capture, far).values == 0)
+
+
+def test_voxels_on_the_wall_stay_finite(capture: Capture) -> None:
+    touching = Grid(planar_wall()[0, :, 0], planar_wall()[:, 0, 1], [0.0, 0.1])
+    assert np.all(np.isfinite(METHOD.reconstruct(capture, touching).values))
+
+
+def test_progress_counts_all_lookups_and_may_interrupt(capture: Capture) -> None:
+    done: list[int] = []
+    METHOD.reconstruct(capture, GRID, done.append)
+    assert sum(done) == METHOD.lookups(capture, GRID) == 17 * 21 * GRID.size
+
+    def interrupt(_: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        METHOD.reconstruct(capture, GRID, interrupt)
+
+
+def test_the_volume_remembers_how_it_was_made(capture: Capture) -> None:
+    made = METHOD.reconstruct(replace(capture, provenance={"shot": 7}), Grid([0], [0], [0.5])).provenance
+    assert made == {"shot": 7, "imaging": {"method": "backprojection", "wavelength_m": 0.125, "cycles": 3}}
+
+
+def test_support_is_true_or_says_why_not(capture: Capture) -> None:
+    assert METHOD.supports(capture, GRID)
+    assert METHOD.supports(capture, GRID).reason == ""
+    Support().require()
+
+
+@pytest.mark.parametrize(
+    ("method", "grid", "reason"),
+    [
+        (METHOD, Grid.box((-0.2, 0.2), (-0.2, 0.2), (-0.8, -0.4), 0.1), "behind the hindmost wall point"),
+        (METHOD, Grid.box((-0.2, 0.2), (-0.2, 0.2), (-0.1, 0.4), 0.1), "behind the hindmost wall point"),
+        (METHOD, Grid.box((-1, 1), (-1, 1), (0.1, 2), 0.0015), "GiB allowed"),
+        (Backprojection(0.001), GRID, "empty band"),
+    ],
+)
+def test_what_cannot_be_imaged_is_refused(method: Backprojection, grid: Grid, reason: str, capture: Capture) -> None:
+    support = method.supports(capture, grid)
+    assert not support
+    assert reason in support.reason
+    with pytest.raises(InputError, match=reason):
+        method.reconstruct(capture, grid)
+
+
+def test_one_wall_point_is_refused() -> None:
+    lonely = Capture(np.ones(9), [0.0, 0.0, 0.0], [0.1, 0.0, 0.0], 16e-12)
+    assert "one wall point" in METHOD.supports(lonely, GRID).reason
+    with pytest.raises(InputError, match="one wall point"):
+        exact_phasor_field(lonely, GRID, METHOD.pulse)
+
+
+@pytest.mark.parametrize(("wavelength", "cycles"), [(0, 3), (0.1, -1), (np.nan, 3)])
+def test_the_pulse_is_checked_at_once(wavelength: float, cycles: float) -> None:
+    with pytest.raises(InputError, match="virtual pulse"):
+        Backprojection(wavelength, cycles)
+
+
+def test_a_long_path_keeps_its_phase_in_float32() -> None:
+    """A record that begins 300 m down the path: phases of 15 000 rad, of which float32 keeps less than 1e-3."""
+    wall = curved_wall(7, 8)
+    near = PointScene([HIDDEN]).seen_from(wall, [0.1, 0.0, 0.0], AXIS, JITTER)
+    shift = np.array([0.0, 0.0, 150.0])
+    far_axis = TimeAxis(AXIS.bins, AXIS.bin_width, 300.0)
+    far = PointScene([HIDDEN + shift]).seen_from(wall, [0.1, 0.0, 0.0], far_axis, JITTER)
+    grid = Grid(GRID.x, GRID.y, HIDDEN[2] + 150.0 + 0.05 * np.arange(-3, 4))
+    found = METHOD.phasor_field(far, grid).values
+    exact = exact_phasor_field(far, grid, METHOD.pulse).values
+    assert near.signal.any()
+    assert far.signal.any()
+    # Distances of 150 m in float32 are good to 8e-6 m each way, 8e-4 rad at this wavelength.
+    assert relative_error(found, exact) < 3e-3

@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nlos.band import Band, VirtualPulse
+from nlos.time_axis import TimeAxis
+from tofclip.errors import InputError
+
+AXIS = TimeAxis(bins=300, bin_width=16e-12, start=0.7)
+PULSE = VirtualPulse(0.125, 3)
+
+
+def waveform_of(signal: np.ndarray, band: Band) -> tuple[np.ndarray, np.ndarray]:
+    waveforms = band.waveforms(band.phasors(signal[None]))
+    paths = waveforms.start + waveforms.spacing * np.arange(waveforms.values.shape[1])
+    return paths, waveforms.values[0]
+
+
+def test_the_cycles_fill_the_envelope_to_three_standard_deviations() -> None:
+    assert PULSE.sigma == pytest.approx(0.125 / 2)
+    assert PULSE.spectrum(2 * np.pi / 0.125) == pytest.approx(1)
+    assert PULSE.spectrum(2 * np.pi / 0.125 + 1 / PULSE.sigma) == pytest.approx(np.exp(-0.5))
+
+
+@pytest.mark.parametrize("cycles", [3, 5, 8])
+def test_an_impulse_becomes_the_virtual_pulse(cycles: float) -> None:
+    pulse = VirtualPulse(0.125, cycles)
+    signal = np.zeros(AXIS.bins)
+    signal[120] = 1.0
+    paths, found = waveform_of(signal, Band(pulse, AXIS))
+    distance = paths - AXIS.paths[120]
+    # The inverse Fourier transform of G(k) over all positive and negative k, for samples `spacing` apart.
+    height = 2 * AXIS.spacing / (pulse.sigma * np.sqrt(2 * np.pi))
+    expected = height * np.exp(-(distance**2) / (2 * pulse.sigma**2)) * np.exp(2j * np.pi * distance / pulse.wavelength)
+    # The band is cut where G < 0.01: two Gaussian tails of 0.0024 of its area are missing.
+    assert np.max(np.abs(found - expected)) < 0.01 * height
+
+
+def test_the_carrier_becomes_a_unit_phasor_of_growing_phase() -> None:
+    k = PULSE.wavenumber
+    paths, found = waveform_of(np.cos(k * AXIS.paths), Band(PULSE, AXIS))
+    inside = (paths > AXIS.start + 4 * PULSE.sigma) & (paths < AXIS.paths[-1] - 4 * PULSE.sigma)
+    # The band's missing tails hold G < 0.01 of what leaks from the carrier's cut ends.
+    assert np.max(np.abs(found - np.exp(1j * k * paths))[inside]) < 5e-3
+
+
+def test_phasors_are_the_weighted_fourier_sum_of_their_definition() -> None:
+    band = Band(PULSE, AXIS)
+    signal = np.random.default_rng(3).normal(size=(2, AXIS.bins))
+    kernel = np.exp(-1j * np.outer(AXIS.paths, band.wavenumbers))
+    expected = band.weights * (signal @ kernel)
+    assert band.phasors(signal) == pytest.approx(expected, rel=1e-10, abs=1e-14)
+    single = band.phasors(signal.astype(np.float32))
+    assert single.dtype == np.complex64
+    # float32 sums of 300 terms.
+    assert np.linalg.norm(single - expected) < 1e-5 * np.linalg.norm(expected)
+
+
+def test_a_constant_background_leaves_nothing_inside() -> None:
+    _, found = waveform_of(np.ones(AXIS.bins), Band(VirtualPulse(0.125, 5), AXIS))
+    middle = found[found.size // 2 - 50 : found.size // 2 + 50]
+    # The band has no frequency 0; the ends of the record ring as far as the cut band does.
+    assert np.max(np.abs(middle)) < 1e-3
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    position=st.integers(0, 199),
+    wavelength=st.floats(0.02, 0.3),
+    cycles=st.floats(3, 8),
+    start=st.floats(-2, 2),
+)
+def test_nothing_wraps_around_the_end_of_the_record(
+    position: int, wavelength: float, cycles: float, start: float
+) -> None:
+    axis = TimeAxis(200, 16e-12, start)
+    signal = np.zeros(axis.bins)
+    signal[position] = 1.0
+    pulse = VirtualPulse(wavelength, cycles)
+    paths, found = waveform_of(signal, Band(pulse, axis))
+    assert paths[0] <= axis.start - 4 * pulse.sigma
+    assert paths[-1] >= axis.paths[-1] + 4 * pulse.sigma - 1e-9
+    assert np.all(found[[0, -2, -1]] == 0)
+    far = np.abs(paths - axis.paths[position]) > 6 * pulse.sigma
+    # Ringing of the band cut at 1 % of its peak, with two such edges, decays like 1 / distance.
+    assert np.all(np.abs(found[far]) < 0.01 * np.abs(found).max())
+    assert np.abs(paths[np.argmax(np.abs(found))] - axis.paths[position]) <= axis.spacing
+
+
+def test_the_samples_are_fine_enough_for_linear_interpolation() -> None:
+    band = Band(VirtualPulse(0.048, 3), TimeAxis(1016, 4.6e-12, 0.138))
+    spacing = band.waveforms(band.phasors(np.zeros((1, 1016), np.float32))).spacing
+    assert spacing <= 0.048 / 64
+    # Whole bins are still hit: no interpolation error where the record itself has a sample.
+    assert (band.axis.spacing / spacing) % 1 == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("wavelength", [1e-4, 2 * AXIS.spacing])
+def test_bins_too_coarse_for_the_wavelength_are_an_empty_band(wavelength: float) -> None:
+    with pytest.raises(InputError, match="empty band"):
+        Band(VirtualPulse(wavelength, 3), AXIS)
+
+
+@pytest.mark.parametrize(("wavelength", "cycles"), [(0, 3), (-1, 3), (np.nan, 3), (0.1, 0), (0.1, np.inf)])
+def test_a_pulse_needs_positive_numbers(wavelength: float, cycles: float) -> None:
+    with pytest.raises(InputError, match="virtual pulse must be a positive"):
+        VirtualPulse(wavelength, cycles)

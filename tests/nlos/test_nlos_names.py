@@ -1,0 +1,24 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+import nlos
+
+
+def test_public_names() -> None:
+    assert nlos.__all__ == ["Backprojection", "Capture", "Grid", "Volume"]
+    for name in nlos.__all__:
+        assert getattr(nlos, name).__name__ == name
+        assert name in dir(nlos)
+    with pytest.raises(AttributeError, match="no attribute 'Telepathy'"):
+        _ = nlos.Telepathy
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    heavy = "numba", "scipy", "matplotlib", "h5py", "numpy"
+    code = f"import sys, nlos; print([m for m in {heavy!r} if m in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
