@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apps.figures.style import BRIGHTNESS, DEPTH, NOTHING, colour_bar, draw, label, page
+from apps.figures.style import BRIGHTNESS, DEPTH, NOTHING, colour_bar, draw, label, outer_edges, page
 from tofclip.units import MILLIMETRE, NANOSECOND, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
@@ -45,8 +45,8 @@ def _normalised(values: Any) -> Any:
 
 
 def _draw_streak(axes: Axes, streak: Streak) -> None:
-    time = streak.times / NANOSECOND
-    extent = (-0.5, streak.counts.shape[1] - 0.5, float(time[-1]), float(time[0]))
+    first, last = outer_edges(streak.times / NANOSECOND)
+    extent = (-0.5, streak.counts.shape[1] - 0.5, last, first)
     drawn = draw(axes, streak.counts, extent, aspect="auto", vmin=0, vmax=np.percentile(streak.counts, BRIGHTEST))
     label(axes, "streak image: one shot, seven views", "slit column (px)", "time axis (ns)")
     colour_bar(axes, drawn, "photons")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.figures.style import DEPTH, SMALL, colour_bar, draw, label, page
+from apps.figures.style import DEPTH, SMALL, colour_bar, draw, label, outer_edges, page
 from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
@@ -121,8 +121,8 @@ def _toned(picture: NDArray[Any], brightest: float = BRIGHTEST) -> NDArray[Any]:
 def _draw_streak(axes: Axes, streak: Streak) -> None:
     from tofclip.camera import dark_level
 
-    time = streak.times / NANOSECOND
-    extent = (-0.5, streak.counts.shape[1] - 0.5, float(time[-1]), float(time[0]))
+    first, last = outer_edges(streak.times / NANOSECOND)
+    extent = (-0.5, streak.counts.shape[1] - 0.5, last, first)
     draw(axes, _toned(np.maximum(streak.counts - dark_level(streak.counts), 0)), extent, aspect="auto")
     label(axes, "streak image as measured", "slit column (px)", "time axis (ns)")
 
@@ -163,7 +163,7 @@ def _draw_moments(panels: Any, brightness: NDArray[Any], moments: list[Moment], 
 
 def _lit_part(pictures: list[NDArray[Any]]) -> tuple[slice, slice]:
     """Rows and columns that hold everything bright in any picture, with a margin."""
-    bright = np.any([picture > CROP_SHARE * picture.max() for picture in pictures], axis=0)
+    bright = np.any([picture >= CROP_SHARE * picture.max() for picture in pictures], axis=0)
     sides = []
     for lit in (bright.any(axis=1), bright.any(axis=0)):
         first, last = np.flatnonzero(lit)[[0, -1]].tolist()

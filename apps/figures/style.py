@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -64,3 +65,9 @@ def colour_bar(axes: Axes, mapped: Any, meaning: str) -> None:
     bar = axes.figure.colorbar(mapped, ax=axes, shrink=0.9)
     bar.set_label(meaning, fontsize=SMALL)
     bar.ax.tick_params(labelsize=SMALL)
+
+
+def outer_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
+    """Outer edges of the first and the last pixel of an evenly spaced axis; a single pixel is as wide as its unit."""
+    half = (axis[-1] - axis[0]) / (2 * (axis.size - 1)) if axis.size > 1 else 0.5
+    return float(axis[0] - half), float(axis[-1] + half)

@@ -1,0 +1,142 @@
+"""The small parts behind the verbs: reports, progress, names of files, and what the pictures choose to show."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from apps.figures.preview import COLUMNS, MOST_MOMENTS, preview_figure, telling_moments
+from apps.figures.style import page, save
+from apps.files import history, make_folder, require_writable
+from apps.progress import progress
+from apps.report import plainly, report
+from tofclip import Camera, Frames, Streak
+from tofclip.errors import StorageError
+from tofclip.storage import Record
+
+
+class TestReport:
+    def test_json_has_no_nan_and_no_numpy(self, capsys: pytest.CaptureFixture[str]) -> None:
+        figures = {"a": np.float32(0.5), "b": np.array([1.0, np.nan]), "c": (1, Path("x")), "d": {"e": np.int64(3)}}
+        report(figures, as_json=True, written=[Path("out.h5")])
+        found = json.loads(capsys.readouterr().out)
+        assert found == {"a": 0.5, "b": [1.0, None], "c": [1, "x"], "d": {"e": 3}}
+
+    def test_table_for_people(self, capsys: pytest.CaptureFixture[str]) -> None:
+        report({"range_m": [1.23456, float("inf")], "points": 3}, as_json=False, written=[Path("out.h5")])
+        assert capsys.readouterr().out == "range m  1.235, unknown\npoints   3\nwrote out.h5\n"
+
+    def test_infinity_is_unknown(self) -> None:
+        assert plainly([np.inf, -np.inf, True, None, "text"]) == [None, None, True, None, "text"]
+
+
+class TestProgress:
+    def test_silent_where_nobody_watches(self, capsys: pytest.CaptureFixture[str]) -> None:
+        with progress("working", 10) as advance:
+            advance(10)
+        assert capsys.readouterr() == ("", "")
+
+    def test_after_ctrl_c_every_thread_stops(self) -> None:
+        stopped = threading.Event()
+
+        def work() -> None:
+            try:
+                while True:
+                    advance(1)
+            except KeyboardInterrupt:
+                stopped.set()
+
+        before = signal.getsignal(signal.SIGINT)
+        with progress("working", 10) as advance:
+            worker = threading.Thread(target=work)
+            worker.start()
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+            worker.join(timeout=10)
+            assert stopped.is_set()
+        assert signal.getsignal(signal.SIGINT) is before
+
+    def test_other_threads_may_use_it(self) -> None:
+        amounts: list[int] = []
+
+        def work() -> None:
+            with progress("working", 1) as advance:
+                advance(1)
+                amounts.append(1)
+
+        worker = threading.Thread(target=work)
+        worker.start()
+        worker.join(timeout=10)
+        assert amounts == [1]
+
+
+class TestFiles:
+    def test_folder_without_permission(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("os.access", lambda *_: False)  # a test may run as root, whom nothing stops
+        with pytest.raises(StorageError, match="not permitted"):
+            require_writable(tmp_path / "a.h5")
+        with pytest.raises(StorageError, match="not permitted"):
+            make_folder(tmp_path)
+
+    def test_a_folder_is_no_file(self, tmp_path: Path) -> None:
+        with pytest.raises(StorageError, match="is a folder"):
+            require_writable(tmp_path)
+
+    def test_history_keeps_the_past(self, tmp_path: Path) -> None:
+        (tmp_path / "in.txt").write_text("x")
+        told = history({"verb": "test"}, tmp_path / "in.txt", earlier={"software": "older"})
+        assert told["earlier"] == {"software": "older"}
+        # SHA-256 of the letter x
+        assert told["inputs"][0]["sha256"] == "2d711642b726b04401627ca9fbac32f5c8530fb1903cc4db02258717921a4881"
+        assert "earlier" not in history({})
+
+
+def frames_with(camera: Camera, energy: np.ndarray, attachments: dict[str, Record] | None = None) -> Frames:
+    """Frames whose only bright pixel has the given brightness over time, at ranges around 3 m."""
+    values = np.zeros((energy.size, *camera.image_shape), np.float32)
+    values[:, 5, 6] = energy
+    times = 20e-9 + np.arange(energy.size) * 20e-12
+    return Frames(values, times, camera, attachments=attachments or {})
+
+
+class TestMoments:
+    def test_separate_objects_make_separate_peaks(self, camera: Camera) -> None:
+        rows, bins = np.array([20, 60, 110, 170, 199]), np.arange(200)
+        energy = np.exp(-(((bins[:, np.newaxis] - rows) / 2.5) ** 2) / 2) @ np.array([5.0, 1, 3, 2, 4])
+        found = telling_moments(frames_with(camera, energy))
+        assert [moment.frame for moment in found] == pytest.approx(rows, abs=1)
+        # Half height of a Gaussian of 2.5 bins, smoothed by 1.5, is 3.4 bins away from its peak.
+        assert [moment.last - moment.first for moment in found[:4]] == pytest.approx([7] * 4, abs=1)
+
+    def test_only_the_strongest_are_shown(self, camera: Camera) -> None:
+        energy = np.zeros(600)
+        energy[10::30] = np.arange(1, 21)
+        found = [moment.frame for moment in telling_moments(frames_with(camera, energy))]
+        assert found == list(range(250, 600, 30))
+        assert len(found) == MOST_MOMENTS
+
+    def test_light_without_a_pause_is_cut_into_even_shares(self, camera: Camera) -> None:
+        energy = np.exp(-(((np.arange(300) - 150) / 40) ** 2) / 2)
+        moments = telling_moments(frames_with(camera, energy, {"relay_wall": Record("relay_wall")}))
+        assert len(moments) == MOST_MOMENTS
+        shares = [energy[moment.first : moment.last + 1].sum() / energy.sum() for moment in moments]
+        # A twelfth each, up to the frame that a cut falls on (at most 1 % of the light).
+        np.testing.assert_allclose(shares, 0.98 / MOST_MOMENTS, atol=0.011)
+
+    @pytest.mark.parametrize("energy", [np.ones(1), np.zeros(5), np.ones(3)])
+    def test_the_picture_can_always_be_drawn(self, camera: Camera, tmp_path: Path, energy: np.ndarray) -> None:
+        streak = Streak(np.ones((energy.size, camera.slit_width_px)), camera=camera).with_bin_width(20e-12)
+        save(preview_figure(streak, frames_with(camera, energy)), tmp_path / "look.png")
+        assert (tmp_path / "look.png").stat().st_size > 10_000
+        assert len(telling_moments(frames_with(camera, energy))) >= COLUMNS
+
+
+def test_a_picture_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    with pytest.raises(StorageError):
+        save(page(2, 2), tmp_path / "absent" / "look.png")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,123 @@
+"""The program as a process: help, exit statuses, interruption, pipes."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from small_instrument import Run
+
+import tofclip
+from apps import cli
+
+PROGRAM = [sys.executable, "-m", "apps"]
+ROOT = Path(tofclip.__file__).parents[1]
+LONGEST_WAIT_S = 60.0  # compiling the kernels on a slow, cold machine
+
+
+def ran(*words: object) -> subprocess.CompletedProcess[str]:
+    command = [*PROGRAM, *map(str, words)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=LONGEST_WAIT_S, check=False)
+
+
+def test_alone_it_shows_the_map_of_verbs(run: Run) -> None:
+    outcome = run()
+    assert (outcome.status, outcome.err) == (0, "")
+    for verb in ("demo", "calibrate", "recover", "cloud", "nlos reconstruct", "convert", "info"):
+        assert f"\n  {verb} " in outcome.out
+
+
+def test_every_verb_explains_itself(run: Run) -> None:
+    for verb in ("demo", "calibrate", "recover", "cloud", "convert", "info"):
+        outcome = run(verb, "--help")
+        assert outcome.status == 0
+        assert f"Usage: tofclip {verb}" in outcome.out
+        assert "--json" in outcome.out
+    assert "--wavelength-mm" in run("nlos", "reconstruct", "--help").out
+    assert "reconstruct" in run("nlos").out
+
+
+def test_version(run: Run) -> None:
+    assert run("--version").out == f"{tofclip.__version__}\n"
+
+
+def test_help_needs_nothing_heavy() -> None:
+    code = "import sys; from apps.cli import main; main(['--help']); print(*sorted(sys.modules), file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert "Usage: tofclip" in done.stdout
+    heavy = {"numpy", "scipy", "numba", "h5py", "matplotlib", "tifffile", "open3d", "pyvista"}
+    assert heavy.isdisjoint(done.stderr.split())
+
+
+def test_statuses_of_the_process(files: Path) -> None:
+    good, bad = ran("info", files / "camera.h5", "--json"), ran("info", files / "absent.h5")
+    assert (good.returncode, good.stderr, json.loads(good.stdout)["kind"]) == (0, "", "camera")
+    assert (bad.returncode, bad.stdout, bad.stderr.count("\n")) == (2, "", 1)
+
+
+def test_debug_shows_where_an_error_came_from(run: Run, tmp_path: Path) -> None:
+    plain, traced = run("info", tmp_path / "absent"), run("info", tmp_path / "absent", "--debug")
+    assert "Traceback" not in plain.err
+    assert traced.err.startswith("Traceback")
+    assert traced.err.endswith(plain.err)
+    assert traced.status == 2
+
+
+def test_a_defect_is_one_line_as_well(run: Run, monkeypatch: pytest.MonkeyPatch, files: Path) -> None:
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("a defect\nin two lines")
+
+    monkeypatch.setattr("apps.verbs.info._record_in", fail)
+    outcome = run("info", files / "camera.h5")
+    assert outcome.status == cli.DEFECT
+    assert outcome.err.startswith("tofclip: error: unforeseen ZeroDivisionError: a defect in two lines")
+    assert outcome.err.count("\n") == 1
+
+
+def test_a_reader_that_goes_away(files: Path) -> None:
+    read, write = os.pipe()
+    os.close(read)  # nobody will ever read
+    done = subprocess.run(
+        [*PROGRAM, "info", files / "camera.h5"], cwd=ROOT, stdout=write, stderr=subprocess.PIPE, text=True, check=False
+    )
+    os.close(write)
+    assert (done.returncode, done.stderr) == (cli.READER_GONE, "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
+def test_ctrl_c_during_recovery_leaves_nothing_behind(files: Path, tmp_path: Path) -> None:
+    words = ["recover", files / "streak.h5", "--out", tmp_path / "frames.h5", "--iterations", "1000000"]
+    terminal, child_side = pty.openpty()
+    process = subprocess.Popen(
+        [*PROGRAM, *map(str, words)], cwd=ROOT, stdout=subprocess.PIPE, stderr=child_side, text=True
+    )
+    os.close(child_side)
+    wait_for(terminal, "recovering")  # the bar is drawn, so the iterations have begun
+    process.send_signal(signal.SIGINT)
+    pressed = time.monotonic()
+    out, _ = process.communicate(timeout=LONGEST_WAIT_S)
+    assert process.returncode == 130
+    assert out == ""
+    # A million iterations would take an hour; the end must not wait for them. The margin is for a busy machine.
+    assert time.monotonic() - pressed < 20
+    assert wait_for(terminal, "tofclip: interrupted").count("Traceback") == 0
+    os.close(terminal)
+    assert list(tmp_path.iterdir()) == []
+
+
+def wait_for(terminal: int, text: str) -> str:
+    """Read from a terminal until `text` appears."""
+    seen = ""
+    while text not in seen:
+        try:
+            seen += os.read(terminal, 4096).decode(errors="replace")
+        except OSError:  # the other side is closed and everything has been read
+            pytest.fail(f"'{text}' never appeared on the terminal: {seen!r}")
+    return seen
