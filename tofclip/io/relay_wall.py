@@ -97,7 +97,8 @@ def read_relay_wall(archive: Archive, image_shape: tuple[int, int]) -> RelayWall
     points = np.moveaxis(archive.array("wall_grid_m", 3, None, None), 0, -1).astype(np.float64)
     axis_px = (image_shape[0] // 2, image_shape[1] // 2)
     offset_px = (axis_px[0] - points.shape[0] // 2, axis_px[1] - points.shape[1] // 2)
-    if min(offset_px) < 0 or np.count_nonzero(np.all(np.isfinite(points), axis=-1)) < 4:
+    fits = min(offset_px) >= 0 and all(np.add(offset_px, points.shape[:2]) <= image_shape)
+    if not fits or np.count_nonzero(np.all(np.isfinite(points), axis=-1)) < 4:
         raise FileFormatError(
             archive.path, f"field 'wall_grid_m' must hold wall points for at most {image_shape} pixels"
         )

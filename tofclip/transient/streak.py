@@ -24,7 +24,7 @@ class Streak:
     counts : (rows, columns) array
         Sensor readings, kept as float32. May hold negative values (background already subtracted).
     row_times : (rows,) array or None
-        Instant of each row, s, strictly increasing, not necessarily evenly spaced. None where the file has no time axis.
+        Instant of each row, s, strictly increasing, not necessarily evenly. None where the file has no time axis.
     saturated : (rows, columns) bool array or None
         Pixels that reached the sensor's limit.
     metadata : mapping of str to str
@@ -54,7 +54,8 @@ class Streak:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        counts = np.ascontiguousarray(self.counts, dtype=np.float32)
+        with np.errstate(over="ignore"):  # too large for float32 becomes infinite, which is refused below
+            counts = np.ascontiguousarray(self.counts, dtype=np.float32)
         object.__setattr__(self, "counts", counts)
         if counts.ndim != 2 or counts.size == 0:
             raise ShapeError(f"{self.source}: a streak image", "(rows, columns)", counts.shape)
@@ -89,7 +90,7 @@ class Streak:
         """Return the same picture with evenly spaced rows of `bin_width` seconds, the first at 0."""
         if not (np.isfinite(bin_width) and bin_width > 0):
             raise InputError(f"bin width must be a positive number of seconds, got {bin_width}")
-        return replace(self, row_times=np.arange(self.counts.shape[0]) * float(bin_width))
+        return replace(self, row_times=np.arange(self.counts.shape[0], dtype=np.float64) * float(bin_width))
 
     def to_record(self) -> Record:
         """Return everything that has to be stored."""

@@ -1,0 +1,219 @@
+"""Every format through the one door, and everything that must not pass it."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from tofclip.camera import Camera, SkewSweep
+from tofclip.errors import FileFormatError, InputError, MissingTimeAxisError, StorageError, TofclipError
+from tofclip.io import read_streak
+from tofclip.storage import Field, Record
+from tofclip.transient import Frames, Streak
+
+
+@pytest.fixture
+def plain(tmp_path: Path) -> Any:
+    """Write a TIFF as any other program would."""
+
+    def write(picture: NDArray[Any], **options: Any) -> Path:
+        tifffile.imwrite(tmp_path / "plain.tif", picture, **options)
+        return tmp_path / "plain.tif"
+
+    return write
+
+
+def test_hpdta_counts_and_text(write_hpdta: Any, pixels: NDArray[np.uint16]) -> None:
+    streak = read_streak(write_hpdta(np.arange(20)))
+    # Raw counts: the camera's offset of 100 is known from the text and still in the picture.
+    np.testing.assert_array_equal(streak.counts, pixels)
+    assert streak.counts.dtype == np.float32
+    expected = {
+        "Streak camera/Time Range": "20 ns",
+        "Acquisition/ExposureTime": "300 ms",
+        "Camera/Prop_ConversionFactorOffset": "100",
+        "Application/Date": "5/2/2021",
+        "DateTime": "2021:05:02 20:49:12",
+    }
+    assert expected.items() <= streak.metadata.items()
+
+
+def test_saturation_at_the_cameras_own_limit(write_hpdta: Any, pixels: NDArray[np.uint16]) -> None:
+    pixels[3, 4], pixels[5, 6] = 4095, 4094
+    assert np.argwhere(read_streak(write_hpdta(place="Other", bits=12)).saturated).tolist() == [[3, 4]]
+    # Summed exposures pass 4095 unsaturated.
+    assert not read_streak(write_hpdta(place="Other", bits=12, exposures=4)).saturated.any()
+    assert not read_streak(write_hpdta(place="Other", bits=16)).saturated.any()
+    pixels[7, 8] = 65535
+    assert np.argwhere(read_streak(write_hpdta(place="Other", bits=16)).saturated).tolist() == [[7, 8]]
+
+
+def test_nothing_but_saturated_pixels_is_refused(plain: Any) -> None:
+    with pytest.raises(InputError, match="every pixel is saturated at 255 counts"):
+        read_streak(plain(np.full((4, 5), 255, np.uint8)))
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16", "uint32", "int16", "float32", "float64"])
+@pytest.mark.parametrize(
+    "options", [{}, {"byteorder": ">"}, {"rowsperstrip": 3}, {"compression": "zlib"}], ids=["", "big", "strips", "zip"]
+)
+def test_plain_tiff_has_counts_and_no_time_axis(plain: Any, dtype: str, options: dict[str, Any]) -> None:
+    picture = (np.arange(120).reshape(10, 12) + 1).astype(dtype)
+    streak = read_streak(plain(picture, **options))
+    np.testing.assert_array_equal(streak.counts, picture)
+    with pytest.raises(MissingTimeAxisError):
+        _ = streak.times
+    assert (streak.saturated is None) == dtype.startswith("float")
+    np.testing.assert_allclose(read_streak(streak.source, bin_width=5e-12).times, np.arange(10) * 5e-12, rtol=1e-15)
+
+
+@pytest.mark.parametrize("bin_width", [0, -1e-12, np.nan, np.inf])
+def test_an_impossible_bin_width_is_refused(plain: Any, bin_width: float) -> None:
+    with pytest.raises(InputError, match="bin width must be a positive number of seconds"):
+        read_streak(plain(np.ones((4, 5), np.uint16)), bin_width=bin_width)
+
+
+@pytest.mark.parametrize(
+    ("picture", "fault", "problem"),
+    [
+        (np.zeros((4, 5), np.uint16), InputError, "every pixel is zero"),
+        (np.array([[1.0, np.nan], [np.inf, 2.0]], np.float32), InputError, "2 pixels are NaN or infinite"),
+        (np.full((4, 5), 1e300), InputError, "20 pixels are NaN or infinite"),
+        (np.array([[1, -2], [-3, 4]], np.int16), InputError, "2 pixels are negative"),
+        (np.ones((4, 5, 3), np.uint8), FileFormatError, "expected grey"),
+        (np.ones((4, 5), np.complex64), FileFormatError, "expected grey"),
+        (np.ones((3, 4, 5), np.uint16), FileFormatError, "holds 3 pictures"),
+    ],
+    ids=["zero", "nan", "overflow", "negative", "colour", "complex", "pages"],
+)
+def test_unusable_pictures_are_refused(
+    plain: Any, picture: NDArray[Any], fault: type[TofclipError], problem: str
+) -> None:
+    options = {"photometric": "rgb"} if picture.shape[-1] == 3 else {"photometric": "minisblack"}
+    with pytest.raises(fault, match=rf"plain\.tif.*{problem}"):
+        read_streak(plain(picture, **options))
+
+
+def test_a_header_that_claims_too_much_is_refused_before_memory_is_taken(plain: Any) -> None:
+    path = plain(np.ones((4, 5), np.uint16))
+    with tifffile.TiffFile(path, mode="r+") as tiff:
+        tiff.pages.first.tags["ImageLength"].overwrite(2**31 - 1)
+        tiff.pages.first.tags["ImageWidth"].overwrite(2**31 - 1)
+    with pytest.raises(FileFormatError, match="claims an impossible size"):
+        read_streak(path)
+
+
+@pytest.mark.parametrize("keep", [4, 8, 100, 600, 1000])
+@pytest.mark.parametrize("kind", ["hpdta", "lift", "hdf5"])
+def test_truncated_files_are_refused(
+    write_hpdta: Any, write_lift: Any, tmp_path: Path, pixels: NDArray[np.uint16], kind: str, keep: int
+) -> None:
+    if kind == "hdf5":
+        path = tmp_path / "shot.h5"
+        Streak(pixels).save(path)
+    else:
+        path = write_lift() if kind == "lift" else write_hpdta(np.arange(20))
+    data = path.read_bytes()
+    assert len(data) > keep
+    path.write_bytes(data[:keep])
+    with pytest.raises(FileFormatError, match="shot"):
+        read_streak(path)
+
+
+def test_damaged_tiffs_raise_only_our_own_errors(write_hpdta: Any, capfd: pytest.CaptureFixture[str]) -> None:
+    path = write_hpdta(np.arange(20))
+    whole, random = path.read_bytes(), np.random.default_rng(4)
+    messages = []
+    for _ in range(150):
+        damaged = np.frombuffer(whole, np.uint8).copy()
+        damaged[random.integers(0, 400, 4)] = random.integers(0, 256, 4)
+        path.write_bytes(damaged.tobytes())
+        try:
+            read_streak(path)
+        except TofclipError as fault:
+            messages.append(str(fault))
+    assert len(messages) > 20
+    assert not any("\n" in message for message in messages)
+    # The decoder keeps quiet: the one line is ours.
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("content", [b"", b"hello, this is no picture", b"PK\x03\x04rest", b"II*\0", b"%PDF-1.4"])
+@pytest.mark.parametrize("name", ["a.tif", "a.npz", "a.h5", "a"])
+def test_other_files_are_refused_whatever_they_are_called(tmp_path: Path, name: str, content: bytes) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(FileFormatError, match="is empty" if not content else "is "):
+        read_streak(tmp_path / name)
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match=r"absent\.tif: no such file"):
+        read_streak(tmp_path / "absent.tif")
+    with pytest.raises(StorageError, match="is a folder"):
+        read_streak(tmp_path)
+
+
+def test_our_own_file_brings_everything_back(tmp_path: Path, pixels: NDArray[np.uint16]) -> None:
+    camera = Camera([8.0, 21.5], [0.1, -0.2], (9, 11), 30, sweep=SkewSweep([8.0, 21.5], [0.5, -1.0], [0.0, 0.01]))
+    shot = Streak(
+        counts=pixels,
+        row_times=np.cumsum(np.linspace(18e-12, 20e-12, 20)),
+        saturated=pixels > 3900,
+        metadata={"Streak camera/Time Range": "20 ns", "Comment/UserComment": ""},
+        camera=camera,
+        attachments={"relay_wall": Record("relay_wall", {"laser": Field(np.ones(3), "m")}, {"row_offset": 25})},
+        provenance={"settings": {"a": 1}},
+    )
+    shot.save(tmp_path / "without_suffix")
+    got = read_streak(tmp_path / "without_suffix")
+    np.testing.assert_array_equal(got.counts, shot.counts)
+    np.testing.assert_array_equal(got.times, shot.times)
+    np.testing.assert_array_equal(got.saturated, shot.saturated)
+    assert got.metadata == shot.metadata
+    assert got.camera is not None
+    np.testing.assert_array_equal(got.camera.centres_px, camera.centres_px)
+    np.testing.assert_array_equal(got.camera.sweep.offsets_bin, [0.5, -1.0])
+    assert got.attachments["relay_wall"].attributes == {"row_offset": 25}
+    assert got.provenance["earlier"] == {"settings": {"a": 1}}
+
+
+def test_another_kind_of_our_own_files_is_refused(tmp_path: Path) -> None:
+    camera = Camera([5.0], [0.0], (3, 4), 10)
+    Frames(np.ones((2, 3, 4), np.float32), np.array([0.0, 1e-12]), camera).save(tmp_path / "frames.h5")
+    with pytest.raises(FileFormatError, match="holds a frames record, expected streak"):
+        read_streak(tmp_path / "frames.h5")
+
+
+def test_provenance_names_file_and_bin_width(plain: Any) -> None:
+    path = plain(np.ones((4, 5), np.uint16))
+    found = read_streak(path, bin_width=2e-11).provenance
+    assert found["settings"] == {"bin_width_s": 2e-11}
+    assert found["inputs"] == [{"name": "plain.tif", "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}]
+
+
+def test_recorded_flash_lidar_shot(shared_data: Path) -> None:
+    """Known of this shot: 1008 rows, from 18.78 ps each at the start to 20.49 ps at the end, 19.41 ps on average."""
+    streak = read_streak(shared_data / "clip" / "scene5.tif")
+    assert streak.counts.shape == (1008, 1344)
+    steps = np.diff(streak.times)
+    # Half of the last known digit, and the five rows that the shot leaves out at the slow end.
+    np.testing.assert_allclose([steps[0], steps.mean()], [18.78e-12, 19.41e-12], atol=0.005e-12)
+    assert 20.47e-12 < steps[-1] < 20.495e-12
+    assert streak.times[0] == pytest.approx(4 * 18.78e-12, rel=1e-3)
+    assert streak.metadata["Streak camera/Time Range"] == "20 ns"
+    assert streak.metadata["Acquisition/areSource"] == "0,4,1344,1008"
+    assert np.count_nonzero(streak.saturated) == np.count_nonzero(streak.counts == 65535) == 4
+
+
+@pytest.mark.parametrize("name", ["LinePattern", "LinePattern_bkg", "DotPattern", "DotPattern_bkg"])
+def test_recorded_focus_pictures_have_no_time_axis(shared_data: Path, name: str) -> None:
+    streak = read_streak(shared_data / "clip" / f"{name}.tif")
+    assert streak.counts.shape == (1016, 1344)
+    assert streak.row_times is None
+    assert streak.metadata["Streak camera/Mode"] == "Focus"
