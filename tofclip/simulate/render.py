@@ -62,15 +62,15 @@ def streak_of_rays(rays: RayBundle, view: int, instrument: Instrument) -> FloatA
     slit = camera.centres_px[view] + rays.x - rays.y * np.tan(camera.angles[view])
     row = (rays.time + camera.time_zero) / detector.bin_width
     row, slit, stretch = _swept(camera, row, slit)
-    first_column, light = _share_columns(slit, camera.gains[view] * rays.brightness, instrument.rays_per_pixel_side)
-    first_row, pulse = share_rows(row, stretch * pulse_sigma_bins(instrument))
-    rows = first_row[:, np.newaxis, np.newaxis] + np.arange(pulse.shape[1])[:, np.newaxis]
-    columns = first_column[:, np.newaxis, np.newaxis] + np.arange(2)
-    amount = pulse[:, :, np.newaxis] * light[:, np.newaxis, :]
-    shape = (detector.rows, camera.slit_width_px)
-    on_screen = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
-    pixel = rows * shape[1] + columns
-    return gathered(pixel[on_screen], amount[on_screen], shape)
+    ray, column, light = _share_columns(slit, camera.gains[view] * rays.brightness, instrument.rays_per_pixel_side)
+    first, pulse = share_rows(row, stretch * pulse_sigma_bins(instrument))
+    reach, width = pulse.shape[1], camera.slit_width_px
+    seen = (first[ray] > -reach) & (first[ray] < detector.rows) & (column >= 0) & (column < width)
+    ray, column, light = ray[seen], column[seen], light[seen]
+    rows = first[ray][:, np.newaxis] + np.arange(reach, 2 * reach)  # the screen has a margin for pulses it cuts off
+    amount = light[:, np.newaxis] * pulse[ray]
+    with_margin = gathered(rows * width + column[:, np.newaxis], amount, (detector.rows + 2 * reach, width))
+    return with_margin[reach:-reach]
 
 
 def _swept(camera: Camera, row: FloatArray, slit: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -82,20 +82,27 @@ def _swept(camera: Camera, row: FloatArray, slit: FloatArray) -> tuple[FloatArra
     return raw_row, raw_column, stretch
 
 
-def _share_columns(position: FloatArray, light: FloatArray, side: int) -> tuple[NDArray[np.intp], FloatArray]:
+def _share_columns(
+    position: FloatArray, light: FloatArray, side: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
     """Split each ray, 1/side of a pixel wide, exactly between the one or two slit pixels that it covers.
 
-    Slit pixel j reaches from j - 1/2 to j + 1/2. Returns the left pixel and the light on it and on the next.
+    Slit pixel j reaches from j - 1/2 to j + 1/2. Returns ray number, slit pixel and amount of light, piece by piece.
     """
     left_edge = position - 0.5 / side
-    first = np.floor(left_edge + 0.5)
-    on_next = np.clip((left_edge + 1 / side - (first + 0.5)) * side, 0.0, 1.0)
-    return first.astype(np.intp), np.stack([light * (1 - on_next), light * on_next], axis=-1)
+    column = np.floor(left_edge + 0.5)
+    on_next = np.clip((left_edge + 1 / side - (column + 0.5)) * side, 0.0, 1.0)
+    crossing = np.flatnonzero(on_next > 0)
+    return (
+        np.concatenate([np.arange(position.size), crossing]),
+        np.concatenate([column, column[crossing] + 1]).astype(np.intp),
+        np.concatenate([light * (1 - on_next), light[crossing] * on_next[crossing]]),
+    )
 
 
 def gathered(cell: NDArray[np.intp], amount: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     """Add each amount to its cell, numbered in raster order, of an array of `shape`."""
-    total: Any = np.bincount(cell, amount, minlength=int(np.prod(shape)))
+    total: Any = np.bincount(cell.ravel(), amount.ravel(), minlength=int(np.prod(shape)))
     return np.asarray(total, dtype=np.float64).reshape(shape)
 
 
