@@ -1,0 +1,65 @@
+"""The README's commands do what it says, on the files of a small instrument."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+from small_instrument import Run
+
+import tofclip
+
+ROOT = Path(tofclip.__file__).parents[1]
+README = ROOT / "README.md"
+
+
+def commands(start: str) -> list[str]:
+    """Lines of the README's shell blocks that begin with `start`."""
+    blocks = re.findall(r"```sh\n(.*?)```", README.read_text(encoding="utf-8"), flags=re.DOTALL)
+    return [line for block in blocks for line in block.splitlines() if line.startswith(start)]
+
+
+def test_the_walk_through(run: Run, files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("line", "line_background", "dot", "dot_background"):
+        shutil.copy(files / f"{name}.tif", tmp_path)
+    # A shot whose file has a time axis, under the README's names: files are known by content, not by suffix.
+    shutil.copy(files / "streak.h5", tmp_path / "shot.tif")
+    shutil.copy(files / "wall.h5", tmp_path / "wall.npz")
+    monkeypatch.chdir(tmp_path)
+    walk = commands("tofclip ")
+    assert len(walk) == 7
+    for command in walk:
+        outcome = run(*shlex.split(command)[1:])
+        assert (outcome.status, outcome.err) == (0, ""), command
+    expected = "camera.h5 camera.png frames.h5 frames.png mip.png scene.ply volume.h5 wall.h5 wall_frames.h5"
+    assert set(expected.split()) <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_the_python_example(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copy(files / "camera.h5", tmp_path)
+    shutil.copy(files / "streak.h5", tmp_path / "shot.tif")
+    wall = tofclip.recover(tofclip.read_streak(files / "wall.h5"), method="linear")
+    wall.save(tmp_path / "wall_frames.h5")
+    monkeypatch.chdir(tmp_path)
+    code = re.search(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert code is not None
+    names: dict[str, object] = {}
+    exec(code[1], names)
+    assert Path("scene.ply").stat().st_size > 0
+    assert names["volume"].values.shape == names["grid"].shape  # type: ignore[attr-defined]
+
+
+def test_continuous_integration_runs_the_readmes_test_command() -> None:
+    promised = next(line for line in commands("python3 -m venv") if "pytest" in line).split(" && ")
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    assert promised[0] in script
+    assert script.rstrip().endswith(promised[-1])  # last, so that its summary is the last line
+
+
+def test_the_picture_is_there_and_small() -> None:
+    with open(ROOT / "docs" / "pictures" / "demo.png", "rb") as file:
+        assert file.read(8) == b"\x89PNG\r\n\x1a\n"
+    assert (ROOT / "docs" / "pictures" / "demo.png").stat().st_size < 300_000
