@@ -201,8 +201,20 @@ class PreparedInverse:
 
     def recover(self, readings: Array, progress: Progress = silent) -> Result:
         """Recover one picture per column of `readings`, (readings, frames)."""
+        from threadpoolctl import threadpool_limits
+
         readings = _checked(self.operator, readings, None)
-        return Adjoint().recover(self.operator, self.inverse_gram @ readings, None, progress)
+        frames = np.empty((readings.shape[1], *self.operator.shape_in), self.operator.dtype)
+
+        def solve(piece: slice) -> None:
+            weights = self.inverse_gram @ _full_block(readings, piece)
+            _write_frames(self.operator.adjoint(weights), frames, piece)
+            progress(piece.stop - piece.start)
+
+        # The blocks already keep every core busy: BLAS threads of its own would wait for, and spin against, ours.
+        with threadpool_limits(1, "blas"):
+            run_blocks(solve, readings.shape[1])
+        return Result(frames)
 
 
 @dataclass(frozen=True)
