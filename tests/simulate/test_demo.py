@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tofclip.errors import InputError, ShapeError
-from tofclip.lidar import Detection, depth, point_cloud
+from tofclip.lidar import depth, point_cloud
 from tofclip.simulate import Truth, default_instrument, default_scene, score, simulate, true_frames
 from tofclip.simulate.shapes import cut_out, letter, plain
 from tofclip.transient import Frames
@@ -72,8 +72,8 @@ def test_true_frames_give_the_reflectance(shot, frames):
 
 def test_photon_noise_leaves_the_depth_far_below_half_a_bin(shot, frames):
     noisy = np.random.default_rng(0).poisson(frames.values + 0.05).astype(np.float32)
-    figures = score(depth(replace(frames, values=noisy), detection=Detection(share_of_scene=0.01)), shot.truth)
-    # about 25 photons a pixel from the wall: 26 ps / sqrt(25) is 0.8 mm; half a bin is 1.5 mm
+    figures = score(depth(replace(frames, values=noisy)), shot.truth)
+    # some 60 photons a pixel: 26 ps / sqrt(60) * c / 2 is 0.5 mm as a standard deviation; half a bin is 1.5 mm
     assert figures["median_depth_error_m"] < 0.5 * BIN_M / 2
     assert figures["share_within_one_bin"] > 0.95
 
