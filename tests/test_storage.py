@@ -130,6 +130,19 @@ def test_a_newer_format_is_refused(record: Record, tmp_path: Path) -> None:
         Record.load(tmp_path / "a.h5")
 
 
+def test_content_that_is_not_ours_is_refused(record: Record, tmp_path: Path) -> None:
+    record.save(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file["link"] = h5py.SoftLink("/nowhere")
+    with pytest.raises(FileFormatError, match="'link' cannot be read"):
+        Record.load(tmp_path / "a.h5")
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        del file["link"]
+        file.attrs["provenance"] = "by hand"
+    with pytest.raises(FileFormatError, match="provenance is not JSON"):
+        Record.load(tmp_path / "a.h5")
+
+
 def test_a_record_of_another_kind_is_refused(record: Record, tmp_path: Path) -> None:
     record.save(tmp_path / "a.h5")
     assert Record.load(tmp_path / "a.h5", "frames", "streak").kind == "streak"
@@ -162,7 +175,7 @@ def test_attributes_and_children_are_checked(record: Record) -> None:
             parent.child(name, kind)
 
 
-@pytest.mark.parametrize("fault", [ValueError, KeyboardInterrupt, OSError])
+@pytest.mark.parametrize("fault", [ValueError, KeyboardInterrupt, OSError, StorageError])
 def test_an_interrupted_write_leaves_the_old_file(fault: type[BaseException], tmp_path: Path) -> None:
     target = tmp_path / "scene.ply"
     target.write_text("old")
@@ -172,8 +185,10 @@ def test_an_interrupted_write_leaves_the_old_file(fault: type[BaseException], tm
             temporary.write_text("half")
             raise fault("stop")
 
-    with pytest.raises(StorageError if fault is OSError else fault, match="stop"):
+    with pytest.raises(StorageError if fault is OSError else fault, match=r"stop$") as caught:
         write()
+    # What the block itself reports about some other file keeps its words.
+    assert ("scene.ply" in str(caught.value)) == (fault is OSError)
     assert target.read_text() == "old"
     assert os.listdir(tmp_path) == ["scene.ply"]
 
