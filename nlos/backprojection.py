@@ -19,7 +19,7 @@ from tofclip.arrays import blocks, run_blocks
 from tofclip.errors import InputError
 
 TABLE_BYTES = 32 << 20
-"""Filtered signals held at a time; the captures of this world have up to 64 MB raw."""
+"""Filtered signals held at a time."""
 
 BRICK_Z, BRICK_Y, BRICK_X = 8, 8, 128
 """Voxels treated together: few enough for the cache, rows along x long enough for vector registers, and at a batch of
@@ -36,7 +36,7 @@ class Backprojection:
 
     Costs one look-up per voxel and wall point; memory for the volume and for 32 MiB of signals.
 
-    Liu et al., Nature 572, 620 (2019), Methods; "Rayleigh-Sommerfeld diffraction" summed point by point.
+    Liu et al., "Non-line-of-sight imaging using phasor-field virtual wave optics", Nature 572, 620-623 (2019).
 
     Parameters
     ----------
@@ -115,7 +115,10 @@ class _Batch:
         values = self.waveforms.values.view(np.float32)
         start, spacing = np.float32(self.waveforms.start), np.float32(self.waveforms.spacing)
         axes = (axis.astype(np.float32) for axis in (x, y, z))
-        add_backprojection(values, start, spacing, self.wall, self.lasers, *axes, field)
+        # A brick of its own, because a contiguous array lets one compiled version serve every piece of a volume.
+        brick = np.zeros(field.shape, np.complex64)
+        add_backprojection(values, start, spacing, self.wall, self.lasers, *axes, brick)
+        field += brick
 
 
 def _batches(capture: Capture, band: Band) -> Iterator[_Batch]:

@@ -22,7 +22,7 @@ EVEN_STEPS = 1e-3
 def captured_wall(frames: Frames) -> Capture:
     """Do what `Capture.from_frames` describes."""
     record = frames.attachments.get(ATTACHMENT)
-    if record is None:
+    if record is None or record.kind != ATTACHMENT:
         raise InputError(
             "these frames carry no relay wall: recover them from a streak image converted with its wall's geometry"
         )

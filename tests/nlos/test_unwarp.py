@@ -117,6 +117,8 @@ def test_whole_bins_are_moved_exactly_and_what_lies_outside_is_zero() -> None:
 def test_frames_without_a_wall_say_what_is_missing() -> None:
     with pytest.raises(InputError, match="carry no relay wall"):
         Capture.from_frames(frames_of(np.ones((4, 3, 3)), {}))
+    with pytest.raises(InputError, match="carry no relay wall"):
+        Capture.from_frames(frames_of(np.ones((4, 3, 3)), {"relay_wall": Record("shopping_list")}))
 
 
 def test_a_wall_record_without_its_camera_is_named() -> None:
