@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -72,6 +73,9 @@ def test_frames_say_what_they_are(shot, frames):
     np.testing.assert_allclose(frames.times, shot.streak.times - shot.camera.time_zero)
     assert frames.figures["method"] == "tv"
     assert frames.figures["stopped_because"] == "iteration limit"
+    objective = frames.provenance["objective"]
+    assert len(objective) == frames.figures["iterations"] + 1
+    assert all(after <= before for before, after in itertools.pairwise(objective))
 
 
 def test_progress_adds_up(shot, uncalibrated):

@@ -98,7 +98,7 @@ class Task:
             camera=camera,
             figures=figures,
             attachments=self.streak.attachments,
-            provenance=self.streak.provenance,
+            provenance={**self.streak.provenance, "objective": result.objective.tolist()},
         )
 
 
