@@ -13,7 +13,7 @@ from apps.options import AsJson
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
-    from nlos import Capture
+    from nlos import Backprojection, Capture, Grid
 
 METHODS = ("backprojection",)
 
@@ -42,13 +42,20 @@ def reconstruct(
     far_m: Annotated[
         float | None, typer.Option(metavar="M", help="Last depth.", show_default="as far as the record reaches")
     ] = None,
+    everywhere: Annotated[
+        bool, typer.Option("--everywhere", help="Fill all the space in front of the wall with such voxels; slow.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Image the hidden scene from the transients on a relay wall."""
+    """Image the hidden scene from the transients on a relay wall.
+
+    The space in front of the wall is looked over with voxels of half a wavelength first; then the part that is bright
+    is imaged with the voxels asked for.
+    """
     from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, history, require_writable
     from apps.progress import progress
     from apps.report import report
-    from nlos import Backprojection, Grid
+    from nlos import Backprojection
     from tofclip.errors import InputError
 
     if method not in METHODS:
@@ -58,12 +65,12 @@ def reconstruct(
         require_writable(png, *PICTURE_SUFFIXES, inputs=(source,))
     imaging = Backprojection(wavelength=wavelength_mm * MILLIMETRE, cycles=cycles)
     capture = _capture(source)
-    grid = Grid.in_front_of(capture, voxel_mm * MILLIMETRE, near_m, far_m)
-    imaging.supports(capture, grid).require()
     started = time.perf_counter()
+    grid = _grid(imaging, capture, voxel_mm * MILLIMETRE, (near_m, far_m), everywhere)
+    looked_over = time.perf_counter()
     with progress("imaging", imaging.lookups(capture, grid)) as advance:
         volume = imaging.reconstruct(capture, grid, advance)
-    seconds = time.perf_counter() - started
+    finished = time.perf_counter()
     settings = {"verb": "nlos reconstruct", "method": repr(imaging), "voxel_mm": voxel_mm}
     replace(volume, provenance=history(settings, source, earlier=capture.provenance)).save(out)
     if png is not None:
@@ -73,11 +80,30 @@ def reconstruct(
         "method": method,
         "voxels": list(grid.shape),
         "wall_points": len(capture.points),
-        "seconds": seconds,
-        "lookups_per_second": imaging.lookups(capture, grid) / seconds,
+        "seconds": finished - started,
+        "lookups_per_second": imaging.lookups(capture, grid) / (finished - looked_over),
         "peak_m": {"x": x, "y": y, "z": z},
     }
     report(figures, as_json, [out] if png is None else [out, png])
+
+
+def _grid(
+    imaging: Backprojection,
+    capture: Capture,
+    voxel: float,
+    depths: tuple[float | None, float | None],
+    everywhere: bool,
+) -> Grid:
+    """Choose the voxels: all the space in front of the wall, or what a coarse look finds bright there."""
+    from apps.progress import progress
+    from nlos import Grid
+
+    coarse_voxel = imaging.wavelength / 2
+    if everywhere or voxel >= coarse_voxel:
+        return Grid.in_front_of(capture, voxel, *depths)
+    coarse = Grid.in_front_of(capture, coarse_voxel, *depths)
+    with progress("looking over", imaging.lookups(capture, coarse)) as advance:
+        return Grid.around(imaging.reconstruct(capture, coarse, advance), voxel)
 
 
 def _capture(source: Path) -> Capture:
