@@ -107,8 +107,9 @@ def test_what_is_missing_is_asked_for(shot):
     with pytest.raises(MissingTimeAxisError, match="bin-width-ps"):
         recover(replace(shot.streak, row_times=None))
     narrow = Streak(shot.streak.counts[:, :-1], shot.streak.times)
-    with pytest.raises(CalibrationError, match="1343 columns"):
-        recover(narrow, shot.camera)
+    for camera in (shot.camera, shot.camera.replace(sweep=None)):
+        with pytest.raises(CalibrationError, match="1343 columns"):
+            recover(narrow, camera)
 
 
 def test_views_that_do_not_belong_together_are_refused(uncalibrated):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.camera import Camera, SkewSweep, dark_level
+from tofclip.camera import Camera, SkewSweep, dark_level, require_width
 from tofclip.errors import CalibrationError
 
 FloatArray = NDArray[np.float64]
@@ -49,7 +49,7 @@ def estimate_skew(counts: NDArray[np.float32], camera: Camera) -> SkewEstimate:
     Raises
     ------
     CalibrationError
-        A view's curve does not resemble the reference's.
+        A view's curve does not resemble the reference's, or the picture is not as wide as the camera's slit.
     """
     curves = _structure(view_energies(counts, camera))
     reference = int(np.argmin(np.abs(camera.view_positions)))
@@ -68,6 +68,7 @@ def estimate_skew(counts: NDArray[np.float32], camera: Camera) -> SkewEstimate:
 
 def view_energies(counts: NDArray[np.float32], camera: Camera) -> FloatArray:
     """Sum of each row over each view's part of the slit, above the dark level; (views, rows)."""
+    require_width(counts, camera)
     signal = counts - np.float32(dark_level(counts))
     half = min(camera.image_shape[1] // 2, _half_pitch(camera))
     edges = [(max(0, round(c) - half), round(c) + half + 1) for c in camera.centres_px]

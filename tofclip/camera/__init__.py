@@ -1,6 +1,6 @@
 """The camera: where each view lies on the slit, how its lenslet projects, how the sweep bends time."""
 
-from tofclip.camera.measurement import Measurement, dark_level, measure
+from tofclip.camera.measurement import Measurement, dark_level, measure, require_width
 from tofclip.camera.model import Camera
 from tofclip.camera.sweep import PolynomialSweep, ProjectiveSweep, SkewSweep, Sweep
 
@@ -13,4 +13,5 @@ __all__ = [
     "Sweep",
     "dark_level",
     "measure",
+    "require_width",
 ]

@@ -53,11 +53,7 @@ def measure(counts: FloatImage, saturated: Mask | None, camera: Camera, dark: fl
     InputError
         Nothing remains above the dark level, or no reading can be trusted.
     """
-    if counts.shape[1] != camera.slit_width_px:
-        raise CalibrationError(
-            f"the streak image has {counts.shape[1]} columns but the camera's slit has {camera.slit_width_px}; "
-            "use the camera file that belongs to this instrument"
-        )
+    require_width(counts, camera)
     dark = dark_level(counts) if dark is None else dark
     signal = counts - np.float32(dark)
     bad = np.zeros(counts.shape, bool) if saturated is None else saturated
@@ -69,6 +65,15 @@ def measure(counts: FloatImage, saturated: Mask | None, camera: Camera, dark: fl
     if not np.any(signal[good] > 0):
         raise InputError("nothing rises above the dark level; was there any light?")
     return Measurement(np.ascontiguousarray(signal.T), np.ascontiguousarray(good.T))
+
+
+def require_width(counts: FloatImage, camera: Camera) -> None:
+    """Raise `CalibrationError` unless the picture is as wide as the camera's slit."""
+    if counts.shape[1] != camera.slit_width_px:
+        raise CalibrationError(
+            f"the streak image has {counts.shape[1]} columns but the camera's slit has {camera.slit_width_px}; "
+            "use the camera file that belongs to this instrument"
+        )
 
 
 def dark_level(counts: FloatImage) -> float:
