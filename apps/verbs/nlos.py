@@ -13,7 +13,7 @@ from apps.options import AsJson
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
-    from nlos import Backprojection, Capture, Grid
+    from nlos import Backprojection, Capture, Grid, Volume
 
 METHODS = ("backprojection",)
 
@@ -53,7 +53,6 @@ def reconstruct(
     is imaged with the voxels asked for.
     """
     from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, history, require_writable
-    from apps.progress import progress
     from apps.report import report
     from nlos import Backprojection
     from tofclip.errors import InputError
@@ -65,26 +64,39 @@ def reconstruct(
         require_writable(png, *PICTURE_SUFFIXES, inputs=(source,))
     imaging = Backprojection(wavelength=wavelength_mm * MILLIMETRE, cycles=cycles)
     capture = _capture(source)
-    started = time.perf_counter()
-    grid = _grid(imaging, capture, voxel_mm * MILLIMETRE, (near_m, far_m), everywhere)
-    looked_over = time.perf_counter()
-    with progress("imaging", imaging.lookups(capture, grid)) as advance:
-        volume = imaging.reconstruct(capture, grid, advance)
-    finished = time.perf_counter()
+    volume, speed = _imaged(imaging, capture, voxel_mm * MILLIMETRE, (near_m, far_m), everywhere)
     settings = {"verb": "nlos reconstruct", "method": repr(imaging), "voxel_mm": voxel_mm}
     replace(volume, provenance=history(settings, source, earlier=capture.provenance)).save(out)
     if png is not None:
         volume.save_picture(png)
-    x, y, z = volume.brightest()
     figures = {
         "method": method,
-        "voxels": list(grid.shape),
+        "voxels": volume.grid.shape,
         "wall_points": len(capture.points),
-        "seconds": finished - started,
-        "lookups_per_second": imaging.lookups(capture, grid) / (finished - looked_over),
-        "peak_m": {"x": x, "y": y, "z": z},
+        **speed,
+        "peak_m": dict(zip("xyz", volume.brightest(), strict=True)),
     }
     report(figures, as_json, [out] if png is None else [out, png])
+
+
+def _imaged(
+    imaging: Backprojection,
+    capture: Capture,
+    voxel: float,
+    depths: tuple[float | None, float | None],
+    everywhere: bool,
+) -> tuple[Volume, dict[str, float]]:
+    """Image the hidden scene, and say how long it took altogether and how fast the fine picture was made."""
+    from apps.progress import progress
+
+    started = time.perf_counter()
+    grid = _grid(imaging, capture, voxel, depths, everywhere)
+    lookups = imaging.lookups(capture, grid)
+    looked_over = time.perf_counter()
+    with progress("imaging", lookups) as advance:
+        volume = imaging.reconstruct(capture, grid, advance)
+    finished = time.perf_counter()
+    return volume, {"seconds": finished - started, "lookups_per_second": lookups / (finished - looked_over)}
 
 
 def _grid(

@@ -28,8 +28,10 @@ class TestReport:
         assert found == {"a": 0.5, "b": [1.0, None], "c": [1, "x"], "d": {"e": 3}}
 
     def test_table_for_people(self, capsys: pytest.CaptureFixture[str]) -> None:
-        report({"range_m": [1.23456, float("inf")], "points": 3}, as_json=False, written=[Path("out.h5")])
-        assert capsys.readouterr().out == "range m  1.235, unknown\npoints   3\nwrote out.h5\n"
+        figures = {"range_m": [1.23456, float("inf")], "points": 3, "at": {"x": 0.5, "z": 12345.6}}
+        report(figures, as_json=False, written=[Path("out.h5")])
+        lines = ["range m  1.235, unknown", "points   3", "at       x 0.5, z 12346", "wrote out.h5"]
+        assert capsys.readouterr().out.splitlines() == lines
 
     def test_infinity_is_unknown(self) -> None:
         assert plainly([np.inf, -np.inf, True, None, "text"]) == [None, None, True, None, "text"]

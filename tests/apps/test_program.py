@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import pty
+import shlex
 import signal
 import subprocess
 import sys
@@ -91,8 +91,18 @@ def test_a_reader_that_goes_away(files: Path) -> None:
     assert (done.returncode, done.stderr) == (cli.READER_GONE, "")
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
+def test_a_disk_without_room(files: Path, tmp_path: Path) -> None:
+    """A limit on the size of files stands for the disk: both refuse to write on, in the middle of a file."""
+    limited = f"ulimit -f 8; exec {shlex.join(PROGRAM)} convert {files / 'streak.h5'} --out {tmp_path / 'copy.h5'}"
+    done = subprocess.run(["bash", "-c", limited], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert "copy.h5: cannot be written" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_ctrl_c_during_recovery_leaves_nothing_behind(files: Path, tmp_path: Path) -> None:
+    import pty  # exists only where the test can run
+
     words = ["recover", files / "streak.h5", "--out", tmp_path / "frames.h5", "--iterations", "1000000"]
     terminal, child_side = pty.openpty()
     process = subprocess.Popen(

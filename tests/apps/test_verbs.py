@@ -212,3 +212,14 @@ def test_recorded_shots_can_be_described(run: Run, shared_data: Path) -> None:
     assert found["children"]["metadata"]["attributes"]["Streak camera/Time Range"] == "20 ns"
     found = object_of(run, "info", shared_data / "lift" / "nlos_LetterN.npz")
     assert found["children"]["relay_wall"]["fields"]["wall"]["units"] == "m"
+
+
+def test_the_recorded_focus_pictures(run: Run, shared_data: Path, tmp_path: Path) -> None:
+    names = {"line": "LinePattern", "line-background": "LinePattern_bkg", "dot": "DotPattern"}
+    flags = [(f"--{flag}", shared_data / "clip" / f"{name}.tif") for flag, name in names.items()]
+    words = [*itertools.chain(*flags), "--dot-background", shared_data / "clip" / "DotPattern_bkg.tif"]
+    found = object_of(run, "calibrate", *words, "--out", tmp_path / "camera.h5")
+    # An independent trial on the same pictures; half a degree and half a pixel is what the two may differ by.
+    np.testing.assert_allclose(found["angles_deg"], [-43.3, -25.7, -12.7, 0.6, 22.9, 37.5, 48.0], atol=0.5)
+    trial = [147.7, 320.0, 490.2, 664.1, 835.5, 1011.5, 1192.3]
+    np.testing.assert_allclose(found["centres_px"], trial, atol=0.5)
