@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,8 +44,8 @@ class Moment:
 def preview_figure(streak: Streak, frames: Frames) -> Figure:
     """Draw a recovery.
 
-    Brightness is multiplied by range squared, so that near and far surfaces of one kind look alike; frames of a relay
-    wall, whose light took three bounces, are drawn as they are.
+    Where time tells the range, brightness is multiplied by range squared, so that near and far surfaces of one kind
+    look alike.
     """
     moments = telling_moments(frames)
     lines = math.ceil(len(moments) / COLUMNS)
@@ -68,8 +69,11 @@ def telling_moments(frames: Frames) -> list[Moment]:
     its height to half its height. Light that comes without a pause is cut into even shares instead.
     """
     energy = frames.values.sum(axis=(1, 2), dtype=np.float64) * _compensation(frames)
+    if energy.size <= MOST_MOMENTS:
+        return [Moment(frame, frame, frame) for frame in range(energy.size)]
     peaks = _peaks(energy)
-    return peaks if len(peaks) >= COLUMNS else _even_shares(energy)
+    separate = all(earlier.last < later.first for earlier, later in pairwise(peaks))
+    return peaks if separate and len(peaks) >= COLUMNS else _even_shares(energy)
 
 
 def _peaks(energy: NDArray[np.float64]) -> list[Moment]:
@@ -88,27 +92,27 @@ def _peaks(energy: NDArray[np.float64]) -> list[Moment]:
 def _even_shares(energy: NDArray[np.float64]) -> list[Moment]:
     share = np.cumsum(energy) / (energy.sum() or 1.0)
     cuts = np.searchsorted(share, np.linspace(0.01, 0.99, MOST_MOMENTS + 1)).clip(0, energy.size - 1)
-    pairs = zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True)
-    return [Moment((first + last) // 2, first, max(first, last - 1)) for first, last in pairs]
+    return [Moment((first + last) // 2, first, max(first, last - 1)) for first, last in pairwise(cuts.tolist())]
 
 
 def _ranges(frames: Frames) -> NDArray[np.float64]:
     return frames.times * SPEED_OF_LIGHT / 2
 
 
-def _sees_relay_wall(frames: Frames) -> bool:
-    return "relay_wall" in frames.attachments
+def _tells_range(frames: Frames) -> bool:
+    """Whether time is range: not without a time zero, and not for a relay wall, whose light took three bounces."""
+    return frames.camera.time_zero != 0 and "relay_wall" not in frames.attachments
 
 
 def _compensation(frames: Frames) -> NDArray[np.float32]:
     """Factor of each frame that undoes the fall-off with range; 1 where it does not apply."""
-    if _sees_relay_wall(frames):
-        return np.ones(frames.times.size, np.float32)
-    return np.maximum(_ranges(frames), 0).astype(np.float32) ** 2
+    if _tells_range(frames):
+        return np.maximum(_ranges(frames), 0).astype(np.float32) ** 2
+    return np.ones(frames.times.size, np.float32)
 
 
 def _compensated(frames: Frames) -> str:
-    return "" if _sees_relay_wall(frames) else " \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}"
+    return " \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}" if _tells_range(frames) else ""
 
 
 def _toned(picture: NDArray[Any], brightest: float = BRIGHTEST) -> NDArray[Any]:
@@ -134,14 +138,14 @@ def _draw_distance(axes: Axes, brightness: NDArray[Any], frames: Frames) -> None
     from matplotlib.colors import Normalize
 
     light = _toned(brightness.max(axis=0), BRIGHT_AREA)
-    scale, meaning = (frames.times / NANOSECOND, "time of flight (ns)")
-    if not _sees_relay_wall(frames):
+    scale, meaning = (frames.times / NANOSECOND, "time (ns)")
+    if _tells_range(frames):
         scale, meaning = _ranges(frames), "range (m)"
     distance = scale[brightness.argmax(axis=0)]
     lit = distance[light > LIT] if np.any(light > LIT) else distance
     mapped = ScalarMappable(Normalize(*np.percentile(lit, (1, 99))), colormaps[DEPTH])
     draw(axes, mapped.to_rgba(distance)[..., :3] * light[..., np.newaxis])
-    label(axes, "distance of the brightest return", "x (px)", "y (px), down")
+    label(axes, "when each pixel was brightest", "x (px)", "y (px), down")
     colour_bar(axes, mapped, meaning)
 
 
@@ -153,9 +157,10 @@ def _draw_moments(panels: Any, brightness: NDArray[Any], moments: list[Moment], 
     for axes, moment, picture in zip(panels, moments, pictures, strict=False):
         draw(axes, picture[rows, columns], extent, vmin=0)
         where = f"{frames.times[moment.frame] / NANOSECOND:.2f} ns"
-        if not _sees_relay_wall(frames):
+        if _tells_range(frames):
             where = f"{_ranges(frames)[moment.frame]:.2f} m"
-        label(axes, f"{where}  (frames {moment.first} to {moment.last})", "", "")
+        which = f"frame {moment.frame}" if moment.first == moment.last else f"frames {moment.first} to {moment.last}"
+        label(axes, f"{where}  ({which})", "", "")
     for axes in panels[len(moments) :]:
         axes.set_axis_off()
     panels[0].figure.suptitle("frames, each scaled to its own brightness; x and y in px", fontsize=SMALL + 2)
