@@ -72,16 +72,16 @@ class Grid:
         voxel : float
             Distance of neighbouring voxel centres, m.
         near, far : float, optional
-            First and last z, m. They default to one voxel in front of the foremost wall point, and to the depth that
-            light reaches and returns from within the record, at most two wall widths.
+            First and last z, m. They default to one voxel in front of the middle of the wall's relief, and to the
+            depth that light reaches and returns from within the record, at most two wall widths.
         """
         low, high = capture.points.min(axis=0), capture.points.max(axis=0)
         width = float(max(high[0] - low[0], high[1] - low[1]))
+        middle = float(low[2] + high[2]) / 2
         if near is None:
-            near = float(high[2]) + voxel
+            near = middle + voxel
         if far is None:
-            reach = capture.axis.paths[-1] / 2
-            far = float(low[2] + high[2]) / 2 + float(min(reach, DEEPEST_WALL_WIDTHS * width))
+            far = middle + min(float(capture.axis.paths[-1]) / 2, DEEPEST_WALL_WIDTHS * width)
         if far < near:
             raise InputError(
                 f"no room for a hidden scene: z would run from {near:.3g} to {far:.3g} m; does the record "
@@ -90,7 +90,7 @@ class Grid:
         return cls.box((low[0], high[0]), (low[1], high[1]), (near, far), voxel)
 
     @classmethod
-    def around(cls, volume: Volume, voxel: float, fraction: float = 0.1) -> Grid:
+    def around(cls, volume: Volume, voxel: float, fraction: float = 0.15) -> Grid:
         """Fill the smallest box that holds everything bright in a coarse volume, with one of its voxels to spare.
 
         Imaging coarsely first and then here finely costs a small part of imaging everything finely.
