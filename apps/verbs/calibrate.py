@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from apps.options import AsJson, Picture, TimeZero
-from tofclip.units import NANOSECOND
+from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
     from tofclip.calibration import FocusCalibration
@@ -21,6 +21,17 @@ def calibrate(
     dot_background: Annotated[Path, typer.Option(metavar="TIF", help="The same without the source.")],
     out: Annotated[Path, typer.Option(metavar="H5", help="The camera file to write.")],
     time_zero_ns: TimeZero = None,
+    focal_length_px: Annotated[
+        float,
+        typer.Option(
+            metavar="PX",
+            help="Distance from lenslet to picture in pixels: it gives the cloud its width and height, and these "
+            "pictures do not show it. The default is that of similar instruments.",
+        ),
+    ] = 265.0,
+    pulse_ps: Annotated[
+        float, typer.Option(metavar="PS", help="Full width at half maximum of the response to a short pulse.")
+    ] = 60.0,
     preview: Picture = None,
     as_json: AsJson = False,
 ) -> None:
@@ -37,7 +48,11 @@ def calibrate(
     require_writable(preview, *PICTURE_SUFFIXES, inputs=pictures)
     lines, no_lines, dots, no_dots = (read_streak(path).counts for path in pictures)
     found = fit(lines, no_lines, dots, no_dots)
-    camera = found.camera(time_zero=(time_zero_ns or 0.0) * NANOSECOND)
+    camera = found.camera(
+        time_zero=(time_zero_ns or 0.0) * NANOSECOND,
+        focal_length_px=focal_length_px,
+        pulse_fwhm=pulse_ps * PICOSECOND,
+    )
     camera.save(out)
     save(calibration_figure(found), preview)
     _report(found, as_json, [out, preview])

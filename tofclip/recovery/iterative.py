@@ -1,0 +1,108 @@
+"""Recovery with a prior: the proximal methods."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofclip.arrays import LANES, run_blocks
+from tofclip.errors import InputError
+from tofclip.operators import LinearOperator, squared_norm
+from tofclip.recovery.data_terms import LeastSquares
+from tofclip.recovery.fista import Fista
+from tofclip.recovery.loop import History, Progress, Result, Stopping, iterate, silent
+from tofclip.recovery.method import Array, Mask, checked_readings, full_block, write_frames
+from tofclip.recovery.proximal import NonnegativeSparsity, NonnegativeTotalVariation, Regulariser
+
+NORM_ITERATIONS = 15
+NORM_MARGIN = 1.02  # 15 power iterations on a nonnegative matrix are within 1 % of the largest eigenvalue
+
+
+@dataclass(frozen=True)
+class _ProximalMethod(ABC):
+    """FISTA with a prior; what the prior is, subclasses say.
+
+    Parameters
+    ----------
+    weight : float
+        Regularisation relative to the largest value of ``A'f`` over all frames. At 1 the sparsest solution, zero, is
+        reached; the scale of the readings does not matter.
+    iterations : int
+        At most so many for each frame.
+    tolerance : float
+        Relative change of a block's objective below which it is done; 0: never.
+    """
+
+    weight: float
+    iterations: int
+    tolerance: float = 0.0
+
+    @abstractmethod
+    def _regulariser(self, weight: float) -> Regulariser:
+        """Make the prior for one block with an absolute weight."""
+
+    def recover(
+        self, operator: LinearOperator, readings: Array, good: Mask = None, progress: Progress = silent
+    ) -> Result:
+        """Recover one picture per column of `readings`; see `Method`."""
+        readings = checked_readings(operator, readings, good)
+        stopping = Stopping(self.iterations, self.tolerance)
+        step = 1 / (NORM_MARGIN * squared_norm(operator, NORM_ITERATIONS))
+        weight = self.weight * _largest_back_projection(operator, readings, good)
+        frames = np.empty((readings.shape[1], *operator.shape_in), operator.dtype)
+        histories: dict[int, History] = {}
+
+        def solve(piece: slice) -> None:
+            lanes = piece.stop - piece.start
+            data = LeastSquares(full_block(readings, piece), None if good is None else full_block(good, piece))
+            solver = Fista(operator, data, self._regulariser(weight), step, LANES)
+            histories[piece.start] = iterate(solver, stopping, progress, lanes)
+            write_frames(solver.current, frames, piece)
+
+        run_blocks(solve, readings.shape[1])
+        return Result.of_blocks(frames, [histories[start] for start in sorted(histories)])
+
+    def work(self, frames: int) -> int:
+        """Return how many frame iterations `recover` reports at most."""
+        return frames * self.iterations
+
+
+@dataclass(frozen=True)
+class Sparse(_ProximalMethod):
+    """Nonnegative pictures with few bright pixels (l1): right for single time bins of a ToF scene."""
+
+    weight: float = 2e-3
+    iterations: int = 60
+    name = "l1"
+
+    def _regulariser(self, weight: float) -> Regulariser:
+        return NonnegativeSparsity(weight)
+
+
+@dataclass(frozen=True)
+class TotalVariation(_ProximalMethod):
+    """Nonnegative pictures with sharp borders between even surfaces (isotropic total variation)."""
+
+    weight: float = 1e-3
+    iterations: int = 60
+    name = "tv"
+
+    def _regulariser(self, weight: float) -> Regulariser:
+        return NonnegativeTotalVariation(weight)
+
+
+def _largest_back_projection(operator: LinearOperator, readings: Array, good: Mask) -> float:
+    """The largest value of A'f: the weight at which the sparsest nonnegative solution becomes zero."""
+    peaks: list[float] = []
+
+    def look(piece: slice) -> None:
+        block = full_block(readings if good is None else readings * good, piece)
+        peaks.append(float(operator.adjoint(block).max()))
+
+    run_blocks(look, readings.shape[1])
+    peak = max(peaks)
+    if peak <= 0:
+        raise InputError("no view sees anything positive; was too high a background subtracted?")
+    return peak
