@@ -22,16 +22,20 @@ def calibrate(
     out: Annotated[Path, typer.Option(metavar="H5", help="The camera file to write.")],
     time_zero_ns: TimeZero = None,
     focal_length_px: Annotated[
-        float,
+        float | None,
         typer.Option(
             metavar="PX",
-            help="Distance from lenslet to picture in pixels: it gives the cloud its width and height, and these "
-            "pictures do not show it. The default is that of similar instruments.",
+            help="Distance from lenslet to picture in pixels, which these pictures do not show. It gives the cloud its "
+            "width and height.",
+            show_default="that of similar instruments",
         ),
-    ] = 265.0,
+    ] = None,
     pulse_ps: Annotated[
-        float, typer.Option(metavar="PS", help="Full width at half maximum of the response to a short pulse.")
-    ] = 60.0,
+        float | None,
+        typer.Option(
+            metavar="PS", help="Full width at half maximum of the response to a short pulse.", show_default="60"
+        ),
+    ] = None,
     preview: Picture = None,
     as_json: AsJson = False,
 ) -> None:
@@ -48,11 +52,12 @@ def calibrate(
     require_writable(preview, *PICTURE_SUFFIXES, inputs=pictures)
     lines, no_lines, dots, no_dots = (read_streak(path).counts for path in pictures)
     found = fit(lines, no_lines, dots, no_dots)
-    camera = found.camera(
-        time_zero=(time_zero_ns or 0.0) * NANOSECOND,
-        focal_length_px=focal_length_px,
-        pulse_fwhm=pulse_ps * PICOSECOND,
-    )
+    known = {
+        "time_zero": None if time_zero_ns is None else time_zero_ns * NANOSECOND,
+        "focal_length_px": focal_length_px,
+        "pulse_fwhm": None if pulse_ps is None else pulse_ps * PICOSECOND,
+    }
+    camera = found.camera(**{name: value for name, value in known.items() if value is not None})
     camera.save(out)
     save(calibration_figure(found), preview)
     _report(found, as_json, [out, preview])

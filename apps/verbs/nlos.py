@@ -37,7 +37,8 @@ def reconstruct(
     cycles: Annotated[float, typer.Option(metavar="N", help="Length of the virtual pulse in wavelengths.")] = 3.0,
     voxel_mm: Annotated[float, typer.Option(metavar="MM", help="Distance of neighbouring voxels.")] = 6.0,
     near_m: Annotated[
-        float | None, typer.Option(metavar="M", help="First depth.", show_default="just before the wall")
+        float | None,
+        typer.Option(metavar="M", help="First depth.", show_default="one voxel beyond the middle of the wall's relief"),
     ] = None,
     far_m: Annotated[
         float | None, typer.Option(metavar="M", help="Last depth.", show_default="as far as the record reaches")

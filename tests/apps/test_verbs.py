@@ -55,11 +55,15 @@ class TestCalibrate:
         assert camera.time_zero == 0
         assert (tmp_path / "camera.png").read_bytes().startswith(PNG)
 
-    def test_time_zero_and_table(self, run: Run, files: Path, tmp_path: Path) -> None:
+    def test_what_pictures_cannot_show_and_table(self, run: Run, files: Path, tmp_path: Path) -> None:
         out, picture = tmp_path / "camera.h5", tmp_path / "fits.png"
-        outcome = run(*self.words(files, out), "--time-zero-ns", "-10.784", "--preview", picture)
+        known = ("--time-zero-ns", "-10.784", "--focal-length-px", "411.5", "--pulse-ps", "45")
+        outcome = run(*self.words(files, out), *known, "--preview", picture)
         assert outcome.status == 0
-        assert Camera.load(out).time_zero == pytest.approx(-10.784e-9)
+        camera = Camera.load(out)
+        assert camera.time_zero == pytest.approx(-10.784e-9)
+        assert camera.focal_length_px == 411.5
+        assert camera.pulse_fwhm == pytest.approx(45e-12)
         lines = outcome.out.splitlines()
         assert len(lines) == 1 + 7 + 2  # heading, views, two files
         assert lines[-2:] == [f"wrote {out}", f"wrote {picture}"]
