@@ -2,6 +2,7 @@
 
 from tofclip.operators.base import (
     Adjoint,
+    BlockDiagonal,
     Composition,
     Diagonal,
     LinearOperator,
@@ -9,14 +10,25 @@ from tofclip.operators.base import (
     squared_norm,
 )
 from tofclip.operators.projection import LineProjection
+from tofclip.operators.radon import RadonProjection
+from tofclip.operators.shear import FourierShear, LinearShear
+from tofclip.operators.single_pixel import HadamardCodes, RandomCodes
 from tofclip.operators.sparse import SparseMatrix
+from tofclip.operators.weighting import MeanWeighting
 
 __all__ = [
     "Adjoint",
+    "BlockDiagonal",
     "Composition",
     "Diagonal",
+    "FourierShear",
+    "HadamardCodes",
     "LineProjection",
     "LinearOperator",
+    "LinearShear",
+    "MeanWeighting",
+    "RadonProjection",
+    "RandomCodes",
     "SparseMatrix",
     "Stack",
     "squared_norm",

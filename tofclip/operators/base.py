@@ -156,6 +156,27 @@ class Stack(LinearOperator):
         return total
 
 
+class BlockDiagonal(LinearOperator):
+    """One operator for each entry of the input's first axis, their results joined: ``[A_1 x_1; A_2 x_2; ...]``.
+
+    With a view's encoder for each view it is the model of a whole 4D light field (supplement Eq. 20).
+    """
+
+    def __init__(self, operators: Sequence[LinearOperator]) -> None:
+        stacked = Stack(operators)  # refuses operators that do not fit each other
+        super().__init__((len(operators), *stacked.shape_in), stacked.shape_out, stacked.dtype)
+        self.operators = stacked.operators
+        self._cuts = np.cumsum([operator.shape_out[0] for operator in operators])[:-1]
+
+    def _forward(self, block: Array) -> Array:
+        pairs = zip(self.operators, block, strict=True)
+        return np.concatenate([operator._forward(part) for operator, part in pairs])
+
+    def _adjoint(self, block: Array) -> Array:
+        pairs = zip(self.operators, np.split(block, self._cuts), strict=True)
+        return np.stack([operator._adjoint(part) for operator, part in pairs])
+
+
 class Diagonal(LinearOperator):
     """Elementwise weights, such as view gains or a mask of live pixels; self-adjoint."""
 

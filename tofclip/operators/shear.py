@@ -1,0 +1,104 @@
+"""The shear B_k: from the refocused reference picture to the picture that a view sees (supplement Eq. 3)."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from tofclip.errors import InputError
+from tofclip.operators.base import Array, LinearOperator
+
+View = tuple[float, float]
+
+
+class _Shear(LinearOperator):
+    """A shift of the whole picture by s times the view's distance from the reference view.
+
+    View (v, u) sees ``p(x, y) = h(x - s (u - u_ref), y - s (v - v_ref))``. The adjoint is the opposite shift, exactly.
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+        Rows and columns.
+    shear : float
+        s, pixels per view step.
+    view, reference : (float, float)
+        (v, u) on the view grid. The reference may lie anywhere (viewpoint synthesis).
+    dtype : dtype
+        float32 or float64.
+
+    Raises
+    ------
+    InputError
+        The shift is not finite or pushes the whole picture out of the field.
+    """
+
+    def __init__(
+        self,
+        image_shape: tuple[int, int],
+        shear: float,
+        view: View,
+        reference: View = (0.0, 0.0),
+        dtype: DTypeLike = np.float32,
+    ) -> None:
+        super().__init__(image_shape, image_shape, dtype)
+        self.shift_px = tuple(float(shear * (a - b)) for a, b in zip(view, reference, strict=True))
+        if not all(abs(shift) < size for shift, size in zip(self.shift_px, image_shape, strict=True)):
+            raise InputError(
+                f"shear {shear} moves view {view} by {self.shift_px} px, out of a {image_shape} picture; "
+                "take a shear nearer to zero"
+            )
+
+    def _forward(self, block: Array) -> Array:
+        return self._shifted(block, self.shift_px[0], self.shift_px[1])
+
+    def _adjoint(self, block: Array) -> Array:
+        return self._shifted(block, -self.shift_px[0], -self.shift_px[1])
+
+    @abstractmethod
+    def _shifted(self, block: Array, down: float, right: float) -> Array:
+        """Shift a (rows, columns, batch) block."""
+
+
+class LinearShear(_Shear):
+    """The shear with linear interpolation between neighbouring pixels; dark beyond the border."""
+
+    def _shifted(self, block: Array, down: float, right: float) -> Array:
+        return _shift_linearly(_shift_linearly(block, down, 0), right, 1)
+
+
+class FourierShear(_Shear):
+    """The shear with Fourier interpolation: no blur, but periodic: what leaves on one side enters on the other."""
+
+    def _shifted(self, block: Array, down: float, right: float) -> Array:
+        import scipy.fft
+
+        rows, columns = self.shape_in
+        spectrum = scipy.fft.rfft2(block, axes=(0, 1))
+        spectrum *= _delay(np.fft.fftfreq(rows), down)[:, np.newaxis, np.newaxis]
+        spectrum *= _delay(np.fft.rfftfreq(columns), right)[:, np.newaxis]
+        shifted = scipy.fft.irfft2(spectrum, s=(rows, columns), axes=(0, 1))
+        return np.ascontiguousarray(shifted, dtype=self.dtype)
+
+
+def _delay(cycles_per_px: Array, shift_px: float) -> Array:
+    """Spectrum of a shift. At the Nyquist frequency only its real part keeps a real picture real."""
+    delay = np.exp(-2j * np.pi * cycles_per_px * shift_px)
+    return np.where(np.abs(cycles_per_px) == 0.5, delay.real, delay)
+
+
+def _shift_linearly(block: Array, shift_px: float, axis: int) -> Array:
+    """Shift along one axis; ``result[i] = (1 - f) block[i - n] + f block[i - n - 1]`` for a shift of n + f."""
+    if shift_px == 0:
+        return block
+    whole = int(np.floor(shift_px))
+    share = block.dtype.type(shift_px - whole)
+    result = np.zeros_like(block)
+    target, source = np.moveaxis(result, axis, 0), np.moveaxis(block, axis, 0)
+    size = block.shape[axis]
+    for steps, weight in ((whole, 1 - share), (whole + 1, share)):
+        if abs(steps) < size and weight != 0:
+            target[max(steps, 0) : size + min(steps, 0)] += weight * source[max(-steps, 0) : size - max(steps, 0)]
+    return result
