@@ -48,6 +48,22 @@ def test_a_prepared_inverse_serves_many_shots(operator):
     np.testing.assert_array_equal(prepared.recover(readings).frames, LinearInverse().recover(operator, readings).frames)
 
 
+def test_frames_can_be_written_into_memory_at_hand(operator):
+    readings = np.random.default_rng(6).random((40, 33))
+    prepared = LinearInverse().prepare(operator)
+    out = np.full((33, 12, 11), np.nan)
+    assert prepared.recover(readings, out=out).frames is out
+    np.testing.assert_array_equal(out, prepared.recover(readings).frames)
+    for unfit in (out[:-1], out.astype(np.float32), np.asfortranarray(out)):
+        with pytest.raises(ShapeError, match="out must have shape"):
+            prepared.recover(readings, out=unfit)
+
+
+def test_setting_up_is_told_apart_from_recovering(operator):
+    result = LinearInverse().recover(operator, np.ones((40, 2)))
+    assert result.setup_seconds > 0
+
+
 def test_adjoint_is_the_adjoint_up_to_one_factor(operator):
     readings = np.random.default_rng(3).random((40, 37))
     expected = np.moveaxis(operator.adjoint(readings), -1, 0)
@@ -132,3 +148,15 @@ def test_relative_residual_by_hand(operator):
     assert relative_residual(operator, frames, readings, good) < 1e-14
     with pytest.raises(InputError, match="zero"):
         relative_residual(operator, frames, 0 * readings)
+
+
+@pytest.mark.parametrize("method", [Sparse(), TotalVariation()], ids=lambda method: method.name)
+def test_a_lone_picture_is_recovered_as_in_a_block(method):
+    """One picture takes loops of one lane, many take blocks; float32 rounding is all that may differ."""
+    random = np.random.default_rng(4)
+    operator = LineProjection((15, 17), 90, [14.0, 44.0, 74.0], [0.5, 0.0, -0.5], [1.0, 1.0, 1.0])
+    picture = (random.random((15, 17)) > 0.8).astype(np.float32)
+    readings = operator(picture)[:, np.newaxis]
+    alone = method.recover(operator, readings).frames[0]
+    many = method.recover(operator, np.tile(readings, 3)).frames
+    np.testing.assert_allclose(alone, many[1], atol=1e-3 * alone.max())

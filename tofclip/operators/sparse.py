@@ -43,10 +43,20 @@ class SparseMatrix(LinearOperator):
         self._columns = Tiles.of(self.matrix.T.tocsr())
 
     def _forward(self, block: Array) -> Array:
+        if block.shape[-1] == 1:
+            return self._single(self.matrix, block, self.shape_out)
         return self._product(self._rows, block, self.shape_in, self.shape_out)
 
     def _adjoint(self, block: Array) -> Array:
+        if block.shape[-1] == 1:
+            return self._single(self.matrix.T, block, self.shape_in)
         return self._product(self._columns, block, self.shape_out, self.shape_in)
+
+    @staticmethod
+    def _single(matrix: scipy.sparse.csr_array, block: Array, target: Shape) -> Array:
+        """Multiply a batch of one, where there are no neighbouring frames to share a vector instruction with."""
+        product: Array = matrix @ block.reshape(-1)
+        return product.reshape(*target, 1)
 
     def _product(self, tiles: Tiles, block: Array, source: Shape, target: Shape) -> Array:
         from tofclip.operators.kernels import sparse_times_block

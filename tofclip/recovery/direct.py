@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import LANES, run_blocks
-from tofclip.errors import InputError
+from tofclip.arrays import LANES, blocks, run_blocks
+from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator, SparseMatrix, squared_norm
 from tofclip.recovery.loop import Progress, Result, silent
 from tofclip.recovery.method import Array, Mask, checked_readings, full_block, write_frames
 
+DENSE_FRAMES = 4 * LANES  # the dense matrix is read from memory once for so many frames
 NORM_ITERATIONS = 15  # the damping need not be known better than to a percent
 
 
@@ -65,8 +67,10 @@ class LinearInverse:
 
         Readings that are bad in every frame are left out; a linear map cannot leave out a reading of one frame only.
         """
-        alive = None if good is None else np.asarray(good.any(axis=1))
-        return self.prepare(operator, alive).recover(readings, progress)
+        started = time.perf_counter()
+        prepared = self.prepare(operator, None if good is None else np.asarray(good.any(axis=1)))
+        setup_seconds = time.perf_counter() - started
+        return replace(prepared.recover(readings, progress), setup_seconds=setup_seconds)
 
     def work(self, frames: int) -> int:
         """Return how many frame iterations `recover` reports at most."""
@@ -87,21 +91,35 @@ class PreparedInverse:
     operator: LinearOperator
     inverse_gram: Array
 
-    def recover(self, readings: Array, progress: Progress = silent) -> Result:
-        """Recover one picture per column of `readings`, (readings, frames)."""
+    def recover(self, readings: Array, progress: Progress = silent, out: Array | None = None) -> Result:
+        """Recover one picture per column of `readings`.
+
+        Parameters
+        ----------
+        readings : (readings, frames) array
+        progress : callable
+            Called with the number of frames just done.
+        out : (frames, rows, columns) array of the operator's type, optional
+            Where the frames are written; for shot after shot, fresh memory would cost a quarter of the time.
+        """
         from threadpoolctl import threadpool_limits
 
         readings = checked_readings(self.operator, readings, None)
-        frames = np.empty((readings.shape[1], *self.operator.shape_in), self.operator.dtype)
+        shape = (readings.shape[1], *self.operator.shape_in)
+        frames = np.empty(shape, self.operator.dtype) if out is None else out
+        if frames.shape != shape or frames.dtype != self.operator.dtype or not frames.flags.c_contiguous:
+            raise ShapeError("out", f"{shape}, contiguous, {self.operator.dtype}", (*frames.shape, frames.dtype))
 
         def solve(piece: slice) -> None:
-            weights = self.inverse_gram @ full_block(readings, piece)
-            write_frames(self.operator.adjoint(weights), frames, piece)
+            weights = self.inverse_gram @ readings[:, piece]
+            for part in blocks(piece.stop - piece.start):
+                whole = slice(piece.start + part.start, piece.start + part.stop)
+                write_frames(self.operator.adjoint(full_block(weights, part)), frames, whole)
             progress(piece.stop - piece.start)
 
         # The blocks already keep every core busy: BLAS threads of its own would wait for, and spin against, ours.
         with threadpool_limits(1, "blas"):
-            run_blocks(solve, readings.shape[1])
+            run_blocks(solve, readings.shape[1], DENSE_FRAMES)
         return Result(frames)
 
 

@@ -11,7 +11,7 @@ from tofclip.recovery.proximal import Regulariser
 
 
 class Fista:
-    """Minimise ``data(A h) + R(h)`` for a block of `LANES` frames at once.
+    """Minimise ``data(A h) + R(h)`` for a block of frames at once.
 
     A. Beck, M. Teboulle, SIAM J. Imaging Sci. 2, 183 (2009); a step that would raise a frame's objective is refused
     and that frame's momentum starts anew (B. O'Donoghue, E. Candes, Found. Comput. Math. 15, 715 (2015)). ``A z`` at

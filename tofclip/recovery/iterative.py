@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofclip.arrays import LANES, run_blocks
+from tofclip.arrays import run_blocks
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, squared_norm
 from tofclip.recovery.data_terms import LeastSquares
@@ -55,10 +55,9 @@ class _ProximalMethod(ABC):
         histories: dict[int, History] = {}
 
         def solve(piece: slice) -> None:
-            lanes = piece.stop - piece.start
             data = LeastSquares(full_block(readings, piece), None if good is None else full_block(good, piece))
-            solver = Fista(operator, data, self._regulariser(weight), step, LANES)
-            histories[piece.start] = iterate(solver, stopping, progress, lanes)
+            solver = Fista(operator, data, self._regulariser(weight), step, data.readings.shape[1])
+            histories[piece.start] = iterate(solver, stopping, progress, piece.stop - piece.start)
             write_frames(solver.current, frames, piece)
 
         run_blocks(solve, readings.shape[1])

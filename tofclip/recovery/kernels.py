@@ -1,4 +1,4 @@
-"""Compiled inner loops of the solvers, on blocks of exactly `LANES` frames side by side.
+"""Compiled inner loops of the solvers, on blocks of frames side by side: `LANES` of them, or a single one.
 
 Every array is C-contiguous with the frames as last axis, so that one vector instruction treats many frames at once and
 every frame's result is independent of its neighbours in the block. Sums over a picture are taken row by row and added
@@ -15,20 +15,22 @@ from tofclip.arrays import LANES
 TILE = 32
 
 compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy")
+inlined = njit(inline="always")  # so that a full block's number of lanes is a constant to the compiler
 
 
 @compiled
 def nonnegative_shrinkage(current, previous, momentum, gradient, step, threshold, total):
     """``previous = max(z - step * gradient - threshold, 0)`` with ``z = current + momentum * (current - previous)``.
 
-    Pictures are (rows, columns, LANES), `momentum` is (LANES,); `total` (LANES,) float64 gets the sum of the result.
+    Pictures are (rows, columns, lanes), `momentum` is (lanes,); `total` (lanes,) float64 gets the sum of the result.
     """
-    partial = np.empty(LANES, current.dtype)
+    lanes = current.shape[2]
+    partial = np.empty(lanes, current.dtype)
     total[:] = 0
     for row in range(current.shape[0]):
         partial[:] = 0
         for column in range(current.shape[1]):
-            for lane in range(LANES):
+            for lane in range(lanes):
                 here = current[row, column, lane]
                 point = here + momentum[lane] * (here - previous[row, column, lane])
                 value = max(point - step * gradient[row, column, lane] - threshold, np.float32(0))
@@ -40,9 +42,10 @@ def nonnegative_shrinkage(current, previous, momentum, gradient, step, threshold
 @compiled
 def gradient_step(current, previous, momentum, gradient, step):
     """``gradient = z - step * gradient`` with ``z = current + momentum * (current - previous)``."""
+    lanes = current.shape[2]
     for row in range(current.shape[0]):
         for column in range(current.shape[1]):
-            for lane in range(LANES):
+            for lane in range(lanes):
                 here = current[row, column, lane]
                 point = here + momentum[lane] * (here - previous[row, column, lane])
                 gradient[row, column, lane] = point - step * gradient[row, column, lane]
@@ -64,17 +67,18 @@ def lanes_to_frames(block, frames):
 
 @compiled
 def put_back(candidate, current, rejected):
-    """``candidate = current`` in the lanes where `rejected` is 1; it is 0 elsewhere. Arrays are (..., LANES)."""
+    """``candidate = current`` in the lanes where `rejected` is 1; it is 0 elsewhere. Arrays are (..., lanes)."""
+    lanes = candidate.shape[2]
     for row in range(current.shape[0]):
         for column in range(current.shape[1]):
-            for lane in range(LANES):
+            for lane in range(lanes):
                 here = candidate[row, column, lane]
                 candidate[row, column, lane] = here + rejected[lane] * (current[row, column, lane] - here)
 
 
-@compiled
-def _primal_row(row, noisy, dual, weight, result):
-    """One row of ``result = max(noisy + weight * div(dual), 0)``; `dual` is (2, rows, columns, LANES).
+@inlined
+def _primal_row(row, noisy, dual, weight, result, lanes):
+    """One row of ``result = max(noisy + weight * div(dual), 0)``; `dual` is (2, rows, columns, lanes).
 
     The last row of the vertical and the last column of the horizontal dual are always zero (the difference across the
     border is), so only the first ones need care.
@@ -84,19 +88,19 @@ def _primal_row(row, noisy, dual, weight, result):
     for column in range(noisy.shape[1]):
         left = max(column - 1, 0)
         has_left = noisy.dtype.type(column > 0)
-        for lane in range(LANES):
+        for lane in range(lanes):
             divergence = dual[0, row, column, lane] - has_above * dual[0, above, column, lane]
             divergence += dual[1, row, column, lane] - has_left * dual[1, row, left, lane]
             result[row, column, lane] = max(noisy[row, column, lane] + weight * divergence, np.float32(0))
 
 
-@compiled
-def _dual_row(row, picture, dual, step):
+@inlined
+def _dual_row(row, picture, dual, step, lanes):
     """One row of ``dual = project(dual + step * grad(picture))`` onto vectors of length at most 1."""
     below = min(row + 1, picture.shape[0] - 1)
     for column in range(picture.shape[1]):
         right = min(column + 1, picture.shape[1] - 1)
-        for lane in range(LANES):
+        for lane in range(lanes):
             here = picture[row, column, lane]
             vertical = dual[0, row, column, lane] + step * (picture[below, column, lane] - here)
             horizontal = dual[1, row, column, lane] + step * (picture[row, right, lane] - here)
@@ -105,39 +109,55 @@ def _dual_row(row, picture, dual, step):
             dual[1, row, column, lane] = horizontal * shrink
 
 
+@inlined
+def _dual_sweeps(noisy, dual, weight, sweeps, result, lanes):
+    rows = noisy.shape[0]
+    step = 1 / (8 * weight)
+    for _ in range(sweeps):
+        _primal_row(0, noisy, dual, weight, result, lanes)
+        for row in range(rows):
+            if row + 1 < rows:
+                _primal_row(row + 1, noisy, dual, weight, result, lanes)
+            _dual_row(row, result, dual, step, lanes)
+
+
 @compiled
 def total_variation_dual_sweeps(noisy, dual, weight, sweeps, result):
     """Projected-gradient sweeps on the dual of ``1/2 |x - noisy|^2 + weight * TV(x), x >= 0`` (Chambolle 2004).
 
     The primal row below is made before a dual row changes, so that a sweep passes through memory once.
     """
-    rows = noisy.shape[0]
-    step = 1 / (8 * weight)
-    for _ in range(sweeps):
-        _primal_row(0, noisy, dual, weight, result)
-        for row in range(rows):
-            if row + 1 < rows:
-                _primal_row(row + 1, noisy, dual, weight, result)
-            _dual_row(row, result, dual, step)
+    if noisy.shape[2] == LANES:
+        _dual_sweeps(noisy, dual, weight, sweeps, result, LANES)
+    else:
+        _dual_sweeps(noisy, dual, weight, sweeps, result, noisy.shape[2])
 
 
-@compiled
-def total_variation_primal(noisy, dual, weight, result, total):
-    """Make the picture that belongs to `dual`; `total` (LANES,) float64 gets its isotropic total variation."""
+@inlined
+def _primal(noisy, dual, weight, result, total, lanes):
     rows, columns = noisy.shape[0], noisy.shape[1]
-    partial = np.empty(LANES, noisy.dtype)
+    partial = np.empty(lanes, noisy.dtype)
     total[:] = 0
-    _primal_row(0, noisy, dual, weight, result)
+    _primal_row(0, noisy, dual, weight, result, lanes)
     for row in range(rows):
         below = min(row + 1, rows - 1)
         if row + 1 < rows:
-            _primal_row(row + 1, noisy, dual, weight, result)
+            _primal_row(row + 1, noisy, dual, weight, result, lanes)
         partial[:] = 0
         for column in range(columns):
             right = min(column + 1, columns - 1)
-            for lane in range(LANES):
+            for lane in range(lanes):
                 here = result[row, column, lane]
                 vertical = result[below, column, lane] - here
                 horizontal = result[row, right, lane] - here
                 partial[lane] += np.sqrt(vertical * vertical + horizontal * horizontal)
         total += partial
+
+
+@compiled
+def total_variation_primal(noisy, dual, weight, result, total):
+    """Make the picture that belongs to `dual`; `total` (lanes,) float64 gets its isotropic total variation."""
+    if noisy.shape[2] == LANES:
+        _primal(noisy, dual, weight, result, total, LANES)
+    else:
+        _primal(noisy, dual, weight, result, total, noisy.shape[2])

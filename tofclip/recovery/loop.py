@@ -103,12 +103,15 @@ class Result:
         Sum over all frames; blocks that stopped early count with their last value. Empty for direct methods.
     stopped_because : str
         ``"converged"``, ``"iteration limit"`` or ``"direct method"``.
+    setup_seconds : float
+        Time spent on what depends on the operator only and could be kept for the next shot.
     """
 
     frames: NDArray[Any]
     iterations: int = 0
     objective: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     stopped_because: str = "direct method"
+    setup_seconds: float = 0.0
 
     @classmethod
     def of_blocks(cls, frames: NDArray[Any], histories: list[History]) -> Result:

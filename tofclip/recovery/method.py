@@ -80,14 +80,14 @@ def checked_readings(operator: LinearOperator, readings: Array, good: Mask) -> A
 
 
 def full_block(values: Array, piece: slice) -> Array:
-    """Copy the columns `piece` into a block of exactly `LANES` columns, zero beyond them."""
-    block = np.zeros((values.shape[0], LANES), values.dtype)
+    """Copy the columns `piece` into a block of exactly `LANES` columns, zero beyond them; a lone frame stays alone."""
+    block = np.zeros((values.shape[0], LANES if values.shape[1] > 1 else 1), values.dtype)
     block[:, : piece.stop - piece.start] = values[:, piece]
     return block
 
 
 def write_frames(block: Array, frames: Array, piece: slice) -> None:
-    """Put a (rows, columns, LANES) block where its frames belong."""
+    """Put a (rows, columns, lanes) block where its frames belong."""
     from tofclip.recovery.kernels import lanes_to_frames
 
     target = frames[piece].reshape(piece.stop - piece.start, -1)

@@ -13,13 +13,13 @@ Array = NDArray[Any]
 
 
 class Regulariser(Protocol):
-    """A penalty R(h) whose proximal map is known, on a block of (rows, columns, LANES) pictures."""
+    """A penalty R(h) whose proximal map is known, on a block of (rows, columns, lanes) pictures."""
 
     def descend(self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float) -> Array:
         """Overwrite `previous` with ``prox_{step R}(z - step * gradient)``, a proximal gradient step.
 
         ``z = current + momentum * (current - previous)`` is the extrapolated point and `gradient` belongs to it.
-        `gradient` may be overwritten as well. Returns R of the result for each frame, (LANES,) float64.
+        `gradient` may be overwritten as well. Returns R of the result for each frame, (lanes,) float64.
         """
         ...
 
