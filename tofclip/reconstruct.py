@@ -90,7 +90,8 @@ class Task:
             "stopped_because": result.stopped_because,
             "relative_residual": relative_residual(operator, result.frames, measurement.readings, measurement.good),
             "seconds": time.perf_counter() - started,
-            "frames_per_second": result.frames.shape[0] / (solved - solving),
+            "frames_per_second": result.frames.shape[0] / (solved - solving - result.setup_seconds),
+            "setup_seconds": result.setup_seconds,
         }
         return Frames(
             values=result.frames,

@@ -95,11 +95,13 @@ def table(frames: int, repeats: int) -> list[dict[str, object]]:
     """Measure everything; one row for each action."""
     projection, data = operator(), readings(frames)
     prepared = LinearInverse().prepare(projection)
+    memory = np.empty((frames, *projection.shape_in), np.float32)
     actions: dict[str, Callable[[], object]] = {
         "bare products": lambda: bare_products(projection, frames, ITERATIONS),
         "scipy products": lambda: scipy_products(projection, frames, ITERATIONS),
         **{name: (lambda method=method: method.recover(projection, data)) for name, method in METHODS.items()},
         "linear, prepared": lambda: prepared.recover(data),
+        "linear, in place": lambda: prepared.recover(data, out=memory),
     }
     rows: list[dict[str, object]] = []
     floor = 0.0

@@ -35,12 +35,14 @@ def _row_times_block(
     values: Any,
     first: Any,
     last: Any,
+    onto: Any,
 ) -> Any:
-    """``result[row, :LANES] += sum_q values[q] * block[columns[q], :LANES]`` for q in [first, last).
+    """``result[row, :LANES] = start + sum_q values[q] * block[columns[q], :LANES]`` for q in [first, last).
 
-    `stride` is the length of a row of both blocks, which must be C-contiguous.
+    `start` is 0, or what stands there already where the boolean `onto` says so. `stride` is the length of a row of
+    both blocks, which must be C-contiguous.
     """
-    signature = types.void(result, row, stride, block, columns, values, first, last)
+    signature = types.void(result, row, stride, block, columns, values, first, last, onto)
 
     def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         def data(k: int) -> Any:
@@ -65,7 +67,8 @@ def _row_times_block(
 
         destination = lanes_at(target, row_number)
         zero = ir.Constant(vector, [0.0] * LANES)
-        starts = [builder.load(destination, align=4)] + [zero] * (UNROLL - 1)
+        present = builder.select(arguments[8], builder.load(destination, align=4), zero)
+        starts = [present] + [zero] * (UNROLL - 1)
         accumulators = [cgutils.alloca_once_value(builder, start) for start in starts]
         position = cgutils.alloca_once_value(builder, begin)
         for step in (UNROLL, 1):
@@ -112,9 +115,9 @@ def sparse_times_block(tile_starts, columns, values, block, result):
     block : (M's columns, LANES) C-contiguous array of the type of `values`
     result : (rows, LANES) C-contiguous array, overwritten
     """
-    result[:] = 0
     for tile in range(tile_starts.shape[0]):
+        onto = tile > 0
         for row in range(tile_starts.shape[1] - 1):
             first, last = tile_starts[tile, row], tile_starts[tile, row + 1]
-            if first < last:
-                _row_times_block(result, row, LANES, block, columns, values, first, last)
+            if first < last or not onto:
+                _row_times_block(result, row, LANES, block, columns, values, first, last, onto)
