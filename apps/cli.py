@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from apps.verbs import calibrate, cloud, convert, demo, info, nlos, recover
+from apps.verbs import calibrate, clip, cloud, convert, demo, info, nlos, recover
 from tofclip import __version__
 from tofclip.errors import TofclipError
 
@@ -43,6 +43,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   recover            streak image to one picture per instant
   cloud              recovered frames to a point cloud
   nlos reconstruct   recovered frames of a wall to the scene hidden around the corner
+  clip               light fields from few readings: simulate a camera, recover a picture
   convert            any readable streak image to this program's own HDF5
   info               what a file holds
 
@@ -54,6 +55,7 @@ app.command(epilog=EPILOG)(calibrate.calibrate)
 app.command(epilog=EPILOG)(recover.recover)
 app.command(epilog=EPILOG)(cloud.cloud)
 app.add_typer(nlos.app, name="nlos")
+app.add_typer(clip.app, name="clip")
 app.command(epilog=EPILOG)(convert.convert)
 app.command(epilog=EPILOG)(info.info)
 

@@ -47,7 +47,13 @@ class _ProximalMethod(ABC):
         self, operator: LinearOperator, readings: Array, good: Mask = None, progress: Progress = silent
     ) -> Result:
         """Recover one picture per column of `readings`; see `Method`."""
-        readings = checked_readings(operator, readings, good)
+        from threadpoolctl import threadpool_limits
+
+        # Blocks share the cores already, and a lone picture's products are too small to share.
+        with threadpool_limits(1, "blas"):
+            return self._recover(operator, checked_readings(operator, readings, good), good, progress)
+
+    def _recover(self, operator: LinearOperator, readings: Array, good: Mask, progress: Progress) -> Result:
         stopping = Stopping(self.iterations, self.tolerance)
         step = 1 / (NORM_MARGIN * squared_norm(operator, NORM_ITERATIONS))
         weight = self.weight * _largest_back_projection(operator, readings, good)

@@ -1,0 +1,131 @@
+"""Readings of a light-field camera: how they were made, how they are kept, and the problem that they pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import InputError, ShapeError
+from tofclip.light_field import LightField
+from tofclip.operators import LinearOperator
+from tofclip.operators.light_field_camera import CAMERAS, LightFieldCamera
+from tofclip.storage import Field, Record
+
+TOTAL_VARIATION = {"line": 2.5e-2, "single-pixel": 8e-2}  # weights relative to the largest A'f, from sweeps on letters
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Which camera measures.
+
+    Parameters
+    ----------
+    encoder : str
+        ``"line"`` or ``"single-pixel"``.
+    sampling_ratio : float
+        Readings over pixels of one picture.
+    seed : int
+    """
+
+    encoder: str
+    sampling_ratio: float
+    seed: int
+
+    def camera(self, image_shape: tuple[int, int], views: NDArray[np.float64]) -> LightFieldCamera:
+        """Build the camera; the same setup builds the same one again."""
+        if self.encoder not in CAMERAS:
+            raise InputError(f"unknown encoder '{self.encoder}'; take one of {', '.join(CAMERAS)}")
+        return CAMERAS[self.encoder](image_shape, [(v, u) for v, u in views.tolist()], self.sampling_ratio, self.seed)
+
+
+@dataclass(frozen=True)
+class ClipMeasurement:
+    """Readings and the camera that made them.
+
+    Parameters
+    ----------
+    readings : (readings,) float32 array
+    views : (views, 2) array
+        (v, u) of every view.
+    image_shape : (int, int)
+    setup : Setup
+    """
+
+    readings: NDArray[Any]
+    views: NDArray[np.float64]
+    image_shape: tuple[int, int]
+    setup: Setup
+
+    def problem(self, shear: float) -> tuple[LinearOperator, NDArray[Any], float]:
+        """Return the weighted model F(d), the weighted readings, and the prior's relative weight."""
+        camera = self.setup.camera(self.image_shape, self.views)
+        weighting = camera.weighting()
+        if self.readings.shape != weighting.shape_in:
+            raise ShapeError("the readings of this camera", weighting.shape_in, self.readings.shape)
+        return weighting @ camera.model(shear), weighting(self.readings), TOTAL_VARIATION[self.setup.encoder]
+
+    def to_record(self, provenance: Mapping[str, Any]) -> Record:
+        """Return what is written to a file."""
+        return Record(
+            "clip_measurement",
+            {
+                "readings": Field(self.readings, "", ("reading",)),
+                "views": Field(self.views, "", ("view", "vu")),
+            },
+            {
+                "rows": self.image_shape[0],
+                "columns": self.image_shape[1],
+                "encoder": self.setup.encoder,
+                "sampling_ratio": self.setup.sampling_ratio,
+                "seed": self.setup.seed,
+            },
+            provenance=provenance,
+        )
+
+    @classmethod
+    def from_record(cls, record: Record) -> ClipMeasurement:
+        """Rebuild a measurement from its record."""
+        setup = Setup(
+            str(record.attribute("encoder")),
+            float(record.attribute("sampling_ratio")),
+            int(record.attribute("seed")),
+        )
+        shape = (int(record.attribute("rows")), int(record.attribute("columns")))
+        return cls(record.array("readings", np.float32, 1), record.array("views", np.float64, 2), shape, setup)
+
+
+def measure(light_field: LightField, setup: Setup) -> ClipMeasurement:
+    """Encode the true views, each by its own A_k: no model of refocusing takes part."""
+    shape = (light_field.pictures.shape[1], light_field.pictures.shape[2])
+    camera = setup.camera(shape, light_field.views)
+    readings = camera.light_field_model()(light_field.pictures[list(camera.used)])
+    return ClipMeasurement(readings, light_field.views, shape, setup)
+
+
+def spoilt(measurement: ClipMeasurement, photons: float | None, bad_fraction: float) -> ClipMeasurement:
+    """Add photon noise, then set a share of all readings to 0 or to the largest, at random.
+
+    Parameters
+    ----------
+    measurement : ClipMeasurement
+    photons : float or None
+        Photons of the largest reading; None: no noise.
+    bad_fraction : float
+        Between 0 and 1.
+    """
+    if not 0 <= bad_fraction <= 1:
+        raise InputError(f"the share of bad readings must lie between 0 and 1, got {bad_fraction}")
+    if photons is not None and not (np.isfinite(photons) and photons > 0):
+        raise InputError(f"the number of photons must be positive, got {photons}")
+    random = np.random.default_rng([measurement.setup.seed, 1])
+    readings = measurement.readings.copy()
+    largest = readings.max()
+    if photons is not None:
+        readings = (random.poisson(readings * (photons / largest)) * (largest / photons)).astype(np.float32)
+    bad = random.permutation(readings.size)[: round(bad_fraction * readings.size)]
+    readings[bad] = random.choice(np.array([0, largest], np.float32), bad.size)
+    return replace(measurement, readings=readings)
