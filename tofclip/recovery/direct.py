@@ -58,7 +58,10 @@ class LinearInverse:
         inverse = np.zeros((alive.size, alive.size), operator.dtype)
         factor = scipy.linalg.cho_factor(gram, lower=True, overwrite_a=True)
         inverse[np.ix_(alive, alive)] = scipy.linalg.cho_solve(factor, np.eye(gram.shape[0]))
-        return PreparedInverse(operator, inverse)
+        prepared = PreparedInverse(operator, inverse)
+        # One dark block loads the compiled loops and the BLAS before the first shot needs them.
+        prepared.recover(np.zeros((alive.size, LANES), operator.dtype))
+        return prepared
 
     def recover(
         self, operator: LinearOperator, readings: Array, good: Mask = None, progress: Progress = silent

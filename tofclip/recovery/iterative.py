@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -55,7 +56,10 @@ class _ProximalMethod(ABC):
 
     def _recover(self, operator: LinearOperator, readings: Array, good: Mask, progress: Progress) -> Result:
         stopping = Stopping(self.iterations, self.tolerance)
+        started = time.perf_counter()
         step = 1 / (NORM_MARGIN * squared_norm(operator, NORM_ITERATIONS))
+        self._load_loops(operator, step, full_block(readings, slice(0, 0)))
+        setup_seconds = time.perf_counter() - started
         weight = self.weight * _largest_back_projection(operator, readings, good)
         frames = np.empty((readings.shape[1], *operator.shape_in), operator.dtype)
         histories: dict[int, History] = {}
@@ -67,7 +71,14 @@ class _ProximalMethod(ABC):
             write_frames(solver.current, frames, piece)
 
         run_blocks(solve, readings.shape[1])
-        return Result.of_blocks(frames, [histories[start] for start in sorted(histories)])
+        return Result.of_blocks(frames, [histories[start] for start in sorted(histories)], setup_seconds)
+
+    def _load_loops(self, operator: LinearOperator, step: float, dark: Array) -> None:
+        """Take one step on a dark block, so that compiled loops are loaded before the first thread needs them."""
+        lanes = dark.shape[1]
+        solver = Fista(operator, LeastSquares(dark), self._regulariser(1.0), step, lanes)
+        solver.step()
+        write_frames(solver.current, np.empty((lanes, *operator.shape_in), operator.dtype), slice(0, lanes))
 
     def work(self, frames: int) -> int:
         """Return how many frame iterations `recover` reports at most."""
@@ -103,7 +114,9 @@ def _largest_back_projection(operator: LinearOperator, readings: Array, good: Ma
     peaks: list[float] = []
 
     def look(piece: slice) -> None:
-        block = full_block(readings if good is None else readings * good, piece)
+        block = full_block(readings, piece)
+        if good is not None:
+            block *= full_block(good, piece)
         peaks.append(float(operator.adjoint(block).max()))
 
     run_blocks(look, readings.shape[1])

@@ -104,7 +104,7 @@ class Result:
     stopped_because : str
         ``"converged"``, ``"iteration limit"`` or ``"direct method"``.
     setup_seconds : float
-        Time spent on what depends on the operator only and could be kept for the next shot.
+        Time spent on what depends on the operator only and on loading compiled loops, not on the readings.
     """
 
     frames: NDArray[Any]
@@ -114,7 +114,7 @@ class Result:
     setup_seconds: float = 0.0
 
     @classmethod
-    def of_blocks(cls, frames: NDArray[Any], histories: list[History]) -> Result:
+    def of_blocks(cls, frames: NDArray[Any], histories: list[History], setup_seconds: float = 0.0) -> Result:
         """Join the histories of all blocks."""
         longest = max(history.iterations for history in histories)
         total = np.zeros(longest + 1)
@@ -122,4 +122,4 @@ class Result:
             kept_on = np.full(longest - history.iterations, history.objective[-1])
             total += np.concatenate([history.objective, kept_on])
         converged = all(history.converged for history in histories)
-        return cls(frames, longest, total, "converged" if converged else "iteration limit")
+        return cls(frames, longest, total, "converged" if converged else "iteration limit", setup_seconds)
