@@ -45,7 +45,7 @@ class Archive:
     def array(self, name: str, *shape: int | None) -> NDArray[Any]:
         """Return entry `name`, a numeric array of `shape`; None stands for any length but zero."""
         if name not in self:
-            raise FileFormatError(self.path, f"has no field '{name}', which a LIFT archive holds")
+            raise FileFormatError(self.path, f"has no field '{name}', which is needed here")
         found = np.asarray(self._entries[name])
         fits = len(shape) == found.ndim and all(
             n > 0 and wanted in (None, n) for wanted, n in zip(shape, found.shape, strict=True)

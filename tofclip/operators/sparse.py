@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -21,8 +22,8 @@ TILE_BYTES = 1 << 19  # half of a present-day core's second-level cache
 class SparseMatrix(LinearOperator):
     """A CSR matrix and its transpose, applied to blocks of frames.
 
-    Both are stored, so that forward and adjoint are the same gathering product; memory is twice the matrix
-    (8 bytes per nonzero and side in float32).
+    Matrix and transpose are cut up on first use, so that forward and adjoint are one gathering product on blocks; memory
+    is 8 bytes per nonzero and side in float32. A lone picture goes through scipy's own product.
 
     Parameters
     ----------
@@ -39,8 +40,14 @@ class SparseMatrix(LinearOperator):
         if not np.all(np.isfinite(matrix.data)):
             raise InputError("the sparse matrix must be finite")
         self.matrix = matrix.tocsr()
-        self._rows = Tiles.of(self.matrix)
-        self._columns = Tiles.of(self.matrix.T.tocsr())
+
+    @cached_property
+    def _rows(self) -> Tiles:
+        return Tiles.of(self.matrix)
+
+    @cached_property
+    def _columns(self) -> Tiles:
+        return Tiles.of(self.matrix.T.tocsr())
 
     def _forward(self, block: Array) -> Array:
         if block.shape[-1] == 1:
