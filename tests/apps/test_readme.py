@@ -7,6 +7,7 @@ import shlex
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from small_instrument import Run
 
@@ -22,20 +23,29 @@ def commands(start: str) -> list[str]:
     return [line for block in blocks for line in block.splitlines() if line.startswith(start)]
 
 
+def write_light_field(path: Path) -> None:
+    """A bright card on a dark ground, without parallax, in 8 x 8 views."""
+    card = np.zeros((48, 48), np.uint16)
+    card[14:34, 16:30] = 60000
+    steps = np.arange(-4, 4)
+    np.savez(path, lf=np.tile(card, (8, 8, 1, 1)), scale=1 / 65535, v=steps, u=steps)
+
+
 def test_the_walk_through(run: Run, files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("line", "line_background", "dot", "dot_background"):
         shutil.copy(files / f"{name}.tif", tmp_path)
     # A shot whose file has a time axis, under the README's names: files are known by content, not by suffix.
     shutil.copy(files / "streak.h5", tmp_path / "shot.tif")
     shutil.copy(files / "wall.h5", tmp_path / "wall.npz")
+    write_light_field(tmp_path / "light_field.npz")
     monkeypatch.chdir(tmp_path)
     walk = commands("tofclip ")
-    assert len(walk) == 7
+    assert len(walk) == 9
     for command in walk:
         outcome = run(*shlex.split(command)[1:])
         assert (outcome.status, outcome.err) == (0, ""), command
     expected = "camera.h5 camera.png frames.h5 frames.png mip.png scene.ply volume.h5 wall.h5 wall_frames.h5"
-    assert set(expected.split()) <= {path.name for path in tmp_path.iterdir()}
+    assert {*expected.split(), "readings.h5", "picture.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
 def test_the_python_example(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,8 +22,8 @@ TILE_BYTES = 1 << 19  # half of a present-day core's second-level cache
 class SparseMatrix(LinearOperator):
     """A CSR matrix and its transpose, applied to blocks of frames.
 
-    Matrix and transpose are cut up on first use, so that forward and adjoint are one gathering product on blocks; memory
-    is 8 bytes per nonzero and side in float32. A lone picture goes through scipy's own product.
+    Matrix and transpose are cut up on first use, so that forward and adjoint are one gathering product on blocks;
+    memory is 8 bytes per nonzero and side in float32. A lone picture goes through scipy's own product.
 
     Parameters
     ----------
