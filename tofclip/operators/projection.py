@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tofclip.errors import ShapeError
-from tofclip.operators.sparse import SparseMatrix
+from tofclip.operators.sparse import SparseMatrix, split_between_bins
 
 
 class LineProjection(SparseMatrix):
@@ -65,11 +65,6 @@ class LineProjection(SparseMatrix):
         y = (np.arange(rows) - rows // 2)[:, np.newaxis]
         x = (np.arange(columns) - columns // 2)[np.newaxis, :]
         position = self.centres_px[:, np.newaxis, np.newaxis] + x - y * np.tan(self.angles)[:, np.newaxis, np.newaxis]
-        left = np.floor(position).astype(np.int64)
-        share = position - left
-        gain = self.gains[:, np.newaxis, np.newaxis]
-        slit = np.stack([left, left + 1])
-        weight = np.stack([gain * (1.0 - share), gain * share])
-        pixel = np.broadcast_to(np.arange(rows * columns).reshape(image_shape), slit.shape)
-        seen = (slit >= 0) & (slit < slit_width_px) & (weight != 0)
-        return slit[seen], pixel[seen], weight[seen]
+        entry, slit, weight = split_between_bins(position, slit_width_px)
+        view, pixel = np.divmod(entry, rows * columns)
+        return slit, pixel, self.gains[view] * weight

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tofclip.errors import InputError, ShapeError
-from tofclip.operators.sparse import SparseMatrix
+from tofclip.operators.sparse import SparseMatrix, split_between_bins
 
 
 class RadonProjection(SparseMatrix):
@@ -60,18 +60,13 @@ class RadonProjection(SparseMatrix):
 
     def _entries(
         self, image_shape: tuple[int, int], detector_px: int
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Row, column and value of every nonzero."""
         rows, columns = image_shape
         y = (np.arange(rows) - rows // 2)[:, np.newaxis]
         x = (np.arange(columns) - columns // 2)[np.newaxis, :]
         angle = self.angles[:, np.newaxis, np.newaxis]
         position = detector_px // 2 + x * np.cos(angle) + y * np.sin(angle) + self.offsets_px[:, None, None]
-        left = np.floor(position).astype(np.int32)
-        share = position - left
-        bins = np.stack([left, left + 1])
-        weight = np.stack([1.0 - share, share])
-        pixel = np.broadcast_to(np.arange(rows * columns, dtype=np.int32).reshape(image_shape), bins.shape)
-        first = np.arange(self.angles.size, dtype=np.int32)[:, np.newaxis, np.newaxis] * detector_px
-        seen = (bins >= 0) & (bins < detector_px) & (weight != 0)
-        return (bins + first)[seen], pixel[seen], weight[seen]
+        entry, bins, weight = split_between_bins(position, detector_px)
+        number, pixel = np.divmod(entry, rows * columns)
+        return number * detector_px + bins, pixel, weight

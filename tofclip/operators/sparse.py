@@ -116,3 +116,28 @@ class Tiles(NamedTuple):
         ends = np.cumsum(per_row).reshape(per_row.shape)
         starts = np.concatenate([(ends - per_row), ends[:, -1:]], axis=1)
         return cls(starts, matrix.indices[order].astype(np.uint32), matrix.data[order])
+
+
+def split_between_bins(
+    position: NDArray[np.float64], bins: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Share every pixel's light between the two bins nearest to where it falls, by linear interpolation.
+
+    Parameters
+    ----------
+    position : (groups, rows, columns) array
+        Where each pixel falls among the bins of each group, in bins.
+    bins : int
+        What falls beyond them is lost.
+
+    Returns
+    -------
+    entry, bin, weight : (nonzeros,) arrays
+        Flat index into `position`, the bin, and the share of the light that it gets.
+    """
+    left = np.floor(position).astype(np.int64)
+    share = position - left
+    nearest, weight = np.stack([left, left + 1]), np.stack([1.0 - share, share])
+    entry = np.broadcast_to(np.arange(position.size).reshape(position.shape), nearest.shape)
+    seen = (nearest >= 0) & (nearest < bins) & (weight != 0)
+    return entry[seen], nearest[seen], weight[seen]
