@@ -1,1 +1,50 @@
-"""The USB layer that talks to streak and SPAD hardware. Not written yet: nothing here touches a device."""
+"""Instruments: one interface to those that are connected, recorded or simulated.
+
+::
+
+    with devices.open("sim+timetag://?seed=1") as source:
+        for batch in source:
+            batch.records      # NumPy structured array, one row per record
+    source.stats               # acquired = delivered + unread + dropped_host + lost_device + malformed
+
+Which address opens which instrument is written down in `devices.registry`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from devices.codec import Codec, Decoded
+    from devices.registry import Found, discover, open  # noqa: A004 - the name users type
+    from devices.source import Batch, Info, Source
+    from devices.statistics import Stats
+
+__all__ = ["Batch", "Codec", "Decoded", "Found", "Info", "Source", "Stats", "discover", "open"]
+
+_HOMES = {
+    "Batch": "devices.source",
+    "Codec": "devices.codec",
+    "Decoded": "devices.codec",
+    "Found": "devices.registry",
+    "Info": "devices.source",
+    "Source": "devices.source",
+    "Stats": "devices.statistics",
+    "discover": "devices.registry",
+    "open": "devices.registry",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use, so that ``import devices`` stays quick."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'devices' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names, imported or not."""
+    return sorted({*globals(), *__all__})

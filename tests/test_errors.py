@@ -18,6 +18,17 @@ TREE = {
     "FileFormatError": (errors.TofclipError, ValueError),
     "StorageError": (errors.TofclipError, OSError),
     "MissingDependencyError": (errors.TofclipError, ImportError),
+    "DeviceError": (errors.TofclipError, OSError),
+    "UsbBackendError": (errors.DeviceError,),
+    "DeviceNotFoundError": (errors.DeviceError,),
+    "DevicePermissionError": (errors.DeviceError,),
+    "DeviceBusyError": (errors.DeviceError,),
+    "DeviceTimeoutError": (errors.DeviceError, TimeoutError),
+    "DeviceStalledError": (errors.DeviceError,),
+    "DeviceDisconnectedError": (errors.DeviceError,),
+    "TransferOverflowError": (errors.DeviceError,),
+    "BufferOverflowError": (errors.DeviceError,),
+    "ProtocolError": (errors.DeviceError,),
 }
 
 

@@ -10,6 +10,17 @@
     +-- FileFormatError         (ValueError)   a file is damaged, incomplete or of another format
     +-- StorageError            (OSError)      a file could not be read or written: disk full, no permission
     +-- MissingDependencyError  (ImportError)  an optional library is not usable on this machine
+    +-- DeviceError             (OSError)      an instrument, or the way to it, does not do what it should
+        +-- UsbBackendError                    there is no libusb on this machine
+        +-- DeviceNotFoundError                no such instrument is connected
+        +-- DevicePermissionError              this user may not talk to it
+        +-- DeviceBusyError                    another program talks to it
+        +-- DeviceTimeoutError  (TimeoutError) it sent nothing in time
+        +-- DeviceStalledError                 an endpoint stalled, and stalled again after it was cleared
+        +-- DeviceDisconnectedError            it was unplugged, or the connection broke, and did not come back
+        +-- TransferOverflowError              it sent more than was asked for, and the transfer is lost
+        +-- BufferOverflowError                the records came faster than they were read
+        +-- ProtocolError                      it said what its protocol does not allow
 
 A message is one line that says what was wrong and what to do about it. The command line prints it and exits with
 status 2.
@@ -20,14 +31,25 @@ from __future__ import annotations
 from pathlib import Path
 
 __all__ = [
+    "BufferOverflowError",
     "CalibrationError",
+    "DeviceBusyError",
+    "DeviceDisconnectedError",
+    "DeviceError",
+    "DeviceNotFoundError",
+    "DevicePermissionError",
+    "DeviceStalledError",
+    "DeviceTimeoutError",
     "FileFormatError",
     "InputError",
     "MissingDependencyError",
     "MissingTimeAxisError",
+    "ProtocolError",
     "ShapeError",
     "StorageError",
     "TofclipError",
+    "TransferOverflowError",
+    "UsbBackendError",
 ]
 
 
@@ -76,3 +98,47 @@ class StorageError(TofclipError, OSError):
 
 class MissingDependencyError(TofclipError, ImportError):
     """An optional library is absent or does not load on this machine."""
+
+
+class DeviceError(TofclipError, OSError):
+    """An instrument, or the way to it, does not do what it should."""
+
+
+class UsbBackendError(DeviceError):
+    """The library that talks to the USB, libusb, is absent or does not load."""
+
+
+class DeviceNotFoundError(DeviceError):
+    """No instrument of that kind and serial number is connected."""
+
+
+class DevicePermissionError(DeviceError):
+    """The operating system does not let this user talk to the instrument."""
+
+
+class DeviceBusyError(DeviceError):
+    """Another program holds the instrument."""
+
+
+class DeviceTimeoutError(DeviceError, TimeoutError):
+    """The instrument sent nothing in the time allowed."""
+
+
+class DeviceStalledError(DeviceError):
+    """An endpoint stalled, and stalled again after its halt was cleared."""
+
+
+class DeviceDisconnectedError(DeviceError):
+    """The instrument was unplugged, or its connection broke, and it did not come back in time."""
+
+
+class TransferOverflowError(DeviceError):
+    """The instrument sent more than was asked for; the whole transfer is lost."""
+
+
+class BufferOverflowError(DeviceError):
+    """Records came faster than they were read, and the buffer's policy is to fail."""
+
+
+class ProtocolError(DeviceError):
+    """The instrument said something that its protocol does not allow."""

@@ -1,0 +1,118 @@
+"""Which address opens what. The tables are all there is to registering an instrument.
+
+Every entry is ``"module:name"`` and is imported when it is needed, so that one instrument's libraries never keep
+another from working.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from devices.codec import Codec
+from devices.source import Source
+from devices.uri import Uri
+from tofclip.errors import InputError
+from tofclip.storage import Scalar
+
+OPENERS: dict[str, str] = {}
+"""Scheme of an address -> function ``(Uri) -> Source``."""
+
+FILES: dict[str, str] = {}
+"""Ending of a file's name, lower case -> function ``(Uri) -> Source``, for addresses ``file://PATH``."""
+
+FINDERS: tuple[str, ...] = ()
+"""Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail, without hardware."""
+
+CODECS: dict[str, str] = {}
+"""Name of a codec -> its class; a recording names the codec that its bytes need."""
+
+
+class Opener(Protocol):
+    """What the tables name."""
+
+    def __call__(self, uri: Uri, /) -> Source:
+        """Open the source at a parsed address."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """An instrument that can be opened now.
+
+    Parameters
+    ----------
+    uri : str
+        What `open` takes.
+    instrument : str
+        What it is, in words.
+    note : str
+        What keeps it from being used, if anything does: no permission, no firmware.
+    """
+
+    uri: str
+    instrument: str
+    note: str = ""
+
+
+def open(uri: str) -> Source:  # noqa: A001 - the name users type: devices.open
+    """Open a source.
+
+    Parameters
+    ----------
+    uri : str
+        Its address: ``timetag://SERIAL``, ``sim+timetag://?seed=1``, ``file://PATH``; see `OPENERS` for all.
+
+    Raises
+    ------
+    InputError
+        The address is no address, or of no known kind.
+    DeviceError
+        The instrument cannot be reached.
+    """
+    parsed = Uri.parse(uri)
+    if parsed.scheme == "file":
+        return _open_file(parsed)
+    if parsed.scheme not in OPENERS:
+        known = ", ".join(sorted([*OPENERS, "file"]))
+        raise InputError(f"'{uri}': no source is called '{parsed.scheme}'; known are {known}")
+    opener: Opener = named(OPENERS[parsed.scheme])
+    return opener(parsed)
+
+
+def discover() -> list[Found]:
+    """Look for instruments; without any hardware, or libraries for it, the list is empty."""
+    return [found for finder in FINDERS for found in named(finder)()]
+
+
+def codec_named(name: str, settings: Mapping[str, Scalar]) -> Codec:
+    """Build the codec called `name` from the settings that it once gave.
+
+    Raises
+    ------
+    InputError
+        There is no such codec, or it does not take these settings.
+    """
+    if name not in CODECS:
+        raise InputError(f"no codec is called '{name}'; known are {', '.join(sorted(CODECS))}")
+    try:
+        codec: Codec = named(CODECS[name])(**settings)
+    except TypeError as fault:
+        raise InputError(f"codec '{name}' does not take {', '.join(settings)}") from fault
+    return codec
+
+
+def _open_file(uri: Uri) -> Source:
+    ending = Path(uri.place).suffix.lower()
+    if ending not in FILES:
+        raise InputError(f"'{uri.text}': the name must end in {', '.join(sorted(FILES))}")
+    opener: Opener = named(FILES[ending])
+    return opener(uri)
+
+
+def named(entry: str) -> Any:
+    """Import what a table's entry names."""
+    module, _, name = entry.partition(":")
+    return getattr(importlib.import_module(module), name)

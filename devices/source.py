@@ -1,0 +1,144 @@
+"""One interface for instruments that are connected, recorded or simulated."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Self
+
+from devices.codec import Records
+from devices.statistics import Stats
+from tofclip.errors import InputError
+from tofclip.storage import Record, Scalar
+
+PATIENCE = 5.0
+"""Seconds that an iteration waits for the next batch of a live instrument."""
+
+
+@dataclass(frozen=True)
+class Info:
+    """What is known about an instrument.
+
+    Parameters
+    ----------
+    instrument : str
+        What it is, in words.
+    serial : str
+        Its serial number; empty where it has none.
+    details : mapping of str to str, int, float or bool
+        Firmware, clock and the like; units in the names (``clock_hz``). Where a protocol is not public, ``"limits"``
+        says what that means.
+    """
+
+    instrument: str
+    serial: str = ""
+    details: Mapping[str, Scalar] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Scalar]:
+        """Return everything in one mapping."""
+        return {"instrument": self.instrument, "serial": self.serial, **self.details}
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Records that were decoded together.
+
+    Parameters
+    ----------
+    records : (n,) structured array
+        Of the codec's `dtype`. May be empty.
+    first : int
+        Number of the first one among all records that arrived well, from 0; what `Source.seek` takes.
+    after_gap : bool
+        Something is missing right before these records. Where the instrument was away, its clock has started anew.
+    """
+
+    records: Records
+    first: int = 0
+    after_gap: bool = False
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+
+class Source(abc.ABC):
+    """A stream of records: a context manager and an iterator over batches.
+
+    A subclass gives `read`, `close`, `info` and `stats`, and where they differ from the defaults the rest.
+    Opening is done by the constructor (or the function in `devices.registry`); leaving the context closes.
+    """
+
+    @property
+    @abc.abstractmethod
+    def info(self) -> Info:
+        """What is known about the instrument."""
+
+    @property
+    @abc.abstractmethod
+    def stats(self) -> Stats:
+        """Where every record went so far; final after `close`."""
+
+    @property
+    def calibration(self) -> Record | None:
+        """Tables and constants that turn records into seconds and pixels, None where there are none."""
+        return None
+
+    @property
+    def is_live(self) -> bool:
+        """Whether the records come from an instrument, real or emulated, and go by if nobody reads them."""
+        return False
+
+    @property
+    def is_seekable(self) -> bool:
+        """Whether `seek` works."""
+        return False
+
+    @abc.abstractmethod
+    def read(self, timeout: float = PATIENCE) -> Batch | None:
+        """Return the next batch, or None at the end of the stream.
+
+        Parameters
+        ----------
+        timeout : float
+            Seconds to wait at most.
+
+        Raises
+        ------
+        DeviceTimeoutError
+            Nothing came in that time; reading on is fine.
+        DeviceError
+            The instrument failed in another way; what arrived before has been read by now.
+        """
+
+    def seek(self, record: int) -> None:
+        """Go to record number `record`, so that the next batch begins with it.
+
+        Raises
+        ------
+        InputError
+            The source cannot go back, or has no such record.
+        """
+        raise InputError("a live source cannot seek; record it and open the recording")
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Stop the instrument and let go of it; closing twice is fine."""
+
+    def __iter__(self) -> Iterator[Batch]:
+        return self
+
+    def __next__(self) -> Batch:
+        batch = self.read()
+        if batch is None:
+            raise StopIteration
+        return batch
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
