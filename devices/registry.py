@@ -27,7 +27,9 @@ FILES: dict[str, str] = {}
 FINDERS: tuple[str, ...] = ()
 """Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail, without hardware."""
 
-CODECS: dict[str, str] = {}
+CODECS: dict[str, str] = {
+    "timetag": "devices.codecs.timetag:TimeTagCodec",
+}
 """Name of a codec -> its class; a recording names the codec that its bytes need."""
 
 
