@@ -11,12 +11,12 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.errors import FileFormatError
+from tofclip.errors import FileFormatError, InputError
 from tofclip.storage import reading
 
 TIME_UNITS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9, "ps": 1e-12, "fs": 1e-15}
@@ -72,12 +72,11 @@ def row_times(metadata: Mapping[str, str], path: str | Path, rows: int) -> NDArr
         The table does not lie in the file, is shorter than the picture, or does not increase.
     """
     unit = TIME_UNITS.get(metadata.get("Scaling/ScalingYUnit", ""))
-    place = metadata.get("Scaling/ScalingYScalingFile", "")
-    if unit is None or place == _FOCUS_MODE:
+    if unit is None or metadata.get("Scaling/ScalingYScalingFile") == _FOCUS_MODE:
         return None
-    table = _TABLE.fullmatch(place)
+    table = table_place(metadata, "Y")
     if table:
-        start, count = int(table[1]), int(table[2])
+        start, count = table
         first = 0 if count == rows else _first_row(metadata)
         if first + rows > count:
             raise FileFormatError(
@@ -87,6 +86,32 @@ def row_times(metadata: Mapping[str, str], path: str | Path, rows: int) -> NDArr
     if metadata.get("Scaling/ScalingYType") == _LINEAR:
         return np.arange(rows, dtype=np.float64) * (_positive(metadata, "Scaling/ScalingYScale", path) * unit)
     return None
+
+
+def table_place(metadata: Mapping[str, str], axis: str) -> tuple[int, int] | None:
+    """Return where in its file the scaling table of `axis` (``"X"`` or ``"Y"``) lies: first byte, float32 entries.
+
+    None where the axis has no table: it is linear, or has no unit at all.
+    """
+    found = _TABLE.fullmatch(metadata.get(f"Scaling/Scaling{axis}ScalingFile", ""))
+    return (int(found[1]), int(found[2])) if found else None
+
+
+def saturated_pixels(pixels: NDArray[Any], metadata: Mapping[str, str], path: str | Path) -> NDArray[np.bool_] | None:
+    """Mark the pixels that reached the sensor's limit; None for floating-point pictures, which have none.
+
+    Raises
+    ------
+    InputError
+        Every pixel reached it.
+    """
+    if pixels.dtype.kind == "f":
+        return None
+    limit = min(np.iinfo(pixels.dtype).max, full_scale(metadata))
+    saturated: NDArray[np.bool_] = pixels >= limit
+    if saturated.all():
+        raise InputError(f"{path}: every pixel is saturated at {limit} counts; lower the gain or the exposure")
+    return saturated
 
 
 def full_scale(metadata: Mapping[str, str]) -> float:

@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from tofclip.errors import FileFormatError
+from tofclip.io.itex import SIGNATURE as ITEX_SIGNATURE
+from tofclip.io.itex import read_itex
 from tofclip.io.lift import read_lift
 from tofclip.io.tiff import read_tiff
 from tofclip.storage import SIGNATURE, provenance, reading
@@ -19,14 +21,16 @@ READERS: dict[bytes, Callable[[str | Path], Streak]] = {
     b"MM\0*": read_tiff,
     b"PK\x03\x04": read_lift,
     SIGNATURE: Streak.load,
+    ITEX_SIGNATURE: read_itex,
 }
 
 
 def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
     """Read a streak image: rows are instants, columns are slit pixels.
 
-    The format is recognised by content: a TIFF of Hamamatsu's HPD-TA with its text and time axis, any other grey
-    TIFF (no time axis), a LIFT archive (``.npz``) with its camera, or a streak image of our own (HDF5).
+    The format is recognised by content: a TIFF of Hamamatsu's HPD-TA with its text and time axis, the same program's
+    ITEX (``.img``), any other grey TIFF (no time axis), a LIFT archive (``.npz``) with its camera, or a streak image of
+    our own (HDF5).
 
     Parameters
     ----------
@@ -66,6 +70,7 @@ def _reader_of(path: str | Path) -> Callable[[str | Path], Streak]:
     for signature, reader in READERS.items():
         if start.startswith(signature):
             return reader
+    size = os.path.getsize(path)
     raise FileFormatError(
-        path, f"is no TIFF, LIFT archive (.npz) or HDF5 streak image ({os.path.getsize(path)} bytes of something else)"
+        path, f"is no TIFF, ITEX (.img), LIFT archive (.npz) or HDF5 streak image ({size} bytes of something else)"
     )

@@ -44,7 +44,7 @@ def read_tiff(path: str | Path) -> Streak:
     return Streak(
         counts=pixels,
         row_times=times,
-        saturated=_saturated(pixels, metadata, path),
+        saturated=hpdta.saturated_pixels(pixels, metadata, path),
         metadata=metadata,
         source=str(path),
     )
@@ -81,13 +81,3 @@ def _only_page(tiff: tifffile.TiffFile, path: str | Path) -> tifffile.TiffPage:
     if end > size or (page.compression == 1 and sum(page.databytecounts) < page.nbytes):
         raise FileFormatError(path, f"is truncated: {page.shape} pixels of {page.dtype} do not fit into {size} bytes")
     return page
-
-
-def _saturated(pixels: NDArray[Any], metadata: dict[str, str], path: str | Path) -> NDArray[np.bool_] | None:
-    if pixels.dtype.kind == "f":
-        return None
-    limit = min(np.iinfo(pixels.dtype).max, hpdta.full_scale(metadata))
-    saturated: NDArray[np.bool_] = pixels >= limit
-    if saturated.all():
-        raise InputError(f"{path}: every pixel is saturated at {limit} counts; lower the gain or the exposure")
-    return saturated
