@@ -10,13 +10,17 @@ import pytest
 from tofclip.errors import InputError, ShapeError, TofclipError
 from tofclip.operators import (
     BlockDiagonal,
+    DenseSensor,
     Diagonal,
     FourierShear,
     HadamardCodes,
     LinearOperator,
     LinearShear,
     LineProjection,
+    MaskedSensor,
     MeanWeighting,
+    PitchedSensor,
+    PointSpreadConvolution,
     RadonProjection,
     RandomCodes,
     SparseMatrix,
@@ -103,6 +107,32 @@ def light_field_model(dtype: type) -> LinearOperator:
     return BlockDiagonal([RandomCodes((5, 7), 3 + k, k, dtype) for k in range(3)])
 
 
+def point_spread_convolution(dtype: type) -> LinearOperator:
+    return PointSpreadConvolution((11, 14), np.random.default_rng(6).random((6, 9)), dtype=dtype)
+
+
+def seen_beyond_the_sensor(dtype: type) -> LinearOperator:
+    """Without a lens: the picture is larger than the sensor."""
+    return PointSpreadConvolution((21, 16), np.random.default_rng(7).random((9, 16)), (9, 7), dtype)
+
+
+def dense_sensor(dtype: type) -> LinearOperator:
+    return DenseSensor((5, 7), dtype)
+
+
+def pitched_sensor(dtype: type) -> LinearOperator:
+    return PitchedSensor((11, 14), (2, 3.4), (1, 0), dtype)
+
+
+def masked_sensor(dtype: type) -> LinearOperator:
+    return MaskedSensor(np.random.default_rng(8).random((5, 9)) < 0.7, dtype)
+
+
+def sparse_camera(dtype: type) -> LinearOperator:
+    """A sparse sensor behind a diffuser (supplement Note 3)."""
+    return pitched_sensor(dtype) @ point_spread_convolution(dtype)
+
+
 BUILDERS: list[Callable[[type], LinearOperator]] = [
     line_projection,
     sparse_matrix,
@@ -120,6 +150,12 @@ BUILDERS: list[Callable[[type], LinearOperator]] = [
     mean_weighting,
     refocused_single_pixel,
     light_field_model,
+    point_spread_convolution,
+    seen_beyond_the_sensor,
+    dense_sensor,
+    pitched_sensor,
+    masked_sensor,
+    sparse_camera,
 ]
 BATCHES = [(), (1,), (3,), (32,), (33,)]
 
@@ -240,6 +276,14 @@ def test_the_adjoint_of_the_adjoint_is_the_operator():
         lambda: RandomCodes((8, 8), 0, 0),
         lambda: MeanWeighting([3, 0]),
         lambda: MeanWeighting([3], 1.5),
+        lambda: PointSpreadConvolution((9, 9), np.ones((10, 3))),
+        lambda: PointSpreadConvolution((9, 9), np.ones(3)),
+        lambda: PointSpreadConvolution((9, 9), np.zeros((3, 3))),
+        lambda: PointSpreadConvolution((9, 9), [[1.0, np.nan]]),
+        lambda: PitchedSensor((9, 9), (0.5, 1)),
+        lambda: PitchedSensor((9, 9), (2, 2), (9, 0)),
+        lambda: MaskedSensor(np.zeros((4, 4), bool)),
+        lambda: MaskedSensor(np.ones(4, bool)),
     ],
 )
 def test_operators_that_do_not_fit_are_refused(build):

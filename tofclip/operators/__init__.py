@@ -9,8 +9,10 @@ from tofclip.operators.base import (
     Stack,
     squared_norm,
 )
+from tofclip.operators.convolution import PointSpreadConvolution
 from tofclip.operators.projection import LineProjection
 from tofclip.operators.radon import RadonProjection
+from tofclip.operators.sensors import DenseSensor, MaskedSensor, PitchedSensor
 from tofclip.operators.shear import FourierShear, LinearShear
 from tofclip.operators.single_pixel import HadamardCodes, RandomCodes
 from tofclip.operators.sparse import SparseMatrix
@@ -20,13 +22,17 @@ __all__ = [
     "Adjoint",
     "BlockDiagonal",
     "Composition",
+    "DenseSensor",
     "Diagonal",
     "FourierShear",
     "HadamardCodes",
     "LineProjection",
     "LinearOperator",
     "LinearShear",
+    "MaskedSensor",
     "MeanWeighting",
+    "PitchedSensor",
+    "PointSpreadConvolution",
     "RadonProjection",
     "RandomCodes",
     "SparseMatrix",

