@@ -122,9 +122,16 @@ class Source(abc.ABC):
         """
         raise InputError("a live source cannot seek; record it and open the recording")
 
+    def stop(self) -> None:
+        """Let the instrument register nothing more; what arrived can still be read, up to the None at the end.
+
+        Where nothing waits to be read this is the same as `close`.
+        """
+        self.close()
+
     @abc.abstractmethod
     def close(self) -> None:
-        """Stop the instrument and let go of it; closing twice is fine."""
+        """Stop the instrument and let go of it; then `read` returns None. Closing twice is fine."""
 
     def __iter__(self) -> Iterator[Batch]:
         return self
