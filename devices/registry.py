@@ -28,6 +28,7 @@ FINDERS: tuple[str, ...] = ()
 """Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail, without hardware."""
 
 CODECS: dict[str, str] = {
+    "linospad2": "devices.linospad2.codec:LinoSpad2Codec",
     "timetag": "devices.codecs.timetag:TimeTagCodec",
 }
 """Name of a codec -> its class; a recording names the codec that its bytes need."""

@@ -1,0 +1,147 @@
+"""What a LinoSPAD2 board's calibration knows: how wide each code is, how late each pixel, and which pixels are hot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from devices.codec import Records
+from devices.linospad2.codec import PIXELS
+from tofclip.errors import FileFormatError, InputError, ShapeError
+from tofclip.storage import Field, Record, one_line, reading
+
+CODES = 140
+"""Codes in one period of the board's clock."""
+
+CLOCK_PERIOD = 2500e-12
+"""Period of the board's clock, s."""
+
+_LARGEST_FILE = 1 << 23
+_ROUNDING = 1e-6 * CLOCK_PERIOD
+
+
+@dataclass(frozen=True)
+class BoardCalibration:
+    """Tables that turn a pixel's codes into seconds.
+
+    Parameters
+    ----------
+    code_ends : (256, 140) array
+        Instant at which each code ends, s since the clock's tick, for each pixel; the converters' steps are uneven.
+    offsets : (256,) array
+        Added to a pixel's times, s.
+    hot_pixels : (k,) int array
+        Pixels that count without light.
+
+    Raises
+    ------
+    ShapeError, InputError
+        A table has another shape, is not finite, goes back, or leaves the clock's period; or there is no such pixel.
+    """
+
+    code_ends: NDArray[np.float64]
+    offsets: NDArray[np.float64]
+    hot_pixels: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+
+    def __post_init__(self) -> None:
+        for name, shape in (("code_ends", (PIXELS, CODES)), ("offsets", (PIXELS,))):
+            table = np.ascontiguousarray(getattr(self, name), np.float64)
+            object.__setattr__(self, name, table)
+            if table.shape != shape:
+                raise ShapeError(f"LinoSPAD2's {name}", shape, table.shape)
+            if not np.all(np.isfinite(table)):
+                raise InputError(f"LinoSPAD2's {name} must be finite")
+        ends = self.code_ends
+        if np.any(np.diff(ends, axis=1) < 0) or ends.min() < -_ROUNDING or ends.max() > CLOCK_PERIOD + _ROUNDING:
+            raise InputError("LinoSPAD2's code_ends must not go back, and stay within the clock's 2.5 ns")
+        if np.any((self.hot_pixels < 0) | (self.hot_pixels >= PIXELS)):
+            raise InputError(f"LinoSPAD2's hot pixels must lie within 0..{PIXELS - 1}")
+
+    @classmethod
+    def ideal(cls) -> BoardCalibration:
+        """Return a board of even codes and pixels that are all in step."""
+        ends = np.arange(1, CODES + 1) * (CLOCK_PERIOD / CODES)
+        return cls(np.tile(ends, (PIXELS, 1)), np.zeros(PIXELS))
+
+    @property
+    def code_begins(self) -> NDArray[np.float64]:
+        """Instant at which each code begins, s since the clock's tick, (256, 140)."""
+        begins: NDArray[np.float64] = np.pad(self.code_ends[:, :-1], ((0, 0), (1, 0)))
+        return begins
+
+    def times(self, records: Records) -> NDArray[np.float64]:
+        """Return when each photon came, s since its cycle began: the end of its code.
+
+        ``time = (code - code % 140) * 2500 ps / 140 + code_ends[pixel, code % 140] + offsets[pixel]``
+        """
+        periods, code = np.divmod(records["code"], CODES)
+        found: NDArray[np.float64] = periods * CLOCK_PERIOD
+        found += self.code_ends[records["pixel"], code]
+        found += self.offsets[records["pixel"]]
+        return found
+
+    def to_record(self) -> Record:
+        """Return everything that has to be stored."""
+        fields = {
+            "code_ends": Field(self.code_ends, "s", ("pixel", "code")),
+            "offsets": Field(self.offsets, "s", ("pixel",)),
+        }
+        if self.hot_pixels.size:
+            fields["hot_pixels"] = Field(self.hot_pixels, "px", ("hot",))
+        return Record("linospad2_calibration", fields)
+
+    @classmethod
+    def from_record(cls, record: Record) -> BoardCalibration:
+        """Rebuild the tables from what was stored."""
+        ends, offsets = record.array("code_ends", np.float64, 2, "s"), record.array("offsets", np.float64, 1, "s")
+        if "hot_pixels" not in record.fields:
+            return cls(ends, offsets)
+        return cls(ends, offsets, record.array("hot_pixels", np.int64, 1, "px"))
+
+
+def load_calibration(
+    code_table: str | Path, offset_table: str | Path, hot_pixels: str | Path | None = None
+) -> BoardCalibration:
+    """Read tables as the board's makers and daplis write them.
+
+    Parameters
+    ----------
+    code_table : path-like
+        CSV, ps: a line of code numbers, then for each pixel its number and 140 ends of codes.
+    offset_table : path-like
+        NPY with 256 numbers, ps.
+    hot_pixels : path-like, optional
+        Text with one pixel number in each line.
+
+    Raises
+    ------
+    StorageError
+        A file is absent or may not be read.
+    FileFormatError
+        A file holds something else.
+    """
+    picosecond = 1e-12
+    table = _numbers(code_table, lambda path: np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2))
+    offsets = _numbers(offset_table, lambda path: np.load(path, allow_pickle=False))
+    hot = np.empty(0)
+    if hot_pixels is not None:
+        hot = _numbers(hot_pixels, lambda path: np.loadtxt(path, ndmin=1))
+    if table.ndim != 2 or table.shape[1] != CODES + 1:
+        raise FileFormatError(code_table, f"must have {CODES + 1} columns, found shape {table.shape}")
+    return BoardCalibration(table[:, 1:] * picosecond, offsets * picosecond, hot.astype(np.int64))
+
+
+def _numbers(path: str | Path, reader: Callable[[Path], Any]) -> NDArray[np.float64]:
+    with reading(path):
+        size = Path(path).stat().st_size
+        if size > _LARGEST_FILE:
+            raise FileFormatError(path, f"is larger than any table of LinoSPAD2: {size} bytes")
+        try:
+            return np.asarray(reader(Path(path)), np.float64)
+        except (ValueError, TypeError, EOFError) as fault:
+            raise FileFormatError(path, f"holds no table of numbers ({one_line(fault)})") from fault

@@ -1,0 +1,125 @@
+"""What LinoSPAD2's recordings do not say themselves, in a small TOML file beside each of them."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from devices.linospad2.calibration import BoardCalibration, load_calibration
+from devices.linospad2.codec import LinoSpad2Codec
+from tofclip.errors import FileFormatError, InputError, StorageError
+from tofclip.storage import reading
+
+_LARGEST_FILE = 1 << 16
+_KEYS: dict[str, type] = {
+    "firmware": str,
+    "timestamps_per_cycle": int,
+    "absolute_counter": bool,
+    "board": str,
+    "code_table": str,
+    "offset_table": str,
+    "hot_pixels": str,
+    "laser_period_ps": float,
+    "camera": str,
+}
+_NEEDED = ("firmware", "timestamps_per_cycle", "absolute_counter")
+
+
+@dataclass(frozen=True)
+class Sidecar:
+    """How to read a recording.
+
+    Parameters
+    ----------
+    codec : LinoSpad2Codec
+    calibration : BoardCalibration
+        The board's tables; `BoardCalibration.ideal` where none are named.
+    board : str
+        Which board it was; may be empty.
+    laser_period : float or None
+        Time between two laser pulses, s, where pulses were locked to the board's clock.
+    camera : Path or None
+        File of the camera in front of the line.
+    """
+
+    codec: LinoSpad2Codec
+    calibration: BoardCalibration
+    board: str = ""
+    laser_period: float | None = None
+    camera: Path | None = None
+
+
+def read_sidecar(recording: str | Path) -> Sidecar:
+    """Read the TOML file that lies beside `recording` and has its name.
+
+    Its keys are ``firmware`` ("2212b" or "2212s"), ``timestamps_per_cycle`` and ``absolute_counter`` (true or false),
+    and optionally ``board``, ``code_table`` with ``offset_table``, ``hot_pixels``, ``laser_period_ps`` and ``camera``.
+    Names of files are relative to the TOML file.
+
+    Raises
+    ------
+    StorageError
+        There is no such file.
+    FileFormatError
+        It is no TOML, lacks a key, has one too many, or a value of another kind.
+    """
+    path = Path(recording).with_suffix(".toml")
+    values = _checked(_parsed(path, recording), path)
+    if ("code_table" in values) != ("offset_table" in values):
+        raise FileFormatError(path, "code_table and offset_table belong together: give both or neither")
+    try:
+        codec = LinoSpad2Codec(values["firmware"], values["timestamps_per_cycle"], values["absolute_counter"])
+        calibration = _calibration(values, path.parent)
+    except InputError as fault:
+        raise FileFormatError(path, str(fault)) from fault
+    period = values.get("laser_period_ps")
+    if period is not None and not 0 < period < float("inf"):
+        raise FileFormatError(path, f"laser_period_ps must be a positive number, found {period}")
+    return Sidecar(
+        codec,
+        calibration,
+        values.get("board", ""),
+        None if period is None else period * 1e-12,
+        path.parent / values["camera"] if "camera" in values else None,
+    )
+
+
+def _parsed(path: Path, recording: str | Path) -> dict[str, Any]:
+    if not path.exists():
+        keys = ", ".join(_NEEDED)
+        raise StorageError(
+            f"{recording}: its format is not in the file itself; write {keys} into {path.name} beside it"
+        )
+    with reading(path), open(path, "rb") as file:
+        data = file.read(_LARGEST_FILE + 1)
+    if len(data) > _LARGEST_FILE:
+        raise FileFormatError(path, f"is larger than any description of a recording: more than {_LARGEST_FILE} bytes")
+    try:
+        return tomllib.loads(data.decode())
+    except ValueError as fault:
+        raise FileFormatError(path, f"is no TOML ({fault})") from fault
+
+
+def _checked(found: dict[str, Any], path: Path) -> dict[str, Any]:
+    for key in _NEEDED:
+        if key not in found:
+            raise FileFormatError(path, f"lacks the key '{key}'")
+    for key, value in found.items():
+        if key not in _KEYS:
+            raise FileFormatError(path, f"has the unknown key '{key}'; known are {', '.join(_KEYS)}")
+        kind = _KEYS[key]
+        is_number = kind is float and type(value) is int
+        if type(value) is not kind and not is_number:
+            raise FileFormatError(path, f"{key} must be a {kind.__name__}, found {value!r}")
+    return found
+
+
+def _calibration(values: dict[str, Any], folder: Path) -> BoardCalibration:
+    hot = folder / values["hot_pixels"] if "hot_pixels" in values else None
+    if "code_table" in values:
+        return load_calibration(folder / values["code_table"], folder / values["offset_table"], hot)
+    if hot is not None:
+        raise InputError("hot_pixels needs code_table and offset_table as well")
+    return BoardCalibration.ideal()
