@@ -1,0 +1,138 @@
+"""Compiled loops that put photons into bins.
+
+A photon is known to lie within an interval, the width of its converter's code: it is shared out evenly over the
+interval, bin by bin. So codes of uneven width leave no ripple, which rounding every photon to one bin would.
+
+An interval may cover many bins. Its density is a step up by ``1 / width`` where it begins and a step down where it
+ends, so only *steps* are added, each in two neighbouring bins, and the sum over all earlier bins turns them into
+photons (`devices.histogram.accumulator`). The cost of a photon does not depend on its interval, and there is no branch
+that the processor could guess wrong.
+
+Positions are in bins: bin k reaches from k to k + 1. An array of steps is (pixels, bins + 2) float64.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+compiled = njit(nogil=True, cache=True, error_model="numpy")
+inlined = njit(inline="always", error_model="numpy")
+
+
+@inlined
+def _step(row, position, height):
+    """Add a step at `position`; one before the first bin counts from there, one behind the last makes no difference."""
+    inside = min(max(position, 0.0), row.size - 2.0)
+    place = int(inside)
+    late = height * (inside - place)
+    row[place] += height - late
+    row[place + 1] += late
+
+
+@inlined
+def _add(row, position, width, density, period, per_period):
+    """Add one photon, folded into the first of all periods; a period of 0 means that there is none."""
+    if period > 0:
+        position -= math.floor(position * per_period) * period
+        if position + width > period:  # what reaches beyond the end of a period belongs to the beginning of the next
+            _step(row, position - period, density)
+            _step(row, position - period + width, -density)
+    _step(row, position, density)
+    _step(row, position + width, -density)
+
+
+@compiled
+def add_stamps(stamps, clock_bins, codes, period, steps):
+    """Add LinoSPAD2's time stamps.
+
+    Parameters
+    ----------
+    stamps : (n, columns) uint32 array
+        The last two columns are code and pixel.
+    clock_bins : float
+        Period of the board's clock.
+    codes : (pixels, codes, 2) float32 array
+        Where a code begins within the first period of the clock, offset and start of the axis included; its length.
+    period : float
+        Time between two laser pulses, 0 for none.
+    steps : (pixels, bins + 2) float64 array
+
+    Returns
+    -------
+    int
+        Stamps left out because there is no such pixel.
+    """
+    number = np.uint32(codes.shape[1])
+    last = stamps.shape[1] - 1
+    per_period = 1.0 / period
+    strays = 0
+    for stamp in range(stamps.shape[0]):
+        code, pixel = stamps[stamp, last - 1], stamps[stamp, last]
+        if pixel >= codes.shape[0]:
+            strays += 1
+            continue
+        periods = code // number
+        phase = code - periods * number
+        begin, width = np.float64(codes[pixel, phase, 0]), np.float64(codes[pixel, phase, 1])
+        _add(steps[pixel], periods * clock_bins + begin, width, 1.0 / width, period, per_period)
+    return strays
+
+
+@compiled
+def add_times(pixels, times, scale, shift, width, period, steps):
+    """Add photons of which pixel and time are known; ``position = times * scale + shift``."""
+    density, per_period = 1.0 / width, 1.0 / period
+    for photon in range(times.size):
+        _add(steps[pixels[photon]], times[photon] * scale + shift, width, density, period, per_period)
+
+
+@compiled
+def last_sync(ticks, channels, flags, ignored, sync, before, known):
+    """Return the time of the last sync pulse before record `before`, `known` if there is none.
+
+    A record with one of the `ignored` flags tells of levels, not of edges.
+    """
+    for record in range(before - 1, -1, -1):
+        if channels[record] & sync and not flags[record] & ignored:
+            return ticks[record]
+    return known
+
+
+@compiled
+def add_tags(ticks, channels, flags, ignored, sync, known, pixel_of, scale, shift, period, steps):
+    """Add time tags, each by how long it came after the last sync pulse.
+
+    Parameters
+    ----------
+    ticks, channels, flags : (n,) array
+        One bit of `channels` for each channel that saw an edge.
+    ignored : int
+        Flags of records that tell of no edges.
+    sync : int
+        The sync's bit.
+    known : int
+        Ticks at the last sync before the first record, -1 where there was none: photons before the first one are left
+        out.
+    pixel_of : (channels,) int64 array
+        Negative: not a pixel.
+    scale, shift : float
+        ``position = ticks since sync * scale + shift``; a tick is `scale` bins long.
+    period : float
+    steps : (pixels, bins + 2) float64 array
+    """
+    density, per_period = 1.0 / scale, 1.0 / period
+    for record in range(ticks.size):
+        lines = channels[record]
+        if flags[record] & ignored:
+            continue
+        if lines & sync:
+            known = ticks[record]
+        if known < 0:
+            continue
+        position = (ticks[record] - known) * scale + shift
+        for channel in range(pixel_of.size):
+            if (lines >> channel) & 1 and pixel_of[channel] >= 0:
+                _add(steps[pixel_of[channel]], position, scale, density, period, per_period)

@@ -1,0 +1,256 @@
+"""Histograms of photons, against sums over each bin's overlap with each photon's interval."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from numpy.typing import NDArray
+
+from devices.codecs.timetag import DELTA, RECORD
+from devices.histogram import Accumulator, BinAxis, StampHistogram, TagHistogram, TimeHistogram
+from devices.linospad2.calibration import CLOCK_PERIOD, CODES, BoardCalibration
+from devices.linospad2.codec import STAMP, STAMP_WITH_COUNTER
+from tofclip.arrays import THREADS_VARIABLE
+from tofclip.camera import Camera
+from tofclip.errors import InputError, ShapeError
+
+unhurried = settings(deadline=None)  # the first call compiles
+PS = 1e-12
+
+
+def overlaps(first: NDArray[Any], last: NDArray[Any], axis: BinAxis) -> NDArray[Any]:
+    """Share of each interval in each bin, (photons, bins), straight from the definition; all periods added up."""
+    edges = axis.start + (np.arange(axis.bins + 1) - 0.5) * axis.bin_width
+    total = np.zeros((len(first), axis.bins))
+    turns = range(-8, 9) if axis.period else (0,)
+    for turn in turns:
+        shift = turn * (axis.period or 0)
+        inside = np.clip(edges, (first + shift)[:, None], (last + shift)[:, None])
+        total += np.diff(inside, axis=1) / (last - first)[:, None]
+    return total
+
+
+axes = st.builds(
+    BinAxis,
+    st.sampled_from([20 * PS, 31.7 * PS, 900 * PS]),
+    st.integers(1, 12),
+    st.floats(-30 * PS, 4000 * PS),
+    st.sampled_from([None, 12_500 * PS, 11_003.3 * PS]),
+)
+
+
+@unhurried
+@given(axes, st.integers(0, 2**32 - 1), st.sampled_from([5 * PS, 250 * PS, 5000 * PS]))
+def test_times_are_shared_out_over_the_bins_they_cover(axis: BinAxis, seed: int, resolution: float) -> None:
+    random = np.random.default_rng(seed)
+    pixels, times = random.integers(0, 3, 40), random.uniform(-3e-9, 60e-9, 40)
+    histogram = TimeHistogram(3, axis, resolution)
+    histogram.add(pixels, times)
+    shares = overlaps(times, times + resolution, axis)
+    expected = np.stack([shares[pixels == pixel].sum(axis=0) for pixel in range(3)], axis=1)
+    # Positions of 60 ns / 20 ps = 3000 bins in float64 and widths of a quarter bin, summed 40 times; see NOTHING.
+    np.testing.assert_allclose(histogram.counts, expected, atol=1e-6)
+
+
+@pytest.fixture
+def board() -> BoardCalibration:
+    """Codes of very uneven widths, some of them empty, and pixels out of step."""
+    random = np.random.default_rng(3)
+    widths = random.uniform(0, 2, (256, CODES)) * (random.random((256, CODES)) < 0.9)
+    ends = np.cumsum(widths, axis=1)
+    return BoardCalibration(ends * (CLOCK_PERIOD / ends[:, -1:]), random.uniform(-6e-9, 4e-9, 256), np.array([17, 200]))
+
+
+def stamps_at(times: NDArray[Any], pixels: NDArray[Any], board: BoardCalibration) -> NDArray[Any]:
+    """What the board stamps on photons that come at `times`, s since the cycle began."""
+    local = times - board.offsets[pixels]
+    periods, phase = np.divmod(local, CLOCK_PERIOD)
+    codes = [
+        int(np.searchsorted(board.code_ends[pixel], at, side="right")) for pixel, at in zip(pixels, phase, strict=True)
+    ]
+    records = np.zeros(len(times), STAMP)
+    records["pixel"], records["code"] = pixels, periods.astype(int) * CODES + np.minimum(codes, CODES - 1)
+    return records
+
+
+@pytest.mark.parametrize("period", [None, 25e-9, 17.3e-9])
+def test_stamps_are_shared_out_over_their_codes(board: BoardCalibration, period: float | None) -> None:
+    random = np.random.default_rng(5)
+    pixels = random.integers(0, 256, 500)
+    records = stamps_at(random.uniform(10e-9, 120e-9, 500), pixels, board)
+    axis = BinAxis(37 * PS, 400, 300 * PS, period)
+    histogram = StampHistogram(axis, board)
+    histogram.add(records)
+    last = board.times(records)
+    width = (board.code_ends - board.code_begins)[pixels, records["code"] % CODES]
+    shares = overlaps(last - width, last, axis)
+    expected = np.zeros((400, 256))
+    np.add.at(expected.T, pixels, shares)
+    # float32 tables: 700 bins to 6e-8 of their value, divided by codes as narrow as a hundredth of a bin.
+    np.testing.assert_allclose(histogram.counts, expected, atol=5e-3)
+    np.testing.assert_allclose(histogram.counts.sum(), expected.sum(), rtol=1e-5)
+
+
+def test_even_light_gives_even_bins_whatever_the_codes(board: BoardCalibration) -> None:
+    """Uncorrected, the ripple is as deep as the codes are uneven; corrected, only the photons' own noise remains."""
+    random = np.random.default_rng(6)
+    photons = 400_000
+    pixels = np.full(photons, 40)
+    records = stamps_at(random.uniform(10e-9, 110e-9, photons), pixels, board)
+    axis = BinAxis(CLOCK_PERIOD / 50, 50, 0.0, CLOCK_PERIOD)
+    corrected, plain = StampHistogram(axis, board), StampHistogram(axis, BoardCalibration.ideal())
+    corrected.add(records)
+    plain.add(records)
+    mean = photons / 50
+    assert np.std(plain.counts[:, 40]) > 0.2 * mean
+    # Poisson noise is sqrt(8000) = 89; sharing out makes neighbours alike and never noisier. 1.3: 50 bins' own scatter.
+    assert np.std(corrected.counts[:, 40]) < 1.3 * np.sqrt(mean)
+    assert corrected.counts[:, 40].sum() == pytest.approx(photons, rel=1e-6)
+
+
+def test_a_pulse_comes_back_in_all_pixels_at_once(board: BoardCalibration) -> None:
+    """Pixels out of step by nanoseconds, and a laser whose period is no multiple of the clock's."""
+    random = np.random.default_rng(8)
+    pixels = np.arange(256).repeat(300)
+    pulse = 4.21e-9
+    times = pulse + 7.77e-9 * random.integers(2, 500, len(pixels))
+    histogram = StampHistogram(BinAxis(2 * PS, 3880, 0.0, 7.77e-9), board)
+    histogram.add(stamps_at(times, pixels, board))
+    centre = (histogram.counts * histogram.axis.times[:, None]).sum(axis=0) / histogram.counts.sum(axis=0)
+    # A code is 18 ps wide on average and up to 45 ps here; 300 photons in 250 places on the codes average that out.
+    # Bins are narrow, because the centre of wide ones is not that of the photons in them.
+    assert np.abs(centre - pulse).max() < 5 * PS
+    assert np.median(np.abs(centre - pulse)) < 1 * PS
+
+
+def test_stamps_with_a_counter_and_in_pieces(board: BoardCalibration, monkeypatch: pytest.MonkeyPatch) -> None:
+    random = np.random.default_rng(9)
+    pixels = random.integers(0, 256, 200_000)
+    plain = np.zeros(200_000, STAMP)
+    plain["pixel"], plain["code"] = pixels, random.integers(0, 1 << 20, 200_000)
+    counted = np.zeros(200_000, STAMP_WITH_COUNTER)
+    for name in STAMP.names or ():
+        counted[name] = plain[name]
+    axis = BinAxis(20 * PS, 576, 0.0, 25e-9)
+    monkeypatch.setenv(THREADS_VARIABLE, "1")
+    whole = StampHistogram(axis, board)
+    whole.add(plain)
+    monkeypatch.setenv(THREADS_VARIABLE, "3")
+    pieces = StampHistogram(axis, board)
+    pieces.add(counted[:150_000])
+    pieces.add(counted[150_000:])
+    # The order of additions in float64.
+    np.testing.assert_allclose(pieces.counts, whole.counts, atol=1e-6)
+
+
+def tags(rows: list[tuple[int, int, int]]) -> NDArray[Any]:
+    return np.array(rows, RECORD)
+
+
+def test_tags_count_from_the_last_pulse() -> None:
+    histogram = TagHistogram(BinAxis(1e-9, 10, 0.5e-9), 0, (2, 1), 1e-9)
+    histogram.add(
+        tags(
+            [
+                (3, 0b100, 0),  # before the first pulse
+                (10, 0b001, 0),
+                (12, 0b100, 0),
+                (15, 0b110, 0),
+                (16, 0b010, DELTA),  # a level, not an edge
+                (16, 0b001, DELTA),
+                (30, 0b101, 0),  # a photon together with a pulse
+                (99, 0b100, 0),  # beyond the bins
+            ]
+        )
+    )
+    expected = np.zeros((10, 2))
+    expected[[2, 5, 0], 0] = 1
+    expected[5, 1] = 1
+    np.testing.assert_allclose(histogram.counts, expected, atol=1e-9)
+
+
+def test_tags_after_a_gap_wait_for_the_next_pulse() -> None:
+    histogram = TagHistogram(BinAxis(1e-9, 10), 3, (0,), 1e-9)
+    histogram.add(tags([(10, 0b1000, 0)]))
+    histogram.add(tags([(12, 1, 0)]))
+    histogram.add(tags([(14, 1, 0)]), after_gap=True)
+    histogram.add(tags([(15, 0b1000, 0), (17, 1, 0)]))
+    assert histogram.counts.sum() == pytest.approx(2)
+
+
+def test_tags_on_threads_know_the_pulse_before_their_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pulses are so rare that a piece may hold none."""
+    random = np.random.default_rng(4)
+    records = np.zeros(300_000, RECORD)
+    records["time_ticks"] = np.cumsum(random.integers(0, 3, 300_000))
+    records["channels"] = random.choice([2, 4], 300_000)
+    records["channels"][[5, 120_000]] |= 1
+    axis = BinAxis(1e-6, 400)
+    found = []
+    for threads in ("1", "4"):
+        monkeypatch.setenv(THREADS_VARIABLE, threads)
+        histogram = TagHistogram(axis, 0, (1, 2), 1e-9)
+        histogram.add(records)
+        found.append(histogram.counts)
+    np.testing.assert_allclose(found[1], found[0], atol=1e-6)
+    assert found[0].sum() == pytest.approx(300_000 - 5, abs=1)  # an interval at either end may stick out
+
+
+def test_the_sum_is_a_streak_image_that_does_not_trust_hot_pixels(board: BoardCalibration) -> None:
+    histogram = StampHistogram(BinAxis(20 * PS, 100, 1e-9, 25e-9), board)
+    pixels = np.arange(256)
+    histogram.add(stamps_at(np.full(256, 27e-9), pixels, board))
+    camera = Camera(np.array([128.0]), np.array([0.0]), (9, 9), 256)
+    streak = histogram.streak(camera, "a board")
+    np.testing.assert_allclose(streak.times, 1e-9 + np.arange(100) * 20 * PS, rtol=1e-12)
+    assert streak.saturated is not None
+    assert np.flatnonzero(streak.saturated.any(axis=0)).tolist() == [17, 200]
+    assert (streak.camera, streak.source) == (camera, "a board")
+    # All at 2 ns after a pulse: row 50, and no code is longer than three rows.
+    assert np.abs(np.argmax(streak.counts, axis=0) - 50).max() <= 2
+
+
+def test_nothing_came() -> None:
+    with pytest.raises(InputError, match="every pixel is zero"):
+        TimeHistogram(2, BinAxis(1e-9, 5)).streak()
+
+
+@pytest.mark.parametrize(
+    "arguments", [(0.0, 5), (np.nan, 5), (1e-9, 0), (1e-9, 5, np.inf), (1e-9, 5, 0.0, -1.0), (1e-9, 5, 0.0, 4e-9)]
+)
+def test_impossible_axes_are_refused(arguments: tuple[Any, ...]) -> None:
+    with pytest.raises(InputError):
+        BinAxis(*arguments)
+
+
+def test_impossible_histograms_are_refused() -> None:
+    axis = BinAxis(1e-9, 1 << 20)
+    with pytest.raises(InputError, match="more than"):
+        Accumulator(256, axis)
+    with pytest.raises(InputError, match="more than"):
+        Accumulator(0, axis)
+    with pytest.raises(InputError, match="channels of their own"):
+        TagHistogram(axis, 1, (1, 2), 1e-9)
+    with pytest.raises(InputError, match="a tick must be"):
+        TagHistogram(axis, 0, (1, 2), 0.0)
+    with pytest.raises(InputError, match="a resolution must be"):
+        TimeHistogram(2, axis, -1.0)
+
+
+def test_photons_that_cannot_be_are_refused() -> None:
+    histogram = TimeHistogram(2, BinAxis(1e-9, 5))
+    with pytest.raises(ShapeError):
+        histogram.add(np.zeros(3, int), np.zeros(2))
+    with pytest.raises(InputError, match=r"2 pixels, got 0\.\.2"):
+        histogram.add(np.array([0, 2]), np.zeros(2))
+    with pytest.raises(InputError, match="finite"):
+        histogram.add(np.array([0, 1]), np.array([0.0, np.nan]))
+    stamps = StampHistogram(BinAxis(1e-9, 5), BoardCalibration.ideal())
+    with pytest.raises(InputError, match="end in code and pixel"):
+        stamps.add(tags([(3, 1, 0)]))
+    with pytest.raises(InputError, match="256 pixels; 1 time stamps"):
+        stamps.add(np.array([(0, 5, 256), (0, 5, 255)], STAMP))
