@@ -14,6 +14,8 @@ from tofclip.operators import (
     Diagonal,
     FourierShear,
     HadamardCodes,
+    Identity,
+    Integration,
     LinearOperator,
     LinearShear,
     LineProjection,
@@ -23,6 +25,7 @@ from tofclip.operators import (
     PointSpreadConvolution,
     RadonProjection,
     RandomCodes,
+    SliceConvolution,
     SparseMatrix,
     Stack,
 )
@@ -133,6 +136,20 @@ def sparse_camera(dtype: type) -> LinearOperator:
     return pitched_sensor(dtype) @ point_spread_convolution(dtype)
 
 
+def slice_convolution(dtype: type) -> LinearOperator:
+    return SliceConvolution((11, 14), np.random.default_rng(9).random((3, 10, 9)), dtype)
+
+
+def integration(dtype: type) -> LinearOperator:
+    """Views that add up on one sensor (supplement Eq. 19)."""
+    spreads = np.random.default_rng(10).random((3, 4, 5))
+    return Integration([PointSpreadConvolution((9, 7), spread, dtype=dtype) for spread in spreads])
+
+
+def identity(dtype: type) -> LinearOperator:
+    return Identity((3, 5), dtype)
+
+
 BUILDERS: list[Callable[[type], LinearOperator]] = [
     line_projection,
     sparse_matrix,
@@ -156,6 +173,9 @@ BUILDERS: list[Callable[[type], LinearOperator]] = [
     pitched_sensor,
     masked_sensor,
     sparse_camera,
+    slice_convolution,
+    integration,
+    identity,
 ]
 BATCHES = [(), (1,), (3,), (32,), (33,)]
 
@@ -251,6 +271,11 @@ def test_leaves_its_input_alone(build):
     np.testing.assert_array_equal(y, y_before)
 
 
+def test_composed_with_the_identity_an_operator_is_itself():
+    operator = line_projection(np.float32)
+    assert Identity((37,)) @ operator is operator
+
+
 def test_the_adjoint_of_the_adjoint_is_the_operator():
     operator = line_projection(np.float32)
     assert operator.H.H is operator
@@ -281,6 +306,12 @@ def test_the_adjoint_of_the_adjoint_is_the_operator():
         lambda: PointSpreadConvolution((9, 9), np.zeros((3, 3))),
         lambda: PointSpreadConvolution((9, 9), [[1.0, np.nan]]),
         lambda: PitchedSensor((9, 9), (0.5, 1)),
+        lambda: SliceConvolution((9, 9), np.ones((2, 9, 10))),
+        lambda: SliceConvolution((9, 9), np.ones((9, 9))),
+        lambda: Integration([]),
+        lambda: Integration([dense_sensor(np.float32), mean_weighting(np.float32)]),
+        lambda: Integration([dense_sensor(np.float32), dense_sensor(np.float64)]),
+        lambda: Identity((37,), np.float64) @ line_projection(np.float32),
         lambda: PitchedSensor((9, 9), (2, 2), (9, 0)),
         lambda: MaskedSensor(np.zeros((4, 4), bool)),
         lambda: MaskedSensor(np.ones(4, bool)),

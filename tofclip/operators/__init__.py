@@ -5,10 +5,13 @@ from tofclip.operators.base import (
     BlockDiagonal,
     Composition,
     Diagonal,
+    Identity,
+    Integration,
     LinearOperator,
     Stack,
     squared_norm,
 )
+from tofclip.operators.coded_lines import SliceConvolution
 from tofclip.operators.convolution import PointSpreadConvolution
 from tofclip.operators.projection import LineProjection
 from tofclip.operators.radon import RadonProjection
@@ -26,6 +29,8 @@ __all__ = [
     "Diagonal",
     "FourierShear",
     "HadamardCodes",
+    "Identity",
+    "Integration",
     "LineProjection",
     "LinearOperator",
     "LinearShear",
@@ -35,6 +40,7 @@ __all__ = [
     "PointSpreadConvolution",
     "RadonProjection",
     "RandomCodes",
+    "SliceConvolution",
     "SparseMatrix",
     "Stack",
     "squared_norm",

@@ -177,6 +177,53 @@ class BlockDiagonal(LinearOperator):
         return np.stack([operator._adjoint(part) for operator, part in pairs])
 
 
+class Integration(LinearOperator):
+    """The sum of what an operator makes of each entry of the input's first axis: ``[A_1, A_2, ...] [x_1; x_2; ...]``.
+
+    With a view's encoder for each view it is the model of a sensor on which all views add up (supplement Eq. 19).
+    """
+
+    def __init__(self, operators: Sequence[LinearOperator]) -> None:
+        if not operators:
+            raise InputError("an integration needs at least one operator")
+        first = operators[0]
+        for other in operators[1:]:
+            if (other.shape_in, other.shape_out) != (first.shape_in, first.shape_out):
+                shapes = (f"{kind.shape_in} -> {kind.shape_out}" for kind in (first, other))
+                raise ShapeError("every operator of an integration", *shapes)
+            if other.dtype != first.dtype:
+                raise InputError(f"cannot add {first.dtype} to {other.dtype}; build both in one type")
+        super().__init__((len(operators), *first.shape_in), first.shape_out, first.dtype)
+        self.operators = tuple(operators)
+
+    def _forward(self, block: Array) -> Array:
+        total = np.zeros((*self.shape_out, block.shape[-1]), self.dtype)
+        for operator, part in zip(self.operators, block, strict=True):
+            total += operator._forward(part)
+        return total
+
+    def _adjoint(self, block: Array) -> Array:
+        return np.stack([operator._adjoint(block) for operator in self.operators])
+
+
+class Identity(LinearOperator):
+    """Leaves everything as it is; composed with another operator it is that operator itself."""
+
+    def __init__(self, shape: Shape, dtype: DTypeLike = np.float32) -> None:
+        super().__init__(shape, shape, dtype)
+
+    def _forward(self, block: Array) -> Array:
+        return block
+
+    def _adjoint(self, block: Array) -> Array:
+        return block
+
+    def __matmul__(self, other: LinearOperator) -> LinearOperator:
+        """Return `other`, if it fits."""
+        Composition(self, other)  # refuses operators that do not fit each other
+        return other
+
+
 class Diagonal(LinearOperator):
     """Elementwise weights, such as view gains or a mask of live pixels; self-adjoint."""
 

@@ -52,11 +52,10 @@ class PointSpreadConvolution(LinearOperator):
 
         sensor_shape = image_shape if sensor_shape is None else sensor_shape
         super().__init__(image_shape, sensor_shape, dtype)
-        spread = checked_point_spread(point_spread, image_shape)
+        spread, centre = _without_dark_border(checked_point_spread(point_spread, image_shape))
         first = [image // 2 - sensor // 2 for image, sensor in zip(image_shape, sensor_shape, strict=True)]
-        centre = [size // 2 for size in spread.shape]
         self._padded = tuple(
-            scipy.fft.next_fast_len(_unmixed_length(*sizes), real=True)
+            scipy.fft.next_fast_len(unmixed_length(*sizes), real=True)
             for sizes in zip(image_shape, sensor_shape, spread.shape, first, centre, strict=True)
         )
         placed = np.zeros(self._padded, self.dtype)
@@ -96,7 +95,14 @@ def checked_point_spread(point_spread: ArrayLike, image_shape: tuple[int, int]) 
     return spread
 
 
-def _unmixed_length(image: int, sensor: int, spread: int, first: int, centre: int) -> int:
+def _without_dark_border(spread: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[int]]:
+    """Cut a PSF down to where it is not zero; return it and where its origin lies then."""
+    lit = [np.flatnonzero(spread.any(axis=other)) for other in (1, 0)]
+    cut = spread[lit[0][0] : lit[0][-1] + 1, lit[1][0] : lit[1][-1] + 1]
+    return cut, [size // 2 - int(axis[0]) for size, axis in zip(spread.shape, lit, strict=True)]
+
+
+def unmixed_length(image: int, sensor: int, spread: int, first: int, centre: int) -> int:
     """Least period for which no sensor pixel gets light from a periodic image of the picture.
 
     Sensor pixels lie at first ... first + sensor - 1 of the picture's own pixels 0 ... image - 1; the PSF reaches from

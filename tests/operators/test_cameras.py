@@ -1,0 +1,100 @@
+"""Light-field cameras: how many readings they take, and that their two models agree where they must."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofclip.errors import InputError
+from tofclip.operators import Composition, DenseSensor, LinearShear, PointSpreadConvolution, SparseMatrix
+from tofclip.operators.light_field_camera import CAMERAS, CodedApertureCamera, MeasuredCamera
+from tofclip.operators.point_spreads import MeasuredPointSpreads
+
+VIEWS = [(float(v), float(u)) for v in range(-2, 2) for u in range(-1, 2)]
+SHAPE = (48, 56)
+AREA = ("coded-aperture", "cubic-phase", "diffuser")
+
+every_camera = pytest.mark.parametrize("name", CAMERAS)
+
+
+def blob(y: float = 24.0, x: float = 29.0) -> np.ndarray:
+    """A spot that no shear or PSF of these cameras brings near a border, and smooth enough for interpolation."""
+    rows, columns = np.indices(SHAPE)
+    return np.exp(-((rows - y) ** 2 + (columns - x) ** 2) / 12).astype(np.float32)
+
+
+@every_camera
+@pytest.mark.parametrize("ratio", [1.0, 0.5, 0.13])
+def test_the_sampling_ratio_holds(name, ratio):
+    camera = CAMERAS[name](SHAPE, VIEWS, ratio, 0)
+    expected = ratio * SHAPE[0] * SHAPE[1]
+    assert camera.light_field_model().shape_out == camera.model(0.0).shape_out == (camera.readings,)
+    # A line detector, a row of the area sensor or a code for each view is the least that can be added or left out.
+    step = len(VIEWS) if name == "single-pixel" else max(SHAPE)
+    assert abs(camera.readings - expected) <= step
+    assert camera.weighting().shape_in == (camera.readings,)
+
+
+@every_camera
+@pytest.mark.parametrize("reference", [(0.0, 0.0), (0.5, -0.7)])
+def test_a_flat_scene_is_seen_alike_by_both_models(name, reference):
+    """Eq. 20 on the sheared views is Eq. 21 on the picture; linear interpolation in another order differs by 3 %."""
+    camera = CAMERAS[name](SHAPE, VIEWS, 0.6, 1)
+    pictures = [LinearShear(SHAPE, -0.8, camera.views[k], reference)(blob()) for k in camera.used]
+    true = camera.light_field_model()(np.stack(pictures))
+    seen = camera.model(-0.8, reference)(blob())
+    assert np.linalg.norm(seen - true) < 0.03 * np.linalg.norm(true)
+    assert np.linalg.norm(camera.model(0.4, reference)(blob()) - true) > 0.04 * np.linalg.norm(true)
+
+
+@every_camera
+def test_the_seed_decides_the_camera(name):
+    readings = [CAMERAS[name](SHAPE, VIEWS, 0.5, seed).model(0.7)(blob()) for seed in (3, 3, 4)]
+    np.testing.assert_array_equal(readings[0], readings[1])
+    assert name == "cubic-phase" or not np.allclose(readings[0], readings[2], rtol=1e-3)
+
+
+@every_camera
+@pytest.mark.parametrize("ratio", [0.0, -1.0, np.nan, 1e-6])
+def test_a_ratio_that_leaves_no_reading_is_refused(name, ratio):
+    with pytest.raises(InputError, match="sampling ratio"):
+        CAMERAS[name](SHAPE, VIEWS, ratio, 0)
+
+
+@pytest.mark.parametrize("name", AREA)
+def test_one_area_sensor_cannot_read_more_than_its_pixels(name):
+    with pytest.raises(InputError, match="up to 1, not 2"):
+        CAMERAS[name](SHAPE, VIEWS, 2.0, 0)
+
+
+@every_camera
+def test_a_shear_that_leaves_the_field_is_refused(name):
+    with pytest.raises(InputError, match="shear"):
+        CAMERAS[name](SHAPE, VIEWS, 0.5, 0).model(60.0)
+
+
+def test_few_lines_leave_views_without_any():
+    camera = CAMERAS["line"](SHAPE, VIEWS, 0.1, 0)
+    assert len(camera.used) == camera.readings // max(SHAPE) == 5
+    assert isinstance(camera.weighting() @ camera.model(0.3), SparseMatrix)
+
+
+def test_a_closed_cell_blinds_its_view():
+    camera = CodedApertureCamera(SHAPE, VIEWS, 1.0, 0)
+    code = camera.element().code
+    assert 0 < len(camera.used) == code.sum() < len(VIEWS)
+
+
+def test_a_measured_camera_is_one_convolution_with_the_depth_s_spread():
+    stack = np.random.default_rng(0).random((2, 20, 24))
+    measured = MeasuredPointSpreads(stack, [-1.0, 0.0])
+    expected = PointSpreadConvolution(SHAPE, measured.at(-0.3))(blob())
+    np.testing.assert_allclose(MeasuredCamera(SHAPE, measured).model(-0.3)(blob()), expected.ravel(), rtol=1e-6)
+
+
+def test_a_measured_camera_without_a_lens_sees_beyond_its_sensor():
+    measured = MeasuredPointSpreads(np.ones((1, 20, 24)), [0.0])
+    model = MeasuredCamera(SHAPE, measured, DenseSensor((24, 28))).model(0.0)
+    assert isinstance(model, Composition)
+    assert model.shape_in == SHAPE
+    assert model(blob(24, 6)).sum() > 0

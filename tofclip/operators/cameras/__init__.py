@@ -1,0 +1,1 @@
+"""Cameras of compact light-field photography, one module for each kind; `light_field_camera` has the table."""

@@ -1,0 +1,77 @@
+"""What every light-field camera has in common."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from tofclip.errors import InputError
+from tofclip.operators.base import BlockDiagonal, Identity, LinearOperator
+from tofclip.operators.shear import View
+
+
+class LightFieldCamera(ABC):
+    """An encoder A_k for each view, and the two models that follow from them.
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+        Rows and columns of every view's picture.
+    views : sequence of (float, float)
+        (v, u) of every view.
+    sampling_ratio : float
+        Readings over pixels of one picture.
+    seed : int
+        Of everything random.
+
+    Attributes
+    ----------
+    used : tuple of int
+        Numbers of the views that get readings, in the order of the readings.
+    readings : int
+        How many readings there are.
+
+    Raises
+    ------
+    InputError
+        So few readings are asked for that there would be none.
+    """
+
+    name: ClassVar[str]
+    readings: int
+
+    def __init__(self, image_shape: tuple[int, int], views: Sequence[View], sampling_ratio: float, seed: int) -> None:
+        if not (np.isfinite(sampling_ratio) and sampling_ratio > 0):
+            raise InputError(f"the sampling ratio must be positive, got {sampling_ratio}")
+        self.image_shape, self.views = image_shape, tuple(views)
+        self.sampling_ratio, self.seed = sampling_ratio, seed
+        self.used = self._deal()
+
+    @abstractmethod
+    def _deal(self) -> tuple[int, ...]:
+        """Give readings to views and set `readings`; return the numbers of the views that get any."""
+
+    @cached_property
+    def encoders(self) -> tuple[LinearOperator, ...]:
+        """A_k of the used views."""
+        return self._encoders()
+
+    @abstractmethod
+    def _encoders(self) -> tuple[LinearOperator, ...]:
+        """Build A_k of the used views."""
+
+    @abstractmethod
+    def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
+        """Return F(d): from the picture refocused at `shear`, seen from `reference`, to the readings (Eq. 21)."""
+
+    def weighting(self) -> LinearOperator:
+        """Return the weights W that readings and model get in a recovery; 1 unless the camera has a reason."""
+        return Identity((self.readings,))
+
+    def light_field_model(self) -> LinearOperator:
+        """Return the map from the used views' pictures, (views, rows, columns), to the readings (Eq. 20)."""
+        return BlockDiagonal(self.encoders)

@@ -1,0 +1,52 @@
+"""CLIP-1D: line projections."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import InputError
+from tofclip.operators.base import LinearOperator
+from tofclip.operators.cameras.base import LightFieldCamera
+from tofclip.operators.cameras.dealing import count_of_lines, dealt_at_random
+from tofclip.operators.radon import RadonProjection
+from tofclip.operators.shear import View
+
+
+class LineCamera(LightFieldCamera):
+    """CLIP-1D: line projections, their angles dealt to the views at random (supplement Note 6).
+
+    ``sampling_ratio * rows * columns / detector`` angles, evenly in [0, pi). A detector has as many pixels as the
+    picture's longer side.
+    """
+
+    name: ClassVar[str] = "line"
+
+    def _deal(self) -> tuple[int, ...]:
+        self.detector_px = max(self.image_shape)
+        count = count_of_lines(self.image_shape, self.detector_px, self.sampling_ratio)
+        self.readings = count * self.detector_px
+        used, self.angles = self._dealt(np.arange(count) * np.pi / count)
+        return used
+
+    def _dealt(self, angles: NDArray[np.float64]) -> tuple[tuple[int, ...], list[NDArray[np.float64]]]:
+        """Give angles to views; return the views that get any, and each one's own angles."""
+        return dealt_at_random(angles, len(self.views), np.random.default_rng(self.seed))
+
+    def _encoders(self) -> tuple[LinearOperator, ...]:
+        return tuple(self._projection(own, np.zeros(own.size)) for own in self.angles)
+
+    def _projection(self, angles: NDArray[np.float64], offsets_px: NDArray[np.float64]) -> RadonProjection:
+        return RadonProjection(self.image_shape, self.detector_px, angles, offsets_px)
+
+    def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
+        """Return F(d) as one sparse matrix: a sheared view is one whose detector is offset."""
+        offsets = []
+        for view, angles in zip(self.used, self.angles, strict=True):
+            down, right = (shear * (a - b) for a, b in zip(self.views[view], reference, strict=True))
+            if not max(abs(down), abs(right)) < self.detector_px:
+                raise InputError(f"shear {shear} moves view {self.views[view]} out of the field; take a smaller one")
+            offsets.append(right * np.cos(angles) + down * np.sin(angles))
+        return self._projection(np.concatenate(self.angles), np.concatenate(offsets))
