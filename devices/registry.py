@@ -18,13 +18,16 @@ from devices.uri import Uri
 from tofclip.errors import InputError
 from tofclip.storage import Scalar
 
-OPENERS: dict[str, str] = {}
+OPENERS: dict[str, str] = {
+    "timetag": "devices.timetag:open_timetag",
+    "sim+timetag": "devices.emulation.timetag:open_emulated",
+}
 """Scheme of an address -> function ``(Uri) -> Source``."""
 
 FILES: dict[str, str] = {}
 """Ending of a file's name, lower case -> function ``(Uri) -> Source``, for addresses ``file://PATH``."""
 
-FINDERS: tuple[str, ...] = ()
+FINDERS: tuple[str, ...] = ("devices.timetag:find_timetaggers",)
 """Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail, without hardware."""
 
 CODECS: dict[str, str] = {

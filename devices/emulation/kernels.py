@@ -1,0 +1,79 @@
+"""Compiled loops that make photons."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from devices.kernels import RECORD_BYTES, TIME_BITS, TIME_MASK, WRAP
+
+compiled = njit(nogil=True, cache=True, error_model="numpy")
+
+_DOUBLE = 2.0**-53
+
+
+@compiled
+def _next(state):
+    """One step of splitmix64 (Steele, Lea, Flood, OOPSLA 2014); returns the new state and 64 random bits."""
+    state = state + np.uint64(0x9E3779B97F4A7C15)
+    mixed = state
+    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return state, mixed ^ (mixed >> np.uint64(31))
+
+
+@compiled
+def poisson_words(state, now, mean_gap, shares, last, words):
+    """Write the words of photons that arrive at random on four channels, one at most per tick.
+
+    Parameters
+    ----------
+    state : (1,) uint64 array
+        Of the random numbers; changed in place.
+    now : (1,) int64 array
+        Tick of the last record; changed in place.
+    mean_gap : float
+        Mean ticks from one photon to the next, more than 1.
+    shares : (4,) float64 array
+        Of all photons, the share of each channel, added up.
+    last : int
+        No record is later than this tick.
+    words : bytes
+        Filled with as many records as fit.
+
+    Returns
+    -------
+    int
+        Records written.
+    """
+    written = 0
+    while written < words.size // RECORD_BYTES:
+        after, bits = _next(state[0])
+        gap = -math.log(((bits >> np.uint64(11)) + np.uint64(1)) * _DOUBLE) * (mean_gap - 1)
+        tick = now[0] + 1 + np.int64(gap)
+        after, bits = _next(after)
+        where = (bits >> np.uint64(11)) * _DOUBLE
+        wrap = ((now[0] >> TIME_BITS) + 1) << TIME_BITS
+        lines, kind = 0, WRAP
+        if tick < wrap:
+            lines, kind = 1, 0
+            for channel in range(3):
+                if where >= shares[channel]:
+                    lines <<= 1
+        else:
+            tick, after = wrap, state[0]
+        if tick > last:
+            break
+        state[0], now[0] = after, tick
+        at = written * RECORD_BYTES
+        time = tick & TIME_MASK
+        words[at] = kind << 5
+        words[at + 1] = (lines << 4) | (time >> 32)
+        words[at + 2] = (time >> 24) & 0xFF
+        words[at + 3] = (time >> 16) & 0xFF
+        words[at + 4] = (time >> 8) & 0xFF
+        words[at + 5] = time & 0xFF
+        written += 1
+    return written

@@ -1,0 +1,54 @@
+"""Light for emulated instruments."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from devices.codec import ByteView
+from devices.codecs.timetag import RECORD_BYTES
+from devices.emulation.kernels import poisson_words
+from tofclip.errors import InputError
+
+CHANNELS = 4
+FOREVER = (1 << 62) - 1
+"""A tick that never comes."""
+
+
+class TagStream(Protocol):
+    """What falls on a time tagger, as the words that it makes of it."""
+
+    def words(self, limit: int, last: int) -> ByteView:
+        """Return the next words: `limit` at most, none of them later than tick `last`; fewer is for good.
+
+        Wraps of the counter are among them. How a stream is cut into calls does not change it.
+        """
+
+
+class Poisson:
+    """Photons at random, at a constant rate.
+
+    Parameters
+    ----------
+    rate : float
+        Photons per second on all channels together.
+    clock_hz : int
+        Ticks per second. There is one record at most per tick.
+    seed : int
+    shares : tuple of four floats
+        How the photons are shared among the channels; any positive scale.
+    """
+
+    def __init__(self, rate: float, clock_hz: int, seed: int, shares: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)) -> None:
+        if not 0 < rate < clock_hz:
+            raise InputError(f"a rate must be above 0 and below the clock's {clock_hz} per second, got {rate:g}")
+        self._mean_gap = clock_hz / rate
+        self._shares = np.cumsum(shares) / np.sum(shares)
+        self._state = np.array([seed], np.uint64)
+        self._now = np.zeros(1, np.int64)
+
+    def words(self, limit: int, last: int) -> ByteView:
+        words = np.empty(limit * RECORD_BYTES, np.uint8)
+        written = poisson_words(self._state, self._now, self._mean_gap, self._shares, last, words)
+        return words[: written * RECORD_BYTES]

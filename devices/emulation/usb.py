@@ -1,0 +1,188 @@
+"""A USB of software: the interface that pyusb expects of a backend, over instruments that are objects."""
+
+from __future__ import annotations
+
+import abc
+import array
+import errno
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import usb.backend
+import usb.core
+
+from devices.usb import INTERFACE, UsbIdentity
+
+BULK = 2
+HIGH_SPEED = 3
+PACKET_BYTES = 512
+ENGLISH = 0x0409
+GET_DESCRIPTOR, STRING = 6, 3
+
+
+def usb_error(number: int) -> usb.core.USBError:
+    """Return the exception that pyusb raises for a system error."""
+    kind = usb.core.USBTimeoutError if number == errno.ETIMEDOUT else usb.core.USBError
+    return kind(errno.errorcode[number], None, number)
+
+
+class VirtualDevice(abc.ABC):
+    """An instrument on the virtual USB.
+
+    Parameters
+    ----------
+    identity : UsbIdentity
+    strings : tuple of str
+        Manufacturer, product and serial number.
+    endpoints : tuple of int
+        Addresses of its bulk endpoints.
+    """
+
+    def __init__(self, identity: UsbIdentity, strings: tuple[str, str, str], endpoints: tuple[int, ...]) -> None:
+        self.identity, self.strings, self.endpoints = identity, strings, endpoints
+        self.halted: set[int] = set()
+        self.looks_until_replug: float = 0
+        """Enumerations in which it does not show; infinite: it is gone for good."""
+        self.may_be_opened = True
+        self.held_by_other = False
+
+    @property
+    def is_plugged(self) -> bool:
+        """Whether it answers."""
+        return self.looks_until_replug <= 0
+
+    def unplug(self, looks: float) -> None:
+        """Take it off the bus for so many enumerations."""
+        self.looks_until_replug = looks
+
+    def clear_halt(self, endpoint: int) -> None:
+        """End an endpoint's stall."""
+        self.halted.discard(endpoint)
+
+    @abc.abstractmethod
+    def receive(self, endpoint: int, data: bytes) -> None:
+        """Take what the host sends."""
+
+    @abc.abstractmethod
+    def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
+        """Write what the host asks for into `buffer` and return how many bytes; raise `usb_error` for faults."""
+
+
+class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no types
+    """A backend for pyusb (`usb.backend.IBackend`) over virtual devices.
+
+    Parameters
+    ----------
+    *devices : VirtualDevice
+    """
+
+    def __init__(self, *devices: VirtualDevice) -> None:
+        self._devices = devices
+
+    def enumerate_devices(self) -> Iterator[VirtualDevice]:
+        for device in self._devices:
+            if device.is_plugged:
+                yield device
+            else:
+                device.looks_until_replug -= 1
+
+    def get_device_descriptor(self, dev: VirtualDevice) -> SimpleNamespace:
+        return SimpleNamespace(
+            bLength=18, bDescriptorType=1, bcdUSB=0x200, bDeviceClass=255, bDeviceSubClass=255, bDeviceProtocol=255,
+            bMaxPacketSize0=64, idVendor=dev.identity.vendor, idProduct=dev.identity.product, bcdDevice=0x100,
+            iManufacturer=1, iProduct=2, iSerialNumber=3 if dev.strings[2] else 0, bNumConfigurations=1,
+            address=self._devices.index(dev) + 1, bus=1, port_number=1, port_numbers=(1,), speed=HIGH_SPEED,
+        )  # fmt: skip
+
+    def get_configuration_descriptor(self, dev: VirtualDevice, config: int) -> SimpleNamespace:
+        _require(config == 0)
+        return SimpleNamespace(
+            bLength=9, bDescriptorType=2, wTotalLength=18 + 7 * len(dev.endpoints), bNumInterfaces=1,
+            bConfigurationValue=1, iConfiguration=0, bmAttributes=0x80, bMaxPower=250, extra_descriptors=[],
+        )  # fmt: skip
+
+    def get_interface_descriptor(self, dev: VirtualDevice, intf: int, alt: int, config: int) -> SimpleNamespace:
+        _require((intf, alt, config) == (INTERFACE, 0, 0))
+        return SimpleNamespace(
+            bLength=9, bDescriptorType=4, bInterfaceNumber=INTERFACE, bAlternateSetting=0,
+            bNumEndpoints=len(dev.endpoints), bInterfaceClass=255, bInterfaceSubClass=255, bInterfaceProtocol=255,
+            iInterface=0, extra_descriptors=[],
+        )  # fmt: skip
+
+    def get_endpoint_descriptor(self, dev: VirtualDevice, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
+        _require(ep < len(dev.endpoints) and (intf, alt, config) == (INTERFACE, 0, 0))
+        return SimpleNamespace(
+            bLength=7, bDescriptorType=5, bEndpointAddress=dev.endpoints[ep], bmAttributes=BULK,
+            wMaxPacketSize=PACKET_BYTES, bInterval=0, bRefresh=0, bSynchAddress=0, extra_descriptors=[],
+        )  # fmt: skip
+
+    def open_device(self, dev: VirtualDevice) -> VirtualDevice:
+        _present(dev)
+        if not dev.may_be_opened:
+            raise usb_error(errno.EACCES)
+        return dev
+
+    def close_device(self, dev_handle: VirtualDevice) -> None:
+        """Nothing is held open."""
+
+    def get_configuration(self, dev_handle: VirtualDevice) -> int:
+        _present(dev_handle)
+        return 1
+
+    def is_kernel_driver_active(self, dev_handle: VirtualDevice, intf: int) -> bool:
+        _present(dev_handle)
+        return False
+
+    def claim_interface(self, dev_handle: VirtualDevice, intf: int) -> None:
+        _present(dev_handle)
+        if dev_handle.held_by_other:
+            raise usb_error(errno.EBUSY)
+
+    def release_interface(self, dev_handle: VirtualDevice, intf: int) -> None:
+        _present(dev_handle)
+
+    def clear_halt(self, dev_handle: VirtualDevice, ep: int) -> None:
+        _present(dev_handle)
+        dev_handle.clear_halt(ep)
+
+    def ctrl_transfer(
+        self, dev_handle: VirtualDevice, bmRequestType: int, bRequest: int, wValue: int, wIndex: int, data: Any,
+        timeout: int,
+    ) -> int:  # fmt: skip
+        """Answer requests for string descriptors, the only control requests that pyusb needs here."""
+        _present(dev_handle)
+        number = wValue & 0xFF
+        if (bRequest, wValue >> 8) != (GET_DESCRIPTOR, STRING) or number > len(dev_handle.strings):
+            raise usb_error(errno.EPIPE)
+        text = dev_handle.strings[number - 1].encode("utf-16-le") if number else ENGLISH.to_bytes(2, "little")
+        answer = bytes([2 + len(text), STRING]) + text
+        length = min(len(answer), len(data))
+        data[:length] = array.array("B", answer[:length])
+        return length
+
+    def bulk_write(self, dev_handle: VirtualDevice, ep: int, intf: int, data: array.array[int], timeout: int) -> int:
+        self._ready(dev_handle, ep)
+        dev_handle.receive(ep, data.tobytes())
+        return len(data)
+
+    def bulk_read(self, dev_handle: VirtualDevice, ep: int, intf: int, buff: array.array[int], timeout: int) -> int:
+        self._ready(dev_handle, ep)
+        return dev_handle.fill(ep, memoryview(buff), timeout / 1000)
+
+    @staticmethod
+    def _ready(device: VirtualDevice, endpoint: int) -> None:
+        _present(device)
+        if endpoint in device.halted:
+            raise usb_error(errno.EPIPE)
+
+
+def _present(device: VirtualDevice) -> None:
+    if not device.is_plugged:
+        raise usb_error(errno.ENODEV)
+
+
+def _require(exists: bool) -> None:
+    """Say, as pyusb expects, that a descriptor is the last of its kind."""
+    if not exists:
+        raise IndexError

@@ -1,0 +1,54 @@
+"""Book-keeping of records: every change moves records from one account to another, so the accounts always balance."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+from devices.statistics import Stats
+
+
+class Ledger:
+    """The accounts of a running source; safe to use from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._stats = Stats()
+
+    @property
+    def stats(self) -> Stats:
+        """The accounts as they stand."""
+        return self._stats
+
+    def arrive(self, records: int) -> None:
+        """Enter records that arrived and wait to be read."""
+        self._add(acquired=records, unread=records)
+
+    def settle(self, delivered: int, malformed: int) -> None:
+        """Move records that waited to those that were read."""
+        self._add(unread=-delivered - malformed, delivered=delivered, malformed=malformed)
+
+    def drop(self, records: int) -> None:
+        """Move records that waited to those that nobody read in time."""
+        self._add(unread=-records, dropped_host=records)
+
+    def break_off(self, records: int = 1) -> None:
+        """Enter records of which only a part arrived."""
+        self._add(acquired=records, malformed=records)
+
+    def lose(self, records: int) -> None:
+        """Enter records that the instrument registered and that never arrived."""
+        self._add(acquired=records, lost_device=records)
+
+    def time_out(self) -> None:
+        """Count a time that nothing came."""
+        self._add(timeouts=1)
+
+    def reconnect(self) -> None:
+        """Count a time that the instrument was found anew."""
+        self._add(reconnects=1)
+
+    def _add(self, **changes: int) -> None:
+        with self._lock:
+            now = self._stats
+            self._stats = replace(now, **{name: getattr(now, name) + change for name, change in changes.items()})

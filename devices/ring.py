@@ -1,0 +1,136 @@
+"""The bounded buffer between the thread that empties an instrument and whoever reads its records."""
+
+from __future__ import annotations
+
+import enum
+import threading
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from devices.ledger import Ledger
+from tofclip.errors import BufferOverflowError, DeviceTimeoutError
+
+Policy = Literal["block", "drop_oldest", "fail"]
+POLICIES: tuple[Policy, ...] = ("block", "drop_oldest", "fail")
+
+
+class Gap(enum.IntEnum):
+    """What is missing right before a piece of a stream."""
+
+    NONE = 0
+    LOSS = 1
+    """Records; the instrument's clock went on."""
+    RESTART = 2
+    """The instrument itself: it was away and may have begun anew."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Whole records as they came, not decoded yet.
+
+    Parameters
+    ----------
+    data : bytes
+    records : int
+        How many, by the codec's count.
+    gap : Gap
+    """
+
+    data: bytes
+    records: int
+    gap: Gap = Gap.NONE
+
+
+class Ring:
+    """A queue of pieces that never holds more than `capacity` bytes (but always at least one piece).
+
+    Parameters
+    ----------
+    capacity : int
+        Bytes.
+    policy : {"block", "drop_oldest", "fail"}
+        What happens when it is full: the writer waits (and the instrument's own memory fills up), the oldest piece
+        goes, or reading ends with `BufferOverflowError` after what is in the queue.
+    ledger : Ledger
+        Where arrivals and drops are entered.
+    """
+
+    def __init__(self, capacity: int, policy: Policy, ledger: Ledger) -> None:
+        self._capacity, self._policy, self._ledger = capacity, policy, ledger
+        self._pieces: deque[Piece] = deque()
+        self._bytes = 0
+        self._changed = threading.Condition()
+        self._ended = False
+        self._fault: Exception | None = None
+        self._lost_before_next = Gap.NONE
+
+    def put(self, piece: Piece) -> None:
+        """Append a piece. With policy ``"block"`` this waits until there is room or the ring has ended."""
+        with self._changed:
+            self._ledger.arrive(piece.records)
+            if self._policy == "block":
+                self._changed.wait_for(lambda: self._fits(piece) or self._ended)
+            elif self._policy == "fail" and not self._fits(piece):
+                self._ledger.drop(piece.records)
+                self._fault = BufferOverflowError(
+                    f"records came faster than they were read and the buffer of {self._capacity} bytes is full; "
+                    "read faster, or choose policy=block or policy=drop_oldest"
+                )
+                raise self._fault
+            while not self._fits(piece) and self._policy == "drop_oldest":
+                self._drop_oldest()
+            self._pieces.append(replace(piece, gap=max(piece.gap, self._lost_before_next)))
+            self._bytes += len(piece.data)
+            self._lost_before_next = Gap.NONE
+            self._changed.notify_all()
+
+    def get(self, timeout: float) -> Piece | None:
+        """Take the oldest piece; None at the end of the stream.
+
+        Raises
+        ------
+        DeviceTimeoutError
+            None came within `timeout` seconds.
+        Exception
+            What `fail` was given, once everything before it has been taken.
+        """
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._pieces or self._ended or self._fault, timeout):
+                raise DeviceTimeoutError(
+                    f"the instrument sent nothing for {timeout:g} s; is there light on the detector?"
+                )
+            if self._pieces:
+                piece = self._pieces.popleft()
+                self._bytes -= len(piece.data)
+                self._changed.notify_all()
+                return piece
+            if self._fault is not None:
+                raise self._fault
+            return None
+
+    def fail(self, fault: Exception) -> None:
+        """End the stream with an exception; the first one counts."""
+        with self._changed:
+            self._fault = self._fault or fault
+            self._changed.notify_all()
+
+    def end(self) -> None:
+        """End the stream; what is in it can still be taken, and a writer that waits for room waits no more."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+    def _fits(self, piece: Piece) -> bool:
+        return not self._pieces or self._bytes + len(piece.data) <= self._capacity
+
+    def _drop_oldest(self) -> None:
+        """Take out the oldest piece and remember, at the next one, that something is missing."""
+        oldest = self._pieces.popleft()
+        self._bytes -= len(oldest.data)
+        self._ledger.drop(oldest.records)
+        gap = max(oldest.gap, Gap.LOSS)
+        if self._pieces:
+            self._pieces[0] = replace(self._pieces[0], gap=max(self._pieces[0].gap, gap))
+        else:
+            self._lost_before_next = max(self._lost_before_next, gap)

@@ -1,0 +1,210 @@
+"""Sources whose instrument pushes bytes: one thread empties the instrument, `Source.read` decodes.
+
+::
+
+    instrument -> Feed -> [thread: whole records] -> Ring -> (tap) -> Codec -> Batch
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import monotonic
+from typing import Protocol
+
+from devices.codec import Codec, as_bytes
+from devices.ledger import Ledger
+from devices.ring import Gap, Piece, Policy, Ring
+from devices.source import PATIENCE, Batch, Info, Source
+from devices.statistics import Stats
+from tofclip.errors import DeviceError, DeviceTimeoutError
+from tofclip.storage import Record
+
+POLL = 0.1
+"""Seconds after which the thread looks whether it should stop, though nothing came."""
+
+LONGEST_DRAIN = 3.0
+"""Seconds in which a stopped instrument must have handed over what it still holds."""
+
+LONGEST_STOP = 15.0
+"""Seconds that `StreamSource.close` waits for the thread, which never takes so long."""
+
+Tap = Callable[[Piece], None]
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """What one transfer brought.
+
+    Parameters
+    ----------
+    data : bytes-like
+        Valid until the next `Feed.pull`.
+    gap : Gap
+        What is missing before it. After a gap the data begins with a whole record.
+    """
+
+    data: memoryview
+    gap: Gap = Gap.NONE
+
+
+class Feed(Protocol):
+    """Where a stream's bytes come from. Every method is called from one thread, never two at once."""
+
+    @property
+    def info(self) -> Info:
+        """What is known about the instrument."""
+
+    @property
+    def calibration(self) -> Record | None:
+        """What turns records into seconds and pixels."""
+
+    def start(self) -> None:
+        """Let the instrument send."""
+
+    def pull(self, timeout: float) -> Arrival | None:
+        """Return what came next, None at the end; `DeviceTimeoutError` if nothing came. Enters reconnections itself."""
+
+    def stop(self) -> None:
+        """Let the instrument register nothing more; what it holds can still be pulled."""
+
+    def close(self) -> None:
+        """Enter what the instrument says that it lost, and let go of it."""
+
+
+@dataclass(frozen=True)
+class Buffering:
+    """How much a stream holds for a slow reader, and what happens then; see `Ring`."""
+
+    capacity: int = 64 << 20
+    policy: Policy = "block"
+
+
+class StreamSource(Source):
+    """A live source. Opening starts the instrument.
+
+    Memory: the buffer's capacity, plus one transfer and one decoded piece.
+
+    Parameters
+    ----------
+    feed : Feed
+    codec : Codec
+    ledger : Ledger
+        The one that the feed enters losses into.
+    buffering : Buffering
+    """
+
+    def __init__(self, feed: Feed, codec: Codec, ledger: Ledger, buffering: Buffering | None = None) -> None:
+        buffering = buffering or Buffering()
+        self.codec = codec
+        self.tap: Tap | None = None
+        """Called with every piece right before it is decoded."""
+        self._feed, self._ledger = feed, ledger
+        self._ring = Ring(buffering.capacity, buffering.policy, ledger)
+        self._state = codec.start
+        self._stopping, self._closed = threading.Event(), False
+        feed.start()
+        self._info, self._calibration = feed.info, feed.calibration
+        self._thread = threading.Thread(target=self._empty, name="device reader", daemon=True)
+        self._thread.start()
+
+    @property
+    def info(self) -> Info:
+        return self._info
+
+    @property
+    def calibration(self) -> Record | None:
+        return self._calibration
+
+    @property
+    def stats(self) -> Stats:
+        return self._ledger.stats
+
+    @property
+    def is_live(self) -> bool:
+        return True
+
+    def read(self, timeout: float = PATIENCE) -> Batch | None:
+        piece = None if self._closed else self._ring.get(timeout)
+        if piece is None:
+            return None
+        if self.tap is not None:
+            self.tap(piece)
+        if piece.gap is Gap.RESTART:
+            self._state = self.codec.start
+        found = self.codec.decode(as_bytes(piece.data), self._state, piece.gap is not Gap.NONE)
+        self._state = found.state
+        first = self._ledger.stats.delivered
+        self._ledger.settle(len(found.records), found.malformed)
+        return Batch(found.records, first, piece.gap is not Gap.NONE)
+
+    def stop(self) -> None:
+        self._stopping.set()
+
+    def close(self) -> None:
+        self._closed = True
+        self._stopping.set()
+        self._ring.end()
+        self._thread.join(LONGEST_STOP)
+
+    def _empty(self) -> None:
+        """Move bytes from the instrument into the ring until the end; the thread's whole life."""
+        try:
+            _Reader(self._feed, self.codec, self._ledger, self._ring).run(self._stopping)
+        except Exception as fault:  # whoever reads gets to see it
+            self._ring.fail(fault)
+        try:
+            self._feed.close()
+        except DeviceError as fault:
+            self._ring.fail(fault)
+        self._ring.end()
+
+
+class _Reader:
+    """Cuts what a feed brings into whole records."""
+
+    def __init__(self, feed: Feed, codec: Codec, ledger: Ledger, ring: Ring) -> None:
+        self._feed, self._codec, self._ledger, self._ring = feed, codec, ledger, ring
+        self._rest, self._gap = b"", Gap.NONE
+
+    def run(self, stopping: threading.Event) -> None:
+        """Pull until the end of the stream, or until a stopped instrument has nothing left."""
+        try:
+            while not stopping.is_set():
+                try:
+                    arrival = self._feed.pull(POLL)
+                except DeviceTimeoutError:
+                    self._ledger.time_out()
+                    continue
+                if arrival is None:
+                    break
+                self._take(arrival)
+            self._drain()
+        finally:
+            self._break_off()
+
+    def _drain(self) -> None:
+        self._feed.stop()
+        deadline = monotonic() + LONGEST_DRAIN
+        with contextlib.suppress(DeviceTimeoutError):
+            while monotonic() < deadline and (arrival := self._feed.pull(POLL)) is not None:
+                self._take(arrival)
+
+    def _take(self, arrival: Arrival) -> None:
+        if arrival.gap is not Gap.NONE:
+            self._break_off()
+            self._gap = max(self._gap, arrival.gap)
+        data = self._rest + arrival.data
+        end = self._codec.whole(as_bytes(data))
+        whole, self._rest = data[:end], data[end:]
+        if whole:
+            self._ring.put(Piece(whole, self._codec.count(as_bytes(whole)), self._gap))
+            self._gap = Gap.NONE
+
+    def _break_off(self) -> None:
+        """Enter a record of which the end never came."""
+        if self._rest:
+            self._ledger.break_off()
+            self._rest = b""

@@ -1,0 +1,248 @@
+"""USB by pyusb: finding an instrument, talking to it, and the faults of both as our exceptions."""
+
+from __future__ import annotations
+
+import array
+import contextlib
+import errno
+from collections.abc import Callable, Iterator
+from time import monotonic, sleep
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from tofclip.errors import (
+    DeviceBusyError,
+    DeviceDisconnectedError,
+    DeviceError,
+    DeviceNotFoundError,
+    DevicePermissionError,
+    DeviceStalledError,
+    DeviceTimeoutError,
+    TransferOverflowError,
+    UsbBackendError,
+)
+
+if TYPE_CHECKING:
+    import usb.core
+
+INTERFACE = 0
+REPLUG_POLL = 0.05
+"""Seconds between two looks for an instrument that was unplugged."""
+
+_GONE = (errno.ENODEV, errno.EIO, errno.ENOENT, errno.ENXIO, errno.ESHUTDOWN)
+
+
+class UsbIdentity(NamedTuple):
+    """Vendor and product number."""
+
+    vendor: int
+    product: int
+
+    def __str__(self) -> str:
+        return f"{self.vendor:04x}:{self.product:04x}"
+
+    @property
+    def udev_rule(self) -> str:
+        """The line that lets the users of a Linux machine talk to such an instrument."""
+        return (
+            f'SUBSYSTEM=="usb", ATTR{{idVendor}}=="{self.vendor:04x}", ATTR{{idProduct}}=="{self.product:04x}", '
+            'TAG+="uaccess"'
+        )
+
+
+def system_backend() -> Any:
+    """Return pyusb's backend for this machine's USB, on the libusb that `libusb-package` brings.
+
+    Raises
+    ------
+    UsbBackendError
+        There is none.
+    """
+    try:
+        import libusb_package
+        import usb.backend.libusb1
+
+        backend = usb.backend.libusb1.get_backend(find_library=libusb_package.find_library)
+    except (ImportError, OSError) as fault:
+        raise UsbBackendError(f"the USB library does not load ({fault}); install pyusb and libusb-package") from fault
+    if backend is None:
+        raise UsbBackendError("libusb does not load on this machine; install libusb-package or the system's libusb-1.0")
+    return backend
+
+
+def find(identity: UsbIdentity, backend: Any) -> Iterator[usb.core.Device]:
+    """Yield every connected instrument of that kind."""
+    import usb.core
+
+    with translated(identity):
+        yield from usb.core.find(find_all=True, backend=backend, idVendor=identity.vendor, idProduct=identity.product)
+
+
+def serial_of(device: usb.core.Device, identity: UsbIdentity) -> str:
+    """Return the serial number, empty where there is none; `DevicePermissionError` where it may not be read."""
+    with translated(identity):
+        return str(device.serial_number or "")
+
+
+@contextlib.contextmanager
+def translated(identity: UsbIdentity) -> Iterator[None]:
+    """Turn the exceptions of pyusb into ours."""
+    import usb.core
+
+    try:
+        yield
+    except usb.core.NoBackendError as fault:  # a ValueError, so it has to come first
+        raise UsbBackendError("no USB library was found; install libusb-package") from fault
+    except usb.core.USBError as fault:
+        raise _ours(fault, identity) from fault
+    except ValueError as fault:
+        if "langid" not in str(fault):
+            raise
+        raise _forbidden(identity) from fault  # pyusb says so where it may not open the device
+    except NotImplementedError as fault:
+        raise DeviceError(f"USB device {identity}: this system's USB library cannot do that ({fault})") from fault
+
+
+def _ours(fault: usb.core.USBError, identity: UsbIdentity) -> DeviceError:
+    import usb.core
+
+    number = fault.errno
+    if isinstance(fault, usb.core.USBTimeoutError) or number == errno.ETIMEDOUT:
+        return DeviceTimeoutError(f"USB device {identity} sent nothing in time")
+    if number == errno.EACCES:
+        return _forbidden(identity)
+    if number in _GONE:
+        return DeviceDisconnectedError(f"USB device {identity} was unplugged")
+    if number == errno.EBUSY:
+        return DeviceBusyError(f"USB device {identity} is used by another program; close that first")
+    if number == errno.EPIPE:
+        return DeviceStalledError(f"USB device {identity} stalled; unplug it and plug it in again")
+    if number == errno.EOVERFLOW:
+        return TransferOverflowError(f"USB device {identity} sent more than was asked for; the transfer is lost")
+    return DeviceError(f"USB device {identity}: {' '.join(str(fault).split())}")
+
+
+def _forbidden(identity: UsbIdentity) -> DevicePermissionError:
+    return DevicePermissionError(
+        f"USB device {identity} may not be opened by this user; put this line into "
+        f"/etc/udev/rules.d/70-tofclip.rules and plug it in again: {identity.udev_rule}"
+    )
+
+
+class UsbLink:
+    """One claimed USB instrument, known by its serial number.
+
+    Not for two threads at once. Reading and writing clear a stalled endpoint and try once more.
+
+    Parameters
+    ----------
+    identity : UsbIdentity
+    serial : str
+        Empty: the only one that is connected.
+    backend : object
+        pyusb's backend; `system_backend`, or an emulator's.
+
+    Raises
+    ------
+    DeviceNotFoundError, DevicePermissionError, DeviceBusyError
+        DeviceNotFoundError also where several are connected and no serial number was given.
+    """
+
+    def __init__(self, identity: UsbIdentity, serial: str, backend: Any) -> None:
+        self.identity, self._backend = identity, backend
+        self._device, self.serial = self._found(serial)
+        self._claim()
+
+    def read(self, endpoint: int, buffer: array.array[int], timeout: float) -> int:
+        """Fill `buffer` from a bulk endpoint and return how many bytes came; fewer than fit are no fault.
+
+        Raises
+        ------
+        DeviceTimeoutError, DeviceStalledError, DeviceDisconnectedError, TransferOverflowError
+        """
+        return self._halt_cleared(endpoint, lambda: int(self._device.read(endpoint, buffer, _milliseconds(timeout))))
+
+    def write(self, endpoint: int, data: bytes, timeout: float) -> None:
+        """Send all of `data` to a bulk endpoint.
+
+        Raises
+        ------
+        DeviceTimeoutError, DeviceStalledError, DeviceDisconnectedError
+            DeviceTimeoutError also where only a part was taken.
+        """
+        sent = self._halt_cleared(endpoint, lambda: int(self._device.write(endpoint, data, _milliseconds(timeout))))
+        if sent != len(data):
+            raise DeviceTimeoutError(f"USB device {self.identity} took only {sent} of {len(data)} bytes in time")
+
+    def reconnect(self, patience: float) -> None:
+        """Wait until the instrument with this serial number is back, and claim it.
+
+        Raises
+        ------
+        DeviceDisconnectedError
+            It did not come back within `patience` seconds.
+        """
+        deadline = monotonic() + patience
+        self.close()
+        while monotonic() < deadline:
+            # Not there yet, or there before the system has given this user the right to it.
+            with contextlib.suppress(DeviceError):
+                self._device, self.serial = self._found(self.serial)
+                self._claim()
+                return
+            sleep(min(REPLUG_POLL, patience / 10))
+        raise DeviceDisconnectedError(
+            f"USB device {self.identity} {self.serial} was unplugged and did not come back within {patience:g} s"
+        )
+
+    def close(self) -> None:
+        """Let go of the instrument; that it is gone already is fine."""
+        import usb.core
+        import usb.util
+
+        with contextlib.suppress(usb.core.USBError):
+            usb.util.dispose_resources(self._device)
+
+    def _found(self, serial: str) -> tuple[usb.core.Device, str]:
+        """Find the one instrument that is meant, and its serial number."""
+        known = [(device, serial_of(device, self.identity)) for device in find(self.identity, self._backend)]
+        fitting = [(device, number) for device, number in known if serial in ("", number)]
+        if not fitting:
+            others = ", ".join(number for _, number in known) or "none"
+            wanted = f" with serial number {serial}" if serial else ""
+            raise DeviceNotFoundError(f"no USB device {self.identity}{wanted} is connected (connected: {others})")
+        if len(fitting) > 1:
+            numbers = ", ".join(number for _, number in fitting)
+            raise DeviceNotFoundError(f"several USB devices {self.identity} are connected; say which: {numbers}")
+        return fitting[0]
+
+    def _claim(self) -> None:
+        import usb.core
+        import usb.util
+
+        with translated(self.identity):
+            with contextlib.suppress(NotImplementedError):  # only Linux and macOS have drivers to detach
+                if self._device.is_kernel_driver_active(INTERFACE):
+                    self._device.detach_kernel_driver(INTERFACE)
+            try:
+                self._device.get_active_configuration()
+            except usb.core.USBError:
+                self._device.set_configuration()  # only where there is none, because this resets the device
+            usb.util.claim_interface(self._device, INTERFACE)
+
+    def _halt_cleared(self, endpoint: int, transfer: Callable[[], int]) -> int:
+        """Do a transfer; if the endpoint has stalled, clear it and try once more."""
+        import usb.core
+
+        with translated(self.identity):
+            try:
+                return transfer()
+            except usb.core.USBError as fault:
+                if fault.errno != errno.EPIPE:
+                    raise
+            self._device.clear_halt(endpoint)
+            return transfer()
+
+
+def _milliseconds(seconds: float) -> int:
+    """Return what libusb takes: 0 would mean for ever."""
+    return max(1, round(seconds * 1000))

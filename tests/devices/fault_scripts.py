@@ -1,0 +1,79 @@
+"""Random faults against the emulated time tagger: what came, what was told, what really happened."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from devices.emulation.faults import FOR_GOOD, Fault
+from devices.emulation.photons import Poisson
+from devices.emulation.timetag import CLOCK_HZ, EmulatedTimeTagger, Setting, Truth
+from devices.emulation.usb import VirtualUsb
+from devices.source import Batch, Source
+from devices.statistics import Stats
+from devices.timetag import opened
+from devices.uri import Uri
+from tofclip.errors import DeviceDisconnectedError, DeviceError, DeviceStalledError, DeviceTimeoutError
+
+RECORDS = 8000
+TRANSFERS = 36
+"""Of 512 bytes each: by then the instrument is not dark, even if six faults lose 600 records each."""
+ADDRESS = "timetag://?transfer_kib=0.5&reconnect_s=0.5"
+LONGEST_RUN = 60.0
+
+
+@dataclass
+class Outcome:
+    """How a run ended."""
+
+    batches: list[Batch]
+    stats: Stats
+    truth: Truth
+    fault: Exception | None = None
+    is_over: bool = False
+
+
+def run(script: Sequence[Fault], seed: int, records: int = RECORDS, address: str = ADDRESS) -> Outcome:
+    """Read an emulated instrument until it is dark or fails, under a watchdog."""
+    light = Poisson(1e6, CLOCK_HZ, seed)
+    instrument = EmulatedTimeTagger(light, "T1", Setting(records=records), script)
+    outcome = Outcome([], Stats(), instrument.truth)
+    thread = threading.Thread(target=_read, args=(instrument, address, outcome), daemon=True)
+    thread.start()
+    thread.join(LONGEST_RUN)
+    assert outcome.is_over, f"hangs with {script}"
+    return outcome
+
+
+def _read(instrument: EmulatedTimeTagger, address: str, outcome: Outcome) -> None:
+    source = opened(Uri.parse(address), "", VirtualUsb(instrument))
+    try:
+        with source:
+            while instrument.truth.registered < instrument.setting.records:
+                _read_what_is_there(source, outcome.batches)
+            source.stop()
+            while (batch := source.read()) is not None:
+                outcome.batches.append(batch)
+    except DeviceError as fault:
+        outcome.fault = fault
+    outcome.stats = source.stats
+    outcome.is_over = True
+
+
+def _read_what_is_there(source: Source, batches: list[Batch]) -> None:
+    with contextlib.suppress(DeviceTimeoutError):
+        while (batch := source.read(0.02)) is not None:
+            batches.append(batch)
+
+
+def expected_fault(script: Sequence[Fault]) -> type[DeviceError] | None:
+    """Return the exception that must end a run, which nothing but a lasting stall or absence does."""
+    stalls = {fault.transfer for fault in script if fault.kind == "stall"}
+    for fault in script:
+        if fault.kind == "stall" and (fault.amount > 1 or fault.transfer + 1 in stalls):
+            return DeviceStalledError
+        if fault.kind in ("unplug", "powerloss") and fault.amount >= FOR_GOOD:
+            return DeviceDisconnectedError
+    return None

@@ -1,0 +1,223 @@
+"""Every fault of the USB as an exception of ours, through pyusb's own code."""
+
+from __future__ import annotations
+
+import array
+import errno
+import sys
+from typing import Any
+
+import pytest
+import usb.backend.libusb1
+import usb.core
+
+from devices import timetag
+from devices.emulation.usb import VirtualDevice, VirtualUsb, usb_error
+from devices.timetag import BARE_CHIP, find_timetaggers, open_timetag
+from devices.uri import Uri
+from devices.usb import UsbIdentity, UsbLink, system_backend, translated
+from tofclip.errors import (
+    DeviceBusyError,
+    DeviceDisconnectedError,
+    DeviceError,
+    DeviceNotFoundError,
+    DevicePermissionError,
+    DeviceStalledError,
+    DeviceTimeoutError,
+    TransferOverflowError,
+    UsbBackendError,
+)
+
+KIND = UsbIdentity(0x04B4, 0x1004)
+OUT, IN = 0x02, 0x86
+
+
+class Echo(VirtualDevice):
+    """Sends back what it got; raises what it is told to raise, once each."""
+
+    def __init__(self, serial: str = "A1", identity: UsbIdentity = KIND) -> None:
+        super().__init__(identity, ("makers", "echo", serial), (OUT, IN))
+        self.got = b""
+        self.faults: list[int] = []
+
+    def receive(self, endpoint: int, data: bytes) -> None:
+        self.got += data
+
+    def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
+        if self.faults:
+            number = self.faults.pop(0)
+            if number == errno.EPIPE:
+                self.halted.add(endpoint)
+            if number == errno.ENODEV:
+                self.unplug(2)
+            raise usb_error(number)
+        length = min(len(buffer), len(self.got))
+        buffer[:length] = self.got[:length]
+        return length
+
+
+def linked(*instruments: VirtualDevice, serial: str = "") -> UsbLink:
+    return UsbLink(KIND, serial, VirtualUsb(*instruments))
+
+
+def received(link: UsbLink) -> bytes:
+    buffer = array.array("B", bytes(64))
+    return buffer[: link.read(IN, buffer, 0.1)].tobytes()
+
+
+def test_bytes_go_out_and_come_in() -> None:
+    link = linked(Echo())
+    link.write(OUT, b"hello", 0.1)
+    assert (link.serial, received(link)) == ("A1", b"hello")
+    link.close()
+
+
+def test_the_serial_number_chooses() -> None:
+    first, second = Echo("A1"), Echo("B2")
+    assert linked(first, second, serial="B2").serial == "B2"
+    with pytest.raises(DeviceNotFoundError, match=r"several.*say which: A1, B2"):
+        linked(first, second)
+    with pytest.raises(DeviceNotFoundError, match="with serial number C3 is connected \\(connected: A1, B2\\)"):
+        linked(first, second, serial="C3")
+    with pytest.raises(DeviceNotFoundError, match="connected: none"):
+        linked()
+    assert linked(Echo("")).serial == ""
+
+
+def test_no_permission_shows_the_rule_to_add() -> None:
+    instrument = Echo()
+    instrument.may_be_opened = False
+    with pytest.raises(DevicePermissionError) as caught:
+        linked(instrument)
+    assert isinstance(caught.value.__cause__, ValueError)  # what pyusb makes of it
+    rule = 'SUBSYSTEM=="usb", ATTR{idVendor}=="04b4", ATTR{idProduct}=="1004", TAG+="uaccess"'
+    assert rule in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_another_program_holds_it() -> None:
+    instrument = Echo()
+    instrument.held_by_other = True
+    with pytest.raises(DeviceBusyError, match="another program"):
+        linked(instrument)
+
+
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [
+        (errno.ETIMEDOUT, DeviceTimeoutError),
+        (errno.ENODEV, DeviceDisconnectedError),
+        (errno.EIO, DeviceDisconnectedError),
+        (errno.EOVERFLOW, TransferOverflowError),
+        (errno.EACCES, DevicePermissionError),
+        (errno.ENOMEM, DeviceError),
+    ],
+)
+def test_faults_of_a_transfer(number: int, expected: type[DeviceError]) -> None:
+    instrument = Echo()
+    link = linked(instrument)
+    instrument.faults = [number]
+    with pytest.raises(expected) as caught:
+        received(link)
+    assert type(caught.value) is expected
+
+
+def test_a_stall_is_cleared_once() -> None:
+    instrument = Echo()
+    link = linked(instrument)
+    link.write(OUT, b"x", 0.1)
+    instrument.faults = [errno.EPIPE]
+    assert received(link) == b"x"
+    instrument.faults = [errno.EPIPE, errno.EPIPE]
+    with pytest.raises(DeviceStalledError):
+        received(link)
+
+
+def test_an_unplugged_instrument_is_found_again() -> None:
+    instrument = Echo()
+    link = linked(instrument, Echo("B2"), serial="A1")
+    instrument.faults = [errno.ENODEV]
+    with pytest.raises(DeviceDisconnectedError):
+        received(link)
+    link.reconnect(5.0)
+    link.write(OUT, b"again", 0.1)
+    assert received(link) == b"again"
+    instrument.unplug(float("inf"))
+    with pytest.raises(DeviceDisconnectedError, match=r"A1 .* did not come back within 0.1 s"):
+        link.reconnect(0.1)
+    link.close()
+
+
+def test_a_partial_write_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    link = linked(Echo())
+    monkeypatch.setattr(VirtualUsb, "bulk_write", lambda *_: 2)
+    with pytest.raises(DeviceTimeoutError, match="only 2 of 5"):
+        link.write(OUT, b"hello", 0.1)
+
+
+def test_an_unconfigured_device_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen: list[int] = []
+    monkeypatch.setattr(VirtualUsb, "get_configuration", lambda *_: 0)
+    monkeypatch.setattr(VirtualUsb, "set_configuration", lambda _, __, value: chosen.append(value))
+    linked(Echo())
+    assert chosen == [1]
+
+
+def test_a_kernel_driver_is_detached(monkeypatch: pytest.MonkeyPatch) -> None:
+    detached: list[int] = []
+    monkeypatch.setattr(VirtualUsb, "is_kernel_driver_active", lambda *_: True)
+    monkeypatch.setattr(VirtualUsb, "detach_kernel_driver", lambda _, __, interface: detached.append(interface))
+    linked(Echo())
+    assert detached == [0]
+
+
+def test_no_usb_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda **_: None)
+    with pytest.raises(UsbBackendError, match="libusb-package"):
+        system_backend()
+    assert find_timetaggers() == []
+    with pytest.raises(UsbBackendError):
+        open_timetag(Uri.parse("timetag://"))
+    monkeypatch.setitem(sys.modules, "libusb_package", None)
+    with pytest.raises(UsbBackendError, match="does not load"):
+        system_backend()
+
+
+def test_exceptions_that_pyusb_disguises() -> None:
+    with pytest.raises(UsbBackendError), translated(KIND):
+        raise usb.core.NoBackendError("No backend available")
+    with pytest.raises(DeviceError, match="cannot do that"), translated(KIND):
+        raise NotImplementedError
+    with pytest.raises(ValueError, match=r"^a defect$"), translated(KIND):
+        raise ValueError("a defect")
+
+
+def test_the_system_has_a_usb_library() -> None:
+    assert system_backend() is not None
+
+
+def test_instruments_are_discovered(monkeypatch: pytest.MonkeyPatch) -> None:
+    shut = Echo("S9")
+    shut.may_be_opened = False
+    bus = VirtualUsb(Echo("A1"), shut, Echo("", BARE_CHIP))
+    monkeypatch.setattr(timetag, "system_backend", lambda: bus)
+    found = find_timetaggers()
+    assert [(one.uri, bool(one.note)) for one in found] == [
+        ("timetag://A1", False),
+        ("timetag://", True),
+        ("timetag://", True),
+    ]
+    assert "udev" in found[1].note
+    assert "firmware" in found[2].note
+
+
+def test_a_chip_without_firmware_is_told_from_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def behind(*instruments: VirtualDevice) -> Any:
+        return lambda: VirtualUsb(*instruments)
+
+    monkeypatch.setattr(timetag, "system_backend", behind(Echo("", BARE_CHIP)))
+    with pytest.raises(DeviceNotFoundError, match="without firmware"):
+        open_timetag(Uri.parse("timetag://"))
+    monkeypatch.setattr(timetag, "system_backend", behind())
+    with pytest.raises(DeviceNotFoundError, match="04b4:1004 is connected"):
+        open_timetag(Uri.parse("timetag://"))
