@@ -137,7 +137,7 @@ def sparse_camera(dtype: type) -> LinearOperator:
 
 
 def slice_convolution(dtype: type) -> LinearOperator:
-    return SliceConvolution((11, 14), np.random.default_rng(9).random((3, 10, 9)), dtype)
+    return SliceConvolution((11, 14), np.random.default_rng(9).random((3, 10, 9)), 19, dtype)
 
 
 def integration(dtype: type) -> LinearOperator:

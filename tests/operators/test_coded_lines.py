@@ -10,19 +10,20 @@ from tofclip.operators import PointSpreadConvolution, SliceConvolution
 from tofclip.operators.coded_lines import coded_line
 
 
+@pytest.mark.parametrize("sensor", [5, 14, 31])
 @pytest.mark.parametrize(("rows", "columns", "spread"), [(12, 9, (12, 9)), (11, 14, (11, 14)), (12, 14, (5, 6))])
-def test_a_1d_sensor_reads_the_middle_row_of_the_convolution(rows, columns, spread):
+def test_a_1d_sensor_reads_the_middle_row_of_the_convolution(rows, columns, spread, sensor):
     random = np.random.default_rng(0)
     picture, spreads = random.random((rows, columns)), random.random((3, *spread))
-    seen = SliceConvolution((rows, columns), spreads, np.float64)(picture).reshape(3, columns)
+    seen = SliceConvolution((rows, columns), spreads, sensor, np.float64)(picture).reshape(3, sensor)
     for line, each in zip(seen, spreads, strict=True):
-        whole = PointSpreadConvolution((rows, columns), each, dtype=np.float64)(picture)
+        whole = PointSpreadConvolution((rows, columns), each, (rows, sensor), np.float64)(picture)
         np.testing.assert_allclose(line, whole[(rows - 1) // 2], atol=1e-12)
 
 
 @pytest.mark.parametrize("rows", [10, 11])
 def test_a_spread_as_high_as_the_picture_sees_every_row(rows):
-    seen = SliceConvolution((rows, 8), np.ones((1, rows, 1)), np.float64)(np.ones((rows, 8)))
+    seen = SliceConvolution((rows, 8), np.ones((1, rows, 1)), dtype=np.float64)(np.ones((rows, 8)))
     np.testing.assert_allclose(seen, rows, rtol=1e-12)
 
 
@@ -35,7 +36,7 @@ def test_a_point_falls_where_the_line_s_angle_says():
         tilted[row] = np.interp(np.arange(21), [place - 1, place, place + 1], [0, 1, 0])
     picture = np.zeros((21, 31))
     picture[10 + 4, 15 - 3] = 1
-    seen = SliceConvolution((21, 31), tilted[None], np.float64)(picture)
+    seen = SliceConvolution((21, 31), tilted[None], dtype=np.float64)(picture)
     centroid = np.sum(seen * np.arange(31)) / seen.sum()
     assert centroid - 15 == pytest.approx(-3 - 4 * np.tan(angle), abs=1e-9)
 

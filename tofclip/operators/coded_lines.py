@@ -21,19 +21,27 @@ class SliceConvolution(LinearOperator):
     Parameters
     ----------
     image_shape : (int, int)
-        Rows and columns of the picture. The sensor has its columns and lies at row ``(rows - 1) // 2``, from where a
-        PSF as high as the picture reaches all rows.
+        Rows and columns of the picture. The sensors lie at row ``(rows - 1) // 2``, from where a PSF as high as the
+        picture reaches all rows.
     point_spreads : (lines, rows, columns) array
         Light on the sensor's plane from a point in the middle; the origin is pixel ``(rows // 2, columns // 2)``.
+    sensor_px : int, optional
+        Pixels of each sensor, about the picture's middle; the default is the picture's columns.
     dtype : dtype
         float32 or float64.
 
     Notes
     -----
-    Readings are (lines * columns,), PSF by PSF.
+    Readings are (lines * sensor_px,), PSF by PSF.
     """
 
-    def __init__(self, image_shape: tuple[int, int], point_spreads: ArrayLike, dtype: DTypeLike = np.float32) -> None:
+    def __init__(
+        self,
+        image_shape: tuple[int, int],
+        point_spreads: ArrayLike,
+        sensor_px: int | None = None,
+        dtype: DTypeLike = np.float32,
+    ) -> None:
         import scipy.fft
 
         spreads = np.asarray(point_spreads, dtype=dtype)
@@ -42,18 +50,20 @@ class SliceConvolution(LinearOperator):
         for spread in spreads:
             checked_point_spread(spread, image_shape)
         rows, columns = image_shape
-        super().__init__(image_shape, (len(spreads) * columns,), dtype)
+        self.sensor_px = columns if sensor_px is None else sensor_px
+        super().__init__(image_shape, (len(spreads) * self.sensor_px,), dtype)
         # The sensor's row sees row y of the picture through row `centre + sensor - y` of the PSF.
         mirrored = np.zeros((len(spreads), rows, spreads.shape[2]), self.dtype)
         seen_through = spreads.shape[1] // 2 + (rows - 1) // 2 - np.arange(rows)
         reached = (seen_through >= 0) & (seen_through < spreads.shape[1])
         mirrored[:, reached] = spreads[:, seen_through[reached]]
         centre = spreads.shape[2] // 2
-        least = unmixed_length(columns, columns, spreads.shape[2], 0, centre)
+        first = columns // 2 - self.sensor_px // 2
+        least = unmixed_length(columns, self.sensor_px, spreads.shape[2], first, centre)
         self._padded = scipy.fft.next_fast_len(least, real=True)
         placed = np.zeros((len(spreads), rows, self._padded), self.dtype)
         placed[..., : spreads.shape[2]] = mirrored
-        spectra = scipy.fft.rfft(np.roll(placed, -centre, axis=2), axis=2)
+        spectra = scipy.fft.rfft(np.roll(placed, -(first + centre), axis=2), axis=2)
         self.spectra = np.ascontiguousarray(np.moveaxis(spectra, 2, 0))
         """G_k of every frequency k of the padded sensor, (frequencies, lines, rows)."""
 
@@ -61,13 +71,13 @@ class SliceConvolution(LinearOperator):
         import scipy.fft
 
         columns = np.moveaxis(scipy.fft.rfft(block, self._padded, axis=1), 1, 0)
-        lines = scipy.fft.irfft(self.spectra @ columns, self._padded, axis=0)[: self.shape_in[1]]
+        lines = scipy.fft.irfft(self.spectra @ columns, self._padded, axis=0)[: self.sensor_px]
         return np.ascontiguousarray(np.moveaxis(lines, 0, 1)).reshape(*self.shape_out, -1)
 
     def _adjoint(self, block: Array) -> Array:
         import scipy.fft
 
-        readings = block.reshape(-1, self.shape_in[1], block.shape[-1])
+        readings = block.reshape(-1, self.sensor_px, block.shape[-1])
         lines = np.moveaxis(scipy.fft.rfft(readings, self._padded, axis=1), 1, 0)
         # G^H l without a conjugated copy of G: conj(G^T conj(l)).
         columns = (self.spectra.swapaxes(1, 2) @ lines.conj()).conj()

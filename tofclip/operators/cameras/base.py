@@ -34,6 +34,8 @@ class LightFieldCamera(ABC):
         Numbers of the views that get readings, in the order of the readings.
     readings : int
         How many readings there are.
+    row_length : int
+        Consecutive readings of one row of a detector, whose errors are alike; 1 where each stands for itself.
 
     Raises
     ------
@@ -43,6 +45,7 @@ class LightFieldCamera(ABC):
 
     name: ClassVar[str]
     readings: int
+    row_length: int = 1
 
     def __init__(self, image_shape: tuple[int, int], views: Sequence[View], sampling_ratio: float, seed: int) -> None:
         if not (np.isfinite(sampling_ratio) and sampling_ratio > 0):

@@ -28,7 +28,7 @@ class CodedLineCamera(LightFieldCamera):
 
     def _deal(self) -> tuple[int, ...]:
         count = count_of_lines(self.image_shape, self.image_shape[1], self.sampling_ratio)
-        self.readings = count * self.image_shape[1]
+        self.readings, self.row_length = count * self.image_shape[1], self.image_shape[1]
         random = np.random.default_rng(self.seed)
         angles = STEEPEST * (2 * np.arange(count) + 1 - count) / count
         used, dealt = dealt_at_random(angles, len(self.views), random)

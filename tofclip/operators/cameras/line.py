@@ -27,7 +27,7 @@ class LineCamera(LightFieldCamera):
     def _deal(self) -> tuple[int, ...]:
         self.detector_px = max(self.image_shape)
         count = count_of_lines(self.image_shape, self.detector_px, self.sampling_ratio)
-        self.readings = count * self.detector_px
+        self.readings, self.row_length = count * self.detector_px, self.detector_px
         used, self.angles = self._dealt(np.arange(count) * np.pi / count)
         return used
 

@@ -1,0 +1,1 @@
+"""Studies of the paper as functions that return numbers."""
