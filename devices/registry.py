@@ -19,18 +19,23 @@ from tofclip.errors import InputError
 from tofclip.storage import Scalar
 
 OPENERS: dict[str, str] = {
+    "remoteex": "devices.remoteex.source:open_remoteex",
     "timetag": "devices.timetag:open_timetag",
     "sim+timetag": "devices.emulation.timetag:open_emulated",
 }
 """Scheme of an address -> function ``(Uri) -> Source``."""
 
-FILES: dict[str, str] = {}
+FILES: dict[str, str] = {
+    ".h5": "devices.replay:open_recording",
+    ".hdf5": "devices.replay:open_recording",
+}
 """Ending of a file's name, lower case -> function ``(Uri) -> Source``, for addresses ``file://PATH``."""
 
 FINDERS: tuple[str, ...] = ("devices.timetag:find_timetaggers",)
 """Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail, without hardware."""
 
 CODECS: dict[str, str] = {
+    "frames": "devices.frames:FrameCodec",
     "linospad2": "devices.linospad2.codec:LinoSpad2Codec",
     "timetag": "devices.codecs.timetag:TimeTagCodec",
 }

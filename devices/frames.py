@@ -1,0 +1,133 @@
+"""Cameras' pictures as records, each with its number, so that they are buffered, recorded and replayed like photons."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from devices.codec import ByteView, Decoded, Records, as_bytes
+from tofclip.errors import InputError
+from tofclip.storage import Scalar
+
+MOST_FRAME_BYTES = 1 << 26
+"""No camera here has larger pictures: 16 megapixels of 32 bits."""
+
+_NUMBER = np.dtype("<i8")
+_PIXELS = {1: "u1", 8: "u1", 16: "<u2", 32: "<u4"}
+
+
+@dataclass(frozen=True)
+class FrameCodec:
+    """A picture's number (8 bytes, little-endian) and its pixels as the camera sent them, to records and back.
+
+    A frame is malformed if its number is not above that of the one before. Decoding allocates what the pixels take,
+    8 bits for each of those that came as single bits.
+
+    Parameters
+    ----------
+    rows, columns : int
+    bits : int
+        1 (eight pixels in a byte, the leftmost highest), 8, 16 or 32 (little-endian).
+
+    Raises
+    ------
+    InputError
+        There is no such depth, or a picture would be empty, larger than 64 MiB, or not made of whole bytes.
+    """
+
+    rows: int
+    columns: int
+    bits: int = 16
+
+    name: ClassVar[str] = "frames"
+    start: ClassVar[int] = -1
+    """Number of the last frame."""
+
+    def __post_init__(self) -> None:
+        if self.bits not in _PIXELS:
+            raise InputError(f"pixels have {', '.join(map(str, _PIXELS))} bits, not {self.bits}")
+        total = self.rows * self.columns * self.bits
+        if self.rows < 1 or self.columns < 1 or total > 8 * MOST_FRAME_BYTES or self.columns * self.bits % 8:
+            raise InputError(f"pictures of {self.rows} x {self.columns} pixels of {self.bits} bits cannot be")
+
+    @cached_property
+    def dtype(self) -> np.dtype[Any]:
+        """`number` and `counts` (rows, columns)."""
+        return np.dtype([("number", _NUMBER), ("counts", _PIXELS[self.bits], (self.rows, self.columns))])
+
+    @property
+    def settings(self) -> Mapping[str, Scalar]:
+        """Arguments that build this codec again."""
+        return {"rows": self.rows, "columns": self.columns, "bits": self.bits}
+
+    @property
+    def pixel_bytes(self) -> int:
+        """Bytes of a picture without its number."""
+        return self.rows * self.columns * self.bits // 8
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of a picture and its number."""
+        return _NUMBER.itemsize + self.pixel_bytes
+
+    def whole(self, data: ByteView) -> int:
+        """Return how many bytes at the front of `data` form whole frames."""
+        return len(data) - len(data) % self.frame_bytes
+
+    def count(self, data: ByteView) -> int:
+        """Return the number of frames in `data`."""
+        return len(data) // self.frame_bytes
+
+    def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> Decoded:
+        """Decode whole frames; `state` is the last one's number."""
+        words = as_bytes(data)
+        if words.size % self.frame_bytes:
+            raise InputError(f"{words.size} bytes are not a whole number of {self.frame_bytes}-byte frames")
+        frames = np.ascontiguousarray(words).reshape(-1, self.frame_bytes)
+        numbers = frames[:, : _NUMBER.itemsize].copy().view(_NUMBER)[:, 0]
+        before = np.maximum.accumulate(np.concatenate([[state], numbers]))
+        good = numbers > before[:-1]
+        records = np.empty(int(good.sum()), self.dtype)
+        records["number"] = numbers[good]
+        records["counts"] = self._pixels(frames[good, _NUMBER.itemsize :])
+        return Decoded(records, len(numbers) - len(records), int(before[-1]))
+
+    def encode(self, records: Records) -> bytes:
+        """Return numbers and pixels as the camera sends them.
+
+        Raises
+        ------
+        InputError
+            They are of another kind, their numbers do not rise, or a single bit is neither 0 nor 1.
+        """
+        if records.dtype != self.dtype or records.ndim != 1:
+            raise InputError(f"frames must be a one-dimensional array of {self.dtype}")
+        if np.any(np.diff(records["number"], prepend=-1) <= 0):
+            raise InputError("frames must have rising numbers from 0")
+        if self.bits == 1 and records["counts"].max(initial=0) > 1:
+            raise InputError("a single bit is 0 or 1")
+        frames = np.empty((len(records), self.frame_bytes), np.uint8)
+        numbers = np.ascontiguousarray(records["number"])
+        frames[:, : _NUMBER.itemsize] = numbers.view(np.uint8).reshape(-1, _NUMBER.itemsize)
+        frames[:, _NUMBER.itemsize :] = self._bytes(records["counts"])
+        return frames.tobytes()
+
+    def numbered(self, number: int, pixels: bytes) -> bytes:
+        """Return a frame's bytes from those of its pixels."""
+        return number.to_bytes(_NUMBER.itemsize, "little") + pixels
+
+    def _pixels(self, data: ByteView) -> Any:
+        shape = (len(data), self.rows, self.columns)
+        if self.bits == 1:
+            return np.unpackbits(data, axis=1).reshape(shape)
+        return np.ascontiguousarray(data).view(_PIXELS[self.bits]).reshape(shape)
+
+    def _bytes(self, counts: Any) -> Any:
+        flat = np.ascontiguousarray(counts).reshape(len(counts), self.rows * self.columns)
+        if self.bits == 1:
+            return np.packbits(flat, axis=1)
+        return flat.view(np.uint8)

@@ -1,0 +1,125 @@
+"""A TCP server for emulated instruments, which nothing but this computer can reach."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+HOST = "127.0.0.1"
+PATIENCE = 0.03
+"""Seconds after which a waiting thread looks whether the server has closed."""
+
+LONGEST_REQUEST = 1 << 16
+
+
+class Connection:
+    """A client's end, as the server sees it."""
+
+    def __init__(self, link: socket.socket, closing: threading.Event) -> None:
+        self._link, self._closing = link, closing
+        self._held = b""
+        self._sending = threading.Lock()
+        link.settimeout(PATIENCE)
+
+    def send(self, data: bytes) -> None:
+        """Send all of `data`, however long the client takes, unless it goes away or the server closes."""
+        left = memoryview(data)
+        with self._sending:
+            while left and not self._closing.is_set():
+                try:
+                    left = left[self._link.send(left) :]
+                except TimeoutError:
+                    continue
+                except OSError:
+                    return
+
+    def request(self, end: bytes) -> bytes | None:
+        """Return what came up to `end`, None when the client is gone, says too much, or the server closes."""
+        while end not in self._held:
+            if self._closing.is_set() or len(self._held) > LONGEST_REQUEST:
+                return None
+            try:
+                came = self._link.recv(4096)
+            except TimeoutError:
+                continue
+            except OSError:
+                return None
+            if not came:
+                return None
+            self._held += came
+        request, _, self._held = self._held.partition(end)
+        return request
+
+    def close(self) -> None:
+        """Hang up; the client sees the end of the stream."""
+        with contextlib.suppress(OSError):
+            self._link.shutdown(socket.SHUT_RDWR)
+        self._link.close()
+
+
+class LoopbackServer:
+    """Listens on a free port of 127.0.0.1 and serves each client on a thread of its own.
+
+    Parameters
+    ----------
+    serve : callable
+        Called with each new `Connection`; when it returns the connection is closed.
+    """
+
+    def __init__(self, serve: Callable[[Connection], None]) -> None:
+        self._serve = serve
+        self._closing = threading.Event()
+        self._listener = socket.create_server((HOST, 0))
+        self._listener.settimeout(PATIENCE)
+        self.port: int = self._listener.getsockname()[1]
+        self._connections: list[Connection] = []
+        self._threads = [threading.Thread(target=self._accept, name="emulated instrument", daemon=True)]
+        self._threads[0].start()
+
+    def hang_up(self) -> None:
+        """Close all connections; clients may come again."""
+        for connection in self._connections:
+            connection.close()
+        self._connections.clear()
+
+    def close(self) -> None:
+        """Serve nobody any more; closing twice is fine."""
+        self._closing.set()
+        self._listener.close()
+        self.hang_up()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(2)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _accept(self) -> None:
+        while not self._closing.is_set():
+            try:
+                link, _ = self._listener.accept()
+            except TimeoutError:
+                continue
+            except OSError:
+                return
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            connection = Connection(link, self._closing)
+            self._connections.append(connection)
+            thread = threading.Thread(target=self._run, args=(connection,), name="emulated instrument", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+
+    def _run(self, connection: Connection) -> None:
+        try:
+            self._serve(connection)
+        finally:
+            connection.close()

@@ -1,0 +1,186 @@
+"""RemoteEx's messages as text, after Hamamatsu's RemoteEx Programmers Handbook (HPD-TA 9.5).
+
+A command is ``Name(argument,argument)`` and a carriage return, its answer ``code,Name,argument,argument`` and another.
+Answers of code 4 come unasked, when something happened. Pictures and tables travel on a second connection, as long as
+the answer says; both connections begin with a greeting.
+"""
+
+from __future__ import annotations
+
+import enum
+import re
+from dataclasses import dataclass
+
+from tofclip.errors import DeviceBusyError, DeviceError, InputError, ProtocolError
+
+COMMAND_PORT, DATA_PORT = 1001, 1002
+END = b"\r"
+GREETING, DATA_GREETING = "RemoteEx Ready", "RemoteEx Data Ready"
+LONGEST_MESSAGE = 1 << 16
+
+_COMMAND = re.compile(r"([A-Za-z]\w*)\((.*)\)", re.ASCII)
+_NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
+_ARGUMENT = re.compile(r"[^,()\x00-\x1f\x7f]*")
+
+
+class Code(enum.IntEnum):
+    """What became of a command."""
+
+    DONE = 0
+    SYNTAX = 1
+    UNKNOWN = 2
+    NOT_NOW = 3
+    MESSAGE = 4
+    NOTICE = 5
+    MISSING = 6
+    IMPOSSIBLE = 7
+    FAILED = 8
+    NO_DATA_LINK = 9
+    OUT_OF_RANGE = 10
+
+
+REASONS = {
+    Code.SYNTAX: "its syntax is wrong",
+    Code.UNKNOWN: "it, or one of its parameters, is unknown",
+    Code.NOT_NOW: "it is not possible now",
+    Code.MISSING: "a parameter is missing",
+    Code.IMPOSSIBLE: "it cannot be executed",
+    Code.FAILED: "it failed",
+    Code.NO_DATA_LINK: "its data cannot be sent",
+    Code.OUT_OF_RANGE: "a value is out of range",
+}
+_ERRORS: dict[Code, type[DeviceError]] = {
+    Code.NOT_NOW: DeviceBusyError,
+    Code.IMPOSSIBLE: DeviceError,
+    Code.FAILED: DeviceError,
+    Code.NO_DATA_LINK: DeviceError,
+}
+
+
+@dataclass(frozen=True)
+class Command:
+    """Something to do.
+
+    Parameters
+    ----------
+    name : str
+    arguments : tuple of str
+        Without commas, parentheses and control characters; the protocol has no way to quote them.
+    """
+
+    name: str
+    arguments: tuple[str, ...] = ()
+
+    def encode(self) -> bytes:
+        """Return the bytes to send.
+
+        Raises
+        ------
+        InputError
+            A name or argument holds what the protocol cannot carry.
+        """
+        _require_plain(self.name, self.arguments)
+        return f"{self.name}({','.join(self.arguments)})".encode() + END
+
+    @classmethod
+    def decode(cls, message: bytes) -> Command:
+        """Read a command, its end taken off."""
+        text = _text(message)
+        found = _COMMAND.fullmatch(text)
+        if found is None:
+            raise ProtocolError(f"'{text[:80]}' is no command Name(argument,...)")
+        return cls(found[1], tuple(found[2].split(",")) if found[2] else ())
+
+    def __str__(self) -> str:
+        return f"{self.name}({','.join(self.arguments)})"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What RemoteEx says.
+
+    Parameters
+    ----------
+    code : Code
+    name : str
+        The command's, or what a message is about.
+    arguments : tuple of str
+    """
+
+    code: Code
+    name: str
+    arguments: tuple[str, ...] = ()
+
+    @property
+    def is_message(self) -> bool:
+        """Whether it came unasked."""
+        return self.code in (Code.MESSAGE, Code.NOTICE)
+
+    def encode(self) -> bytes:
+        """Return the bytes to send.
+
+        Raises
+        ------
+        InputError
+            A name or argument holds what the protocol cannot carry.
+        """
+        _require_plain(self.name, self.arguments)
+        return ",".join([str(int(self.code)), self.name, *self.arguments]).encode() + END
+
+    @classmethod
+    def decode(cls, message: bytes) -> Answer:
+        """Read an answer, its end taken off.
+
+        Raises
+        ------
+        ProtocolError
+            It does not begin with a known code and a name.
+        """
+        text = _text(message)
+        code, _, rest = text.partition(",")
+        name, *arguments = rest.split(",")
+        if not (code.isascii() and code.isdecimal() and len(code) < 4 and int(code) in list(Code) and name):
+            raise ProtocolError(f"'{text[:80]}' is no answer of RemoteEx")
+        return cls(Code(int(code)), name, tuple(arguments))
+
+    def require_done(self, command: Command) -> tuple[str, ...]:
+        """Return the arguments, or raise what the code means.
+
+        Raises
+        ------
+        DeviceBusyError
+            The command is not possible now.
+        DeviceError
+            It failed.
+        ProtocolError
+            RemoteEx does not understand it.
+        """
+        if self.code is Code.DONE:
+            return self.arguments
+        said = f" ({', '.join(self.arguments)[:120]})" if self.arguments else ""
+        error = _ERRORS.get(self.code, ProtocolError)
+        raise error(f"RemoteEx refused {command}: {REASONS.get(self.code, 'no reason given')}{said}")
+
+
+def whole_number(text: str, what: str) -> int:
+    """Return a number that RemoteEx sent, refusing anything else."""
+    if not (text.isascii() and text.isdecimal() and len(text) < 16):
+        raise ProtocolError(f"RemoteEx sent '{text[:40]}' as {what}, expected a whole number")
+    return int(text)
+
+
+def _require_plain(name: str, arguments: tuple[str, ...]) -> None:
+    if not _NAME.fullmatch(name):
+        raise InputError(f"'{name}' is no name of a RemoteEx command")
+    for argument in arguments:
+        if not _ARGUMENT.fullmatch(argument):
+            raise InputError(f"RemoteEx cannot carry the argument {argument!r}")
+    if arguments == ("",):
+        raise InputError("RemoteEx cannot carry a single argument that is empty")
+
+
+def _text(message: bytes) -> str:
+    try:
+        return message.decode().strip("\n")
+    except UnicodeDecodeError as fault:
+        raise ProtocolError(f"RemoteEx sent {message[:40]!r}, which is no text") from fault

@@ -1,0 +1,334 @@
+"""RemoteEx: messages, and the driver against an emulated camera that can fail."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given
+
+import devices
+from devices.emulation.faults import Fault
+from devices.loopback import HOST, Connection, LoopbackServer
+from devices.remoteex.client import RemoteEx
+from devices.remoteex.emulator import EmulatedLight, EmulatedStreakCamera
+from devices.remoteex.protocol import END, REASONS, Answer, Code, Command
+from devices.remoteex.source import LiveSettings
+from devices.source import Source
+from tofclip.errors import (
+    DeviceBusyError,
+    DeviceDisconnectedError,
+    DeviceError,
+    DeviceNotFoundError,
+    DeviceTimeoutError,
+    InputError,
+    ProtocolError,
+)
+
+LIGHT = EmulatedLight(
+    np.random.default_rng(1).uniform(0, 50, (12, 20)), np.cumsum(np.linspace(18e-12, 20e-12, 12)), full_scale=60, seed=3
+)
+
+names = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,20}", fullmatch=True)
+arguments = st.lists(
+    st.text(st.characters(exclude_characters=",()", exclude_categories=["Cs", "Cc"]), max_size=9), max_size=5
+).filter(lambda words: words != [""])
+
+
+@given(names, arguments)
+def test_commands_come_back(name: str, words: list[str]) -> None:
+    command = Command(name, tuple(words))
+    assert Command.decode(command.encode().removesuffix(END)) == command
+
+
+@given(st.sampled_from(Code), names, arguments)
+def test_answers_come_back(code: Code, name: str, words: list[str]) -> None:
+    answer = Answer(code, name, tuple(words))
+    assert Answer.decode(answer.encode().removesuffix(END)) == answer
+
+
+def test_messages_as_the_handbook_writes_them() -> None:
+    assert Command("DevParamSet", ("TD", "MCP Gain", "0")).encode() == b"DevParamSet(TD,MCP Gain,0)\r"
+    assert Command("AcqStop").encode() == b"AcqStop()\r"
+    assert Answer.decode(b"0,ImgRingBufferGet,672,508,2,0,14,1234") == Answer(
+        Code.DONE, "ImgRingBufferGet", ("672", "508", "2", "0", "14", "1234")
+    )
+
+
+@pytest.mark.parametrize("words", [("a,b",), ("(",), ("a\r",), ("",)])
+def test_what_the_protocol_cannot_carry(words: tuple[str, ...]) -> None:
+    with pytest.raises(InputError):
+        Command("AcqStart", words).encode()
+    with pytest.raises(InputError):
+        Answer(Code.DONE, "Acq Start").encode()
+
+
+@pytest.mark.parametrize("message", [b"", b"0", b"0,", b"11,Name", b"x,Name", b"-1,Name", b"\xff\xfe", b"\xb2,Name"])
+def test_answers_that_are_none(message: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        Answer.decode(message)
+
+
+@pytest.mark.parametrize("code", REASONS)
+def test_every_refusal_is_explained(code: Code) -> None:
+    with pytest.raises(DeviceError, match=r"refused AcqStart\(Live\): .*\(why\)") as caught:
+        Answer(code, "AcqStart", ("why",)).require_done(Command("AcqStart", ("Live",)))
+    assert isinstance(caught.value, DeviceBusyError) == (code is Code.NOT_NOW)
+
+
+Camera = Callable[..., EmulatedStreakCamera]
+
+
+@pytest.fixture
+def camera() -> Iterator[Camera]:
+    """Make emulated cameras that are switched off in the end."""
+    made = []
+
+    def make(*faults: Fault, rate: float = 100.0, frames: int = 1000) -> EmulatedStreakCamera:
+        made.append(EmulatedStreakCamera(LIGHT, rate, frames, faults))
+        return made[-1]
+
+    yield make
+    for server in made:
+        server.close()
+
+
+def opened(server: EmulatedStreakCamera, **values: object) -> Source:
+    port, data_port = server.ports
+    query = "".join(f"&{name}={value}" for name, value in values.items())
+    return devices.open(f"remoteex://{HOST}:{port}?data_port={data_port}{query}")
+
+
+def taken(source: Source, frames: int) -> list[np.ndarray]:
+    """Read so many frames, then stop."""
+    found: list[np.ndarray] = []
+    while len(found) < frames:
+        batch = source.read(10)
+        assert batch is not None
+        found += list(batch.records)
+    return found
+
+
+def require_balance(source: Source) -> None:
+    while source.read(10) is not None:
+        pass
+    source.close()
+    assert source.stats.is_balanced, source.stats
+    assert source.stats.unread == 0
+
+
+def test_pictures_come_in_order_and_bit_for_bit(camera: Camera) -> None:
+    server = camera()
+    with opened(server, mcp_gain=30) as source:
+        assert server.gain == "30"
+        assert source.is_live
+        frames = taken(source, 12)
+        source.stop()
+        require_balance(source)
+    numbers = [int(frame["number"]) for frame in frames]
+    assert numbers == list(range(numbers[0], numbers[0] + 12))
+    for frame in frames:
+        np.testing.assert_array_equal(frame["counts"], LIGHT.exposure(int(frame["number"])))
+    assert server.gain == "0"
+
+
+def test_what_is_known_of_the_camera(camera: Camera) -> None:
+    with opened(camera()) as source:
+        info, calibration = source.info.as_dict(), source.calibration
+    assert info["time_range"] == "20 ns"
+    assert (info["mode"], info["rows"], info["columns"]) == ("Operate", 12, 20)
+    assert calibration is not None
+    # float32 numbers in ns, as the camera sends them.
+    np.testing.assert_allclose(calibration.array("row_times", float, 1, "s"), LIGHT.row_times, rtol=1e-7)
+
+
+def test_the_gain_goes_down_even_if_the_stream_has_failed(camera: Camera) -> None:
+    server = camera(Fault(3, "corrupt"))
+    with opened(server, mcp_gain=20) as source, pytest.raises(ProtocolError):
+        taken(source, 100)
+    assert server.gain == "0"
+    assert source.stats.is_balanced
+
+
+def test_pictures_that_fell_out_of_the_ring_are_accounted_for(camera: Camera) -> None:
+    with opened(camera(Fault(4, "lost", 7))) as source:
+        gaps = []
+        while source.stats.delivered < 20:
+            batch = source.read(10)
+            assert batch is not None
+            gaps.append(batch.after_gap)
+        source.stop()
+        require_balance(source)
+    assert source.stats.lost_device >= 7
+    assert any(gaps)
+
+
+def test_a_late_answer_is_waited_for_and_not_asked_for_again(camera: Camera) -> None:
+    """An answer later than the time to wait: the picture comes all the same, and no other is taken for it."""
+    with opened(camera(Fault(3, "timeout", 5), Fault(6, "short", 5)), timeout_s=0.2) as source:
+        frames = taken(source, 15)
+        source.stop()
+        require_balance(source)
+    assert source.stats.timeouts >= 2
+    for frame in frames:
+        np.testing.assert_array_equal(frame["counts"], LIGHT.exposure(int(frame["number"])))
+
+
+def test_after_an_unplugged_cable_the_stream_goes_on(camera: Camera) -> None:
+    with opened(camera(Fault(5, "unplug"))) as source:
+        gaps = []
+        while source.stats.delivered < 20:
+            batch = source.read(10)
+            assert batch is not None
+            gaps += [batch.after_gap]
+        source.stop()
+        require_balance(source)
+    assert source.stats.reconnects == 1
+    assert gaps.count(True) == 1
+
+
+def test_a_camera_that_stays_away(camera: Camera) -> None:
+    server = camera()
+    with opened(server, reconnect_s=0.3) as source:
+        taken(source, 3)
+        server.close()
+        with pytest.raises(DeviceDisconnectedError, match=r"nobody answered for 0\.3 s"):
+            taken(source, 100)
+    assert source.stats.is_balanced
+
+
+def test_a_picture_larger_than_any_is_refused_before_memory_is_taken(camera: Camera) -> None:
+    with opened(camera(Fault(2, "overflow"))) as source, pytest.raises(ProtocolError, match="at most"):
+        taken(source, 100)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_faults_leave_balanced_accounts(camera: Camera, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    kinds = random.choice(["timeout", "short", "unplug", "lost", "corrupt"], 3, p=[0.3, 0.25, 0.2, 0.2, 0.05])
+    places = 1 + random.choice(12, 3, replace=False)  # a fault in the first exchange leaves no source to account for
+    faults = [Fault(int(place), kind, int(random.integers(1, 4))) for place, kind in zip(places, kinds, strict=True)]
+    server = camera(*faults, rate=200)
+    with opened(server, timeout_s=0.15) as source:
+        try:
+            taken(source, 20)
+            source.stop()
+            require_balance(source)
+        except ProtocolError:
+            assert "corrupt" in kinds
+    assert source.stats.is_balanced
+    assert server.gain == "0"
+
+
+def test_nobody_there() -> None:
+    with pytest.raises(DeviceNotFoundError, match="is its program running"):
+        devices.open(f"remoteex://{HOST}:1")
+
+
+@pytest.mark.parametrize(
+    "query", ["buffers=0", "mcp_gain=64", "timeout_s=0", "speed=1", "policy=x", "buffer_mib=0", "mcp_gain=x"]
+)
+def test_impossible_values_are_refused(query: str) -> None:
+    with pytest.raises(InputError):
+        devices.open(f"remoteex://{HOST}:1?{query}")
+
+
+def test_impossible_emulations_are_refused() -> None:
+    with pytest.raises(InputError, match="frame rate"):
+        EmulatedStreakCamera(LIGHT, 0)
+    with pytest.raises(InputError, match="faults are"):
+        EmulatedStreakCamera(LIGHT, 1, 5, [Fault(0, "stall")])
+    with pytest.raises(InputError, match="times to wait"):
+        LiveSettings(reconnect=-1)
+
+
+def scripted(answers: dict[bytes, bytes]) -> Callable[[Connection], None]:
+    """Serve from a script: every request has its answer, an unknown one has none."""
+
+    def serve(connection: Connection) -> None:
+        connection.send(answers.get(b"greeting", b"RemoteEx Ready\r"))
+        while (request := connection.request(END)) is not None:
+            connection.send(answers.get(request, b""))
+
+    return serve
+
+
+def data_server(data: bytes) -> LoopbackServer:
+    def serve(connection: Connection) -> None:
+        connection.send(b"RemoteEx Data Ready\r" + data)
+        connection.request(END)
+
+    return LoopbackServer(serve)
+
+
+PICTURE = b"ImgRingBufferGet(Data,0)"
+
+
+@pytest.mark.parametrize(
+    ("answer", "problem"),
+    [
+        (b"0,ImgRingBufferGet\r", "described a picture by 0 words"),
+        (b"0,ImgRingBufferGet,a,2,2,0,0\r", "expected a whole number"),
+        (b"0,ImgRingBufferGet,2,2,3,0,0\r", "pixels of 3 bytes"),
+        (b"0,ImgRingBufferGet,99999999,99999999,2,0,0\r", "at most"),
+        (b"0,ImgRingBufferGet,2,2,1,0,x\r", "expected a whole number"),
+        (b"0,Other,2,2,1,0,0\r", "answered Other when asked"),
+        (b"x" * 70000, "without the end"),
+    ],
+)
+def test_answers_about_pictures_that_make_no_sense(answer: bytes, problem: str) -> None:
+    with LoopbackServer(scripted({PICTURE: answer})) as commands, data_server(b"pixels") as data:
+        link = RemoteEx(HOST, commands.port, data.port, 2)
+        with pytest.raises(ProtocolError, match=problem):
+            link.picture(0)
+        link.close()
+
+
+def test_messages_are_kept_while_an_answer_is_awaited() -> None:
+    answers = {b"AcqStop()": b"4,LiveMonitor,RingBuffer,1\r0,AcqStop\r", b"Other()": b"0,Unasked\r"}
+    with LoopbackServer(scripted(answers)) as commands, data_server(b"") as data:
+        link = RemoteEx(HOST, commands.port, data.port, 0.3)
+        assert link.ask("AcqStop") == ()
+        assert link.message(1).arguments == ("RingBuffer", "1")
+        with pytest.raises(DeviceTimeoutError):
+            link.message(0.05)
+        with pytest.raises(DeviceTimeoutError, match=r"AcqStart\(\) for 0\.3 s; it is not asked again"):
+            link.ask("AcqStart")
+        with pytest.raises(DeviceTimeoutError):  # still owed: nothing else is sent before it has come
+            link.ask("AcqStop")
+        link.close()
+
+
+@pytest.mark.parametrize("greeting", [b"SSH-2.0\r", b"RemoteEx Data Ready\r"])
+def test_another_server_is_recognised(greeting: bytes) -> None:
+    with (
+        LoopbackServer(scripted({b"greeting": greeting})) as commands,
+        pytest.raises(ProtocolError, match="expected 'RemoteEx Ready'"),
+    ):
+        RemoteEx(HOST, commands.port, commands.port, 2)
+
+
+def test_servers_are_for_this_computer_only() -> None:
+    with LoopbackServer(lambda connection: None) as server:
+        assert server._listener.getsockname()[0] == "127.0.0.1"
+        others = {str(entry[4][0]) for entry in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
+        for address in others - {"127.0.0.1"}:
+            with pytest.raises(OSError, match="refused"):
+                socket.create_connection((address, server.port), 1)
+
+
+def test_no_thread_is_left_behind(camera: Camera) -> None:
+    before = threading.active_count()
+    server = camera()
+    with opened(server) as source:
+        taken(source, 3)
+    server.close()
+    deadline = time.monotonic() + 5
+    while threading.active_count() > before and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert threading.active_count() == before
