@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 from time import monotonic
 from typing import Protocol
 
 from devices.codec import Codec, as_bytes
+from devices.decoded import DecodedSource
 from devices.ledger import Ledger
 from devices.ring import Gap, Piece, Policy, Ring
-from devices.source import PATIENCE, Batch, Info, Source
-from devices.statistics import Stats
+from devices.source import PATIENCE, Batch, Info
 from tofclip.errors import DeviceError, DeviceTimeoutError
 from tofclip.storage import Record
 
@@ -30,8 +29,6 @@ LONGEST_DRAIN = 3.0
 
 LONGEST_STOP = 15.0
 """Seconds that `StreamSource.close` waits for the thread, which never takes so long."""
-
-Tap = Callable[[Piece], None]
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,7 @@ class Buffering:
     policy: Policy = "block"
 
 
-class StreamSource(Source):
+class StreamSource(DecodedSource):
     """A live source. Opening starts the instrument.
 
     Memory: the buffer's capacity, plus one transfer and one decoded piece.
@@ -98,12 +95,9 @@ class StreamSource(Source):
 
     def __init__(self, feed: Feed, codec: Codec, ledger: Ledger, buffering: Buffering | None = None) -> None:
         buffering = buffering or Buffering()
-        self.codec = codec
-        self.tap: Tap | None = None
-        """Called with every piece right before it is decoded."""
-        self._feed, self._ledger = feed, ledger
+        super().__init__(codec, ledger)
+        self._feed = feed
         self._ring = Ring(buffering.capacity, buffering.policy, ledger)
-        self._state = codec.start
         self._stopping, self._closed = threading.Event(), False
         feed.start()
         self._info, self._calibration = feed.info, feed.calibration
@@ -119,10 +113,6 @@ class StreamSource(Source):
         return self._calibration
 
     @property
-    def stats(self) -> Stats:
-        return self._ledger.stats
-
-    @property
     def is_live(self) -> bool:
         return True
 
@@ -130,15 +120,7 @@ class StreamSource(Source):
         piece = None if self._closed else self._ring.get(timeout)
         if piece is None:
             return None
-        if self.tap is not None:
-            self.tap(piece)
-        if piece.gap is Gap.RESTART:
-            self._state = self.codec.start
-        found = self.codec.decode(as_bytes(piece.data), self._state, piece.gap is not Gap.NONE)
-        self._state = found.state
-        first = self._ledger.stats.delivered
-        self._ledger.settle(len(found.records), found.malformed)
-        return Batch(found.records, first, piece.gap is not Gap.NONE)
+        return self._decoded(piece)
 
     def stop(self) -> None:
         self._stopping.set()

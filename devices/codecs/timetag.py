@@ -33,7 +33,7 @@ RANGE = 1 << TIME_BITS
 CHANNELS = 0xF
 FLAGS = DELTA | WRAP | LOST
 
-RECORD = np.dtype([("time_ticks", np.int64), ("channels", np.uint8), ("flags", np.uint8)], align=True)
+RECORD = np.dtype([("time_ticks", np.int64), ("channels", np.uint32), ("flags", np.uint32)])
 """`time_ticks`: since the counter was reset, wraps added up. `channels`: one bit each. `flags`: DELTA, WRAP, LOST."""
 
 
