@@ -33,6 +33,25 @@ def test_offsetting_the_detector_shears_the_picture():
     assert np.linalg.norm(plain(picture) - sheared) > 0.1 * np.linalg.norm(sheared)
 
 
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_a_lone_picture_is_projected_as_by_the_matrix(count):
+    """Without a matrix and with it; detectors so short and so far off that light is lost on both sides."""
+    random = np.random.default_rng(count)
+    offsets = random.uniform(-9, 9, count)
+    operator = RadonProjection((12, 17), 9, random.uniform(0, np.pi, count), offsets, np.float64)
+    picture, readings = random.random((12, 17)), random.random(9 * count)
+    np.testing.assert_allclose(operator(picture), operator.matrix @ picture.ravel(), atol=1e-13)
+    np.testing.assert_allclose(operator.adjoint(readings).ravel(), operator.matrix.T @ readings, atol=1e-13)
+    assert operator(picture).sum() < count * picture.sum()
+
+
+def test_hadamard_codes_are_rows_of_a_hadamard_matrix_with_signs():
+    """All codes of a picture, made -1 and 1, are orthogonal to each other."""
+    codes = 2 * HadamardCodes((4, 8), 32, 7, np.float64)(np.eye(32).reshape(4, 8, 32)) - 1
+    assert set(np.unique(codes)) == {-1.0, 1.0}
+    np.testing.assert_allclose(codes @ codes.T, 32 * np.eye(32), atol=1e-12)
+
+
 @pytest.mark.parametrize("kind", [HadamardCodes, RandomCodes])
 def test_codes_are_zeros_and_ones_half_of_them_open(kind):
     codes = kind((13, 16), 60, 3, np.float64)(np.eye(208).reshape(13, 16, 208))

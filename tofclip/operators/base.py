@@ -150,9 +150,9 @@ class Stack(LinearOperator):
         return np.concatenate([operator._forward(block) for operator in self.operators])
 
     def _adjoint(self, block: Array) -> Array:
-        parts = np.split(block, self._cuts)
-        pairs = zip(self.operators, parts, strict=True)
-        total: Array = np.sum([operator._adjoint(part) for operator, part in pairs], axis=0)
+        total = np.zeros((*self.shape_in, block.shape[-1]), self.dtype)
+        for operator, part in zip(self.operators, np.split(block, self._cuts), strict=True):
+            total += operator._adjoint(part)
         return total
 
 

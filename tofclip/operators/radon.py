@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tofclip.errors import InputError, ShapeError
+from tofclip.operators.base import Array, LinearOperator
 from tofclip.operators.sparse import SparseMatrix, split_between_bins
+
+if TYPE_CHECKING:
+    import scipy.sparse
+
+FRACTION_BITS = 32
+"""Positions on a detector are whole multiples of 2^-32 pixels, in the matrix and in the compiled loops alike."""
 
 
 class RadonProjection(SparseMatrix):
@@ -32,7 +42,7 @@ class RadonProjection(SparseMatrix):
 
     Notes
     -----
-    Readings are (angles * detector_px,), angle by angle.
+    Readings are (angles * detector_px,), angle by angle. A lone picture is projected without a matrix.
     """
 
     def __init__(
@@ -43,30 +53,71 @@ class RadonProjection(SparseMatrix):
         offsets_px: ArrayLike,
         dtype: DTypeLike = np.float32,
     ) -> None:
-        import scipy.sparse
-
         self.angles = np.asarray(angles, dtype=np.float64)
         self.offsets_px = np.asarray(offsets_px, dtype=np.float64)
         if self.angles.ndim != 1 or self.angles.shape != self.offsets_px.shape:
             raise ShapeError("angles and offsets", "(angles,) each", (self.angles.shape, self.offsets_px.shape))
         if not np.all(np.isfinite([self.angles, self.offsets_px])):
             raise InputError("angles and offsets must be finite")
-        reading, pixel, weight = self._entries(image_shape, detector_px)
-        readings = self.angles.size * detector_px
-        matrix = scipy.sparse.csr_array(
-            (weight.astype(dtype), (reading, pixel)), shape=(readings, image_shape[0] * image_shape[1])
-        )
-        super().__init__(matrix, image_shape, (readings,))
+        self.detector_px = detector_px
+        # Not by way of SparseMatrix: the matrix is made if a block of frames or a caller asks for it.
+        LinearOperator.__init__(self, image_shape, (self.angles.size * detector_px,), dtype)
 
-    def _entries(
-        self, image_shape: tuple[int, int], detector_px: int
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    @cached_property
+    def matrix(self) -> scipy.sparse.csr_array:
+        """The CSR matrix, (angles * detector_px, rows * columns); made on first use."""
+        import scipy.sparse
+
+        reading, pixel, weight = self._entries()
+        shape = (self.shape_out[0], self.shape_in[0] * self.shape_in[1])
+        made = scipy.sparse.csr_array((weight.astype(self.dtype), (reading, pixel)), shape=shape)
+        return SparseMatrix(made, self.shape_in, self.shape_out).matrix
+
+    def _entries(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
         """Row, column and value of every nonzero."""
-        rows, columns = image_shape
-        y = (np.arange(rows) - rows // 2)[:, np.newaxis]
-        x = (np.arange(columns) - columns // 2)[np.newaxis, :]
-        angle = self.angles[:, np.newaxis, np.newaxis]
-        position = detector_px // 2 + x * np.cos(angle) + y * np.sin(angle) + self.offsets_px[:, None, None]
-        entry, bins, weight = split_between_bins(position, detector_px)
+        rows, columns = self.shape_in
+        before, _, paths = self._paths
+        first, right, down = (path[:, np.newaxis, np.newaxis] for path in paths)
+        fixed = first + np.arange(columns) * right + np.arange(rows)[:, np.newaxis] * down
+        # Exact: positions have fewer bits than float64's mantissa.
+        entry, bins, weight = split_between_bins(fixed * 0.5**FRACTION_BITS - before, self.detector_px)
         number, pixel = np.divmod(entry, rows * columns)
-        return number * detector_px + bins, pixel, weight
+        return number * self.detector_px + bins, pixel, weight
+
+    @cached_property
+    def _paths(self) -> tuple[int, int, list[NDArray[np.int64]]]:
+        """Bins before the detector's first, bins in all, and positions on lines extended so.
+
+        The positions are those of each line's first pixel and the steps to its right and lower neighbour, in units of
+        2^-32 bins. The lines are long enough for every pixel to fall on them, so that compiled loops need not ask.
+        """
+        rows, columns = self.shape_in
+        right, down = np.cos(self.angles), np.sin(self.angles)
+        first = self.detector_px // 2 + self.offsets_px - columns // 2 * right - rows // 2 * down
+        across, along = (columns - 1) * right, (rows - 1) * down
+        lowest = first + np.minimum(across, 0) + np.minimum(along, 0)
+        highest = first + np.maximum(across, 0) + np.maximum(along, 0)
+        before = max(0, -int(np.floor(lowest.min()))) + 1
+        bins = before + max(self.detector_px, int(np.ceil(highest.max())) + 2)
+        fixed = [np.rint(values * 2.0**FRACTION_BITS).astype(np.int64) for values in (first + before, right, down)]
+        return before, bins, fixed
+
+    def _lone_forward(self, picture: Array) -> Array:
+        from tofclip.operators.kernels import project_onto_lines
+
+        before, bins, paths = self._paths
+        lines = np.zeros((self.angles.size, bins, 2), self.dtype)
+        project_onto_lines(picture, *paths, lines)
+        seen = slice(before, before + self.detector_px)
+        shared = slice(before - 1, before + self.detector_px - 1)
+        return (lines[:, seen, 0] + lines[:, shared, 1]).reshape(self.shape_out)
+
+    def _lone_adjoint(self, readings: Array) -> Array:
+        from tofclip.operators.kernels import back_project_lines
+
+        before, bins, paths = self._paths
+        lines = np.zeros((self.angles.size, bins), self.dtype)
+        lines[:, before : before + self.detector_px] = readings.reshape(-1, self.detector_px)
+        picture = np.empty(self.shape_in, self.dtype)
+        back_project_lines(lines, *paths, picture)
+        return picture

@@ -66,7 +66,13 @@ class LinearShear(_Shear):
     """The shear with linear interpolation between neighbouring pixels; dark beyond the border."""
 
     def _shifted(self, block: Array, down: float, right: float) -> Array:
-        return _shift_linearly(_shift_linearly(block, down, 0), right, 1)
+        from tofclip.operators.kernels import shift_linearly
+
+        rows, columns = (int(np.floor(shift)) for shift in (down, right))
+        below, beside = np.array([down - rows, right - columns], self.dtype)
+        shifted = np.empty_like(block)
+        shift_linearly(block, rows, columns, below, beside, shifted)
+        return shifted
 
 
 class FourierShear(_Shear):
@@ -87,18 +93,3 @@ def _delay(cycles_per_px: Array, shift_px: float) -> Array:
     """Spectrum of a shift. At the Nyquist frequency only its real part keeps a real picture real."""
     delay = np.exp(-2j * np.pi * cycles_per_px * shift_px)
     return np.where(np.abs(cycles_per_px) == 0.5, delay.real, delay)
-
-
-def _shift_linearly(block: Array, shift_px: float, axis: int) -> Array:
-    """Shift along one axis; ``result[i] = (1 - f) block[i - n] + f block[i - n - 1]`` for a shift of n + f."""
-    if shift_px == 0:
-        return block
-    whole = int(np.floor(shift_px))
-    share = block.dtype.type(shift_px - whole)
-    result = np.zeros_like(block)
-    target, source = np.moveaxis(result, axis, 0), np.moveaxis(block, axis, 0)
-    size = block.shape[axis]
-    for steps, weight in ((whole, 1 - share), (whole + 1, share)):
-        if abs(steps) < size and weight != 0:
-            target[max(steps, 0) : size + min(steps, 0)] += weight * source[max(-steps, 0) : size - max(steps, 0)]
-    return result

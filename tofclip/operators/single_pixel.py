@@ -15,7 +15,7 @@ class HadamardCodes(LinearOperator):
     A code is ``(1 + H D) / 2``: D holds a random sign for each pixel, and the rows of H are drawn without
     replacement (structurally random matrices, T. T. Do et al., IEEE Trans. Signal Process. 60, 139 (2012)). H is the
     Kronecker product of one Hadamard matrix for each side, the picture padded to powers of two, so that all of it
-    is a matrix product on either side of the picture.
+    is a fast Walsh-Hadamard transform along either side of the picture.
 
     Parameters
     ----------
@@ -29,33 +29,45 @@ class HadamardCodes(LinearOperator):
     """
 
     def __init__(self, image_shape: tuple[int, int], codes: int, seed: int, dtype: DTypeLike = np.float32) -> None:
-        import scipy.linalg
-
         super().__init__(image_shape, (codes,), dtype)
-        padded = [1 << (size - 1).bit_length() for size in image_shape]
-        if codes > padded[0] * padded[1]:
-            raise InputError(f"a {image_shape} picture has at most {padded[0] * padded[1]} codes, not {codes}")
+        self._padded = tuple(1 << (size - 1).bit_length() for size in image_shape)
+        cells = self._padded[0] * self._padded[1]
+        if codes > cells:
+            raise InputError(f"a {image_shape} picture has at most {cells} codes, not {codes}")
         random = np.random.default_rng(seed)
-        self._signs = random.choice(np.array([-1, 1], self.dtype), image_shape)
-        chosen = random.choice(padded[0] * padded[1], codes, replace=False)
-        self._chosen = np.unravel_index(chosen, padded)
-        self._vertical, self._horizontal = (
-            scipy.linalg.hadamard(n).astype(self.dtype)[:, :size] for n, size in zip(padded, image_shape, strict=True)
-        )
+        self._signs = random.choice(np.array([-1, 1], self.dtype), image_shape)[..., np.newaxis]
+        rows, columns = np.unravel_index(random.choice(cells, codes, replace=False), self._padded)
+        self._chosen = columns * self._padded[0] + rows  # the spectrum comes out transposed
 
     def _forward(self, block: Array) -> Array:
-        pictures = np.moveaxis(block, -1, 0)
-        spectrum = self._vertical @ (pictures * self._signs) @ self._horizontal.T
-        coded = spectrum[:, self._chosen[0], self._chosen[1]] + pictures.sum(axis=(1, 2))[:, np.newaxis]
-        return np.ascontiguousarray(coded.T / 2)
+        from tofclip.operators.kernels import walsh_hadamard
+
+        (rows, columns), (padded_rows, padded_columns), batch = self.shape_in, self._padded, block.shape[-1]
+        signed = np.zeros((padded_rows, columns, batch), self.dtype)
+        np.multiply(block, self._signs, out=signed[:rows])
+        walsh_hadamard(signed.reshape(padded_rows, -1))
+        spectrum = np.zeros((padded_columns, padded_rows, batch), self.dtype)
+        spectrum[:columns] = signed.swapaxes(0, 1)
+        walsh_hadamard(spectrum.reshape(padded_columns, -1))
+        coded: Array = spectrum.reshape(-1, batch)[self._chosen]
+        coded += block.sum(axis=0).sum(axis=0)
+        coded /= 2
+        return coded
 
     def _adjoint(self, block: Array) -> Array:
-        readings = block.T
-        spectrum = np.zeros((block.shape[-1], self._vertical.shape[0], self._horizontal.shape[0]), self.dtype)
-        spectrum[:, self._chosen[0], self._chosen[1]] = readings
-        pictures = (self._vertical.T @ spectrum @ self._horizontal) * self._signs
-        pictures += readings.sum(axis=1)[:, np.newaxis, np.newaxis]
-        return np.ascontiguousarray(np.moveaxis(pictures / 2, 0, -1))
+        from tofclip.operators.kernels import walsh_hadamard
+
+        (rows, columns), (padded_rows, padded_columns), batch = self.shape_in, self._padded, block.shape[-1]
+        spectrum = np.zeros((padded_columns * padded_rows, batch), self.dtype)
+        spectrum[self._chosen] = block
+        walsh_hadamard(spectrum.reshape(padded_columns, -1))
+        half_way = spectrum.reshape(padded_columns, padded_rows, batch)[:columns]
+        signed = np.ascontiguousarray(half_way.swapaxes(0, 1))
+        walsh_hadamard(signed.reshape(padded_rows, -1))
+        pictures: Array = signed[:rows] * self._signs
+        pictures += block.sum(axis=0)
+        pictures /= 2
+        return pictures
 
 
 class RandomCodes(LinearOperator):

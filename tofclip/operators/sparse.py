@@ -34,12 +34,20 @@ class SparseMatrix(LinearOperator):
 
     def __init__(self, matrix: scipy.sparse.csr_array, shape_in: Shape, shape_out: Shape) -> None:
         super().__init__(shape_in, shape_out, matrix.dtype)
+        matrix = matrix.tocsr()
         expected = (int(np.prod(shape_out)), int(np.prod(shape_in)))
         if matrix.shape != expected:
             raise ShapeError("the sparse matrix", expected, matrix.shape)
         if not np.all(np.isfinite(matrix.data)):
             raise InputError("the sparse matrix must be finite")
-        self.matrix = matrix.tocsr()
+        # Products wait for memory: half as long an index is a third less to read.
+        short = matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32 if matrix.nnz < 1 << 31 else np.int64)
+        self._given = type(matrix)((matrix.data, *short), shape=matrix.shape)
+
+    @cached_property
+    def matrix(self) -> scipy.sparse.csr_array:
+        """The CSR matrix, (all of `shape_out`, all of `shape_in`)."""
+        return self._given
 
     @cached_property
     def _rows(self) -> Tiles:
@@ -51,19 +59,22 @@ class SparseMatrix(LinearOperator):
 
     def _forward(self, block: Array) -> Array:
         if block.shape[-1] == 1:
-            return self._single(self.matrix, block, self.shape_out)
+            return self._lone_forward(block[..., 0])[..., np.newaxis]
         return self._product(self._rows, block, self.shape_in, self.shape_out)
 
     def _adjoint(self, block: Array) -> Array:
         if block.shape[-1] == 1:
-            return self._single(self.matrix.T, block, self.shape_in)
+            return self._lone_adjoint(block[..., 0])[..., np.newaxis]
         return self._product(self._columns, block, self.shape_out, self.shape_in)
 
-    @staticmethod
-    def _single(matrix: scipy.sparse.csr_array, block: Array, target: Shape) -> Array:
-        """Multiply a batch of one, where there are no neighbouring frames to share a vector instruction with."""
-        product: Array = matrix @ block.reshape(-1)
-        return product.reshape(*target, 1)
+    def _lone_forward(self, picture: Array) -> Array:
+        """Apply to a lone array: there are no neighbouring frames to share a vector instruction with."""
+        product: Array = self.matrix @ picture.reshape(-1)
+        return product.reshape(self.shape_out)
+
+    def _lone_adjoint(self, readings: Array) -> Array:
+        product: Array = self.matrix.T @ readings.reshape(-1)
+        return product.reshape(self.shape_in)
 
     def _product(self, tiles: Tiles, block: Array, source: Shape, target: Shape) -> Array:
         from tofclip.operators.kernels import sparse_times_block
