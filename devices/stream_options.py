@@ -1,4 +1,4 @@
-"""Values of an address that every live source takes: how much it holds for a slow reader, and what happens then."""
+"""Values of an address that live sources share: times to wait, and what is held for a slow reader."""
 
 from __future__ import annotations
 
@@ -19,3 +19,11 @@ def buffering(uri: Uri) -> Buffering:
         raise InputError(f"'{uri.text}': buffer_mib must be within 0 and 65536")
     policy = next(policy for policy in POLICIES if policy == uri.choice("policy", *POLICIES))
     return Buffering(int(capacity), policy)
+
+
+def seconds(uri: Uri, name: str, default: float) -> float:
+    """Read a time to wait, within 0 and 600 s."""
+    found = uri.value(name, float, default)
+    if not 0 < found <= 600:
+        raise InputError(f"'{uri.text}': {name} must be above 0 and at most 600")
+    return found

@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from time import monotonic, sleep
+from time import monotonic
 
 import numpy as np
 from numpy.typing import NDArray
 
 from devices.frames import FrameCodec
 from devices.ledger import Ledger
+from devices.persistence import persistently
 from devices.remoteex.client import Picture, RemoteEx
 from devices.remoteex.protocol import COMMAND_PORT, whole_number
 from devices.ring import Gap
@@ -20,14 +21,7 @@ from devices.stream import Arrival, StreamSource
 from devices.stream_options import OPTIONS as STREAM_OPTIONS
 from devices.stream_options import buffering
 from devices.uri import Uri
-from tofclip.errors import (
-    DeviceDisconnectedError,
-    DeviceError,
-    DeviceNotFoundError,
-    DeviceTimeoutError,
-    InputError,
-    ProtocolError,
-)
+from tofclip.errors import DeviceDisconnectedError, DeviceError, InputError, ProtocolError
 from tofclip.io.hpdta import TIME_UNITS
 from tofclip.storage import Field, Record, Scalar
 
@@ -38,7 +32,6 @@ OPTIONS = ("data_port", "buffers", "mcp_gain", "timeout_s", "reconnect_s", *STRE
 
 _PARAMETERS = {"time_range": "Time Range", "mode": "Mode", "mcp_gain": GAIN}
 _STOP = (("DevParamSet", STREAK_TUBE, GAIN, "0"), ("AcqStop",), ("AcqLiveMonitor", "Off"))
-_RETRY = 0.1
 
 Connect = Callable[[], RemoteEx]
 
@@ -194,20 +187,9 @@ class RemoteExFeed:
     def _reconnect(self) -> None:
         self._lose_announced()
         self._link.close()
-        deadline = monotonic() + self._settings.reconnect
-        while True:
-            try:
-                self._begin()
-            except (DeviceNotFoundError, DeviceDisconnectedError, DeviceTimeoutError) as fault:
-                if monotonic() > deadline:
-                    raise DeviceDisconnectedError(
-                        f"the connection broke and nobody answered for {self._settings.reconnect:g} s ({fault})"
-                    ) from fault
-                sleep(_RETRY)
-            else:
-                self._ledger.reconnect()
-                self._gap = Gap.RESTART
-                return
+        persistently(self._begin, self._settings.reconnect)
+        self._ledger.reconnect()
+        self._gap = Gap.RESTART
 
     def _lose_announced(self) -> None:
         """Enter pictures that were announced and will not come."""
