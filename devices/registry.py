@@ -19,13 +19,19 @@ from tofclip.errors import InputError
 from tofclip.storage import Scalar
 
 OPENERS: dict[str, str] = {
+    "linospad2": "devices.linospad2.source:open_recording",
     "remoteex": "devices.remoteex.source:open_remoteex",
+    "spad512": "devices.spad512.source:open_spad512",
+    "sim+linospad2": "devices.linospad2.simulation:open_simulated",
+    "sim+remoteex": "devices.remoteex.emulator:open_emulated",
+    "sim+spad512": "devices.spad512.emulator:open_emulated",
     "timetag": "devices.timetag:open_timetag",
     "sim+timetag": "devices.emulation.timetag:open_emulated",
 }
 """Scheme of an address -> function ``(Uri) -> Source``."""
 
 FILES: dict[str, str] = {
+    ".dat": "devices.linospad2.source:open_recording",
     ".h5": "devices.replay:open_recording",
     ".hdf5": "devices.replay:open_recording",
 }
