@@ -1,0 +1,232 @@
+"""The contract of sources: every kind is listed here and passes all of it.
+
+A kind is a function that takes a folder and returns the address of a source with a few thousand records, after which
+a live one is silent and any other at its end.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import devices
+from devices.codec import Records, as_bytes
+from devices.decoded import DecodedSource
+from devices.recorder import record
+from devices.recording.check import verify
+from devices.source import Batch, Source
+from tofclip.errors import DeviceTimeoutError, InputError
+
+RECORDS = 4000
+SILENCE = 0.2
+ENOUGH = 0.6
+"""Seconds in which each of them has sent everything."""
+LONG = 60.0  # compiling, on a slow machine
+SIMULATED = f"sim+timetag://?seed=3&records={RECORDS}&transfer_kib=1&reconnect_s=5"
+
+
+def emulated(folder: Path) -> str:
+    return SIMULATED
+
+
+def emulated_in_short_packets(folder: Path) -> str:
+    return f"{SIMULATED}&packet_bytes=510"
+
+
+def emulated_with_faults(folder: Path) -> str:
+    return f"{SIMULATED}&faults=stall@2,unplug@5:1,corrupt@8:3,overflow@11,short@13:5,lost@15:20"
+
+
+def recorded(folder: Path) -> str:
+    path = folder / "run.h5"
+    if not path.exists():
+        record(devices.open(emulated_with_faults(folder)), path, ENOUGH)
+    return f"file://{path}"
+
+
+def recorded_and_paced(folder: Path) -> str:
+    return f"{recorded(folder)}?pace=realtime"
+
+
+KINDS = [emulated, emulated_in_short_packets, emulated_with_faults, recorded, recorded_and_paced]
+Open = Callable[[], Source]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the kinds write, once."""
+    return tmp_path_factory.mktemp("sources")
+
+
+@pytest.fixture(params=KINDS, ids=lambda kind: kind.__name__)
+def address(request: pytest.FixtureRequest, folder: Path) -> str:
+    return str(request.param(folder))
+
+
+@pytest.fixture
+def opened(address: str) -> Open:
+    return lambda: devices.open(address)
+
+
+def read_on(source: Source, batches: list[Batch]) -> None:
+    """Read until nothing more comes."""
+    wait = LONG
+    try:
+        while (batch := source.read(wait)) is not None:
+            batches.append(batch)
+            wait = SILENCE
+    except DeviceTimeoutError:
+        assert source.is_live
+        source.stop()
+        while (batch := source.read(wait)) is not None:
+            batches.append(batch)
+
+
+def joined(batches: list[Batch]) -> Records:
+    return np.concatenate([batch.records for batch in batches])
+
+
+def test_it_says_what_it_is(opened: Open) -> None:
+    with opened() as source:
+        assert source.info.instrument
+        assert json.loads(json.dumps(source.info.as_dict()))["instrument"] == source.info.instrument
+        assert source.calibration is None or source.calibration.kind == "calibration"
+
+
+def test_batches_are_numbered_arrays_of_records(opened: Open) -> None:
+    batches: list[Batch] = []
+    with opened() as source:
+        read_on(source, batches)
+    assert len(batches) > 5
+    position = 0
+    for batch in batches:
+        assert batch.first == position
+        assert batch.records.dtype.names
+        assert batch.records.ndim == 1
+        position += len(batch)
+    assert position > RECORDS / 2
+
+
+def test_accounts_balance_at_every_moment(opened: Open) -> None:
+    delivered = 0
+    with opened() as source:
+        assert source.stats.is_balanced
+        for _ in range(4):
+            batch = source.read(LONG)
+            assert batch is not None
+            delivered += len(batch)
+            assert source.stats.is_balanced
+            assert source.stats.delivered == delivered
+    assert source.stats.is_balanced
+    assert source.stats.delivered == delivered
+    assert source.stats.unread > 0
+
+
+def test_everything_read_is_everything_there_was(opened: Open) -> None:
+    batches: list[Batch] = []
+    with opened() as source:
+        read_on(source, batches)
+    stats = source.stats
+    assert (stats.unread, stats.dropped_host) == (0, 0)
+    assert stats.delivered == len(joined(batches))
+    if source.is_live:
+        assert stats.acquired == RECORDS
+
+
+def test_after_the_end_there_is_nothing(opened: Open) -> None:
+    with opened() as source:
+        read_on(source, [])
+        assert source.read(0.0) is None
+        assert list(source) == []
+
+
+def test_after_closing_there_is_nothing(opened: Open) -> None:
+    source = opened()
+    source.read(LONG)
+    source.close()
+    source.close()
+    assert source.read(0.0) is None
+    assert source.stats.is_balanced
+
+
+def test_an_exception_closes_it(opened: Open) -> None:
+    with pytest.raises(ZeroDivisionError), opened() as source:
+        raise ZeroDivisionError
+    assert source.read(0.0) is None
+
+
+def test_waiting_is_bounded(opened: Open) -> None:
+    with opened() as source:
+        if not source.is_live:
+            return
+        source.read(LONG)
+        with pytest.raises(DeviceTimeoutError):
+            list(iter(lambda: source.read(SILENCE), None))
+        begin = time.monotonic()
+        with pytest.raises(DeviceTimeoutError):
+            source.read(SILENCE)
+        assert SILENCE <= time.monotonic() - begin < SILENCE + 5
+
+
+def test_seeking_is_exact_or_refused(opened: Open) -> None:
+    with opened() as source:
+        if not source.is_seekable:
+            with pytest.raises(InputError, match="cannot seek"):
+                source.seek(0)
+            return
+        first: list[Batch] = []
+        read_on(source, first)
+        whole = joined(first)
+        for target in (0, len(whole) // 3, len(whole) - 1):
+            source.seek(target)
+            again: list[Batch] = []
+            read_on(source, again)
+            assert again[0].first == target
+            np.testing.assert_array_equal(joined(again), whole[target:])
+        with pytest.raises(InputError):
+            source.seek(len(whole) + 1)
+
+
+def test_the_same_again_is_the_same(opened: Open) -> None:
+    runs: list[list[Batch]] = [[], []]
+    for batches in runs:
+        with opened() as source:
+            read_on(source, batches)
+    np.testing.assert_array_equal(joined(runs[0]), joined(runs[1]))
+    gaps = [[batch.first for batch in batches if batch.after_gap] for batches in runs]
+    assert gaps[0] == gaps[1]
+
+
+def test_its_bytes_are_tapped_before_they_are_decoded(opened: Open, tmp_path: Path) -> None:
+    with opened() as source:
+        if not isinstance(source, DecodedSource):
+            return
+        tapped: list[bytes] = []
+        source.tap = lambda piece: tapped.append(piece.data)
+        batch = source.read(LONG)
+        assert batch is not None
+        found = source.codec.decode(as_bytes(tapped[0]), source.codec.start)
+        np.testing.assert_array_equal(found.records, batch.records)
+
+
+def test_its_recording_replays_what_it_gave(opened: Open, tmp_path: Path) -> None:
+    path = tmp_path / "again.h5"
+    record(opened(), path, ENOUGH)
+    assert verify(path).is_sound
+    live: list[Batch] = []
+    with opened() as source:
+        read_on(source, live)
+    with devices.open(f"file://{path}") as replay:
+        again = list(replay)
+    assert joined(again).tobytes() == joined(live).tobytes()
+    assert replay.info == source.info
+
+
+def test_unknown_values_in_its_address_are_refused(address: str) -> None:
+    with pytest.raises(InputError, match="'colour' is unknown"):
+        devices.open(f"{address}{'&' if '?' in address else '?'}colour=red")
