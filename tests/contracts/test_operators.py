@@ -20,14 +20,17 @@ from tofclip.operators import (
     LinearShear,
     LineProjection,
     MaskedSensor,
+    MaskedViews,
     MeanWeighting,
     PitchedSensor,
     PointSpreadConvolution,
     RadonProjection,
     RandomCodes,
+    ShearedViews,
     SliceConvolution,
     SparseMatrix,
     Stack,
+    WeightedViews,
 )
 
 CENTRES = [6.3, 19.0, 31.8]
@@ -146,6 +149,18 @@ def integration(dtype: type) -> LinearOperator:
     return Integration([PointSpreadConvolution((9, 7), spread, dtype=dtype) for spread in spreads])
 
 
+def weighted_views(dtype: type) -> LinearOperator:
+    return WeightedViews((5, 7), np.random.default_rng(11).random((3, 4)), dtype)
+
+
+def masked_views(dtype: type) -> LinearOperator:
+    return MaskedViews(np.random.default_rng(12).random((4, 5, 7)), dtype)
+
+
+def sheared_views(dtype: type) -> LinearOperator:
+    return ShearedViews((11, 14), [(-1, 0), (0, 2), (1, 1)], 0.7, (0.3, 0), dtype)
+
+
 def identity(dtype: type) -> LinearOperator:
     return Identity((3, 5), dtype)
 
@@ -175,6 +190,9 @@ BUILDERS: list[Callable[[type], LinearOperator]] = [
     sparse_camera,
     slice_convolution,
     integration,
+    weighted_views,
+    masked_views,
+    sheared_views,
     identity,
 ]
 BATCHES = [(), (1,), (3,), (32,), (33,)]
@@ -308,6 +326,10 @@ def test_the_adjoint_of_the_adjoint_is_the_operator():
         lambda: PitchedSensor((9, 9), (0.5, 1)),
         lambda: SliceConvolution((9, 9), np.ones((2, 9, 10))),
         lambda: SliceConvolution((9, 9), np.ones((9, 9))),
+        lambda: WeightedViews((9, 9), np.ones(3)),
+        lambda: WeightedViews((9, 9), [[np.nan]]),
+        lambda: MaskedViews(np.ones((9, 9))),
+        lambda: MaskedViews(np.full((2, 3, 3), np.inf)),
         lambda: Integration([]),
         lambda: Integration([dense_sensor(np.float32), mean_weighting(np.float32)]),
         lambda: Integration([dense_sensor(np.float32), dense_sensor(np.float64)]),

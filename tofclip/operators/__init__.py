@@ -12,6 +12,7 @@ from tofclip.operators.base import (
     squared_norm,
 )
 from tofclip.operators.coded_lines import SliceConvolution
+from tofclip.operators.coded_views import MaskedViews, ShearedViews, WeightedViews
 from tofclip.operators.convolution import PointSpreadConvolution
 from tofclip.operators.projection import LineProjection
 from tofclip.operators.radon import RadonProjection
@@ -35,13 +36,16 @@ __all__ = [
     "LinearOperator",
     "LinearShear",
     "MaskedSensor",
+    "MaskedViews",
     "MeanWeighting",
     "PitchedSensor",
     "PointSpreadConvolution",
     "RadonProjection",
     "RandomCodes",
+    "ShearedViews",
     "SliceConvolution",
     "SparseMatrix",
     "Stack",
+    "WeightedViews",
     "squared_norm",
 ]

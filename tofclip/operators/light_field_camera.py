@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from tofclip.operators.cameras.base import LightFieldCamera
 from tofclip.operators.cameras.coded_line import CodedLineCamera
+from tofclip.operators.cameras.compressive import AshokCamera, BabacanCamera, CompressiveCamera, MarwahCamera
 from tofclip.operators.cameras.line import LineCamera
 from tofclip.operators.cameras.point_spread import (
     CodedApertureCamera,
@@ -16,12 +17,17 @@ from tofclip.operators.cameras.single_pixel import SinglePixelCamera
 
 __all__ = [
     "CAMERAS",
+    "COMPRESSIVE_CAMERAS",
+    "AshokCamera",
+    "BabacanCamera",
     "CodedApertureCamera",
     "CodedLineCamera",
+    "CompressiveCamera",
     "CubicPhaseCamera",
     "DiffuserCamera",
     "LightFieldCamera",
     "LineCamera",
+    "MarwahCamera",
     "MeasuredCamera",
     "PointSpreadCamera",
     "SinglePixelCamera",
@@ -38,3 +44,8 @@ CAMERAS: dict[str, type[LightFieldCamera]] = {
         DiffuserCamera,
     )
 }
+
+COMPRESSIVE_CAMERAS: dict[str, type[CompressiveCamera]] = {
+    kind.name: kind for kind in (AshokCamera, BabacanCamera, MarwahCamera)
+}
+"""Cameras that are made to recover whole light fields from dense sensors, for comparison (supplement Note 5)."""
