@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from apps.verbs import calibrate, clip, cloud, convert, demo, info, nlos, recover
+from apps.verbs import calibrate, clip, cloud, convert, demo, devices, info, nlos, record, recover
 from tofclip import __version__
 from tofclip.errors import TofclipError
 
@@ -44,6 +44,8 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   cloud              recovered frames to a point cloud
   nlos reconstruct   recovered frames of a wall to the scene hidden around the corner
   clip               light fields from few readings: simulate a camera, recover a picture
+  devices            instruments and their recordings: list, info, test, verify, repair
+  record             an instrument's bytes, to be replayed exactly
   convert            any readable streak image to this program's own HDF5
   info               what a file holds
 
@@ -56,6 +58,8 @@ app.command(epilog=EPILOG)(recover.recover)
 app.command(epilog=EPILOG)(cloud.cloud)
 app.add_typer(nlos.app, name="nlos")
 app.add_typer(clip.app, name="clip")
+app.add_typer(devices.app, name="devices")
+app.command(epilog=EPILOG)(record.record)
 app.command(epilog=EPILOG)(convert.convert)
 app.command(epilog=EPILOG)(info.info)
 

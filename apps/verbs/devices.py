@@ -1,0 +1,106 @@
+"""`tofclip devices`: find instruments, try them out, look after their recordings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from apps.options import AsJson
+
+DAMAGED = 2
+
+app = typer.Typer(help="Streak cameras, SPAD sensors, time taggers and their recordings.", no_args_is_help=True)
+
+Address = Annotated[
+    str, typer.Argument(metavar="URI", help="Such as timetag://SERIAL, file://run.h5 or 'sim+timetag://?seed=1'.")
+]
+Recording = Annotated[Path, typer.Argument(metavar="H5", help="Made by tofclip record.")]
+
+
+@app.command("list")
+def list_(as_json: AsJson = False) -> None:
+    """Show the instruments that are connected, and the kinds of addresses there are."""
+    from dataclasses import asdict
+
+    from apps.report import report
+    from devices import discover, registry
+
+    found = [asdict(one) for one in discover()]
+    kinds = sorted({*registry.OPENERS, "file"})
+    if as_json:
+        report({"devices": found, "kinds": kinds, "file_types": sorted(registry.FILES)}, as_json)
+        return
+    for one in found:
+        print(f"{one['uri']:<24}{one['instrument']}{': ' if one['note'] else ''}{one['note']}")
+    print(f"{len(found) or 'no'} instruments are connected")
+    print(f"addresses begin with {', '.join(f'{kind}://' for kind in kinds)}")
+
+
+@app.command()
+def info(uri: Address, as_json: AsJson = False) -> None:
+    """Say what is known about an instrument or a recording."""
+    import devices
+    from apps.report import report
+
+    with devices.open(uri) as source:
+        figures: dict[str, Any] = {
+            **source.info.as_dict(),
+            "is_live": source.is_live,
+            "is_seekable": source.is_seekable,
+        }
+        calibration = source.calibration
+    if calibration is not None:
+        shapes = {name: list(entry.values.shape) for name, entry in calibration.fields.items()}
+        figures |= {f"calibration_{name}": value for name, value in calibration.attributes.items()}
+        figures |= {f"calibration_{name}_shape": shape for name, shape in shapes.items()}
+    report(figures, as_json)
+
+
+@app.command("test")
+def try_(
+    uri: Address,
+    seconds: Annotated[float, typer.Option(metavar="S", help="How long to read.")] = 5.0,
+    as_json: AsJson = False,
+) -> None:
+    """Read and decode for a while, and say how fast and how well that went."""
+    import devices
+    from apps.report import report
+    from apps.verbs.record import ticking
+    from devices.trial import try_out
+
+    with ticking("reading", seconds) as watch:
+        trial = try_out(devices.open(uri), seconds, watch)
+    report(trial.figures, as_json)
+
+
+@app.command()
+def verify(file: Recording, as_json: AsJson = False) -> None:
+    """Read a recording from end to end and compare it with its checksums and accounts; exit status 2 if it is damaged.
+
+    A recording of a program that was killed is not complete, but as good as any up to its end.
+    """
+    from apps.report import report
+    from devices.recording.check import verify as verified
+
+    found = verified(file)
+    report(found.as_dict(), as_json)
+    if not found.is_sound:
+        typer.echo(f"tofclip: error: {file}: is damaged; tofclip devices repair makes a sound copy", err=True)
+        raise typer.Exit(DAMAGED)
+
+
+@app.command()
+def repair(
+    file: Recording,
+    out: Annotated[Path, typer.Option(metavar="H5", help="The sound copy to write.")],
+    as_json: AsJson = False,
+) -> None:
+    """Copy all that is sound of a damaged or unfinished recording, and mark where something is missing."""
+    from apps.files import RECORD_SUFFIXES, require_writable
+    from apps.report import report
+    from devices.recording.check import repair as repaired
+
+    require_writable(out, *RECORD_SUFFIXES, inputs=(file,))
+    report(repaired(file, out).as_dict(), as_json, [out])
