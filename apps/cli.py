@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from apps.verbs import calibrate, clip, cloud, convert, demo, devices, info, nlos, record, recover
+from apps.verbs import calibrate, clip, cloud, convert, demo, devices, info, lidar, nlos, record, recover
 from tofclip import __version__
 from tofclip.errors import TofclipError
 
@@ -42,6 +42,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   calibrate          find a camera's views in four pictures of a point source
   recover            streak image to one picture per instant
   cloud              recovered frames to a point cloud
+  lidar accuracy     how well counted photons tell a range, beside the theoretical limit
   nlos reconstruct   recovered frames of a wall to the scene hidden around the corner
   clip               light fields from few readings: simulate a camera, recover a picture
   devices            instruments and their recordings: list, info, test, verify, repair
@@ -56,6 +57,7 @@ app.command(epilog=EPILOG)(demo.demo)
 app.command(epilog=EPILOG)(calibrate.calibrate)
 app.command(epilog=EPILOG)(recover.recover)
 app.command(epilog=EPILOG)(cloud.cloud)
+app.add_typer(lidar.app, name="lidar")
 app.add_typer(nlos.app, name="nlos")
 app.add_typer(clip.app, name="clip")
 app.add_typer(devices.app, name="devices")

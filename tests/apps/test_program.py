@@ -30,7 +30,7 @@ def ran(*words: object) -> subprocess.CompletedProcess[str]:
 def test_alone_it_shows_the_map_of_verbs(run: Run) -> None:
     outcome = run()
     assert (outcome.status, outcome.err) == (0, "")
-    for verb in ("demo", "calibrate", "recover", "cloud", "nlos reconstruct", "convert", "info"):
+    for verb in ("demo", "calibrate", "recover", "cloud", "lidar accuracy", "nlos reconstruct", "convert", "info"):
         assert f"\n  {verb} " in outcome.out
 
 

@@ -11,6 +11,9 @@ from tofclip.errors import InputError
 
 SAMPLES_PER_WIDTH = 128  # linear interpolation then errs by less than 2e-5 of the peak
 REACH_IN_WIDTHS = 2.0  # a Gaussian is 1.5e-5 of its peak there
+REACH_IN_DECAYS = 11.0  # an exponential is 1.7e-5 of its start there
+FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
+SAMPLES_PER_BIN = 64  # of a pulse that was summed over bins
 SIGNIFICANT = 0.01  # below this share of its peak a pulse says nothing about where it is
 
 
@@ -58,6 +61,48 @@ class Pulse:
         widths = np.arange(-half, half + 1) / SAMPLES_PER_WIDTH
         return cls(np.exp2(-((2 * widths) ** 2)), fwhm / SAMPLES_PER_WIDTH, float(half))
 
+    @classmethod
+    def exponentially_modified(cls, fwhm: float, decay: float) -> Pulse:
+        """Return a Gaussian convolved with an exponential decay, as photon-counting diodes answer a short pulse.
+
+        Parameters
+        ----------
+        fwhm : float
+            Full width at half maximum of the Gaussian, s. Its middle, before the decay, is the arrival.
+        decay : float
+            Time constant of the exponential, s.
+
+        Raises
+        ------
+        InputError
+            A width or decay that is not a positive time.
+        """
+        from scipy.stats import exponnorm
+
+        if not (np.isfinite(fwhm) and fwhm > 0 and np.isfinite(decay) and decay > 0):
+            raise InputError(f"width and decay of a pulse must be positive times, got {fwhm} and {decay}")
+        before = int(REACH_IN_WIDTHS * SAMPLES_PER_WIDTH)
+        after = before + int(REACH_IN_DECAYS * decay / fwhm * SAMPLES_PER_WIDTH)
+        spacing, sigma = fwhm / SAMPLES_PER_WIDTH, fwhm / FWHM_PER_SIGMA
+        time = np.arange(-before, after + 1) * spacing
+        return cls(exponnorm.pdf(time, decay / sigma, scale=sigma), spacing, float(before))
+
+    def binned(self, bin_width: float) -> Pulse:
+        """Return the shape that bins of `bin_width`, s, show: its light summed from half a bin before to half after.
+
+        Sampled at the middles of bins it is, up to one factor, each bin's share of the light.
+        """
+        if not (np.isfinite(bin_width) and bin_width > 0):
+            raise InputError(f"the width of a bin must be a positive time, got {bin_width}")
+        spacing = min(self.spacing, bin_width / SAMPLES_PER_BIN)
+        before = int(np.ceil((self.origin * self.spacing + bin_width / 2) / spacing))
+        after = int(np.ceil(((self.samples.size - 1 - self.origin) * self.spacing + bin_width / 2) / spacing))
+        time = np.arange(-before, after + 1) * spacing
+        arrived = np.concatenate([[0.0], np.cumsum((self.samples[1:] + self.samples[:-1]) / 2)])
+        position = (time[:, np.newaxis] + np.array([-0.5, 0.5]) * bin_width) / self.spacing + self.origin
+        start, end = np.interp(position, np.arange(self.samples.size), arrived).T
+        return Pulse(end - start, spacing, float(before))
+
     def compressed(self, factor: float) -> Pulse:
         """Return the same shape, `factor` times shorter."""
         return Pulse(self.samples, self.spacing / factor, self.origin)
@@ -67,6 +112,16 @@ class Pulse:
         position = np.asarray(time, dtype=np.float64) / self.spacing + self.origin
         return np.interp(position, np.arange(self.samples.size), self.samples, left=0.0, right=0.0)
 
+    def slope_at(self, time: ArrayLike) -> NDArray[np.float64]:
+        """Change of brightness per second at `time`, s, after the arrival."""
+        position = np.asarray(time, dtype=np.float64) / self.spacing + self.origin
+        return np.interp(position, np.arange(self.samples.size), self.slope, left=0.0, right=0.0)
+
+    @property
+    def area(self) -> float:
+        """Brightness summed over time, s."""
+        return float(np.sum(self.samples[1:] + self.samples[:-1]) / 2 * self.spacing)
+
     @property
     def slope(self) -> NDArray[np.float64]:
         """Change of brightness per second at each sample."""
@@ -75,16 +130,16 @@ class Pulse:
     @property
     def fwhm(self) -> float:
         """Full width at half maximum, s."""
-        first, last = self._extent(0.5)
+        first, last = self.extent(0.5)
         return last - first
 
     @property
     def support(self) -> tuple[float, float]:
         """First and last instant, s after the arrival, at which the pulse matters."""
-        return self._extent(SIGNIFICANT)
+        return self.extent(SIGNIFICANT)
 
-    def _extent(self, level: float) -> tuple[float, float]:
-        """Where the curve first rises through `level` and last falls through it."""
+    def extent(self, level: float) -> tuple[float, float]:
+        """Return when the curve first rises through `level` of its peak and last falls through it, s after arrival."""
         above = np.flatnonzero(self.samples >= level)
         first, last = float(above[0]), float(above[-1])
         if above[0] > 0:

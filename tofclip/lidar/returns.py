@@ -2,8 +2,8 @@
 
 A recovered frame is no photon count: it went through an inverse problem, whose errors are spread over pixels and bins
 and are nearly even in time. For such errors the least-squares fit of the pulse is the maximum-likelihood estimate, so
-candidates are judged by the matched filter and refined by Gauss-Newton steps of that fit, below a bin. For bare
-photon counts that estimate is unbiased too, but the log-matched filter would be the sharper one.
+candidates are judged by the matched filter and refined by Gauss-Newton steps of that fit, below a bin. Histograms of
+counted photons are for `tofclip.lidar.photons`, whose estimator is the maximum-likelihood one there.
 """
 
 from __future__ import annotations

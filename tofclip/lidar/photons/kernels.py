@@ -1,0 +1,223 @@
+"""The compiled search for returns in histograms of photons.
+
+Peaks, positions below a bin and overlapping returns are treated by the steps of `tofclip.lidar.kernels`; here is what
+Poisson statistics add.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from tofclip.lidar.kernels import pulse_at, refine, unexplained, window
+
+POISSON = (0.0, 1.0)  # the variance of a bin is what is expected in it
+HALF_A_PHOTON = 0.5  # lets an empty histogram have a background
+
+
+@njit(nogil=True, cache=True)
+def best_score(counts, weights, first):
+    """Largest log-matched filter response over all bins, and its bin.
+
+    ``score[j] = sum_w weights[w] * counts[j + first + w]``; photons are few, so each one adds to the bins it concerns.
+    """
+    score = np.zeros(counts.size)
+    for i in range(counts.size):
+        if counts[i] > 0:
+            for w in range(weights.size):
+                j = i - first - w
+                if 0 <= j < counts.size:
+                    score[j] += counts[i] * weights[w]
+    best = np.argmax(score)
+    return score[best], best
+
+
+@njit(nogil=True, cache=True)
+def best_scores(histograms, weights, first, best):
+    """Fill `best` with the largest response of each histogram."""
+    for row in range(histograms.shape[0]):
+        best[row] = best_score(histograms[row], weights, first)[0]
+
+
+@njit(nogil=True, cache=True)
+def best_scores_of_scattered(photons, bins, noise, weights, first, best):
+    """Fill `best` with the best scores of histograms over which `photons` are thrown evenly by a random generator."""
+    counts = np.zeros(bins)
+    for trial in range(best.size):
+        counts[:] = 0
+        for _ in range(photons):
+            counts[noise.integers(0, bins)] += 1
+        best[trial] = best_score(counts, weights, first)[0]
+
+
+@njit(nogil=True, cache=True)
+def take_strongest(rest, free, dither, level, table, first, pulse, times, peaks, numbers):
+    """Find the strongest return of each histogram and take its bins out, for the next one to be sought in the rest.
+
+    Parameters
+    ----------
+    rest : (n, bins) float64 array, changed
+        Photons that belong to no return yet.
+    free : (n,) int64 array, changed
+        Bins that belong to no return yet.
+    dither : (n,) array
+        Added to the scores, to decide ties.
+    level : (n,) int64 array
+        Row of the table for each histogram; negative: nothing is sought.
+    table : (levels,), (levels, width) arrays
+        Threshold and filter weights.
+    first : int
+        Bin of the first weight relative to the return's.
+    pulse, times
+        As in `tofclip.lidar.kernels`.
+    peaks : (n, most returns) int64 array, changed
+    numbers : (n,) int64 array, changed
+    """
+    thresholds, weights = table
+    for row in range(rest.shape[0]):
+        if level[row] < 0:
+            continue
+        score, best = best_score(rest[row], weights[level[row]], first)
+        if score + dither[row] <= thresholds[level[row]]:
+            continue
+        peaks[row, numbers[row]] = best
+        numbers[row] += 1
+        begin, end = window(times, times[best], pulse)
+        rest[row, begin:end] = 0
+        free[row] -= end - begin
+
+
+@njit(nogil=True, cache=True)
+def locate(histograms, peaks, numbers, pulse, times, found):
+    """Refine the returns of each histogram to the likelihood's maximum.
+
+    Parameters
+    ----------
+    histograms : (n, bins) float64 array
+    peaks, numbers
+        As `take_strongest` left them.
+    pulse, times
+        As in `tofclip.lidar.kernels`.
+    found : (n, most returns, 3) float64 array
+        Overwritten with arrival, photons and standard deviation of the arrival where there is a return.
+    """
+    estimate = np.empty((peaks.shape[1], 2))
+    for row in range(histograms.shape[0]):
+        trace, number = histograms[row], numbers[row]
+        background = quiet_rate(trace, times, peaks[row, :number], pulse)
+        for k in range(number):
+            estimate[k, 0] = times[peaks[row, k]]
+            estimate[k, 1] = first_height(trace, times, background, pulse, estimate[k, 0])
+        refine(trace, times, background, pulse, estimate[:number], POISSON)
+        for k in range(number):
+            summarise(trace, times, background, pulse, estimate[:number], k, found[row, k])
+
+
+@njit(nogil=True, cache=True)
+def quiet_rate(trace, times, peaks, pulse):
+    """Background photons of a bin, from the bins that no return reaches."""
+    free = np.ones(trace.size, np.bool_)
+    for peak in peaks:
+        first, last = window(times, times[peak], pulse)
+        free[first:last] = False
+    photons = bins = 0.0
+    for i in range(trace.size):
+        if free[i]:
+            photons += trace[i]
+            bins += 1
+    return (photons + HALF_A_PHOTON) / max(bins, 1.0)
+
+
+@njit(nogil=True, cache=True)
+def first_height(trace, times, background, pulse, arrival):
+    """Height of a return from the photons around it; never less than half a photon's."""
+    first, last = window(times, arrival, pulse)
+    area = excess = 0.0
+    for i in range(first, last):
+        area += pulse_at(times[i] - arrival, pulse)[0]
+        excess += trace[i] - background
+    return max(excess, HALF_A_PHOTON) / max(area, 1e-3)
+
+
+@njit(nogil=True, cache=True)
+def summarise(trace, times, background, pulse, estimate, k, found):
+    """Arrival, photons and the arrival's Cramer-Rao deviation at the estimate."""
+    arrival, height = estimate[k, 0], estimate[k, 1]
+    first, last = window(times, arrival, pulse)
+    pp = pd = dd = total = 0.0
+    for i in range(first, last):
+        p, d = pulse_at(times[i] - arrival, pulse)
+        weight = 1 / (trace[i] - unexplained(trace, times, background, pulse, estimate, i, -1))
+        pp += weight * p * p
+        pd += weight * p * d
+        dd += weight * d * d
+        total += height * p
+    found[0], found[1], found[2] = arrival, total, np.inf
+    if height > 0 and pp * dd > pd * pd:
+        found[2] = 1 / (height * np.sqrt(dd - pd * pd / pp))
+
+
+@njit(nogil=True, cache=True)
+def scores(histograms, weights, first, score):
+    """Log-matched filter response of each histogram at each bin, (n, bins)."""
+    score[:] = 0
+    for row in range(histograms.shape[0]):
+        for i in range(histograms.shape[1]):
+            if histograms[row, i] > 0:
+                for w in range(weights.size):
+                    j = i - first - w
+                    if 0 <= j < histograms.shape[1]:
+                        score[row, j] += histograms[row, i] * weights[w]
+
+
+@njit(nogil=True, cache=True)
+def add_path(score, slope_cost, jump_cost, total):
+    """Add to `total` the best score of all paths that reach each entry along the first axis.
+
+    From one step to the next a path may keep its bin for nothing, change by one bin at `slope_cost`, or by any number
+    at `jump_cost`: the recursion of semi-global matching. `score` and `total` are (steps, lanes, bins).
+    """
+    path, before = np.empty(score.shape[2]), np.empty(score.shape[2])
+    for lane in range(score.shape[1]):
+        before[:] = 0
+        for step in range(score.shape[0]):
+            highest = before.max()
+            for t in range(path.size):
+                best = max(before[t], highest - jump_cost)
+                if t > 0:
+                    best = max(best, before[t - 1] - slope_cost)
+                if t + 1 < path.size:
+                    best = max(best, before[t + 1] - slope_cost)
+                path[t] = score[step, lane, t] + best - highest
+                total[step, lane, t] += path[t]
+            before[:] = path
+
+
+@njit(nogil=True, cache=True)
+def pool(counts, label, reach, apart, pooled, contributors):
+    """Sum each pixel's histogram with those of neighbours on the same surface, moved to the pixel's own bin.
+
+    Parameters
+    ----------
+    counts : (rows, columns, bins) float64 array
+    label : (rows, columns) int64 array
+        Bin of the return.
+    reach : int
+        Neighbours up to so many pixels away.
+    apart : int
+        Neighbours whose bins differ by more for each pixel of distance lie on another surface.
+    pooled : (rows, columns, bins) float64 array, overwritten
+    contributors : (rows, columns) int64 array, overwritten
+    """
+    rows, columns, bins = counts.shape
+    pooled[:] = 0
+    contributors[:] = 0
+    for y in range(rows):
+        for x in range(columns):
+            for v in range(max(0, y - reach), min(rows, y + reach + 1)):
+                for u in range(max(0, x - reach), min(columns, x + reach + 1)):
+                    move = label[v, u] - label[y, x]
+                    if abs(move) <= apart * max(abs(v - y), abs(u - x)):
+                        contributors[y, x] += 1
+                        for t in range(max(0, -move), min(bins, bins - move)):
+                            pooled[y, x, t] += counts[v, u, t + move]

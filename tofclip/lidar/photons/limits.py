@@ -1,0 +1,56 @@
+"""How well a return can be located at all: the Cramer-Rao bound of counted photons."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofclip.errors import InputError
+from tofclip.lidar.pulse import Pulse
+from tofclip.units import SPEED_OF_LIGHT
+
+PHASES = 16  # positions of the arrival within a bin that the bound is averaged over
+
+
+def range_bound(pulse: Pulse, bin_width: float, photons: float, background: float) -> float:
+    """Least standard deviation of the range that an unbiased estimate can have (Cramer-Rao).
+
+    Photons are Poisson distributed; arrival and number of photons are unknown, the background is known. The variance
+    is averaged over where in a bin the pulse arrives.
+
+    Parameters
+    ----------
+    pulse : Pulse
+        Shape of a return.
+    bin_width : float
+        Duration of a bin, s.
+    photons : float
+        Expected photons of the return.
+    background : float
+        Expected background photons in a bin.
+
+    Returns
+    -------
+    float
+        Metres: the bound of the time of flight times half the speed of light.
+
+    Raises
+    ------
+    InputError
+        A bin width or number of photons that is not positive, or a negative background.
+    """
+    if not (bin_width > 0 and 0 < photons < np.inf and 0 <= background < np.inf):
+        raise InputError(
+            "bin width and photons must be positive and the background not negative, got "
+            f"{bin_width}, {photons} and {background}"
+        )
+    shape = pulse.binned(bin_width)
+    first, last = shape.extent(0.0)
+    bins = np.arange(np.floor(first / bin_width) - 1, np.ceil(last / bin_width) + 2) * bin_width
+    late = bins - ((np.arange(PHASES) + 0.5) / PHASES - 0.5)[:, np.newaxis] * bin_width
+    height = photons * bin_width / shape.area
+    signal, slope = height * shape(late), height * shape.slope_at(late)
+    expected = signal + background
+    weight = np.divide(1.0, expected, out=np.zeros_like(expected), where=expected > 0)
+    delay, mixed, amount = (np.sum(weight * term, axis=1) for term in (slope**2, slope * signal, signal**2))
+    variance = 1 / (delay - mixed**2 / amount)
+    return float(SPEED_OF_LIGHT / 2 * np.sqrt(variance.mean()))
