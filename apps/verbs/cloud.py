@@ -12,6 +12,7 @@ from apps.options import AsJson
 
 if TYPE_CHECKING:
     from tofclip.lidar import PointCloud, Returns
+    from tofclip.transient import Frames
 
 FORMATS = (".ply", ".pcd", ".csv", ".npz", ".h5")
 
@@ -23,19 +24,31 @@ def cloud(
 ) -> None:
     """Find each pixel's returns and place them in space: x right, y down, z forward, in metres."""
     from apps.files import history, require_writable
-    from tofclip.errors import InputError
-    from tofclip.lidar import depth, point_cloud
     from tofclip.transient import Frames
 
     require_writable(out, *FORMATS, inputs=(frames,))
     recovered = Frames.load(frames)
-    returns = depth(recovered)
-    if len(returns) == 0:
-        raise InputError(f"{frames}: no return stands out of the background, so there is no point to write")
     past = history({"verb": "cloud"}, frames, earlier=recovered.provenance)
-    points = replace(point_cloud(returns), provenance=past)
+    points, returns = _found(replace(recovered, provenance=past), str(frames))
     points.save(out)
     _report(points, returns, as_json, out)
+
+
+def save_cloud(frames: Frames, out: Path) -> Path:
+    """Write the point cloud of frames that were just recovered, and return where."""
+    points, _ = _found(frames, "the recovered frames")
+    points.save(out)
+    return out
+
+
+def _found(frames: Frames, origin: str) -> tuple[PointCloud, Returns]:
+    from tofclip.errors import InputError
+    from tofclip.lidar import depth, point_cloud
+
+    returns = depth(frames)
+    if len(returns) == 0:
+        raise InputError(f"{origin}: no return stands out of the background, so there is no point to write")
+    return replace(point_cloud(returns), provenance=frames.provenance), returns
 
 
 def _report(points: PointCloud, returns: Returns, as_json: bool, out: Path) -> None:

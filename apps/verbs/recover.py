@@ -14,11 +14,17 @@ from tofclip.units import NANOSECOND, PICOSECOND
 if TYPE_CHECKING:
     from tofclip.reconstruct import Task
     from tofclip.recovery import Method
-    from tofclip.transient import Frames
+    from tofclip.transient import Frames, Streak
 
 
 def recover(
-    streak: Annotated[Path, typer.Argument(metavar="STREAK", help="HPD-TA TIFF, LIFT archive or our HDF5.")],
+    streak: Annotated[
+        str,
+        typer.Argument(
+            metavar="STREAK",
+            help="HPD-TA TIFF, ITEX, LIFT archive, our HDF5, or a source such as sim+linospad2://?seed=1.",
+        ),
+    ],
     out: Annotated[Path, typer.Option(metavar="H5", help="The frames to write.")],
     camera: Annotated[
         Path | None, typer.Option(metavar="H5", help="Made by calibrate.", show_default="the one inside STREAK")
@@ -32,6 +38,9 @@ def recover(
     iterations: Annotated[
         int | None, typer.Option(metavar="N", help="At most so many, for tv and l1.", show_default="the method's")
     ] = None,
+    cloud: Annotated[
+        Path | None, typer.Option(metavar="PLY", help="A point cloud to write as well.", show_default="none")
+    ] = None,
     preview: Picture = None,
     as_json: AsJson = False,
 ) -> None:
@@ -43,35 +52,56 @@ def recover(
     from apps.figures.style import save
     from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
     from apps.progress import progress
+    from apps.verbs.cloud import FORMATS as CLOUD_SUFFIXES
+    from apps.verbs.cloud import save_cloud
     from tofclip.reconstruct import method_named
 
-    inputs = (streak,) if camera is None else (streak, camera)
+    inputs = tuple(Path(name) for name in (streak, camera) if name is not None and not _is_address(name))
     preview = preview or out.with_suffix(".png")
     require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
     require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
+    if cloud is not None:
+        require_writable(cloud, *CLOUD_SUFFIXES, inputs=inputs)
     chosen = method_named(method) if iterations is None else method_named(method, iterations=iterations)
     task = _prepared(streak, camera, bin_width_ps, time_zero_ns, chosen)
     with progress("recovering", task.work) as advance:
         frames = _with_history(task.run(advance), task, inputs)
     frames.save(out)
     save(preview_figure(task.streak, frames), preview)
-    _report(frames, as_json, [out, preview])
+    written = [out, preview]
+    if cloud is not None:
+        written.append(save_cloud(frames, cloud))
+    _report(frames, as_json, written)
 
 
 def _prepared(
-    streak: Path, camera: Path | None, bin_width_ps: float | None, time_zero_ns: float | None, method: Method
+    streak: str, camera: Path | None, bin_width_ps: float | None, time_zero_ns: float | None, method: Method
 ) -> Task:
     """Read the inputs and check them against each other."""
     from tofclip.camera import Camera
-    from tofclip.io import read_streak
     from tofclip.reconstruct import prepare
 
     known = None if camera is None else Camera.load(camera)
-    shot = read_streak(streak, None if bin_width_ps is None else bin_width_ps * PICOSECOND)
+    shot = _shot(streak, None if bin_width_ps is None else bin_width_ps * PICOSECOND)
     task = prepare(shot, known, method)
     if time_zero_ns is None:
         return task
     return replace(task, camera=task.camera.replace(time_zero=time_zero_ns * NANOSECOND))
+
+
+def _is_address(name: str | Path) -> bool:
+    return "://" in str(name)
+
+
+def _shot(streak: str, bin_width: float | None) -> Streak:
+    """Read a file, or a source until it ends."""
+    if _is_address(streak):
+        from devices.transients import read_transient
+
+        return read_transient(streak, bin_width)
+    from tofclip.io import read_streak
+
+    return read_streak(streak, bin_width)
 
 
 def _with_history(frames: Frames, task: Task, inputs: tuple[Path, ...]) -> Frames:

@@ -1,0 +1,227 @@
+"""From a source's address to the streak image that recovery takes: photons histogrammed, frames added up.
+
+Besides what a source itself takes, its address may say how to gather (`GATHERING`), e.g.
+``file://run.h5?seconds=2&bins=576``:
+
+* ``seconds``: of reading, at most; a live source that never ends needs it, 10 by default;
+* ``frames``: of a camera, to add up; 1 by default;
+* ``bins``, ``start_ps``, ``period_ps``: number of histogram bins, middle of the first one after the laser's pulse, and
+  the laser's period, where the source does not know it;
+* ``sync``, ``pixels``: channel of the laser's pulses and channels of the line's pixels of a time tagger, ``0`` and
+  ``1,2,3`` by default.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from time import monotonic
+from urllib.parse import quote, urlencode
+
+import numpy as np
+from numpy.typing import NDArray
+
+from devices.histogram import BinAxis, StampHistogram, TagHistogram
+from devices.linospad2.calibration import BoardCalibration
+from devices.registry import open as open_source
+from devices.source import PATIENCE, Batch, Source
+from devices.uri import Uri
+from tofclip.camera import Camera
+from tofclip.errors import DeviceTimeoutError, InputError
+from tofclip.storage import Record, provenance
+from tofclip.transient import Streak
+
+GATHERING = ("seconds", "frames", "bins", "start_ps", "period_ps", "sync", "pixels")
+BIN_WIDTH = 20e-12
+"""Width of a histogram's bins where nobody gives another, s."""
+
+PICOSECOND = 1e-12
+
+
+@dataclass(frozen=True)
+class Gathering:
+    """How records become a streak image; see the module's text.
+
+    Parameters
+    ----------
+    seconds : float
+    frames : int
+    bins : int or None
+        None: as many as fit into the laser's period.
+    start : float
+        s.
+    period : float or None
+        s. None: as the source says.
+    sync : int
+    pixels : tuple of int
+    bin_width : float or None
+        s. None: `BIN_WIDTH` for photons, and the camera's own time axis for frames.
+    """
+
+    seconds: float = 10.0
+    frames: int = 1
+    bins: int | None = None
+    start: float = 0.0
+    period: float | None = None
+    sync: int = 0
+    pixels: tuple[int, ...] = (1, 2, 3)
+    bin_width: float | None = None
+
+    @classmethod
+    def of(cls, uri: Uri, bin_width: float | None) -> Gathering:
+        """Read the values of an address that say how to gather."""
+        standard = cls()
+        pixels = uri.value("pixels", _whole_numbers, standard.pixels)
+        found = cls(
+            uri.value("seconds", float, standard.seconds),
+            uri.value("frames", int, standard.frames),
+            uri.value("bins", int, 0) if "bins" in uri.values else None,
+            uri.value("start_ps", float, 0.0) * PICOSECOND,
+            uri.value("period_ps", float, 0.0) * PICOSECOND if "period_ps" in uri.values else None,
+            uri.value("sync", int, standard.sync),
+            pixels,
+            bin_width,
+        )
+        if not (0 < found.seconds < float("inf") and found.frames >= 1):
+            raise InputError(f"'{uri.text}': seconds and frames must be positive")
+        return found
+
+    def axis(self, known_period: float | None) -> BinAxis:
+        """Return the bins of a histogram of photons.
+
+        Raises
+        ------
+        InputError
+            Neither the address nor the source says how many bins there are, or how long the laser's period is.
+        """
+        width = BIN_WIDTH if self.bin_width is None else self.bin_width
+        period = self.period or known_period
+        if self.bins is not None:
+            return BinAxis(width, self.bins, self.start, period)
+        if period is None:
+            raise InputError("nobody knows the laser's period: add period_ps=... or bins=... to the address")
+        if not 0 < width <= period:
+            raise InputError(f"bins must be longer than 0 and shorter than the laser's period, got {width} s")
+        return BinAxis(width, int(period / width * (1 + 1e-9)), self.start, period)
+
+
+def read_transient(address: str, bin_width: float | None = None) -> Streak:
+    """Read a source until it ends, or as long as its address says, and return a streak image.
+
+    Memory: one batch of the source, and the streak image.
+
+    Parameters
+    ----------
+    address : str
+        As `devices.open` takes it, with `GATHERING`'s values where needed.
+    bin_width : float, optional
+        Width of a photon histogram's bins, s, 20 ps by default; of a camera's rows instead of its own time axis.
+
+    Returns
+    -------
+    Streak
+        With the camera that the source knows, if it knows one; hot pixels, and pixels that reached a camera's limit,
+        are marked in ``Streak.saturated``.
+
+    Raises
+    ------
+    InputError
+        The address is none, its values cannot be, or there were no photons.
+    DeviceError
+        The instrument failed before there was anything to gather.
+    """
+    uri = Uri.parse(address)
+    gathering = Gathering.of(uri, bin_width)
+    with open_source(_own(uri)) as source:
+        streak = _gathered(source, gathering)
+        known = source.calibration
+        past = {**provenance({"address": address, "bin_width_s": bin_width}), "source": source.info.as_dict()}
+        source.stop()
+        while source.read() is not None:
+            pass
+    past["stats"] = source.stats.as_dict()
+    return replace(streak, camera=_camera(known), source=address, provenance=past)
+
+
+def _gathered(source: Source, gathering: Gathering) -> Streak:
+    batches = _batches(source, gathering.seconds)
+    first = next(batches, None)
+    if first is None:
+        raise InputError("the source ended before it gave anything")
+    names = first.records.dtype.names or ()
+    if "counts" in names:
+        return _sum_of_frames(first, batches, source.calibration, gathering)
+    histogram = _histogram(names, source.calibration, gathering)
+    while first is not None:
+        if isinstance(histogram, TagHistogram):
+            histogram.add(first.records, first.after_gap)
+        else:
+            histogram.add(first.records)
+        first = next(batches, None)
+    return histogram.streak()
+
+
+def _batches(source: Source, seconds: float) -> Iterator[Batch]:
+    """Read until the end, or for so many seconds of a live source."""
+    deadline = monotonic() + seconds
+    while not source.is_live or monotonic() < deadline:
+        try:
+            batch = source.read(PATIENCE)
+        except DeviceTimeoutError:
+            if not source.stats.delivered:
+                raise
+            return
+        if batch is None:
+            return
+        yield batch
+
+
+def _histogram(
+    names: tuple[str, ...], calibration: Record | None, gathering: Gathering
+) -> StampHistogram | TagHistogram:
+    """Return an empty histogram for records of this kind."""
+    known = calibration or Record("none")
+    if names[-2:] == ("code", "pixel"):
+        period = float(known.attribute("laser_period_s", 0.0)) or None
+        return StampHistogram(gathering.axis(period), BoardCalibration.from_record(known))
+    if "time_ticks" in names:
+        tick = float(known.attribute("tick_s"))
+        return TagHistogram(gathering.axis(None), gathering.sync, gathering.pixels, tick)
+    raise InputError(f"records of {', '.join(names)} are no photons of a line of pixels")
+
+
+def _sum_of_frames(first: Batch, batches: Iterator[Batch], calibration: Record | None, gathering: Gathering) -> Streak:
+    """Add up a camera's frames; a pixel that reached its limit in one of them is not to be trusted."""
+    limit = np.iinfo(first.records.dtype["counts"].base).max
+    total: NDArray[np.float64] = np.zeros(first.records.dtype["counts"].shape)
+    saturated, left, batch = np.zeros(total.shape, bool), gathering.frames, first
+    while True:
+        pictures = batch.records["counts"][:left]
+        total += pictures.sum(axis=0, dtype=np.float64)
+        saturated |= (pictures == limit).any(axis=0)
+        left -= len(pictures)
+        following = next(batches, None) if left else None
+        if following is None:
+            break
+        batch = following
+    times = None
+    if calibration is not None and "row_times" in calibration.fields:
+        times = calibration.array("row_times", np.float64, 1, "s")
+    streak = Streak(total.astype(np.float32), times, saturated)
+    return streak if gathering.bin_width is None else streak.with_bin_width(gathering.bin_width)
+
+
+def _camera(calibration: Record | None) -> Camera | None:
+    known = None if calibration is None else calibration.children.get("camera")
+    return None if known is None else Camera.from_record(known)
+
+
+def _own(uri: Uri) -> str:
+    """Return the address without what says how to gather."""
+    values = {name: value for name, value in uri.values.items() if name not in GATHERING}
+    place = quote(uri.place, safe="/:@[]~ ")
+    return f"{uri.scheme}://{place}" + (f"?{urlencode(values)}" if values else "")
+
+
+def _whole_numbers(text: str) -> tuple[int, ...]:
+    return tuple(int(word) for word in text.split(","))
