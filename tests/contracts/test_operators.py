@@ -26,6 +26,7 @@ from tofclip.operators import (
     PointSpreadConvolution,
     RadonProjection,
     RandomCodes,
+    Reshape,
     ShearedViews,
     SliceConvolution,
     SparseMatrix,
@@ -161,6 +162,10 @@ def sheared_views(dtype: type) -> LinearOperator:
     return ShearedViews((11, 14), [(-1, 0), (0, 2), (1, 1)], 0.7, (0.3, 0), dtype)
 
 
+def reshape(dtype: type) -> LinearOperator:
+    return Reshape((3, 4, 5), (12, 5), dtype)
+
+
 def identity(dtype: type) -> LinearOperator:
     return Identity((3, 5), dtype)
 
@@ -193,6 +198,7 @@ BUILDERS: list[Callable[[type], LinearOperator]] = [
     weighted_views,
     masked_views,
     sheared_views,
+    reshape,
     identity,
 ]
 BATCHES = [(), (1,), (3,), (32,), (33,)]
@@ -326,6 +332,7 @@ def test_the_adjoint_of_the_adjoint_is_the_operator():
         lambda: PitchedSensor((9, 9), (0.5, 1)),
         lambda: SliceConvolution((9, 9), np.ones((2, 9, 10))),
         lambda: SliceConvolution((9, 9), np.ones((9, 9))),
+        lambda: Reshape((3, 4), (11,)),
         lambda: WeightedViews((9, 9), np.ones(3)),
         lambda: WeightedViews((9, 9), [[np.nan]]),
         lambda: MaskedViews(np.ones((9, 9))),

@@ -8,6 +8,7 @@ from tofclip.operators.base import (
     Identity,
     Integration,
     LinearOperator,
+    Reshape,
     Stack,
     squared_norm,
 )
@@ -42,6 +43,7 @@ __all__ = [
     "PointSpreadConvolution",
     "RadonProjection",
     "RandomCodes",
+    "Reshape",
     "ShearedViews",
     "SliceConvolution",
     "SparseMatrix",

@@ -224,6 +224,21 @@ class Identity(LinearOperator):
         return other
 
 
+class Reshape(LinearOperator):
+    """The same values in another shape, such as the views of a light field one below the other as one tall picture."""
+
+    def __init__(self, shape_in: Shape, shape_out: Shape, dtype: DTypeLike = np.float32) -> None:
+        if np.prod(shape_in) != np.prod(shape_out):
+            raise ShapeError("the result", f"as many elements as {shape_in}", shape_out)
+        super().__init__(shape_in, shape_out, dtype)
+
+    def _forward(self, block: Array) -> Array:
+        return block.reshape(*self.shape_out, -1)
+
+    def _adjoint(self, block: Array) -> Array:
+        return block.reshape(*self.shape_in, -1)
+
+
 class Diagonal(LinearOperator):
     """Elementwise weights, such as view gains or a mask of live pixels; self-adjoint."""
 

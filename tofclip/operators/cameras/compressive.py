@@ -97,7 +97,8 @@ class BabacanCamera(ApertureMaskCamera):
 class MarwahCamera(CompressiveCamera):
     """One exposure through a random mask just in front of the sensor.
 
-    K. Marwah et al., ACM Trans. Graph. 32, 46 (2013). Each view sees the mask moved by `MASK_SHEAR` pixels against its neighbour (Eq. 18).
+    Each view sees the mask moved by `MASK_SHEAR` pixels against its neighbour (Eq. 18; K. Marwah et al., ACM Trans.
+    Graph. 32, 46 (2013)).
     """
 
     name: ClassVar[str] = "marwah"
