@@ -20,15 +20,21 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from nlos.backprojection import Backprojection
     from nlos.capture import Capture
+    from nlos.confocal.light_cone import LightCone
+    from nlos.confocal.migration import FKMigration
+    from nlos.filtered import FilteredBackprojection
     from nlos.geometry import Grid
     from nlos.volume import Volume
 
-__all__ = ["Backprojection", "Capture", "Grid", "Volume"]
+__all__ = ["Backprojection", "Capture", "FKMigration", "FilteredBackprojection", "Grid", "LightCone", "Volume"]
 
 _HOMES = {
     "Backprojection": "nlos.backprojection",
     "Capture": "nlos.capture",
+    "FKMigration": "nlos.confocal.migration",
+    "FilteredBackprojection": "nlos.filtered",
     "Grid": "nlos.geometry",
+    "LightCone": "nlos.confocal.light_cone",
     "Volume": "nlos.volume",
 }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,9 +21,33 @@ from tofclip.errors import InputError
 TABLE_BYTES = 32 << 20
 """Filtered signals held at a time."""
 
+Filter = Callable[[NDArray[np.float32]], Waveforms]
+"""Turns signals (points, t) into what is smeared over the voxels."""
+
 BRICK_Z, BRICK_Y, BRICK_X = 8, 8, 128
 """Voxels treated together: few enough for the cache, rows along x long enough for vector registers, and at a batch of
 wall points some 30 ms of work, which is how long an interruption waits."""
+
+
+@dataclass(frozen=True)
+class Weighting:
+    """Factor ``cos(angle)^obliquity / distance^falloff`` of a wall point's signal at a voxel.
+
+    Parameters
+    ----------
+    falloff : float
+        1: each wall point is a source of a spherical wave, as in Liu et al. 2019; 0: all voxels alike.
+    obliquity : float
+        Power of the cosine of the angle at the wall point between the voxel and +z; 1 with falloff 1 makes it the far
+        field of the first Rayleigh-Sommerfeld integral; 0: all directions alike.
+    """
+
+    falloff: float = 1.0
+    obliquity: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.falloff) and np.isfinite(self.obliquity) and self.obliquity >= 0):
+            raise InputError(f"weights need finite powers, that of the obliquity not negative, got {self}")
 
 
 @dataclass(frozen=True)
@@ -44,10 +68,13 @@ class Backprojection:
         Carrier wavelength of the virtual pulse, m of path. Lateral resolution is about wavelength * depth / wall size.
     cycles : float
         Length of the pulse in wavelengths; see `nlos.band.VirtualPulse`.
+    weighting : Weighting
+        How much a voxel gets by its distance and direction from the wall point.
     """
 
     wavelength: float
     cycles: float = 3.0
+    weighting: Weighting = Weighting()
     pulse: VirtualPulse = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -95,11 +122,45 @@ class Backprojection:
     def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in the signal."""
         self.supports(capture, grid).require()
-        total = np.zeros(grid.shape, np.complex64)
-        for batch in _batches(capture, Band(self.pulse, capture.axis)):
-            _backproject(batch, grid, total, progress)
+        band = Band(self.pulse, capture.axis)
+
+        def filtered(traces: NDArray[np.float32]) -> Waveforms:
+            return band.waveforms(band.phasors(traces))
+
+        count = max(1, TABLE_BYTES // (band.samples * np.dtype(np.complex64).itemsize))
+        total = smeared(capture, grid, filtered, count, self.weighting, progress)
         settings = {"method": "backprojection", "wavelength_m": self.wavelength, "cycles": self.cycles}
         return Volume(total, grid, {**capture.provenance, "imaging": settings})
+
+
+def smeared(
+    capture: Capture, grid: Grid, filtered: Filter, points_at_a_time: int, weighting: Weighting, progress: Progress
+) -> NDArray[np.complex64]:
+    """Smear every wall point's filtered signal over the voxels that it may come from, and add all up.
+
+    Parameters
+    ----------
+    capture : Capture
+    grid : Grid
+    filtered : callable
+        Filters the signals of some wall points.
+    points_at_a_time : int
+        How many are filtered at once; bounds the memory.
+    weighting : Weighting
+    progress : callable
+        Called with the number of look-ups just done.
+
+    Returns
+    -------
+    (z, y, x) complex64 array
+    """
+    total = np.zeros(grid.shape, np.complex64)
+    for some in blocks(len(capture.points), points_at_a_time):
+        lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[some]
+        wall = capture.points[some].astype(np.float32)
+        batch = _Batch(filtered(capture.traces(some)), wall, lasers.astype(np.float32), weighting)
+        _backproject(batch, grid, total, progress)
+    return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +170,7 @@ class _Batch:
     waveforms: Waveforms
     wall: NDArray[np.float32]
     lasers: NDArray[np.float32]
+    weighting: Weighting
 
     def add_to(self, field: NDArray[np.complex64], x: FloatArray, y: FloatArray, z: FloatArray) -> None:
         """Add what these wall points contribute to a brick of voxels."""
@@ -117,17 +179,9 @@ class _Batch:
         axes = (axis.astype(np.float32) for axis in (x, y, z))
         # A brick of its own, because a contiguous array lets one compiled version serve every piece of a volume.
         brick = np.zeros(field.shape, np.complex64)
-        add_backprojection(values, start, spacing, self.wall, self.lasers, *axes, brick)
+        powers = np.array([1 - self.weighting.falloff, self.weighting.obliquity], np.float32)
+        add_backprojection(values, start, spacing, self.wall, self.lasers, *axes, powers, brick)
         field += brick
-
-
-def _batches(capture: Capture, band: Band) -> Iterator[_Batch]:
-    """Filter as many wall points at a time as fit into the table."""
-    count = max(1, TABLE_BYTES // (band.samples * np.dtype(np.complex64).itemsize))
-    for some in blocks(len(capture.points), count):
-        lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[some]
-        waveforms = band.waveforms(band.phasors(capture.traces(some)))
-        yield _Batch(waveforms, capture.points[some].astype(np.float32), lasers.astype(np.float32))
 
 
 def _backproject(batch: _Batch, grid: Grid, total: NDArray[np.complex64], progress: Progress) -> None:

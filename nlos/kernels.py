@@ -30,7 +30,7 @@ def delayed_reading(signal, late_bins):
 
 
 @compiled
-def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, field):
+def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, powers, field):
     """Add every wall point's waveform, read at each voxel's path and divided by the last leg, to `field`.
 
     Meant for a brick of voxels so small that their paths to a wall point span a short piece of its waveform, which
@@ -47,6 +47,8 @@ def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, field):
         One laser spot for all wall points or one for each.
     x, y, z : float32 array
         Axes of the brick.
+    powers : (2,) float32 array
+        Further weights: powers of the last leg's length and of the cosine of its angle with z.
     field : (z, y, x) complex64 array
     """
     per_metre = np.float32(1) / spacing
@@ -54,6 +56,7 @@ def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, field):
     sums = np.zeros((z.size, y.size, 4 * x.size), np.float32)
     outward = np.empty((z.size, y.size, x.size), np.float32)
     sample, before, after = np.empty(x.size, np.int32), np.empty(x.size, np.float32), np.empty(x.size, np.float32)
+    weighted = powers[0] != 0 or powers[1] != 0
     for p in range(wall.shape[0]):
         if p < lasers.shape[0]:
             _outward_samples(lasers[p], start, per_metre, x, y, z, outward)
@@ -62,6 +65,8 @@ def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, field):
                 across = (y[iy] - wall[p, 1]) ** 2 + (z[iz] - wall[p, 2]) ** 2
                 last = np.float32(waveforms.shape[1] // 2 - 2)
                 _find_samples(x, wall[p, 0], across, outward[iz, iy], per_metre, last, sample, before, after)
+                if weighted:
+                    _weigh(x, wall[p, 0], across, max(z[iz] - wall[p, 2], np.float32(0)), powers, before, after)
                 _add_samples(waveforms[p], sample, before, after, sums[iz, iy])
     for iz in range(z.size):
         for iy in range(y.size):
@@ -92,6 +97,17 @@ def _find_samples(x, wall_x, across, outward, per_metre, last, sample, before, a
         weight = np.float32(1) / distance
         after[ix] = (position - np.float32(index)) * weight
         before[ix] = weight - after[ix]
+
+
+@compiled
+def _weigh(x, wall_x, across, ahead, powers, before, after):
+    """Multiply the weights of a row of voxels by powers of their distance and of the cosine of their direction."""
+    across = max(across, np.float32(NEAREST * NEAREST))
+    for ix in range(x.size):
+        distance = math.sqrt((x[ix] - wall_x) ** 2 + across)
+        factor = distance ** powers[0] * (ahead / distance) ** powers[1]
+        before[ix] *= factor
+        after[ix] *= factor
 
 
 @compiled

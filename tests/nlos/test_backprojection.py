@@ -10,6 +10,7 @@ from relay_walls import AXIS, HIDDEN, JITTER, curved_wall, lasers_for, planar_wa
 
 import nlos.backprojection
 from nlos import Backprojection, Capture, Grid
+from nlos.backprojection import Weighting
 from nlos.band import Band
 from nlos.exact import exact_phasor_field
 from nlos.method import Support
@@ -215,3 +216,26 @@ def test_a_long_path_keeps_its_phase_in_float32() -> None:
     assert far.signal.any()
     # Distances of 150 m in float32 are good to 8e-6 m each way, 8e-4 rad at this wavelength.
     assert relative_error(found, exact) < 3e-3
+
+
+@pytest.mark.parametrize(("falloff", "obliquity"), [(0, 0), (1, 1), (2, 0.5)])
+def test_weights_are_powers_of_distance_and_direction(falloff: float, obliquity: float, capture: Capture) -> None:
+    """One wall point at a time, so that the weight is a factor of the whole field."""
+    weighted = replace(METHOD, weighting=Weighting(falloff, obliquity))
+    signal = np.zeros_like(capture.signal)
+    signal[:, 4, 7] = capture.signal[:, 4, 7]
+    lone = replace(capture, signal=signal)
+    plain, found = METHOD.phasor_field(lone, GRID).values, weighted.phasor_field(lone, GRID).values
+    z, y, x = np.meshgrid(GRID.z, GRID.y, GRID.x, indexing="ij")
+    away = np.stack([x, y, z], axis=-1) - capture.wall[4, 7]
+    distance = np.linalg.norm(away, axis=-1)
+    expected = plain * distance ** (1 - falloff) * (away[..., 2] / distance) ** obliquity
+    assert np.any(expected)
+    # Products of float32.
+    assert relative_error(found, expected) < 1e-5
+
+
+def test_weights_are_checked() -> None:
+    for wrong in ((np.nan, 0), (1, -1), (1, np.inf)):
+        with pytest.raises(InputError, match="weights"):
+            Weighting(*wrong)

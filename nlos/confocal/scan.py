@@ -1,0 +1,157 @@
+"""What both methods need of a confocal capture: its lattice, and its signals from path 0 on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.capture import Capture
+from nlos.confocal.lattice import OFF_LATTICE, Lattice
+from nlos.geometry import FloatArray, Grid
+from nlos.kernels import delayed_reading
+from nlos.method import Support, common_support
+from tofclip.errors import InputError
+
+MEMORY_LIMIT_BYTES = 4 << 30
+"""Larger transforms are refused before anything is allocated."""
+
+BYTES_PER_SAMPLE = 12
+"""Of the padded box (2 rows, 2 columns, 2 bins): two half spectra in complex64, and the signals and what is cut out of
+the result besides."""
+
+NOTHING_TO_MOVE = 1e-3
+"""A start that lies this close to a whole bin, in bins, is taken for one."""
+
+
+@dataclass(frozen=True, eq=False)
+class ConfocalScan:
+    """Signals on a lattice of wall points.
+
+    Parameters
+    ----------
+    signal : (y, x, t) float32 array
+        What every wall point saw; bin i stands for the distance ``i * spacing`` from it.
+    lattice : Lattice
+    spacing : float
+        Distance per bin, m: half the path.
+    """
+
+    signal: NDArray[np.float32]
+    lattice: Lattice
+    spacing: float
+
+    @classmethod
+    def of(cls, capture: Capture, grid: Grid) -> ConfocalScan:
+        """Sort a capture onto its lattice, from distance 0 as far as any voxel of the grid is from any wall point."""
+        lattice = Lattice.of(capture.points)
+        if lattice is None:
+            raise InputError("the capture's wall points form no lattice")
+        traces = _from_distance_zero(capture, _useful_bins(capture, lattice, grid))
+        signal = traces[lattice.order].reshape(lattice.y.size, lattice.x.size, traces.shape[1])
+        return cls(signal, lattice, capture.axis.spacing / 2)
+
+    def weighted(self, falloff: float) -> NDArray[np.float32]:
+        """Undo the loss of brightness with distance d by the factor d^falloff; the farthest bin keeps its scale."""
+        relative = np.arange(self.signal.shape[2], dtype=np.float32) / (self.signal.shape[2] - 1)
+        return np.asarray(self.signal * relative**falloff, dtype=np.float32)
+
+
+def confocal_support(capture: Capture, grid: Grid) -> Support:
+    """Check what both methods need: a confocal scan on a lattice of a plane, a grid close by, and memory."""
+    basic = common_support(capture, grid)
+    if not basic:
+        return basic
+    lattice = Lattice.of(capture.points)
+    if lattice is None:
+        return Support(
+            "the wall points must fill an evenly spaced lattice x, y on a plane z = const; use another method"
+        )
+    return Support(_laser_problem(capture, lattice) or _reach_problem(lattice, grid) or _size_problem(capture))
+
+
+def padded(count: int) -> int:
+    """At least twice as many samples: an even number that Fourier transforms are quick with."""
+    from scipy.fft import next_fast_len
+
+    return 2 * int(next_fast_len(count))
+
+
+def interpolated(values: NDArray[np.float32], position: FloatArray, axis: int) -> NDArray[np.float32]:
+    """Read an axis at fractional positions by linear interpolation; it is periodic."""
+    below = np.floor(position).astype(np.intp)
+    share = (position - below).astype(np.float32)
+    share = share.reshape([-1 if i == axis else 1 for i in range(values.ndim)])
+    count = values.shape[axis]
+    lower, upper = (np.take(values, index % count, axis) for index in (below, below + 1))
+    return np.asarray(lower + share * (upper - lower))
+
+
+def onto_grid(
+    values: NDArray[np.float32], scan: ConfocalScan, grid: Grid, depth_position: FloatArray
+) -> NDArray[np.float32]:
+    """Read an image (y, x, depth) on the padded lattice at the voxels of a grid, shape (z, y, x)."""
+    image = interpolated(values, depth_position, 2)
+    image = interpolated(image, scan.lattice.column(grid.x), 1)
+    return np.ascontiguousarray(np.moveaxis(interpolated(image, scan.lattice.row(grid.y), 0), 2, 0))
+
+
+def _laser_problem(capture: Capture, lattice: Lattice) -> str:
+    if len(capture.lasers) != len(capture.points):
+        return "a confocal scan is needed, where every wall point is its own laser spot; use another method"
+    apart = float(np.abs(capture.lasers - capture.points).max())
+    if apart > OFF_LATTICE * min(lattice.steps):
+        return (
+            f"a confocal scan is needed, but lasers are up to {apart:.3g} m from their wall points; use another method"
+        )
+    return ""
+
+
+def _reach_problem(lattice: Lattice, grid: Grid) -> str:
+    for name, axis, wanted in (("x", lattice.x, grid.x), ("y", lattice.y, grid.y)):
+        margin = (axis[-1] - axis[0]) / 2
+        low, high = axis[0] - margin, axis[-1] + margin
+        if wanted[0] < low or wanted[-1] > high:
+            return (
+                f"the grid's {name} runs from {wanted[0]:.3g} to {wanted[-1]:.3g} m, but this method sees only from "
+                f"{low:.3g} to {high:.3g} m, half a wall beyond the wall"
+            )
+    return ""
+
+
+def _size_problem(capture: Capture) -> str:
+    bins = capture.axis.bins + max(0, int(capture.start / capture.axis.spacing))
+    needed = 8 * len(capture.points) * bins * BYTES_PER_SAMPLE
+    if needed <= MEMORY_LIMIT_BYTES:
+        return ""
+    return (
+        f"{len(capture.points)} wall points with {bins} bins need {needed / 2**30:.1f} GiB, more than the "
+        f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: put time bins together or leave wall points out"
+    )
+
+
+def _useful_bins(capture: Capture, lattice: Lattice, grid: Grid) -> int:
+    """Bins from path 0 to the end of the record, or as far as light of the grid can come from."""
+    across = [
+        max(abs(voxel - point) for voxel in (wanted[0], wanted[-1]) for point in (axis[0], axis[-1]))
+        for axis, wanted in ((lattice.x, grid.x), (lattice.y, grid.y))
+    ]
+    farthest = float(np.hypot(np.hypot(*across), grid.z[-1] - lattice.z))
+    recorded = int(np.ceil(capture.axis.paths[-1] / capture.axis.spacing)) + 1
+    return max(2, min(recorded, int(np.ceil(2 * farthest / capture.axis.spacing)) + 2))
+
+
+def _from_distance_zero(capture: Capture, bins: int) -> NDArray[np.float32]:
+    """Signals (points, bins) whose bin 0 is path 0: moved by whole bins where that suffices, else interpolated."""
+    late = capture.start / capture.axis.spacing
+    whole = round(late)
+    traces = capture.traces()
+    if abs(late - whole) > NOTHING_TO_MOVE:
+        by_bin = np.ascontiguousarray(traces.T)
+        traces = np.ascontiguousarray(delayed_reading(by_bin, np.full(len(traces), whole - late)).T)
+    moved = np.zeros((len(traces), bins), np.float32)
+    first, last = max(0, whole), min(bins, whole + traces.shape[1])
+    if first < last:
+        moved[:, first:last] = traces[:, first - whole : last - whole]
+    return moved

@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nlos import Capture
+from nlos.preparation import binned, cropped, without_first_bounce
+from tofclip.errors import InputError
+from tofclip.units import SPEED_OF_LIGHT
+
+WALL = np.array([[0.0, 0, 0], [0.3, 0, 0], [np.nan, 0, 0]])
+SPACING = 0.01
+SIGNAL = np.random.default_rng(3).normal(size=(100, 3))
+CAPTURE = Capture(SIGNAL, WALL, [0.0, 0, 0], SPACING / SPEED_OF_LIGHT, 0.2, {"shot": 7})
+
+
+def test_cropping_keeps_every_bin_at_its_path() -> None:
+    kept = cropped(CAPTURE, 0.395, 0.605)
+    assert kept.axis.paths == pytest.approx(np.arange(0.40, 0.606, 0.01))
+    assert np.array_equal(kept.signal, CAPTURE.signal[20:41])
+    assert kept.provenance == {"shot": 7}
+    with pytest.raises(InputError, match=r"record runs from 0\.2 to 1\.19 m"):
+        cropped(CAPTURE, 2, 3)
+
+
+def test_bins_put_together_stand_for_their_middle() -> None:
+    few = binned(CAPTURE, 8)
+    assert few.signal.shape == (12, 3)
+    assert few.signal[2] == pytest.approx(CAPTURE.signal[16:24].sum(axis=0), rel=1e-5)
+    assert few.bin_width == pytest.approx(8 * CAPTURE.bin_width)
+    assert few.axis.paths[2] == pytest.approx(CAPTURE.axis.paths[16:24].mean())
+    assert np.array_equal(binned(CAPTURE, 1).signal, CAPTURE.signal)
+    for factor in (0, -2, 51):
+        with pytest.raises(InputError, match="put together"):
+            binned(CAPTURE, factor)
+
+
+def test_the_first_bounce_comes_later_far_from_the_laser() -> None:
+    gated = without_first_bounce(CAPTURE, 0.25)
+    assert np.all(gated.signal[CAPTURE.axis.paths < 0.2501, 0] == 0)
+    assert np.array_equal(gated.signal[6:, 0], CAPTURE.signal[6:, 0])
+    assert np.all(gated.signal[:36, 1] == 0)
+    assert np.array_equal(gated.signal[36:, 1], CAPTURE.signal[36:, 1])
+    # Where the wall point is not known the signal is not used either.
+    assert np.array_equal(gated.signal[:, 2], CAPTURE.signal[:, 2])
+    with pytest.raises(InputError, match="margin"):
+        without_first_bounce(CAPTURE, -1)
