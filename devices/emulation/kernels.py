@@ -25,7 +25,7 @@ def _next(state):
 
 
 @compiled
-def poisson_words(state, now, mean_gap, shares, last, words):
+def poisson_words(state, now, scale, shares, last, words):
     """Write the words of photons that arrive at random on four channels, one at most per tick.
 
     Parameters
@@ -34,8 +34,8 @@ def poisson_words(state, now, mean_gap, shares, last, words):
         Of the random numbers; changed in place.
     now : (1,) int64 array
         Tick of the last record; changed in place.
-    mean_gap : float
-        Mean ticks from one photon to the next, more than 1.
+    scale : float
+        Of the exponential distribution of which the whole part is the number of ticks between two photons.
     shares : (4,) float64 array
         Of all photons, the share of each channel, added up.
     last : int
@@ -51,7 +51,7 @@ def poisson_words(state, now, mean_gap, shares, last, words):
     written = 0
     while written < words.size // RECORD_BYTES:
         after, bits = _next(state[0])
-        gap = -math.log(((bits >> np.uint64(11)) + np.uint64(1)) * _DOUBLE) * (mean_gap - 1)
+        gap = -math.log(((bits >> np.uint64(11)) + np.uint64(1)) * _DOUBLE) * scale
         tick = now[0] + 1 + np.int64(gap)
         after, bits = _next(after)
         where = (bits >> np.uint64(11)) * _DOUBLE

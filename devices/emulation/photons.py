@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import numpy as np
@@ -43,12 +44,13 @@ class Poisson:
     def __init__(self, rate: float, clock_hz: int, seed: int, shares: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)) -> None:
         if not 0 < rate < clock_hz:
             raise InputError(f"a rate must be above 0 and below the clock's {clock_hz} per second, got {rate:g}")
-        self._mean_gap = clock_hz / rate
+        # The whole part of an exponential variable is geometric, here with mean (ticks per photon) - 1.
+        self._scale = 1 / math.log1p(1 / (clock_hz / rate - 1))
         self._shares = np.cumsum(shares) / np.sum(shares)
         self._state = np.array([seed], np.uint64)
         self._now = np.zeros(1, np.int64)
 
     def words(self, limit: int, last: int) -> ByteView:
         words = np.empty(limit * RECORD_BYTES, np.uint8)
-        written = poisson_words(self._state, self._now, self._mean_gap, self._shares, last, words)
+        written = poisson_words(self._state, self._now, self._scale, self._shares, last, words)
         return words[: written * RECORD_BYTES]

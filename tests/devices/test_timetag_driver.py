@@ -70,9 +70,9 @@ def test_photons_are_poisson() -> None:
         as_bytes(Poisson(RATE, CLOCK_HZ, 8, (1, 2, 3, 4)).words(200_000, FOREVER)), codec.start
     ).records
     gaps = np.diff(records["time_ticks"])
-    # A gap of a tick and an exponential one of 9 ticks, rounded down: 9.5 ticks on average, spread by 9.
-    assert abs(gaps.mean() - 9.5) < 0.1
-    assert abs(gaps.std() - 9) < 0.1
+    # Ten ticks per photon, geometrically distributed; five standard deviations of 200 000.
+    assert abs(gaps.mean() - 10) < 0.11
+    assert abs(gaps.std() - np.sqrt(90)) < 0.2
     shares = np.bincount(records["channels"], minlength=9)[[1, 2, 4, 8]] / len(records)
     np.testing.assert_allclose(shares, [0.1, 0.2, 0.3, 0.4], atol=0.005)  # four standard deviations
 
