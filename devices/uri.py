@@ -42,6 +42,8 @@ class Uri:
         InputError
             It has no scheme, or its query is not made of ``name=value``, each name once.
         """
+        if not text.isprintable():
+            raise InputError(f"{text!r} holds control characters, which no address has")
         scheme, separator, rest = text.partition("://")
         if not separator or not scheme:
             raise InputError(

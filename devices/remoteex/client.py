@@ -170,7 +170,7 @@ class RemoteEx:
             if self._owed:
                 command = self._owed[0]
                 answer = self._owed_answer()
-                self._unread = _announced(answer) if command.name in ("ImgRingBufferGet", "ImgDataGet") else 0
+                self._unread = announced(answer) if command.name in ("ImgRingBufferGet", "ImgDataGet") else 0
 
     def _owed_answer(self) -> Answer:
         """Return the answer to the first command that is owed one; keep the messages that come before."""
@@ -201,7 +201,7 @@ class RemoteEx:
         return data
 
 
-def _announced(answer: Answer) -> int:
+def announced(answer: Answer) -> int:
     """How much data follows an answer that came too late: a picture's size, or a table's length."""
     if answer.code != 0:
         return 0

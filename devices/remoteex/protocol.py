@@ -20,7 +20,8 @@ LONGEST_MESSAGE = 1 << 16
 
 _COMMAND = re.compile(r"([A-Za-z]\w*)\((.*)\)", re.ASCII)
 _NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
-_ARGUMENT = re.compile(r"[^,()\x00-\x1f\x7f]*")
+_ARGUMENT = re.compile(r"[^,()\x00-\x1f\x7f-\x9f]*")
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 class Code(enum.IntEnum):
@@ -88,7 +89,7 @@ class Command:
         text = _text(message)
         found = _COMMAND.fullmatch(text)
         if found is None:
-            raise ProtocolError(f"'{text[:80]}' is no command Name(argument,...)")
+            raise ProtocolError(f"{text[:80]!r} is no command Name(argument,...)")
         return cls(found[1], tuple(found[2].split(",")) if found[2] else ())
 
     def __str__(self) -> str:
@@ -140,7 +141,7 @@ class Answer:
         code, _, rest = text.partition(",")
         name, *arguments = rest.split(",")
         if not (code.isascii() and code.isdecimal() and len(code) < 4 and int(code) in list(Code) and name):
-            raise ProtocolError(f"'{text[:80]}' is no answer of RemoteEx")
+            raise ProtocolError(f"{text[:80]!r} is no answer of RemoteEx")
         return cls(Code(int(code)), name, tuple(arguments))
 
     def require_done(self, command: Command) -> tuple[str, ...]:
@@ -165,7 +166,7 @@ class Answer:
 def whole_number(text: str, what: str) -> int:
     """Return a number that RemoteEx sent, refusing anything else."""
     if not (text.isascii() and text.isdecimal() and len(text) < 16):
-        raise ProtocolError(f"RemoteEx sent '{text[:40]}' as {what}, expected a whole number")
+        raise ProtocolError(f"RemoteEx sent {text[:40]!r} as {what}, expected a whole number")
     return int(text)
 
 
@@ -181,6 +182,9 @@ def _require_plain(name: str, arguments: tuple[str, ...]) -> None:
 
 def _text(message: bytes) -> str:
     try:
-        return message.decode().strip("\n")
+        text = message.decode().strip("\n")
     except UnicodeDecodeError as fault:
         raise ProtocolError(f"RemoteEx sent {message[:40]!r}, which is no text") from fault
+    if _CONTROL.search(text):
+        raise ProtocolError(f"RemoteEx sent {message[:40]!r}, which holds control characters")
+    return text

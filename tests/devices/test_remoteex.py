@@ -68,7 +68,9 @@ def test_what_the_protocol_cannot_carry(words: tuple[str, ...]) -> None:
         Answer(Code.DONE, "Acq Start").encode()
 
 
-@pytest.mark.parametrize("message", [b"", b"0", b"0,", b"11,Name", b"x,Name", b"-1,Name", b"\xff\xfe", b"\xb2,Name"])
+@pytest.mark.parametrize(
+    "message", [b"", b"0", b"0,", b"11,Name", b"x,Name", b"-1,Name", b"\xff\xfe", b"\xb2,Name", b"0,A\nB"]
+)
 def test_answers_that_are_none(message: bytes) -> None:
     with pytest.raises(ProtocolError):
         Answer.decode(message)
