@@ -11,11 +11,8 @@ from numpy.typing import NDArray
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.light_field import LightField
-from tofclip.operators import LinearOperator
 from tofclip.operators.light_field_camera import CAMERAS, LightFieldCamera
 from tofclip.storage import Field, Record
-
-TOTAL_VARIATION = {"line": 2.5e-2, "single-pixel": 8e-2}  # weights relative to the largest A'f, from sweeps on letters
 
 
 @dataclass(frozen=True)
@@ -25,7 +22,7 @@ class Setup:
     Parameters
     ----------
     encoder : str
-        ``"line"`` or ``"single-pixel"``.
+        A name in `tofclip.operators.light_field_camera.CAMERAS`.
     sampling_ratio : float
         Readings over pixels of one picture.
     seed : int
@@ -53,20 +50,47 @@ class ClipMeasurement:
         (v, u) of every view.
     image_shape : (int, int)
     setup : Setup
+    photons_per_unit : float
+        What a reading of 1 means in counted photons; 0: not known.
     """
 
     readings: NDArray[Any]
     views: NDArray[np.float64]
     image_shape: tuple[int, int]
     setup: Setup
+    photons_per_unit: float = 0.0
 
-    def problem(self, shear: float) -> tuple[LinearOperator, NDArray[Any], float]:
-        """Return the weighted model F(d), the weighted readings, and the prior's relative weight."""
+    def __post_init__(self) -> None:
+        if not np.all(np.isfinite(self.readings)):
+            raise InputError("the readings hold NaN or infinity")
+        if not self.readings.any():
+            raise InputError("every reading is zero; there is nothing to recover")
+
+    def camera(self) -> LightFieldCamera:
+        """Build the camera that made the readings.
+
+        Raises
+        ------
+        ShapeError
+            It makes another number of readings: the file is not from this setup.
+        """
         camera = self.setup.camera(self.image_shape, self.views)
-        weighting = camera.weighting()
-        if self.readings.shape != weighting.shape_in:
-            raise ShapeError("the readings of this camera", weighting.shape_in, self.readings.shape)
-        return weighting @ camera.model(shear), weighting(self.readings), TOTAL_VARIATION[self.setup.encoder]
+        if self.readings.shape != (camera.readings,):
+            raise ShapeError("the readings of this camera", (camera.readings,), self.readings.shape)
+        return camera
+
+    def counts(self) -> NDArray[Any]:
+        """Return the readings in photons, (readings,) float32.
+
+        Raises
+        ------
+        InputError
+            Nobody knows how many photons a reading stands for.
+        """
+        if self.photons_per_unit <= 0:
+            raise InputError("these readings do not say how many photons they stand for; take squares or huber")
+        counted: NDArray[Any] = self.readings * np.float32(self.photons_per_unit)
+        return counted
 
     def to_record(self, provenance: Mapping[str, Any]) -> Record:
         """Return what is written to a file."""
@@ -82,6 +106,7 @@ class ClipMeasurement:
                 "encoder": self.setup.encoder,
                 "sampling_ratio": self.setup.sampling_ratio,
                 "seed": self.setup.seed,
+                "photons_per_unit": self.photons_per_unit,
             },
             provenance=provenance,
         )
@@ -95,7 +120,8 @@ class ClipMeasurement:
             int(record.attribute("seed")),
         )
         shape = (int(record.attribute("rows")), int(record.attribute("columns")))
-        return cls(record.array("readings", np.float32, 1), record.array("views", np.float64, 2), shape, setup)
+        views, photons = record.array("views", np.float64, 2), float(record.attribute("photons_per_unit"))
+        return cls(record.array("readings", np.float32, 1), views, shape, setup, photons)
 
 
 def measure(light_field: LightField, setup: Setup) -> ClipMeasurement:
@@ -124,8 +150,9 @@ def spoilt(measurement: ClipMeasurement, photons: float | None, bad_fraction: fl
     random = np.random.default_rng([measurement.setup.seed, 1])
     readings = measurement.readings.copy()
     largest = readings.max()
+    per_unit = 0.0 if photons is None else float(photons / largest)
     if photons is not None:
-        readings = (random.poisson(readings * (photons / largest)) * (largest / photons)).astype(np.float32)
+        readings = (random.poisson(np.maximum(readings, 0) * per_unit) / per_unit).astype(np.float32)
     bad = random.permutation(readings.size)[: round(bad_fraction * readings.size)]
     readings[bad] = random.choice(np.array([0, largest], np.float32), bad.size)
-    return replace(measurement, readings=readings)
+    return replace(measurement, readings=readings, photons_per_unit=per_unit)

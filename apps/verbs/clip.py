@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, fields
 from pathlib import Path
-from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -14,11 +13,8 @@ from apps.options import AsJson
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tofclip.clip_measurement import ClipMeasurement
-    from tofclip.recovery import Result
 
 SCORED_BORDER_PX = 12
-RELATIVE_CHANGE = 1e-4  # of the objective in an iteration: then the recovery has converged
 
 app = typer.Typer(help="Light fields from few nonlocal readings.", no_args_is_help=True)
 
@@ -26,7 +22,12 @@ app = typer.Typer(help="Light fields from few nonlocal readings.", no_args_is_he
 @app.command()
 def simulate(
     light_field: Annotated[Path, typer.Argument(metavar="LIGHTFIELD", help="NPZ with lf (v, u, y, x), scale, v, u.")],
-    encoder: Annotated[str, typer.Option(metavar="NAME", help="line or single-pixel.")],
+    encoder: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="line, single-pixel, coded-line, coded-aperture, cubic-phase, diffuser or line-spread."
+        ),
+    ],
     out: Annotated[Path, typer.Option(metavar="H5", help="The readings to write.")],
     sampling_ratio: Annotated[float, typer.Option(metavar="SR", help="Readings over pixels of one picture.")] = 0.5,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of angles, codes, photons and bad readings.")] = 0,
@@ -57,50 +58,48 @@ def recover(
     measurement: Annotated[Path, typer.Argument(metavar="H5", help="Readings made by clip simulate.")],
     shear: Annotated[float, typer.Option(metavar="S", help="Depth to focus on, pixels per view step.")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The picture: .h5, .png or .exr.")],
+    prior: Annotated[
+        str, typer.Option(metavar="NAME", help="tv, wavelet or l1; or a denoiser: collaborative, bm3d or nlm.")
+    ] = "tv",
+    preset: Annotated[str, typer.Option(metavar="NAME", help="fast, or quality: a denoiser finishes.")] = "fast",
+    weight: Annotated[
+        str, typer.Option(metavar="auto|VALUE", help="Of the prior, relative; auto: cross-validation.")
+    ] = "auto",
+    data_term: Annotated[
+        str, typer.Option(metavar="NAME", help="squares; huber for bad readings; poisson for few photons.")
+    ] = "squares",
     truth: Annotated[Path | None, typer.Option(metavar="LIGHTFIELD", help="Light field to score against.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Recover the picture refocused at one depth (total variation)."""
+    """Recover the picture refocused at one depth."""
     from apps.files import require_writable
     from apps.report import report
     from tofclip.clip_measurement import ClipMeasurement
+    from tofclip.clip_recovery import ClipRecovery
     from tofclip.storage import Record
 
     inputs = (measurement,) if truth is None else (measurement, truth)
     require_writable(out, ".h5", ".png", ".exr", inputs=inputs)
+    settings = ClipRecovery(prior, preset, _weight(weight), data_term)
     readings = ClipMeasurement.from_record(Record.load(measurement, "clip_measurement"))
-    recovery = _recovered(readings, shear)
-    picture = recovery.result.frames[0]
-    figures: dict[str, Any] = {} if truth is None else _score(picture, truth, shear)
-    figures |= {
-        "weight": recovery.weight,
-        "iterations": recovery.result.iterations,
-        "seconds": recovery.seconds,
-        "seconds_setup": recovery.seconds_setup,
-        "stopped_because": recovery.result.stopped_because,
-    }
-    _write(picture, out, measurement, shear)
+    recovered = settings.recover(readings, shear)
+    figures: dict[str, Any] = {} if truth is None else _score(recovered.picture, truth, shear)
+    figures |= {field.name: getattr(recovered, field.name) for field in fields(recovered) if field.name != "picture"}
+    past = {"verb": "clip recover", "shear": shear, "prior": prior, "preset": preset, "data_term": data_term}
+    _write(recovered.picture, out, measurement, past | {"weight": recovered.weight})
     report(figures, as_json, [out])
 
 
-@dataclass(frozen=True)
-class _Recovery:
-    """A recovered picture, the relative weight of its prior, and the time that both steps took."""
+def _weight(text: str) -> float | None:
+    """Return the weight that was asked for, None for `auto`."""
+    from tofclip.errors import InputError
 
-    result: Result
-    weight: float
-    seconds_setup: float
-    seconds: float
-
-
-def _recovered(measurement: ClipMeasurement, shear: float) -> _Recovery:
-    from tofclip.recovery import TotalVariation
-
-    begin = perf_counter()
-    model, readings, weight = measurement.problem(shear)
-    ready = perf_counter()
-    result = TotalVariation(weight, 400, RELATIVE_CHANGE).recover(model, readings[:, None])
-    return _Recovery(result, weight, ready - begin, perf_counter() - ready)
+    if text == "auto":
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"--weight takes 'auto' or a number, not '{text}'") from None
 
 
 def _score(picture: NDArray[Any], truth: Path, shear: float) -> dict[str, float]:
@@ -116,14 +115,15 @@ def _score(picture: NDArray[Any], truth: Path, shear: float) -> dict[str, float]
     }
 
 
-def _write(picture: NDArray[Any], out: Path, measurement: Path, shear: float) -> None:
+def _write(picture: NDArray[Any], out: Path, measurement: Path, settings: dict[str, Any]) -> None:
     """Write the picture; a PNG is scaled to the picture's own brightest pixel, the others keep the values."""
     from apps.files import history
     from tofclip.storage import Field, Record, atomic_path
 
     if out.suffix.lower() == ".h5":
-        past = history({"verb": "clip recover", "shear": shear}, measurement)
-        Record("picture", {"picture": Field(picture, "", ("y", "x"))}, {"shear": shear}, provenance=past).save(out)
+        fields_kept = {"picture": Field(picture, "", ("y", "x"))}
+        past = history(settings, measurement)
+        Record("picture", fields_kept, {"shear": settings["shear"]}, provenance=past).save(out)
         return
     with atomic_path(out) as temporary:
         if out.suffix.lower() == ".exr":

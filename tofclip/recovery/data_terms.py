@@ -2,51 +2,166 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.errors import ShapeError
+from tofclip.errors import InputError, ShapeError
 
 Array = NDArray[Any]
+Mask = NDArray[np.bool_] | None
 
 
-class DataTerm(Protocol):
-    """A smooth function of the predicted readings whose gradient has Lipschitz constant 1, frame by frame."""
+class DataTerm(ABC):
+    """A smooth function of the predicted readings whose gradient has Lipschitz constant 1, frame by frame.
 
-    def value(self, predicted: Array) -> NDArray[np.float64]:
-        """Return the misfit of each frame, (frames,), for `predicted` of shape (readings, frames)."""
-        ...
-
-    def gradient(self, predicted: Array) -> Array:
-        """Return the derivative with respect to `predicted`, same shape."""
-        ...
-
-
-class LeastSquares:
-    """``1/2 |W (predicted - readings)|^2`` for each frame, W = 0 or 1: readings known to be bad are left out.
+    Every one has a gradient of the form ``weights * (predicted - readings)``, so that a solver of quadratic problems
+    can treat it by iteratively reweighted least squares.
 
     Parameters
     ----------
     readings : (readings, frames) array
     good : (readings, frames) bool array, optional
-        False where a reading is saturated or dead.
+        False where a reading is saturated or dead: it is left out.
     """
 
-    def __init__(self, readings: Array, good: NDArray[np.bool_] | None = None) -> None:
+    def __init__(self, readings: Array, good: Mask = None) -> None:
         if good is not None and good.shape != readings.shape:
             raise ShapeError("the mask of good readings", readings.shape, good.shape)
         self.readings = readings
         self.good = None if good is None or good.all() else good.astype(readings.dtype)
+
+    @abstractmethod
+    def value(self, predicted: Array) -> NDArray[np.float64]:
+        """Return the misfit of each frame, (frames,), for `predicted` of shape (readings, frames)."""
+
+    @abstractmethod
+    def weights(self, predicted: Array) -> Array:
+        """Return between 0 and 1 what each reading's residual counts at `predicted`, (readings, frames)."""
+
+    def gradient(self, predicted: Array) -> Array:
+        """Return the derivative with respect to `predicted`, same shape."""
+        slope: Array = self.weights(predicted) * (predicted - self.readings)
+        return slope
+
+    def _masked(self, values: Array) -> Array:
+        return values if self.good is None else values * self.good
+
+
+class DataTermMaker(Protocol):
+    """Makes the data term of a block of frames."""
+
+    def __call__(self, readings: Array, good: Mask = None) -> DataTerm:
+        """Return the term for `readings` (readings, frames), those not `good` left out."""
+        ...
+
+
+class LeastSquares(DataTerm):
+    """``1/2 |W (predicted - readings)|^2`` for each frame, W = 0 or 1: right for even, Gaussian errors."""
 
     def value(self, predicted: Array) -> NDArray[np.float64]:
         residual = self.gradient(predicted)
         misfit: NDArray[np.float64] = 0.5 * np.einsum("if,if->f", residual, residual, dtype=np.float64)
         return misfit
 
+    def weights(self, predicted: Array) -> Array:
+        return self._masked(np.ones_like(predicted))
+
     def gradient(self, predicted: Array) -> Array:
         residual: Array = predicted - self.readings
         if self.good is not None:
             residual *= self.good
         return residual
+
+
+class Huber(DataTerm):
+    """Squares up to a threshold and straight lines beyond: a few wildly wrong readings do no harm.
+
+    P. J. Huber, Ann. Math. Stat. 35, 73 (1964).
+
+    Parameters
+    ----------
+    readings : (readings, frames) array
+    good : (readings, frames) bool array, optional
+    threshold : float
+        In the unit of the readings; one to three times `robust_deviation` is usual.
+    """
+
+    def __init__(self, readings: Array, good: Mask = None, *, threshold: float) -> None:
+        if not (np.isfinite(threshold) and threshold > 0):
+            raise InputError(f"Huber's threshold must be positive, got {threshold}")
+        super().__init__(readings, good)
+        self.threshold = threshold
+
+    def value(self, predicted: Array) -> NDArray[np.float64]:
+        size = np.abs(predicted - self.readings)
+        kept = np.minimum(size, self.threshold)
+        misfit: NDArray[np.float64] = self._masked(kept * (size - 0.5 * kept)).sum(axis=0, dtype=np.float64)
+        return misfit
+
+    def weights(self, predicted: Array) -> Array:
+        size = np.abs(predicted - self.readings)
+        return self._masked(self.threshold / np.maximum(size, self.threshold))
+
+
+class Poisson(DataTerm):
+    """The negative log-likelihood of photon counts, each residual in units of its own reading's noise.
+
+    Predicted and counted are both divided by ``deviation = sqrt(count + 1)`` beforehand (weigh the operator's rows
+    alike), so that every reading's curvature at its own count is about 1. Below half a count and a half the logarithm
+    is continued by its parabola, whose gradient stays Lipschitz; the whole is divided by the largest curvature.
+
+    Parameters
+    ----------
+    readings : (readings, frames) array
+        Counts over `deviation`.
+    good : (readings, frames) bool array, optional
+    deviation : (readings,) array
+    """
+
+    CURVATURE = 4.0  # at the knee, where it is largest
+
+    def __init__(self, readings: Array, good: Mask = None, *, deviation: Array) -> None:
+        if readings.min() < 0:
+            raise InputError("photon counts must not be negative; take the data term of squares")
+        super().__init__(readings, good)
+        self.deviation = deviation[:, np.newaxis].astype(readings.dtype)
+        self._counted = readings * self.deviation
+        self._knee = self.deviation**2 / 2
+
+    def value(self, predicted: Array) -> NDArray[np.float64]:
+        expected = predicted * self.deviation
+        base = np.maximum(expected, self._knee)
+        short = np.minimum(expected - self._knee, 0)
+        loss = base - self._counted * np.log(base)
+        loss += (1 - self._counted / self._knee) * short + self._counted / self._knee**2 * short**2 / 2
+        best = self._counted - self._counted * np.log(np.maximum(self._counted, 1e-30))
+        misfit: NDArray[np.float64] = self._masked(loss - best).sum(axis=0, dtype=np.float64) / self.CURVATURE
+        return misfit
+
+    def weights(self, predicted: Array) -> Array:
+        base = np.maximum(predicted * self.deviation, self._knee)
+        return self._masked(self.deviation**2 / base / self.CURVATURE)
+
+    def gradient(self, predicted: Array) -> Array:
+        expected = predicted * self.deviation
+        base = np.maximum(expected, self._knee)
+        slope = 1 - self._counted / base
+        slope += self._counted / self._knee**2 * np.minimum(expected - self._knee, 0)
+        return self._masked(self.deviation / self.CURVATURE * slope)
+
+
+def robust_deviation(residual: Array) -> float:
+    """Return the standard deviation that Gaussian errors with the median size of `residual` have.
+
+    Raises
+    ------
+    InputError
+        More than half of the residual is zero: there is no scale to be had.
+    """
+    deviation = 1.4826 * float(np.median(np.abs(residual)))
+    if not deviation > 0:
+        raise InputError("most readings are met exactly; there is nothing to be robust against")
+    return deviation

@@ -11,7 +11,7 @@ import numpy as np
 from tofclip.arrays import run_blocks
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, squared_norm
-from tofclip.recovery.data_terms import LeastSquares
+from tofclip.recovery.data_terms import DataTermMaker, LeastSquares
 from tofclip.recovery.fista import Fista
 from tofclip.recovery.loop import History, Progress, Result, Stopping, iterate, silent
 from tofclip.recovery.method import Array, Mask, checked_readings, full_block, write_frames
@@ -22,7 +22,7 @@ NORM_MARGIN = 1.02  # 15 power iterations on a nonnegative matrix are within 1 %
 
 
 @dataclass(frozen=True)
-class _ProximalMethod(ABC):
+class ProximalMethod(ABC):
     """FISTA with a prior; what the prior is, subclasses say.
 
     Parameters
@@ -34,11 +34,14 @@ class _ProximalMethod(ABC):
         At most so many for each frame.
     tolerance : float
         Relative change of a block's objective below which it is done; 0: never.
+    data_term : DataTermMaker
+        What a misfit costs.
     """
 
     weight: float
     iterations: int
     tolerance: float = 0.0
+    data_term: DataTermMaker = LeastSquares
 
     @abstractmethod
     def _regulariser(self, weight: float) -> Regulariser:
@@ -65,7 +68,7 @@ class _ProximalMethod(ABC):
         histories: dict[int, History] = {}
 
         def solve(piece: slice) -> None:
-            data = LeastSquares(full_block(readings, piece), None if good is None else full_block(good, piece))
+            data = self.data_term(full_block(readings, piece), None if good is None else full_block(good, piece))
             solver = Fista(operator, data, self._regulariser(weight), step, data.readings.shape[1])
             histories[piece.start] = iterate(solver, stopping, progress, piece.stop - piece.start)
             write_frames(solver.current, frames, piece)
@@ -86,7 +89,7 @@ class _ProximalMethod(ABC):
 
 
 @dataclass(frozen=True)
-class Sparse(_ProximalMethod):
+class Sparse(ProximalMethod):
     """Nonnegative pictures with few bright pixels (l1): right for single time bins of a ToF scene."""
 
     weight: float = 2e-3
@@ -98,7 +101,7 @@ class Sparse(_ProximalMethod):
 
 
 @dataclass(frozen=True)
-class TotalVariation(_ProximalMethod):
+class TotalVariation(ProximalMethod):
     """Nonnegative pictures with sharp borders between even surfaces (isotropic total variation)."""
 
     weight: float = 1e-3
@@ -107,6 +110,20 @@ class TotalVariation(_ProximalMethod):
 
     def _regulariser(self, weight: float) -> Regulariser:
         return NonnegativeTotalVariation(weight)
+
+
+@dataclass(frozen=True)
+class Wavelets(ProximalMethod):
+    """Nonnegative pictures with few details at every scale (Daubechies 4, cycle spinning)."""
+
+    weight: float = 2e-3
+    iterations: int = 60
+    name = "wavelet"
+
+    def _regulariser(self, weight: float) -> Regulariser:
+        from tofclip.recovery.wavelets import NonnegativeWavelets
+
+        return NonnegativeWavelets(weight)
 
 
 def _largest_back_projection(operator: LinearOperator, readings: Array, good: Mask) -> float:

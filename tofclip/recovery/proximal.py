@@ -34,7 +34,7 @@ class NonnegativeSparsity:
     """
 
     def __init__(self, weight: float) -> None:
-        self.weight = _checked(weight)
+        self.weight = checked_weight(weight)
 
     def descend(self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float) -> Array:
         from tofclip.recovery.kernels import nonnegative_shrinkage
@@ -61,7 +61,7 @@ class NonnegativeTotalVariation:
     """
 
     def __init__(self, weight: float, sweeps: int = 1) -> None:
-        self.weight = _checked(weight)
+        self.weight = checked_weight(weight)
         self.sweeps = sweeps
         self._dual: Array | None = None
 
@@ -80,7 +80,8 @@ class NonnegativeTotalVariation:
         return self.weight * total
 
 
-def _checked(weight: float) -> float:
+def checked_weight(weight: float) -> float:
+    """Return a regularisation weight, refusing what is none."""
     if not (np.isfinite(weight) and weight >= 0):
         raise InputError(f"a regularisation weight must be finite and not negative, got {weight}")
     return float(weight)

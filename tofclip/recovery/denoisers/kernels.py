@@ -1,0 +1,97 @@
+"""Compiled loops of the denoisers."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy")
+
+
+@compiled
+def _distances(pilot, row, column, patch, reach, distances, corners):
+    """Squared distances of the patches around one; `corners` gets where they begin. Returns how many there are."""
+    count = 0
+    last_row, last_column = pilot.shape[0] - patch, pilot.shape[1] - patch
+    for other_row in range(max(0, row - reach), min(last_row, row + reach) + 1):
+        for other_column in range(max(0, column - reach), min(last_column, column + reach) + 1):
+            distance = np.float32(0)
+            for i in range(patch):
+                for j in range(patch):
+                    difference = pilot[other_row + i, other_column + j] - pilot[row + i, column + j]
+                    distance += difference * difference
+            distances[count] = distance
+            corners[count, 0], corners[count, 1] = other_row, other_column
+            count += 1
+    return count
+
+
+@compiled
+def _keep_nearest(distances, corners, count, wanted):
+    """Move the `wanted` nearest corners to the front; returns how many there are."""
+    if count <= wanted:
+        return count
+    limit = np.partition(distances[:count], wanted - 1)[wanted - 1]
+    kept = 0
+    for candidate in range(count):
+        if distances[candidate] <= limit and kept < wanted:
+            corners[kept] = corners[candidate]
+            kept += 1
+    return kept
+
+
+@compiled
+def _gather(picture, corners, patch, group):
+    for member in range(group.shape[0]):
+        row, column = corners[member]
+        for i in range(patch):
+            for j in range(patch):
+                group[member, i * patch + j] = picture[row + i, column + j]
+
+
+@compiled
+def _wiener_gain(centred, variance):
+    """Return ``(C + variance I)^-1 C`` of the group's covariance C."""
+    covariance = np.dot(centred.T, centred) / np.float32(centred.shape[0])
+    loaded = covariance.copy()
+    for pixel in range(loaded.shape[0]):
+        loaded[pixel, pixel] += variance
+    return np.linalg.solve(loaded, covariance)
+
+
+@compiled
+def _scatter(group, corners, patch, weight, total, weights):
+    for member in range(group.shape[0]):
+        row, column = corners[member]
+        for i in range(patch):
+            for j in range(patch):
+                total[row + i, column + j] += weight * group[member, i * patch + j]
+                weights[row + i, column + j] += weight
+
+
+@compiled
+def filter_groups(noisy, pilot, deviation, settings):
+    """Filter groups of similar patches and average where they overlap, steadier groups counting more.
+
+    `settings` is (side of a patch, stride, reach of the search, patches in a group); pictures are float32.
+    """
+    patch, stride, reach, wanted = settings
+    rows, columns = noisy.shape
+    total, weights = np.zeros_like(noisy), np.zeros_like(noisy)
+    around = (2 * reach + 1) ** 2
+    distances, corners = np.empty(around, np.float32), np.empty((around, 2), np.int64)
+    variance = max(deviation * deviation, np.float32(1e-12))
+    for step_row in range((rows - patch + stride - 1) // stride + 1):
+        row = min(step_row * stride, rows - patch)
+        for step_column in range((columns - patch + stride - 1) // stride + 1):
+            column = min(step_column * stride, columns - patch)
+            count = _distances(pilot, row, column, patch, reach, distances, corners)
+            members = _keep_nearest(distances, corners, count, wanted)
+            alike, seen = np.empty((members, patch * patch), np.float32), np.empty((members, patch * patch), np.float32)
+            _gather(pilot, corners, patch, alike)
+            _gather(noisy, corners, patch, seen)
+            mean = alike.sum(axis=0) / np.float32(members)
+            gain = _wiener_gain(alike - mean, variance)
+            clean = np.dot(seen - mean, gain) + mean
+            _scatter(clean, corners, patch, 1 / (np.trace(gain) + np.float32(1)), total, weights)
+    return total / weights
