@@ -47,19 +47,19 @@ def compiled() -> None:
         source.read(60.0)
 
 
-def written(path: Path, pieces: int = PIECES, finish: bool = True) -> list[Records]:
+def written(path: Path, finish: bool = True, stats: Stats = Stats(600, 600)) -> list[Records]:  # noqa: B008
     """Write a small recording and return its records, piece by piece."""
     head = head_of(CODEC, Info("a tagger", "7", {"clock_hz": 5}), CALIBRATION, {"verb": "test"})
     writer = RecordingWriter(path, head)
     found = []
-    for number in range(pieces):
+    for number in range(PIECES):
         records = np.zeros(50, RECORD)
         records["time_ticks"] = 1000 * number + 10 * np.arange(1, 51)
         records["channels"] = 1 + number % 15
         writer.add(Piece(CODEC.encode(records), 50))
         found.append(records)
     if finish:
-        writer.finish(Stats(50 * pieces, 50 * pieces))
+        writer.finish(stats)
     writer.close()
     return found
 
@@ -199,6 +199,22 @@ def test_recording_for_some_time(tmp_path: Path) -> None:
     assert 0.3 <= done.seconds < 5
     assert seen[0] < 0.3
     assert found.as_dict()["sound"] is True
+
+
+@pytest.mark.parametrize(
+    ("stats", "sound"),
+    [
+        (Stats(600, 600), True),
+        (Stats(600, 550, unread=50), True),  # interrupted between tapping and decoding a piece
+        (Stats(601, 600, malformed=1), True),  # the end of a record never came
+        (Stats(601, 601), False),
+        (Stats(550, 550), False),
+    ],
+)
+def test_accounts_must_agree_with_the_records(tmp_path: Path, stats: Stats, sound: bool) -> None:
+    written(tmp_path / "run.h5", stats=stats)
+    found = verify(tmp_path / "run.h5")
+    assert (found.is_sound, found.records, found.damaged_blocks) == (sound, 600, 0)
 
 
 def test_a_recording_can_be_recorded(tmp_path: Path) -> None:
