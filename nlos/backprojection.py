@@ -14,6 +14,7 @@ from nlos.capture import Capture
 from nlos.geometry import FloatArray, Grid
 from nlos.kernels import add_backprojection
 from nlos.method import Progress, Support, common_support, silent
+from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
 from tofclip.arrays import blocks, run_blocks
 from tofclip.errors import InputError
@@ -123,6 +124,7 @@ class Backprojection:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in the signal."""
         self.supports(capture, grid).require()
         band = Band(self.pulse, capture.axis)
+        warn_of_aliasing(capture, band)
 
         def filtered(traces: NDArray[np.float32]) -> Waveforms:
             return band.waveforms(band.phasors(traces))

@@ -20,10 +20,23 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
+BIN_WIDTHS = (1e-15, 1e-7)
+"""Shortest and longest credible time bin, s: from 0.3 um to 30 m of path."""
+
+WIDEST_WALL = 1e3
+"""m; a wider one was not measured in metres."""
+
+
+MEASURED_POINTS = 1000
+"""Wall points whose nearest neighbours tell the sampling of the wall."""
+
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """What a detector saw at points of a relay wall while the laser lit one spot, or each point itself.
+    """What a detector saw at points of a relay wall while the laser lit one spot, or a spot for each point.
+
+    A confocal scan has ``laser`` equal to ``wall``; a paired scan has another spot for every point; a grid of lasers
+    that were all combined with all points becomes paired by `exhaustive`.
 
     Parameters
     ----------
@@ -43,7 +56,8 @@ class Capture:
     Raises
     ------
     ShapeError, InputError
-        Shapes disagree, a used signal is not finite, no wall point is left, or the time axis is unusable.
+        Shapes disagree, a used signal is not finite, no wall point is left, the time axis is unusable, lengths or
+        durations are not in metres or seconds, or the laser spot lies far behind the wall.
     """
 
     signal: NDArray[np.float32]
@@ -72,6 +86,7 @@ class Capture:
         if self.laser.shape == (3,) and not np.all(np.isfinite(self.laser)):
             raise InputError(f"the laser spot must be finite, got {self.laser}")
         TimeAxis(self.signal.shape[0], self.bin_width, self.start)
+        self._validate_units()
         if not np.any(self.valid):
             raise InputError("every wall point is NaN: nothing is left to image with")
         bad = int(np.count_nonzero(~np.isfinite(self.signal[:, self.valid])))
@@ -79,6 +94,52 @@ class Capture:
             raise InputError(
                 f"{bad} samples of the signal are NaN or infinite; set them to 0, or their wall points to NaN"
             )
+
+    def _validate_units(self) -> None:
+        if not BIN_WIDTHS[0] <= self.bin_width <= BIN_WIDTHS[1]:
+            raise InputError(f"a bin width of {self.bin_width:g} s is not credible; give seconds (16 ps are 16e-12)")
+        if not np.any(self.valid):
+            return
+        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        extent = float((high - low).max())
+        if extent > WIDEST_WALL:
+            raise InputError(f"a wall of {extent:g} m is not credible; give its points in metres")
+        behind = float(low[2] - self.lasers[:, 2].min())
+        if len(self.points) > 1 and behind > extent / 2:
+            raise InputError(
+                f"the laser spot lies {behind:.3g} m behind the hindmost wall point: give the spot on the wall, not "
+                "the device, and z growing from the wall into the hidden scene"
+            )
+
+    @classmethod
+    def exhaustive(
+        cls,
+        signal: Any,
+        wall: Any,
+        laser: Any,
+        bin_width: float,
+        start: float = 0.0,
+        provenance: Mapping[str, Any] | None = None,
+    ) -> Capture:
+        """Take a record in which every laser spot of a grid was combined with every wall point.
+
+        Parameters
+        ----------
+        signal : (t, lasers..., points...) array
+        wall : (points..., 3) array
+            Wall points, m.
+        laser : (lasers..., 3) array
+            Laser spots, m.
+        bin_width, start, provenance
+            As of `Capture`.
+        """
+        wall, laser = _real(wall, np.float64, "wall"), _real(laser, np.float64, "laser")
+        shape = (*laser.shape[:-1], *wall.shape[:-1], 3)
+        every_laser = laser.reshape(*laser.shape[:-1], *[1] * (wall.ndim - 1), laser.shape[-1])
+        if wall.shape[-1:] != (3,) or laser.shape[-1:] != (3,):
+            raise ShapeError("wall and laser", "(..., 3)", (wall.shape, laser.shape))
+        pairs = np.broadcast_to(wall, shape), np.broadcast_to(every_laser, shape)
+        return cls(signal, *pairs, bin_width, start, provenance or {})
 
     @property
     def axis(self) -> TimeAxis:
@@ -99,6 +160,17 @@ class Capture:
     def lasers(self) -> FloatArray:
         """Laser spots, m: shape (1, 3) if it stands still, else (points, 3) in the order of `points`."""
         return self.laser[np.newaxis] if self.laser.shape == (3,) else self.laser[self.valid]
+
+    @cached_property
+    def spacing(self) -> float:
+        """Typical distance of neighbouring wall points, m: the median to the nearest other; infinite for a lone one."""
+        from scipy.spatial import cKDTree
+
+        # An exhaustive capture names every wall point once per laser.
+        places = np.unique(self.points, axis=0)
+        if len(places) == 1:
+            return float("inf")
+        return float(np.median(cKDTree(places).query(places[:: len(places) // MEASURED_POINTS + 1], 2)[0][:, 1]))
 
     def traces(self, selection: slice = slice(None)) -> NDArray[np.float32]:
         """Signals of some valid wall points, in the order of `points`, shape (points, t)."""

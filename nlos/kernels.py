@@ -58,7 +58,7 @@ def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, powers,
     sample, before, after = np.empty(x.size, np.int32), np.empty(x.size, np.float32), np.empty(x.size, np.float32)
     weighted = powers[0] != 0 or powers[1] != 0
     for p in range(wall.shape[0]):
-        if p < lasers.shape[0]:
+        if p == 0 or (p < lasers.shape[0] and _differ(lasers[p], lasers[p - 1])):
             _outward_samples(lasers[p], start, per_metre, x, y, z, outward)
         for iz in range(z.size):
             for iy in range(y.size):
@@ -73,6 +73,12 @@ def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, powers,
             row = sums[iz, iy].reshape(-1, 2, 2)
             for ix in range(x.size):
                 field[iz, iy, ix] += complex(row[ix, 0, 0] + row[ix, 1, 0], row[ix, 0, 1] + row[ix, 1, 1])
+
+
+@compiled
+def _differ(one, other):
+    """Whether two points do; in an exhaustive capture many in a row are the same."""
+    return one[0] != other[0] or one[1] != other[1] or one[2] != other[2]
 
 
 @compiled

@@ -79,6 +79,32 @@ def unwarp(signal: Any, wall: Any, camera: Any, laser: Any, bin_width: float) ->
     return shifted
 
 
+def without_device_legs(capture: Capture, source: Any, camera: Any) -> Capture:
+    """Take the ways device -> laser spot and wall point -> camera off a capture that still holds them.
+
+    Every wall point's signal is moved earlier by ``(|r_L - source| + |r_p - camera|) / c``, by linear interpolation;
+    the part that is common to all goes into the start.
+
+    Parameters
+    ----------
+    capture : Capture
+        Its bins stand for the whole way source -> laser spot -> hidden point -> wall point -> camera.
+    source, camera : (3,) array
+        Position of the laser device and of the camera, m.
+    """
+    source, camera = np.asarray(source, dtype=np.float64), np.asarray(camera, dtype=np.float64)
+    for name, place in (("source", source), ("camera", camera)):
+        if place.shape != (3,) or not np.all(np.isfinite(place)):
+            raise InputError(f"the {name} position must be three finite numbers, got {place}")
+    legs = np.linalg.norm(capture.laser - source, axis=-1) + np.linalg.norm(capture.wall - camera, axis=-1)
+    common = float(legs[capture.valid].min())
+    late_bins = np.nan_to_num((legs - common) / capture.axis.spacing, nan=capture.axis.bins + 1.0)
+    flat = np.ascontiguousarray(capture.signal.reshape(capture.axis.bins, -1))
+    signal = delayed_reading(np.nan_to_num(flat), late_bins.ravel()).reshape(capture.signal.shape)
+    start = capture.start - common
+    return Capture(signal, capture.wall, capture.laser, capture.bin_width, start, capture.provenance)
+
+
 def _even_bin_width(frames: Frames) -> float:
     bin_width = frames.bin_width
     steps = np.diff(frames.times)

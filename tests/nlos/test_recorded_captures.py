@@ -9,6 +9,9 @@ from nlos import Backprojection, Capture, Grid
 from nlos.unwarp import unwarp
 from tofclip.units import SPEED_OF_LIGHT
 
+# The walls here are coarser than the shortest of the pulse's waves wants; see test_sampling.py.
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")
+
 FIRST_BOUNCE_BINS = 600
 
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nlos import Backprojection, Capture, Grid
-from nlos.unwarp import unwarp
+from nlos.unwarp import unwarp, without_device_legs
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.storage import Field, Record
@@ -149,3 +149,26 @@ def test_unwarp_checks_what_it_is_given() -> None:
         unwarp(np.ones((5, 2)), np.zeros((2, 3)), [0, np.nan, 0], LASER, BIN_WIDTH)
     with pytest.raises(InputError, match="laser position"):
         unwarp(np.ones((5, 2)), np.zeros((2, 3)), CAMERA, [0, 0], BIN_WIDTH)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_both_ways_to_the_device_are_taken_off(moving: bool) -> None:
+    wall = wall_of(9, 11)
+    laser = wall[:, ::-1] if moving else LASER
+    source, camera = np.array([0.4, -0.2, 1.3]), CAMERA
+    legs = np.linalg.norm(laser - source, axis=-1) + np.linalg.norm(wall - camera, axis=-1)
+    path = np.linalg.norm(laser - np.array(HIDDEN), axis=-1) + np.linalg.norm(wall - HIDDEN, axis=-1)
+    spacing = SPEED_OF_LIGHT * BIN_WIDTH
+    start = 2.0
+    arrival = (path + legs - start) / spacing
+    signal = np.exp(-0.5 * ((np.arange(1500)[:, None, None] - arrival) / 5) ** 2)
+    # A masked wall point must not decide what is common to all.
+    wall[0, 0] = np.nan
+    raw = Capture(signal, wall, laser, BIN_WIDTH, start)
+    capture = without_device_legs(raw, source, camera)
+    traces = capture.traces().astype(np.float64)
+    centroid = traces @ capture.axis.paths / traces.sum(axis=1)
+    # Linear interpolation keeps centroids; float32 leaves 1e-3 of a bin.
+    assert np.max(np.abs(centroid - path[capture.valid])) < 5e-3 * spacing
+    with pytest.raises(InputError, match="source position"):
+        without_device_legs(raw, [0, np.nan, 0], camera)

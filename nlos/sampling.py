@@ -1,0 +1,33 @@
+"""Whether a wall is sampled finely enough for the waves that it is imaged with."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from nlos.band import Band
+from nlos.capture import Capture
+
+
+class AliasingWarning(UserWarning):
+    """Wall points lie so far apart that false images of bright things may appear beside them."""
+
+
+def warn_of_aliasing(capture: Capture, band: Band) -> None:
+    """Warn if neighbouring wall points lie more than half the band's shortest wavelength apart.
+
+    In a confocal scan the path grows on both legs from point to point, so that a quarter is the limit.
+    """
+    shortest = 2 * np.pi / float(band.wavenumbers[-1])
+    confocal = len(capture.lasers) > 1 and np.array_equal(capture.lasers, capture.points)
+    finest = shortest / 4 if confocal else shortest / 2
+    # A wall drawn exactly at the limit must not be warned of for a rounding error.
+    if np.isfinite(capture.spacing) and capture.spacing > finest * (1 + 1e-6):
+        warnings.warn(
+            f"wall points {capture.spacing:.3g} m apart are too coarse for waves of {shortest:.3g} m, the shortest of "
+            f"the virtual pulse: false images may appear; use points at most {finest:.3g} m apart, or a wavelength "
+            f"{capture.spacing / finest:.2g} times longer",
+            AliasingWarning,
+            stacklevel=3,
+        )
