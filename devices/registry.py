@@ -32,6 +32,9 @@ OPENERS: dict[str, str] = {
 
 FILES: dict[str, str] = {
     ".dat": "devices.linospad2.source:open_recording",
+    ".phu": "devices.tcspc:open_phu",
+    ".ptu": "devices.tcspc:open_ptu",
+    ".sdt": "devices.tcspc:open_sdt",
     ".h5": "devices.replay:open_recording",
     ".hdf5": "devices.replay:open_recording",
 }

@@ -21,10 +21,11 @@ from urllib.parse import quote, urlencode
 import numpy as np
 from numpy.typing import NDArray
 
-from devices.histogram import BinAxis, StampHistogram, TagHistogram
+from devices.histogram import BinAxis, StampHistogram, TagHistogram, TimeHistogram
 from devices.linospad2.calibration import BoardCalibration
 from devices.registry import open as open_source
 from devices.source import PATIENCE, Batch, Source
+from devices.tcspc import times_of
 from devices.uri import Uri
 from tofclip.camera import Camera
 from tofclip.errors import DeviceTimeoutError, InputError
@@ -151,10 +152,14 @@ def _gathered(source: Source, gathering: Gathering) -> Streak:
     names = first.records.dtype.names or ()
     if "counts" in names:
         return _sum_of_frames(first, batches, source.calibration, gathering)
+    if "histogram" in names:
+        return _ready_histograms([first, *batches], source.calibration or Record("none"), gathering)
     histogram = _histogram(names, source.calibration, gathering)
     while first is not None:
         if isinstance(histogram, TagHistogram):
             histogram.add(first.records, first.after_gap)
+        elif isinstance(histogram, TimeHistogram):
+            histogram.add(first.records["channel"], times_of(first.records, source.calibration or Record("none")))
         else:
             histogram.add(first.records)
         first = next(batches, None)
@@ -178,7 +183,7 @@ def _batches(source: Source, seconds: float) -> Iterator[Batch]:
 
 def _histogram(
     names: tuple[str, ...], calibration: Record | None, gathering: Gathering
-) -> StampHistogram | TagHistogram:
+) -> StampHistogram | TagHistogram | TimeHistogram:
     """Return an empty histogram for records of this kind."""
     known = calibration or Record("none")
     if names[-2:] == ("code", "pixel"):
@@ -187,7 +192,18 @@ def _histogram(
     if "time_ticks" in names:
         tick = float(known.attribute("tick_s"))
         return TagHistogram(gathering.axis(None), gathering.sync, gathering.pixels, tick)
+    if "bin" in names:
+        axis = gathering.axis(float(known.attribute("laser_period_s", 0.0)) or None)
+        return TimeHistogram(int(known.attribute("channels")), axis, float(known.attribute("resolution_s")))
     raise InputError(f"records of {', '.join(names)} are no photons of a line of pixels")
+
+
+def _ready_histograms(batches: list[Batch], calibration: Record, gathering: Gathering) -> Streak:
+    """Return histograms that the instrument has made itself, a channel in each column."""
+    counts = np.concatenate([batch.records["histogram"] for batch in batches]).T
+    times: NDArray[np.float64] = (np.arange(len(counts)) + 0.5) * np.float64(calibration.attribute("resolution_s"))
+    streak = Streak(counts.astype(np.float32), times)
+    return streak if gathering.bin_width is None else streak.with_bin_width(gathering.bin_width)
 
 
 def _sum_of_frames(first: Batch, batches: Iterator[Batch], calibration: Record | None, gathering: Gathering) -> Streak:
