@@ -1,0 +1,201 @@
+"""Light fields from one coded exposure with a learnt dictionary.
+
+The method of K. Marwah et al., ACM Trans. Graph. 32, 46 (2013), to compare CLIP with (supplement Note 5 and 8): patches
+of a light field are sparse in a dictionary that was learnt from others, and a patch of the exposure is enough to find
+which atoms they are made of.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.arrays import blocks
+from tofclip.errors import InputError, MissingDependencyError, ShapeError
+from tofclip.light_field import LightField
+
+Array = NDArray[Any]
+
+PATCHES_AT_ONCE = 64
+TRAINING_PATCHES = 2000
+COMPONENTS = 256
+"""Principal components that patches are learnt in: light fields have few, and learning is as much faster."""
+SPARSITY = 0.2  # of unit patches
+EPOCHS = 2
+POWER_ITERATIONS = 15
+
+
+@dataclass(frozen=True)
+class LightFieldDictionary:
+    """Atoms that patches of light fields are made of.
+
+    Parameters
+    ----------
+    atoms : (atoms, views, rows, columns) float32 array
+        Of unit norm. The first is constant: brightness costs nothing in a recovery.
+    """
+
+    atoms: Array
+
+    @property
+    def patch_px(self) -> int:
+        """Rows and columns of a patch."""
+        return int(self.atoms.shape[2])
+
+
+def learn_dictionary(
+    light_fields: Sequence[LightField], patch_px: int = 8, atoms: int = 256, seed: int = 0
+) -> LightFieldDictionary:
+    """Learn atoms from patches of light fields with the same views (scikit-learn's online dictionary learning).
+
+    Parameters
+    ----------
+    light_fields : sequence of LightField
+    patch_px : int
+        Rows and columns of a patch; it has all views.
+    atoms : int
+    seed : int
+        Of the patches that are looked at and of the learning.
+
+    Raises
+    ------
+    MissingDependencyError
+        scikit-learn is not installed.
+    ShapeError
+        The light fields have different numbers of views or are smaller than a patch.
+    """
+    try:
+        from sklearn.decomposition import PCA, MiniBatchDictionaryLearning
+        from sklearn.exceptions import ConvergenceWarning
+    except ImportError as fault:
+        raise MissingDependencyError(
+            "learning a dictionary needs scikit-learn: pip install 'tofclip[learning]'"
+        ) from fault
+    patches = _training_patches(light_fields, patch_px, np.random.default_rng(seed))
+    flat = patches.reshape(len(patches), -1)
+    kept = min(COMPONENTS, *flat.shape)
+    components = PCA(kept, svd_solver="randomized", random_state=seed).fit(flat).components_
+    learner = MiniBatchDictionaryLearning(
+        atoms - 1, alpha=SPARSITY, max_iter=EPOCHS, batch_size=64, fit_algorithm="cd", random_state=seed
+    )
+    with warnings.catch_warnings():
+        # Shares that are not exact in one step are mended by the next batches.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        found = learner.fit(flat @ components.T).components_ @ components
+    every = np.concatenate([np.ones((1, flat.shape[1])), found]).astype(np.float32)
+    every /= np.linalg.norm(every, axis=1, keepdims=True)
+    return LightFieldDictionary(every.reshape(-1, *patches.shape[1:]))
+
+
+def recover_with_dictionary(
+    exposure: Array, codes: Array, dictionary: LightFieldDictionary, weight: float = 1e-2, iterations: int = 100
+) -> Array:
+    """Recover a light field from one coded exposure, patch by patch, overlapping by half; their mean is taken.
+
+    For each patch ``1/2 |y - sum_k C_k (D a)_k|^2 + w |a|_1`` is minimised by FISTA; the constant atom is free.
+
+    Parameters
+    ----------
+    exposure : (rows, columns) array
+    codes : (views, rows, columns) array
+        The mask as each view sees it, `MarwahCamera.codes`.
+    dictionary : LightFieldDictionary
+    weight : float
+        Sparsity, relative to each patch's largest correlation with an atom.
+    iterations : int
+
+    Returns
+    -------
+    (views, rows, columns) float32 array
+
+    Notes
+    -----
+    Memory beyond the result is that of 64 patches' coded dictionaries, 4 MB with the default sizes.
+    """
+    if codes.ndim != 3 or exposure.shape != codes.shape[1:] or dictionary.atoms.shape[1] != len(codes):
+        expected = (dictionary.atoms.shape[1], *exposure.shape)
+        raise ShapeError("mask codes for this dictionary and exposure", expected, codes.shape)
+    size = dictionary.patch_px
+    if min(exposure.shape) < size:
+        raise ShapeError("the exposure", f"at least ({size}, {size}) px, a patch", exposure.shape)
+    total, count = np.zeros(codes.shape, np.float32), np.zeros(exposure.shape, np.float32)
+    corners = list(_corners((exposure.shape[0], exposure.shape[1]), size, max(size // 2, 1)))
+    for some in blocks(len(corners), PATCHES_AT_ONCE):
+        windows = [(slice(y, y + size), slice(x, x + size)) for y, x in corners[some]]
+        readings = np.stack([exposure[window].ravel() for window in windows]).astype(np.float32)
+        masks = np.stack([codes[(slice(None), *window)] for window in windows]).astype(np.float32)
+        coded = masks.transpose(2, 3, 0, 1) @ dictionary.atoms.transpose(2, 3, 1, 0)
+        by_patch = np.ascontiguousarray(coded.reshape(size * size, len(windows), -1).swapaxes(0, 1))
+        shares = _sparse_shares(by_patch, readings, weight, iterations)
+        patches = np.tensordot(shares, dictionary.atoms, axes=1)
+        for window, patch in zip(windows, patches, strict=True):
+            total[(slice(None), *window)] += patch
+            count[window] += 1
+    return total / count
+
+
+def _sparse_shares(coded: Array, readings: Array, weight: float, iterations: int) -> Array:
+    """Shares of the atoms, (patches, atoms), for coded dictionaries (patches, pixels, atoms)."""
+    transposed = coded.swapaxes(1, 2)
+    correlation = (transposed @ readings[..., np.newaxis])[..., 0]
+    step = 1 / (1.05 * _largest_eigenvalues(coded))[:, np.newaxis]
+    threshold = step * weight * np.abs(correlation).max(axis=1, keepdims=True) * np.ones_like(correlation)
+    threshold[:, 0] = 0  # brightness
+    shares = ahead = np.zeros_like(correlation)
+    age = 1.0
+    for _ in range(iterations):
+        residual = coded @ ahead[..., np.newaxis] - readings[..., np.newaxis]
+        moved = ahead - step * (transposed @ residual)[..., 0]
+        following = np.sign(moved) * np.maximum(np.abs(moved) - threshold, 0)
+        older, age = age, (1 + np.sqrt(1 + 4 * age**2)) / 2
+        ahead = following + np.float32((older - 1) / age) * (following - shares)
+        shares = following
+    return shares
+
+
+def _largest_eigenvalues(coded: Array) -> Array:
+    """Of each coded dictionary's Gram matrix, by power iteration."""
+    vector = np.ones((coded.shape[0], coded.shape[2], 1), np.float32)
+    length = np.ones(coded.shape[0], np.float32)
+    for _ in range(POWER_ITERATIONS):
+        vector = coded.swapaxes(1, 2) @ (coded @ vector)
+        length = np.linalg.norm(vector[..., 0], axis=1)
+        vector /= np.maximum(length, np.finfo(np.float32).tiny)[:, np.newaxis, np.newaxis]
+    safe: Array = np.maximum(length, np.finfo(np.float32).tiny)
+    return safe
+
+
+def _training_patches(light_fields: Sequence[LightField], patch_px: int, random: np.random.Generator) -> Array:
+    """Patches at random places, those with most contrast, their mean taken off and their norm made 1."""
+    if not light_fields:
+        raise InputError("at least one light field is needed to learn from")
+    views = len(light_fields[0].pictures)
+    found = []
+    for light_field in light_fields:
+        _, rows, columns = light_field.pictures.shape
+        if len(light_field.pictures) != views or min(rows, columns) < patch_px:
+            expected = f"({views}, at least {patch_px}, at least {patch_px})"
+            raise ShapeError("every light field to learn from", expected, light_field.pictures.shape)
+        corners = list(_corners((rows, columns), patch_px, 1))
+        chosen = random.permutation(len(corners))[: 4 * TRAINING_PATCHES // len(light_fields)]
+        found += [light_field.pictures[:, y : y + patch_px, x : x + patch_px] for y, x in (corners[n] for n in chosen)]
+    spread = np.array([patch.std() for patch in found])
+    kept = np.argsort(spread)[::-1][:TRAINING_PATCHES]
+    kept = kept[spread[kept] > 0]
+    if kept.size == 0:
+        raise InputError("the light fields are flat everywhere; there is nothing to learn from them")
+    patches = np.stack([found[number] for number in kept])
+    patches -= patches.mean(axis=(1, 2, 3), keepdims=True)
+    unit: Array = patches / spread[kept, np.newaxis, np.newaxis, np.newaxis] / np.sqrt(patches[0].size)
+    return unit
+
+
+def _corners(shape: tuple[int, int], size: int, stride: int) -> Iterator[tuple[int, int]]:
+    """Upper left corners of patches that cover everything, the last ones flush with the border."""
+    rows, columns = (sorted({*range(0, length - size + 1, stride), length - size}) for length in shape)
+    return ((row, column) for row in rows for column in columns)
