@@ -64,7 +64,8 @@ class TcspcFile(Source):
             raise
         except Exception as fault:  # whatever the library stumbles over, it is the file that is damaged
             raise FileFormatError(path, f"is a damaged or unsupported file ({one_line(fault)})") from fault
-        self._next, self._ledger, self._closed = 0, Ledger(), False
+        self._closed = False
+        self.seek(0)
 
     @property
     def info(self) -> Info:
@@ -89,14 +90,15 @@ class TcspcFile(Source):
         if self._closed or len(records) == 0:
             return None
         self._next += len(records)
-        self._ledger.arrive(len(records))
         self._ledger.settle(len(records), 0)
         return Batch(records, first)
 
     def seek(self, record: int) -> None:
         if not 0 <= record <= len(self._records):
             raise InputError(f"the file has {len(self._records)} records, there is no number {record}")
-        self._next = record
+        self._next, self._ledger = record, Ledger()
+        self._ledger.arrive(len(self._records))
+        self._ledger.settle(record, 0)
 
     def close(self) -> None:
         self._closed = True

@@ -143,6 +143,11 @@ class LinoSpad2Codec:
         kept, malformed = self._counts(self._cycles(data))
         return int(kept.sum()) + malformed
 
+    def count_good(self, data: ByteView) -> int:
+        """Return how many records `decode` would make of `data`."""
+        kept, _ = self._counts(self._cycles(data))
+        return int(kept.sum())
+
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> Decoded:
         """Decode whole cycles; `state` is how many came before. Cycles that were lost are not counted."""
         cycles = self._cycles(data)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+from bisect import bisect_right
 from pathlib import Path
 
 from devices.codec import as_bytes
+from devices.decoded import DecodedSource
 from devices.ledger import Ledger
-from devices.linospad2.sidecar import Sidecar, read_sidecar
+from devices.linospad2.codec import LinoSpad2Codec
+from devices.linospad2.sidecar import read_sidecar
 from devices.linospad2.simulation import calibration_record
-from devices.source import PATIENCE, Batch, Info, Source
-from devices.statistics import Stats
+from devices.ring import Piece
+from devices.source import PATIENCE, Batch, Info
 from devices.uri import Uri
 from tofclip.errors import FileFormatError, InputError
 from tofclip.storage import Record, reading
@@ -20,10 +23,13 @@ PIECE = 1 << 22
 """Bytes that are read and decoded at once, or one cycle where that is longer."""
 
 
-class LinoSpad2File(Source):
+class LinoSpad2File(DecodedSource):
     """A recording, with the TOML file beside it that says how to read it (`devices.linospad2.sidecar`).
 
-    Memory: one piece of 4 MiB, or one cycle, and what it decodes to.
+    Opening counts the time stamps of the whole recording, which takes about a second for two gigabytes. After `seek`
+    the accounts are as if everything before had been read.
+
+    Memory: one piece of 4 MiB, or one cycle, and what it decodes to; 16 bytes for each piece of the recording.
 
     Parameters
     ----------
@@ -37,23 +43,24 @@ class LinoSpad2File(Source):
         The TOML file is damaged, or there is not one whole cycle.
     """
 
+    codec: LinoSpad2Codec
+
     def __init__(self, path: str | Path) -> None:
         self._path, self._sidecar = Path(path), read_sidecar(path)
-        self.codec = self._sidecar.codec
-        self._ledger = Ledger()
+        codec = self._sidecar.codec
+        super().__init__(codec, Ledger())
         with reading(path):
             self._file = open(path, "rb")  # noqa: SIM115 - closed by `close`
-            self._size = os.fstat(self._file.fileno()).st_size
-        if self._size < self.codec.cycle_bytes:
+        size = os.fstat(self._file.fileno()).st_size
+        if size < codec.cycle_bytes:
             self._file.close()
-            raise FileFormatError(path, f"holds {self._size} bytes; one cycle takes {self.codec.cycle_bytes}")
-        self._piece = max(1, PIECE // self.codec.cycle_bytes) * self.codec.cycle_bytes
-        self._record, self._skip = 0, 0
-
-    @property
-    def sidecar(self) -> Sidecar:
-        """How the recording is read."""
-        return self._sidecar
+            raise FileFormatError(path, f"holds {size} bytes; one cycle takes {codec.cycle_bytes}")
+        self._is_cut_off = size % codec.cycle_bytes > 0
+        self._cycles = max(1, PIECE // codec.cycle_bytes)
+        self._pieces = -(-(size // codec.cycle_bytes) // self._cycles)
+        self._good, self._malformed = self._counted()
+        self._next = self._skip = 0
+        self._go_to(0)
 
     @property
     def info(self) -> Info:
@@ -65,51 +72,52 @@ class LinoSpad2File(Source):
         return calibration_record(self._sidecar.calibration, self._sidecar.laser_period, camera)
 
     @property
-    def stats(self) -> Stats:
-        return self._ledger.stats
-
-    @property
     def is_seekable(self) -> bool:
         return True
 
     def read(self, timeout: float = PATIENCE) -> Batch | None:
         """Return the next batch at once; `timeout` does not matter."""
-        if self._file.closed:
+        if self._file.closed or self._next == self._pieces:
             return None
-        cycles = self._file.tell() // self.codec.cycle_bytes
-        data = as_bytes(self._file.read(self._piece))
-        whole = self.codec.whole(data)
-        if whole < len(data):
-            self._ledger.break_off()  # the recording ends in the middle of a cycle
-        if whole == 0:
-            return None
-        found = self.codec.decode(data[:whole], cycles)
-        records, self._skip = found.records[self._skip :], 0
-        self._ledger.arrive(len(records) + found.malformed)
-        self._ledger.settle(len(records), found.malformed)
-        first, self._record = self._record, self._record + len(records)
-        return Batch(records, first)
+        data = self._piece(self._next)
+        batch = self._decoded(Piece(data, self.codec.count(as_bytes(data))))
+        self._next += 1
+        skipped, self._skip = self._skip, 0
+        return Batch(batch.records[skipped:], batch.first + skipped)
 
     def seek(self, record: int) -> None:
-        """Go to time stamp number `record`; everything before it is counted, which takes a second per gigabyte."""
-        if record < 0:
-            raise InputError(f"a recording begins with record 0, there is no {record}")
-        first, place = 0, 0
-        while place < self._size - self.codec.cycle_bytes + 1:
-            self._file.seek(place)
-            data = as_bytes(self._file.read(self._piece))
-            data = data[: self.codec.whole(data)]
-            kept = len(self.codec.decode(data, 0).records)
-            if record < first + kept:
-                break
-            first, place = first + kept, place + len(data)
-        if record > first and place >= self._size - self.codec.cycle_bytes + 1:
-            raise InputError(f"{self._path} holds {first} records, there is no number {record}")
-        self._file.seek(place)
-        self._record, self._skip = record, record - first
+        if not 0 <= record <= self._good[-1]:
+            raise InputError(f"{self._path} holds {self._good[-1]} records, there is no number {record}")
+        self._go_to(min(bisect_right(self._good, record) - 1, self._pieces))
+        self._skip = record - self._good[self._next]
 
     def close(self) -> None:
         self._file.close()
+
+    def _piece(self, number: int) -> bytes:
+        length = self._cycles * self.codec.cycle_bytes
+        self._file.seek(number * length)
+        data = self._file.read(length)
+        return data[: self.codec.whole(as_bytes(data))]
+
+    def _counted(self) -> tuple[list[int], list[int]]:
+        """Return how many good and malformed time stamps there are before each piece, and altogether."""
+        good, malformed = [0], [0]
+        for number in range(self._pieces):
+            data = as_bytes(self._piece(number))
+            kept = self.codec.count_good(data)
+            good.append(good[-1] + kept)
+            malformed.append(malformed[-1] + self.codec.count(data) - kept)
+        return good, malformed
+
+    def _go_to(self, number: int) -> None:
+        """Make the next piece the one with that number, as if all before it had been read."""
+        self._next, self._skip, self._state = number, 0, number * self._cycles
+        self._ledger = Ledger()
+        self._ledger.arrive(self._good[-1] + self._malformed[-1])
+        self._ledger.settle(self._good[number], self._malformed[number])
+        if self._is_cut_off:
+            self._ledger.break_off()
 
 
 def open_recording(uri: Uri) -> LinoSpad2File:

@@ -86,7 +86,7 @@ def test_a_recording_that_was_cut_off(recording: Path) -> None:
     with devices.open(f"linospad2://{recording}") as source:
         found = records_of(source)
     np.testing.assert_array_equal(found, whole[whole["cycle"] < 19])
-    assert (source.stats.malformed, source.stats.is_balanced) == (1, True)
+    assert (source.stats.malformed, source.stats.is_balanced, source.stats.unread) == (1, True, 0)
     recording.write_bytes(b"short")
     with pytest.raises(FileFormatError, match="one cycle takes"):
         devices.open(f"linospad2://{recording}")
