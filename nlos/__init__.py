@@ -24,9 +24,19 @@ if TYPE_CHECKING:
     from nlos.confocal.migration import FKMigration
     from nlos.filtered import FilteredBackprojection
     from nlos.geometry import Grid
+    from nlos.rsd.planar import PlanarRSD
     from nlos.volume import Volume
 
-__all__ = ["Backprojection", "Capture", "FKMigration", "FilteredBackprojection", "Grid", "LightCone", "Volume"]
+__all__ = [
+    "Backprojection",
+    "Capture",
+    "FKMigration",
+    "FilteredBackprojection",
+    "Grid",
+    "LightCone",
+    "PlanarRSD",
+    "Volume",
+]
 
 _HOMES = {
     "Backprojection": "nlos.backprojection",
@@ -35,6 +45,7 @@ _HOMES = {
     "FilteredBackprojection": "nlos.filtered",
     "Grid": "nlos.geometry",
     "LightCone": "nlos.confocal.light_cone",
+    "PlanarRSD": "nlos.rsd.planar",
     "Volume": "nlos.volume",
 }
 

@@ -1,0 +1,93 @@
+"""The parts of a capture that one illumination made, and a band in which no voxel sees an echo of the record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.band import Band, VirtualPulse
+from nlos.capture import Capture
+from nlos.geometry import Grid
+from nlos.method import Support
+from nlos.time_axis import TimeAxis
+
+FloatArray = NDArray[np.float64]
+
+POINTS_PER_SPOT = 4
+"""With fewer wall points per laser spot, a wave from each spot is not worth its own field."""
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """Wall points whose light started at one laser spot, or at each point itself.
+
+    Parameters
+    ----------
+    laser : (3,) array or None
+        m; None for a confocal scan, in which the way out is the way back.
+    members : (n,) int array
+        Which of the capture's valid points.
+    """
+
+    laser: FloatArray | None
+    members: NDArray[np.intp]
+
+    @property
+    def passes(self) -> int:
+        """How often the field's wave runs between wall and voxel: 1, or 2 if confocal."""
+        return 2 if self.laser is None else 1
+
+    def phasors(self, capture: Capture, band: Band) -> NDArray[np.complex64]:
+        """Return the phasors of the members, shape (n, frequencies)."""
+        return np.asarray(band.phasors(capture.traces()[self.members]), np.complex64)
+
+
+def exposures(capture: Capture) -> list[Exposure]:
+    """Sort the valid wall points of a capture by laser spot."""
+    everyone = np.arange(len(capture.points))
+    if len(capture.lasers) == 1:
+        return [Exposure(capture.lasers[0], everyone)]
+    if np.array_equal(capture.lasers, capture.points):
+        return [Exposure(None, everyone)]
+    spots, belonging = np.unique(capture.lasers, axis=0, return_inverse=True)
+    return [Exposure(spot, np.flatnonzero(belonging.ravel() == i)) for i, spot in enumerate(spots)]
+
+
+def exposure_support(capture: Capture) -> Support:
+    """Check that each laser spot lit enough for a field of its own."""
+    count = len(exposures(capture))
+    if count * POINTS_PER_SPOT > len(capture.points):
+        return Support(
+            f"{count} laser spots for {len(capture.points)} wall points: a field per spot needs at least "
+            f"{POINTS_PER_SPOT} points each; image such pairs by back-projection"
+        )
+    return Support()
+
+
+def unfolded_band(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Band:
+    """Return the pulse's band over a period so long that every voxel sees the record once, or silence.
+
+    Evenly spaced frequencies repeat a signal with their period; where the paths of the grid go beyond the record, the
+    record is continued with silence.
+    """
+    axis = capture.axis
+    tail = Band(pulse, axis).tail_bins * axis.spacing
+    shortest, longest = _paths(capture, grid)
+    period = max(longest - (axis.start - tail), axis.paths[-1] + tail - shortest)
+    bins = max(axis.bins, int(np.ceil(period / axis.spacing)) - 2 * Band(pulse, axis).tail_bins)
+    return Band(pulse, TimeAxis(bins, axis.bin_width, axis.start))
+
+
+def _paths(capture: Capture, grid: Grid) -> tuple[float, float]:
+    """Bounds of the path from a laser spot over a voxel to a wall point, m."""
+    axes = (grid.x, grid.y, grid.z)
+    low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
+    least, most = [], []
+    for ends in (capture.points, capture.lasers):
+        outside = np.maximum(np.maximum(low - ends, ends - high), 0)
+        across = np.maximum(np.abs(ends - low), np.abs(high - ends))
+        least.append(float(np.linalg.norm(outside, axis=1).min()))
+        most.append(float(np.linalg.norm(across, axis=1).max()))
+    return sum(least), sum(most)

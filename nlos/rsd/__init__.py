@@ -1,0 +1,1 @@
+"""Rayleigh-Sommerfeld diffraction from one plane to many."""

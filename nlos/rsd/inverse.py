@@ -1,0 +1,69 @@
+"""From plane waves to the voxels of a plane: inverse Fourier transforms without the parts that are 0 or unwanted."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.rsd.spectrum import PlaneWaves
+
+_PLANNING = threading.Lock()  # FFTW plans one transform at a time
+
+ALIGNED = 8
+"""complex64 numbers in 64 bytes, what vector instructions like to start at."""
+
+
+class InverseTransform:
+    """Inverse transforms of several spectra, with memory of their own; not to be shared between threads.
+
+    Along y only the columns that plane waves fall into are transformed, along x only the rows that voxels lie in. Where
+    voxels are too coarse for the finest waves, these are folded into the lattice, as the voxels see them.
+
+    Parameters
+    ----------
+    waves : PlaneWaves
+    lattice : (int, int)
+        Voxels in a period along y and x.
+    wanted : (int, int)
+        Voxels wanted along y and x, from the origin on.
+    terms : int
+        Spectra at most.
+    """
+
+    def __init__(self, waves: PlaneWaves, lattice: tuple[int, int], wanted: tuple[int, int], terms: int) -> None:
+        import pyfftw
+
+        high, wide = lattice
+        reach = int(np.max(waves.column))
+        columns = min(2 * reach + 1, wide)
+        # Unfolded columns are shifted so that none is negative; `carrier` takes the shift back.
+        self._shift = reach if 2 * reach + 1 < wide else 0
+        column = (waves.column + self._shift) % wide
+        self.cell: NDArray[np.int64] = column * high + waves.row % high
+        self.carrier = np.exp(-2j * np.pi * self._shift / wide * np.arange(wanted[1])).astype(np.complex64)
+        rows, self._wanted = wanted[0], wanted
+        spectra, images = ((terms, _padded(n), length) for n, length in ((columns, high), (rows, wide)))
+        self.spectra: NDArray[np.complex64] = pyfftw.zeros_aligned(spectra, np.complex64)
+        self._images: NDArray[np.complex64] = pyfftw.zeros_aligned(images, np.complex64)
+        middle: NDArray[np.complex64] = pyfftw.zeros_aligned((high, wide), np.complex64)
+        self._columns, self._rows, self._middle = columns, rows, middle
+        with _PLANNING:
+            backward = {"direction": "FFTW_BACKWARD", "axes": (1,), "flags": ("FFTW_MEASURE",)}
+            self._along_y = pyfftw.FFTW(self.spectra[0, :columns], middle[:, :columns].T, **backward)
+            self._along_x = pyfftw.FFTW(middle[:rows], self._images[0, :rows], **backward)
+        middle[:] = 0
+
+    def images(self, terms: int) -> NDArray[np.complex64]:
+        """Transform the first `terms` of `spectra`; the result (term, y, x) is valid until the next call."""
+        for term in range(terms):
+            self._along_y.update_arrays(self.spectra[term, : self._columns], self._middle[:, : self._columns].T)
+            self._along_y.execute()
+            self._along_x.update_arrays(self._middle[: self._rows], self._images[term, : self._rows])
+            self._along_x.execute()
+        return self._images[:terms, : self._wanted[0], : self._wanted[1]]
+
+
+def _padded(count: int) -> int:
+    return -(-count // ALIGNED) * ALIGNED

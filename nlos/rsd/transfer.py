@@ -1,0 +1,122 @@
+"""Transfer functions from plane to plane that are exact on a finite window."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.rsd.kernels import TAPS, interpolation, sample_waves
+
+FloatArray = NDArray[np.float64]
+
+OVERSAMPLING = 3.0
+"""Nodes along the lateral wavenumber, relative to the Nyquist rate of the window's radius."""
+
+RADII_PER_PERIOD = 1.25
+"""Samples along the radius per period of the fastest product of wave and Bessel function."""
+
+WINDOW_STEEPNESS = 1.6
+"""Of the window's edge, an error function: at its ends it is 1 - 0.012 and 0.012."""
+
+
+@dataclass(frozen=True, eq=False)
+class Waves:
+    """The spherical waves that carry a field on.
+
+    Parameters
+    ----------
+    first, step, count : float, float, int
+        Evenly spaced wavenumbers, rad/m.
+    continued : bool
+        False for ``exp(1j * k * R) / R``, the wave of a point; True for the first Rayleigh-Sommerfeld integral's
+        ``z / (2 pi R^2) * (1 / R - 1j * k) * exp(1j * k * R)``, which continues a field known on a plane.
+    """
+
+    first: float
+    step: float
+    count: int
+    continued: bool
+
+    @property
+    def highest(self) -> float:
+        """Largest wavenumber, rad/m."""
+        return self.first + self.step * (self.count - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """Fourier transform of a wave's cross-section at some distance, cut off smoothly outside a circle.
+
+    It is the Hankel transform ``2 pi * int g(sqrt(rho^2 + z^2)) * window(rho) * J_0(q * rho) * rho d rho``. Since the
+    window, not a period, ends the wave, a convolution through it is as exact as one with the sampled wave, wherever
+    source and target are nearer to each other than `reach`; and since it depends on q alone, few values make it up.
+
+    Parameters
+    ----------
+    waves : Waves
+    reach : float
+        Radius up to which the window is 1, m.
+    edge : float
+        Radius from which on it is 0, m.
+    lateral : float
+        Largest lateral wavenumber q wanted, rad/m.
+    finest : float
+        Smallest distance that will be asked for, m: the nearer, the more sharply peaked the wave.
+    """
+
+    waves: Waves
+    reach: float
+    edge: float
+    lateral: float
+    finest: float
+
+    @cached_property
+    def node_step(self) -> float:
+        """Distance of neighbouring nodes in q, rad/m."""
+        return np.pi / (self.edge * OVERSAMPLING)
+
+    @cached_property
+    def _radii(self) -> tuple[FloatArray, FloatArray]:
+        """Radii, m, and the weights of an integral over the plane; exponentially accurate for smooth waves.
+
+        A trapezoidal rule in t with ``rho = h * log(1 + exp(t))``: evenly spaced but for a few ever smaller radii.
+        """
+        fastest = self.waves.highest + self.lateral
+        h = min(2 * np.pi / (fastest * RADII_PER_PERIOD), self.finest)
+        t = np.arange(-8.0, self.edge / h + 1)
+        radii = h * np.logaddexp(0, t)
+        return radii, 2 * np.pi * radii * h / (1 + np.exp(-t))
+
+    @cached_property
+    def prepared(self) -> NDArray[np.float32]:
+        """``J_0(q * rho)`` with all weights, shape (nodes, radii)."""
+        from scipy.special import erfc, j0
+
+        radii, weights = self._radii
+        ramp = (radii - self.reach) / (self.edge - self.reach)
+        window = np.where(ramp <= 1, erfc(WINDOW_STEEPNESS * (2 * ramp - 1)) / 2, 0)
+        # The transfer function is even in q: nodes on both sides of 0 serve the interpolation there.
+        nodes = self.node_step * np.arange(-(TAPS // 2), np.ceil(self.lateral / self.node_step) + TAPS // 2 + 1)
+        return np.asarray(j0(np.outer(nodes, radii)) * (weights * window), np.float32)
+
+    def interpolation(self, lateral: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Find lateral wavenumbers among the nodes: the first node to take, and the weights of `TAPS` from it on."""
+        node, share = np.empty(lateral.size, np.int64), np.empty((lateral.size, TAPS), np.float32)
+        interpolation(lateral / self.node_step + TAPS // 2, node, share)
+        return node, share
+
+    def at(self, distance: float, delay: FloatArray) -> NDArray[np.float32]:
+        """Return the transfer function over a distance, shape (nodes, 2, frequencies), real and imaginary parts.
+
+        A delay (path, k_0) turns every frequency by ``(k - k_0) * path`` besides. A negative distance undoes a
+        positive one, as far as waves travel at all.
+        """
+        radii, _ = self._radii
+        waves = np.empty((radii.size, 2, self.waves.count), np.float32)
+        sample_waves(radii, distance, self.waves.first, self.waves.step, delay, self.waves.continued, waves)
+        flat = self.prepared @ waves.reshape(radii.size, -1)
+        nodes: NDArray[np.float32] = flat.reshape(-1, 2, self.waves.count)
+        return nodes
