@@ -26,7 +26,7 @@ OPENERS: dict[str, str] = {
     "sim+remoteex": "devices.remoteex.emulator:open_emulated",
     "sim+spad512": "devices.spad512.emulator:open_emulated",
     "timetag": "devices.timetag:open_timetag",
-    "sim+timetag": "devices.emulation.timetag:open_emulated",
+    "sim+timetag": "devices.emulation.addresses:open_timetag",
 }
 """Scheme of an address -> function ``(Uri) -> Source``."""
 

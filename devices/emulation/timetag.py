@@ -13,24 +13,20 @@ from usb.core import USBError
 from devices.codec import ByteView
 from devices.codecs.timetag import LOST, RECORD_BYTES
 from devices.emulation.faults import Fault
-from devices.emulation.photons import FOREVER, Poisson, TagStream
-from devices.emulation.usb import PACKET_BYTES, VirtualDevice, VirtualUsb, usb_error
-from devices.stream import StreamSource
-from devices.timetag import COMMANDS, DATA, IDENTITY, INSTRUMENT, OPTIONS, REPLIES, Capture, Register, opened
-from devices.uri import Uri
+from devices.emulation.photons import FOREVER, TagStream
+from devices.emulation.usb import PACKET_BYTES, VirtualDevice, usb_error
+from devices.timetag import COMMANDS, DATA, IDENTITY, INSTRUMENT, REPLIES, Capture, Register
 from tofclip.errors import InputError
 
 MAGIC, WRITE = 0xAA, 1
 CLOCK_HZ = 128_000_000
 VERSION = 1
-RATE = 12_800_000.0
 SHORT_PACKET_BYTES = 510
 UNUSED_BITS = 0x1F
 MOST_AT_ONCE = 1 << 17
 DARK = 5e-3
 """Seconds after which an instrument whose time is not the clock's says that nothing comes."""
 NAP = 1e-3
-EMULATOR_OPTIONS = ("seed", "rate", "pace", "records", "packet_bytes", "memory_mib", "faults")
 
 
 @dataclass
@@ -265,27 +261,3 @@ class EmulatedTimeTagger(VirtualDevice):
 
 def _fresh_registers() -> dict[Register, int]:
     return {**dict.fromkeys(Register, 0), Register.VERSION: VERSION, Register.CLOCK: CLOCK_HZ}
-
-
-def open_emulated(uri: Uri) -> StreamSource:
-    """Open ``sim+timetag://?seed=1``: an emulated time tagger behind the real driver.
-
-    Besides the driver's own (`devices.timetag.OPTIONS`) it takes ``rate`` (photons per second of its clock),
-    ``pace=fast|realtime``, ``records`` (then it is dark), ``packet_bytes=510|512``, ``memory_mib`` and ``faults`` (as
-    `Fault.parse` reads them).
-    """
-    uri.only(*OPTIONS, *EMULATOR_OPTIONS)
-    seed = uri.value("seed", int, 0)
-    if not 0 <= seed < 1 << 64:
-        raise InputError(f"'{uri.text}': a seed must be within 0 and 2**64")
-    standard = Setting()
-    setting = Setting(
-        uri.choice("pace", "fast", "realtime") == "realtime",
-        uri.value("records", int, standard.records),
-        uri.value("packet_bytes", int, standard.packet_bytes),
-        int(uri.value("memory_mib", float, standard.memory_bytes / (1 << 20)) * (1 << 20)),
-    )
-    light = Poisson(uri.value("rate", float, RATE), CLOCK_HZ, seed)
-    serial = uri.place or f"SIM{seed}"
-    instrument = EmulatedTimeTagger(light, serial, setting, Fault.parse(uri.value("faults", str, "")))
-    return opened(uri, serial, VirtualUsb(instrument))
