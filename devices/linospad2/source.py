@@ -19,7 +19,7 @@ from tofclip.errors import FileFormatError, InputError
 from tofclip.storage import Record, reading
 
 LIMITS = "LinoSPAD2's USB commands are not public: its recordings are read, no board is driven"
-PIECE = 1 << 22
+PIECE = 1 << 20
 """Bytes that are read and decoded at once, or one cycle where that is longer."""
 
 
@@ -29,7 +29,7 @@ class LinoSpad2File(DecodedSource):
     Opening counts the time stamps of the whole recording, which takes about a second for two gigabytes. After `seek`
     the accounts are as if everything before had been read.
 
-    Memory: one piece of 4 MiB, or one cycle, and what it decodes to; 16 bytes for each piece of the recording.
+    Memory: one piece of 1 MiB, or one cycle, and what it decodes to; 16 bytes for each piece of the recording.
 
     Parameters
     ----------

@@ -17,8 +17,11 @@ import pytest
 import devices
 from devices.codec import Records, as_bytes
 from devices.decoded import DecodedSource
+from devices.linospad2.codec import LinoSpad2Codec
+from devices.linospad2.simulation import SimulatedBoard, uneven_board
 from devices.recorder import record
 from devices.recording.check import verify
+from devices.scenes import line_light
 from devices.source import Batch, Source
 from tofclip.errors import DeviceTimeoutError, InputError
 
@@ -64,6 +67,17 @@ def recorded_linospad2(folder: Path) -> str:
     return f"file://{path}"
 
 
+def words_of_linospad2(folder: Path) -> str:
+    path = folder / "words.dat"
+    if not path.exists():
+        board = SimulatedBoard(line_light(), uneven_board(2), LinoSpad2Codec(), 100, 2)
+        path.write_bytes(b"".join(board.cycle(number) for number in range(45)))
+        path.with_suffix(".toml").write_text(
+            'firmware = "2212b"\ntimestamps_per_cycle = 512\nabsolute_counter = false\n'
+        )
+    return f"linospad2://{path}"
+
+
 def emulated_streak_camera(folder: Path) -> str:
     return "sim+remoteex://?seed=2&scene=small&frames=8&frame_rate=100"
 
@@ -76,6 +90,7 @@ KINDS = [
     recorded_and_paced,
     simulated_linospad2,
     recorded_linospad2,
+    words_of_linospad2,
     emulated_streak_camera,
 ]
 Open = Callable[[], Source]
