@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from tofclip.clip_measurement import Setup, measure, spoilt
+from tofclip.clip_recovery import ClipRecovery
 from tofclip.errors import FileFormatError, InputError, ShapeError, TofclipError
 from tofclip.io.light_fields import read_light_field
 from tofclip.light_field import LightField
 from tofclip.metrics import nmse
-from tofclip.recovery import TotalVariation
 
 VIEWS = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 2)
 SHEAR = -2.0
@@ -58,8 +58,7 @@ def test_a_card_is_recovered_sharply_at_its_own_depth_only(encoder):
     measurement = measure(light_field(), Setup(encoder, 0.8, 0))
 
     def error(shear: float) -> float:
-        model, readings, weight = measurement.problem(shear)
-        return nmse(TotalVariation(weight, 200).recover(model, readings[:, None]).frames[0], scene())
+        return nmse(ClipRecovery(weight=0.02).recover(measurement, shear).picture, scene())
 
     assert error(SHEAR) < 0.1
     assert error(0.0) > 3 * error(SHEAR)
@@ -120,7 +119,7 @@ def test_readings_of_another_camera_are_refused():
 
     made = measure(light_field(), Setup("line", 1.0, 0))
     with pytest.raises(ShapeError):
-        replace(made, readings=made.readings[1:]).problem(SHEAR)
+        replace(made, readings=made.readings[1:]).camera()
 
 
 def test_a_light_field_file_is_read_and_a_wrong_one_refused(tmp_path):
