@@ -10,11 +10,18 @@ compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "re
 
 @compiled
 def _distances(pilot, row, column, patch, reach, distances, corners):
-    """Squared distances of the patches around one; `corners` gets where they begin. Returns how many there are."""
-    count = 0
+    """Squared distances of the patches around one; `corners` gets where they begin. Returns how many there are.
+
+    The patch itself comes first, so that it is in its own group however many others are just like it.
+    """
+    distances[0] = -1
+    corners[0, 0], corners[0, 1] = row, column
+    count = 1
     last_row, last_column = pilot.shape[0] - patch, pilot.shape[1] - patch
     for other_row in range(max(0, row - reach), min(last_row, row + reach) + 1):
         for other_column in range(max(0, column - reach), min(last_column, column + reach) + 1):
+            if other_row == row and other_column == column:
+                continue
             distance = np.float32(0)
             for i in range(patch):
                 for j in range(patch):
