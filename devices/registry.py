@@ -32,6 +32,9 @@ OPENERS: dict[str, str] = {
 
 FILES: dict[str, str] = {
     ".dat": "devices.linospad2.source:open_recording",
+    ".img": "devices.pictures:open_picture",
+    ".tif": "devices.pictures:open_picture",
+    ".tiff": "devices.pictures:open_picture",
     ".phu": "devices.tcspc:open_phu",
     ".ptu": "devices.tcspc:open_ptu",
     ".sdt": "devices.tcspc:open_sdt",

@@ -208,7 +208,8 @@ def _ready_histograms(batches: list[Batch], calibration: Record, gathering: Gath
 
 def _sum_of_frames(first: Batch, batches: Iterator[Batch], calibration: Record | None, gathering: Gathering) -> Streak:
     """Add up a camera's frames; a pixel that reached its limit in one of them is not to be trusted."""
-    limit = np.iinfo(first.records.dtype["counts"].base).max
+    kind = first.records.dtype["counts"].base
+    limit = np.iinfo(kind).max if kind.kind in "ui" else np.inf
     total: NDArray[np.float64] = np.zeros(first.records.dtype["counts"].shape)
     saturated, left, batch = np.zeros(total.shape, bool), gathering.frames, first
     while True:
