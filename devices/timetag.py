@@ -27,7 +27,6 @@ from tofclip.errors import (
     InputError,
     ProtocolError,
     TransferOverflowError,
-    UsbBackendError,
 )
 from tofclip.storage import Record, Scalar
 
@@ -271,11 +270,11 @@ def opened(uri: Uri, serial: str, backend: Any) -> StreamSource:
 
 
 def find_timetaggers() -> list[Found]:
-    """Look for connected time tagger; an empty list where there is no USB."""
+    """Look for connected time taggers; an empty list where there is no USB to look at."""
     try:
         backend = system_backend()
         return [*_listed(backend), *_bare_chips(backend)]
-    except UsbBackendError:
+    except DeviceError:
         return []
 
 

@@ -34,6 +34,7 @@ def info(
 
 def _record_in(file: Path) -> Record:
     """Read our own records as they are, streak images and point clouds of other formats through their readers."""
+    from devices.recording.reader import head_if_recording
     from tofclip.errors import FileFormatError
     from tofclip.io import read_streak
     from tofclip.lidar import PointCloud
@@ -42,7 +43,7 @@ def _record_in(file: Path) -> Record:
     with reading(file), open(file, "rb") as opened:
         start = opened.read(len(HDF5_SIGNATURE))
     if start == HDF5_SIGNATURE:
-        return Record.load(file)
+        return head_if_recording(file) or Record.load(file)  # recordings do not fit into memory
     if file.suffix.lower() not in TABLE_SUFFIXES:
         return read_streak(file).to_record()
     try:

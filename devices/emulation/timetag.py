@@ -19,6 +19,7 @@ from devices.timetag import COMMANDS, DATA, IDENTITY, INSTRUMENT, REPLIES, Captu
 from tofclip.errors import InputError
 
 MAGIC, WRITE = 0xAA, 1
+COMMAND = struct.Struct("<BBHI")
 CLOCK_HZ = 128_000_000
 VERSION = 1
 SHORT_PACKET_BYTES = 510
@@ -66,13 +67,14 @@ class Setting:
         Size of a packet. 510, as of the public firmware: each is shorter than the endpoint's 512 and ends a transfer.
         512: transfers are filled.
     memory_bytes : int
-        What fits into the instrument.
+        What fits into the instrument. Far more than into a real one, because here it shares the processor with the host,
+        which is not always given its turn in time.
     """
 
     is_paced: bool = False
     records: int = FOREVER
     packet_bytes: int = PACKET_BYTES
-    memory_bytes: int = 16 << 20
+    memory_bytes: int = 64 << 20
 
     def __post_init__(self) -> None:
         if self.packet_bytes not in (SHORT_PACKET_BYTES, PACKET_BYTES):
@@ -109,8 +111,10 @@ class EmulatedTimeTagger(VirtualDevice):
         self._segment_bytes = self._told = 0
 
     def receive(self, endpoint: int, data: bytes) -> None:
-        magic, what, number, value = struct.unpack("<BBHI", data)
-        if magic != MAGIC or endpoint != COMMANDS:
+        if endpoint != COMMANDS or len(data) != COMMAND.size or data[0] != MAGIC:
+            raise usb_error(errno.EPIPE)
+        _, what, number, value = COMMAND.unpack(data)
+        if number not in set(Register):
             raise usb_error(errno.EPIPE)
         register = Register(number)
         if what == WRITE:

@@ -22,6 +22,7 @@ from devices.source import Info
 from tofclip.errors import FileFormatError, InputError
 from tofclip.storage import Record, one_line, reading
 
+KIND = "recording"
 STRETCH = 1 << 20
 """Bytes in which the next sound block is searched at once."""
 
@@ -197,12 +198,21 @@ class Recording:
             raise FileFormatError(self.path, f"is no recording, or a damaged one ({one_line(fault)})") from fault
 
 
+def head_if_recording(path: Path) -> Record | None:
+    """Return what a recording says about its instrument, None for any other HDF5 file; its bytes are not read."""
+    with contextlib.suppress(OSError), h5py.File(path, "r", locking=False) as file:
+        if file.attrs.get("kind", b"") == KIND.encode():
+            with Recording(path) as recording:
+                return recording.head
+    return None
+
+
 def head_in(image: bytes, path: Path) -> Record:
     """Read the record in the HDF5 image that a HEAD block holds."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder, path.name)
         copy.write_bytes(image)
-        head = Record.load(copy, "recording")
+        head = Record.load(copy, KIND)
     return Record(head.kind, {}, head.attributes, head.children, head.provenance, str(path))
 
 

@@ -96,6 +96,13 @@ def test_recording_and_verifying(run: Run, tmp_path: Path) -> None:
     assert verify(again).records == done["delivered"]
 
 
+def test_info_does_not_read_the_bytes(run: Run, recording: Path) -> None:
+    found = json.loads(run("info", recording, "--json").out)
+    assert (found["kind"], found["attributes"]["codec"]) == ("recording", "timetag")
+    assert found["children"]["calibration"]["attributes"]["tick_s"] == 1 / 128e6
+    assert "fields" not in found
+
+
 def test_damage_is_named_and_repaired(run: Run, recording: Path, tmp_path: Path) -> None:
     damaged, out = tmp_path / "run.h5", tmp_path / "sound.h5"
     content = bytearray(recording.read_bytes())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import array
 import time
 
 import numpy as np
@@ -14,10 +15,10 @@ from devices.emulation.photons import FOREVER, Poisson
 from devices.emulation.timetag import CLOCK_HZ, EmulatedTimeTagger, Setting
 from devices.emulation.usb import VirtualUsb
 from devices.source import Source
-from devices.timetag import IDENTITY, Capture, Register, TimeTagger, opened
+from devices.timetag import COMMANDS, IDENTITY, REPLIES, Capture, Register, TimeTagger, opened
 from devices.uri import Uri
 from devices.usb import UsbLink
-from tofclip.errors import BufferOverflowError, DeviceTimeoutError, InputError, ProtocolError
+from tofclip.errors import BufferOverflowError, DeviceStalledError, DeviceTimeoutError, InputError, ProtocolError
 
 RATE = 12_800_000.0
 SMALL = "sim+timetag://?seed=3&transfer_kib=8"
@@ -165,6 +166,17 @@ def test_registers_answer_and_reset() -> None:
     assert (registers.read(Register.STROBE), registers.read(Register.DELTA)) == (0b101, 0b10)
     registers.reset()
     assert registers.read(Register.CAPTURE) == Capture.OFF
+
+
+@pytest.mark.parametrize("command", ["", "aa0002", "ab00020000000000", "aa00630000000000"])
+def test_a_wrong_command_stalls_the_instrument(command: str) -> None:
+    _, bus = tagger()
+    link = UsbLink(IDENTITY, "", bus)
+    with pytest.raises(DeviceStalledError):
+        link.write(COMMANDS, bytes.fromhex(command), 0.1)
+    buffer = array.array("B", bytes(8))
+    with pytest.raises(DeviceTimeoutError):
+        link.read(REPLIES, buffer, 0.1)
 
 
 @pytest.mark.parametrize(
