@@ -1,0 +1,5 @@
+"""Captures in the files of other laboratories and programs, turned once, at this border, into `nlos.Capture`."""
+
+from nlos.io.recognise import read_capture
+
+__all__ = ["read_capture"]

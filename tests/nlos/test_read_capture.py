@@ -1,0 +1,438 @@
+"""Every format that `nlos.io.read_capture` knows, in files that these tests write, and the ways such files can fail."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from relay_walls import HIDDEN, JITTER, planar_wall
+
+from nlos import Backprojection, Capture, Grid
+from nlos.io import read_capture
+from nlos.io.turning import turned_to_scene
+from nlos.simulate import PointScene
+from nlos.time_axis import TimeAxis
+from tofclip.errors import FileFormatError, InputError, StorageError
+from tofclip.units import SPEED_OF_LIGHT
+
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")
+
+AXIS = TimeAxis(bins=220, bin_width=16e-12, start=0.5)
+WALL = planar_wall(9, 12)
+SPOT = np.array([0.12, 0.05, 0.0])
+SOURCE, EYE = np.array([0.3, -0.4, 1.5]), np.array([-0.6, 0.2, 1.8])
+
+
+def simulated(laser: Any = SPOT, wall: np.ndarray = WALL, axis: TimeAxis = AXIS) -> Capture:
+    return PointScene([HIDDEN]).seen_from(wall, laser, axis, JITTER)
+
+
+def with_legs(capture: Capture, start: float) -> tuple[np.ndarray, float]:
+    """The same light as a device records it, drawn without any shifting."""
+    legs = np.linalg.norm(capture.laser - SOURCE, axis=-1) + np.linalg.norm(capture.wall - EYE, axis=-1)
+    path = np.linalg.norm(capture.laser - HIDDEN, axis=-1) + np.linalg.norm(capture.wall - HIDDEN, axis=-1) + legs
+    paths = start + AXIS.spacing * np.arange(400)
+    return np.exp(-0.5 * ((paths.reshape(-1, *[1] * path.ndim) - path) / 0.012) ** 2), start
+
+
+def same(found: Capture, expected: Capture) -> None:
+    assert np.array_equal(found.signal, expected.signal)
+    assert found.wall == pytest.approx(expected.wall, nan_ok=True)
+    assert found.laser == pytest.approx(expected.laser)
+    assert found.bin_width == pytest.approx(expected.bin_width)
+    assert found.start == pytest.approx(expected.start, abs=1e-9)
+
+
+def shows_the_point(capture: Capture, point: Any = HIDDEN) -> None:
+    steps = 0.04 * np.arange(-3, 4)
+    volume = Backprojection(0.2).reconstruct(capture, Grid(*(c + steps for c in point)))
+    assert volume.brightest() == pytest.approx(tuple(point))
+
+
+# --- our own ---------------------------------------------------------------------------------------------------------
+
+
+def test_our_own_captures_keep_their_history(tmp_path: Path) -> None:
+    capture = Capture(simulated().signal, WALL, SPOT, AXIS.bin_width, AXIS.start, {"shot": 7})
+    capture.save(tmp_path / "wall.h5")
+    found = read_capture(tmp_path / "wall.h5")
+    same(found, capture)
+    assert found.provenance == {"shot": 7}
+
+
+def test_frames_with_a_wall_become_a_capture(tmp_path: Path) -> None:
+    from test_unwarp import DELAY_BINS, frames_of, relay_wall, seen_by_camera, wall_of
+
+    wall = wall_of(6, 7)
+    frames_of(seen_by_camera(wall), {"relay_wall": relay_wall(wall)}).save(tmp_path / "frames.h5")
+    found = read_capture(tmp_path / "frames.h5")
+    assert found.signal.shape == (800, 6, 7)
+    assert found.start == pytest.approx(DELAY_BINS * 5e-12 * SPEED_OF_LIGHT)
+
+
+def test_another_record_of_ours_is_no_capture(tmp_path: Path) -> None:
+    from tofclip.storage import Record
+
+    Record("camera").save(tmp_path / "camera.h5")
+    with pytest.raises(FileFormatError, match="holds a camera record, expected capture or frames"):
+        read_capture(tmp_path / "camera.h5")
+
+
+# --- NumPy archives --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("laser", [SPOT, WALL], ids=["single", "confocal"])
+def test_a_numpy_archive(laser: np.ndarray, tmp_path: Path) -> None:
+    expected = simulated(laser)
+    arrays = {"H": expected.signal, "wall_xyz": WALL.astype(np.float32), "laser_xyz": laser.astype(np.float32)}
+    np.savez(tmp_path / "a.npz", **arrays, delta_t_s=AXIS.bin_width, t_start_m=AXIS.start, confocal=1)
+    found = read_capture(tmp_path / "a.npz")
+    same(found, expected)
+    assert found.provenance["inputs"][0]["name"] == "a.npz"
+
+
+def test_a_foreign_numpy_archive_says_what_it_lacks(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", H=np.ones((3, 2)), holiday=np.ones(3))
+    with pytest.raises(FileFormatError, match="holds H, holiday, but a capture needs the fields"):
+        read_capture(tmp_path / "a.npz")
+
+
+def test_the_recorded_archives(shared_data: Path) -> None:
+    capture = read_capture(shared_data / "nlos" / "otoole2018_diffuse_s.npz")
+    assert capture.signal.shape == (2048, 64, 64)
+    assert np.array_equal(capture.laser, capture.wall)
+    letter = read_capture(shared_data / "lift" / "nlos_LetterN.npz")
+    assert letter.signal.shape == (1016, 125, 125)
+    assert letter.bin_width == pytest.approx(4.6e-12)
+
+
+# --- y-tal -----------------------------------------------------------------------------------------------------------
+
+
+def write_tal(path: Path, capture: Capture, laser: np.ndarray, signal: np.ndarray | None = None, **more: Any) -> None:
+    with h5py.File(path, "w") as file:
+        file["H"] = capture.signal if signal is None else signal
+        file["H_format"] = np.array([1], "i4")
+        file["sensor_grid_xyz"], file["laser_grid_xyz"] = WALL, laser
+        file["delta_t"], file["t_start"] = capture.axis.spacing, capture.start
+        file["scene_info"] = "a: 1"
+        file["laser_grid_normals"] = h5py.Empty(float)
+        for name, value in {"t_accounts_first_and_last_bounces": False, **more}.items():
+            file[name] = value
+
+
+def test_tal_single_confocal_and_exhaustive(tmp_path: Path) -> None:
+    write_tal(tmp_path / "single.hdf5", simulated(), SPOT.reshape(1, 1, 3))
+    same(read_capture(tmp_path / "single.hdf5"), simulated())
+    write_tal(tmp_path / "confocal.hdf5", simulated(WALL), WALL)
+    same(read_capture(tmp_path / "confocal.hdf5"), simulated(WALL))
+    lasers = WALL[::4, ::5] + [0.01, 0, 0]
+    each = np.stack([simulated(spot).signal for spot in lasers.reshape(-1, 3)], axis=1)
+    signal = each.reshape(AXIS.bins, *lasers.shape[:2], *WALL.shape[:2])
+    write_tal(tmp_path / "all.hdf5", simulated(), lasers, signal)
+    found = read_capture(tmp_path / "all.hdf5")
+    same(found, Capture.exhaustive(signal, WALL, lasers, AXIS.bin_width, AXIS.start))
+    shows_the_point(found)
+
+
+def test_tal_with_the_ways_to_the_devices(tmp_path: Path) -> None:
+    signal, start = with_legs(simulated(), 3.6)
+    positions = {"laser_xyz": SOURCE, "sensor_xyz": EYE, "t_accounts_first_and_last_bounces": True}
+    raw = Capture(signal, WALL, SPOT, AXIS.bin_width, start)
+    write_tal(tmp_path / "legs.hdf5", raw, SPOT.reshape(1, 3), **positions)
+    shows_the_point(read_capture(tmp_path / "legs.hdf5"))
+
+
+def test_tal_with_shapes_that_disagree(tmp_path: Path) -> None:
+    write_tal(tmp_path / "odd.hdf5", simulated(), WALL[:2])
+    with pytest.raises(FileFormatError, match="belongs neither to"):
+        read_capture(tmp_path / "odd.hdf5")
+
+
+# --- Zaragoza --------------------------------------------------------------------------------------------------------
+
+# In that data set the wall is upright in x and z, and the scene lies at smaller y.
+TO_ZARAGOZA = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
+
+
+def write_zaragoza(path: Path, signal: np.ndarray, laser: np.ndarray, start: float, columns_first: bool) -> None:
+    """Split the signal over 2 colours and 3 bounces; `signal` is (t, [lasers...,] points...)."""
+    parts = np.array([0.5, 0.3, 0.2])[:, None] * np.array([0.25, 0.75])
+    split = np.multiply.outer(parts, signal)  # (bounce, colour, t, ...)
+    if columns_first:
+        order = split.transpose(1, 2, 0, *range(3, split.ndim))
+        if split.ndim == 7:
+            order = order.transpose(0, 1, 2, 5, 6, 3, 4)  # cameras before lasers
+    else:
+        order = split.transpose(*range(3, split.ndim), 0, 2, 1)
+    wall, spots = WALL @ TO_ZARAGOZA.T, laser @ TO_ZARAGOZA.T
+    with h5py.File(path, "w") as file:
+        file["data"] = order.astype(np.float32)
+        for name, points in (("camera", wall), ("laser", spots)):
+            file[f"{name}GridPositions"] = np.moveaxis(points, -1, 0) if columns_first else points
+        normals = np.broadcast_to(TO_ZARAGOZA @ [0, 0, 1.0], wall.shape)
+        file["cameraGridNormals"] = np.moveaxis(normals, -1, 0) if columns_first else normals
+        file["hiddenVolumePosition"] = (TO_ZARAGOZA @ HIDDEN).reshape(3, 1)
+        file["cameraPosition"], file["laserPosition"] = TO_ZARAGOZA @ EYE, TO_ZARAGOZA @ SOURCE
+        file["deltaT"], file["t0"] = np.array([[AXIS.spacing]]), start
+
+
+@pytest.mark.parametrize("columns_first", [True, False])
+@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
+def test_zaragoza(kind: str, columns_first: bool, tmp_path: Path) -> None:
+    if kind == "confocal":
+        laser = WALL
+        signal, start = with_legs(simulated(WALL), 3.6)
+    else:
+        laser = SPOT.reshape(1, 1, 3) if kind == "single" else WALL[::4, ::5]
+        each = [with_legs(simulated(spot), 3.6) for spot in laser.reshape(-1, 3)]
+        start = each[0][1]
+        signal = np.stack([one for one, _ in each], axis=1).reshape(400, *laser.shape[:2], *WALL.shape[:2])
+    write_zaragoza(tmp_path / "z.hdf5", signal, laser, start, columns_first)
+    found = read_capture(tmp_path / "z.hdf5")
+    assert found.points[:, 2] == pytest.approx(np.zeros(len(found.points)), abs=1e-12)
+    shows_the_point(found)
+
+
+def test_zaragoza_with_odd_axes(tmp_path: Path) -> None:
+    write_zaragoza(tmp_path / "z.hdf5", with_legs(simulated(WALL), 3.6)[0], WALL, 3.6, True)
+    with h5py.File(tmp_path / "z.hdf5", "a") as file:
+        del file["data"]
+        file["data"] = np.ones((3, 4))
+    with pytest.raises(FileFormatError, match="5 or 7 axes"):
+        read_capture(tmp_path / "z.hdf5")
+
+
+@pytest.mark.parametrize("direction", [(0, 0, 2.0), (0, 0, -1), (0, -1, 0), (1, 0, 0), (0.6, 0, 0.8)])
+def test_turning_makes_a_direction_z_and_keeps_distances(direction: tuple[float, float, float]) -> None:
+    towards = np.array(direction) / np.linalg.norm(direction)
+    # The scene stays in front: a hidden point at 0.5 along the direction has z = 0.5 afterwards.
+    turned = turned_to_scene(Capture(np.ones((3, 2)), [0.5 * towards, [0, 0, 0]], 0.5 * towards, 1e-11), towards)
+    assert turned.wall[0] == pytest.approx([0, 0, 0.5])
+    basis = turned_to_scene(Capture(np.ones((3, 3)), np.eye(3), np.eye(3), 1e-11), towards).wall
+    assert basis.T @ basis == pytest.approx(np.eye(3))
+    assert np.linalg.det(basis) == pytest.approx(1)
+    with pytest.raises(InputError, match="direction"):
+        turned_to_scene(turned, np.zeros(3))
+
+
+# --- MATLAB ----------------------------------------------------------------------------------------------------------
+
+
+def write_matlab(path: Path, version: str, **variables: Any) -> None:
+    """Write MATLAB's own layout: version 5 by SciPy, 7.3 as HDF5 with reversed axes behind a header of 512 bytes."""
+    if version == "5":
+        scipy.io.savemat(path, variables)
+        return
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, value in variables.items():
+            parts = value if isinstance(value, dict) else {"": value}
+            for part, array in parts.items():
+                file[f"{name}/{part}".rstrip("/")] = np.atleast_2d(array).T
+    with open(path, "r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+
+
+versions = pytest.mark.parametrize("version", ["5", "7.3"])
+
+
+@versions
+def test_light_cone_data(version: str, tmp_path: Path) -> None:
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 11), np.linspace(-0.5, 0.5, 11), indexing="ij")
+    wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    expected = simulated(wall, wall, TimeAxis(1800, 4e-12))
+    rect_data = np.moveaxis(expected.signal, 0, 2)
+    write_matlab(tmp_path / "data_s.mat", version, rect_data=rect_data, width=0.5)
+    same(read_capture(tmp_path / "data_s.mat"), expected)
+    shows_the_point(read_capture(tmp_path / "data_s.mat"))
+
+
+@versions
+@pytest.mark.parametrize("beside", [True, False])
+def test_migration_data(version: str, beside: bool, tmp_path: Path) -> None:
+    x, y = np.meshgrid(np.linspace(-1, 1, 14), np.linspace(-1, 1, 13))
+    wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    expected = simulated(wall, wall, TimeAxis(300, 32e-12))
+    late_bins = np.random.default_rng(1).integers(3, 20, wall.shape[:2])
+    meas = np.zeros((13, 14, 330), np.float32)
+    for i, j in np.ndindex(13, 14):
+        meas[i, j, late_bins[i, j] : late_bins[i, j] + 300] = expected.signal[:, i, j]
+    tofgrid = late_bins * 32.0
+    if beside:
+        write_matlab(tmp_path / "meas_10min.mat", version, meas=meas)
+        write_matlab(tmp_path / "tof.mat", version, tofgrid=tofgrid)
+    else:
+        write_matlab(tmp_path / "meas_10min.mat", version, meas=meas, tofgrid=tofgrid)
+    found = read_capture(tmp_path / "meas_10min.mat")
+    assert found.signal[:300] == pytest.approx(expected.signal, rel=1e-4, abs=1e-6)
+    assert np.array_equal(found.laser, found.wall)
+    shows_the_point(found)
+
+
+def test_migration_data_without_its_arrival_times(tmp_path: Path) -> None:
+    write_matlab(tmp_path / "meas_10min.mat", "5", meas=np.ones((3, 4, 5)))
+    with pytest.raises(FileFormatError, match=r"no tof\.mat beside it"):
+        read_capture(tmp_path / "meas_10min.mat")
+
+
+@versions
+def test_phasor_field_data(version: str, tmp_path: Path) -> None:
+    points = WALL.reshape(-1, 3)
+    listed = simulated(SPOT, points)
+    # Their laser scans our wall points; our laser spot is where their camera looks.
+    legs = np.linalg.norm(SPOT - SOURCE) + np.linalg.norm(points - EYE, axis=-1)
+    path = np.linalg.norm(SPOT - HIDDEN) + np.linalg.norm(points - HIDDEN, axis=-1) + legs
+    signal = np.exp(-0.5 * ((3.6 + AXIS.spacing * np.arange(400) - path[:, None]) / 0.012) ** 2)
+    dataset = {
+        "data": signal[:, None, :],
+        "t": 400,
+        "deltat": AXIS.spacing,
+        "t0": 3.6,
+        "laserPos": points @ TO_ZARAGOZA.T,
+        "cameraPos": (TO_ZARAGOZA @ SPOT)[None],
+        "laserOrigin": TO_ZARAGOZA @ EYE,
+        "cameraOrigin": TO_ZARAGOZA @ SOURCE,
+        "laserNorm": np.broadcast_to(TO_ZARAGOZA @ [0, 0, 1.0], points.shape),
+    }
+    write_matlab(tmp_path / "office.mat", version, dataset=dataset)
+    found = read_capture(tmp_path / "office.mat")
+    assert found.wall == pytest.approx(listed.wall, abs=1e-12)
+    assert found.laser == pytest.approx(SPOT, abs=1e-12)
+    shows_the_point(found)
+    dataset["t"] = 399
+    write_matlab(tmp_path / "cut.mat", version, dataset=dataset)
+    with pytest.raises(FileFormatError, match="must end with 399 bins"):
+        read_capture(tmp_path / "cut.mat")
+
+
+@versions
+def test_rectified_data(version: str, tmp_path: Path) -> None:
+    x, y = np.meshgrid((np.arange(12) - 6) * 0.1, (np.arange(10) - 5) * 0.1)
+    wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    expected = simulated(wall[4, 7], wall, TimeAxis(300, 16e-12))
+    arrays = {"rect_data": np.moveaxis(expected.signal, 0, 2), "ts": 16e-12, "sampling_spacing": 0.1}
+    write_matlab(tmp_path / "four.mat", version, **arrays, SPAD_index=[7, 4])
+    same(read_capture(tmp_path / "four.mat"), expected)
+    write_matlab(tmp_path / "off.mat", version, **arrays, SPAD_index=[12, 4])
+    with pytest.raises(FileFormatError, match="SPAD_index"):
+        read_capture(tmp_path / "off.mat")
+
+
+@versions
+def test_a_foreign_matlab_file(version: str, tmp_path: Path) -> None:
+    write_matlab(tmp_path / "other.mat", version, holiday=np.ones(3))
+    with pytest.raises(FileFormatError, match="holds holiday, but a capture needs"):
+        read_capture(tmp_path / "other.mat")
+
+
+# --- EXR -------------------------------------------------------------------------------------------------------------
+
+GEOMETRY = """
+bin_width_ps = 16.0
+start_m = 0.5
+wall_corners_m = [[-0.6, -0.5, 0], [0.6, -0.5, 0], [-0.6, 0.5, 0]]
+laser_m = [0.12, 0.05, 0.0]
+"""
+
+
+def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {name: np.ascontiguousarray(v, np.float32) for name, v in channels.items()}).write(str(path))
+
+
+def write_streaks(folder: Path, capture: Capture, geometry: str = GEOMETRY) -> None:
+    for row in range(capture.signal.shape[1]):
+        brightness = capture.signal[:, row].T  # (column, t)
+        # No leading zeros, as renderers number them: 10 comes after 9.
+        write_exr(folder / f"streak_{row}.exr", {"R": 0.5 * brightness, "G": brightness, "B": 1.5 * brightness})
+    (folder / "geometry.toml").write_text(geometry)
+
+
+def test_exr_streaks(tmp_path: Path) -> None:
+    expected = simulated(wall=planar_wall(12, 9))
+    write_streaks(tmp_path, expected)
+    found = read_capture(tmp_path)
+    assert found.signal == pytest.approx(expected.signal, rel=1e-6)
+    assert found.wall == pytest.approx(expected.wall, abs=1e-12)
+    shows_the_point(found)
+    (tmp_path / "geometry.toml").write_text(GEOMETRY.replace("[0.12, 0.05, 0.0]", '"confocal"'))
+    assert np.array_equal(read_capture(tmp_path).laser, read_capture(tmp_path).wall)
+
+
+@pytest.mark.parametrize(
+    ("geometry", "problem"),
+    [
+        (GEOMETRY.replace("start_m", "begin_m"), "lacking or unknown: begin_m, start_m"),
+        (GEOMETRY.replace("16.0", '"fast"'), "bin_width_ps must be numbers"),
+        (GEOMETRY.replace("0.12, 0.05, 0.0", "0.12"), "laser_m must be numbers of shape"),
+        (GEOMETRY.replace(", [-0.6, 0.5, 0]", ""), "wall_corners_m must be numbers"),
+        ("bin_width_ps = ", "is no TOML"),
+    ],
+)
+def test_exr_geometry_is_checked(geometry: str, problem: str, tmp_path: Path) -> None:
+    write_streaks(tmp_path, simulated(wall=planar_wall(2, 3)), geometry)
+    with pytest.raises(FileFormatError, match=problem):
+        read_capture(tmp_path)
+
+
+def test_exr_folders_that_are_no_capture(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="without EXR files"):
+        read_capture(tmp_path)
+    write_streaks(tmp_path, simulated(wall=planar_wall(3, 4)))
+    (tmp_path / "geometry.toml").unlink()
+    with pytest.raises(FileFormatError, match=r"no geometry\.toml"):
+        read_capture(tmp_path)
+    (tmp_path / "geometry.toml").write_text(GEOMETRY)
+    write_exr(tmp_path / "streak_1.exr", {"Y": np.ones((4, 5))})
+    with pytest.raises(FileFormatError, match=r"streak_1\.exr: is \(4, 5\) pixels"):
+        read_capture(tmp_path)
+    write_exr(tmp_path / "streak_1.exr", {"Z": np.ones((4, 5))})
+    with pytest.raises(FileFormatError, match="none of which is R, G, B or Y"):
+        read_capture(tmp_path)
+    whole = (tmp_path / "streak_0.exr").read_bytes()
+    (tmp_path / "streak_1.exr").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(FileFormatError, match="truncated or damaged EXR"):
+        read_capture(tmp_path)
+
+
+# --- damage ----------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_no_file_or_no_capture_says_so(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="no such file"):
+        read_capture(tmp_path / "absent.h5")
+    (tmp_path / "empty").write_bytes(b"")
+    with pytest.raises(FileFormatError, match="is empty"):
+        read_capture(tmp_path / "empty")
+    (tmp_path / "text").write_text("once upon a time")
+    with pytest.raises(FileFormatError, match="no capture of a known format"):
+        read_capture(tmp_path / "text")
+    with h5py.File(tmp_path / "foreign.h5", "w") as file:
+        file["holiday"] = np.ones(3)
+    with pytest.raises(FileFormatError, match="holds holiday, but a capture needs"):
+        read_capture(tmp_path / "foreign.h5")
+
+
+@pytest.mark.parametrize("name", ["own.h5", "a.npz", "tal.hdf5", "five.mat", "seven.mat"])
+def test_truncated_files_are_refused(name: str, tmp_path: Path) -> None:
+    capture, path = simulated(), tmp_path / name
+    rect = {"rect_data": np.moveaxis(capture.signal, 0, 2), "width": 0.5}
+    if name == "own.h5":
+        capture.save(path)
+    elif name == "a.npz":
+        np.savez(path, H=capture.signal, wall_xyz=WALL, laser_xyz=SPOT, delta_t_s=1e-11, t_start_m=0)
+    elif name == "tal.hdf5":
+        write_tal(path, capture, SPOT)
+    else:
+        write_matlab(path, "5" if name == "five.mat" else "7.3", **rect)
+    whole = path.read_bytes()
+    for share in (0.3, 0.9):
+        path.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(FileFormatError, match=r"truncated|damaged"):
+            read_capture(path)
