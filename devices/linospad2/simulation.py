@@ -6,6 +6,7 @@ There is no wire to emulate, because the board's USB commands are not public; th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from time import monotonic, sleep
 
 import numpy as np
@@ -62,6 +63,21 @@ class SimulatedBoard:
         if not 0 < self.photons_per_cycle <= most:
             raise InputError(f"photons per cycle must be above 0 and at most {most}, got {self.photons_per_cycle:g}")
 
+    @cached_property
+    def _share(self) -> NDArray[np.float64]:
+        """Photons up to each cell of the light, in raster order."""
+        return np.cumsum(self.light.photons)
+
+    @cached_property
+    def _apart(self) -> NDArray[np.float64]:
+        """Where each pixel's codes begin in `_ends`: a little more than a period apart, s."""
+        return 2 * CLOCK_PERIOD * np.arange(PIXELS, dtype=np.float64)
+
+    @cached_property
+    def _ends(self) -> NDArray[np.float64]:
+        """Ends of all pixels' codes in one table that rises throughout, s."""
+        return (self.calibration.code_ends + self._apart[:, np.newaxis]).ravel()
+
     def cycle(self, number: int) -> bytes:
         """Return the words of one cycle; the same number gives the same words.
 
@@ -79,9 +95,10 @@ class SimulatedBoard:
     def _photons(self, random: np.random.Generator) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Draw pixel and time since the cycle began of each photon of a cycle."""
         columns = self.light.photons.shape[1]
-        share = np.cumsum(self.light.photons)
         total = random.poisson(self.photons_per_cycle)
-        row, pixel = np.divmod(np.searchsorted(share, random.uniform(0, share[-1], total), side="right"), columns)
+        row, pixel = np.divmod(
+            np.searchsorted(self._share, random.uniform(0, self._share[-1], total), side="right"), columns
+        )
         # The last pulses of a cycle are left out, so that the board's offsets cannot carry a photon beyond it.
         pulse = random.integers(1, round(CYCLE_TIME / LASER_PERIOD) - 1, total) * LASER_PERIOD
         width = self.light.row_times[1] - self.light.row_times[0]
@@ -90,10 +107,7 @@ class SimulatedBoard:
     def _codes(self, pixel: NDArray[np.intp], time: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return the code in which each time lies, for its own pixel's converter."""
         periods, phase = np.divmod(time - self.calibration.offsets[pixel], CLOCK_PERIOD)
-        # One rising table for all pixels, each a little longer than a period apart.
-        apart = 2 * CLOCK_PERIOD * np.arange(PIXELS)
-        table = (self.calibration.code_ends + apart[:, np.newaxis]).ravel()
-        code = np.searchsorted(table, phase + apart[pixel], side="right") - pixel * CODES
+        code = np.searchsorted(self._ends, phase + self._apart[pixel], side="right") - pixel * CODES
         codes: NDArray[np.int64] = periods.astype(np.int64) * CODES + np.clip(code, 0, CODES - 1)
         return codes
 

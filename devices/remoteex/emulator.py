@@ -17,6 +17,7 @@ from devices.remoteex.client import RemoteEx
 from devices.remoteex.protocol import DATA_GREETING, END, GREETING, Answer, Code, Command
 from devices.remoteex.source import GAIN, OPTIONS, STREAK_TUBE, LiveSettings, RemoteExFeed, live_settings
 from devices.scenes import LineLight, demonstration_light, line_light
+from devices.source import Info
 from devices.stream import StreamSource
 from devices.stream_options import buffering
 from devices.uri import Uri
@@ -263,6 +264,11 @@ class EmulatedFeed(RemoteExFeed):
         self._server, self._camera = server, camera
         port, data_port = server.ports
         super().__init__(lambda: RemoteEx(HOST, port, data_port, settings.timeout), ledger, settings)
+
+    @property
+    def info(self) -> Info:
+        known = super().info
+        return replace(known, instrument=f"emulated {known.instrument}")
 
     @property
     def calibration(self) -> Record | None:

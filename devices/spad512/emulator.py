@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from devices.emulation.faults import Fault
 from devices.ledger import Ledger
 from devices.loopback import HOST, Connection, LoopbackServer
 from devices.scenes import array_light
+from devices.source import Info
 from devices.spad512.protocol import DONE, END, ERROR, ROWS, Exposure
 from devices.spad512.source import OPTIONS, Spad512Feed, exposure_of, waiting
 from devices.stream import StreamSource
@@ -111,6 +113,11 @@ class EmulatedFeed(Spad512Feed):
     ) -> None:
         self._server = server
         super().__init__(lambda: TcpLink(HOST, server.port, patience), ledger, exposure, patience, reconnect)
+
+    @property
+    def info(self) -> Info:
+        known = super().info
+        return replace(known, instrument=f"emulated {known.instrument}")
 
     def close(self) -> None:
         super().close()
