@@ -159,10 +159,7 @@ class LinoSpad2Codec:
 
         def work(block: slice) -> None:
             first, last = (int(ends[block.start - 1]) if block.start else 0), int(ends[block.stop - 1])
-            # The row behind the last belongs to the next block's thread: room of our own for it.
-            own = np.empty((last - first + 1, rows.shape[1]), _WORD)
-            decode_stamps(cycles[block], self.header, state + block.start, self.pixel_of, own)
-            rows[first:last] = own[:-1]
+            decode_stamps(cycles[block], self.header, state + block.start, self.pixel_of, rows[first:last])
 
         run_blocks(work, len(cycles), max(1, _BLOCK_BYTES // self.cycle_bytes))
         return Decoded(records, malformed, state + len(cycles))

@@ -51,7 +51,7 @@ def decode_stamps(cycles, header, first_cycle, pixel_of, records):
     """Write the valid words of all converters that have pixels, as rows of `records`.
 
     Every word is written to the next free row, and only a valid one moves on to the row behind it: no branch that the
-    processor could guess wrong. So `records` needs one row more than there are valid words.
+    processor could guess wrong. It ends with the last row, behind which there are no valid words.
 
     Parameters
     ----------
@@ -61,8 +61,8 @@ def decode_stamps(cycles, header, first_cycle, pixel_of, records):
     first_cycle : int
         Number of the first cycle.
     pixel_of : (converters, addresses) uint32 array
-    records : (rows + 1, header + 3) uint32 array
-        Gets header, cycle, code and pixel.
+    records : (rows, header + 3) uint32 array
+        One row for each valid word; gets header, cycle, code and pixel.
     """
     depth = (cycles.shape[1] - header) // CONVERTERS
     row = 0
@@ -73,6 +73,8 @@ def decode_stamps(cycles, header, first_cycle, pixel_of, records):
             pixels = pixel_of[converter]
             begin = header + converter * depth
             for place in range(begin, begin + depth):
+                if row == records.shape[0]:
+                    return
                 word = words[place]
                 for column in range(header):
                     records[row, column] = words[column]
