@@ -1,0 +1,83 @@
+"""Hidden points that scatter evenly: the simplest scene, whose image is known exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.capture import Capture
+from nlos.time_axis import TimeAxis
+from tofclip.errors import InputError, ShapeError
+from tofclip.units import SPEED_OF_LIGHT
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PointScene:
+    """Hidden points that scatter evenly in all directions, see each other not, and hide nothing.
+
+    A point of albedo a, at distance d_L from the laser spot and d_p from wall point p, returns ``a / (d_L * d_p)^2``
+    after a path of ``d_L + d_p``. No grid of voxels takes part, so the simulation shares nothing with a method that
+    images it.
+
+    Parameters
+    ----------
+    positions : (n, 3) array
+        m.
+    albedo : (n,) array, optional
+        Defaults to 1.
+    """
+
+    positions: FloatArray
+    albedo: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        positions = np.atleast_2d(np.asarray(self.positions, dtype=np.float64))
+        albedo = np.ones(len(positions)) if self.albedo is None else np.asarray(self.albedo, dtype=np.float64)
+        if positions.ndim != 2 or positions.shape[1] != 3:
+            raise ShapeError("positions of hidden points", "(n, 3)", positions.shape)
+        if albedo.shape != (len(positions),):
+            raise ShapeError("albedo", (len(positions),), albedo.shape)
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "albedo", albedo)
+
+    def seen_from(self, wall: Any, laser: Any, axis: TimeAxis, jitter: float) -> Capture:
+        """Simulate a capture without noise.
+
+        Parameters
+        ----------
+        wall : (..., 3) array
+            Wall points, m; where one is NaN, its signal is 0.
+        laser : (3,) or (..., 3) array
+            Laser spot, m, or one per wall point.
+        axis : TimeAxis
+        jitter : float
+            Standard deviation of the instrument's Gaussian response, s; its integral over every time bin is exact.
+
+        Returns
+        -------
+        Capture
+        """
+        if not (np.isfinite(jitter) and jitter > 0):
+            raise InputError(f"jitter must be a positive number of seconds, got {jitter}")
+        wall, laser = np.asarray(wall, dtype=np.float64), np.asarray(laser, dtype=np.float64)
+        signal = np.zeros((axis.bins, *wall.shape[:-1]))
+        for position, albedo in zip(self.positions, np.asarray(self.albedo), strict=True):
+            outward = np.linalg.norm(laser - position, axis=-1)
+            back = np.linalg.norm(wall - position, axis=-1)
+            brightness = albedo / (outward * back) ** 2
+            signal += brightness * _gaussian_bins(axis, outward + back, SPEED_OF_LIGHT * jitter)
+        return Capture(np.nan_to_num(signal), wall, laser, axis.bin_width, axis.start)
+
+
+def _gaussian_bins(axis: TimeAxis, path: FloatArray, sigma: float) -> FloatArray:
+    """Share of a unit Gaussian about `path` (...) in every bin, shape (t, ...); bin i is centred on its path."""
+    from scipy.special import ndtr
+
+    edges = axis.start + axis.spacing * (np.arange(axis.bins + 1) - 0.5)
+    below: FloatArray = ndtr((edges.reshape(-1, *[1] * path.ndim) - path) / sigma)
+    return np.diff(below, axis=0)
