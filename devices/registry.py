@@ -25,7 +25,7 @@ OPENERS: dict[str, str] = {
     "sim+linospad2": "devices.linospad2.simulation:open_simulated",
     "sim+remoteex": "devices.remoteex.emulator:open_emulated",
     "sim+spad512": "devices.spad512.emulator:open_emulated",
-    "timetag": "devices.timetag:open_timetag",
+    "timetag": "devices.timetag.source:open_timetag",
     "sim+timetag": "devices.emulation.addresses:open_timetag",
 }
 """Scheme of an address -> function ``(Uri) -> Source``."""
@@ -43,13 +43,13 @@ FILES: dict[str, str] = {
 }
 """Ending of a file's name, lower case -> function ``(Uri) -> Source``, for addresses ``file://PATH``."""
 
-FINDERS: tuple[str, ...] = ("devices.timetag:find_timetaggers",)
+FINDERS: tuple[str, ...] = ("devices.timetag.source:find_timetaggers",)
 """Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail, without hardware."""
 
 CODECS: dict[str, str] = {
     "frames": "devices.frames:FrameCodec",
     "linospad2": "devices.linospad2.codec:LinoSpad2Codec",
-    "timetag": "devices.codecs.timetag:TimeTagCodec",
+    "timetag": "devices.timetag.codec:TimeTagCodec",
 }
 """Name of a codec -> its class; a recording names the codec that its bytes need."""
 

@@ -8,7 +8,7 @@ from devices.emulation.scene_light import PulsedScene
 from devices.emulation.timetag import CLOCK_HZ, EmulatedTimeTagger, Setting
 from devices.emulation.usb import VirtualUsb
 from devices.stream import StreamSource
-from devices.timetag import OPTIONS, opened
+from devices.timetag.source import OPTIONS, opened
 from devices.uri import Uri
 from tofclip.errors import InputError
 
@@ -20,9 +20,9 @@ EMULATOR_OPTIONS = ("seed", "light", "rate", "pace", "records", "packet_bytes", 
 def open_timetag(uri: Uri) -> StreamSource:
     """Open ``sim+timetag://?seed=1``: an emulated time tagger behind the real driver.
 
-    Besides the driver's own (`devices.timetag.OPTIONS`) it takes ``light=poisson|scene`` (`Poisson` on all channels, or
-    a `PulsedScene`), ``rate`` (photons per second of its clock), ``pace=fast|realtime``, ``records`` (then it is
-    dark), ``packet_bytes=510|512``, ``memory_mib`` and ``faults`` (as `Fault.parse` reads them).
+    Besides the driver's own (`devices.timetag.source.OPTIONS`) it takes ``light=poisson|scene`` (`Poisson` on all
+    channels, or a `PulsedScene`), ``rate`` (photons per second of its clock), ``pace=fast|realtime``, ``records`` (then
+    it is dark), ``packet_bytes=510|512``, ``memory_mib`` and ``faults`` (as `Fault.parse` reads them).
     """
     uri.only(*OPTIONS, *EMULATOR_OPTIONS)
     seed = uri.value("seed", int, 0)

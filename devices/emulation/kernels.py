@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from devices.kernels import RECORD_BYTES, TIME_BITS, TIME_MASK, WRAP
+from devices.timetag.kernels import RECORD_BYTES, TIME_BITS, TIME_MASK, WRAP
 
 compiled = njit(nogil=True, cache=True, error_model="numpy")
 

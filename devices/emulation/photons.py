@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 
 from devices.codec import ByteView
-from devices.codecs.timetag import RECORD_BYTES
 from devices.emulation.kernels import poisson_words
+from devices.timetag.codec import RECORD_BYTES
 from tofclip.errors import InputError
 
 CHANNELS = 4

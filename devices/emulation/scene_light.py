@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from devices.codec import ByteView, Records
-from devices.codecs.timetag import RANGE, RECORD, RECORD_BYTES, WRAP
-from devices.kernels import encode_timetags
 from devices.scenes import LineLight
+from devices.timetag.codec import RANGE, RECORD, RECORD_BYTES, WRAP
+from devices.timetag.kernels import encode_timetags
 from tofclip.errors import InputError
 
 SYNC = 1

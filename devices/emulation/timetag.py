@@ -11,11 +11,11 @@ from time import monotonic, sleep
 from usb.core import USBError
 
 from devices.codec import ByteView
-from devices.codecs.timetag import LOST, RECORD_BYTES
 from devices.emulation.faults import Fault
 from devices.emulation.photons import FOREVER, TagStream
 from devices.emulation.usb import PACKET_BYTES, VirtualDevice, usb_error
-from devices.timetag import COMMANDS, DATA, IDENTITY, INSTRUMENT, REPLIES, Capture, Register
+from devices.timetag.codec import LOST, RECORD_BYTES
+from devices.timetag.registers import COMMANDS, DATA, IDENTITY, INSTRUMENT, REPLIES, Capture, Register
 from tofclip.errors import InputError
 
 MAGIC, WRITE = 0xAA, 1
@@ -67,7 +67,7 @@ class Setting:
         Size of a packet. 510, as of the public firmware: each is shorter than the endpoint's 512 and ends a transfer.
         512: transfers are filled.
     memory_bytes : int
-        What fits into the instrument. Far more than into a real one, because here it shares the processor with the host,
+        What fits into the instrument. Far more than into a real one, because it shares the processor with the host,
         which is not always given its turn in time.
     """
 

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from devices.codec import Records
-from devices.codecs.timetag import DELTA
 from devices.histogram.accumulator import NARROWEST, Accumulator, BinAxis
 from devices.histogram.kernels import add_stamps, add_tags, add_times, last_sync
 from devices.linospad2.calibration import CLOCK_PERIOD, BoardCalibration
 from devices.linospad2.codec import PIXELS
+from devices.timetag.codec import DELTA
 from tofclip.errors import InputError, ShapeError
 
 _WORD = np.dtype("<u4")
@@ -86,7 +86,7 @@ class TagHistogram(Accumulator):
         self._known = -1
 
     def add(self, records: Records, after_gap: bool = False) -> None:
-        """Add time tags, an array of `devices.codecs.timetag.RECORD`; `after_gap`: some are missing before them."""
+        """Add time tags, an array of `devices.timetag.codec.RECORD`; `after_gap`: some are missing before them."""
         if after_gap:
             self._known = -1
         known, columns = self._known, [records[name] for name in ("time_ticks", "channels", "flags")]

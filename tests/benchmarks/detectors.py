@@ -19,13 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from devices.codec import Records, as_bytes
-from devices.codecs.timetag import RECORD
 from devices.histogram import BinAxis, StampHistogram, TagHistogram
 from devices.ledger import Ledger
 from devices.linospad2.codec import STAMP, LinoSpad2Codec
 from devices.linospad2.simulation import LASER_PERIOD, uneven_board
 from devices.source import Info
 from devices.stream import Arrival, Buffering, StreamSource
+from devices.timetag.codec import RECORD
 from tofclip.arrays import thread_count
 from tofclip.storage import Record
 

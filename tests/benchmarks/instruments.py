@@ -20,11 +20,11 @@ from typing import Any
 
 import devices
 from devices.codec import as_bytes
-from devices.codecs.timetag import RECORD_BYTES, TimeTagCodec
 from devices.emulation.faults import random_script
 from devices.emulation.photons import FOREVER, Poisson
 from devices.emulation.timetag import CLOCK_HZ
 from devices.recorder import record
+from devices.timetag.codec import RECORD_BYTES, TimeTagCodec
 from devices.trial import try_out
 from tofclip.errors import DeviceDisconnectedError
 

@@ -13,7 +13,7 @@ from devices.emulation.timetag import CLOCK_HZ, EmulatedTimeTagger, Setting, Tru
 from devices.emulation.usb import VirtualUsb
 from devices.source import Batch, Source
 from devices.statistics import Stats
-from devices.timetag import opened
+from devices.timetag.source import opened
 from devices.uri import Uri
 from tofclip.errors import DeviceDisconnectedError, DeviceError, DeviceStalledError, DeviceTimeoutError
 

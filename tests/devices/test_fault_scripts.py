@@ -14,10 +14,10 @@ import pytest
 from fault_scripts import RECORDS, TRANSFERS, Outcome, expected_fault, run
 
 from devices.codec import Records, as_bytes
-from devices.codecs.timetag import RECORD, TimeTagCodec
 from devices.emulation.faults import FOR_GOOD, Fault, random_script
 from devices.emulation.photons import FOREVER, Poisson
 from devices.emulation.timetag import CLOCK_HZ
+from devices.timetag.codec import RECORD, TimeTagCodec
 from tofclip.errors import DeviceDisconnectedError, DeviceStalledError, InputError
 
 SCRIPTS = 300

@@ -7,27 +7,33 @@ sample; ``python tests/devices/test_fuzz.py 200000`` runs as many mutations as i
 from __future__ import annotations
 
 import sys
+import tempfile
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from devices.codec import Codec, as_bytes
-from devices.codecs.timetag import RECORD, TimeTagCodec, mark_wraps
 from devices.frames import FrameCodec
+from devices.ledger import Ledger
 from devices.linospad2.codec import LinoSpad2Codec
+from devices.linospad2.sidecar import read_sidecar
 from devices.recording.blocks import BlockHeader, Kind
 from devices.recording.reader import Block, BlockReader
-from devices.remoteex.client import announced
+from devices.remoteex.client import RemoteEx, announced
 from devices.remoteex.protocol import Answer, Code, Command, whole_number
+from devices.remoteex.source import LiveSettings, RemoteExFeed
 from devices.ring import Gap
 from devices.spad512.protocol import Exposure
+from devices.spad512.source import Spad512Feed
+from devices.timetag.codec import RECORD, TimeTagCodec, mark_wraps
 from devices.uri import Uri
-from tofclip.errors import TofclipError
+from tofclip.errors import DeviceDisconnectedError, DeviceTimeoutError, ProtocolError, TofclipError
 from tofclip.io import hpdta, itex
 
 SUITE_MUTATIONS = 20_000
@@ -114,7 +120,116 @@ def _recording() -> Target:
     return Target(decode, (b"".join(blocks),))
 
 
+class Replayed:
+    """Stands in for a connection: says what it was given, then hangs up."""
+
+    name = "replayed"
+
+    def __init__(self, data: bytes) -> None:
+        self._left = data
+
+    def send(self, data: bytes, timeout: float) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def some(self, limit: int, timeout: float) -> bytes:
+        if not self._left:
+            raise DeviceDisconnectedError("the replay is over")
+        return self._taken(limit)
+
+    def exactly(self, length: int, limit: int, timeout: float) -> bytes:
+        if not 0 <= length <= limit:
+            raise ProtocolError("too much")
+        if length > len(self._left):
+            raise DeviceDisconnectedError("the replay is over")
+        return self._taken(length)
+
+    def until(self, end: bytes, limit: int, timeout: float) -> bytes:
+        found = self._left.find(end)
+        if found < 0:
+            raise DeviceDisconnectedError("the replay is over")
+        message = self._taken(found)
+        self._taken(len(end))
+        return message
+
+    def _taken(self, length: int) -> bytes:
+        taken, self._left = self._left[:length], self._left[length:]
+        return taken
+
+
+def _remoteex_session() -> Target:
+    """A whole conversation: greetings, the start, messages, pictures, a table; then the end, whatever comes."""
+    picture = np.arange(24, dtype="<u2").tobytes()
+    said = (
+        b"RemoteEx Ready\r0,AcqLiveMonitor\r4,LiveMonitor,RingBuffer,0,1\r0,AcqStart\r"
+        b"0,ImgRingBufferGet,6,4,2,0,0,1\r0,DevParamGet,20 ns\r0,DevParamGet,Operate\r0,DevParamGet,30\r"
+        b"0,ImgDataGet,4,1\r4,LiveMonitor,RingBuffer,1,9\r0,ImgRingBufferGet,6,4,2,0,1,9\r0,DevParamSet\r0,AcqStop\r"
+        b"0,AcqLiveMonitor\r"
+    )
+    data = b"RemoteEx Data Ready\r" + picture + np.arange(4, dtype="<f4").tobytes() + picture
+    border = b"<border>"
+
+    def decode(both: bytes) -> None:
+        links = [Replayed(part) for part in both.partition(border)[::2]]
+        with mock.patch("devices.remoteex.client.TcpLink", side_effect=lambda *_: links.pop(0)):
+            feed = RemoteExFeed(lambda: RemoteEx("replayed", 1, 2, 0.01), Ledger(), LiveSettings(reconnect=0))
+            assert feed.calibration is None or feed.info.instrument
+        with mock.patch.object(feed, "_reconnect", side_effect=DeviceDisconnectedError("it stays away")):
+            try:
+                for _ in range(2):
+                    feed.pull(0.01)
+            finally:
+                feed.close()
+
+    return Target(decode, (said + border + data,))
+
+
+def _spad512_session() -> Target:
+    """Greeting, two requests of two pictures, the end."""
+    exposure = Exposure(8, 1e-3, 2, 4)
+    pictures = bytes(range(256)) * (exposure.codec.pixel_bytes * 2 // 256)
+
+    def decode(data: bytes) -> None:
+        texts = [b"hello", b"", b"off", b""]
+
+        class Server(Replayed):
+            def some(self, limit: int, timeout: float) -> bytes:
+                text = texts.pop(0) if texts else super().some(limit, timeout)
+                if not text:
+                    raise DeviceTimeoutError("it is quiet")
+                return text
+
+        with mock.patch("devices.spad512.source._QUIET", 0):
+            feed = Spad512Feed(lambda: Server(data), Ledger(), exposure, 0.0, 0.0)  # type: ignore[arg-type,return-value]
+        with mock.patch.object(feed, "_reconnect", side_effect=DeviceDisconnectedError("it stays away")):
+            try:
+                for _ in range(4):
+                    feed.pull(0.0)
+            finally:
+                feed.close()
+
+    return Target(decode, ((pictures + b"DONE") * 2,))
+
+
+def _sidecar() -> Target:
+    folder = tempfile.TemporaryDirectory()
+    path = Path(folder.name, "run.toml")
+
+    def decode(data: bytes) -> None:
+        assert folder.name  # it lives as long as this function
+        path.write_bytes(data)
+        read_sidecar(path.with_suffix(".dat"))
+
+    seed = b'firmware = "2212b"\ntimestamps_per_cycle = 512\nabsolute_counter = false\nlaser_period_ps = 25e3\n'
+    return Target(decode, (seed,))
+
+
 TARGETS = {
+    "RemoteEx sessions": _remoteex_session(),
+    "SPAD512 sessions": _spad512_session(),
+    "LinoSPAD2 sidecars": _sidecar(),
     "blocks of recordings": _recording(),
     "time tags": _time_tags(),
     "LinoSPAD2": _line_sensor(counter=False),

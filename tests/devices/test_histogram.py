@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from numpy.typing import NDArray
 
-from devices.codecs.timetag import DELTA, RECORD
 from devices.histogram import Accumulator, BinAxis, StampHistogram, TagHistogram, TimeHistogram
 from devices.linospad2.calibration import CLOCK_PERIOD, CODES, BoardCalibration
 from devices.linospad2.codec import STAMP, STAMP_WITH_COUNTER
+from devices.timetag.codec import DELTA, RECORD
 from tofclip.arrays import THREADS_VARIABLE
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError

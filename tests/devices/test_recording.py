@@ -17,7 +17,6 @@ from hypothesis import given, settings
 
 import devices
 from devices.codec import Records, as_bytes
-from devices.codecs.timetag import RECORD, TimeTagCodec
 from devices.decoded import DecodedSource
 from devices.emulation.faults import random_script
 from devices.recorder import record
@@ -31,6 +30,7 @@ from devices.replay import ReplaySource
 from devices.ring import Gap, Piece
 from devices.source import Batch, Info, Source
 from devices.statistics import Stats
+from devices.timetag.codec import RECORD, TimeTagCodec
 from tofclip.errors import DeviceDisconnectedError, DeviceTimeoutError, FileFormatError, InputError, StorageError
 from tofclip.storage import Field, Record
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from devices.codec import Records, as_bytes
-from devices.codecs.timetag import RANGE, WRAP, TimeTagCodec
 from devices.emulation.photons import FOREVER
 from devices.emulation.scene_light import BLOCK_TICKS, ENLARGEMENT, PERIOD_TICKS, SYNC, PulsedScene
 from devices.emulation.timetag import CLOCK_HZ
 from devices.scenes import LineLight, line_light
+from devices.timetag.codec import RANGE, WRAP, TimeTagCodec
 from devices.transients import read_transient
 from tofclip.errors import InputError
 

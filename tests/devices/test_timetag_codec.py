@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 
 from devices.codec import Records, as_bytes
-from devices.codecs.timetag import DELTA, LOST, RANGE, RECORD, WRAP, TimeTagCodec, mark_wraps
+from devices.timetag.codec import DELTA, LOST, RANGE, RECORD, WRAP, TimeTagCodec, mark_wraps
 from tofclip.errors import InputError
 
 CODEC = TimeTagCodec()

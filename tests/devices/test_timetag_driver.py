@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import errno
 import time
 
 import numpy as np
@@ -10,12 +11,16 @@ import pytest
 
 import devices
 from devices.codec import as_bytes
-from devices.codecs.timetag import RANGE, WRAP, TimeTagCodec
+from devices.emulation.faults import Fault
 from devices.emulation.photons import FOREVER, Poisson
 from devices.emulation.timetag import CLOCK_HZ, EmulatedTimeTagger, Setting
-from devices.emulation.usb import VirtualUsb
+from devices.emulation.usb import VirtualUsb, usb_error
+from devices.ledger import Ledger
 from devices.source import Source
-from devices.timetag import COMMANDS, IDENTITY, REPLIES, Capture, Register, TimeTagger, opened
+from devices.timetag.codec import RANGE, WRAP, TimeTagCodec
+from devices.timetag.feed import Acquisition, TimeTaggerFeed
+from devices.timetag.registers import COMMANDS, IDENTITY, REPLIES, Capture, Register, TimeTagger
+from devices.timetag.source import opened
 from devices.uri import Uri
 from devices.usb import UsbLink
 from tofclip.errors import BufferOverflowError, DeviceStalledError, DeviceTimeoutError, InputError, ProtocolError
@@ -208,6 +213,53 @@ def test_odd_answers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(EmulatedTimeTagger, "_reply", lambda *_: 4)
     with pytest.raises(ProtocolError, match="0 Hz"):
         opened(Uri.parse("timetag://"), "", bus)
+
+
+@pytest.mark.parametrize("fault", [Fault(1, "unplug", 2), Fault(1, "powerloss", 2), Fault(1, "overflow")])
+def test_one_that_was_stopped_stays_so_whatever_happens(fault: Fault) -> None:
+    light = Poisson(RATE, CLOCK_HZ, 1)
+    link = UsbLink(IDENTITY, "", VirtualUsb(EmulatedTimeTagger(light, "T1", Setting(packet_bytes=510), [fault])))
+    feed = TimeTaggerFeed(link, Ledger(), Acquisition(transfer_bytes=1024))
+    feed.start()
+    assert feed.pull(0.1) is not None
+    feed.stop()
+    with pytest.raises(DeviceTimeoutError):
+        feed.pull(0.5)
+    assert not TimeTagger(link).read(Register.CAPTURE) & Capture.REGISTER
+
+
+def test_closing_does_not_wait_for_one_that_is_gone() -> None:
+    instrument, bus = tagger()
+    source = opened(Uri.parse("timetag://?transfer_kib=0.5&reconnect_s=600"), "", bus)
+    source.read()
+    instrument.unplug(float("inf"))
+    begin = time.monotonic()
+    source.close()
+    assert time.monotonic() - begin < 5
+    assert source.stats.is_balanced
+
+
+def test_a_loose_plug_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It goes again while it is being set up after it came back."""
+    instrument, bus = tagger()
+    with opened(Uri.parse("timetag://?transfer_kib=0.5&reconnect_s=10"), "", bus) as source:
+        source.read()
+        answer, left = instrument.receive, [3]
+
+        def receive(endpoint: int, data: bytes) -> None:
+            if left[0]:
+                left[0] -= 1
+                instrument.unplug(1)
+                raise usb_error(errno.ENODEV)
+            answer(endpoint, data)
+
+        monkeypatch.setattr(instrument, "receive", receive)
+        instrument.unplug(1)
+        while not (batch := source.read()).after_gap:  # type: ignore[union-attr]
+            pass
+        assert batch is not None
+        assert source.stats.reconnects == 1
+        assert left == [0]
 
 
 def test_a_defect_in_the_thread_reaches_the_reader(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,9 +11,10 @@ import pytest
 import usb.backend.libusb1
 import usb.core
 
-from devices import timetag
 from devices.emulation.usb import VirtualDevice, VirtualUsb, usb_error
-from devices.timetag import BARE_CHIP, find_timetaggers, open_timetag
+from devices.timetag import source as timetag
+from devices.timetag.registers import BARE_CHIP
+from devices.timetag.source import find_timetaggers, open_timetag
 from devices.uri import Uri
 from devices.usb import UsbIdentity, UsbLink, system_backend, translated
 from tofclip.errors import (

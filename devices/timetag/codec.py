@@ -21,7 +21,16 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from devices.codec import ByteView, Decoded, Records, as_bytes
-from devices.kernels import DELTA, LOST, RECORD_BYTES, TIME_BITS, TIME_MASK, WRAP, decode_timetags, encode_timetags
+from devices.timetag.kernels import (
+    DELTA,
+    LOST,
+    RECORD_BYTES,
+    TIME_BITS,
+    TIME_MASK,
+    WRAP,
+    decode_timetags,
+    encode_timetags,
+)
 from tofclip.errors import InputError
 from tofclip.storage import Scalar
 
