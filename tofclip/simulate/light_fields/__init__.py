@@ -1,0 +1,24 @@
+"""Light fields of scenes with a known answer: solid bodies in 3D, ray-cast for each view, with their exact shears."""
+
+from tofclip.simulate.light_fields.array import CameraArray
+from tofclip.simulate.light_fields.bodies import Body, Box, Rectangle, Sphere
+from tofclip.simulate.light_fields.materials import Lambertian, Specular
+from tofclip.simulate.light_fields.render import RenderedLightField, Scene, render, render_view, shear_map
+from tofclip.simulate.light_fields.scenes import SCENES, known_scene
+
+__all__ = [
+    "SCENES",
+    "Body",
+    "Box",
+    "CameraArray",
+    "Lambertian",
+    "Rectangle",
+    "RenderedLightField",
+    "Scene",
+    "Specular",
+    "Sphere",
+    "known_scene",
+    "render",
+    "render_view",
+    "shear_map",
+]

@@ -1,0 +1,192 @@
+"""Bodies: a shape in its own coordinates, where it stands, and what it is made of."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.simulate.light_fields.materials import Material
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Where rays meet a shape.
+
+    Parameters
+    ----------
+    distance : (rays,) array
+        In lengths of the ray's direction; infinite where it misses.
+    normal : (rays, 3) array
+        Of length 1, towards the ray's origin.
+    place : (rays, 2) array
+        On the pattern, from 0 to 1, right and down; meaningless where the ray misses.
+    """
+
+    distance: Array
+    normal: Array
+    place: Array
+
+
+class Shape(ABC):
+    """A surface around the origin; x right, y down, z away from the reader."""
+
+    @abstractmethod
+    def hits(self, origin: Array, directions: Array) -> Hits:
+        """Return where rays from (3,) `origin` along (rays, 3) `directions` first meet the surface."""
+
+    @property
+    @abstractmethod
+    def half(self) -> Array:
+        """Half of the width, height and thickness of an upright box that holds the shape, m."""
+
+
+@dataclass(frozen=True)
+class Rectangle(Shape):
+    """A flat plate in the plane z = 0.
+
+    Parameters
+    ----------
+    width, height : float
+        Metres.
+    """
+
+    width: float
+    height: float
+
+    @property
+    def half(self) -> Array:
+        """Half of width, height and thickness, m."""
+        return np.array([self.width, self.height, 0.0]) / 2
+
+    def hits(self, origin: Array, directions: Array) -> Hits:
+        """Return where rays meet the plate, from either side."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = -origin[2] / directions[:, 2]
+            place = (origin[:2] + distance[:, np.newaxis] * directions[:, :2]) / (self.width, self.height) + 0.5
+            right, down = place.T
+            met = (distance > 0) & (right >= 0) & (right < 1) & (down >= 0) & (down < 1)
+        normal = np.zeros_like(directions)
+        normal[:, 2] = -np.sign(directions[:, 2])
+        return Hits(np.where(met, distance, np.inf), normal, place)
+
+
+@dataclass(frozen=True)
+class Sphere(Shape):
+    """A ball; its pattern runs around once, the middle facing the reader.
+
+    Parameters
+    ----------
+    radius : float
+        Metres.
+    """
+
+    radius: float
+
+    @property
+    def half(self) -> Array:
+        """The radius three times, m."""
+        return np.full(3, self.radius)
+
+    def hits(self, origin: Array, directions: Array) -> Hits:
+        """Return where rays from outside meet the ball."""
+        along, square = directions @ origin, np.einsum("ij,ij->i", directions, directions)
+        below_root = along**2 - square * (origin @ origin - self.radius**2)
+        distance = (-along - np.sqrt(np.maximum(below_root, 0))) / square
+        normal = (origin + distance[:, np.newaxis] * directions) / self.radius
+        around = np.arctan2(normal[:, 0], -normal[:, 2]) / (2 * np.pi) + 0.5
+        down = np.arcsin(np.clip(normal[:, 1], -1, 1)) / np.pi + 0.5
+        met = (below_root > 0) & (distance > 0)
+        return Hits(np.where(met, distance, np.inf), normal, np.stack([around, down], axis=-1))
+
+
+@dataclass(frozen=True)
+class Box(Shape):
+    """A block with the whole pattern on each face.
+
+    Parameters
+    ----------
+    width, height, thickness : float
+        Along x, y and z, metres.
+    """
+
+    width: float
+    height: float
+    thickness: float
+
+    @property
+    def half(self) -> Array:
+        """Half of width, height and thickness, m."""
+        return np.array([self.width, self.height, self.thickness]) / 2
+
+    def hits(self, origin: Array, directions: Array) -> Hits:
+        """Return where rays from outside meet the block."""
+        half = self.half
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slabs = np.sort(np.stack([(-half - origin) / directions, (half - origin) / directions]), axis=0)
+        axis, distance = slabs[0].argmax(axis=1), slabs[0].max(axis=1)
+        met = (distance > 0) & (distance <= slabs[1].min(axis=1))
+        met_at = np.where(met, distance, 0.0)
+        places = (origin + met_at[:, np.newaxis] * directions) / (2 * half) + 0.5
+        normal = np.eye(3)[axis] * -np.sign(directions)
+        shown = np.array([[2, 1], [0, 2], [0, 1]])[axis]  # the face's own two coordinates
+        place = np.clip(np.take_along_axis(places, shown, axis=1), 0, 1 - 1e-9)
+        return Hits(np.where(met, distance, np.inf), normal, place)
+
+
+@dataclass(frozen=True)
+class Body:
+    """A shape that stands somewhere.
+
+    Parameters
+    ----------
+    shape : Shape
+    material : Material
+    centre : (3,) array
+        Metres.
+    axes : (3, 3) array
+        Columns: where the shape's own x, y and z point; orthonormal, mirrored for a flipped body.
+    """
+
+    shape: Shape
+    material: Material
+    centre: Array
+    axes: Array = field(default_factory=lambda: np.eye(3))
+
+    def hits(self, origin: Array, directions: Array) -> Hits:
+        """Return where rays meet the body; holes of its pattern let them pass."""
+        found = self.shape.hits((origin - self.centre) @ self.axes, directions @ self.axes)
+        solid = self.material.solid(found.place)
+        return Hits(np.where(solid, found.distance, np.inf), found.normal @ self.axes.T, found.place)
+
+    def candidates(self, origin: Array, directions: Array) -> Array:
+        """Return the numbers of those rays, all forward, that may meet the body; most of a picture's do not."""
+        (x, y, z), (width, height, thickness) = self.centre - origin, np.abs(self.axes) @ self.shape.half
+        if z <= thickness:
+            return np.arange(len(directions))
+        beside, below = ((side + thickness * abs(off) / z) / (z - thickness) for side, off in ((width, x), (height, y)))
+        slopes = directions[:, :2] / directions[:, 2:]
+        return np.flatnonzero((abs(slopes[:, 0] - x / z) <= beside) & (abs(slopes[:, 1] - y / z) <= below))
+
+    def shifted(self, x: float, y: float, z: float = 0.0) -> Body:
+        """Return the body moved by metres."""
+        return replace(self, centre=self.centre + np.array([x, y, z]))
+
+    def flipped(self) -> Body:
+        """Return the body mirrored left to right in its own middle."""
+        return replace(self, axes=np.diag([-1.0, 1.0, 1.0]) @ self.axes)
+
+    def turned(self, angle: float) -> Body:
+        """Return the body turned clockwise, as seen, about its middle and the line of sight; `angle` in rad."""
+        cosine, sine = np.cos(angle), np.sin(angle)
+        return replace(self, axes=np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]) @ self.axes)
+
+    def tilted(self, angle: float) -> Body:
+        """Return the body turned about the upright line through its middle, its right side away; `angle` in rad."""
+        cosine, sine = np.cos(angle), np.sin(angle)
+        return replace(self, axes=np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]) @ self.axes)
