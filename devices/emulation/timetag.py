@@ -24,10 +24,10 @@ CLOCK_HZ = 128_000_000
 VERSION = 1
 SHORT_PACKET_BYTES = 510
 UNUSED_BITS = 0x1F
-MOST_AT_ONCE = 1 << 17
+MOST_AT_ONCE = 1 << 14
 DARK = 5e-3
 """Seconds after which an instrument whose time is not the clock's says that nothing comes."""
-NAP = 1e-3
+NAP = 4e-3
 
 
 @dataclass
@@ -174,7 +174,10 @@ class EmulatedTimeTagger(VirtualDevice):
         if not self.setting.is_paced or Capture.REGISTER not in self._capture:
             return
         tick = int((monotonic() - self._started) * CLOCK_HZ)
-        while len(words := self._seen(MOST_AT_ONCE, tick)):
+        found = MOST_AT_ONCE
+        while found == MOST_AT_ONCE:
+            words = self._seen(MOST_AT_ONCE, tick)
+            found = len(words) // RECORD_BYTES
             room = max(0, self.setting.memory_bytes - len(self._memory)) // RECORD_BYTES * RECORD_BYTES
             self._keep(words[:room])
             self._lose(words[room:])
