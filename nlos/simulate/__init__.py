@@ -1,6 +1,23 @@
-"""Captures of known hidden scenes: the truth that reconstructions are compared with."""
+"""Captures of known hidden scenes: the truth that reconstructions are compared with.
 
+`PointScene` is the plainest and exact to float64; `HiddenScene` has letters and triangle meshes that hide one another.
+"""
+
+from nlos.simulate.materials import Lambert, Material, Retroreflector
+from nlos.simulate.noise import counted
 from nlos.simulate.points import PointScene
+from nlos.simulate.scene import HiddenScene
+from nlos.simulate.surfaces import Surface
 from nlos.simulate.walls import WALLS, relay_wall
 
-__all__ = ["WALLS", "PointScene", "relay_wall"]
+__all__ = [
+    "WALLS",
+    "HiddenScene",
+    "Lambert",
+    "Material",
+    "PointScene",
+    "Retroreflector",
+    "Surface",
+    "counted",
+    "relay_wall",
+]

@@ -1,0 +1,121 @@
+"""Compiled inner loops of the simulation: what hides what, and light into time bins."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from nlos.kernels import compiled
+
+TOUCHING = 1e-4
+"""Share of a way at either end where a triangle hides nothing: the facet's own triangle begins there."""
+
+
+@compiled
+def is_hidden(start, end, triangles):
+    """Whether a triangle crosses the way between two points (T. Moller, B. Trumbore, J. Graph. Tools 2, 21 (1997))."""
+    dx, dy, dz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
+    for i in range(triangles.shape[0]):
+        ax, ay, az = triangles[i, 0, 0], triangles[i, 0, 1], triangles[i, 0, 2]
+        ux, uy, uz = triangles[i, 1, 0] - ax, triangles[i, 1, 1] - ay, triangles[i, 1, 2] - az
+        vx, vy, vz = triangles[i, 2, 0] - ax, triangles[i, 2, 1] - ay, triangles[i, 2, 2] - az
+        px, py, pz = dy * vz - dz * vy, dz * vx - dx * vz, dx * vy - dy * vx
+        determinant = ux * px + uy * py + uz * pz
+        if determinant == 0:
+            continue
+        sx, sy, sz = start[0] - ax, start[1] - ay, start[2] - az
+        u = (sx * px + sy * py + sz * pz) / determinant
+        if u < 0 or u > 1:
+            continue
+        qx, qy, qz = sy * uz - sz * uy, sz * ux - sx * uz, sx * uy - sy * ux
+        v = (dx * qx + dy * qy + dz * qz) / determinant
+        if v < 0 or u + v > 1:
+            continue
+        along = (vx * qx + vy * qy + vz * qz) / determinant
+        if TOUCHING < along < 1 - TOUCHING:
+            return True
+    return False
+
+
+@compiled
+def cosine(normal, from_point, to_point, distance):
+    """Cosine of the angle between a normal and a way, 0 behind the surface."""
+    inner = 0.0
+    for i in range(3):
+        inner += normal[i] * (to_point[i] - from_point[i])
+    return max(inner / distance, 0.0)
+
+
+@compiled
+def expose(
+    wall, wall_normals, lasers, laser_normals, positions, normals, areas, material, triangles, start, fine, bins
+):
+    """Add the light of all facets to fine bins, shared between the two that it falls between.
+
+    Parameters
+    ----------
+    wall, wall_normals : (points, 3) float64 array
+    lasers, laser_normals : (1 or points, 3) float64 array
+    positions, normals : (facets, 3) float64 array
+    areas : (facets,) float64 array
+    material : (3,) float64 array
+        Diffuse share, retroreflected share, and spread of the latter.
+    triangles : (m, 3, 3) float64 array
+        What hides.
+    start, fine : float
+        Path of the middle of the first bin and path per bin, m.
+    bins : (points, fine bins) float64 array
+        Added to.
+    """
+    outward = np.empty(positions.shape[0])
+    lit = np.empty(positions.shape[0])
+    for p in range(wall.shape[0]):
+        if p < lasers.shape[0]:
+            for f in range(positions.shape[0]):
+                way = distance_of(lasers[p], positions[f])
+                outward[f] = way
+                arriving = cosine(normals[f], positions[f], lasers[p], way) * cosine(
+                    laser_normals[p], lasers[p], positions[f], way
+                )
+                if arriving > 0 and is_hidden(positions[f], lasers[p], triangles):
+                    arriving = 0.0
+                lit[f] = arriving * areas[f] / (way * way)
+        laser = lasers[min(p, lasers.shape[0] - 1)]
+        for f in range(positions.shape[0]):
+            if lit[f] <= 0:
+                continue
+            way = distance_of(wall[p], positions[f])
+            leaving = cosine(normals[f], positions[f], wall[p], way) * cosine(
+                wall_normals[p], wall[p], positions[f], way
+            )
+            place = (outward[f] + way - start) / fine
+            if leaving <= 0 or place < 0 or place >= bins.shape[1] - 1 or is_hidden(positions[f], wall[p], triangles):
+                continue
+            brightness = (
+                lit[f] * leaving * reflectance(material, positions[f], laser, wall[p], outward[f], way) / (way * way)
+            )
+            index = int(place)
+            share = place - index
+            bins[p, index] += brightness * (1 - share)
+            bins[p, index + 1] += brightness * share
+
+
+@compiled
+def distance_of(one, other):
+    """Distance of two points."""
+    return math.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)
+
+
+@compiled
+def reflectance(material, position, laser, observer, to_laser, to_observer):
+    """Reflectance per steradian; see `nlos.simulate.materials.Material`."""
+    value = material[0] / math.pi
+    if material[1] > 0:
+        inner = 0.0
+        for i in range(3):
+            inner += (laser[i] - position[i]) * (observer[i] - position[i])
+        angle = math.acos(min(max(inner / (to_laser * to_observer), -1.0), 1.0))
+        width = material[2]
+        value += material[1] * math.exp(-0.5 * (angle / width) ** 2) / (2 * math.pi * width * width)
+    return value
