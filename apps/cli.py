@@ -43,6 +43,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   recover            streak image to one picture per instant
   cloud              recovered frames to a point cloud
   lidar accuracy     how well counted photons tell a range, beside the theoretical limit
+  lidar parallax     a shot to how the views move with range, for recover --focus depth-locked
   nlos reconstruct   recovered frames of a wall to the scene hidden around the corner
   clip               light fields from few readings: simulate a camera, recover a picture
   devices            instruments and their recordings: list, info, test, verify, repair

@@ -24,8 +24,8 @@ def shot() -> SimulatedShot:
 
 @pytest.fixture(scope="module")
 def uncalibrated(shot) -> Camera:
-    """The camera as focus pictures would give it: no sweep, no gains."""
-    return shot.camera.replace(sweep=None, gains=np.ones(7))
+    """The camera as focus pictures would give it: no sweep, no gains, no parallax."""
+    return shot.camera.replace(sweep=None, gains=np.ones(7), lenslet_pitch=0.0)
 
 
 @pytest.fixture(scope="module")

@@ -1,20 +1,21 @@
-"""`tofclip lidar accuracy`: how close ranges from counted photons come to the Cramer-Rao bound."""
+"""`tofclip lidar`: how well counted photons tell a range, and how far a shot says that the views move with range."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from apps.options import AsJson
-from tofclip.units import PICOSECOND
+from apps.options import AsJson, TimeZero
+from tofclip.units import NANOSECOND, PICOSECOND
 
 app = typer.Typer()
 
 
 @app.callback(invoke_without_command=True)
 def _without_verb(context: typer.Context) -> None:
-    """Range from counted photons, and how well it can be known."""
+    """How well a range can be known, and how the views' parallax grows with it."""
     if context.invoked_subcommand is None:
         print(context.get_help())
 
@@ -48,3 +49,45 @@ def accuracy(
     pulse = Pulse.gaussian(width) if decay_ps is None else Pulse.exponentially_modified(width, decay_ps * PICOSECOND)
     detector = PhotonDetector(pulse, bin_width_ps * PICOSECOND, bins, false_alarm_rate)
     report(asdict(measure_accuracy(detector, photons, background, trials, seed)), as_json)
+
+
+@app.command()
+def parallax(
+    streak: Annotated[Path, typer.Argument(metavar="STREAK", help="A shot of a scene at several ranges.")],
+    out: Annotated[Path, typer.Option(metavar="H5", help="The camera to write, for recover --focus depth-locked.")],
+    camera: Annotated[
+        Path | None, typer.Option(metavar="H5", help="Made by calibrate.", show_default="the one inside STREAK")
+    ] = None,
+    time_zero_ns: TimeZero = None,
+    gates: Annotated[int, typer.Option(metavar="N", help="Time gates, of equal brightness.")] = 8,
+    shears: Annotated[
+        tuple[float, float, int], typer.Option(metavar="S0 S1 N", help="Shears tried, pixels per view step.")
+    ] = (-3.0, 3.0, 13),
+    as_json: AsJson = False,
+) -> None:
+    """Find lenslet pitch and focus distance from a shot: at which shear the views agree, gate by gate."""
+    from apps.files import RECORD_SUFFIXES, require_writable
+    from apps.progress import progress
+    from apps.report import report
+    from tofclip.calibration.parallax import LOOK
+    from tofclip.camera import Camera
+    from tofclip.io import read_streak
+    from tofclip.reconstruct import parallax_from_shot, prepare
+
+    require_writable(out, *RECORD_SUFFIXES, inputs=(streak,) if camera is None else (streak, camera))
+    task = prepare(read_streak(streak), None if camera is None else Camera.load(camera))
+    known = task.camera if time_zero_ns is None else task.camera.replace(time_zero=time_zero_ns * NANOSECOND)
+    rows = task.streak.counts.shape[0]
+    with progress("focusing", task.work - task.method.work(rows) + shears[2] * LOOK.work(rows)) as advance:
+        found = parallax_from_shot(task.streak, known, gates, shears, advance)
+    found.camera.save(out)
+    figures = {
+        "strength_px_m": found.parallax.strength,
+        "lenslet_pitch_m": found.camera.lenslet_pitch,
+        "focus_distance_m": found.camera.focus_distance,
+        "misfit_px": found.parallax.misfit_px,
+        "range_m": found.distances,
+        "shear_px": found.curve.shears,
+        "weight": found.curve.weight,
+    }
+    report(figures, as_json, [out])

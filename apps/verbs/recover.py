@@ -38,6 +38,14 @@ def recover(
     iterations: Annotated[
         int | None, typer.Option(metavar="N", help="At most so many, for tv and l1.", show_default="the method's")
     ] = None,
+    focus: Annotated[
+        str,
+        typer.Option(
+            metavar="SHEAR",
+            help="depth-locked: each frame at the shear of its range; fixed:S: all at S pixels per view step; "
+            "stack:S0:S1:N: each gate at the best of N.",
+        ),
+    ] = "fixed:0",
     cloud: Annotated[
         Path | None, typer.Option(metavar="PLY", help="A point cloud to write as well.", show_default="none")
     ] = None,
@@ -54,7 +62,7 @@ def recover(
     from apps.progress import progress
     from apps.verbs.cloud import FORMATS as CLOUD_SUFFIXES
     from apps.verbs.cloud import save_cloud
-    from tofclip.reconstruct import method_named
+    from tofclip.reconstruct import focus_named, method_named
 
     inputs = tuple(Path(name) for name in (streak, camera) if name is not None and not _is_address(name))
     preview = preview or out.with_suffix(".png")
@@ -63,7 +71,9 @@ def recover(
     if cloud is not None:
         require_writable(cloud, *CLOUD_SUFFIXES, inputs=inputs)
     chosen = method_named(method) if iterations is None else method_named(method, iterations=iterations)
-    task = _prepared(streak, camera, bin_width_ps, time_zero_ns, chosen)
+    sharp = focus_named(focus)
+    task = replace(_prepared(streak, camera, bin_width_ps, time_zero_ns, chosen), focus=sharp)
+    sharp.require(task.camera)
     with progress("recovering", task.work) as advance:
         frames = _with_history(task.run(advance), task, inputs)
     frames.save(out)
@@ -107,7 +117,12 @@ def _shot(streak: str, bin_width: float | None) -> Streak:
 def _with_history(frames: Frames, task: Task, inputs: tuple[Path, ...]) -> Frames:
     from apps.files import history
 
-    settings = {"verb": "recover", "method": repr(task.method), "time_zero_s": task.camera.time_zero}
+    settings = {
+        "verb": "recover",
+        "method": repr(task.method),
+        "focus": str(task.focus),
+        "time_zero_s": task.camera.time_zero,
+    }
     return replace(frames, provenance=history(settings, *inputs, earlier=frames.provenance))
 
 

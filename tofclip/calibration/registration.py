@@ -102,7 +102,8 @@ def _improved(
     offset, stretch, gain, centre = RELAXATION * corrections.T
     reference = int(np.argmin(np.abs(camera.view_positions)))
     gains = np.maximum(camera.gains * (1 + gain), 0.05)
-    centres = camera.centres_px + centre
+    # Where the parallax was measured so were the centres; a scene at several ranges would only pull them about.
+    centres = camera.centres_px + centre * (camera.lenslet_pitch == 0)
     improved = SkewSweep(
         centres,
         sweep.offsets_bin + offset - offset[reference],

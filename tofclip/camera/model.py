@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tofclip.camera.sweep import FloatArray, Sweep, sweep_from_record
 from tofclip.errors import CalibrationError
@@ -52,6 +52,10 @@ class Camera:
         Full width at half maximum of the instrument's response to a short pulse, s.
     focal_length_px : float
         Distance from the lenslet to the picture in image pixels, which turns pixels into directions.
+    lenslet_pitch : float
+        Distance between the viewpoints of neighbouring view steps, m; 0 where the parallax is not known or none.
+    focus_distance : float
+        Depth at which the views coincide (shear 0), m; may be infinite.
     centre_uncertainty_px, angle_uncertainty : (views,) array, optional
         One standard deviation of the calibration.
 
@@ -72,6 +76,8 @@ class Camera:
     time_zero: float = 0.0
     pulse_fwhm: float = 60e-12
     focal_length_px: float = DEFAULT_FOCAL_LENGTH_PX
+    lenslet_pitch: float = 0.0
+    focus_distance: float = np.inf
     centre_uncertainty_px: FloatArray = field(default_factory=lambda: np.empty(0))
     angle_uncertainty: FloatArray = field(default_factory=lambda: np.empty(0))
 
@@ -125,6 +131,8 @@ class Camera:
             raise CalibrationError("line angles must lie within 90 degrees of the vertical")
         if not (self.pulse_fwhm > 0 and self.focal_length_px > 0 and np.isfinite(self.time_zero)):
             raise CalibrationError("pulse width and focal length must be positive, time zero finite")
+        if not (np.isfinite(self.lenslet_pitch) and self.lenslet_pitch >= 0 and self.focus_distance > 0):
+            raise CalibrationError("the lenslet pitch must not be negative, the focus distance must be positive")
 
     @property
     def views(self) -> int:
@@ -157,6 +165,35 @@ class Camera:
             dtype,
         )
 
+    def shear_at(self, distance: ArrayLike) -> FloatArray:
+        """Shear of a surface at `distance`, m: ``s(d) = -f * pitch * (1/d - 1/focus_distance)``.
+
+        The distance is the depth z. A range along the line of sight does in its place as long as the field of view is
+        narrow: at an angle a from the axis it is longer by 1/cos(a), 2 % at 11 degrees.
+
+        Returns
+        -------
+        float64 array, as `distance`
+            Pixels per view step; negative nearer than the focus; 0 everywhere where no lenslet pitch is known.
+        """
+        nearness = 1 / np.asarray(distance, dtype=np.float64) - 1 / self.focus_distance
+        shear: FloatArray = -self.focal_length_px * self.lenslet_pitch * nearness
+        return shear
+
+    @property
+    def displacement_per_shear(self) -> tuple[float, float]:
+        """(rows, columns) by which a picture moves if it is recovered at a shear of one too little.
+
+        Parallax adds ``s * u_k`` to a view's slit position, ``X - Y * tan(angle_k)``. The part of u_k that is a
+        constant plus a multiple of tan(angle_k) is a translation of the picture, found here by least squares; only the
+        rest defocuses. Where tan(angle) grows evenly along the views (the depth-of-field arrangement) hardly any does.
+        """
+        if self.views == 1:
+            return 0.0, float(self.view_positions[0])
+        design = np.stack([-np.tan(self.angles), np.ones(self.views)], axis=1)
+        rows, columns = np.linalg.lstsq(design, self.view_positions, rcond=None)[0]
+        return float(rows), float(columns)
+
     def replace(self, **changes: Any) -> Camera:
         """Return a copy with some entries changed, validated afresh."""
         return replace(self, **changes)
@@ -179,6 +216,8 @@ class Camera:
             "time_zero_s": self.time_zero,
             "pulse_fwhm_s": self.pulse_fwhm,
             "focal_length_px": self.focal_length_px,
+            "lenslet_pitch_m": self.lenslet_pitch,
+            "focus_distance_m": self.focus_distance,
         }
         children = {} if self.sweep is None else {"sweep": self.sweep.to_record()}
         return Record("camera", fields, attributes, children)
@@ -199,6 +238,8 @@ class Camera:
             time_zero=float(record.attribute("time_zero_s")),
             pulse_fwhm=float(record.attribute("pulse_fwhm_s")),
             focal_length_px=float(record.attribute("focal_length_px")),
+            lenslet_pitch=float(record.attribute("lenslet_pitch_m", 0.0)),
+            focus_distance=float(record.attribute("focus_distance_m", np.inf)),
             centre_uncertainty_px=record.array("centre_uncertainty", np.float64, 1, "px"),
             angle_uncertainty=record.array("angle_uncertainty", np.float64, 1, "rad"),
         )

@@ -149,12 +149,15 @@ class PointCloud:
 def point_cloud(returns: Returns) -> PointCloud:
     """Place every return in space: its range along the direction in which its pixel looks.
 
+    Heights that parallax displaced, because the picture was recovered at another shear than that of its range, are put
+    right where the camera knows its lenslet pitch.
+
     Parameters
     ----------
     returns : Returns
         Radial distances with their camera.
     """
-    directions = ray_directions(returns.camera, returns.y, returns.x)
+    directions = ray_directions(returns.camera, *returns.line_of_sight_px)
     return PointCloud(
         xyz=(directions * returns.range[:, np.newaxis]).astype(np.float32),
         intensity=returns.intensity,

@@ -51,6 +51,8 @@ class Returns:
         The camera that saw them.
     provenance : mapping
         How they came about.
+    shear : (n,) float64 array, optional
+        Shear at which the picture of that instant was recovered; 0 by default.
     """
 
     y: NDArray[np.int32]
@@ -62,14 +64,28 @@ class Returns:
     time: NDArray[np.float64]
     camera: Camera
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    shear: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
-        for name in ("x", "range", "intensity", "confidence", "return_number", "time"):
+        if self.shear.size == 0:
+            object.__setattr__(self, "shear", np.zeros(self.y.shape))
+        for name in ("x", "range", "intensity", "confidence", "return_number", "time", "shear"):
             if getattr(self, name).shape != self.y.shape:
                 raise ShapeError(f"{name} of the returns", self.y.shape, getattr(self, name).shape)
 
     def __len__(self) -> int:
         return self.y.size
+
+    @property
+    def line_of_sight_px(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(rows, columns) of the reference view's pixels in which the returns lie.
+
+        A picture that was not recovered at the shear of its range is displaced by the parallax; here that is undone.
+        """
+        missing = self.camera.shear_at(self.range) - self.shear
+        rows, columns = self.camera.displacement_per_shear
+        known = self.camera.lenslet_pitch > 0
+        return self.y - known * rows * missing, self.x - known * columns * missing
 
     def image(self, name: str) -> NDArray[np.float32]:
         """Picture (y, x) of one property of each pixel's most intense return; NaN where nothing came back.
@@ -134,6 +150,7 @@ def depth(
         return_number=_rank_within(pixel[kept]),
         time=time[kept],
         camera=camera,
+        shear=np.interp(time[kept], frames.times, frames.shears),
         provenance=frames.provenance,
     )
 

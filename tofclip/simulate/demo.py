@@ -21,6 +21,8 @@ OFFSETS_BIN = (-16.3, -10.4, -4.8, 0.0, 3.9, 8.2, 12.0)
 STRETCHES = (0.009, 0.008, 0.004, 0.0, -0.001, -0.006, -0.006)
 TIME_ZERO = -10.784e-9
 FOCAL_LENGTH_PX = 560.0
+LENSLET_PITCH = 2.3e-3
+FOCUS_DISTANCE = 2.3
 
 
 def default_camera() -> Camera:
@@ -35,11 +37,13 @@ def default_camera() -> Camera:
         time_zero=TIME_ZERO,
         pulse_fwhm=60e-12,
         focal_length_px=FOCAL_LENGTH_PX,
+        lenslet_pitch=LENSLET_PITCH,
+        focus_distance=FOCUS_DISTANCE,
     )
 
 
 def default_instrument() -> Instrument:
-    """Return the demonstration's camera with its lenslet pitch, focus distance and detector."""
+    """Return the demonstration's camera with its detector."""
     return Instrument(default_camera(), StreakDetector(full_scale_photons=1900.0))
 
 

@@ -70,33 +70,24 @@ class Instrument:
     Parameters
     ----------
     camera : Camera
-        Geometry, gains, sweep, pulse and time zero.
+        Geometry, gains, sweep, pulse, time zero, lenslet pitch and focus distance. View k stands at
+        ``x = lenslet_pitch * view_positions[k]``.
     detector : StreakDetector
-    lenslet_pitch : float
-        Distance between neighbouring viewpoints, m: view k stands at ``x = lenslet_pitch * view_positions[k]``.
-    focus_distance : float
-        Depth at which the views coincide (shear 0), m.
     rays_per_pixel_side : int
         A picture pixel is sampled by the square of this number of rays.
     """
 
     camera: Camera
     detector: StreakDetector = field(default_factory=StreakDetector)
-    lenslet_pitch: float = 2.3e-3
-    focus_distance: float = 2.3
     rays_per_pixel_side: int = 4
 
     def __post_init__(self) -> None:
-        if not (self.focus_distance > 0 and self.lenslet_pitch >= 0 and self.rays_per_pixel_side >= 1):
-            raise InputError("focus distance and rays must be positive, the lenslet pitch not negative")
-
-    def shear(self, depth: float) -> float:
-        """Shear of a surface at `depth` (z, m) in pixels per view step: negative when nearer than the focus."""
-        return -self.camera.focal_length_px * self.lenslet_pitch * (1 / depth - 1 / self.focus_distance)
+        if not self.rays_per_pixel_side >= 1:
+            raise InputError(f"the number of rays must be positive, got {self.rays_per_pixel_side}")
 
     def viewpoint(self, position: float) -> NDArray[np.float64]:
         """Where the view at `position` view steps stands, m."""
-        return np.array([self.lenslet_pitch * position, 0.0, 0.0])
+        return np.array([self.camera.lenslet_pitch * position, 0.0, 0.0])
 
     def pixel_grid(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Rays of a picture: X and Y from the optical axis in pixels, flat, sub-pixel by sub-pixel in raster order."""
@@ -115,5 +106,5 @@ class Instrument:
         A view's picture is laid so that a point at the focus distance appears at the same place in all views.
         """
         focal = self.camera.focal_length_px
-        aside = self.lenslet_pitch * position / self.focus_distance
+        aside = self.camera.lenslet_pitch * position / self.camera.focus_distance
         return np.stack([x / focal - aside, y / focal, np.ones_like(x)], axis=-1)

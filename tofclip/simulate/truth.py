@@ -92,7 +92,10 @@ def true_frames(scene: Scene, instrument: Instrument, exposure: float = 1.0) -> 
     shape = (detector.rows, *camera.image_shape)
     cell = rows * int(np.prod(camera.image_shape)) + pixel[seen][:, np.newaxis]
     values = gathered(cell[inside], (shares * brightness[:, np.newaxis])[inside], shape)
-    return Frames(values.astype(np.float32), detector.row_times - camera.time_zero, camera)
+    times = detector.row_times - camera.time_zero
+    # The reference view itself has no parallax: its pictures are those that the right shear would give.
+    shears = camera.shear_at(np.maximum(SPEED_OF_LIGHT * times / 2, detector.bin_width * SPEED_OF_LIGHT))
+    return Frames(values.astype(np.float32), times, camera, shears=shears)
 
 
 def _by_pixel(values: NDArray[Any], instrument: Instrument) -> NDArray[Any]:

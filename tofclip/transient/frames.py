@@ -33,6 +33,8 @@ class Frames:
         What travelled along with the streak image.
     provenance : mapping
         How they came about.
+    shears : (time,) array, optional
+        Shear at which each frame was recovered, pixels per view step; 0 everywhere by default.
     """
 
     values: NDArray[np.float32]
@@ -41,6 +43,7 @@ class Frames:
     figures: Mapping[str, Scalar] = field(default_factory=dict)
     attachments: Mapping[str, Record] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    shears: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         times = np.asarray(self.times, dtype=np.float64)
@@ -50,6 +53,10 @@ class Frames:
             raise ShapeError("frames", f"(time, y, x) = {expected}", np.shape(self.values))
         if times.size == 0 or not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
             raise InputError("frame times must be finite and increase")
+        shears = np.asarray(self.shears, dtype=np.float64)
+        object.__setattr__(self, "shears", shears if shears.size else np.zeros(times.size))
+        if self.shears.shape != times.shape or not np.all(np.isfinite(self.shears)):
+            raise ShapeError("the frames' shears", f"{times.shape}, finite", self.shears.shape)
         if not np.all(np.isfinite(self.values)):
             raise InputError("frames must not hold NaN or infinity")
 
@@ -67,6 +74,7 @@ class Frames:
             {
                 "values": Field(self.values, "count", ("time", "y", "x")),
                 "times": Field(self.times, "s", ("time",)),
+                "shears": Field(self.shears, "px", ("time",)),
             },
             self.figures,
             {**self.attachments, "camera": self.camera.to_record()},
@@ -80,6 +88,7 @@ class Frames:
             values=record.array("values", np.float32, 3, "count"),
             times=record.array("times", np.float64, 1, "s"),
             camera=Camera.from_record(record.child("camera", "camera")),
+            shears=record.array("shears", np.float64, 1, "px") if "shears" in record.fields else np.empty(0),
             figures=record.attributes,
             attachments={k: v for k, v in record.children.items() if k != "camera"},
             provenance=record.provenance,

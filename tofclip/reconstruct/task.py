@@ -13,6 +13,8 @@ from tofclip.calibration.registration import register, registration_work
 from tofclip.calibration.skew import estimate_skew
 from tofclip.camera import Camera, measure
 from tofclip.errors import InputError
+from tofclip.reconstruct.focus import AT_THE_CALIBRATED_DEPTH, Focus
+from tofclip.reconstruct.pieces import recover_pieces, residual_of_pieces
 from tofclip.recovery import (
     Adjoint,
     LinearInverse,
@@ -20,7 +22,6 @@ from tofclip.recovery import (
     Progress,
     Sparse,
     TotalVariation,
-    relative_residual,
     silent,
 )
 from tofclip.storage import Scalar
@@ -61,16 +62,20 @@ class Task:
     streak : Streak
     camera : Camera
     method : Method
+    focus : Focus
+        At which shear each frame is recovered.
     """
 
     streak: Streak
     camera: Camera
     method: Method
+    focus: Focus = AT_THE_CALIBRATED_DEPTH
 
     @property
     def work(self) -> int:
         """Frame iterations that will be reported at most."""
-        own = self.method.work(self.streak.counts.shape[0])
+        frames = self.streak.counts.shape[0]
+        own = self.method.work(frames) + self.focus.work(frames)
         return own + (registration_work() if self.camera.sweep is None else 0)
 
     def run(self, progress: Progress = silent) -> Frames:
@@ -80,23 +85,26 @@ class Task:
         if camera.sweep is None:
             camera = fitted_to_shot(self.streak, camera, progress)
         measurement = measure(self.streak.counts, self.streak.saturated, camera)
-        operator = camera.operator()
+        times = self.streak.times - camera.time_zero
         solving = time.perf_counter()
-        result = self.method.recover(operator, measurement.readings, measurement.good, progress)
+        pieces = self.focus.pieces(camera, times, measurement, progress)
+        result = recover_pieces(self.method, camera, measurement, pieces, progress)
         solved = time.perf_counter()
         figures: dict[str, Scalar] = {
             "method": self.method.name,
+            "focus": str(self.focus),
             "iterations": result.iterations,
             "stopped_because": result.stopped_because,
-            "relative_residual": relative_residual(operator, result.frames, measurement.readings, measurement.good),
+            "relative_residual": residual_of_pieces(camera, result.frames, measurement, pieces),
             "seconds": time.perf_counter() - started,
             "frames_per_second": result.frames.shape[0] / (solved - solving - result.setup_seconds),
             "setup_seconds": result.setup_seconds,
         }
         return Frames(
             values=result.frames,
-            times=self.streak.times - camera.time_zero,
+            times=times,
             camera=camera,
+            shears=np.repeat([piece.shear for piece in pieces], [piece.size for piece in pieces]),
             figures=figures,
             attachments=self.streak.attachments,
             provenance={**self.streak.provenance, "objective": result.objective.tolist()},
@@ -108,6 +116,7 @@ def recover(
     camera: Camera | None = None,
     method: str | Method = "tv",
     progress: Progress = silent,
+    focus: Focus | None = None,
 ) -> Frames:
     """Recover every transient frame of a streak image.
 
@@ -124,6 +133,8 @@ def recover(
         ``"tv"`` (default), ``"l1"``, ``"linear"``, ``"adjoint"``, or a configured `tofclip.recovery` method.
     progress : callable
         Called with the number of frame iterations just done.
+    focus : Focus, optional
+        `FixedFocus` (the default, at shear 0), `DepthLocked` or `SharpestFocus` of `tofclip.reconstruct`.
 
     Returns
     -------
@@ -139,16 +150,20 @@ def recover(
     InputError
         There is no camera, no light, or no such method.
     """
-    return prepare(streak, camera, method).run(progress)
+    return prepare(streak, camera, method, focus).run(progress)
 
 
-def prepare(streak: Streak, camera: Camera | None = None, method: str | Method = "tv") -> Task:
+def prepare(
+    streak: Streak, camera: Camera | None = None, method: str | Method = "tv", focus: Focus | None = None
+) -> Task:
     """Check what `recover` needs before any work is done; arguments as there."""
     camera = camera or streak.camera
     if camera is None:
         raise InputError(f"{streak.source} carries no camera: give one (--camera camera.h5, made by calibrate)")
     _ = streak.times  # a missing axis is refused before minutes of work
-    return Task(streak, camera, method_named(method) if isinstance(method, str) else method)
+    focus = AT_THE_CALIBRATED_DEPTH if focus is None else focus
+    focus.require(camera)
+    return Task(streak, camera, method_named(method) if isinstance(method, str) else method, focus)
 
 
 def fitted_to_shot(streak: Streak, camera: Camera, progress: Progress = silent) -> Camera:
