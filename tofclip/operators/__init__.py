@@ -17,6 +17,7 @@ from tofclip.operators.coded_views import MaskedViews, ShearedViews, WeightedVie
 from tofclip.operators.convolution import PointSpreadConvolution
 from tofclip.operators.projection import LineProjection
 from tofclip.operators.radon import RadonProjection
+from tofclip.operators.selection import ViewSelection
 from tofclip.operators.sensors import DenseSensor, MaskedSensor, PitchedSensor
 from tofclip.operators.shear import FourierShear, LinearShear
 from tofclip.operators.single_pixel import HadamardCodes, RandomCodes
@@ -49,5 +50,6 @@ __all__ = [
     "SparseMatrix",
     "Stack",
     "WeightedViews",
+    "ViewSelection",
     "squared_norm",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tofclip.operators.cameras.base import LightFieldCamera
 from tofclip.operators.cameras.coded_line import CodedLineCamera
 from tofclip.operators.cameras.compressive import AshokCamera, BabacanCamera, CompressiveCamera, MarwahCamera
-from tofclip.operators.cameras.line import LineCamera
+from tofclip.operators.cameras.line import LineCamera, SpreadLineCamera
 from tofclip.operators.cameras.point_spread import (
     CodedApertureCamera,
     CubicPhaseCamera,
@@ -31,12 +31,14 @@ __all__ = [
     "MeasuredCamera",
     "PointSpreadCamera",
     "SinglePixelCamera",
+    "SpreadLineCamera",
 ]
 
 CAMERAS: dict[str, type[LightFieldCamera]] = {
     kind.name: kind
     for kind in (
         LineCamera,
+        SpreadLineCamera,
         SinglePixelCamera,
         CodedLineCamera,
         CodedApertureCamera,
