@@ -23,7 +23,7 @@ OPENERS: dict[str, str] = {
     "remoteex": "devices.remoteex.source:open_remoteex",
     "spad512": "devices.spad512.source:open_spad512",
     "sim+linospad2": "devices.linospad2.simulation:open_simulated",
-    "sim+remoteex": "devices.remoteex.emulator:open_emulated",
+    "sim+remoteex": "devices.remoteex.simulation:open_emulated",
     "sim+spad512": "devices.spad512.emulator:open_emulated",
     "timetag": "devices.timetag.source:open_timetag",
     "sim+timetag": "devices.emulation.addresses:open_timetag",

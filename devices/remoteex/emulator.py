@@ -5,25 +5,17 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from devices.emulation.faults import Fault
-from devices.ledger import Ledger
-from devices.loopback import HOST, Connection, LoopbackServer
-from devices.remoteex.client import RemoteEx
+from devices.loopback import Connection, LoopbackServer
 from devices.remoteex.protocol import DATA_GREETING, END, GREETING, Answer, Code, Command
-from devices.remoteex.source import GAIN, OPTIONS, STREAK_TUBE, LiveSettings, RemoteExFeed, live_settings
-from devices.scenes import LineLight, demonstration_light, line_light
-from devices.source import Info
-from devices.stream import StreamSource
-from devices.stream_options import buffering
-from devices.uri import Uri
-from tofclip.camera import Camera
+from devices.remoteex.source import GAIN, STREAK_TUBE
+from devices.scenes import LineLight
 from tofclip.errors import InputError, ProtocolError
-from tofclip.storage import Record
 
 FAULTS = ("timeout", "short", "unplug", "corrupt", "lost", "overflow")
 FOREVER = 1 << 62
@@ -252,58 +244,6 @@ class EmulatedStreakCamera:
     def _send_data(self, data: bytes) -> None:
         if self._data is not None:
             self._data.send(data)
-
-
-class EmulatedFeed(RemoteExFeed):
-    """A camera's pictures, with what the calibration of the lenslets before it would tell.
-
-    Closing switches the emulated camera off.
-    """
-
-    def __init__(self, server: EmulatedStreakCamera, camera: Camera, ledger: Ledger, settings: LiveSettings) -> None:
-        self._server, self._camera = server, camera
-        port, data_port = server.ports
-        super().__init__(lambda: RemoteEx(HOST, port, data_port, settings.timeout), ledger, settings)
-
-    @property
-    def info(self) -> Info:
-        known = super().info
-        return replace(known, instrument=f"emulated {known.instrument}")
-
-    @property
-    def calibration(self) -> Record | None:
-        known = super().calibration
-        return None if known is None else replace(known, children={"camera": self._camera.to_record()})
-
-    def close(self) -> None:
-        try:
-            super().close()
-        finally:
-            self._server.close()
-
-
-def open_emulated(uri: Uri) -> StreamSource:
-    """Open ``sim+remoteex://?seed=1&scene=demo&frame_rate=10&frames=N&faults=...``, an emulated camera behind TCP.
-
-    Besides the driver's own (`devices.remoteex.source.OPTIONS`) it takes ``scene`` (``demo``, or ``small`` for a slit
-    of 256 pixels), ``frames`` (then it is dark) and ``faults`` (as `devices.emulation.faults.Fault.parse` reads them).
-    """
-    uri.only(*(name for name in OPTIONS if name != "data_port"), "seed", "scene", "frame_rate", "frames", "faults")
-    seed = uri.value("seed", int, 0)
-    if seed < 0:
-        raise InputError(f"'{uri.text}': a seed must not be negative")
-    settings, held = live_settings(uri), buffering(uri)
-    rate, frames = uri.value("frame_rate", float, 10.0), uri.value("frames", int, FOREVER)
-    faults = Fault.parse(uri.value("faults", str, ""))
-    scene = demonstration_light() if uri.choice("scene", "demo", "small") == "demo" else line_light()
-    server = EmulatedStreakCamera(EmulatedLight.of(scene, seed), rate, frames, faults)
-    ledger = Ledger()
-    try:
-        feed = EmulatedFeed(server, scene.camera, ledger, settings)
-    except BaseException:
-        server.close()
-        raise
-    return StreamSource(feed, feed.codec, ledger, held)
 
 
 def _done(command: Command, connection: Connection, *arguments: str) -> None:

@@ -1,0 +1,253 @@
+"""What takes bytes from outside: every codec, the drivers' conversations, and the files beside recordings."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+from devices.codec import Codec, as_bytes
+from devices.frames import FrameCodec
+from devices.ledger import Ledger
+from devices.linospad2.codec import LinoSpad2Codec
+from devices.linospad2.sidecar import read_sidecar
+from devices.recording.blocks import BlockHeader, Kind
+from devices.recording.reader import Block, BlockReader
+from devices.remoteex.client import RemoteEx, announced
+from devices.remoteex.protocol import Answer, Code, Command, whole_number
+from devices.remoteex.source import LiveSettings, RemoteExFeed
+from devices.ring import Gap
+from devices.spad512.protocol import Exposure
+from devices.spad512.source import Spad512Feed
+from devices.timetag.codec import RECORD, TimeTagCodec, mark_wraps
+from devices.uri import Uri
+from tofclip.errors import DeviceDisconnectedError, DeviceTimeoutError, ProtocolError
+from tofclip.io import hpdta, itex
+
+Decode = Callable[[bytes], object]
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something that takes bytes from outside, with a few inputs that it likes.
+
+    `slowness`: so many times fewer inputs are tried. `room`: bytes that decoding may take whatever the input.
+    """
+
+    decode: Decode
+    seeds: tuple[bytes, ...]
+    slowness: int = 1
+    room: int = 1 << 16
+
+    def bound(self, length: int) -> int:
+        """Bytes that decoding an input of `length` bytes may take at most."""
+        return self.room + 32 * length
+
+
+def stream(codec: Codec) -> Decode:
+    """Feed a codec as a stream would: as much as is whole, after a loss, from any state."""
+
+    def decode(data: bytes) -> None:
+        view = as_bytes(data)
+        view = view[: codec.whole(view)]
+        found = codec.decode(view, codec.start)
+        assert len(found.records) + found.malformed == codec.count(view)
+        again = codec.decode(view, found.state, after_loss=True)
+        assert len(again.records) + again.malformed == codec.count(view)
+
+    return decode
+
+
+def _time_tags() -> Target:
+    records = np.zeros(200, RECORD)
+    records["time_ticks"], records["channels"] = np.arange(200) << 30, 5
+    codec = TimeTagCodec()
+    return Target(stream(codec), (codec.encode(mark_wraps(records)), b""))
+
+
+def _line_sensor(counter: bool) -> Target:
+    codec = LinoSpad2Codec("2212s", 3, counter)
+    random = np.random.default_rng(1)
+    records = np.zeros(60, codec.dtype)
+    records["cycle"], records["pixel"] = np.arange(60) // 20, random.permutation(256)[:60]
+    records["code"] = random.integers(0, 1 << 28, 60)
+    return Target(stream(codec), (codec.encode(codec.sort_stamps(records)), b""))
+
+
+def _frames(bits: int) -> Target:
+    codec = FrameCodec(6, 8, bits)
+    records = np.zeros(5, codec.dtype)
+    records["number"] = np.arange(5) * 3
+    return Target(stream(codec), (codec.encode(records), b""))
+
+
+def _itex() -> Target:
+    text = '[Scaling],ScalingXScalingFile="",ScalingYUnit="ns",ScalingYScalingFile=""'
+    tables = {"X": np.arange(9, dtype=np.float32), "Y": np.arange(7, dtype=np.float32)}
+    seeds = [itex.encode(itex.ItexImage(np.ones((7, 9), dtype), text, tables=tables)) for dtype in ("u1", "<u2", "<u4")]
+    return Target(lambda data: itex.encode(itex.decode(data)), tuple(seeds))
+
+
+def _answer(data: bytes) -> None:
+    answer = Answer.decode(data)
+    assert announced(answer) >= 0
+    if answer.code is Code.DONE:
+        for word in answer.arguments:
+            whole_number(word, "a number")
+
+
+def _recording() -> Target:
+    payload = _time_tags().seeds[0]
+    blocks = [BlockHeader.of(Kind.PIECE, payload, 5, 200, gap).packed() + payload for gap in Gap]
+
+    def decode(data: bytes) -> None:
+        reader = BlockReader(Path("run.h5"), lambda position, length: data[position : position + length], len(data))
+        for entry in reader:
+            if isinstance(entry, Block):
+                reader.payload(entry)
+
+    return Target(decode, (b"".join(blocks),))
+
+
+class Replayed:
+    """Stands in for a connection: says what it was given, then hangs up."""
+
+    name = "replayed"
+
+    def __init__(self, data: bytes) -> None:
+        self._left = data
+
+    def send(self, data: bytes, timeout: float) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def some(self, limit: int, timeout: float) -> bytes:
+        if not self._left:
+            raise DeviceDisconnectedError("the replay is over")
+        return self._taken(limit)
+
+    def exactly(self, length: int, limit: int, timeout: float) -> bytes:
+        if not 0 <= length <= limit:
+            raise ProtocolError("too much")
+        if length > len(self._left):
+            raise DeviceDisconnectedError("the replay is over")
+        return self._taken(length)
+
+    def until(self, end: bytes, limit: int, timeout: float) -> bytes:
+        found = self._left.find(end)
+        if found < 0:
+            raise DeviceDisconnectedError("the replay is over")
+        message = self._taken(found)
+        self._taken(len(end))
+        return message
+
+    def _taken(self, length: int) -> bytes:
+        taken, self._left = self._left[:length], self._left[length:]
+        return taken
+
+
+def _remoteex_session() -> Target:
+    """A whole conversation: greetings, the start, messages, pictures, a table; then the end, whatever comes."""
+    picture = np.arange(24, dtype="<u2").tobytes()
+    said = (
+        b"RemoteEx Ready\r0,AcqLiveMonitor\r4,LiveMonitor,RingBuffer,0,1\r0,AcqStart\r"
+        b"0,ImgRingBufferGet,6,4,2,0,0,1\r0,DevParamGet,20 ns\r0,DevParamGet,Operate\r0,DevParamGet,30\r"
+        b"0,ImgDataGet,4,1\r4,LiveMonitor,RingBuffer,1,9\r0,ImgRingBufferGet,6,4,2,0,1,9\r0,DevParamSet\r0,AcqStop\r"
+        b"0,AcqLiveMonitor\r"
+    )
+    data = b"RemoteEx Data Ready\r" + picture + np.arange(4, dtype="<f4").tobytes() + picture
+    border = b"<border>"
+
+    def decode(both: bytes) -> None:
+        links = [Replayed(part) for part in both.partition(border)[::2]]
+        with mock.patch("devices.remoteex.client.TcpLink", side_effect=lambda *_: links.pop(0)):
+            feed = RemoteExFeed(lambda: RemoteEx("replayed", 1, 2, 0.01), Ledger(), LiveSettings(reconnect=0))
+            assert feed.calibration is None or feed.info.instrument
+        with mock.patch.object(feed, "_reconnect", side_effect=DeviceDisconnectedError("it stays away")):
+            try:
+                for _ in range(2):
+                    feed.pull(0.01)
+            finally:
+                feed.close()
+
+    return Target(decode, (said + border + data,), slowness=5)
+
+
+def _spad512_session() -> Target:
+    """Greeting, two requests of two pictures, the end."""
+    exposure = Exposure(8, 1e-3, 2, 4)
+    pictures = bytes(range(256)) * (exposure.codec.pixel_bytes * 2 // 256)
+
+    def decode(data: bytes) -> None:
+        texts = [b"hello", b"", b"off", b""]
+
+        class Server(Replayed):
+            def some(self, limit: int, timeout: float) -> bytes:
+                text = texts.pop(0) if texts else super().some(limit, timeout)
+                if not text:
+                    raise DeviceTimeoutError("it is quiet")
+                return text
+
+        with mock.patch("devices.spad512.source._QUIET", 0):
+            feed = Spad512Feed(lambda: Server(data), Ledger(), exposure, 0.0, 0.0)  # type: ignore[arg-type,return-value]
+        with mock.patch.object(feed, "_reconnect", side_effect=DeviceDisconnectedError("it stays away")):
+            try:
+                for _ in range(4):
+                    feed.pull(0.0)
+            finally:
+                feed.close()
+
+    return Target(decode, ((pictures + b"DONE") * 2,), slowness=5)
+
+
+def _sidecar() -> Target:
+    folder = tempfile.TemporaryDirectory()
+    path = Path(folder.name, "run.toml")
+
+    def decode(data: bytes) -> None:
+        assert folder.name  # it lives as long as this function
+        path.write_bytes(data)
+        read_sidecar(path.with_suffix(".dat"))
+
+    seed = b'firmware = "2212b"\ntimestamps_per_cycle = 512\nabsolute_counter = false\nlaser_period_ps = 25e3\n'
+    return Target(decode, (seed,), slowness=2, room=1 << 21)  # a board's tables have 36 000 numbers
+
+
+TARGETS = {
+    "RemoteEx sessions": _remoteex_session(),
+    "SPAD512 sessions": _spad512_session(),
+    "LinoSPAD2 sidecars": _sidecar(),
+    "blocks of recordings": _recording(),
+    "time tags": _time_tags(),
+    "LinoSPAD2": _line_sensor(counter=False),
+    "LinoSPAD2 with counter": _line_sensor(counter=True),
+    "frames of single bits": _frames(1),
+    "frames of 16 bits": _frames(16),
+    "frames of 32 bits": _frames(32),
+    "ITEX": _itex(),
+    "HPD-TA text": Target(
+        lambda data: hpdta.row_times(hpdta.parse_text(data.decode("latin-1")), "/nowhere", 5),
+        (b'[Scaling],ScalingYUnit="ns",ScalingYType=1,ScalingYScale=0.3,ScalingYScalingFile="Other"[Camera],Type=1',),
+    ),
+    "RemoteEx answers": Target(
+        _answer,
+        (
+            Answer(Code.DONE, "ImgRingBufferGet", ("672", "508", "2", "0", "14", "99")).encode()[:-1],
+            Answer(Code.MESSAGE, "LiveMonitor", ("RingBuffer", "7")).encode()[:-1],
+        ),
+    ),
+    "RemoteEx commands": Target(lambda data: Command.decode(data), (b"DevParamSet(TD,MCP Gain,0)", b"AcqStop()")),
+    "SPAD512 requests": Target(
+        lambda data: Exposure.decode(data), (b"I,8,2,3,0,1,0,1,128", b"I,1,2.5e-3,1,0,1,0,1,512")
+    ),
+    "addresses": Target(
+        lambda data: Uri.parse(data.decode("latin-1")).host_and_port(9),
+        (b"remoteex://lab-7:1001?seed=4&rate=x", b"spad512://[::1]:99?seed=1"),
+    ),
+}
