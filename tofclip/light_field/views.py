@@ -1,4 +1,4 @@
-"""Light fields: one picture for each view, and the picture that refocusing makes of them."""
+"""The pictures of all views, and the picture that refocusing makes of them."""
 
 from __future__ import annotations
 
