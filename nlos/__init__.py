@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from nlos.confocal.migration import FKMigration
     from nlos.filtered import FilteredBackprojection
     from nlos.geometry import Grid
+    from nlos.hybrid import Hybrid
+    from nlos.propagation.propagate import propagate
     from nlos.rsd.planar import PlanarRSD
     from nlos.volume import Volume
 
@@ -33,9 +35,11 @@ __all__ = [
     "FKMigration",
     "FilteredBackprojection",
     "Grid",
+    "Hybrid",
     "LightCone",
     "PlanarRSD",
     "Volume",
+    "propagate",
 ]
 
 _HOMES = {
@@ -44,9 +48,11 @@ _HOMES = {
     "FKMigration": "nlos.confocal.migration",
     "FilteredBackprojection": "nlos.filtered",
     "Grid": "nlos.geometry",
+    "Hybrid": "nlos.hybrid",
     "LightCone": "nlos.confocal.light_cone",
     "PlanarRSD": "nlos.rsd.planar",
     "Volume": "nlos.volume",
+    "propagate": "nlos.propagation.propagate",
 }
 
 

@@ -1,0 +1,137 @@
+"""Imaging from walls of any shape: onto a virtual plane first, then from plane to plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from nlos.band import VirtualPulse
+from nlos.capture import Capture
+from nlos.exposure import Exposure, exposure_support, exposures, unfolded_band
+from nlos.geometry import Grid
+from nlos.method import Support, common_support
+from nlos.plane import Plane
+from nlos.propagation.plane_field import virtual_plane
+from nlos.propagation.propagate import Propagation, carried, require_propagation
+from nlos.rsd.diffraction import Diffraction
+from nlos.rsd.meeting import diffract
+from nlos.rsd.planar import grid_support, require_tolerance, source_of, waves_of
+from nlos.sampling import warn_of_aliasing
+from nlos.volume import Volume
+from tofclip.errors import InputError
+
+WIDENING = 1.5
+"""Width of the virtual plane relative to the wall's."""
+
+STRICT, STRICT_WIDENING = 3e-3, 2.0
+"""Below this tolerance the virtual plane is wider."""
+
+
+@dataclass(frozen=True)
+class Hybrid:
+    """The hybrid frequency-time solver: curved, disconnected and scattered walls at nearly the speed of planar ones.
+
+    What the wall recorded is carried onto a virtual plane, on which it is the field of the same outgoing waves; from
+    there Rayleigh-Sommerfeld diffraction carries it to all depths, as `PlanarRSD` does. The image is that of
+    `Backprojection`. Several laser spots add up; confocal scans run at doubled wavenumbers.
+
+    Voxels between wall and virtual plane are reached backwards, without the waves that left the plane's rim.
+
+    Supplementary Note 12 of X. Feng, Y. Ma, L. Gao, "Compact light field photography towards versatile
+    three-dimensional vision", Nat. Commun. 13, 3333 (2022).
+
+    Parameters
+    ----------
+    wavelength : float
+        Carrier wavelength of the virtual pulse, m of path.
+    cycles : float
+        Length of the pulse in wavelengths; see `nlos.band.VirtualPulse`.
+    propagation : {"spectral", "time"}
+        From wall to plane; see `nlos.propagate`. "time" is the paper's, slow and as coarse as the time bins.
+    tolerance : float
+        Relative error of the image that is allowed for the sake of speed, 1e-4 to 0.1.
+    plane_z : float, optional
+        Where the virtual plane stands, m. Defaults to 5 to 10 cm in front of the foremost wall point.
+    """
+
+    wavelength: float
+    cycles: float = 3.0
+    propagation: Propagation = "spectral"
+    tolerance: float = 1e-2
+    plane_z: float | None = None
+    pulse: VirtualPulse = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pulse", VirtualPulse(self.wavelength, self.cycles))
+        require_tolerance(self.tolerance)
+        require_propagation(self.propagation)
+
+    def supports(self, capture: Capture, grid: Grid) -> Support:
+        """Say whether `capture` can be imaged on `grid`, and if not, why.
+
+        True in a condition if it can; ``.reason`` tells why not. Needed are voxels evenly spaced along x and y, few
+        laser spots, a virtual plane in front of the wall, and memory.
+        """
+        general = common_support(capture, grid) and grid_support(grid) and exposure_support(capture)
+        if not general:
+            return general
+        foremost = float(capture.points[:, 2].max())
+        if self.plane_z is not None and self.plane_z <= foremost:
+            return Support(f"the virtual plane must lie in front of the wall, which reaches up to z = {foremost:.4g} m")
+        try:
+            ways = [way for _, way in self._ways(capture, grid)]
+        except InputError as problem:
+            return Support(str(problem))
+        return ways[0].supports()
+
+    def reconstruct(self, capture: Capture, grid: Grid) -> Volume:
+        """Image the hidden scene.
+
+        Returns
+        -------
+        Volume
+            Brightness I(r), float32.
+
+        Raises
+        ------
+        InputError
+            `supports` says no.
+        """
+        complex_field = self.phasor_field(capture, grid)
+        return Volume(np.abs(complex_field.values), grid, complex_field.provenance)
+
+    def phasor_field(self, capture: Capture, grid: Grid) -> Volume:
+        """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in the signal."""
+        self.supports(capture, grid).require()
+        band = unfolded_band(capture, grid, self.pulse)
+        warn_of_aliasing(capture, band)
+        total = np.zeros(grid.shape, np.complex64)
+        for part, way in self._ways(capture, grid):
+            on_plane = carried(capture, part, way.plane, band, self.propagation).values
+            diffract(way, on_plane * np.float32(np.prod(way.plane.steps)), source_of(part, band), total)
+        settings = {
+            "method": "hybrid",
+            "wavelength_m": self.wavelength,
+            "cycles": self.cycles,
+            "propagation": self.propagation,
+            "tolerance": self.tolerance,
+            "plane_z_m": way.plane.z,
+        }
+        return Volume(total, grid, {**capture.provenance, "imaging": settings})
+
+    def virtual_plane(self, capture: Capture, grid: Grid) -> Plane:
+        """Return the virtual plane of a capture's first laser spot."""
+        return self._ways(capture, grid)[0][1].plane
+
+    def _ways(self, capture: Capture, grid: Grid) -> list[tuple[Exposure, Diffraction]]:
+        """Every exposure, and its way from a virtual plane of its own to the grid."""
+        band = unfolded_band(capture, grid, self.pulse)
+        widening = STRICT_WIDENING if self.tolerance < STRICT else WIDENING
+        ways = []
+        for part in exposures(capture):
+            waves = waves_of(part, band, continued=True)
+            points = capture.points[part.members]
+            plane = virtual_plane(points, 2 * np.pi / waves.highest, widening, self.plane_z)
+            ways.append((part, Diffraction(plane, grid, waves, self.tolerance)))
+        return ways

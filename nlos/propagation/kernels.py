@@ -1,0 +1,143 @@
+"""Compiled inner loops of the way from the wall to a plane."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "reassoc", "arcp"}, error_model="numpy")
+inlined = njit(inline="always")
+
+LANES = 64
+"""Points of the plane treated together: four full vectors of 512 bits."""
+
+STEPS = 8
+"""Frequencies for which a wave stays in registers."""
+
+NEAREST = 1e-3
+"""Distance in m below which 1 / distance stops growing."""
+
+
+COSINE = (1.0, -19.739208, 64.939392, -85.456657, 60.242130, -26.404669, 7.8001313, -1.4531124)
+SINE = (6.2831855, -41.341702, 81.605133, -76.703018, 42.025928, -14.899847, 3.2381375)
+"""Polynomials in the square of an angle in turns, fitted to cos(2 pi t) and sin(2 pi t) / t up to half a turn."""
+
+
+@inlined
+def _cosine(turns):
+    """Cosine of an angle of -0.5 to 0.5 turns, to 1e-6."""
+    u = turns * turns
+    high = np.float32(COSINE[4]) + u * (np.float32(COSINE[5]) + u * (np.float32(COSINE[6]) + u * np.float32(COSINE[7])))
+    low = np.float32(COSINE[2]) + u * (np.float32(COSINE[3]) + u * high)
+    return np.float32(COSINE[0]) + u * (np.float32(COSINE[1]) + u * low)
+
+
+@inlined
+def _sine(turns):
+    """Sine of an angle of -0.5 to 0.5 turns, to 1e-6."""
+    u = turns * turns
+    high = np.float32(SINE[4]) + u * (np.float32(SINE[5]) + u * np.float32(SINE[6]))
+    low = np.float32(SINE[2]) + u * (np.float32(SINE[3]) + u * high)
+    return turns * (np.float32(SINE[0]) + u * (np.float32(SINE[1]) + u * low))
+
+
+@compiled
+def add_spherical_waves(sources, phasors, targets, first, step, sums):
+    """Sum ``phasors * exp(1j * k * R) / R`` over all sources, for `LANES` targets.
+
+    The exponential is computed at the lowest wavenumber and continued by ``e_(w+1) = 2 cos(dk R) e_w - e_(w-1)``, two
+    products instead of four. All that the inner loop writes lies in two flat arrays, so that it becomes vector code.
+
+    Parameters
+    ----------
+    sources : (n, 3) float32 array
+        m.
+    phasors : (n, 2 * frequencies) float32 array
+        Real and imaginary parts in turns; the number of frequencies is a multiple of `STEPS`.
+    targets : (3 * LANES,) float32 array
+        All x, all y, all z, m.
+    first, step : float32
+        Lowest wavenumber and distance of neighbouring ones, in turns per m.
+    sums : (frequencies * 2 * LANES,) float32 array
+        Added to: per frequency all real, then all imaginary parts.
+    """
+    wave = np.empty(5 * LANES, np.float32)
+    for p in range(sources.shape[0]):
+        _start_waves(sources[p, 0], sources[p, 1], sources[p, 2], targets, first, step, wave)
+        for w in range(0, phasors.shape[1] // 2, STEPS):
+            _add_frequencies(phasors[p], w, wave, sums)
+
+
+@compiled
+def _start_waves(x, y, z, targets, first, step, wave):
+    """Lowest wave of every target over its distance, the one a step below, and ``2 cos(dk R)``."""
+    for j in range(LANES):
+        across = (targets[j] - x) ** 2 + (targets[LANES + j] - y) ** 2 + (targets[2 * LANES + j] - z) ** 2
+        distance = math.sqrt(max(across, np.float32(NEAREST * NEAREST)))
+        share = np.float32(1) / distance
+        turns = distance * first
+        turns -= math.floor(turns + np.float32(0.5))
+        cosine, sine = _cosine(turns) * share, _sine(turns) * share
+        turns = distance * step
+        turns -= math.floor(turns + np.float32(0.5))
+        along, aside = _cosine(turns), _sine(turns)
+        wave[j], wave[LANES + j] = cosine, sine
+        wave[2 * LANES + j], wave[3 * LANES + j] = cosine * along + sine * aside, sine * along - cosine * aside
+        wave[4 * LANES + j] = along + along
+
+
+@compiled
+def _add_frequencies(phasors, w, wave, sums):
+    """Add `STEPS` frequencies of one source and leave the waves of the next one."""
+    own = phasors[2 * w : 2 * (w + STEPS)]
+    # Unsigned, because an index that might be negative keeps a loop from becoming vector code.
+    place = np.uint64(2 * LANES * w)
+    for j in range(LANES):
+        cosine, sine = wave[j], wave[LANES + j]
+        cosine_before, sine_before, twice = wave[2 * LANES + j], wave[3 * LANES + j], wave[4 * LANES + j]
+        for n in range(STEPS):
+            real, imaginary = own[2 * n], own[2 * n + 1]
+            sums[place + np.uint64(2 * LANES * n + j)] += real * cosine - imaginary * sine
+            sums[place + np.uint64(2 * LANES * n + LANES + j)] += real * sine + imaginary * cosine
+            cosine, cosine_before = twice * cosine - cosine_before, cosine
+            sine, sine_before = twice * sine - sine_before, sine
+        wave[j], wave[LANES + j] = cosine, sine
+        wave[2 * LANES + j], wave[3 * LANES + j] = cosine_before, sine_before
+
+
+@compiled
+def shift_and_sum(signals, sources, targets, scale, latest, sums):
+    """Add every source's signal, moved earlier by its way to a target and divided by it, to the target's.
+
+    Parameters
+    ----------
+    signals : (n, bins) float32 array
+    sources, targets : (n, 3), (m, 3) float64 array
+        m.
+    scale : float
+        Bins per m of distance.
+    latest : float
+        Distance in bins that bin 0 of the results is early by; at least the largest.
+    sums : (m, bins) float32 array
+        Added to; long enough for the earliest and the latest arrival.
+    """
+    bins = signals.shape[1]
+    for v in range(targets.shape[0]):
+        for p in range(sources.shape[0]):
+            across = (targets[v, 0] - sources[p, 0]) ** 2 + (targets[v, 1] - sources[p, 1]) ** 2
+            distance = math.sqrt(max(across + (targets[v, 2] - sources[p, 2]) ** 2, NEAREST * NEAREST))
+            position = latest - distance * scale
+            before = int(position)
+            later = np.float32((position - before) / distance)
+            _add_shifted(signals[p], np.float32(1 / distance) - later, later, sums[v, before : before + bins + 1])
+
+
+@compiled
+def _add_shifted(signal, now, later, total):
+    """Add a signal between two bins; `total` is one longer."""
+    total[0] += now * signal[0]
+    total[signal.size] += later * signal[signal.size - 1]
+    for i in range(1, signal.size):
+        total[i] += now * signal[i] + later * signal[i - 1]

@@ -1,0 +1,71 @@
+"""`nlos.propagate`: what a wall of any shape recorded, as the field on a plane in front of it."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import numpy as np
+
+from nlos.band import Band, VirtualPulse
+from nlos.capture import Capture
+from nlos.exposure import Exposure, exposures
+from nlos.plane import Plane
+from nlos.propagation.direct import direct_sum
+from nlos.propagation.plane_field import PlaneField
+from nlos.propagation.shift_and_sum import delayed_sum
+from tofclip.errors import InputError
+
+Propagation = Literal["spectral", "time"]
+
+
+def propagate(capture: Capture, plane: Plane, pulse: VirtualPulse, propagation: Propagation = "spectral") -> PlaneField:
+    """Carry a capture's phasor field from its wall onto a plane between wall and scene.
+
+    The wall may have any shape and any number of pieces; its points need no order, and masked ones are left out.
+
+    Parameters
+    ----------
+    capture : Capture
+        Of one laser spot, or confocal.
+    plane : Plane
+        In front of every wall point.
+    pulse : VirtualPulse
+    propagation : {"spectral", "time"}
+        At the band's frequencies only, good to 1e-5; or the paper's shifting and adding of transients, whose error is
+        that of linear interpolation between bins.
+
+    Returns
+    -------
+    PlaneField
+
+    Raises
+    ------
+    InputError
+        Several laser spots, an empty band, or a plane that is not in front of the wall.
+    """
+    parts = exposures(capture)
+    if len(parts) > 1:
+        raise InputError(f"{len(parts)} laser spots make as many fields: propagate the wall points of one at a time")
+    return carried(capture, parts[0], plane, Band(pulse, capture.axis), propagation)
+
+
+def carried(capture: Capture, part: Exposure, plane: Plane, band: Band, propagation: Propagation) -> PlaneField:
+    """Carry one exposure of a capture at a band's frequencies; see `propagate`."""
+    require_propagation(propagation)
+    points = capture.points[part.members]
+    foremost = float(points[:, 2].max())
+    if plane.z <= foremost:
+        raise InputError(
+            f"the plane at z = {plane.z:.4g} m must lie in front of the wall, which reaches up to {foremost:.4g} m"
+        )
+    wavenumbers = part.passes * band.wavenumbers
+    if propagation == "time":
+        traces = np.ascontiguousarray(capture.traces()[part.members])
+        return PlaneField(delayed_sum(points, traces, plane, band, part.passes), plane, wavenumbers)
+    return PlaneField(direct_sum(points, part.phasors(capture, band), plane, wavenumbers), plane, wavenumbers)
+
+
+def require_propagation(propagation: str) -> None:
+    """Refuse a word that names no way of propagating."""
+    if propagation not in get_args(Propagation):
+        raise InputError(f"propagation must be one of {', '.join(get_args(Propagation))}, got '{propagation}'")
