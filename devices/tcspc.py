@@ -24,7 +24,7 @@ from tofclip.storage import Record, Scalar, one_line, reading
 PHOTON = np.dtype([("sync", "<u8"), ("bin", "<u4"), ("channel", "<u4")])
 """`sync`: number of the laser's pulse. `bin`: time after it, in the file's resolution. `channel`: from 0."""
 
-BATCH = 1 << 20
+BATCH = 1 << 16
 MOST_BYTES = 1 << 31
 """Larger files are not read: their photons would not fit into memory four times over."""
 

@@ -24,6 +24,7 @@ from tofclip.errors import InputError, ProtocolError, ShapeError
 
 FAULTS = ("timeout", "short", "unplug", "corrupt", "stall")
 GREETING = b"SPAD512S emulated server, ready\n"
+FOREVER = 1 << 62
 TENTH = 0.1
 """Seconds by which a fault of amount 1 delays an answer."""
 
@@ -36,19 +37,23 @@ class EmulatedSpadArray:
     photons : (512, 512) array
         Expected photons of each pixel in one second.
     seed : int
+    pictures : int
+        Until it is dark: then a request finds no answer.
     faults : sequence of Fault
         By number of the request, from 0: ``timeout`` answers `amount` tenths of a second late, ``short`` pauses so long
         in the middle of a picture, ``unplug`` hangs up there, ``corrupt`` ends with other letters, ``stall`` answers
         that it failed.
     """
 
-    def __init__(self, photons: NDArray[np.float64], seed: int, faults: Sequence[Fault] = ()) -> None:
+    def __init__(
+        self, photons: NDArray[np.float64], seed: int, pictures: int = FOREVER, faults: Sequence[Fault] = ()
+    ) -> None:
         if photons.shape != (ROWS, ROWS):
             raise ShapeError("a SPAD512's light", (ROWS, ROWS), photons.shape)
         for fault in faults:
             if fault.kind not in FAULTS:
                 raise InputError(f"a SPAD array's faults are {', '.join(FAULTS)}, not {fault.kind}")
-        self._photons, self._seed = photons, seed
+        self._photons, self._seed, self._left = photons, seed, pictures
         self._faults = {fault.transfer: fault for fault in faults}
         self._requests = 0
         self._server = LoopbackServer(self._serve)
@@ -94,6 +99,9 @@ class EmulatedSpadArray:
             return
         time.sleep(pause if kind == "timeout" else 0)
         for number in range(exposure.images):
+            if self._left <= 0:
+                return
+            self._left -= 1
             data = self.picture(request, number, exposure).tobytes()
             half = len(data) // 2
             connection.send(data[:half])
@@ -127,15 +135,16 @@ class EmulatedFeed(Spad512Feed):
 def open_emulated(uri: Uri) -> StreamSource:
     """Open ``sim+spad512://?seed=1&rate=20000&faults=...``: an emulated array that sees the demonstration.
 
-    Besides the driver's own (`devices.spad512.source.OPTIONS`) it takes ``rate`` (photons per second on a white pixel)
-    and ``faults`` (as `devices.emulation.faults.Fault.parse` reads them).
+    Besides the driver's own (`devices.spad512.source.OPTIONS`) it takes ``rate`` (photons per second on a white
+    pixel), ``pictures`` (then it is dark) and ``faults`` (as `devices.emulation.faults.Fault.parse` reads them).
     """
-    uri.only(*OPTIONS, "seed", "rate", "faults")
+    uri.only(*OPTIONS, "seed", "rate", "pictures", "faults")
     seed, rate = uri.value("seed", int, 0), uri.value("rate", float, 2e4)
     if seed < 0 or not 0 <= rate <= 1e9:
         raise InputError(f"'{uri.text}': a seed must not be negative, a rate within 0..1e9")
     (patience, back), exposure, held = waiting(uri), exposure_of(uri), buffering(uri)
-    server = EmulatedSpadArray(array_light() * rate, seed, Fault.parse(uri.value("faults", str, "")))
+    pictures = uri.value("pictures", int, FOREVER)
+    server = EmulatedSpadArray(array_light() * rate, seed, pictures, Fault.parse(uri.value("faults", str, "")))
     ledger = Ledger()
     try:
         feed = EmulatedFeed(server, ledger, exposure, patience, back)

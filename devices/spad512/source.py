@@ -31,8 +31,7 @@ Connect = Callable[[], TcpLink]
 class Spad512Feed:
     """One picture after the other; see `devices.stream.Feed`.
 
-    Pictures are asked for a request at a time, and a request that finds no answer in time is not sent again. What a
-    broken connection has cost are the pictures of its request that had not come.
+    Pictures are asked for a request at a time, and a request that finds no answer in time is not sent again.
 
     Parameters
     ----------
@@ -90,7 +89,7 @@ class Spad512Feed:
         self._stopped = True
 
     def close(self) -> None:
-        self._lose_due()
+        self._break_off()
         self._link.close()
 
     def _begin(self) -> None:
@@ -150,14 +149,16 @@ class Spad512Feed:
             raise DeviceDisconnectedError(f"the SPAD array sent nothing for {self._patience:g} s beyond the exposure")
 
     def _reconnect(self) -> None:
-        self._lose_due()
+        self._break_off()
         self._link.close()
         persistently(self._begin, self._reconnect_time)
         self._ledger.reconnect()
         self._gap = Gap.RESTART
 
-    def _lose_due(self) -> None:
-        self._ledger.lose(self._due)
+    def _break_off(self) -> None:
+        """Enter a picture of which only a part came; of those that never began nobody knows whether they were taken."""
+        if self._came:
+            self._ledger.break_off()
         self._due = 0
         self._came.clear()
 

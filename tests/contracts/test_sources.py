@@ -78,6 +78,19 @@ def words_of_linospad2(folder: Path) -> str:
     return f"linospad2://{path}"
 
 
+def photons_of_a_ptu(folder: Path) -> str:
+    ptufile = pytest.importorskip("ptufile")
+    path = folder / "photons.ptu"
+    if not path.exists():
+        counts = np.random.default_rng(1).poisson(900, (1, 1, 1, 2, 250)).astype(np.uint16)
+        ptufile.imwrite(path, counts, global_resolution=25e-9, tcspc_resolution=32e-12, pixel_time=1e-2)
+    return f"file://{path}"
+
+
+def emulated_spad_array(folder: Path) -> str:
+    return "sim+spad512://?seed=2&width=16&pictures=20"
+
+
 def emulated_streak_camera(folder: Path) -> str:
     return "sim+remoteex://?seed=2&scene=small&frames=8&frame_rate=100"
 
@@ -91,6 +104,8 @@ KINDS = [
     simulated_linospad2,
     recorded_linospad2,
     words_of_linospad2,
+    photons_of_a_ptu,
+    emulated_spad_array,
     emulated_streak_camera,
 ]
 Open = Callable[[], Source]
@@ -260,8 +275,12 @@ def test_its_bytes_are_tapped_before_they_are_decoded(opened: Open, tmp_path: Pa
 
 
 def test_its_recording_replays_what_it_gave(opened: Open, tmp_path: Path) -> None:
-    path = tmp_path / "again.h5"
-    record(opened(), path, ENOUGH)
+    path, recorded_from = tmp_path / "again.h5", opened()
+    if not isinstance(recorded_from, DecodedSource):
+        with recorded_from, pytest.raises(InputError, match="nothing to record"):
+            record(recorded_from, path, ENOUGH)
+        return
+    record(recorded_from, path, ENOUGH)
     assert verify(path).is_sound
     live: list[Batch] = []
     with opened() as source:

@@ -84,7 +84,7 @@ def array() -> Iterator[Array]:
     made = []
 
     def make(*faults: Fault, light: Any = LIGHT) -> EmulatedSpadArray:
-        made.append(EmulatedSpadArray(light, 7, faults))
+        made.append(EmulatedSpadArray(light, 7, faults=faults))
         return made[-1]
 
     yield make
@@ -179,7 +179,7 @@ def test_after_an_unplugged_cable_the_pictures_go_on(array: Array) -> None:
             assert batch is not None
             gaps += [batch.after_gap]
         finished(source)
-    assert (source.stats.reconnects, source.stats.lost_device, gaps.count(True)) == (1, 2, 1)
+    assert (source.stats.reconnects, source.stats.malformed, gaps.count(True)) == (1, 1, 1)
 
 
 def test_what_the_server_complains_of_is_passed_on(array: Array) -> None:
@@ -220,7 +220,7 @@ def test_nobody_there_and_values_that_cannot_be() -> None:
     with pytest.raises(ShapeError):
         EmulatedSpadArray(np.ones((3, 4)), 0)
     with pytest.raises(InputError, match="faults are"):
-        EmulatedSpadArray(LIGHT, 0, [Fault(0, "lost")])
+        EmulatedSpadArray(LIGHT, 0, faults=[Fault(0, "lost")])
 
 
 def test_the_emulated_array_looks_at_the_demonstration() -> None:
