@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from nlos.geometry import Grid
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
+
+if TYPE_CHECKING:
+    from nlos.export import Mesh
 
 AXES = ("z", "y", "x")
 
@@ -94,6 +97,40 @@ class Volume:
         magnitude = self.magnitude
         kept = np.where(magnitude >= fraction * magnitude.max(), self.values, 0)
         return Volume(kept.astype(self.values.dtype), self.grid, self.provenance)
+
+    def surface(self, fraction: float = 0.3) -> Mesh:
+        """Draw the surface on which the magnitude is `fraction` (0..1) of the largest; save it with ``.save``."""
+        from nlos.export import surface_of
+
+        return surface_of(self, fraction)
+
+    def points(self, fraction: float = 0.3) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Positions (n, 3) in m, and magnitudes (n,), of voxels with at least `fraction` (0..1) of the brightest."""
+        from nlos.export import points_of
+
+        return points_of(self, fraction)
+
+    def export(self, path: str | Path, fraction: float = 0.3) -> None:
+        """Write the magnitude for other programs, in the format that the suffix names, whole or not at all.
+
+        Parameters
+        ----------
+        path : path-like
+            * ``.vti``: all voxels as a VTK image (evenly spaced ones only);
+            * ``.npz``: ``values``, complex where they are, and ``x_m``, ``y_m``, ``z_m``;
+            * ``.exr``: front view, channel Y, and its depth in m, channel Z;
+            * ``.ply``, ``.pcd``, ``.csv``: bright voxels as points.
+        fraction : float
+            Which voxels become points: those with at least this share of the brightest.
+
+        Raises
+        ------
+        InputError
+            Another suffix, or voxels that the format cannot hold.
+        """
+        from nlos.export import export
+
+        export(self, path, fraction)
 
     def save_picture(self, path: str | Path) -> None:
         """Draw front view, depth map, top and side view with axes in metres; PNG, PDF or SVG by the file's name."""

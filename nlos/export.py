@@ -1,0 +1,169 @@
+"""Volumes in the formats that other programs read: VTK images, points, meshes, EXR pictures and NumPy archives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.plane import evenly_spaced, step
+from tofclip.errors import InputError
+from tofclip.storage import atomic_path
+
+if TYPE_CHECKING:
+    from nlos.geometry import FloatArray
+    from nlos.volume import Volume
+
+FLAT_VOXEL = 1e-3
+"""m; thickness told of a volume that is a single voxel deep."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A surface of triangles.
+
+    Parameters
+    ----------
+    vertices : (v, 3) float32 array
+        x, y, z in m.
+    faces : (m, 3) int32 array
+        Corners of each triangle.
+    """
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+
+    def save(self, path: str | Path) -> None:
+        """Write the mesh as binary PLY, whole or not at all."""
+        if Path(path).suffix.lower() != ".ply":
+            raise InputError(f"{path}: a mesh is written as .ply")
+        header = [
+            "ply",
+            "format binary_little_endian 1.0",
+            "comment units: m",
+            f"element vertex {len(self.vertices)}",
+            *(f"property float {axis}" for axis in "xyz"),
+            f"element face {len(self.faces)}",
+            "property list uchar int vertex_indices",
+            "end_header",
+        ]
+        rows = np.empty(len(self.faces), np.dtype([("corners", "u1"), ("faces", "<i4", 3)]))
+        rows["corners"], rows["faces"] = 3, self.faces
+        with atomic_path(path) as temporary, open(temporary, "wb") as file:
+            file.write(("\n".join(header) + "\n").encode())
+            file.write(self.vertices.astype("<f4").tobytes())
+            file.write(rows.tobytes())
+
+
+def surface_of(volume: Volume, fraction: float) -> Mesh:
+    """Draw the surface on which the magnitude is `fraction` (0..1) of the largest, by marching cubes.
+
+    Raises
+    ------
+    InputError
+        The fraction is not between 0 and 1, an axis has a single voxel, or the volume is dark.
+    """
+    import pyvista
+
+    magnitude = volume.magnitude
+    if not 0 < fraction < 1:
+        raise InputError(f"a surface lies at a fraction between 0 and 1 of the brightest, got {fraction}")
+    if min(magnitude.shape) < 2 or not magnitude.any():
+        raise InputError("a surface needs at least 2 voxels along every axis, and light")
+    grid = pyvista.RectilinearGrid(volume.grid.x, volume.grid.y, volume.grid.z)
+    # VTK lists points with x fastest, as a (z, y, x) array lies in memory.
+    found = grid.contour([fraction * float(magnitude.max())], scalars=magnitude.ravel())
+    faces = np.asarray(found.regular_faces, np.int32).reshape(-1, 3)
+    return Mesh(np.asarray(found.points, np.float32), faces)
+
+
+def points_of(volume: Volume, fraction: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Positions (n, 3) in m, and magnitudes (n,), of the voxels with at least `fraction` (0..1) of the brightest."""
+    z, y, x = np.nonzero(volume.threshold(fraction).magnitude)
+    xyz = np.stack([volume.grid.x[x], volume.grid.y[y], volume.grid.z[z]], axis=-1).astype(np.float32)
+    return xyz, volume.magnitude[z, y, x].astype(np.float32)
+
+
+def export(volume: Volume, path: str | Path, fraction: float) -> None:
+    """Do what `Volume.export` describes."""
+    suffix = Path(path).suffix.lower()
+    if suffix in POINT_SUFFIXES:
+        _write_points(volume, path, fraction)
+        return
+    if suffix not in WRITERS:
+        known = ", ".join((*WRITERS, *POINT_SUFFIXES))
+        raise InputError(f"{path}: no format of volumes is called '{suffix}'; use one of {known}")
+    with atomic_path(path) as temporary:
+        WRITERS[suffix](volume, temporary)
+
+
+def _write_points(volume: Volume, path: str | Path, fraction: float) -> None:
+    from tofclip.lidar.column import Column
+    from tofclip.lidar.export import write
+
+    xyz, brightness = points_of(volume, fraction)
+    columns = [Column(name, "m", np.ascontiguousarray(xyz[:, i])) for i, name in enumerate("xyz")]
+    write(path, [*columns, Column("brightness", "", brightness)])
+
+
+def _write_vti(volume: Volume, path: Path) -> None:
+    """Write XML image data (VTK file formats, "XML formats, ImageData"), with the numbers appended in binary."""
+    origin = " ".join(f"{axis[0]:.9g}" for axis in (volume.grid.x, volume.grid.y, volume.grid.z))
+    spacing = " ".join(f"{_spacing(axis, name):.9g}" for axis, name in _axes(volume))
+    extent = " ".join(f"0 {n - 1}" for n in reversed(volume.grid.shape))
+    head = (
+        '<?xml version="1.0"?>\n'
+        '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
+        f'<ImageData WholeExtent="{extent}" Origin="{origin}" Spacing="{spacing}"><Piece Extent="{extent}">\n'
+        '<PointData Scalars="brightness"><DataArray type="Float32" Name="brightness" format="appended" offset="0"/>'
+        '</PointData>\n</Piece></ImageData>\n<AppendedData encoding="raw">\n_'
+    )
+    values = volume.magnitude.astype("<f4")
+    with open(path, "wb") as file:
+        file.write(head.encode())
+        file.write(np.uint64(values.nbytes).astype("<u8").tobytes())
+        values.tofile(file)
+        file.write(b"\n</AppendedData>\n</VTKFile>\n")
+
+
+def _write_npz(volume: Volume, path: Path) -> None:
+    grid = volume.grid
+    with open(path, "wb") as file:
+        _save_npz(file, values=volume.values, x_m=grid.x, y_m=grid.y, z_m=grid.z)
+
+
+def _save_npz(file: BinaryIO, **arrays: NDArray[np.generic]) -> None:
+    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def _write_exr(volume: Volume, path: Path) -> None:
+    import OpenEXR
+
+    projection = volume.maximum_projection()
+    # OpenEXR writes wrong pixels of arrays that are not contiguous.
+    channels = {
+        "Y": np.ascontiguousarray(projection.brightness, np.float32),
+        "Z": np.ascontiguousarray(projection.depth, np.float32),
+    }
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, channels).write(str(path))
+
+
+def _axes(volume: Volume) -> list[tuple[FloatArray, str]]:
+    return [(volume.grid.x, "x"), (volume.grid.y, "y"), (volume.grid.z, "z")]
+
+
+def _spacing(axis: FloatArray, name: str) -> float:
+    if axis.size == 1:
+        return FLAT_VOXEL
+    if not evenly_spaced(axis):
+        raise InputError(f"a VTK image needs evenly spaced voxels along {name}; write .npz or .h5 instead")
+    return step(axis)
+
+
+WRITERS: Mapping[str, Callable[[Volume, Path], None]] = {".vti": _write_vti, ".npz": _write_npz, ".exr": _write_exr}
+POINT_SUFFIXES = (".ply", ".pcd", ".csv")
