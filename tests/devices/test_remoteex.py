@@ -156,24 +156,6 @@ def test_a_picture_larger_than_any_is_refused_before_memory_is_taken(camera: Cam
         taken(source, 100)
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_random_faults_leave_balanced_accounts(camera: Camera, seed: int) -> None:
-    random = np.random.default_rng(seed)
-    kinds = random.choice(["timeout", "short", "unplug", "lost", "corrupt"], 3, p=[0.3, 0.25, 0.2, 0.2, 0.05])
-    places = 1 + random.choice(12, 3, replace=False)  # a fault in the first exchange leaves no source to account for
-    faults = [Fault(int(place), kind, int(random.integers(1, 4))) for place, kind in zip(places, kinds, strict=True)]
-    server = camera(*faults, rate=200)
-    with opened(server, timeout_s=0.15) as source:
-        try:
-            taken(source, 20)
-            source.stop()
-            require_balance(source)
-        except ProtocolError:
-            assert "corrupt" in kinds
-    assert source.stats.is_balanced
-    assert server.gain == "0"
-
-
 def test_nobody_there() -> None:
     with pytest.raises(DeviceNotFoundError, match="is its program running"):
         devices.open(f"remoteex://{HOST}:1")
