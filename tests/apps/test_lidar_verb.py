@@ -10,7 +10,7 @@ import numpy as np
 from small_instrument import Run
 
 from tofclip.camera import Camera, SkewSweep
-from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate
+from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate, true_frames
 from tofclip.simulate.shapes import checkerboard
 from tofclip.transient import Frames
 
@@ -82,3 +82,17 @@ def test_parallax_makes_the_camera_that_depth_locked_recovery_needs(run: Run, tm
     assert Frames.load(tmp_path / "frames.h5").figures["focus"] == "depth-locked"
     for unusable in ("near", "fixed:x", "stack:0:1"):
         assert run(*locked, "--focus", unusable).status == 2
+
+
+def test_clouds_are_tidied_and_become_depth_pictures(run: Run, tmp_path: Path) -> None:
+    scene = Scene((plate(1.3, 0),))
+    shot = simulate(scene, Instrument(CAMERA, StreakDetector(150, 100e-12, peak_photons=2e5)), seed=0)
+    true_frames(scene, Instrument(CAMERA, StreakDetector(150, 100e-12)), shot.exposure).save(tmp_path / "frames.h5")
+    whole, thin = (
+        json.loads(run("cloud", tmp_path / "frames.h5", "--out", tmp_path / name, "--json", *words).out)["points"]
+        for name, words in (("a.laz", ()), ("b.ply", ("--voxel-mm", "30", "--drop-outliers")))
+    )
+    assert 0 < thin < whole / 2
+    assert run("cloud", tmp_path / "frames.h5", "--out", tmp_path / "depth.exr").status == 0
+    assert (tmp_path / "depth.exr").read_bytes()[:4] == b"\x76\x2f\x31\x01"
+    assert run("cloud", tmp_path / "frames.h5", "--out", tmp_path / "c.ply", "--voxel-mm", "0").status == 2

@@ -56,6 +56,9 @@ class Camera:
         Distance between the viewpoints of neighbouring view steps, m; 0 where the parallax is not known or none.
     focus_distance : float
         Depth at which the views coincide (shear 0), m; may be infinite.
+    distortion : (5,) array, optional
+        Lens distortion k1, k2, p1, p2, k3 (Brown and Conrady, in OpenCV's order), of directions x/z and y/z; none by
+        default.
     centre_uncertainty_px, angle_uncertainty : (views,) array, optional
         One standard deviation of the calibration.
 
@@ -78,6 +81,7 @@ class Camera:
     focal_length_px: float = DEFAULT_FOCAL_LENGTH_PX
     lenslet_pitch: float = 0.0
     focus_distance: float = np.inf
+    distortion: FloatArray = field(default_factory=lambda: np.zeros(5))
     centre_uncertainty_px: FloatArray = field(default_factory=lambda: np.empty(0))
     angle_uncertainty: FloatArray = field(default_factory=lambda: np.empty(0))
 
@@ -85,6 +89,7 @@ class Camera:
         views = np.size(self.centres_px)
         steps = np.arange(views, dtype=np.float64) - views // 2
         self._set("centres_px", self.centres_px)
+        self._set("distortion", self.distortion)
         self._set("angles", self.angles)
         self._set("gains", self.gains if np.size(self.gains) else np.ones(views))
         self._set("view_positions", self.view_positions if np.size(self.view_positions) else steps)
@@ -133,6 +138,8 @@ class Camera:
             raise CalibrationError("pulse width and focal length must be positive, time zero finite")
         if not (np.isfinite(self.lenslet_pitch) and self.lenslet_pitch >= 0 and self.focus_distance > 0):
             raise CalibrationError("the lenslet pitch must not be negative, the focus distance must be positive")
+        if self.distortion.shape != (5,) or not np.all(np.isfinite(self.distortion)):
+            raise CalibrationError(f"lens distortion must be 5 finite numbers, got {self.distortion}")
 
     @property
     def views(self) -> int:
@@ -209,6 +216,7 @@ class Camera:
             "centre_uncertainty": Field(self.centre_uncertainty_px, "px", per_view),
             "angle_uncertainty": Field(self.angle_uncertainty, "rad", per_view),
             "dead_columns": Field(self.dead_columns.astype(np.uint8), "", ("column",)),
+            "distortion": Field(self.distortion, "", ("coefficient",)),
             "image_shape": Field(np.array(self.image_shape, dtype=np.int64), "px", ("yx",)),
         }
         attributes = {
@@ -238,6 +246,7 @@ class Camera:
             time_zero=float(record.attribute("time_zero_s")),
             pulse_fwhm=float(record.attribute("pulse_fwhm_s")),
             focal_length_px=float(record.attribute("focal_length_px")),
+            distortion=record.array("distortion", np.float64, 1) if "distortion" in record.fields else np.zeros(5),
             lenslet_pitch=float(record.attribute("lenslet_pitch_m", 0.0)),
             focus_distance=float(record.attribute("focus_distance_m", np.inf)),
             centre_uncertainty_px=record.array("centre_uncertainty", np.float64, 1, "px"),

@@ -1,9 +1,10 @@
 """Flash LiDAR: from a transient cube to returns, and from returns to a point cloud."""
 
 from tofclip.lidar.cloud import PointCloud, point_cloud
+from tofclip.lidar.depth_exr import save_depth
 from tofclip.lidar.detection import Detection
 from tofclip.lidar.geometry import ray_directions
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.returns import Returns, depth
 
-__all__ = ["Detection", "PointCloud", "Pulse", "Returns", "depth", "point_cloud", "ray_directions"]
+__all__ = ["Detection", "PointCloud", "Pulse", "Returns", "depth", "point_cloud", "ray_directions", "save_depth"]

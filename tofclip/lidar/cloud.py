@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.lidar import export
+from tofclip.lidar.column import Column
 from tofclip.lidar.geometry import ray_directions
 from tofclip.lidar.returns import Returns
 from tofclip.storage import Field, Record
@@ -87,7 +88,8 @@ class PointCloud:
         Parameters
         ----------
         path : path-like
-            ``.ply`` and ``.pcd`` (binary, little endian), ``.csv``, ``.npz``, or ``.h5`` (with provenance).
+            ``.ply`` and ``.pcd`` (binary, little endian), ``.csv``, ``.npz``, ``.las``, ``.laz`` (both need
+            laspy), or ``.h5`` (with provenance).
 
         Raises
         ------
@@ -138,11 +140,10 @@ class PointCloud:
         }
         return cls(xyz=record.array("xyz", np.float32, 2, "m"), provenance=record.provenance, **columns)
 
-    def _columns(self) -> list[export.Column]:
+    def _columns(self) -> list[Column]:
         values = dict(zip("xyz", self.xyz.T, strict=True))
         return [
-            export.Column(name, unit, values[name] if name in values else getattr(self, name))
-            for name, unit in UNITS.items()
+            Column(name, unit, values[name] if name in values else getattr(self, name)) for name, unit in UNITS.items()
         ]
 
 

@@ -1,4 +1,4 @@
-"""Tables of points in the formats that other programs read: PLY, PCD, CSV and NPZ.
+"""Tables of points in the formats that other programs read: PLY, PCD, CSV, NPZ, LAS and LAZ.
 
 Every file says the units of its columns: PLY and PCD in a comment, CSV and NPZ in the columns' names (``x_m``).
 """
@@ -6,47 +6,20 @@ Every file says the units of its columns: PLY and PCD in a comment, CSV and NPZ 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError
+from tofclip.lidar.column import Columns, Table
+from tofclip.lidar.las import read_las, write_las
 from tofclip.storage import atomic_path, reading
 
 PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1"}
 PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8", ("U", "1"): "u1"}
 LONGEST_HEADER = 1 << 16
-
-
-@dataclass(frozen=True)
-class Column:
-    """One property of all points.
-
-    Parameters
-    ----------
-    name : str
-    unit : str
-        SI unit, or empty for a pure number.
-    values : (n,) array
-        float32, float64 or uint8.
-    """
-
-    name: str
-    unit: str
-    values: NDArray[Any]
-
-    @property
-    def label(self) -> str:
-        """Name with its unit, as it heads a column."""
-        return f"{self.name}_{self.unit}" if self.unit else self.name
-
-
-Columns = Sequence[Column]
-Table = dict[str, NDArray[Any]]
 
 
 def write(path: str | Path, columns: Columns) -> None:
@@ -209,4 +182,6 @@ FORMATS: dict[str, tuple[Callable[[Path, Columns], None], Callable[[Path], Table
     ".pcd": (_write_pcd, _read_pcd),
     ".csv": (_write_csv, _read_csv),
     ".npz": (_write_npz, _read_npz),
+    ".las": (write_las, read_las),
+    ".laz": (write_las, read_las),
 }

@@ -6,17 +6,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofclip.camera import Camera
+from tofclip.errors import CalibrationError
+
+ROUNDS = 50
+CONVERGED = 1e-10  # in units of the focal length; far below a thousandth of a pixel
 
 
 def ray_directions(camera: Camera, rows: ArrayLike, columns: ArrayLike) -> NDArray[np.float64]:
     """Direction in which each pixel of the reference view looks.
 
-    A pinhole without lens distortion: ``((column - column_0) / f, (row - row_0) / f, 1)``, normalised.
+    A pinhole ``((column - column_0) / f, (row - row_0) / f, 1)``, normalised, with the camera's lens distortion undone.
 
     Parameters
     ----------
     camera : Camera
-        Gives the focal length f and the optical axis.
+        Gives the focal length f, the optical axis and the distortion.
     rows, columns : (n,) array
         Pixel positions, not necessarily whole numbers.
 
@@ -24,10 +28,53 @@ def ray_directions(camera: Camera, rows: ArrayLike, columns: ArrayLike) -> NDArr
     -------
     (n, 3) array
         Unit vectors; x right, y down, z forward.
+
+    Raises
+    ------
+    CalibrationError
+        A distortion so strong that no direction leads to a pixel.
     """
     axis_row, axis_column = camera.optical_axis_px
     right = (np.asarray(columns, dtype=np.float64) - axis_column) / camera.focal_length_px
     down = (np.asarray(rows, dtype=np.float64) - axis_row) / camera.focal_length_px
+    if camera.distortion.any():
+        right, down = undistorted(right, down, camera.distortion)
     directions = np.stack([right, down, np.ones_like(right)], axis=-1)
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     return directions
+
+
+def distorted(
+    right: NDArray[np.float64], down: NDArray[np.float64], coefficients: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where a lens puts the direction (right, down, 1), in units of the focal length.
+
+    Parameters
+    ----------
+    right, down : (n,) array
+    coefficients : (5,) array
+        k1, k2, p1, p2, k3 of D. C. Brown, "Close-range camera calibration", Photogramm. Eng. 37, 855 (1971).
+    """
+    k1, k2, p1, p2, k3 = coefficients
+    square = right**2 + down**2
+    radial = 1 + square * (k1 + square * (k2 + square * k3))
+    return (
+        right * radial + 2 * p1 * right * down + p2 * (square + 2 * right**2),
+        down * radial + p1 * (square + 2 * down**2) + 2 * p2 * right * down,
+    )
+
+
+def undistorted(
+    right: NDArray[np.float64], down: NDArray[np.float64], coefficients: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Undo `distorted`, by a fixed-point iteration."""
+    x, y = right.copy(), down.copy()
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(ROUNDS):
+            seen_x, seen_y = distorted(x, y, coefficients)
+            x += right - seen_x
+            y += down - seen_y
+        left = np.hypot(right - seen_x, down - seen_y).max(initial=0.0)
+    if not left < CONVERGED:
+        raise CalibrationError("the camera's lens distortion is too strong to be undone within the picture")
+    return x, y

@@ -1,0 +1,210 @@
+"""Point clouds cleaned, thinned, measured and laid over each other; their columns are kept.
+
+Neighbourhoods, planes and registration are Open3D's, which is loaded on first use.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofclip.errors import InputError, MissingDependencyError, ShapeError
+from tofclip.lidar.cloud import PointCloud
+
+FloatArray = NDArray[np.float64]
+
+COLUMNS = ("intensity", "confidence", "range", "return_number", "time")
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane ``normal . x = offset``.
+
+    Parameters
+    ----------
+    normal : (3,) array
+        Unit vector, towards the camera.
+    offset : float
+        Its distance from the origin along the normal, m; not positive.
+    inliers : (n,) bool array
+        Points of the cloud that lie on it.
+    rms : float
+        Root mean square distance of these from it, m.
+    """
+
+    normal: FloatArray
+    offset: float
+    inliers: NDArray[np.bool_]
+    rms: float
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How one cloud is laid over another.
+
+    Parameters
+    ----------
+    pose : (4, 4) array
+        Rotation and translation (m) that takes the source to the target.
+    overlap : float
+        Share of the source's points with a neighbour in the target.
+    rms : float
+        Root mean square distance to these neighbours, m.
+    """
+
+    pose: FloatArray
+    overlap: float
+    rms: float
+
+
+def selected(cloud: PointCloud, chosen: NDArray[Any]) -> PointCloud:
+    """Return some points of a cloud, by mask or by numbers."""
+    columns: dict[str, Any] = {name: getattr(cloud, name)[chosen] for name in COLUMNS}
+    return replace(cloud, xyz=cloud.xyz[chosen], **columns)
+
+
+def moved(cloud: PointCloud, pose: ArrayLike) -> PointCloud:
+    """Return a cloud in another frame, such as that of a mount or of a map; ranges stay those from the camera.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    pose : (4, 4) array
+        Extrinsics: rotation and translation (m) from the camera's frame to the other.
+    """
+    matrix = np.asarray(pose, dtype=np.float64)
+    if matrix.shape != (4, 4):
+        raise ShapeError("a pose", (4, 4), matrix.shape)
+    turn = matrix[:3, :3]
+    if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) and np.linalg.det(turn) > 0):
+        raise InputError("a pose must be a rotation and a translation, without scale or mirror")
+    return replace(cloud, xyz=(cloud.xyz @ turn.T + matrix[:3, 3]).astype(np.float32))
+
+
+def downsampled(cloud: PointCloud, voxel: float) -> PointCloud:
+    """Return one point for each occupied cube of side `voxel`, m: means of its points.
+
+    Confidences of independent points shrink with their number; the return number is the least.
+    """
+    if not (np.isfinite(voxel) and voxel > 0):
+        raise InputError(f"the side of a voxel must be a positive length, got {voxel}")
+    if len(cloud) == 0:
+        return cloud
+    cell = np.floor(cloud.xyz / np.float64(voxel)).astype(np.int64)
+    _, group, number = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    group = group.ravel()
+
+    def mean(values: NDArray[Any]) -> FloatArray:
+        total: FloatArray = np.bincount(group, values.astype(np.float64), number.size) / number
+        return total
+
+    first = np.full(number.size, 255, np.uint8)
+    np.minimum.at(first, group, cloud.return_number)
+    columns: dict[str, Any] = {name: mean(getattr(cloud, name)) for name in ("intensity", "range", "time")}
+    columns["confidence"] = np.sqrt(mean(cloud.confidence.astype(np.float64) ** 2) / number)
+    positions = np.stack([mean(axis) for axis in cloud.xyz.T], axis=-1).astype(np.float32)
+    return replace(cloud, xyz=positions, return_number=first, **columns)
+
+
+def without_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 2.0) -> PointCloud:
+    """Leave out points whose mean distance to their neighbours stands out from that of all points.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    neighbours : int
+    deviations : float
+        Standard deviations above the mean from which a point counts as an outlier.
+    """
+    if neighbours < 1 or not deviations > 0:
+        raise InputError("outliers need at least one neighbour and a positive number of deviations")
+    if len(cloud) <= neighbours:
+        return cloud
+    _, kept = _open3d_cloud(cloud).remove_statistical_outlier(neighbours, deviations)
+    return selected(cloud, np.asarray(kept, dtype=np.int64))
+
+
+def normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:
+    """Return each point's surface normal, (n, 3), towards the camera, from a plane through its neighbours."""
+    if len(cloud) < 3 or neighbours < 3:
+        raise InputError("a normal needs at least three points and three neighbours")
+    open3d = _open3d()
+    shape = _open3d_cloud(cloud)
+    shape.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(neighbours))
+    shape.orient_normals_towards_camera_location(np.zeros(3))
+    return np.asarray(shape.normals)
+
+
+def fit_plane(cloud: PointCloud, reach: float, seed: int = 0) -> Plane:
+    """Find the plane with most points, by random sampling, and fit it to them.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    reach : float
+        Points within so many metres lie on the plane.
+    seed : int
+    """
+    if len(cloud) < 3 or not reach > 0:
+        raise InputError("a plane needs at least three points and a positive reach")
+    open3d = _open3d()
+    open3d.utility.random.seed(seed)
+    _, found = _open3d_cloud(cloud).segment_plane(reach, 3, 1000)
+    inliers = np.zeros(len(cloud), dtype=bool)
+    inliers[np.asarray(found, dtype=np.int64)] = True
+    points = cloud.xyz[inliers].astype(np.float64)
+    middle = points.mean(axis=0)
+    normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
+    normal *= -1 if normal @ middle > 0 else 1
+    rms = float(np.sqrt(np.mean(((points - middle) @ normal) ** 2)))
+    return Plane(normal, float(normal @ middle), inliers, rms)
+
+
+def align(source: PointCloud, target: PointCloud, reach: float, start: ArrayLike | None = None) -> Alignment:
+    """Lay a cloud over another one, such as the next of a sequence (point-to-plane iterated closest points).
+
+    Parameters
+    ----------
+    source, target : PointCloud
+    reach : float
+        Largest distance of points that may belong together, m.
+    start : (4, 4) array, optional
+        First guess of the pose.
+    """
+    if min(len(source), len(target)) < 3 or not reach > 0:
+        raise InputError("registration needs at least three points in each cloud and a positive reach")
+    registration = _open3d().pipelines.registration
+    surface = _open3d_cloud(target)
+    surface.normals = _open3d().utility.Vector3dVector(normals(target))
+    found = registration.registration_icp(
+        _open3d_cloud(source),
+        surface,
+        reach,
+        np.eye(4) if start is None else np.asarray(start, dtype=np.float64),
+        registration.TransformationEstimationPointToPlane(),
+    )
+    return Alignment(np.asarray(found.transformation), float(found.fitness), float(found.inlier_rmse))
+
+
+def _open3d_cloud(cloud: PointCloud) -> Any:
+    open3d = _open3d()
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud.xyz.astype(np.float64)))
+
+
+def _open3d() -> Any:
+    """Open3D; it wants a libusb, which libusb-package brings where the system has none."""
+    try:
+        import libusb_package
+
+        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    except (ImportError, OSError):
+        pass  # the system may have its own
+    try:
+        import open3d
+    except (ImportError, OSError) as fault:
+        raise MissingDependencyError(f"Open3D does not load on this machine: {fault}") from fault
+    return open3d
