@@ -6,6 +6,7 @@
         for batch in source:
             batch.records      # NumPy structured array, one row per record
     source.stats               # acquired = delivered + unread + dropped_host + lost_device + malformed
+    streak = devices.read_transient("sim+linospad2://?seed=1")     # photons or frames to what tofclip.recover takes
 
 Which address opens which instrument is written down in `devices.registry`.
 """
@@ -20,8 +21,9 @@ if TYPE_CHECKING:
     from devices.registry import Found, discover, open  # noqa: A004 - the name users type
     from devices.source import Batch, Info, Source
     from devices.statistics import Stats
+    from devices.transients import read_transient
 
-__all__ = ["Batch", "Codec", "Decoded", "Found", "Info", "Source", "Stats", "discover", "open"]
+__all__ = ["Batch", "Codec", "Decoded", "Found", "Info", "Source", "Stats", "discover", "open", "read_transient"]
 
 _HOMES = {
     "Batch": "devices.source",
@@ -33,6 +35,7 @@ _HOMES = {
     "Stats": "devices.statistics",
     "discover": "devices.registry",
     "open": "devices.registry",
+    "read_transient": "devices.transients",
 }
 
 
