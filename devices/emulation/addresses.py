@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from devices.emulation.faults import Fault
 from devices.emulation.photons import Poisson, TagStream
 from devices.emulation.scene_light import PulsedScene
 from devices.emulation.timetag import CLOCK_HZ, EmulatedTimeTagger, Setting
 from devices.emulation.usb import VirtualUsb
+from devices.scenes import line_light
 from devices.stream import StreamSource
 from devices.timetag.source import OPTIONS, opened
 from devices.uri import Uri
@@ -26,8 +29,8 @@ def open_timetag(uri: Uri) -> StreamSource:
     """
     uri.only(*OPTIONS, *EMULATOR_OPTIONS)
     seed = uri.value("seed", int, 0)
-    if not 0 <= seed < 1 << 64:
-        raise InputError(f"'{uri.text}': a seed must be within 0 and 2**64")
+    if not 0 <= seed < 1 << 63:
+        raise InputError(f"'{uri.text}': a seed must be within 0 and 2**63")
     standard = Setting()
     setting = Setting(
         uri.choice("pace", "fast", "realtime") == "realtime",
@@ -40,9 +43,9 @@ def open_timetag(uri: Uri) -> StreamSource:
     return opened(uri, serial, VirtualUsb(instrument))
 
 
-def _light(uri: Uri, seed: int) -> TagStream:
+def _light(uri: Uri, seed: int) -> Callable[[int], TagStream]:
     if uri.choice("light", "poisson", "scene") == "poisson":
-        return Poisson(uri.value("rate", float, RATE), CLOCK_HZ, seed)
-    from devices.scenes import line_light
-
-    return PulsedScene(line_light(), uri.value("rate", float, SCENE_RATE), CLOCK_HZ, seed)
+        rate = uri.value("rate", float, RATE)
+        return lambda resets: Poisson(rate, CLOCK_HZ, seed + resets)
+    scene, scene_rate = line_light(), uri.value("rate", float, SCENE_RATE)
+    return lambda resets: PulsedScene(scene, scene_rate, CLOCK_HZ, seed + resets)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from time import monotonic, sleep
 
@@ -90,16 +90,20 @@ class EmulatedTimeTagger(VirtualDevice):
 
     Parameters
     ----------
-    light : TagStream
+    light : callable
+        Makes the light that falls on it from a moment at which its counter is reset; takes how often it was before.
     serial : str
     setting : Setting
     faults : iterable of Fault
     """
 
-    def __init__(self, light: TagStream, serial: str, setting: Setting, faults: Iterable[Fault] = ()) -> None:
+    def __init__(
+        self, light: Callable[[int], TagStream], serial: str, setting: Setting, faults: Iterable[Fault] = ()
+    ) -> None:
         super().__init__(IDENTITY, ("tofclip", INSTRUMENT, serial), (COMMANDS, DATA, REPLIES))
         self.truth = Truth()
-        self._light, self.setting = light, setting
+        self._make_light, self.setting = light, setting
+        self._light, self._resets = light(0), 0
         self._faults = {fault.transfer: fault for fault in faults}
         self._transfers = 0
         self._stalls = self._to_garble = 0
@@ -157,6 +161,9 @@ class EmulatedTimeTagger(VirtualDevice):
     def _switch(self, to: Capture) -> None:
         if Capture.REGISTER not in to:
             self._register_due()
+        if Capture.RESET in to and self.truth.registered:
+            self._resets += 1
+            self._light = self._make_light(self._resets)
         if Capture.COUNT in to and Capture.COUNT not in self._capture:
             self._started = monotonic()
 

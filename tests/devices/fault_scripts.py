@@ -35,10 +35,14 @@ class Outcome:
     is_over: bool = False
 
 
+def light(seed: int, resets: int = 0) -> Poisson:
+    """Return what the instrument sees after its counter was reset so often."""
+    return Poisson(1e6, CLOCK_HZ, seed + 100_000 * resets)
+
+
 def run(script: Sequence[Fault], seed: int, records: int = RECORDS, address: str = ADDRESS) -> Outcome:
     """Read an emulated instrument until it is dark or fails, under a watchdog."""
-    light = Poisson(1e6, CLOCK_HZ, seed)
-    instrument = EmulatedTimeTagger(light, "T1", Setting(records=records), script)
+    instrument = EmulatedTimeTagger(lambda resets: light(seed, resets), "T1", Setting(records=records), script)
     outcome = Outcome([], Stats(), instrument.truth)
     thread = threading.Thread(target=_read, args=(instrument, address, outcome), daemon=True)
     thread.start()

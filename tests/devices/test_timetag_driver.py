@@ -30,7 +30,7 @@ SMALL = "sim+timetag://?seed=3&transfer_kib=8"
 
 
 def tagger(**options: object) -> tuple[EmulatedTimeTagger, VirtualUsb]:
-    instrument = EmulatedTimeTagger(Poisson(RATE, CLOCK_HZ, 1), "T1", Setting(**options))  # type: ignore[arg-type]
+    instrument = EmulatedTimeTagger(lambda _: Poisson(RATE, CLOCK_HZ, 1), "T1", Setting(**options))  # type: ignore[arg-type]
     return instrument, VirtualUsb(instrument)
 
 
@@ -217,8 +217,8 @@ def test_odd_answers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("fault", [Fault(1, "unplug", 2), Fault(1, "powerloss", 2), Fault(1, "overflow")])
 def test_one_that_was_stopped_stays_so_whatever_happens(fault: Fault) -> None:
-    light = Poisson(RATE, CLOCK_HZ, 1)
-    link = UsbLink(IDENTITY, "", VirtualUsb(EmulatedTimeTagger(light, "T1", Setting(packet_bytes=510), [fault])))
+    instrument = EmulatedTimeTagger(lambda _: Poisson(RATE, CLOCK_HZ, 1), "T1", Setting(packet_bytes=510), [fault])
+    link = UsbLink(IDENTITY, "", VirtualUsb(instrument))
     feed = TimeTaggerFeed(link, Ledger(), Acquisition(transfer_bytes=1024))
     feed.start()
     assert feed.pull(0.1) is not None
