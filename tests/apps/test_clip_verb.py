@@ -53,7 +53,7 @@ def test_choices_are_made_by_name(shared_data, tmp_path, capsys):
     assert main([*recover, *settings, "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["weight"] == 0.03
-    assert figures["stopped_because"] == "8 calls of the denoiser done"
+    assert figures["stopped_because"] == "10 calls of the denoiser done"
 
 
 @pytest.mark.parametrize(

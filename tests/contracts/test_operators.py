@@ -31,6 +31,7 @@ from tofclip.operators import (
     SliceConvolution,
     SparseMatrix,
     Stack,
+    ViewSelection,
     WeightedViews,
 )
 
@@ -47,6 +48,10 @@ def sparse_matrix(dtype: type) -> LinearOperator:
 
     matrix = scipy.sparse.random_array((15, 21), density=0.2, rng=np.random.default_rng(3), dtype=dtype)
     return SparseMatrix(matrix.tocsr(), (3, 7), (15,))
+
+
+def view_selection(dtype: type) -> LinearOperator:
+    return ViewSelection((5, 3, 4), [3, 0], dtype)
 
 
 def many_tiles(dtype: type) -> LinearOperator:
@@ -174,6 +179,7 @@ BUILDERS: list[Callable[[type], LinearOperator]] = [
     line_projection,
     sparse_matrix,
     many_tiles,
+    view_selection,
     diagonal,
     composition,
     stack,

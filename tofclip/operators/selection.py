@@ -29,7 +29,7 @@ class ViewSelection(LinearOperator):
     ) -> None:
         self.kept = np.asarray(kept, np.intp)
         if np.unique(self.kept).size != self.kept.size or not np.all(
-            (0 <= self.kept) & (self.kept < light_field_shape[0])
+            (self.kept >= 0) & (self.kept < light_field_shape[0])
         ):
             raise InputError(f"views to keep must be different numbers from 0 to {light_field_shape[0] - 1}")
         super().__init__(light_field_shape, (self.kept.size, *light_field_shape[1:]), dtype)

@@ -31,6 +31,7 @@ class Fista:
     Attributes
     ----------
     current : (rows, columns, frames) array
+        With a light field's model (views, rows, columns, frames).
         The solution so far.
     objective : (frames,) array
     refused : (frames,) bool array
@@ -82,7 +83,8 @@ class Fista:
         """Put the refused frames back to where they were and let their momentum start anew."""
         from tofclip.recovery.kernels import put_back
 
-        put_back(candidate, self.current, self.refused.astype(self.operator.dtype))
+        flat = (-1, *candidate.shape[-2:])
+        put_back(candidate.reshape(flat), self.current.reshape(flat), self.refused.astype(self.operator.dtype))
         seen[..., self.refused] = self.seen[..., self.refused]
         objective[self.refused] = self.objective[self.refused]
         age[self.refused] = 1

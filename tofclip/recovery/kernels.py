@@ -161,3 +161,76 @@ def total_variation_primal(noisy, dual, weight, result, total):
         _primal(noisy, dual, weight, result, total, LANES)
     else:
         _primal(noisy, dual, weight, result, total, noisy.shape[2])
+
+
+@compiled
+def light_field_primal(noisy, dual, weight, angular, result):
+    """``result = max(noisy + weight * div(dual), 0)``; arrays are (v, u, rows, columns, lanes), `dual` four of them.
+
+    The last difference along every axis crosses the border and is always zero, so only the first needs care.
+    """
+    down, across, rows, columns, lanes = noisy.shape
+    for v in range(down):
+        for u in range(across):
+            for row in range(rows):
+                for column in range(columns):
+                    for lane in range(lanes):
+                        divergence = dual[0, v, u, row, column, lane] + dual[1, v, u, row, column, lane]
+                        between = dual[2, v, u, row, column, lane] + dual[3, v, u, row, column, lane]
+                        if row > 0:
+                            divergence -= dual[0, v, u, row - 1, column, lane]
+                        if column > 0:
+                            divergence -= dual[1, v, u, row, column - 1, lane]
+                        if v > 0:
+                            between -= dual[2, v - 1, u, row, column, lane]
+                        if u > 0:
+                            between -= dual[3, v, u - 1, row, column, lane]
+                        value = noisy[v, u, row, column, lane] + weight * (divergence + angular * between)
+                        result[v, u, row, column, lane] = max(value, np.float32(0))
+
+
+@inlined
+def _differences(field, v, u, row, column, lane, angular):
+    """The four forward differences at a sample, 0 across borders."""
+    down, across, rows, columns = field.shape[:4]
+    here = field[v, u, row, column, lane]
+    return (
+        field[v, u, min(row + 1, rows - 1), column, lane] - here,
+        field[v, u, row, min(column + 1, columns - 1), lane] - here,
+        angular * (field[min(v + 1, down - 1), u, row, column, lane] - here),
+        angular * (field[v, min(u + 1, across - 1), row, column, lane] - here),
+    )
+
+
+@compiled
+def light_field_dual(field, dual, step, angular):
+    """``dual = project(dual + step * grad(field))`` onto vectors of length at most 1."""
+    down, across, rows, columns, lanes = field.shape
+    for v in range(down):
+        for u in range(across):
+            for row in range(rows):
+                for column in range(columns):
+                    for lane in range(lanes):
+                        slope = _differences(field, v, u, row, column, lane, angular)
+                        a = dual[0, v, u, row, column, lane] + step * slope[0]
+                        b = dual[1, v, u, row, column, lane] + step * slope[1]
+                        c = dual[2, v, u, row, column, lane] + step * slope[2]
+                        d = dual[3, v, u, row, column, lane] + step * slope[3]
+                        shrink = 1 / max(np.sqrt(a * a + b * b + c * c + d * d), np.float32(1))
+                        dual[0, v, u, row, column, lane] = a * shrink
+                        dual[1, v, u, row, column, lane] = b * shrink
+                        dual[2, v, u, row, column, lane] = c * shrink
+                        dual[3, v, u, row, column, lane] = d * shrink
+
+
+@compiled
+def light_field_variation(field, angular, total):
+    """Add the isotropic variation of each lane to `total` (lanes,), float64."""
+    down, across, rows, columns, lanes = field.shape
+    for v in range(down):
+        for u in range(across):
+            for row in range(rows):
+                for column in range(columns):
+                    for lane in range(lanes):
+                        a, b, c, d = _differences(field, v, u, row, column, lane, angular)
+                        total[lane] += np.sqrt(a * a + b * b + c * c + d * d)
