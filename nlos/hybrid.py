@@ -10,7 +10,7 @@ from nlos.band import VirtualPulse
 from nlos.capture import Capture
 from nlos.exposure import Exposure, exposure_support, exposures, unfolded_band
 from nlos.geometry import Grid
-from nlos.method import Support, common_support
+from nlos.method import Progress, Support, common_support, silent
 from nlos.plane import Plane
 from nlos.propagation.plane_field import virtual_plane
 from nlos.propagation.propagate import Propagation, carried, require_propagation
@@ -85,8 +85,15 @@ class Hybrid:
             return Support(str(problem))
         return ways[0].supports()
 
-    def reconstruct(self, capture: Capture, grid: Grid) -> Volume:
+    def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Image the hidden scene.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+        progress : callable, optional
+            Called with the number of voxels just done, once for every laser spot.
 
         Returns
         -------
@@ -98,10 +105,10 @@ class Hybrid:
         InputError
             `supports` says no.
         """
-        complex_field = self.phasor_field(capture, grid)
+        complex_field = self.phasor_field(capture, grid, progress)
         return Volume(np.abs(complex_field.values), grid, complex_field.provenance)
 
-    def phasor_field(self, capture: Capture, grid: Grid) -> Volume:
+    def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in the signal."""
         self.supports(capture, grid).require()
         band = unfolded_band(capture, grid, self.pulse)
@@ -109,7 +116,7 @@ class Hybrid:
         total = np.zeros(grid.shape, np.complex64)
         for part, way in self._ways(capture, grid):
             on_plane = carried(capture, part, way.plane, band, self.propagation).values
-            diffract(way, on_plane * np.float32(np.prod(way.plane.steps)), source_of(part, band), total)
+            diffract(way, on_plane * np.float32(np.prod(way.plane.steps)), source_of(part, band), total, progress)
         settings = {
             "method": "hybrid",
             "wavelength_m": self.wavelength,

@@ -12,7 +12,7 @@ from nlos.volume import Volume
 from tofclip.errors import InputError
 
 Progress = Callable[[int], None]
-"""Called with the number of look-ups just done, from several threads; may raise to interrupt."""
+"""Called with the number of look-ups or voxels just done, from several threads; may raise to interrupt."""
 
 MEMORY_LIMIT_BYTES = 8 << 30
 """Larger volumes are refused before anything is allocated."""
@@ -53,7 +53,7 @@ class Reconstructor(Protocol):
         """Say whether the method can image `capture` on `grid`, and if not, why."""
         ...
 
-    def reconstruct(self, capture: Capture, grid: Grid) -> Volume:
+    def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Image the hidden scene."""
         ...
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos.method import Progress, silent
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.illumination import Illumination, constant, split
 from nlos.rsd.inverse import InverseTransform
@@ -62,7 +63,13 @@ class Source:
         return split(self.wavenumbers - self.centre, self.strength, span, ILLUMINATION_SHARE * way.tolerance)
 
 
-def diffract(way: Diffraction, values: NDArray[np.complex64], source: Source, total: NDArray[np.complex64]) -> None:
+def diffract(
+    way: Diffraction,
+    values: NDArray[np.complex64],
+    source: Source,
+    total: NDArray[np.complex64],
+    progress: Progress = silent,
+) -> None:
     """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r, S_k the field carried there from the plane.
 
     Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight imaging systems",
@@ -77,6 +84,8 @@ def diffract(way: Diffraction, values: NDArray[np.complex64], source: Source, to
     source : Source
     total : (z, y, x) complex64 array
         Added to.
+    progress : callable, optional
+        Called with the number of voxels just done.
     """
     from threadpoolctl import threadpool_limits
 
@@ -92,6 +101,7 @@ def diffract(way: Diffraction, values: NDArray[np.complex64], source: Source, to
             bench = spare.pop() if spare else _Bench(way, source, most)
             for i in range(planes.start, planes.stop):
                 bench.image(spectrum, lights[i], float(way.grid.z[i]), total[i])
+                progress(total[i].size)
             spare.append(bench)
 
         run_blocks(work, len(lights), size=PLANES_AT_A_TIME)

@@ -10,7 +10,7 @@ from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
 from nlos.exposure import Exposure, exposure_support, exposures, unfolded_band
 from nlos.geometry import Grid
-from nlos.method import Support, common_support
+from nlos.method import Progress, Support, common_support, silent
 from nlos.plane import Plane, evenly_spaced
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.meeting import Source, diffract
@@ -74,8 +74,15 @@ class PlanarRSD:
             return Support(f"the grid must begin in front of the wall, which is at z = {walls[0].plane.z:.4g} m")
         return self._way(walls[0].plane, grid, band, exposures(capture)[0]).supports()
 
-    def reconstruct(self, capture: Capture, grid: Grid) -> Volume:
+    def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Image the hidden scene.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+        progress : callable, optional
+            Called with the number of voxels just done, once for every laser spot.
 
         Returns
         -------
@@ -87,10 +94,10 @@ class PlanarRSD:
         InputError
             `supports` says no.
         """
-        complex_field = self.phasor_field(capture, grid)
+        complex_field = self.phasor_field(capture, grid, progress)
         return Volume(np.abs(complex_field.values), grid, complex_field.provenance)
 
-    def phasor_field(self, capture: Capture, grid: Grid) -> Volume:
+    def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in the signal."""
         self.supports(capture, grid).require()
         total = np.zeros(grid.shape, np.complex64)
@@ -99,7 +106,7 @@ class PlanarRSD:
         for part in exposures(capture):
             wall = PlanarWall.of(capture.points[part.members])
             values = wall.field(part.phasors(capture, band))
-            diffract(self._way(wall.plane, grid, band, part), values, source_of(part, band), total)
+            diffract(self._way(wall.plane, grid, band, part), values, source_of(part, band), total, progress)
         settings = {
             "method": "rsd",
             "wavelength_m": self.wavelength,

@@ -180,6 +180,12 @@ class TestConvertAndNlos:
         found = object_of(run, *words, "--voxel-mm", 20, "--wavelength-mm", 60)
         # Within a voxel across; along z the pulse of three cycles is 18 cm of path long, peaked within a voxel.
         assert [found["peak_m"][axis] for axis in "xyz"] == pytest.approx(hidden, abs=0.025)
+        for method in ("rsd", "hybrid"):
+            again = object_of(run, *words, "--voxel-mm", 20, "--wavelength-mm", 60, "--method", method)
+            assert (again["method"], again["peak_m"]) == (method, found["peak_m"])
+        refused = run(*words, "--method", "lct")
+        assert refused.status == 2
+        assert "confocal" in refused.err
 
 
 class TestInfo:
