@@ -191,6 +191,64 @@ def back_project_lines(lines, starts, rightward, downward, picture):
 
 
 @compiled
+def count_on_lines(starts, rightward, downward, before, shape, counts):
+    """Count the nonzeros in each row of the matrix that `project_onto_lines` stands for.
+
+    `counts` is (lines, detector pixels), zeros; the detector's first pixel is bin `before`, `shape` the picture's.
+    """
+    for number in range(starts.size):
+        for row in range(shape[0]):
+            start = starts[number] + row * downward[number]
+            for column in range(shape[1]):
+                position = start + column * rightward[number]
+                reading = (position >> FRACTION_BITS) - before
+                if 0 <= reading < counts.shape[1]:
+                    counts[number, reading] += 1
+                if 0 <= reading + 1 < counts.shape[1] and position & FRACTION:
+                    counts[number, reading + 1] += 1
+
+
+@compiled
+def enter_on_lines(starts, rightward, downward, before, shape, places, columns, values):
+    """Write the nonzeros that `count_on_lines` counted.
+
+    `places`, (lines, detector pixels), says where each row of the matrix begins in `columns` and `values`, and says
+    afterwards where it ends.
+    """
+    whole, step = values.dtype.type(1), values.dtype.type(1 / (1 << FRACTION_BITS))
+    for number in range(starts.size):
+        for row in range(shape[0]):
+            start = starts[number] + row * downward[number]
+            for column in range(shape[1]):
+                position = start + column * rightward[number]
+                reading, share = (position >> FRACTION_BITS) - before, values.dtype.type(position & FRACTION) * step
+                for bin_number, weight in ((reading, whole - share), (reading + 1, share)):
+                    if 0 <= bin_number < places.shape[1] and (bin_number == reading or share != 0):
+                        place = places[number, bin_number]
+                        columns[place], values[place] = row * shape[1] + column, weight
+                        places[number, bin_number] = place + 1
+
+
+@compiled
+def count_in_tiles(row_starts, indices, width, counts):
+    """Count a CSR matrix's nonzeros in each tile of `width` columns and row, (tiles, rows) zeros."""
+    for row in range(row_starts.size - 1):
+        for entry in range(row_starts[row], row_starts[row + 1]):
+            counts[indices[entry] // width, row] += 1
+
+
+@compiled
+def sort_into_tiles(row_starts, indices, data, width, places, columns, values):
+    """Write a CSR matrix's nonzeros in the order of tile, row and column; `places` as in `enter_on_lines`."""
+    for row in range(row_starts.size - 1):
+        for entry in range(row_starts[row], row_starts[row + 1]):
+            tile = indices[entry] // width
+            place = places[tile, row]
+            columns[place], values[place] = indices[entry], data[entry]
+            places[tile, row] = place + 1
+
+
+@compiled
 def walsh_hadamard(values):
     """Multiply (n, columns) values by Sylvester's Hadamard matrix of n = 2^k rows, in place; two stages at a time."""
     count, columns = values.shape

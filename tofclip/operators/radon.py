@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators.base import Array, LinearOperator
-from tofclip.operators.sparse import SparseMatrix, split_between_bins
+from tofclip.operators.sparse import SparseMatrix
 
 if TYPE_CHECKING:
     import scipy.sparse
@@ -68,21 +68,17 @@ class RadonProjection(SparseMatrix):
         """The CSR matrix, (angles * detector_px, rows * columns); made on first use."""
         import scipy.sparse
 
-        reading, pixel, weight = self._entries()
-        shape = (self.shape_out[0], self.shape_in[0] * self.shape_in[1])
-        made = scipy.sparse.csr_array((weight.astype(self.dtype), (reading, pixel)), shape=shape)
-        return SparseMatrix(made, self.shape_in, self.shape_out).matrix
+        from tofclip.operators.kernels import count_on_lines, enter_on_lines
 
-    def _entries(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Row, column and value of every nonzero."""
-        rows, columns = self.shape_in
         before, _, paths = self._paths
-        first, right, down = (path[:, np.newaxis, np.newaxis] for path in paths)
-        fixed = first + np.arange(columns) * right + np.arange(rows)[:, np.newaxis] * down
-        # Exact: positions have fewer bits than float64's mantissa.
-        entry, bins, weight = split_between_bins(fixed * 0.5**FRACTION_BITS - before, self.detector_px)
-        number, pixel = np.divmod(entry, rows * columns)
-        return number * self.detector_px + bins, pixel, weight
+        counts = np.zeros((self.angles.size, self.detector_px), np.int64)
+        count_on_lines(*paths, before, self.shape_in, counts)
+        ends = np.cumsum(counts)
+        columns, values = np.empty(ends[-1], np.int32), np.empty(ends[-1], self.dtype)
+        enter_on_lines(*paths, before, self.shape_in, (ends - counts.ravel()).reshape(counts.shape), columns, values)
+        shape = (self.shape_out[0], self.shape_in[0] * self.shape_in[1])
+        made = scipy.sparse.csr_array((values, columns, np.append(0, ends)), shape=shape)
+        return SparseMatrix(made, self.shape_in, self.shape_out).matrix
 
     @cached_property
     def _paths(self) -> tuple[int, int, list[NDArray[np.int64]]]:

@@ -116,17 +116,17 @@ class Tiles(NamedTuple):
 
     @classmethod
     def of(cls, matrix: scipy.sparse.csr_array) -> Tiles:
-        """Sort the nonzeros of `matrix` by tile, then row, then column."""
+        """Sort the nonzeros of `matrix` by tile, then row, then as they stand in the row."""
+        from tofclip.operators.kernels import count_in_tiles, sort_into_tiles
+
         width = max(1, TILE_BYTES // (LANES * matrix.dtype.itemsize))
-        count = -(-matrix.shape[1] // width)
-        rows = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-        tiles = matrix.indices // width
-        order = np.lexsort((matrix.indices, rows, tiles))
-        per_row = np.zeros((count, matrix.shape[0]), np.int64)
-        np.add.at(per_row, (tiles, rows), 1)
+        per_row = np.zeros((-(-matrix.shape[1] // width), matrix.shape[0]), np.int64)
+        count_in_tiles(matrix.indptr, matrix.indices, width, per_row)
         ends = np.cumsum(per_row).reshape(per_row.shape)
-        starts = np.concatenate([(ends - per_row), ends[:, -1:]], axis=1)
-        return cls(starts, matrix.indices[order].astype(np.uint32), matrix.data[order])
+        starts = np.concatenate([ends - per_row, ends[:, -1:]], axis=1)
+        columns, values = np.empty(matrix.nnz, np.uint32), np.empty(matrix.nnz, matrix.dtype)
+        sort_into_tiles(matrix.indptr, matrix.indices, matrix.data, width, starts[:, :-1].copy(), columns, values)
+        return cls(starts, columns, values)
 
 
 def split_between_bins(
