@@ -20,9 +20,10 @@ from devices.remoteex.protocol import (
     whole_number,
 )
 from devices.tcp import TcpLink
-from tofclip.errors import DeviceTimeoutError, ProtocolError
+from tofclip.errors import DeviceDisconnectedError, DeviceError, DeviceTimeoutError, ProtocolError
 
 MOST_TABLE_BYTES = 1 << 20
+_WITH_DATA = ("ImgRingBufferGet", "ImgDataGet")
 MOST_MESSAGES = 4096
 """Messages that are kept until somebody asks for them; the oldest go first."""
 
@@ -112,10 +113,33 @@ class RemoteEx:
         self._owed.append(command)
         return command
 
-    @property
-    def is_late(self) -> bool:
-        """Whether RemoteEx owes an answer, or the rest of a picture."""
-        return bool(self._owed or self._unread)
+    def conclude(self, *commands: tuple[str, ...]) -> None:
+        """Send commands at once, whatever is still owed, and wait until each has been answered.
+
+        Closing without waiting could make the network drop the commands.
+
+        Raises
+        ------
+        DeviceError
+            The first thing that went wrong, after everything else was tried.
+        """
+        last_words = [self.tell(*words) for words in commands]
+        fault: DeviceError | None = None
+        while self._owed:
+            command = self._owed[0]
+            try:
+                self._finish_data()
+                answer = self._owed_answer()
+                if command in last_words:
+                    answer.require_done(command)
+                elif command.name in _WITH_DATA:
+                    self._unread = announced(answer)
+            except (DeviceTimeoutError, DeviceDisconnectedError) as failure:
+                raise fault or failure from None
+            except DeviceError as failure:
+                fault = fault or failure
+        if fault is not None:
+            raise fault
 
     def message(self, timeout: float) -> Answer:
         """Return the next message that came unasked; `DeviceTimeoutError` if there is none."""
@@ -165,12 +189,17 @@ class RemoteEx:
     def _settle(self) -> None:
         """Wait for the answers that are owed, with their data, and forget them."""
         while self._unread or self._owed:
-            if self._unread:
-                self._take(self._unread, MOST_FRAME_BYTES)
+            self._finish_data()
             if self._owed:
                 command = self._owed[0]
                 answer = self._owed_answer()
-                self._unread = announced(answer) if command.name in ("ImgRingBufferGet", "ImgDataGet") else 0
+                self._unread = announced(answer) if command.name in _WITH_DATA else 0
+
+    def _finish_data(self) -> None:
+        """Take the rest of a picture that is late; more than any picture has is given up."""
+        length, self._unread = self._unread, 0
+        if length:
+            self._take(length, MOST_FRAME_BYTES)
 
     def _owed_answer(self) -> Answer:
         """Return the answer to the first command that is owed one; keep the messages that come before."""
@@ -195,10 +224,11 @@ class RemoteEx:
 
     def _take(self, length: int, limit: int) -> bytes:
         """Return data that an answer has announced; what is missing at a timeout stays owed."""
-        self._unread = length
-        data = self._data.exactly(length, limit, self._timeout)
-        self._unread = 0
-        return data
+        try:
+            return self._data.exactly(length, limit, self._timeout)
+        except DeviceTimeoutError:
+            self._unread = length
+            raise
 
 
 def announced(answer: Answer) -> int:

@@ -124,14 +124,7 @@ class RemoteExFeed:
     def stop(self) -> None:
         """Turn the gain down first, whatever the state of the connection, and stop the acquisition."""
         self._stopped = True
-        fault: DeviceError | None = None
-        for words in _STOP:
-            try:
-                (self._link.tell if self._link.is_late else self._link.ask)(*words)
-            except DeviceError as failure:
-                fault = fault or failure
-        if fault is not None:
-            raise fault
+        self._link.conclude(*_STOP)
 
     def close(self) -> None:
         try:

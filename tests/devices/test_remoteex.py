@@ -17,7 +17,9 @@ from devices.remoteex.client import RemoteEx
 from devices.remoteex.emulator import EmulatedLight, EmulatedStreakCamera
 from devices.remoteex.protocol import END
 from devices.remoteex.source import LiveSettings
+from devices.scenes import demonstration_light, line_light
 from devices.source import Source
+from tofclip.camera import Camera
 from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceNotFoundError,
@@ -30,11 +32,11 @@ LIGHT = EmulatedLight(
     np.random.default_rng(1).uniform(0, 50, (12, 20)), np.cumsum(np.linspace(18e-12, 20e-12, 12)), full_scale=60, seed=3
 )
 
-Camera = Callable[..., EmulatedStreakCamera]
+Make = Callable[..., EmulatedStreakCamera]
 
 
 @pytest.fixture
-def camera() -> Iterator[Camera]:
+def camera() -> Iterator[Make]:
     """Make emulated cameras that are switched off in the end."""
     made = []
 
@@ -71,7 +73,7 @@ def require_balance(source: Source) -> None:
     assert source.stats.unread == 0
 
 
-def test_pictures_come_in_order_and_bit_for_bit(camera: Camera) -> None:
+def test_pictures_come_in_order_and_bit_for_bit(camera: Make) -> None:
     server = camera()
     with opened(server, mcp_gain=30) as source:
         assert server.gain == "30"
@@ -86,7 +88,7 @@ def test_pictures_come_in_order_and_bit_for_bit(camera: Camera) -> None:
     assert server.gain == "0"
 
 
-def test_what_is_known_of_the_camera(camera: Camera) -> None:
+def test_what_is_known_of_the_camera(camera: Make) -> None:
     with opened(camera()) as source:
         info, calibration = source.info.as_dict(), source.calibration
     assert info["time_range"] == "20 ns"
@@ -96,7 +98,7 @@ def test_what_is_known_of_the_camera(camera: Camera) -> None:
     np.testing.assert_allclose(calibration.array("row_times", float, 1, "s"), LIGHT.row_times, rtol=1e-7)
 
 
-def test_the_gain_goes_down_even_if_the_stream_has_failed(camera: Camera) -> None:
+def test_the_gain_goes_down_even_if_the_stream_has_failed(camera: Make) -> None:
     server = camera(Fault(3, "corrupt"))
     with opened(server, mcp_gain=20) as source, pytest.raises(ProtocolError):
         taken(source, 100)
@@ -104,7 +106,7 @@ def test_the_gain_goes_down_even_if_the_stream_has_failed(camera: Camera) -> Non
     assert source.stats.is_balanced
 
 
-def test_pictures_that_fell_out_of_the_ring_are_accounted_for(camera: Camera) -> None:
+def test_pictures_that_fell_out_of_the_ring_are_accounted_for(camera: Make) -> None:
     with opened(camera(Fault(4, "lost", 7))) as source:
         gaps = []
         while source.stats.delivered < 20:
@@ -117,7 +119,7 @@ def test_pictures_that_fell_out_of_the_ring_are_accounted_for(camera: Camera) ->
     assert any(gaps)
 
 
-def test_a_late_answer_is_waited_for_and_not_asked_for_again(camera: Camera) -> None:
+def test_a_late_answer_is_waited_for_and_not_asked_for_again(camera: Make) -> None:
     """An answer later than the time to wait: the picture comes all the same, and no other is taken for it."""
     with opened(camera(Fault(3, "timeout", 5), Fault(6, "short", 5)), timeout_s=0.2) as source:
         frames = taken(source, 15)
@@ -128,7 +130,7 @@ def test_a_late_answer_is_waited_for_and_not_asked_for_again(camera: Camera) -> 
         np.testing.assert_array_equal(frame["counts"], LIGHT.exposure(int(frame["number"])))
 
 
-def test_after_an_unplugged_cable_the_stream_goes_on(camera: Camera) -> None:
+def test_after_an_unplugged_cable_the_stream_goes_on(camera: Make) -> None:
     with opened(camera(Fault(5, "unplug"))) as source:
         gaps = []
         while source.stats.delivered < 20:
@@ -141,7 +143,7 @@ def test_after_an_unplugged_cable_the_stream_goes_on(camera: Camera) -> None:
     assert gaps.count(True) == 1
 
 
-def test_a_camera_that_stays_away(camera: Camera) -> None:
+def test_a_camera_that_stays_away(camera: Make) -> None:
     server = camera()
     with opened(server, reconnect_s=0.3) as source:
         taken(source, 3)
@@ -151,7 +153,7 @@ def test_a_camera_that_stays_away(camera: Camera) -> None:
     assert source.stats.is_balanced
 
 
-def test_a_picture_larger_than_any_is_refused_before_memory_is_taken(camera: Camera) -> None:
+def test_a_picture_larger_than_any_is_refused_before_memory_is_taken(camera: Make) -> None:
     with opened(camera(Fault(2, "overflow"))) as source, pytest.raises(ProtocolError, match="at most"):
         taken(source, 100)
 
@@ -244,6 +246,47 @@ def test_another_server_is_recognised(greeting: bytes) -> None:
         RemoteEx(HOST, commands.port, commands.port, 2)
 
 
+def test_another_data_server_is_recognised() -> None:
+    with LoopbackServer(scripted({})) as commands, LoopbackServer(scripted({})) as data:
+        with pytest.raises(ProtocolError, match="expected 'RemoteEx Data Ready'"):
+            RemoteEx(HOST, commands.port, data.port, 2)
+        data.close()
+        with pytest.raises(DeviceNotFoundError):
+            RemoteEx(HOST, commands.port, data.port, 2)
+
+
+def test_an_emulated_camera_sees_a_scene() -> None:
+    light = line_light()
+    with devices.open("sim+remoteex://?seed=4&scene=small&frame_rate=100&frames=4&mcp_gain=5") as source:
+        frames, known, info = taken(source, 4), source.calibration, source.info
+        source.stop()
+        require_balance(source)
+    assert info.instrument.startswith("emulated Hamamatsu")
+    assert known is not None
+    assert Camera.from_record(known.child("camera", "camera")).slit_width_px == 256
+    counts = np.sum([frame["counts"] for frame in frames], axis=0)
+    # Poisson of 4 exposures: the sum over 147 456 pixels to a tenth of a percent, bright pixels to their root.
+    assert counts.sum() == pytest.approx(4 * light.photons.sum(), rel=5e-3)
+    bright = light.photons > 100
+    assert np.std((counts - 4 * light.photons)[bright] / np.sqrt(4 * light.photons[bright])) == pytest.approx(
+        1, abs=0.1
+    )
+
+
+@pytest.mark.parametrize("query", ["seed=-1", "scene=none", "frame_rate=0", "faults=x", "data_port=3", "speed=1"])
+def test_emulations_that_cannot_be(query: str) -> None:
+    with pytest.raises(InputError):
+        devices.open(f"sim+remoteex://?scene=small&{query}")
+
+
+def test_the_demonstrations_light_comes_with_what_focus_pictures_tell() -> None:
+    light = demonstration_light()
+    assert light.photons.shape == (576, 1344)
+    assert light.photons.max() == pytest.approx(2002, rel=1e-6)  # peak and background
+    assert light.camera.sweep is None
+    assert light.camera.gains.tolist() == [1.0] * 7
+
+
 def test_servers_are_for_this_computer_only() -> None:
     with LoopbackServer(lambda connection: None) as server:
         assert server._listener.getsockname()[0] == "127.0.0.1"
@@ -253,7 +296,7 @@ def test_servers_are_for_this_computer_only() -> None:
                 socket.create_connection((address, server.port), 1)
 
 
-def test_no_thread_is_left_behind(camera: Camera) -> None:
+def test_no_thread_is_left_behind(camera: Make) -> None:
     before = threading.active_count()
     server = camera()
     with opened(server) as source:
