@@ -16,8 +16,13 @@ TOUCHING = 1e-4
 def is_hidden(start, end, triangles):
     """Whether a triangle crosses the way between two points (T. Moller, B. Trumbore, J. Graph. Tools 2, 21 (1997))."""
     dx, dy, dz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
+    near, far = min(start[2], end[2]), max(start[2], end[2])
     for i in range(triangles.shape[0]):
         ax, ay, az = triangles[i, 0, 0], triangles[i, 0, 1], triangles[i, 0, 2]
+        bz, cz = triangles[i, 1, 2], triangles[i, 2, 2]
+        # Most triangles lie wholly behind the facet: this asks three numbers of them instead of nine.
+        if (az >= far and bz >= far and cz >= far) or (az <= near and bz <= near and cz <= near):
+            continue
         ux, uy, uz = triangles[i, 1, 0] - ax, triangles[i, 1, 1] - ay, triangles[i, 1, 2] - az
         vx, vy, vz = triangles[i, 2, 0] - ax, triangles[i, 2, 1] - ay, triangles[i, 2, 2] - az
         px, py, pz = dy * vz - dz * vy, dz * vx - dx * vz, dx * vy - dy * vx
