@@ -127,7 +127,8 @@ def load_calibration(
     """
     picosecond = 1e-12
     table = _numbers(code_table, lambda path: np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2))
-    offsets = _numbers(offset_table, lambda path: np.load(path, allow_pickle=False))
+    # Mapped, not read: a header that claims more than the file holds is refused before memory is taken.
+    offsets = _numbers(offset_table, lambda path: np.array(np.load(path, mmap_mode="r", allow_pickle=False)))
     hot = np.empty(0)
     if hot_pixels is not None:
         hot = _numbers(hot_pixels, lambda path: np.loadtxt(path, ndmin=1))
@@ -143,5 +144,5 @@ def _numbers(path: str | Path, reader: Callable[[Path], Any]) -> NDArray[np.floa
             raise FileFormatError(path, f"is larger than any table of LinoSPAD2: {size} bytes")
         try:
             return np.asarray(reader(Path(path)), np.float64)
-        except (ValueError, TypeError, EOFError) as fault:
+        except Exception as fault:  # whatever NumPy stumbles over, it is the file that is damaged
             raise FileFormatError(path, f"holds no table of numbers ({one_line(fault)})") from fault

@@ -283,6 +283,15 @@ def test_sidecars_that_say_nothing_useful(recording: Path, text: str, problem: s
         read_sidecar(recording)
 
 
+@pytest.mark.parametrize("shape", [b"(9256000000000,), }", b"(256,            }"])
+def test_a_table_whose_header_lies(recording: Path, shape: bytes) -> None:
+    """It claims more than the file holds, or is cut off."""
+    path = recording.parent / "offsets.npy"
+    path.write_bytes(path.read_bytes().replace(b"(256,), }".ljust(len(shape)), shape))
+    with pytest.raises(FileFormatError, match="holds no table of numbers"):
+        load_calibration(recording.parent / "codes.csv", path)
+
+
 def test_companions_that_are_absent_or_too_large(recording: Path) -> None:
     recording.with_suffix(".toml").write_text(NEEDED + 'code_table = "absent"\noffset_table = "offsets.npy"\n')
     with pytest.raises(StorageError, match="absent: no such file"):
