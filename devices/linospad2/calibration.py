@@ -131,7 +131,9 @@ def load_calibration(
     offsets = _numbers(offset_table, lambda path: np.array(np.load(path, mmap_mode="r", allow_pickle=False)))
     hot = np.empty(0)
     if hot_pixels is not None:
-        hot = _numbers(hot_pixels, lambda path: np.loadtxt(path, ndmin=1))
+        hot = _numbers(hot_pixels, lambda path: [int(word) for word in path.read_text("ascii").split()])
+        if np.any((hot < 0) | (hot >= PIXELS)):
+            raise FileFormatError(hot_pixels, f"names pixels beyond 0..{PIXELS - 1}")
     if table.ndim != 2 or table.shape[1] != CODES + 1:
         raise FileFormatError(code_table, f"must have {CODES + 1} columns, found shape {table.shape}")
     return BoardCalibration(table[:, 1:] * picosecond, offsets * picosecond, hot.astype(np.int64))

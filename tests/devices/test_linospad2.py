@@ -292,6 +292,17 @@ def test_a_table_whose_header_lies(recording: Path, shape: bytes) -> None:
         load_calibration(recording.parent / "codes.csv", path)
 
 
+@pytest.mark.parametrize(("text", "problem"), [("15\n256", "beyond"), ("1e400", "no table"), ("9" * 30, "beyond")])
+def test_hot_pixels_that_are_none(recording: Path, text: str, problem: str) -> None:
+    folder = recording.parent
+    (folder / "hot.txt").write_text(text)
+    with pytest.raises(FileFormatError, match=problem):
+        load_calibration(folder / "codes.csv", folder / "offsets.npy", folder / "hot.txt")
+    (folder / "hot.txt").write_text("")
+    found = load_calibration(folder / "codes.csv", folder / "offsets.npy", folder / "hot.txt")
+    assert found.hot_pixels.size == 0
+
+
 def test_companions_that_are_absent_or_too_large(recording: Path) -> None:
     recording.with_suffix(".toml").write_text(NEEDED + 'code_table = "absent"\noffset_table = "offsets.npy"\n')
     with pytest.raises(StorageError, match="absent: no such file"):
