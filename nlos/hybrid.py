@@ -21,11 +21,11 @@ from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
 from tofclip.errors import InputError
 
-WIDENING = 1.5
-"""Width of the virtual plane relative to the wall's."""
+ZONES, STRICT_ZONES = 2.0, 4.0
+"""Room on the virtual plane beside the straight ways, in Fresnel zones; the second below `STRICT`."""
 
-STRICT, STRICT_WIDENING = 3e-3, 2.0
-"""Below this tolerance the virtual plane is wider."""
+STRICT = 3e-3
+"""Tolerance."""
 
 
 @dataclass(frozen=True)
@@ -134,11 +134,11 @@ class Hybrid:
     def _ways(self, capture: Capture, grid: Grid) -> list[tuple[Exposure, Diffraction]]:
         """Every exposure, and its way from a virtual plane of its own to the grid."""
         band = unfolded_band(capture, grid, self.pulse)
-        widening = STRICT_WIDENING if self.tolerance < STRICT else WIDENING
+        zones = STRICT_ZONES if self.tolerance < STRICT else ZONES
         ways = []
         for part in exposures(capture):
             waves = waves_of(part, band, continued=True)
             points = capture.points[part.members]
-            plane = virtual_plane(points, 2 * np.pi / waves.highest, widening, self.plane_z)
+            plane = virtual_plane(points, grid, waves, zones, self.plane_z)
             ways.append((part, Diffraction(plane, grid, waves, self.tolerance)))
         return ways

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos.geometry import Grid
 from nlos.plane import Plane
+from nlos.rsd.transfer import Waves
 
 FloatArray = NDArray[np.float64]
 
@@ -33,28 +35,35 @@ class PlaneField:
     wavenumbers: FloatArray
 
 
-def virtual_plane(points: FloatArray, shortest: float, widening: float, z: float | None = None) -> Plane:
-    """Choose a plane in front of a wall.
+def virtual_plane(points: FloatArray, grid: Grid, waves: Waves, zones: float, z: float | None = None) -> Plane:
+    """Choose a plane between a wall and the hidden scene that misses little of what passes.
+
+    It holds the straight way from every wall point to every voxel behind it, and around these some Fresnel zones of the
+    middle wave; its points are half the shortest wavelength apart.
 
     Parameters
     ----------
     points : (n, 3) array
         Wall points, m.
-    shortest : float
-        Shortest wavelength that the plane has to carry, m; its points are half of it apart.
-    widening : float
-        Width and height relative to the wall's.
+    grid : Grid
+    waves : Waves
+    zones : float
+        Room beside the straight ways, in radii of the first Fresnel zone.
     z : float, optional
         Where, m. Defaults to the shortest wavelength, but 5 to 10 cm, in front of the foremost wall point.
     """
     low, high = points.min(axis=0), points.max(axis=0)
+    shortest, middle = 2 * np.pi / waves.highest, 4 * np.pi / (waves.first + waves.highest)
     if z is None:
         z = float(high[2] + np.clip(shortest, NEAREST_GAP, WIDEST_GAP))
-    # A wall that is a line or a point still radiates into all directions.
-    extent = max(float(np.max(high[:2] - low[:2])), shortest)
+    gap = z - float(low[2])
+    behind = grid.z[grid.z > z]
+    share = gap / (gap + float(behind[0]) - z) if behind.size else 1.0
+    room = zones * np.sqrt(middle * gap)
     axes = []
-    for first, last in zip(low[:2], high[:2], strict=True):
-        half = widening * max(last - first, extent / 2) / 2
-        count = int(np.ceil(half / (shortest / 2)))
-        axes.append((first + last) / 2 + np.linspace(-half, half, 2 * count + 1))
+    for first, last, voxels in zip(low[:2], high[:2], (grid.x, grid.y), strict=True):
+        start = first + share * min(0.0, voxels[0] - first) - room
+        stop = last + share * max(0.0, voxels[-1] - last) + room
+        count = max(1, int(np.ceil((stop - start) / (shortest / 2))))
+        axes.append(np.linspace(start, stop, count + 1))
     return Plane(axes[0], axes[1], z)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scene_shapes import SHAPES, SPOT, shaped_capture, shaped_wall
 
-from nlos import Capture, propagate
+from nlos import Capture, Grid, propagate
 from nlos.band import Band, VirtualPulse
 from nlos.plane import Plane
 from nlos.propagation.plane_field import virtual_plane
+from nlos.rsd.transfer import Waves
 from nlos.simulate import PointScene
 from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
@@ -95,14 +96,21 @@ def test_the_number_of_points_on_the_plane_does_not_matter() -> None:
 
 def test_the_virtual_plane_keeps_its_distance_and_samples_the_shortest_wave() -> None:
     points = shaped_wall("relief", 9).reshape(-1, 3)
+    small = Grid([-0.5, 0.5], [-0.5, 0.5], [1.0])
     for shortest, gap in ((0.01, 0.05), (0.07, 0.07), (0.5, 0.1)):
-        plane = virtual_plane(points, shortest, 1.5)
+        plane = virtual_plane(points, small, Waves(2 * np.pi / shortest, 0.0, 1, True), 0.0)
         assert plane.z == pytest.approx(points[:, 2].max() + gap)
         assert max(plane.steps) <= shortest / 2
-        assert (plane.x[0], plane.x[-1], plane.y[-1]) == pytest.approx((-1.5, 1.5, 1.5))
-    assert virtual_plane(points, 0.07, 1.5, 0.9).z == 0.9
-    line = np.stack([np.linspace(0, 1, 5), np.zeros(5), np.zeros(5)], axis=1)
-    assert np.ptp(virtual_plane(line, 0.1, 1.5).y) == pytest.approx(0.75)
+        # All straight ways to voxels within the wall's outline pass within it too.
+        assert (plane.x[0], plane.x[-1], plane.y[-1]) == pytest.approx((-1, 1, 1))
+    waves = Waves(2 * np.pi / 0.07, 0.0, 1, True)
+    assert virtual_plane(points, small, waves, 1.0, 0.9).z == 0.9
+    gap = 0.07 + np.ptp(points[:, 2])
+    roomy = virtual_plane(points, small, waves, 2.0)
+    assert roomy.x[-1] == pytest.approx(1 + 2 * np.sqrt(0.07 * gap))
+    plane_z = points[:, 2].max() + 0.07
+    wide = virtual_plane(points, Grid([-3, 3], [-0.5, 0.5], [plane_z + gap]), waves, 0.0)
+    assert wide.x[-1] == pytest.approx(2)  # half way to a voxel at 3 m
 
 
 def test_what_cannot_be_propagated_is_refused() -> None:
