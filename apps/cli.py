@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from apps.verbs import calibrate, clip, cloud, convert, demo, devices, info, lidar, nlos, record, recover
+from apps.verbs import calibrate, clip, cloud, convert, demo, devices, info, lidar, nlos, record, recover, reproduce
 from tofclip import __version__
 from tofclip.errors import TofclipError
 
@@ -44,8 +44,10 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   cloud              recovered frames to a point cloud
   lidar accuracy     how well counted photons tell a range, beside the theoretical limit
   lidar parallax     a shot to how the views move with range, for recover --focus depth-locked
+  lidar sequence     a folder or stack of shots to a sequence of clouds
   nlos reconstruct   recovered frames of a wall to the scene hidden around the corner
   clip               light fields from few readings: simulate a camera, recover a picture
+  reproduce          the paper's tables and figures, made again: reproduce all --out DIR
   devices            instruments and their recordings: list, info, test, verify, repair
   record             an instrument's bytes, to be replayed exactly
   convert            any readable streak image to this program's own HDF5
@@ -61,6 +63,7 @@ app.command(epilog=EPILOG)(cloud.cloud)
 app.add_typer(lidar.app, name="lidar")
 app.add_typer(nlos.app, name="nlos")
 app.add_typer(clip.app, name="clip")
+app.command(epilog=EPILOG)(reproduce.reproduce)
 app.add_typer(devices.app, name="devices")
 app.command(epilog=EPILOG)(record.record)
 app.command(epilog=EPILOG)(convert.convert)

@@ -1,21 +1,27 @@
-"""`tofclip lidar`: how well counted photons tell a range, and how far a shot says that the views move with range."""
+"""`tofclip lidar`: how well counted photons tell a range, how the views move with range, and clouds of many shots."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from apps.options import AsJson, TimeZero
 from tofclip.units import NANOSECOND, PICOSECOND
 
+if TYPE_CHECKING:
+    from tofclip.lidar.sequence import Ranger
+    from tofclip.transient import Streak
+    from tofclip.transient.stack import StreakStack
+
 app = typer.Typer()
 
 
 @app.callback(invoke_without_command=True)
 def _without_verb(context: typer.Context) -> None:
-    """How well a range can be known, and how the views' parallax grows with it."""
+    """How well a range can be known, and how the views' parallax grows with it; many shots in a row."""
     if context.invoked_subcommand is None:
         print(context.get_help())
 
@@ -91,3 +97,105 @@ def parallax(
         "weight": found.curve.weight,
     }
     report(figures, as_json, [out])
+
+
+@app.command()
+def sequence(
+    shots: Annotated[
+        Path, typer.Argument(metavar="SHOTS", help="A folder of streak images, or an HDF5 stack of them.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the clouds go; those already there are kept.")],
+    camera: Annotated[
+        Path | None, typer.Option(metavar="H5", help="Made by calibrate.", show_default="the one inside the first shot")
+    ] = None,
+    bin_width_ps: Annotated[
+        float | None, typer.Option(metavar="PS", help="Duration of a row in ps; overrides the files' own time axis.")
+    ] = None,
+    time_zero_ns: TimeZero = None,
+    average: Annotated[int, typer.Option(metavar="N", help="Shots averaged for each cloud.")] = 1,
+    focus: Annotated[str, typer.Option(metavar="SHEAR", help="depth-locked or fixed:S.")] = "fixed:0",
+    suffix: Annotated[str, typer.Option(metavar=".EXT", help="Format of the clouds.")] = ".ply",
+    keep_jitter: Annotated[
+        bool, typer.Option("--keep-jitter", help="Do not find how late each shot comes against the first.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Make a cloud of each shot by the linear inverse, one shot in memory at a time.
+
+    Started again after an interruption, it goes on behind the last cloud in the folder.
+    """
+    from time import perf_counter
+
+    from apps.files import make_folder
+    from apps.progress import progress
+    from apps.report import report
+    from apps.verbs.cloud import FORMATS
+    from tofclip.errors import InputError
+    from tofclip.lidar.sequence import cloud_path, clouds, clouds_done
+
+    if suffix not in FORMATS:
+        raise InputError(f"no cloud format is called '{suffix}'; use one of {', '.join(FORMATS)}")
+    make_folder(out)
+    sources = _shots(shots, bin_width_ps)
+    ranger = _ranger(sources[0](), camera, time_zero_ns, focus)
+    done = clouds_done(out, suffix)
+    points, late, started = 0, [], perf_counter()
+    with progress("ranging", len(sources) - done * average) as advance:
+        for step in clouds(sources, ranger, average, not keep_jitter, done):
+            step.cloud.save(cloud_path(out, step.shots[0] // average, suffix))
+            points += len(step.cloud)
+            late.extend(step.late_bin.tolist())
+            advance(len(step.shots))
+    seconds = perf_counter() - started
+    report(
+        {
+            "shots": len(late),
+            "clouds_before": done,
+            "points": points,
+            "shots_per_second": len(late) / seconds,
+            "jitter_rms_bins": (sum(one**2 for one in late) / len(late)) ** 0.5 if late else 0.0,
+        },
+        as_json,
+        [out],
+    )
+
+
+def _shots(source: Path, bin_width_ps: float | None) -> list[Callable[[], Streak]]:
+    """One function for each shot, which reads it."""
+    from functools import partial
+
+    from tofclip.errors import InputError
+    from tofclip.io import read_streak
+    from tofclip.transient.stack import StreakStack
+
+    width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
+    if source.is_dir():
+        files = sorted(path for path in source.iterdir() if path.is_file() and not path.name.startswith("."))
+        if not files:
+            raise InputError(f"{source}: the folder holds no shot")
+        return [partial(read_streak, path, width) for path in files]
+    stack = StreakStack(source)
+    if width is None:
+        return [partial(stack.shot, number) for number in range(len(stack))]
+    return [partial(_timed, stack, number, width) for number in range(len(stack))]
+
+
+def _timed(stack: StreakStack, number: int, bin_width: float) -> Streak:
+    return stack.shot(number).with_bin_width(bin_width)
+
+
+def _ranger(first: Streak, camera: Path | None, time_zero_ns: float | None, focus: str) -> Ranger:
+    """Prepare for the shots of one camera; a sweep that is not known is found from the first shot."""
+    from tofclip.camera import Camera
+    from tofclip.errors import InputError
+    from tofclip.lidar.sequence import Ranger
+    from tofclip.reconstruct import SharpestFocus, fitted_to_shot, focus_named, prepare
+
+    chosen = focus_named(focus)
+    if isinstance(chosen, SharpestFocus):
+        raise InputError("a sequence has one focus for all shots: depth-locked or fixed:S")
+    task = prepare(first, None if camera is None else Camera.load(camera), "linear")
+    known = task.camera if time_zero_ns is None else task.camera.replace(time_zero=time_zero_ns * NANOSECOND)
+    if known.sweep is None:
+        known = fitted_to_shot(first, known)
+    return Ranger(known, first.times, focus=chosen)

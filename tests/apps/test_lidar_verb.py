@@ -13,6 +13,7 @@ from tofclip.camera import Camera, SkewSweep
 from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate, true_frames
 from tofclip.simulate.shapes import checkerboard
 from tofclip.transient import Frames
+from tofclip.transient.stack import save_stack
 
 CENTRES = 40.0 + 60 * np.arange(5)
 CAMERA = Camera(
@@ -96,3 +97,37 @@ def test_clouds_are_tidied_and_become_depth_pictures(run: Run, tmp_path: Path) -
     assert run("cloud", tmp_path / "frames.h5", "--out", tmp_path / "depth.exr").status == 0
     assert (tmp_path / "depth.exr").read_bytes()[:4] == b"\x76\x2f\x31\x01"
     assert run("cloud", tmp_path / "frames.h5", "--out", tmp_path / "c.ply", "--voxel-mm", "0").status == 2
+
+
+def test_a_sequence_is_made_and_goes_on(run: Run, tmp_path: Path) -> None:
+    shots, out = tmp_path / "shots", tmp_path / "clouds"
+    shots.mkdir()
+    made = Instrument(CAMERA, StreakDetector(150, 100e-12, peak_photons=2e4))
+    streaks = [simulate(Scene((plate(1.3, 0),)), made, seed).streak for seed in range(3)]
+    for number, streak in enumerate(streaks):
+        streak.save(shots / f"{number}.h5")
+    first = run("lidar", "sequence", shots, "--out", out, "--focus", "depth-locked", "--json")
+    assert first.status == 0, first.err
+    assert json.loads(first.out)["shots"] == 3
+    (out / "cloud_000002.ply").unlink()
+    again = json.loads(run("lidar", "sequence", shots, "--out", out, "--json").out)
+    assert (again["shots"], again["clouds_before"]) == (1, 2)
+    save_stack(streaks, tmp_path / "stack.h5")
+    CAMERA.save(tmp_path / "camera.h5")
+    words = (
+        "lidar",
+        "sequence",
+        tmp_path / "stack.h5",
+        "--out",
+        tmp_path / "more",
+        "--average",
+        "2",
+        "--suffix",
+        ".npz",
+    )
+    assert run(*words).status == 2  # a stack carries no camera
+    assert run(*words, "--camera", tmp_path / "camera.h5", "--bin-width-ps", "100").status == 0
+    assert sorted(path.name for path in (tmp_path / "more").iterdir()) == ["cloud_000000.npz", "cloud_000001.npz"]
+    (tmp_path / "empty").mkdir()
+    for unusable in ((tmp_path / "empty",), (shots, "--suffix", ".xyz"), (shots, "--focus", "stack:0:1:3")):
+        assert run("lidar", "sequence", *unusable, "--out", out).status == 2

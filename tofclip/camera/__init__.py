@@ -1,6 +1,6 @@
 """The camera: where each view lies on the slit, how its lenslet projects, how the sweep bends time."""
 
-from tofclip.camera.measurement import Measurement, dark_level, measure, require_width
+from tofclip.camera.measurement import Measurement, Rectifier, dark_level, measure, require_width
 from tofclip.camera.model import Camera
 from tofclip.camera.sweep import PolynomialSweep, ProjectiveSweep, SkewSweep, Sweep
 
@@ -9,6 +9,7 @@ __all__ = [
     "Measurement",
     "PolynomialSweep",
     "ProjectiveSweep",
+    "Rectifier",
     "SkewSweep",
     "Sweep",
     "dark_level",

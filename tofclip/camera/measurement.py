@@ -7,14 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import run_blocks
 from tofclip.camera.model import Camera
-from tofclip.camera.sweep import Sweep
-from tofclip.errors import CalibrationError, InputError
+from tofclip.errors import CalibrationError, InputError, ShapeError
 
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 QUIET_SHARE = 0.05
+COLUMNS_PER_BLOCK = 256
 
 
 @dataclass(frozen=True)
@@ -53,18 +54,7 @@ def measure(counts: FloatImage, saturated: Mask | None, camera: Camera, dark: fl
     InputError
         Nothing remains above the dark level, or no reading can be trusted.
     """
-    require_width(counts, camera)
-    dark = dark_level(counts) if dark is None else dark
-    signal = counts - np.float32(dark)
-    bad = np.zeros(counts.shape, bool) if saturated is None else saturated
-    if camera.sweep is not None:
-        signal, bad = rectify(signal, bad, camera.sweep)
-    good = ~(bad | camera.dead_columns)
-    if not good.any():
-        raise InputError("no reading can be trusted: every pixel is saturated, dead or outside the sweep")
-    if not np.any(signal[good] > 0):
-        raise InputError("nothing rises above the dark level; was there any light?")
-    return Measurement(np.ascontiguousarray(signal.T), np.ascontiguousarray(good.T))
+    return Rectifier(camera, counts.shape[0]).measure(counts, saturated, dark)
 
 
 def require_width(counts: FloatImage, camera: Camera) -> None:
@@ -87,26 +77,63 @@ def dark_level(counts: FloatImage) -> float:
     return float(np.median(counts[quiet]))
 
 
-def rectify(signal: FloatImage, bad: Mask, sweep: Sweep) -> tuple[FloatImage, Mask]:
-    """Sample a raw streak image where `sweep` says that each rectified pixel lies (bilinear).
+class Rectifier:
+    """Turns raw streak images of one camera into readings; holding one saves working out the sweep for every shot.
 
-    Returns
-    -------
-    rectified : (rows, columns) float32 array
-        0 beyond the raw image.
-    bad : (rows, columns) bool array
-        True where any of the four raw pixels was bad or lies beyond the raw image.
+    Parameters
+    ----------
+    camera : Camera
+    rows : int
+        Of the raw pictures.
     """
-    from scipy.ndimage import map_coordinates
 
-    rows, columns = signal.shape
-    row, column = np.ogrid[:rows, :columns]
-    position = sweep.raw_position(row.astype(np.float64), column.astype(np.float64))
-    raw_row, raw_column = np.broadcast_arrays(*position)
-    rectified = map_coordinates(signal, [raw_row, raw_column], order=1, output=np.float32)
-    outside = (raw_row < 0) | (raw_row > rows - 1) | (raw_column < 0) | (raw_column > columns - 1)
-    if bad.any():
-        share = map_coordinates(bad.astype(np.float32), [raw_row, raw_column], order=1, output=np.float32)
-        outside |= share > 0
-    rectified[outside] = 0
-    return rectified, outside
+    def __init__(self, camera: Camera, rows: int) -> None:
+        self.camera = camera
+        row, column = np.ogrid[:rows, : camera.slit_width_px]
+        position = (row.astype(np.float64), column.astype(np.float64))
+        raw = position if camera.sweep is None else camera.sweep.raw_position(*position)
+        # An exact row must not become one that lies beyond the picture by a rounding error of float32.
+        self._raw_row, self._raw_column = (
+            np.ascontiguousarray(np.broadcast_to(part, (rows, camera.slit_width_px)), dtype=np.float32) for part in raw
+        )
+
+    def measure(
+        self, counts: FloatImage, saturated: Mask | None = None, dark: float | None = None, late: float = 0.0
+    ) -> Measurement:
+        """Subtract the dark level and rectify the sweep (bilinear).
+
+        Parameters
+        ----------
+        counts : (rows, columns) array
+        saturated : (rows, columns) bool array, optional
+            A reading is bad if any raw pixel that contributes to it is.
+        dark : float, optional
+            Counts; by default `dark_level` of the picture.
+        late : float
+            Rows by which this shot's light comes later than the camera's calibration says.
+
+        Raises
+        ------
+        CalibrationError, InputError
+            As for `measure`, or another number of rows.
+        """
+        from tofclip.camera.kernels import sample
+
+        require_width(counts, self.camera)
+        if counts.shape != self._raw_row.shape:
+            raise ShapeError("a streak image of this camera", self._raw_row.shape, counts.shape)
+        signal = np.ascontiguousarray(counts - np.float32(dark_level(counts) if dark is None else dark))
+        bad = np.zeros(counts.shape, bool) if saturated is None else np.ascontiguousarray(saturated)
+        readings, good = np.empty(counts.shape[::-1], np.float32), np.empty(counts.shape[::-1], bool)
+
+        def work(piece: slice) -> None:
+            positions = self._raw_row[:, piece], self._raw_column[:, piece]
+            sample(signal, bad, *positions, late, readings[piece], good[piece])
+
+        run_blocks(work, counts.shape[1], COLUMNS_PER_BLOCK)
+        good &= ~self.camera.dead_columns[:, np.newaxis]
+        if not good.any():
+            raise InputError("no reading can be trusted: every pixel is saturated, dead or outside the sweep")
+        if not np.any((readings > 0) & good):
+            raise InputError("nothing rises above the dark level; was there any light?")
+        return Measurement(readings, good)

@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-ROUNDS = 16  # Gauss-Newton from within half a bin has converged after three; more for returns that overlap
+ROUNDS = 8  # Gauss-Newton from within half a bin has converged after three; more for returns that overlap
 EVEN = (1.0, 0.0)  # variance of a bin, as constant and factor of its expected brightness: the same everywhere
+HOPELESS = 0.5  # of the share of the strongest return that a candidate needs: the fit does not make up for so much
 CONVERGED_BINS = 1e-4
 
 
@@ -29,8 +30,9 @@ def find_returns(traces, times, sharp, matched, pulse, limits, found, counts):
         Filters of unit energy: row w holds the weight of bin ``j + w - width // 2`` for a return at bin j.
     pulse : tuple
         Samples, slopes, spacing, origin, first and last instant that matter: see `Pulse`.
-    limits : (float, float)
-        Smallest distance between two returns, s, and smallest signal-to-noise.
+    limits : (float, float, float)
+        Smallest distance between two returns, s, smallest signal-to-noise, and smallest share of the strongest return,
+        with the fall-off with range undone.
     found : (pixels, most returns, 3) float64 array, overwritten
         Instant, sum of the fitted pulse over the bins, standard deviation of the instant.
     counts : (pixels,) int64 array, overwritten
@@ -39,18 +41,22 @@ def find_returns(traces, times, sharp, matched, pulse, limits, found, counts):
     score = np.empty(times.size, np.float32)
     peaks = np.empty(found.shape[1], np.int64)
     estimate = np.empty((found.shape[1], 2))
+    strength = np.empty(found.shape[1])
     for pixel in range(traces.shape[0]):
         trace = traces[pixel]
         correlate(trace, sharp, score)
         number = strongest_peaks(score, times, limits[0], peaks)
         background, noise = quiet_level(trace, times, peaks[:number], pulse)
-        kept = 0
+        kept, needed = 0, 0.0
         for k in range(number):
-            if response(trace, matched, background, peaks[k]) > limits[1] * noise:
+            strength[k] = response(trace, matched, background, peaks[k])
+            needed = max(needed, HOPELESS * limits[2] * strength[k] * times[peaks[k]] ** 2)
+        for k in range(number):
+            if strength[k] > limits[1] * noise and strength[k] * times[peaks[k]] ** 2 >= needed:
                 estimate[kept, 0] = times[peaks[k]]
                 estimate[kept, 1] = max(trace[peaks[k]] - background, 0.0)
                 kept += 1
-        refine(trace, times, background, pulse, estimate[:kept], EVEN)
+        refine(trace, times, background, pulse, estimate[:kept], EVEN, ROUNDS)
         least = limits[1] * noise
         counts[pixel] = describe(trace, times, background, noise, pulse, estimate[:kept], least, found[pixel])
 
@@ -177,14 +183,14 @@ def unexplained(trace, times, background, pulse, estimate, i, without):
 
 
 @njit(nogil=True, cache=True)
-def refine(trace, times, background, pulse, estimate, variance):
+def refine(trace, times, background, pulse, estimate, variance, rounds):
     """Least-squares arrival and height of every return, by Gauss-Newton steps on one return at a time.
 
     Taking turns, each against what the others leave, undoes the pull of returns that overlap. A bin weighs as much as
     its variance, ``variance[0] + variance[1] * expected``, is small. With `EVEN` that is the plain fit; with ``(0, 1)``
     and photon counts it is Fisher scoring, which ends at the Poisson likelihood's maximum.
     """
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         largest = 0.0
         for k in range(estimate.shape[0]):
             largest = max(largest, gauss_newton_step(trace, times, background, pulse, estimate, k, variance))

@@ -165,7 +165,7 @@ def _search(frames: Frames, pulse: Pulse, detection: Detection) -> tuple[NDArray
     counts = np.empty(pixels, np.int64)
     sharp, matched = (_filters(frames.times, shape) for shape in (pulse.compressed(SHARPENING), pulse))
     shape = (pulse.samples, pulse.slope, pulse.spacing, pulse.origin, *pulse.support)
-    limits = (pulse.fwhm, float(detection.signal_to_noise))
+    limits = (pulse.fwhm, float(detection.signal_to_noise), float(detection.share_of_pixel))
 
     def work(piece: slice) -> None:
         block = np.ascontiguousarray(traces[:, piece].T)

@@ -12,6 +12,7 @@ from numba import njit
 from tofclip.lidar.kernels import pulse_at, refine, unexplained, window
 
 POISSON = (0.0, 1.0)  # the variance of a bin is what is expected in it
+ROUNDS = 16  # the weights change with the estimate, which takes some rounds more than the plain fit
 HALF_A_PHOTON = 0.5  # lets an empty histogram have a background
 
 
@@ -108,7 +109,7 @@ def locate(histograms, peaks, numbers, pulse, times, found):
         for k in range(number):
             estimate[k, 0] = times[peaks[row, k]]
             estimate[k, 1] = first_height(trace, times, background, pulse, estimate[k, 0])
-        refine(trace, times, background, pulse, estimate[:number], POISSON)
+        refine(trace, times, background, pulse, estimate[:number], POISSON, ROUNDS)
         for k in range(number):
             summarise(trace, times, background, pulse, estimate[:number], k, found[row, k])
 

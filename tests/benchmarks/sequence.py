@@ -1,0 +1,56 @@
+"""How many shots of 1016 rows become clouds in a second, and how much memory that takes.
+
+Run with ``python tests/benchmarks/sequence.py [--shots N] [--json]``. The shots are three simulated ones over and over,
+128 x 128 pixels behind 1344 slit pixels, read from memory; each becomes a cloud by the linear inverse. Peak memory is
+that of the process; to see that it stays, compare ``--shots 20`` with ``--shots 200``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import statistics
+import time
+from dataclasses import replace
+from functools import partial
+
+from tofclip.arrays import thread_count
+from tofclip.lidar.sequence import Ranger, clouds
+from tofclip.simulate import default_instrument, default_scene, simulate
+from tofclip.transient import Streak
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--shots", type=int, default=20)
+    parser.add_argument("--json", action="store_true")
+    asked = parser.parse_args()
+    instrument = default_instrument()
+    instrument = replace(instrument, detector=replace(instrument.detector, rows=1016))
+    streaks = [simulate(default_scene(), instrument, seed).streak for seed in range(3)]
+    ranger = Ranger(instrument.camera, streaks[0].times)
+    shots = [partial(_one, streaks, number) for number in range(asked.shots)]
+    next(clouds(shots[:1], ranger))  # loads the compiled loops
+    seconds, last = [], time.perf_counter()
+    for _ in clouds(shots, ranger):
+        now = time.perf_counter()
+        seconds.append(now - last)
+        last = now
+    figures = {
+        "shots": asked.shots,
+        "threads": thread_count(),
+        "shots_per_second": 1 / statistics.median(seconds),
+        "shots_per_second_best": 1 / min(seconds),
+        "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
+    print(json.dumps(figures) if asked.json else "\n".join(f"{name:22} {value:g}" for name, value in figures.items()))
+
+
+def _one(streaks: list[Streak], number: int) -> Streak:
+    return streaks[number % len(streaks)]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,192 @@
+"""Shot after shot to cloud after cloud, with what does not change from shot to shot worked out once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.camera import Camera, Measurement, Rectifier
+from tofclip.errors import InputError, ShapeError
+from tofclip.lidar.cloud import PointCloud, point_cloud
+from tofclip.lidar.detection import Detection
+from tofclip.lidar.returns import depth
+from tofclip.reconstruct.focus import AT_THE_CALIBRATED_DEPTH, Focus
+from tofclip.recovery import LinearInverse
+from tofclip.transient import Frames, Streak
+
+FloatArray = NDArray[np.float64]
+Shot = Callable[[], Streak]
+
+LARGEST_JITTER_BIN = 32
+ALL_RETURNS = Detection()
+
+
+@dataclass(frozen=True)
+class Step:
+    """One cloud of a sequence.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    shots : range
+        Numbers of the shots it was made from.
+    late_bin : (shots,) array
+        Rows by which each came later than the first shot of the sequence.
+    """
+
+    cloud: PointCloud
+    shots: range
+    late_bin: FloatArray
+
+
+class Ranger:
+    """Makes clouds of shots of one camera by the linear inverse, which needs no iterations.
+
+    Sweep, operators and inverted Gram matrices are worked out once; frames are written into the same memory again.
+
+    Parameters
+    ----------
+    camera : Camera
+        With its sweep; one that has to be found from a shot is found from the first (`fitted_to_shot`) beforehand.
+    row_times : (rows,) array
+        Instant of each row, s.
+    method : LinearInverse, optional
+    focus : Focus, optional
+        One that needs no look at the shot: `FixedFocus` or `DepthLocked`.
+    detection : Detection, optional
+
+    Notes
+    -----
+    Memory: the frames, and a (columns, columns) matrix for each shear.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        row_times: FloatArray,
+        method: LinearInverse | None = None,
+        focus: Focus = AT_THE_CALIBRATED_DEPTH,
+        detection: Detection = ALL_RETURNS,
+    ) -> None:
+        focus.require(camera)
+        method = LinearInverse() if method is None else method
+        self.camera, self.detection = camera, detection
+        self.times = np.asarray(row_times, dtype=np.float64) - camera.time_zero
+        self.rectifier = Rectifier(camera, self.times.size)
+        nothing = Measurement(np.empty((0, 0), np.float32), np.empty((0, 0), bool))
+        self.pieces = focus.pieces(camera, self.times, nothing)
+        alive = ~camera.dead_columns
+        self._inverses = [method.prepare(camera.operator(piece.shear), alive) for piece in self.pieces]
+        shears = np.repeat([piece.shear for piece in self.pieces], [piece.size for piece in self.pieces])
+        self._frames = Frames(
+            np.zeros((self.times.size, *camera.image_shape), np.float32), self.times, camera, shears=shears
+        )
+
+    def cloud(self, readings: NDArray[np.float32]) -> PointCloud:
+        """Make the cloud of one shot's rectified readings, (columns, rows)."""
+        if readings.shape != (self.camera.slit_width_px, self.times.size):
+            raise ShapeError("readings", (self.camera.slit_width_px, self.times.size), readings.shape)
+        for piece, inverse in zip(self.pieces, self._inverses, strict=True):
+            inverse.recover(readings[:, piece.frames], out=self._frames.values[piece.frames])
+        return point_cloud(depth(self._frames, detection=self.detection))
+
+
+@dataclass
+class Jitter:
+    """Finds by how many rows a shot is late, from its light over time.
+
+    Parameters
+    ----------
+    reference : (rows,) array
+        Light of the shot with which the others are compared.
+    """
+
+    reference: FloatArray
+    _spectrum: Any = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._spectrum = np.conj(np.fft.rfft(_edges(self.reference), 2 * self.reference.size))
+
+    def late_bin(self, light: FloatArray) -> float:
+        """Rows by which `light` comes later than the reference, below a row; at most 32 either way."""
+        agreement = np.fft.irfft(np.fft.rfft(_edges(light), 2 * light.size) * self._spectrum)
+        reach = min(LARGEST_JITTER_BIN, light.size // 2 - 1)
+        near = np.concatenate([agreement[-reach:], agreement[: reach + 1]])
+        best = int(near.argmax())
+        if best in (0, near.size - 1):
+            return float(best - reach)
+        left, centre, right = near[best - 1 : best + 2]
+        return best - reach + float((right - left) / 2 / max(2 * centre - left - right, np.finfo(np.float64).tiny))
+
+
+def light_over_time(streak: Streak, camera: Camera) -> FloatArray:
+    """Sum of each raw row over the reference view's middle, where neighbouring views' skew does not matter."""
+    reference = int(np.argmin(np.abs(camera.view_positions)))
+    half = camera.image_shape[1] // 4
+    middle = round(camera.centres_px[reference])
+    return np.asarray(streak.counts[:, max(0, middle - half) : middle + half + 1].sum(axis=1, dtype=np.float64))
+
+
+def clouds(
+    shots: Sequence[Shot], ranger: Ranger, average: int = 1, steady: bool = True, first: int = 0
+) -> Iterator[Step]:
+    """Yield one cloud for every `average` successive shots; what is left over at the end makes one more.
+
+    Parameters
+    ----------
+    shots : sequence of callables
+        Each reads its shot when it is called; one is in memory at a time.
+    ranger : Ranger
+    average : int
+        Shots whose readings are averaged.
+    steady : bool
+        Whether to find how late each shot comes against the first one, and take it off.
+    first : int
+        Number of the first cloud wanted: a sequence that was interrupted goes on there.
+
+    Raises
+    ------
+    InputError
+        No shot, or fewer than one to average; a shot without any light, by its name.
+    """
+    if not shots or average < 1 or first < 0:
+        raise InputError("a sequence needs at least one shot, and at least one to average")
+    jitter = Jitter(light_over_time(shots[0](), ranger.camera)) if steady else None
+    for start in range(first * average, len(shots), average):
+        numbers = range(start, min(start + average, len(shots)))
+        total: NDArray[np.float32] | None = None
+        late = np.zeros(len(numbers))
+        for place, number in enumerate(numbers):
+            streak = shots[number]()
+            if jitter is not None:
+                late[place] = jitter.late_bin(light_over_time(streak, ranger.camera))
+            measured = ranger.rectifier.measure(streak.counts, streak.saturated, late=float(late[place]))
+            total = measured.readings if total is None else np.add(total, measured.readings, out=total)
+        if total is not None:
+            total /= len(numbers)
+            yield Step(ranger.cloud(total), numbers, late)
+
+
+def cloud_path(folder: Path, number: int, suffix: str) -> Path:
+    """Return where cloud `number` of a sequence is kept."""
+    return folder / f"cloud_{number:06d}{suffix}"
+
+
+def clouds_done(folder: Path, suffix: str) -> int:
+    """Count the clouds of a sequence that are there without a gap from the first on."""
+    number = 0
+    while cloud_path(folder, number, suffix).exists():
+        number += 1
+    return number
+
+
+def _edges(light: FloatArray) -> FloatArray:
+    """Changes of the root of the light: near objects outshine far ones, and a constant says nothing."""
+    rise = np.diff(np.sqrt(np.maximum(light - np.median(light), 0)), prepend=0.0)
+    length: float = float(np.linalg.norm(rise)) or 1.0
+    return rise / length
