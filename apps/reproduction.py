@@ -1,0 +1,106 @@
+"""Tables of studies as Markdown and CSV, what is kept of a finished one, and the page that shows them all."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tofclip.storage import atomic_path
+
+if TYPE_CHECKING:
+    from tofclip.studies.outcome import Outcome, Study
+
+PAGE = "reproduction.md"
+
+Result = Mapping[str, Any]
+"""A finished study as it is kept: name, title, note, command, settings, columns, figure, rows, seconds."""
+
+
+def result_of(study: Study, outcome: Outcome, settings: Mapping[str, Any], command: str, seconds: float) -> Result:
+    """Return what is kept of a finished study; plain values only."""
+    rows = [asdict(row) | {"mean": row.mean, "spread": row.spread} for row in outcome.rows]
+    return {
+        "name": study.name,
+        "also": study.also,
+        "title": study.title,
+        "note": study.note,
+        "settings": dict(settings),
+        "command": command,
+        "columns": outcome.columns,
+        "figure": outcome.figure,
+        "rows": rows,
+        "seconds": seconds,
+    }
+
+
+def kept_result(path: Path, settings: Mapping[str, Any]) -> Result | None:
+    """Return the result in `path` if it is whole and was made with the same settings."""
+    try:
+        found = json.loads(path.read_text("utf-8"))
+        return found if found["settings"] == settings else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def write_result(result: Result, folder: Path) -> list[Path]:
+    """Write NAME.md, NAME.csv and at last NAME.json, which tells that the study is finished."""
+    name = result["name"]
+    texts = {
+        f"{name}.md": f"{section(result)}\n",
+        f"{name}.csv": _csv(result),
+        f"{name}.json": json.dumps(result, indent=1, default=list),
+    }
+    for file, text in texts.items():
+        _write(folder / file, text)
+    return [folder / file for file in texts]
+
+
+def write_page(results: Sequence[Result], folder: Path) -> Path:
+    """Write the page with the table and the picture of every study."""
+    head = (
+        "# Tables and figures of the paper, made again\n\n"
+        "Made by `tofclip reproduce`; do not edit. Ours is the mean over the seeds and its standard deviation; the "
+        "paper gives single figures. Measurements come from the true views, never from the model; errors are NMSE "
+        "relative to the variance of shift-and-add of the true views, 12 pixels at the border left out; the prior's "
+        "weight is chosen by cross-validation, without the truth.\n"
+    )
+    _write(folder / PAGE, "\n\n".join([head, *map(section, results)]) + "\n")
+    return folder / PAGE
+
+
+def section(result: Result) -> str:
+    """Return a study's heading, command, table and picture in Markdown."""
+    names = ", ".join([result["name"], *result["also"]])
+    header = [*result["columns"], f"ours ({result['figure']})", "spread", "paper"]
+    lines = [header, ["---"] * len(header), *map(_cells, result["rows"])]
+    table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    made = f"`{result['command']}`, {result['seconds']:.0f} s"
+    picture = f"![{result['title']}]({result['name']}.png)"
+    return f"## {result['title']} ({names})\n\n{result['note']} Made by {made}.\n\n{table}\n\n{picture}"
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    paper = "" if row["paper"] is None else f"{row['paper']:.2f}"
+    spread = f"{row['spread']:.2f}" if len(row["ours"]) > 1 else ""
+    return [*row["labels"], f"{row['mean']:.2f}", spread, paper]
+
+
+def _csv(result: Result) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    seeds = max(len(row["ours"]) for row in result["rows"])
+    writer.writerow([*result["columns"], "mean", "spread", "paper", *(f"seed {number}" for number in range(seeds))])
+    for row in result["rows"]:
+        paper = "" if row["paper"] is None else row["paper"]
+        writer.writerow([*row["labels"], row["mean"], row["spread"], paper, *row["ours"]])
+    return text.getvalue()
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

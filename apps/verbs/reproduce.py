@@ -1,0 +1,107 @@
+"""`tofclip reproduce`: make the paper's synthetic tables and figures again."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from apps.options import AsJson
+
+if TYPE_CHECKING:
+    from apps.reproduction import Result
+    from tofclip.studies.library import Library
+    from tofclip.studies.outcome import Study
+
+
+def reproduce(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="table2, fig12, ...; all for every one.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for tables and pictures; made if missing.")],
+    data: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Recorded data: DIR/lightfields/*.npz are studied as well.")
+    ] = None,
+    seeds: Annotated[int, typer.Option(metavar="N", min=1, help="Repeats with other angles, codes and noise.")] = 3,
+    as_json: AsJson = False,
+) -> None:
+    """Make tables and figures of the paper again, its figures beside ours.
+
+    Each study writes NAME.md, NAME.csv, NAME.png and NAME.json; reproduction.md shows them all. A study that the folder
+    holds already, made with the same settings, is not made again.
+    """
+    from apps.files import make_folder
+    from apps.report import report
+    from apps.reproduction import write_page
+    from tofclip.studies.library import Library
+    from tofclip.studies.registry import studies_called
+
+    studies = studies_called(name)
+    _require_folder(data)
+    make_folder(out)
+    library = Library(data)
+    results = [_result(study, library, seeds, out) for study in studies]
+    page = write_page(_all_results(library, seeds, out), out)
+    figures = {result["name"]: _summary(result) for result in results}
+    report({"seeds": seeds, **figures}, as_json, [page])
+
+
+def _require_folder(data: Path | None) -> None:
+    from tofclip.errors import InputError
+
+    if data is not None and not data.is_dir():
+        raise InputError(f"{data}: no such folder of recorded data")
+
+
+def _settings(study: Study, library: Library, seeds: int) -> dict[str, Any]:
+    """What a result depends on, as it comes back from JSON."""
+    from tofclip import __version__
+
+    recorded = None if library.data is None else str(library.data.resolve())
+    return {"name": study.name, "seeds": seeds, "data": recorded, "version": __version__}
+
+
+def _result(study: Study, library: Library, seeds: int, out: Path) -> Result:
+    """Return a study's result, made now unless the folder has it."""
+    from apps.figures.reproduction import reproduction_figure
+    from apps.figures.style import save
+    from apps.progress import progress
+    from apps.reproduction import kept_result, result_of, write_result
+
+    settings = _settings(study, library, seeds)
+    kept = kept_result(out / f"{study.name}.json", settings)
+    if kept is not None:
+        print(f"{study.name}: kept from an earlier run", file=sys.stderr)
+        return kept
+    started = time.perf_counter()
+    print(f"{study.name}: {study.title}, about {study.seconds * seeds:.0f} s", file=sys.stderr)
+    with progress(study.name, study.steps * seeds) as advance:
+        outcome = study.work(library, seeds, advance)
+    seconds = time.perf_counter() - started
+    recorded = "" if library.data is None else f" --data {library.data.name}"
+    command = f"tofclip reproduce {study.name} --out {out.name}{recorded} --seeds {seeds}"
+    save(reproduction_figure(study.title, outcome), out / f"{study.name}.png")
+    result = result_of(study, outcome, settings, command, seconds)
+    write_result(result, out)
+    print(f"{study.name}: {seconds:.0f} s", file=sys.stderr)
+    return result
+
+
+def _all_results(library: Library, seeds: int, out: Path) -> list[Result]:
+    """Every result that the folder holds with these settings, in the order of the paper's tables."""
+    from apps.reproduction import kept_result
+    from tofclip.studies.registry import STUDIES
+
+    found = (kept_result(out / f"{study.name}.json", _settings(study, library, seeds)) for study in STUDIES)
+    return [result for result in found if result is not None]
+
+
+def _summary(result: Result) -> dict[str, Any]:
+    """Mean of ours and of the paper's over the rows where it has figures, and the time."""
+    known = [row for row in result["rows"] if row["paper"] is not None]
+    figures = {"rows": len(result["rows"]), "seconds": result["seconds"]}
+    if not known:
+        return figures
+    ours, paper = (sum(row[key] for row in known) / len(known) for key in ("mean", "paper"))
+    return figures | {"mean_ours": ours, "mean_paper": paper}

@@ -1,0 +1,119 @@
+"""The studies of the paper on small scenes: their numbers are those of independent measurements and recoveries."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofclip.clip_measurement import Setup, measure
+from tofclip.clip_recovery import ClipRecovery
+from tofclip.errors import InputError
+from tofclip.metrics import nmse
+from tofclip.simulate.light_fields import CameraArray
+from tofclip.studies import dealing, shiny_bodies, whole_light_fields
+from tofclip.studies.cases import BORDER_PX, Case, measured, solve
+from tofclip.studies.library import Library
+from tofclip.studies.outcome import Row
+from tofclip.studies.registry import STUDIES, studies_called
+
+ARRAY = CameraArray((40, 40), 4, focal_length_px=50.0, view_step=0.04, samples=1)
+
+
+@pytest.fixture(scope="module")
+def library() -> Library:
+    return Library(array=ARRAY)
+
+
+def test_a_solved_case_is_what_measuring_and_recovering_by_hand_gives(library):
+    case = Case(("a",), "letters", "line", 1.0, -0.4, 2.5)
+    steps: list[int] = []
+    (solved,) = solve([case], library, 2, steps.append)
+    light_field = library.light_field("letters")
+    by_hand = ClipRecovery().recover(measure(light_field, Setup("line", 1.0, 0)), -0.4)
+    again = ClipRecovery(weight=by_hand.weight).recover(measure(light_field, Setup("line", 1.0, 1)), -0.4)
+    truth = light_field.refocus(-0.4)
+    expected = [100 * nmse(one.picture, truth, BORDER_PX) for one in (by_hand, again)]
+    np.testing.assert_allclose(solved.percent, expected, rtol=1e-3)
+    assert (sum(steps), solved.row().paper) == (2, 2.5)
+
+
+def test_white_noise_is_as_strong_as_asked(library):
+    quiet, noisy = (measured(Case((), "letters", "line", 2.0, 0.0, white_noise=n), library, 0) for n in (0.0, 0.1))
+    # 80 x 40 readings: the standard deviation of a standard deviation is 1.3 %
+    deviation = np.std(noisy.readings - quiet.readings) / np.std(quiet.readings)
+    assert deviation == pytest.approx(0.1, rel=0.06)
+
+
+def test_the_mean_and_the_spread_are_those_of_a_sample():
+    assert Row(("x",), (1.0, 3.0)).mean == 2.0
+    assert Row(("x",), (1.0, 3.0)).spread == pytest.approx(np.sqrt(2))
+    assert Row(("x",), (1.0,)).spread == 0.0
+
+
+def test_scenes_are_rendered_once_and_variants_differ(library):
+    assert library.light_field("blocks") is library.light_field("blocks")
+    whole, middle = (
+        library.light_field("letters"),
+        Library(array=CameraArray((24, 24), 6, 30.0, 0.08)).light_field("blocks:4x4"),
+    )
+    assert (len(whole.pictures), len(middle.pictures)) == (16, 16)
+    assert middle.views.min() == -2
+    assert not np.array_equal(library.light_field("blocks:flip").pictures, library.light_field("blocks").pictures)
+    with pytest.raises(InputError, match="--data"):
+        library.light_field("data:render_letters")
+
+
+def test_recorded_light_fields_join_where_their_folder_is_given(shared_data):
+    known = Library(shared_data)
+    assert known.has_data("render_letters")
+    assert not known.has_data("nothing")
+    assert known.light_field("data:render_letters").pictures.shape == (64, 128, 128)
+
+
+def test_every_study_can_be_called_by_its_tables_and_figures_names():
+    names = [name for study in STUDIES for name in (study.name, *study.also)]
+    assert len(names) == len(set(names))
+    wanted = [f"table{n}" for n in range(1, 11)] + [f"fig{n}" for n in (*range(4, 14), *range(15, 19))]
+    assert set(wanted) <= set(names)
+    assert studies_called("fig16") == studies_called("table8")
+    assert studies_called("all") == STUDIES
+    with pytest.raises(InputError, match="table2"):
+        studies_called("table99")
+
+
+@pytest.mark.parametrize("name", ["table6", "table7"])
+def test_tables_have_a_row_for_each_case_and_count_their_steps(library, name):
+    (study,) = studies_called(name)
+    steps: list[int] = []
+    outcome = study.work(library, 1, steps.append)
+    assert sum(steps) == study.steps
+    labels = [row.labels for row in outcome.rows]
+    assert len(set(labels)) == len(labels)
+    assert all(len(row) == len(outcome.columns) for row in labels)
+    assert all(len(row.ours) == 1 and np.isfinite(row.ours[0]) for row in outcome.rows)
+    # black bars before dark ground take light away, they do not destroy the picture
+    assert all(row.mean < 100 for row in outcome.rows if row.labels[0] == "CLIP-1D")
+
+
+def test_a_light_field_recovered_from_many_readings_is_near_the_true_one(library):
+    """As many readings as unknowns would be SR 16; at 8 total variation has little to fill in."""
+    case = Case((), "letters", "line", 8.0, 0.0)
+    found = whole_light_fields.recovered_light_field(case, library, 0)
+    truth = library.light_field("letters")
+    np.testing.assert_array_equal(found.views, truth.views)
+    assert nmse(found.pictures, truth.pictures, BORDER_PX) < 0.1
+
+
+def test_a_glossy_plate_is_uneven_but_keeps_its_place(library):
+    outcome = shiny_bodies.shiny_bodies(library, 1, lambda _: None)
+    figures = {row.labels: row.mean for row in outcome.rows}
+    uneven, off = "unevenness over the views, %", "median error of s on the plate, px per view"
+    assert figures["glossy", uneven] > 1.5 * figures["matt", uneven]
+    # within half of the step between the refocused depths, one of which is the plate's own
+    assert figures["glossy", off] < 0.15
+
+
+def test_dealing_takes_recorded_scenes_only_where_there_are_any(library, monkeypatch):
+    monkeypatch.setattr(dealing, "RATIOS", (1.0,))
+    outcome = dealing.dealing(library, 1, lambda _: None)
+    assert {row.labels[0] for row in outcome.rows} == {"letters", "blocks"}

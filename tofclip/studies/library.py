@@ -1,0 +1,68 @@
+"""Light fields that studies look at: rendered ones, and recorded ones where their folder is given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import InputError
+from tofclip.io.light_fields import read_light_field
+from tofclip.light_field import LightField
+from tofclip.simulate.light_fields import CameraArray, known_scene, render, render_view
+from tofclip.simulate.light_fields.scenes import EDITS, edited, without_occluder
+
+
+class Library:
+    """Light fields by name, each rendered or read once.
+
+    Parameters
+    ----------
+    data : Path, optional
+        Folder of recorded data, whose ``lightfields`` holds NPZ light fields.
+    array : CameraArray, optional
+        Cameras of the rendered ones; the paper's 8 x 8 views of 128 x 128 pixels unless given.
+    """
+
+    def __init__(self, data: Path | None = None, array: CameraArray | None = None) -> None:
+        self.data, self.array = data, array or CameraArray()
+        self._known: dict[str, LightField] = {}
+
+    def light_field(self, name: str) -> LightField:
+        """Return the light field of a scene.
+
+        Parameters
+        ----------
+        name : str
+            A name of `tofclip.simulate.light_fields.SCENES`, ``NAME:EDIT`` with an edit of the flip test,
+            ``NAME:4x4`` for its middle sixteen views, or ``data:NAME`` for a recorded one.
+        """
+        if name not in self._known:
+            self._known[name] = self._made(name)
+        return self._known[name]
+
+    def unoccluded(self, name: str) -> NDArray[Any]:
+        """Return what the reference view sees of an occlusion scene when its occluder is gone."""
+        return render_view(without_occluder(known_scene(name, self.array)), self.array, (0.0, 0.0))
+
+    def has_data(self, name: str) -> bool:
+        """Tell whether a recorded light field can be read."""
+        return self.data is not None and self._path(name).is_file()
+
+    def _path(self, name: str) -> Path:
+        if self.data is None:
+            raise InputError(f"the recorded light field '{name}' needs the folder of recorded data; name it by --data")
+        return self.data / "lightfields" / f"{name}.npz"
+
+    def _made(self, name: str) -> LightField:
+        scene, _, variant = name.partition(":")
+        if scene == "data":
+            return read_light_field(self._path(variant))
+        if variant == "4x4":
+            whole = self.light_field(scene)
+            middle = np.all((whole.views >= -2) & (whole.views < 2), axis=1)
+            return LightField(whole.pictures[middle], whole.views[middle])
+        known = known_scene(scene, self.array)
+        return render(edited(known, variant) if variant in EDITS else known, self.array).light_field

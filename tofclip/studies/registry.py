@@ -1,0 +1,46 @@
+"""The studies by name."""
+
+from __future__ import annotations
+
+from tofclip.errors import InputError
+from tofclip.studies import (
+    area_sensors,
+    dealing,
+    flip_test,
+    iteration_table,
+    line_rotation,
+    occlusion,
+    representation,
+    shiny_bodies,
+    spoilt_readings,
+    whole_light_fields,
+)
+from tofclip.studies.outcome import Study
+
+STUDIES: tuple[Study, ...] = (
+    iteration_table.STUDY,
+    flip_test.STUDY,
+    *whole_light_fields.STUDIES,
+    *spoilt_readings.STUDIES,
+    occlusion.STUDY,
+    *representation.STUDIES,
+    area_sensors.STUDY,
+    line_rotation.STUDY,
+    shiny_bodies.STUDY,
+    dealing.STUDY,
+)
+
+
+def studies_called(name: str) -> tuple[Study, ...]:
+    """Return the study of a name, of a figure that shows its pictures, or every one for ``all``.
+
+    Raises
+    ------
+    InputError
+        Nothing has that name.
+    """
+    found = tuple(study for study in STUDIES if name in ("all", study.name, *study.also))
+    if not found:
+        known = ", ".join(word for study in STUDIES for word in (study.name, *study.also))
+        raise InputError(f"unknown study '{name}'; take all or one of {known}")
+    return found
