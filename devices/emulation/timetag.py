@@ -11,6 +11,7 @@ from time import monotonic, sleep
 from usb.core import USBError
 
 from devices.codec import ByteView
+from devices.emulation.byte_queue import ByteQueue
 from devices.emulation.faults import Fault
 from devices.emulation.photons import FOREVER, TagStream
 from devices.emulation.usb import PACKET_BYTES, VirtualDevice, usb_error
@@ -108,7 +109,7 @@ class EmulatedTimeTagger(VirtualDevice):
         self._transfers = 0
         self._stalls = self._to_garble = 0
         self._registers = _fresh_registers()
-        self._memory = bytearray()
+        self._memory = ByteQueue()
         self._replies: list[bytes] = []
         self._started = monotonic()
         self._mark_lost = False
@@ -205,7 +206,7 @@ class EmulatedTimeTagger(VirtualDevice):
         words[: garbled * RECORD_BYTES] |= UNUSED_BITS
         self.truth.garbled += garbled
         self._to_garble = 0
-        self._memory += words.data
+        self._memory.append(words)
         self._registers[Register.RECORDS] += len(words) // RECORD_BYTES
 
     def _lose(self, words: ByteView) -> None:
@@ -219,11 +220,9 @@ class EmulatedTimeTagger(VirtualDevice):
         packet = self.setting.packet_bytes
         wanted = len(buffer) if packet == PACKET_BYTES else min(packet, len(buffer))
         self._gather(wanted, timeout)
-        length = min(wanted, len(self._memory))
+        length = self._memory.take(buffer[:wanted])
         if not length:
             raise usb_error(errno.ETIMEDOUT)
-        buffer[:length] = self._memory[:length]
-        del self._memory[:length]
         self._segment_bytes += length
         return length
 
@@ -232,7 +231,7 @@ class EmulatedTimeTagger(VirtualDevice):
         if not self.setting.is_paced:
             if Capture.REGISTER in self._capture:
                 self._keep(self._seen(-(-max(0, length - len(self._memory)) // RECORD_BYTES)))
-            if not self._memory:
+            if not len(self._memory):
                 sleep(min(timeout, DARK))
             return
         deadline = monotonic() + timeout

@@ -75,11 +75,8 @@ def to_disk_and_back(seconds: float) -> dict[str, float]:
 
 
 def steady(seconds: float, rate_mb: float) -> dict[str, float]:
-    """A constant rate for some time: nothing may be lost, and memory must not grow.
-
-    The emulated instrument shares the machine with all else that runs on it; its memory bridges pauses of some seconds.
-    """
-    address = f"{SIM}&pace=realtime&rate={rate_mb * MEGA / RECORD_BYTES}&memory_mib=512"
+    """A constant rate for some time: nothing may be lost, and memory must not grow."""
+    address = f"{SIM}&pace=realtime&rate={rate_mb * MEGA / RECORD_BYTES}"
     memory: list[tuple[float, float]] = []
 
     def look(passed: float) -> None:
