@@ -10,7 +10,7 @@ from tofclip.clip_recovery import ClipRecovery
 from tofclip.errors import InputError
 from tofclip.metrics import nmse
 from tofclip.simulate.light_fields import CameraArray
-from tofclip.studies import dealing, shiny_bodies, whole_light_fields
+from tofclip.studies import dealing_table, shiny_bodies, whole_light_fields
 from tofclip.studies.cases import BORDER_PX, Case, measured, solve
 from tofclip.studies.library import Library
 from tofclip.studies.outcome import Row
@@ -114,6 +114,6 @@ def test_a_glossy_plate_is_uneven_but_keeps_its_place(library):
 
 
 def test_dealing_takes_recorded_scenes_only_where_there_are_any(library, monkeypatch):
-    monkeypatch.setattr(dealing, "RATIOS", (1.0,))
-    outcome = dealing.dealing(library, 1, lambda _: None)
+    monkeypatch.setattr(dealing_table, "RATIOS", (1.0,))
+    outcome = dealing_table.dealing_table(library, 1, lambda _: None)
     assert {row.labels[0] for row in outcome.rows} == {"letters", "blocks"}

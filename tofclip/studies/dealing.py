@@ -1,43 +1,65 @@
-"""Which view gets which angle: dealt at random as in the paper, or evenly over the aperture (beyond the paper)."""
+"""What it gains to deal a line camera's angles evenly over the aperture instead of at random (supplement Note 6)."""
 
 from __future__ import annotations
 
-from tofclip.studies.cases import NAMES, Case, solve
-from tofclip.studies.library import Library
-from tofclip.studies.outcome import Advance, Outcome, Panel, Study
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-RATIOS = (2.0, 1.0, 0.5, 0.25)
-SCENES = {"letters": -0.4, "blocks": -0.6}
-RECORDED = {"render_letters": -0.3, "render_planes": 0.0, "hci_antinous": 0.0}
-ENCODERS = ("line", "line-spread")
+import numpy as np
+from numpy.typing import NDArray
 
+from tofclip.clip_measurement import Setup, measure
+from tofclip.clip_recovery import ClipRecovery
+from tofclip.light_field import LightField
+from tofclip.metrics import nmse
 
-def dealing(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover with both ways of dealing; the recorded light fields too where they are at hand."""
-    scenes = SCENES | {f"data:{name}": shear for name, shear in RECORDED.items() if library.has_data(name)}
-    cases = [
-        Case((scene.removeprefix("data:"), NAMES[encoder], f"{ratio:g}"), scene, encoder, ratio, shear)
-        for scene, shear in scenes.items()
-        for encoder in ENCODERS
-        for ratio in RATIOS
-    ]
-    solved = solve(cases, library, seeds, advance)
-    panels = []
-    for first in range(0, len(solved), len(RATIOS)):
-        line = solved[first : first + len(RATIOS)]
-        scene, camera, _ = line[0].case.labels
-        shown = (one.panel(f"SR = {one.case.labels[2]}") for one in line)
-        panels.append((Panel(f"{scene}, {camera}\ntrue", line[0].truth), *shown))
-    rows = tuple(one.row() for one in solved)
-    return Outcome(("scene", "camera", "SR"), "NMSE, %", rows, tuple(panels))
+BORDER_PX = 12
+"""Left out of the score on every side."""
 
 
-STUDY = Study(
-    "dealing",
-    (),
-    "Angles dealt to views at random, and evenly over the aperture",
-    "Beyond the paper, which deals at random.",
-    60,
-    2 * len(SCENES) * len(RATIOS),
-    dealing,
-)
+@dataclass(frozen=True)
+class DealingComparison:
+    """Errors of both ways to deal, from readings made from the true views.
+
+    Parameters
+    ----------
+    sampling_ratios : (ratios,) array
+    at_random, evenly : (ratios, seeds) arrays
+        NMSE against the shift-and-add picture.
+    """
+
+    sampling_ratios: NDArray[np.float64]
+    at_random: NDArray[np.float64]
+    evenly: NDArray[np.float64]
+
+
+def compare_dealing(
+    light_field: LightField,
+    shear: float,
+    sampling_ratios: Sequence[float] = (2.0, 1.0, 0.5, 0.25),
+    seeds: Sequence[int] = range(5),
+    recovery: ClipRecovery | None = None,
+) -> DealingComparison:
+    """Measure with either camera, recover, and compare with the true views' refocused picture.
+
+    Parameters
+    ----------
+    light_field : LightField
+    shear : float
+        Depth to refocus on, pixels per view step.
+    sampling_ratios, seeds : sequences
+    recovery : ClipRecovery, optional
+        The default is total variation with an automatic weight.
+    """
+    method = ClipRecovery() if recovery is None else recovery
+    truth = light_field.refocus(shear)
+
+    def error(encoder: str, ratio: float, seed: int) -> float:
+        picture = method.recover(measure(light_field, Setup(encoder, ratio, seed)), shear).picture
+        return nmse(picture, truth, BORDER_PX)
+
+    found = {
+        encoder: np.array([[error(encoder, ratio, seed) for seed in seeds] for ratio in sampling_ratios])
+        for encoder in ("line", "line-spread")
+    }
+    return DealingComparison(np.array(sampling_ratios, np.float64), found["line"], found["line-spread"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tofclip.errors import InputError
 from tofclip.studies import (
     area_sensors,
-    dealing,
+    dealing_table,
     flip_test,
     iteration_table,
     line_rotation,
@@ -27,7 +27,7 @@ STUDIES: tuple[Study, ...] = (
     area_sensors.STUDY,
     line_rotation.STUDY,
     shiny_bodies.STUDY,
-    dealing.STUDY,
+    dealing_table.STUDY,
 )
 
 
