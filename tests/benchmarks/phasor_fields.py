@@ -1,0 +1,188 @@
+"""How fast phasor-field imaging around corners is, as ratios to bare Fourier transforms and to y-tal 0.20.
+
+Run with ``python tests/benchmarks/phasor_fields.py [--repeats N] [--ytal PYTHON] [--json]``. All figures come from one
+run on one machine: medians of the repeats, solve call only. "bare" is one inverse Fourier transform per frequency and
+depth of the doubled wall, what the plain way cannot do without, on one thread. y-tal is measured in the Python given,
+which has it installed (``python -m venv ...; pip install y-tal``); without one its rows are left out. The way in time
+is measured on a few rows of the plane and scaled up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyfftw
+
+from nlos import Capture, Grid, Hybrid, PlanarRSD, propagate
+from nlos.band import Band
+from nlos.plane import Plane
+from nlos.sampling import AliasingWarning
+from nlos.simulate import PointScene
+from nlos.time_axis import TimeAxis
+from tofclip.arrays import thread_count
+
+CYCLES = 4.24
+LASER = np.array([0.1, 0.05, 0.02])
+POINTS = np.array([[0.3, -0.2, 1.0], [-0.5, 0.4, 0.9], [0.1, 0.6, 1.4]])
+ROWS_IN_TIME = 2
+
+YTAL = """
+import sys, time, resource
+import numpy as np
+from tal.io.capture_data import NLOSCaptureData
+from tal.enums import CameraSystem, HFormat, GridFormat, VolumeFormat
+from tal.reconstruct import pf
+stored = np.load(sys.argv[1])
+data = NLOSCaptureData()
+data.H = stored["signal"].transpose(0, 2, 1).astype(np.float32)
+data.H_format, data.sensor_grid_format, data.laser_grid_format = HFormat.T_Sx_Sy, GridFormat.X_Y_3, GridFormat.N_3
+data.sensor_grid_xyz = stored["wall"].transpose(1, 0, 2).astype(np.float32)
+data.laser_grid_xyz = stored["laser"].reshape(1, 3).astype(np.float32)
+data.sensor_xyz = data.laser_xyz = np.zeros(3, np.float32)
+data.delta_t, data.t_start, data.t_accounts_first_and_last_bounces = float(stored["spacing"]), 0.0, False
+data.volume_format, data.scene_info = VolumeFormat.X_Y_Z_3, {}
+volume = np.stack(np.meshgrid(stored["x"], stored["y"], stored["z"], indexing="ij"), -1).astype(np.float32)
+start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF)
+pf.solve(data, float(stored["wavelength"]), float(stored["cycles"]), CameraSystem.CONFOCAL_TIME_GATED, volume)
+after = resource.getrusage(resource.RUSAGE_SELF)
+print("seconds", time.perf_counter() - start, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+"""
+
+
+def scene(count: int, relief: float, bins: int = 512, bin_width: float = 32e-12) -> tuple[Capture, Grid, float]:
+    """A capture, a grid of ``count ** 3`` voxels, and a wavelength of four wall points."""
+    axis = np.linspace(-1, 1, count)
+    x, y = np.meshgrid(axis, axis)
+    wall = np.stack([x, y, relief / 2 * (1 + np.sin(3 * x + 1) * np.cos(2 * y))], axis=-1)
+    laser = LASER * [1, 1, relief > 0]
+    capture = PointScene(POINTS).seen_from(wall, laser, TimeAxis(bins, bin_width), 60e-12)
+    return capture, Grid(axis, axis, np.linspace(0.6, 1.6, count)), 8 / count
+
+
+def seconds(action: Callable[[], object], repeats: int) -> float:
+    """Median of the repeats after one warm-up."""
+    action()
+    taken = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        action()
+        taken.append(time.perf_counter() - start)
+    return float(np.median(taken))
+
+
+def bare_transforms(count: int, frequencies: int) -> float:
+    """Seconds of one inverse transform of the doubled plane per frequency and depth."""
+    source, target = (pyfftw.zeros_aligned((2 * count, 2 * count), np.complex64) for _ in range(2))
+    plan = pyfftw.FFTW(source, target, axes=(0, 1), direction="FFTW_BACKWARD", flags=("FFTW_MEASURE",))
+    return seconds(plan.execute, 50) * frequencies * count
+
+
+def ytal_seconds(python: str, capture: Capture, grid: Grid, wavelength: float) -> tuple[float, float] | None:
+    """Wall-clock and processor seconds of y-tal's phasor fields on the same arrays, if it runs."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "capture.npz"
+        numbers = {"spacing": capture.axis.spacing, "wavelength": wavelength, "cycles": CYCLES}
+        axes = {"x": grid.x, "y": grid.y, "z": grid.z}
+        np.savez(path, signal=capture.signal, wall=capture.wall, laser=capture.laser, **axes, **numbers)
+        clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        done = subprocess.run([python, "-c", YTAL, str(path)], capture_output=True, text=True, check=False, env=clean)
+    last = [line.split() for line in done.stdout.splitlines() if line.startswith("seconds ")]
+    if done.returncode or not last:
+        print("y-tal did not run:", done.stderr.strip().splitlines()[-1:], file=sys.stderr)
+        return None
+    return float(last[0][1]), float(last[0][2])
+
+
+def planar_rows(repeats: int, python: str | None) -> list[dict[str, object]]:
+    """Planar and curved walls at 64 and 128."""
+    rows: list[dict[str, object]] = []
+    for count in (64, 128):
+        capture, grid, wavelength = scene(count, 0.0)
+        curved, _, _ = scene(count, 0.3)
+        method = PlanarRSD(wavelength, CYCLES)
+        frequencies = Band(method.pulse, capture.axis).wavenumbers.size
+        bare = bare_transforms(count, frequencies)
+        planar = seconds(lambda method=method, c=capture, g=grid: method.reconstruct(c, g), repeats)
+        hybrid = seconds(lambda w=wavelength, c=curved, g=grid: Hybrid(w, CYCLES).reconstruct(c, g), repeats)
+        rows.append({"name": f"bare {count}, {frequencies} frequencies", "seconds": bare, "times_bare": 1.0})
+        rows.append({"name": f"planar RSD {count}", "seconds": planar, "times_bare": planar / bare})
+        rows.append({"name": f"hybrid, curved {count}", "seconds": hybrid, "times_bare": hybrid / bare})
+        rows[-1]["times_planar"] = hybrid / planar
+        peer = ytal_seconds(python, capture, grid, wavelength) if python else None
+        if peer:
+            rows.append({"name": f"y-tal {count}", "seconds": peer[0], "processor_seconds": peer[1]})
+            rows[-1]["times_planar"] = peer[0] / planar
+    return rows
+
+
+def propagation_rows(repeats: int) -> list[dict[str, object]]:
+    """From a relief of 0.3 m onto a plane of as many points, spectrally and in time, 1016 bins."""
+    rows: list[dict[str, object]] = []
+    for count in (64, 128):
+        capture, grid, wavelength = scene(count, 0.3, 1016, 16e-12)
+        pulse = PlanarRSD(wavelength, CYCLES).pulse
+        plane = Plane(grid.x, grid.y, 0.4)
+        few = Plane(grid.x, grid.y[:ROWS_IN_TIME], 0.4)
+        spectral = seconds(lambda c=capture, p=plane, q=pulse: propagate(c, p, q), repeats)
+        in_time = seconds(lambda c=capture, p=few, q=pulse: propagate(c, p, q, "time"), 1) * count / ROWS_IN_TIME
+        rows.append({"name": f"propagation {count}, spectral", "seconds": spectral})
+        rows.append({"name": f"propagation {count}, time", "seconds": in_time, "times_spectral": in_time / spectral})
+    return rows
+
+
+def large_scene() -> tuple[Capture, Grid]:
+    """A wall of 125 x 125 points and 1016 bins of 4.6 ps, relief 0.15 m, and 100^3 voxels of 6 mm."""
+    x, y = np.meshgrid(np.linspace(-0.69, 0.69, 125), np.linspace(-0.65, 0.65, 125))
+    wall = np.stack([x, y, 0.075 * np.sin(2 * x + y)], axis=-1)
+    capture = PointScene([[0.1, -0.05, 0.35]]).seen_from(wall, LASER / 2, TimeAxis(1016, 4.6e-12, 0.14), 20e-12)
+    axis = 0.006 * (np.arange(100) - 49.5)
+    return capture, Grid(axis, axis, 0.16 + 0.004 * np.arange(100))
+
+
+def large_row(repeats: int) -> dict[str, object]:
+    """Time here, and peak memory of a fresh process."""
+    capture, grid = large_scene()
+    taken = seconds(lambda: Hybrid(0.048).reconstruct(capture, grid), repeats)
+    command = [sys.executable, __file__, "--only-large"]
+    peak = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    return {"name": "hybrid, 125 x 125 x 1016 to 100^3", "seconds": taken, "peak_memory_mb": peak / 1e6}
+
+
+def main() -> None:
+    """Print the table or, with ``--json``, one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--ytal", metavar="PYTHON", help="Python that has y-tal installed")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--only-large", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore", AliasingWarning)
+    if arguments.only_large:
+        capture, grid = large_scene()
+        Hybrid(0.048).reconstruct(capture, grid)
+        print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+        return
+    rows = [*planar_rows(arguments.repeats, arguments.ytal), *propagation_rows(arguments.repeats)]
+    rows.append(large_row(arguments.repeats))
+    if arguments.json:
+        print(json.dumps({"threads": thread_count(), "rows": rows}))
+        return
+    print(f"{thread_count()} threads")
+    for row in rows:
+        rest = "  ".join(f"{name} {value:.3g}" for name, value in row.items() if name not in ("name", "seconds"))
+        print(f"{row['name']:36}{row['seconds']:9.3f} s  {rest}")
+
+
+if __name__ == "__main__":
+    main()
