@@ -44,6 +44,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   cloud              recovered frames to a point cloud
   lidar accuracy     how well counted photons tell a range, beside the theoretical limit
   lidar parallax     a shot to how the views move with range, for recover --focus depth-locked
+  lidar scene        recovered frames to a list of objects and a picture
   lidar sequence     a folder or stack of shots to a sequence of clouds
   nlos reconstruct   recovered frames of a wall to the scene hidden around the corner
   clip               light fields from few readings: simulate a camera, recover a picture

@@ -1,4 +1,4 @@
-"""`tofclip lidar`: how well counted photons tell a range, how the views move with range, and clouds of many shots."""
+"""`tofclip lidar`: how well ranges can be known, how views move with range, objects of a scene, clouds of many shots."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from apps.options import AsJson, TimeZero
-from tofclip.units import NANOSECOND, PICOSECOND
+from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
     from tofclip.lidar.sequence import Ranger
@@ -97,6 +97,39 @@ def parallax(
         "weight": found.curve.weight,
     }
     report(figures, as_json, [out])
+
+
+@app.command()
+def scene(
+    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="Recovered frames (HDF5).")],
+    out: Annotated[Path, typer.Option(metavar="PNG", help="The picture to write.")],
+    reach_mm: Annotated[float, typer.Option(metavar="MM", help="Points this close belong together.")] = 40.0,
+    fewest_points: Annotated[int, typer.Option(metavar="N", help="Smaller groups are no objects.")] = 40,
+    as_json: AsJson = False,
+) -> None:
+    """List the objects of a scene with range, size and confidence, and draw it from three sides."""
+    from apps.figures.scene import scene_figure
+    from apps.figures.style import save
+    from apps.files import PICTURE_SUFFIXES, require_writable
+    from apps.report import report
+    from tofclip.errors import InputError
+    from tofclip.lidar import depth, point_cloud
+    from tofclip.lidar.objects import find_objects
+    from tofclip.transient import Frames
+
+    require_writable(out, *PICTURE_SUFFIXES, inputs=(frames,))
+    recovered = Frames.load(frames)
+    cloud = point_cloud(depth(recovered))
+    objects = find_objects(cloud, reach_mm * MILLIMETRE, fewest_points)
+    if not objects:
+        raise InputError(f"{frames}: no {fewest_points} points lie together within {reach_mm:g} mm")
+    save(scene_figure(recovered, cloud, objects), out)
+    named = ("range", "width", "height", "confidence", "scatter")
+    rows = [{f"{name}_m": getattr(one, name) for name in named} | {"points": one.points.size} for one in objects]
+    if as_json:
+        report({"points": len(cloud), "objects": rows}, as_json=True)
+        return
+    report({f"object {number}": row for number, row in enumerate(rows, 1)}, as_json, [out])
 
 
 @app.command()

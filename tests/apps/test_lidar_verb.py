@@ -131,3 +131,18 @@ def test_a_sequence_is_made_and_goes_on(run: Run, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for unusable in ((tmp_path / "empty",), (shots, "--suffix", ".xyz"), (shots, "--focus", "stack:0:1:3")):
         assert run("lidar", "sequence", *unusable, "--out", out).status == 2
+
+
+def test_a_scene_is_listed_and_drawn(run: Run, tmp_path: Path) -> None:
+    made = Instrument(CAMERA, StreakDetector(150, 100e-12))
+    true_frames(Scene((plate(1.1, -9), plate(1.6, 9))), made, 1e4).save(tmp_path / "frames.h5")
+    words = ("lidar", "scene", tmp_path / "frames.h5", "--out", tmp_path / "scene.png")
+    found = run(*words, "--reach-mm", "60", "--json")
+    assert found.status == 0, found.err
+    first, second = json.loads(found.out)["objects"]
+    assert abs(first["range_m"] - 1.12) < 0.02  # beside the axis the way is longer than the depth
+    assert abs(second["range_m"] - 1.62) < 0.02
+    assert abs(first["width_m"] - 0.09) < 0.03
+    assert (tmp_path / "scene.png").read_bytes()[:4] == b"\x89PNG"
+    assert run(*words, "--fewest-points", "9999").status == 2
+    assert "object 2" in run(*words, "--reach-mm", "60").out

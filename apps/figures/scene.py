@@ -1,0 +1,81 @@
+"""A scene after a flash: the picture summed over time, the cloud from two sides, and pictures at single ranges."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from apps.figures.style import BRIGHTNESS, DEPTH, NOTHING, SMALL, draw, label, page
+from tofclip.units import SPEED_OF_LIGHT
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.figure import Figure
+
+    from tofclip.lidar import PointCloud
+    from tofclip.lidar.objects import SeenObject
+    from tofclip.transient import Frames
+
+BRIGHTEST = 99.5  # percent: a glint does not darken the rest
+RANGES_SHOWN = 4
+HALF_GATE_BIN = 4
+
+
+def scene_figure(frames: Frames, cloud: PointCloud, objects: Sequence[SeenObject]) -> Figure:
+    """Draw a scene in the manner of the paper's Supplementary Figure 21.
+
+    Parameters
+    ----------
+    frames : Frames
+    cloud : PointCloud
+        Of these frames.
+    objects : sequence of SeenObject
+        Numbered in the top view; the four with most points are shown at their ranges.
+    """
+    figure = page(13, 7.5)
+    axes = figure.subplots(2, 4)
+    for panel in axes[0, 1:3]:
+        panel.remove()
+    distance = np.maximum(frames.times, 0) * SPEED_OF_LIGHT / 2
+    brightness = frames.values * (distance**2).astype(np.float32)[:, np.newaxis, np.newaxis]
+    draw(axes[0, 0], _toned(brightness.sum(axis=0)))
+    label(axes[0, 0], "summed over time, times range squared", "x (px)", "y (px), down")
+    _draw_space(figure, cloud)
+    _draw_top(axes[0, 3], cloud, objects)
+    shown = sorted(sorted(objects, key=lambda one: -one.points.size)[:RANGES_SHOWN], key=lambda one: one.range)
+    for panel in axes[1, len(shown) :]:
+        panel.set_axis_off()
+    for panel, one in zip(axes[1], shown, strict=False):
+        row = int(np.abs(distance - one.range).argmin())
+        gate = slice(max(0, row - HALF_GATE_BIN), row + HALF_GATE_BIN + 1)
+        draw(panel, _toned(brightness[gate].sum(axis=0)))
+        label(panel, f"{one.range:.2f} m, shear {frames.shears[row]:.2f} px", "x (px)", "y (px), down")
+    return figure
+
+
+def _toned(picture: Any) -> Any:
+    top = np.percentile(picture, BRIGHTEST) or 1.0
+    return np.clip(picture / top, 0, 1)
+
+
+def _draw_space(figure: Figure, cloud: PointCloud) -> None:
+    """The cloud from above and aside; the camera looks along the axis that goes back."""
+    space: Any = figure.add_subplot(2, 4, (2, 3), projection="3d")
+    x, y, z = cloud.xyz.T
+    space.scatter(x, z, -y, c=cloud.range, cmap=DEPTH, s=1.5, linewidths=0)
+    space.set_xlabel("x (m)", fontsize=SMALL)
+    space.set_ylabel("z (m)", fontsize=SMALL)
+    space.set_zlabel("up (m)", fontsize=SMALL)
+    space.view_init(elev=22, azim=-70)
+    space.tick_params(labelsize=SMALL)
+    space.set_title("point cloud", fontsize=SMALL + 2)
+
+
+def _draw_top(axes: Any, cloud: PointCloud, objects: Sequence[SeenObject]) -> None:
+    axes.set_facecolor(NOTHING)
+    axes.scatter(cloud.xyz[:, 0], cloud.xyz[:, 2], c=_toned(cloud.intensity), cmap=BRIGHTNESS, s=1.5, linewidths=0)
+    for number, one in enumerate(objects, 1):
+        axes.annotate(str(number), (one.centre[0], one.centre[2]), color="white", fontsize=SMALL)
+    label(axes, "top view", "x (m)", "z, away from the camera (m)")

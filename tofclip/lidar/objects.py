@@ -1,0 +1,86 @@
+"""The objects of a cloud: groups of points that hang together, with range, size and confidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from tofclip.errors import InputError
+from tofclip.lidar.cloud import PointCloud
+
+INNER = (5.0, 95.0)  # percent of an object's points that count for its size: a few strays do not widen it
+
+
+@dataclass(frozen=True)
+class SeenObject:
+    """One object.
+
+    Parameters
+    ----------
+    points : (n,) int array
+        Numbers of its points in the cloud.
+    range : float
+        Median distance from the camera, m.
+    confidence : float
+        Median of its points' expected standard deviations of range, m.
+    scatter : float
+        Robust standard deviation of its points' ranges, m: noise and its own depth.
+    centre : (float, float, float)
+        Median position, m; x right, y down, z forward.
+    width, height : float
+        Extent along x and y of the inner nine tenths of its points, m.
+    intensity : float
+        Median, counts referred to 1 m.
+    """
+
+    points: NDArray[np.intp]
+    range: float
+    confidence: float
+    scatter: float
+    centre: tuple[float, float, float]
+    width: float
+    height: float
+    intensity: float
+
+
+def find_objects(cloud: PointCloud, reach: float, fewest: int = 40) -> list[SeenObject]:
+    """Group points that lie within `reach`, m, of each other, directly or through others; the nearest object first.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    reach : float
+    fewest : int
+        Smaller groups are left out.
+    """
+    if not (np.isfinite(reach) and reach > 0) or fewest < 1:
+        raise InputError("objects need a positive reach, and at least one point")
+    if len(cloud) == 0:
+        return []
+    pairs = cKDTree(cloud.xyz).query_pairs(reach, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(cloud), len(cloud)))
+    groups, label = connected_components(links, directed=False)
+    members = (np.flatnonzero(label == group) for group in range(groups))
+    return sorted((_described(cloud, one) for one in members if one.size >= fewest), key=lambda seen: seen.range)
+
+
+def _described(cloud: PointCloud, points: NDArray[np.intp]) -> SeenObject:
+    xyz, distance = cloud.xyz[points], cloud.range[points]
+    low, high = np.percentile(xyz, INNER, axis=0)
+    middle = float(np.median(distance))
+    x, y, z = (float(one) for one in np.median(xyz, axis=0))
+    return SeenObject(
+        points=points,
+        range=middle,
+        confidence=float(np.median(cloud.confidence[points])),
+        scatter=1.4826 * float(np.median(np.abs(distance - middle))),
+        centre=(x, y, z),
+        width=float(high[0] - low[0]),
+        height=float(high[1] - low[1]),
+        intensity=float(np.median(cloud.intensity[points])),
+    )
