@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,63 @@ ALIGNED = 8
 """complex64 numbers in 64 bytes, what vector instructions like to start at."""
 
 
+PRODUCT_RATE = 10
+"""How many operations of a matrix product take as long as one of a pruned Fourier transform; measured."""
+
+
+class Inverse(Protocol):
+    """From the spectra of several terms to their images, with memory of its own; not to be shared between threads."""
+
+    cell: NDArray[np.int64]
+    """Where in a flat spectrum every plane wave goes."""
+
+    carrier: NDArray[np.complex64]
+    """What every column of an image has still to be multiplied by."""
+
+    spectra: NDArray[np.complex64]
+    """Memory for the spectra, term by term."""
+
+    def images(self, terms: int) -> NDArray[np.complex64]:
+        """Transform the first `terms` of `spectra`; the result (term, y, x) is valid until the next call."""
+        ...
+
+
+def inverse(waves: PlaneWaves, lattice: tuple[int, int], wanted: tuple[int, int], terms: int) -> Inverse:
+    """Choose the quicker way: few voxels of a long period by matrix products, many by Fourier transforms.
+
+    Parameters are those of `InverseTransform`.
+    """
+    columns, rows = (2 * int(np.max(index)) + 1 for index in (waves.column, waves.row))
+    products = 8 * columns * wanted[0] * (rows + wanted[1])
+    transforms = 5 * (columns * lattice[0] * np.log2(lattice[0] + 1) + wanted[0] * lattice[1] * np.log2(lattice[1] + 1))
+    if products < PRODUCT_RATE * transforms:
+        return InverseProduct(waves, lattice, wanted, terms)
+    return InverseTransform(waves, lattice, wanted, terms)
+
+
+class InverseProduct:
+    """Inverse transforms of several spectra as two matrix products each.
+
+    Parameters are those of `InverseTransform`.
+    """
+
+    def __init__(self, waves: PlaneWaves, lattice: tuple[int, int], wanted: tuple[int, int], terms: int) -> None:
+        rows, columns = (int(np.max(index)) for index in (waves.row, waves.column))
+        self.cell = (waves.column + columns) * (2 * rows + 1) + waves.row + rows
+        self.carrier = np.ones(wanted[1], np.complex64)
+        self.spectra = np.zeros((terms, 2 * columns + 1, 2 * rows + 1), np.complex64)
+        self._along_y, self._along_x = (
+            np.exp(2j * np.pi / length * np.outer(np.arange(-reach, reach + 1), np.arange(count))).astype(np.complex64)
+            for reach, length, count in zip((rows, columns), lattice, wanted, strict=True)
+        )
+
+    def images(self, terms: int) -> NDArray[np.complex64]:
+        """Transform the first `terms` of `spectra`; the result is (term, y, x)."""
+        return np.stack([(spectrum @ self._along_y).T @ self._along_x for spectrum in self.spectra[:terms]])
+
+
 class InverseTransform:
-    """Inverse transforms of several spectra, with memory of their own; not to be shared between threads.
+    """Inverse transforms of several spectra by pruned Fourier transforms.
 
     Along y only the columns that plane waves fall into are transformed, along x only the rows that voxels lie in. Where
     voxels are too coarse for the finest waves, these are folded into the lattice, as the voxels see them.

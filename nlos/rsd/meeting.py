@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from nlos.method import Progress, silent
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.illumination import Illumination, constant, split
-from nlos.rsd.inverse import InverseTransform
+from nlos.rsd.inverse import inverse
 from nlos.rsd.kernels import illuminate, scatter, transferred
 from tofclip.arrays import blocks, run_blocks
 
@@ -113,7 +113,7 @@ class _Bench:
     def __init__(self, way: Diffraction, source: Source, terms: int) -> None:
         waves, frequencies = way.plane_waves, way.waves.count
         self.way, self.source = way, source
-        self.inverse = InverseTransform(waves, way.lattice, way.grid.shape[1:], terms)
+        self.inverse = inverse(waves, way.lattice, way.grid.shape[1:], terms)
         self.nodes = way.transfer.interpolation(waves.lateral)
         self.products = np.zeros((WAVES_AT_A_TIME, 2, frequencies), np.float32)
         self.weights = np.zeros((2, frequencies), np.float32)

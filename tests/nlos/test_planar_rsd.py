@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from relay_walls import AXIS, HIDDEN, JITTER, curved_wall, planar_wall
 
 import nlos.rsd.diffraction
+import nlos.rsd.inverse
 from nlos import Backprojection, Capture, Grid, PlanarRSD
 from nlos.exact import exact_phasor_field
 from nlos.exposure import exposures, unfolded_band
@@ -119,6 +120,16 @@ def test_a_single_voxel_and_a_single_row() -> None:
     size = np.abs(whole).max()
     assert np.abs(row[0, 0] - whole[3, 3]).max() < 1e-2 * size
     assert abs(voxel[0, 0, 0] - whole[3, 3, 9]) < 1e-2 * size
+
+
+def test_both_ways_back_from_the_spectrum_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = scene("single")
+    for grid in (GRID, Grid(GRID.x[::4], GRID.y[::3], GRID.z), Grid(np.arange(-0.2, 0.2, 0.01), GRID.y, GRID.z[:1])):
+        fields = []
+        for rate in (0, np.inf):
+            monkeypatch.setattr(nlos.rsd.inverse, "PRODUCT_RATE", rate)
+            fields.append(METHOD.phasor_field(capture, grid).values)
+        assert relative_error(*fields) < 1e-5
 
 
 def test_masked_wall_points_and_their_order_do_not_matter() -> None:
