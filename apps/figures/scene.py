@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from tofclip.transient import Frames
 
 BRIGHTEST = 99.5  # percent: a glint does not darken the rest
+FAINTEST_SHOWN = 0.4  # of the colours: dim points stay visible
 RANGES_SHOWN = 4
 HALF_GATE_BIN = 4
 
@@ -75,7 +76,8 @@ def _draw_space(figure: Figure, cloud: PointCloud) -> None:
 
 def _draw_top(axes: Any, cloud: PointCloud, objects: Sequence[SeenObject]) -> None:
     axes.set_facecolor(NOTHING)
-    axes.scatter(cloud.xyz[:, 0], cloud.xyz[:, 2], c=_toned(cloud.intensity), cmap=BRIGHTNESS, s=1.5, linewidths=0)
+    light = FAINTEST_SHOWN + (1 - FAINTEST_SHOWN) * _toned(cloud.intensity)
+    axes.scatter(cloud.xyz[:, 0], cloud.xyz[:, 2], c=light, cmap=BRIGHTNESS, vmin=0, vmax=1, s=1.5, linewidths=0)
     for number, one in enumerate(objects, 1):
         axes.annotate(str(number), (one.centre[0], one.centre[2]), color="white", fontsize=SMALL)
     label(axes, "top view", "x (m)", "z, away from the camera (m)")

@@ -1,4 +1,4 @@
-"""`tofclip lidar`: how well ranges can be known, how views move with range, objects of a scene, clouds of many shots."""
+"""`tofclip lidar`: how well ranges can be known, how views move with range, a scene's objects, clouds of many shots."""
 
 from __future__ import annotations
 
