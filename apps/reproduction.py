@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from tofclip.studies.outcome import Outcome, Study
 
 PAGE = "reproduction.md"
+FOLDER = "reproduction"
+"""Beside the page: what each study made."""
 
 Result = Mapping[str, Any]
 """A finished study as it is kept: name, title, note, command, settings, columns, figure, rows, seconds."""
@@ -69,18 +71,19 @@ def write_page(results: Sequence[Result], folder: Path) -> Path:
         "relative to the variance of shift-and-add of the true views, 12 pixels at the border left out; the prior's "
         "weight is chosen by cross-validation, without the truth.\n"
     )
-    _write(folder / PAGE, "\n\n".join([head, *map(section, results)]) + "\n")
+    sections = (section(result, f"{FOLDER}/") for result in results)
+    _write(folder / PAGE, "\n\n".join([head.rstrip(), *sections]) + "\n")
     return folder / PAGE
 
 
-def section(result: Result) -> str:
-    """Return a study's heading, command, table and picture in Markdown."""
+def section(result: Result, beside: str = "") -> str:
+    """Return a study's heading, command, table and picture in Markdown; pictures lie in the folder `beside`."""
     names = ", ".join([result["name"], *result["also"]])
     header = [*result["columns"], f"ours ({result['figure']})", "spread", "paper"]
     lines = [header, ["---"] * len(header), *map(_cells, result["rows"])]
     table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
     made = f"`{result['command']}`, {result['seconds']:.0f} s"
-    picture = f"![{result['title']}]({result['name']}.png)"
+    picture = f"![{result['title']}]({beside}{result['name']}.png)"
     return f"## {result['title']} ({names})\n\n{result['note']} Made by {made}.\n\n{table}\n\n{picture}"
 
 

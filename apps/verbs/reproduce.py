@@ -28,21 +28,22 @@ def reproduce(
 ) -> None:
     """Make tables and figures of the paper again, its figures beside ours.
 
-    Each study writes NAME.md, NAME.csv, NAME.png and NAME.json; reproduction.md shows them all. A study that the folder
-    holds already, made with the same settings, is not made again.
+    Writes DIR/reproduction.md, which shows everything, and NAME.md, NAME.csv, NAME.png and NAME.json of each study in
+    DIR/reproduction. A study that is there already, made with the same settings, is not made again.
     """
     from apps.files import make_folder
     from apps.report import report
-    from apps.reproduction import write_page
+    from apps.reproduction import FOLDER, write_page
     from tofclip.studies.library import Library
     from tofclip.studies.registry import studies_called
 
     studies = studies_called(name)
     _require_folder(data)
-    make_folder(out)
+    folder = out / FOLDER
+    make_folder(folder)
     library = Library(data)
-    results = [_result(study, library, seeds, out) for study in studies]
-    page = write_page(_all_results(library, seeds, out), out)
+    results = [_result(study, library, seeds, folder) for study in studies]
+    page = write_page(_all_results(library, seeds, folder), out)
     figures = {result["name"]: _summary(result) for result in results}
     report({"seeds": seeds, **figures}, as_json, [page])
 
@@ -58,11 +59,11 @@ def _settings(study: Study, library: Library, seeds: int) -> dict[str, Any]:
     """What a result depends on, as it comes back from JSON."""
     from tofclip import __version__
 
-    recorded = None if library.data is None else str(library.data.resolve())
+    recorded = None if library.data is None else library.data.name
     return {"name": study.name, "seeds": seeds, "data": recorded, "version": __version__}
 
 
-def _result(study: Study, library: Library, seeds: int, out: Path) -> Result:
+def _result(study: Study, library: Library, seeds: int, folder: Path) -> Result:
     """Return a study's result, made now unless the folder has it."""
     from apps.figures.reproduction import reproduction_figure
     from apps.figures.style import save
@@ -70,7 +71,7 @@ def _result(study: Study, library: Library, seeds: int, out: Path) -> Result:
     from apps.reproduction import kept_result, result_of, write_result
 
     settings = _settings(study, library, seeds)
-    kept = kept_result(out / f"{study.name}.json", settings)
+    kept = kept_result(folder / f"{study.name}.json", settings)
     if kept is not None:
         print(f"{study.name}: kept from an earlier run", file=sys.stderr)
         return kept
@@ -80,20 +81,20 @@ def _result(study: Study, library: Library, seeds: int, out: Path) -> Result:
         outcome = study.work(library, seeds, advance)
     seconds = time.perf_counter() - started
     recorded = "" if library.data is None else f" --data {library.data.name}"
-    command = f"tofclip reproduce {study.name} --out {out.name}{recorded} --seeds {seeds}"
-    save(reproduction_figure(study.title, outcome), out / f"{study.name}.png")
+    command = f"tofclip reproduce {study.name} --out {folder.parent.name or '.'}{recorded} --seeds {seeds}"
+    save(reproduction_figure(study.title, outcome), folder / f"{study.name}.png")
     result = result_of(study, outcome, settings, command, seconds)
-    write_result(result, out)
+    write_result(result, folder)
     print(f"{study.name}: {seconds:.0f} s", file=sys.stderr)
     return result
 
 
-def _all_results(library: Library, seeds: int, out: Path) -> list[Result]:
+def _all_results(library: Library, seeds: int, folder: Path) -> list[Result]:
     """Every result that the folder holds with these settings, in the order of the paper's tables."""
     from apps.reproduction import kept_result
     from tofclip.studies.registry import STUDIES
 
-    found = (kept_result(out / f"{study.name}.json", _settings(study, library, seeds)) for study in STUDIES)
+    found = (kept_result(folder / f"{study.name}.json", _settings(study, library, seeds)) for study in STUDIES)
     return [result for result in found if result is not None]
 
 

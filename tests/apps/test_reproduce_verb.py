@@ -30,16 +30,17 @@ def test_a_study_is_written_and_not_made_again(run: Run, tmp_path: Path) -> None
     figures = json.loads(first.out)
     assert figures["table7"]["rows"] == 20
     assert figures["table7"]["mean_paper"] == pytest.approx(3.65, abs=0.05)  # of the paper's sixteen
-    made = {path.name for path in (tmp_path / "made").iterdir()}
-    assert made == {"table7.md", "table7.csv", "table7.png", "table7.json", "reproduction.md"}
-    with (tmp_path / "made" / "table7.csv").open() as file:
+    folder = tmp_path / "made" / "reproduction"
+    made = {path.name for path in folder.iterdir()}
+    assert made == {"table7.md", "table7.csv", "table7.png", "table7.json"}
+    with (folder / "table7.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 20
     assert float(rows[0]["paper"]) == 2.14
     page = (tmp_path / "made" / "reproduction.md").read_text()
     assert "tofclip reproduce table7 --out made --seeds 1" in page
     assert "| CLIP-1D | figure-behind-bars | 1 |" in page
-    assert "![Through occluders](table7.png)" in page
+    assert "![Through occluders](reproduction/table7.png)" in page
     again = run(*words)
     assert json.loads(again.out) == figures
     assert "kept from an earlier run" in again.err
