@@ -35,7 +35,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
                             camera.h5
                                 |
   raw streak image ---------> recover --> frames.h5 --+--> cloud ------------> scene.ply
-  (.tif, .npz, .h5)                                   |
+  or an instrument                                    |
                                                       +--> nlos reconstruct -> volume.h5
 
   demo               all of it on a simulated scene, no files needed: start here

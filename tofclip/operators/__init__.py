@@ -49,7 +49,7 @@ __all__ = [
     "SliceConvolution",
     "SparseMatrix",
     "Stack",
-    "WeightedViews",
     "ViewSelection",
+    "WeightedViews",
     "squared_norm",
 ]
