@@ -3,7 +3,7 @@
 Run with ``python tests/benchmarks/phasor_fields.py [--repeats N] [--ytal PYTHON] [--json]``. All figures come from one
 run on one machine: medians of the repeats, solve call only. "bare" is one inverse Fourier transform per frequency and
 depth of the doubled wall, what the plain way cannot do without, on one thread. y-tal is measured in the Python given,
-which has it installed (``python -m venv ...; pip install y-tal``); without one its rows are left out. The way in time
+which has it installed (``python -m venv ...; pip install y-tal pyfftw``); without one its rows are left out. The way in time
 is measured on a few rows of the plane and scaled up.
 """
 
@@ -46,15 +46,15 @@ from tal.reconstruct import pf
 stored = np.load(sys.argv[1])
 data = NLOSCaptureData()
 data.H = stored["signal"].transpose(0, 2, 1).astype(np.float32)
-data.H_format, data.sensor_grid_format, data.laser_grid_format = HFormat.T_Sx_Sy, GridFormat.X_Y_3, GridFormat.N_3
+data.H_format, data.sensor_grid_format, data.laser_grid_format = HFormat.T_Sx_Sy, GridFormat.X_Y_3, GridFormat.X_Y_3
 data.sensor_grid_xyz = stored["wall"].transpose(1, 0, 2).astype(np.float32)
-data.laser_grid_xyz = stored["laser"].reshape(1, 3).astype(np.float32)
+data.laser_grid_xyz = stored["laser"].reshape(1, 1, 3).astype(np.float32)
 data.sensor_xyz = data.laser_xyz = np.zeros(3, np.float32)
 data.delta_t, data.t_start, data.t_accounts_first_and_last_bounces = float(stored["spacing"]), 0.0, False
 data.volume_format, data.scene_info = VolumeFormat.X_Y_Z_3, {}
 volume = np.stack(np.meshgrid(stored["x"], stored["y"], stored["z"], indexing="ij"), -1).astype(np.float32)
 start, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF)
-pf.solve(data, float(stored["wavelength"]), float(stored["cycles"]), CameraSystem.CONFOCAL_TIME_GATED, volume)
+pf.solve(data, float(stored["wavelength"]), float(stored["cycles"]), CameraSystem.DIRECT_LIGHT, volume)
 after = resource.getrusage(resource.RUSAGE_SELF)
 print("seconds", time.perf_counter() - start, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
 """
