@@ -17,21 +17,10 @@ from tofclip.light_field import (
 )
 from tofclip.metrics import nmse
 from tofclip.simulate.light_fields import CameraArray, known_scene, render, render_view
+from tofclip.studies.light_field_processing import share_of_right_depths
 
 SHEARS = np.arange(-1.4, 1.01, 0.2)
-BORDER_PX, NEIGHBOURS_PX = 6, 2
 ARRAY = CameraArray((64, 64), 8, focal_length_px=80.0, view_step=0.025)
-
-
-def share_right(labels: np.ndarray, shears: np.ndarray, picture: np.ndarray) -> float:
-    """Textured pixels within one step of the true shear; at an object's border, of either side's, 2 px wide."""
-    slope = np.hypot(*np.gradient(picture))
-    textured = slope > 0.2 * np.quantile(slope, 0.99)
-    inner = slice(BORDER_PX, -BORDER_PX)
-    near = range(-NEIGHBOURS_PX, NEIGHBOURS_PX + 1)
-    errors = [np.abs(SHEARS[labels] - np.roll(shears, (y, x), (0, 1))) for y in near for x in near]
-    right = np.min(errors, axis=0) <= 0.15
-    return float(right[inner, inner][textured[inner, inner]].mean())
 
 
 @pytest.mark.parametrize("name", ["render_letters", "render_planes"])
@@ -40,7 +29,7 @@ def test_textured_pixels_get_the_right_plane(shared_data, name):
     path = shared_data / "lightfields" / f"{name}.npz"
     light_field, shears = read_light_field(path), np.load(path)["shear"]
     labels = depth_from_focus(focal_stack(light_field, SHEARS))
-    assert share_right(labels, shears, light_field.pictures[36]) >= 0.95
+    assert share_of_right_depths(SHEARS[labels], shears, light_field.pictures[36], 0.2) >= 0.95
 
 
 @pytest.mark.parametrize("measure", [image_energy, sum_modified_laplacian])
@@ -50,7 +39,7 @@ def test_depth_survives_noise_and_focus_is_better_everywhere_than_at_one_depth(m
     stack = focal_stack(rendered.light_field, SHEARS)
     noise = 0.01 * np.random.default_rng(0).standard_normal(stack.pictures.shape)
     labels = depth_from_focus(FocalStack(stack.pictures + noise, stack.shears), measure)
-    assert share_right(labels, rendered.shears, truth) >= 0.9
+    assert share_of_right_depths(SHEARS[labels], rendered.shears, truth, 0.2) >= 0.9
     assert nmse(stack.sharpest(labels), truth, 6) < 0.5 * min(nmse(picture, truth, 6) for picture in stack.pictures)
 
 

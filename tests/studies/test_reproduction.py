@@ -10,9 +10,10 @@ from tofclip.clip_recovery import ClipRecovery
 from tofclip.errors import InputError
 from tofclip.metrics import nmse
 from tofclip.simulate.light_fields import CameraArray
-from tofclip.studies import dealing_table, shiny_bodies, whole_light_fields
+from tofclip.studies import dealing_table, light_field_processing, shiny_bodies, whole_light_fields
 from tofclip.studies.cases import BORDER_PX, Case, measured, solve
 from tofclip.studies.library import Library
+from tofclip.studies.light_field_processing import share_of_right_depths
 from tofclip.studies.outcome import Row
 from tofclip.studies.registry import STUDIES, studies_called
 
@@ -79,6 +80,27 @@ def test_every_study_can_be_called_by_its_tables_and_figures_names():
     assert studies_called("all") == STUDIES
     with pytest.raises(InputError, match="table2"):
         studies_called("table99")
+
+
+def test_depth_and_viewpoints_of_true_light_fields_are_scored(monkeypatch):
+    monkeypatch.setattr(light_field_processing, "SCENES", ("letters", "blocks"))
+    fine = Library(array=CameraArray((64, 64), 8, focal_length_px=80.0, view_step=0.025))
+    steps: list[int] = []
+    outcome = light_field_processing.light_field_processing(fine, 1, steps.append)
+    figures = {row.labels: row.mean for row in outcome.rows}
+    assert sum(steps) == 2
+    assert figures["letters", "right plane, % of textured pixels"] >= 95
+    synthesised, kept = "viewpoint between the views, NMSE in %", "reference view in its place, NMSE in %"
+    assert all(figures[scene, synthesised] < 0.7 * figures[scene, kept] for scene in ("letters", "blocks"))
+
+
+def test_a_map_of_depths_that_is_wrong_scores_as_wrong():
+    true = np.zeros((30, 30))
+    true[:, 15:] = 1
+    picture = np.random.default_rng(0).random((30, 30))
+    assert share_of_right_depths(true, true, picture, 0.2) == 1
+    assert share_of_right_depths(true + 0.5, true, picture, 0.2) == 0
+    assert 0.3 < share_of_right_depths(np.zeros((30, 30)), true, picture, 0.2) < 0.8
 
 
 @pytest.mark.parametrize("name", ["table6", "table7"])

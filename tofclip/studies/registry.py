@@ -8,6 +8,7 @@ from tofclip.studies import (
     dealing_table,
     flip_test,
     iteration_table,
+    light_field_processing,
     line_rotation,
     occlusion,
     representation,
@@ -27,6 +28,7 @@ STUDIES: tuple[Study, ...] = (
     area_sensors.STUDY,
     line_rotation.STUDY,
     shiny_bodies.STUDY,
+    light_field_processing.STUDY,
     dealing_table.STUDY,
 )
 
