@@ -106,12 +106,22 @@ def _find_samples(x, wall_x, across, outward, per_metre, last, sample, before, a
 
 
 @compiled
+def _power(base, exponent):
+    """Power of a number, quick for the exponents that occur most."""
+    if exponent == 0:
+        return np.float32(1)
+    if exponent == 1:
+        return base
+    return base**exponent
+
+
+@compiled
 def _weigh(x, wall_x, across, ahead, powers, before, after):
     """Multiply the weights of a row of voxels by powers of their distance and of the cosine of their direction."""
     across = max(across, np.float32(NEAREST * NEAREST))
     for ix in range(x.size):
         distance = math.sqrt((x[ix] - wall_x) ** 2 + across)
-        factor = distance ** powers[0] * (ahead / distance) ** powers[1]
+        factor = _power(distance, powers[0]) * _power(ahead / distance, powers[1])
         before[ix] *= factor
         after[ix] *= factor
 
