@@ -3,8 +3,8 @@
 Run with ``python tests/benchmarks/phasor_fields.py [--repeats N] [--ytal PYTHON] [--json]``. All figures come from one
 run on one machine: medians of the repeats, solve call only. "bare" is one inverse Fourier transform per frequency and
 depth of the doubled wall, what the plain way cannot do without, on one thread. y-tal is measured in the Python given,
-which has it installed (``python -m venv ...; pip install y-tal pyfftw``); without one its rows are left out. The way in time
-is measured on a few rows of the plane and scaled up.
+which has it installed (``python -m venv ...; pip install y-tal pyfftw``); without one its rows are left out. The way
+in time is measured on a few rows of the plane and scaled up.
 """
 
 from __future__ import annotations
