@@ -34,7 +34,7 @@ STUDY = Study(
     "Sparse area sensors behind a diffuser, 2.5 % white noise",
     "The paper shows pictures only. Readings are made from 64 true views of scenes with depth, not from one flat "
     "picture; that costs quality.",
-    90,
+    20,
     len(CASES),
     area_sensors,
 )

@@ -37,7 +37,7 @@ STUDY = Study(
     (),
     "Angles dealt to views at random, and evenly over the aperture",
     "Beyond the paper, which deals at random.",
-    60,
+    25,
     2 * len(SCENES) * len(RATIOS),
     dealing_table,
 )

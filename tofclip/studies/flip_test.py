@@ -51,7 +51,7 @@ STUDY = Study(
     ("fig6", "fig7"),
     "Generalised flip test at SR = 0.5",
     "The paper's scenes are not public: its scene 1 and 2 stand beside our own 'still-life' and 'blocks'.",
-    60,
+    40,
     len(CASES),
     flip_test,
 )

@@ -33,7 +33,7 @@ STUDY = Study(
     (),
     "What an iteration costs",
     "The paper gives the operations; seconds are measured here, on one core, and depend on the machine.",
-    20,
+    5,
     1,
     iteration_table,
     seeded=False,

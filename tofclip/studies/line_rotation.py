@@ -13,7 +13,7 @@ from tofclip.studies.coded_line import STEEPEST, coded_line_sensors, psnr_db, re
 from tofclip.studies.library import Library
 from tofclip.studies.outcome import Advance, Outcome, Panel, Row, Study
 
-WIDTHS_PX = (1, 4, 16, 64)
+WIDTHS_PX = (1, 2, 4, 8, 16, 32, 64)
 LINES = 10
 SCENE = "printed-letters"
 ARMS = {"upright": 0.0, "rotated": STEEPEST}
@@ -61,7 +61,7 @@ STUDY = Study(
     (),
     "Ten coded lines, upright and rotated over -45 to 45 degrees",
     "The paper has a plot: rotation gains more than 4 dB at every width. Pictures here are halved to 64 x 64.",
-    60,
+    10,
     2 * len(WIDTHS_PX),
     line_rotation,
 )

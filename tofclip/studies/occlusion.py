@@ -45,7 +45,7 @@ STUDY = Study(
     "Through occluders",
     "Rendered figures and words stand for the paper's. Its errors are against shift-and-add, so are ours; how far that "
     "itself is from the bare target is told in rows of their own.",
-    45,
+    15,
     len(CASES),
     occlusion,
 )

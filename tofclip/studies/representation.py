@@ -73,7 +73,7 @@ def _depth_panels(stack: FocalStack) -> tuple[Panel, Panel]:
 
 
 def _study(name: str, figure: str, title: str, table: Table, note: str) -> Study:
-    return Study(name, (figure,), title, note, 40, len(table.cases), partial(Table.outcome, table))
+    return Study(name, (figure,), title, note, 35, len(table.cases), partial(Table.outcome, table))
 
 
 LETTERS = Table(

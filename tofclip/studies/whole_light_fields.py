@@ -138,7 +138,7 @@ STUDIES = (
         ("fig8", "fig9", "fig10"),
         "CLIP-0D with 4 x 4 views: light field and refocused pictures",
         "The paper's scenes were recorded; rendered words and letters at four depths stand for them.",
-        60,
+        40,
         5 * len(TABLE3),
         table3,
     ),
@@ -148,7 +148,7 @@ STUDIES = (
         "Refocusing a recovered light field beside direct recovery, SR = 1",
         "'blocks' and 'letters' are our own scenes. The prior of the light field is total variation over pixels and "
         "views, with one weight for all; the paper tuned it for each.",
-        120,
+        40,
         3 * len(TABLE4),
         table4,
     ),
