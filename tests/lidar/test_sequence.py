@@ -96,7 +96,8 @@ def test_memory_does_not_grow_with_the_sequence(ranger, tmp_path):
             pass
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peaks[2] < 1.1 * peaks[1]
+    # 36 shots more; threads overlap differently from run to run, which moves the peak by the size of a shot or two
+    assert peaks[2] - peaks[1] < 5 * shot().counts.nbytes
 
 
 def test_clouds_in_a_folder_are_counted_up_to_the_first_gap(tmp_path):
