@@ -126,13 +126,14 @@ def test_a_light_field_recovered_from_many_readings_is_near_the_true_one(library
     assert nmse(found.pictures, truth.pictures, BORDER_PX) < 0.1
 
 
-def test_a_glossy_plate_is_uneven_but_keeps_its_place(library):
-    outcome = shiny_bodies.shiny_bodies(library, 1, lambda _: None)
+def test_a_glossy_plate_is_uneven_but_keeps_its_place():
+    """84 % was measured for both, at full size: wider baselines for the picture's size spoil the recovery itself."""
+    outcome = shiny_bodies.shiny_bodies(Library(array=CameraArray(samples=1)), 1, lambda _: None)
     figures = {row.labels: row.mean for row in outcome.rows}
-    uneven, off = "unevenness over the views, %", "median error of s on the plate, px per view"
+    uneven, right = "unevenness over the views, %", "right plane, % of textured pixels"
     assert figures["glossy", uneven] > 1.5 * figures["matt", uneven]
-    # within half of the step between the refocused depths, one of which is the plate's own
-    assert figures["glossy", off] < 0.15
+    assert figures["glossy", right] >= 75
+    assert figures["glossy", right] >= figures["matt", right] - 10
 
 
 def test_dealing_takes_recorded_scenes_only_where_there_are_any(library, monkeypatch):
