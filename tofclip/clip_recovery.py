@@ -91,7 +91,7 @@ class ClipRecovery:
     weight : float, optional
         Of the variational prior, relative to the largest value of A'f; chosen by cross-validation if not given.
     data_term : str
-        ``squares``; ``huber`` where some readings are wildly wrong; ``poisson`` where few photons were counted.
+        ``squares``; ``huber`` where some readings are wildly wrong; ``poisson`` the likelihood of photon counts.
 
     Raises
     ------
@@ -138,7 +138,8 @@ class ClipRecovery:
         if not isinstance(weighting, Identity):
             raise InputError(f"readings of a {camera.name} camera all have about the same photon noise; take squares")
         counts = measurement.counts()
-        deviation = np.sqrt(counts + 1)
+        # dark readings count no more than a quarter of the mean: they would hold up the convergence of all others
+        deviation = np.sqrt(np.maximum(counts, counts.mean() / 4) + 1)
         model = Diagonal(measurement.photons_per_unit / deviation) @ model
         readings = (counts / deviation)[:, np.newaxis]
         return _Problem(model, readings, camera.row_length, partial(Poisson, deviation=deviation))

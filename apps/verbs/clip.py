@@ -21,11 +21,13 @@ app = typer.Typer(help="Light fields from few nonlocal readings.", no_args_is_he
 
 @app.command()
 def simulate(
-    light_field: Annotated[Path, typer.Argument(metavar="LIGHTFIELD", help="NPZ with lf (v, u, y, x), scale, v, u.")],
+    light_field: Annotated[
+        Path, typer.Argument(metavar="LIGHTFIELD", help="NPZ, HDF5, EXR with a part per view, or a folder.")
+    ],
     encoder: Annotated[
         str,
         typer.Option(
-            metavar="NAME", help="line, single-pixel, coded-line, coded-aperture, cubic-phase, diffuser or line-spread."
+            metavar="NAME", help="line, line-spread, single-pixel, coded-line, coded-aperture, cubic-phase or diffuser."
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="H5", help="The readings to write.")],

@@ -45,7 +45,9 @@ def test_the_walk_through(run: Run, files: Path, tmp_path: Path, monkeypatch: py
         outcome = run(*shlex.split(command)[1:])
         assert (outcome.status, outcome.err) == (0, ""), command
     expected = "camera.h5 camera.png frames.h5 frames.png mip.png scene.ply volume.h5 wall.h5 wall_frames.h5"
-    assert {*expected.split(), "readings.h5", "picture.png", "run.h5", "photons.h5", "photons.ply"} <= {path.name for path in tmp_path.iterdir()}
+    assert {*expected.split(), "readings.h5", "picture.png", "run.h5", "photons.h5", "photons.ply"} <= {
+        path.name for path in tmp_path.iterdir()
+    }
 
 
 def test_the_python_example(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -109,9 +109,10 @@ class Huber(DataTerm):
 class Poisson(DataTerm):
     """The negative log-likelihood of photon counts, each residual in units of its own reading's noise.
 
-    Predicted and counted are both divided by ``deviation = sqrt(count + 1)`` beforehand (weigh the operator's rows
-    alike), so that every reading's curvature at its own count is about 1. Below half a count and a half the logarithm
-    is continued by its parabola, whose gradient stays Lipschitz; the whole is divided by the largest curvature.
+    Predicted and counted are both divided by a `deviation` of at least ``sqrt(count + 1)`` beforehand (weigh the
+    operator's rows alike), so that no reading's curvature at its own count is above 1. Below half the deviation's
+    square the logarithm is continued by its parabola, whose gradient stays Lipschitz; the whole is divided by the
+    largest curvature.
 
     Parameters
     ----------

@@ -22,9 +22,6 @@ RATIO = 10**0.375
 TRIALS = 10
 """At most so many: from the first weight this reaches three decades up or down."""
 
-ROUGHLY = 1e-3
-"""Relative change of the objective that ends a trial: the error of prediction has long settled by then."""
-
 FOLDS = 8
 """Parts that the readings are dealt into; each is predicted from the other seven."""
 
@@ -78,8 +75,7 @@ def choose_weight(method: ProximalMethod, operator: LinearOperator, readings: Ar
     misfit = method.data_term(repeated, held)
 
     def error(weight: float) -> float:
-        trial = replace(method, weight=weight, tolerance=ROUGHLY)
-        pictures = trial.recover(operator, repeated, ~held).frames
+        pictures = replace(method, weight=weight).recover(operator, repeated, ~held).frames
         return float(misfit.value(operator(np.moveaxis(pictures, 0, -1))).sum())
 
     return _downhill(error)

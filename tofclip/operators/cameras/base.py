@@ -35,7 +35,7 @@ class LightFieldCamera(ABC):
     readings : int
         How many readings there are.
     row_length : int
-        Consecutive readings of one row of a detector, whose errors are alike; 1 where each stands for itself.
+        Consecutive readings on a detector whose errors are alike; 1 where each stands for itself.
 
     Raises
     ------

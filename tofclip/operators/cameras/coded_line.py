@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tofclip.operators.base import LinearOperator
 from tofclip.operators.cameras.base import LightFieldCamera
-from tofclip.operators.cameras.dealing import count_of_lines, dealt_at_random
+from tofclip.operators.cameras.dealing import ALIKE_PX, count_of_lines, dealt_at_random
 from tofclip.operators.coded_lines import SliceConvolution, coded_line
 from tofclip.operators.point_spreads import sheared_point_spreads
 from tofclip.operators.shear import View
@@ -28,7 +28,7 @@ class CodedLineCamera(LightFieldCamera):
 
     def _deal(self) -> tuple[int, ...]:
         count = count_of_lines(self.image_shape, self.image_shape[1], self.sampling_ratio)
-        self.readings, self.row_length = count * self.image_shape[1], self.image_shape[1]
+        self.readings, self.row_length = count * self.image_shape[1], min(ALIKE_PX, self.image_shape[1])
         random = np.random.default_rng(self.seed)
         angles = STEEPEST * (2 * np.arange(count) + 1 - count) / count
         used, dealt = dealt_at_random(angles, len(self.views), random)

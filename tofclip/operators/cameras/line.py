@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tofclip.errors import InputError
 from tofclip.operators.base import LinearOperator
 from tofclip.operators.cameras.base import LightFieldCamera
-from tofclip.operators.cameras.dealing import Deal, count_of_lines, dealt_at_random, dealt_evenly
+from tofclip.operators.cameras.dealing import ALIKE_PX, Deal, count_of_lines, dealt_at_random, dealt_evenly
 from tofclip.operators.radon import RadonProjection
 from tofclip.operators.shear import View
 
@@ -27,7 +27,7 @@ class LineCamera(LightFieldCamera):
     def _deal(self) -> tuple[int, ...]:
         self.detector_px = max(self.image_shape)
         count = count_of_lines(self.image_shape, self.detector_px, self.sampling_ratio)
-        self.readings, self.row_length = count * self.detector_px, self.detector_px
+        self.readings, self.row_length = count * self.detector_px, min(ALIKE_PX, self.detector_px)
         used, self.angles = self._dealt(np.arange(count) * np.pi / count)
         return used
 
