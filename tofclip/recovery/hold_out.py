@@ -25,7 +25,7 @@ TRIALS = 10
 FOLDS = 8
 """Parts that the readings are dealt into; each is predicted from the other seven."""
 
-MANY = 512
+MANY = 1024
 """Runs of readings of which one fold alone is a fair sample: the others are not tried."""
 
 
