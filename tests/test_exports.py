@@ -24,7 +24,18 @@ NAMES = {
     ],
     "tofclip.io": ["read_streak"],
     "tofclip.transient": ["Frames", "Streak"],
-    "nlos": ["Backprojection", "Capture", "Grid", "Volume"],
+    "nlos": [
+        "Backprojection",
+        "Capture",
+        "FKMigration",
+        "FilteredBackprojection",
+        "Grid",
+        "Hybrid",
+        "LightCone",
+        "PlanarRSD",
+        "Volume",
+        "propagate",
+    ],
 }
 HEAVY = {"h5py", "matplotlib", "numba", "numpy", "open3d", "pyvista", "scipy", "tifffile"}
 

@@ -128,12 +128,12 @@ def opened(address: str) -> Open:
 
 
 def read_on(source: Source, batches: list[Batch]) -> None:
-    """Read until nothing more comes."""
+    """Read until nothing more comes: a live source is stopped once it falls silent, a paced replay is waited for."""
     wait = LONG
     try:
         while (batch := source.read(wait)) is not None:
             batches.append(batch)
-            wait = SILENCE
+            wait = SILENCE if source.is_live else LONG
     except DeviceTimeoutError:
         assert source.is_live
         source.stop()

@@ -25,7 +25,7 @@ TRIALS = 10
 FOLDS = 8
 """Parts that the readings are dealt into; each is predicted from the other seven."""
 
-MANY = 1024
+MANY = 4096
 """Runs of readings of which one fold alone is a fair sample: the others are not tried."""
 
 
@@ -53,8 +53,8 @@ def choose_weight(method: ProximalMethod, operator: LinearOperator, readings: Ar
 
     No noise level and no true picture are needed, which is why this is taken instead of the discrepancy principle or
     SURE: what F(d) cannot explain (surfaces out of focus) is no noise of a known strength, and generalised
-    cross-validation takes it for signal. The folds are recovered side by side, as the frames of a block. Trials go
-    downhill from the first weight until the minimum is bracketed; a parabola in the weight's logarithm refines it.
+    cross-validation takes it for signal. Trials go downhill from the first weight until the minimum is bracketed; a
+    parabola in the weight's logarithm refines it.
 
     Parameters
     ----------
@@ -71,12 +71,14 @@ def choose_weight(method: ProximalMethod, operator: LinearOperator, readings: Ar
         Of the deal.
     """
     held = folds(readings.size, run, seed)
-    repeated = np.repeat(readings[:, np.newaxis], held.shape[1], axis=1)
-    misfit = method.data_term(repeated, held)
+    column = readings[:, np.newaxis]
 
     def error(weight: float) -> float:
-        pictures = replace(method, weight=weight).recover(operator, repeated, ~held).frames
-        return float(misfit.value(operator(np.moveaxis(pictures, 0, -1))).sum())
+        trial, total = replace(method, weight=weight), 0.0
+        for out in np.split(held, held.shape[1], axis=1):
+            picture = trial.recover(operator, column, ~out).frames[0]
+            total += float(method.data_term(column, out).value(operator(picture)[:, np.newaxis])[0])
+        return total
 
     return _downhill(error)
 
