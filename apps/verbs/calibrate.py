@@ -39,7 +39,11 @@ def calibrate(
     preview: Picture = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find every view's slit centre and line angle, with uncertainties and a picture of the fits over the data."""
+    """Find every view's slit centre and line angle, with uncertainties and a picture of the fits over the data.
+
+    Example: tofclip calibrate --line line.tif --line-background line_background.tif --dot dot.tif
+    --dot-background dot_background.tif --out camera.h5
+    """
     from apps.figures.calibration import calibration_figure
     from apps.figures.style import save
     from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable

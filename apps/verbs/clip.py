@@ -39,7 +39,10 @@ def simulate(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the true views of a light field with a camera of few readings."""
+    """Measure the true views of a light field with a camera of few readings.
+
+    Example: tofclip clip simulate light_field.npz --encoder line --sampling-ratio 0.5 --out readings.h5
+    """
     from apps.files import RECORD_SUFFIXES, history, require_writable
     from apps.report import report
     from tofclip.clip_measurement import Setup, measure, spoilt
@@ -73,7 +76,10 @@ def recover(
     truth: Annotated[Path | None, typer.Option(metavar="LIGHTFIELD", help="Light field to score against.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Recover the picture refocused at one depth."""
+    """Recover the picture refocused at one depth.
+
+    Example: tofclip clip recover readings.h5 --shear -0.3 --preset quality --out picture.png
+    """
     from apps.files import require_writable
     from apps.report import report
     from tofclip.clip_measurement import ClipMeasurement

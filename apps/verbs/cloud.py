@@ -36,7 +36,10 @@ def cloud(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find each pixel's returns and place them in space: x right, y down, z forward, in metres."""
+    """Find each pixel's returns and place them in space: x right, y down, z forward, in metres.
+
+    Example: tofclip cloud frames.h5 --out scene.ply
+    """
     from apps.files import history, require_writable
     from tofclip.transient import Frames
 

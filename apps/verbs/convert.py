@@ -20,7 +20,10 @@ def convert(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Turn a streak image into this program's HDF5, with its time axis, camera, text and relay wall inside."""
+    """Turn a streak image into this program's HDF5, with its time axis, camera, text and relay wall inside.
+
+    Example: tofclip convert wall.npz --out wall.h5
+    """
     from apps.files import RECORD_SUFFIXES, require_writable
     from apps.report import report
     from tofclip.io import read_streak

@@ -29,6 +29,8 @@ def demo(
     """Simulate a scene of letters and plates, recover it from one streak image, and compare with the truth.
 
     Skew, gains and slit centres are found from the shot itself. Writes streak.h5, frames.h5, cloud.ply and preview.png.
+
+    Example: tofclip demo --out demo-output
     """
     from apps.figures.demo import demo_figure
     from apps.figures.style import save

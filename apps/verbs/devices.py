@@ -21,7 +21,10 @@ Recording = Annotated[Path, typer.Argument(metavar="H5", help="Made by tofclip r
 
 @app.command("list")
 def list_(as_json: AsJson = False) -> None:
-    """Show the instruments that are connected, and the kinds of addresses there are."""
+    """Show the instruments that are connected, and the kinds of addresses there are.
+
+    Example: tofclip devices list
+    """
     from dataclasses import asdict
 
     from apps.report import report
@@ -40,7 +43,10 @@ def list_(as_json: AsJson = False) -> None:
 
 @app.command()
 def info(uri: Address, as_json: AsJson = False) -> None:
-    """Say what is known about an instrument or a recording."""
+    """Say what is known about an instrument or a recording.
+
+    Example: tofclip devices info 'sim+linospad2://?seed=1'
+    """
     import devices
     from apps.report import report
 
@@ -64,7 +70,10 @@ def try_(
     seconds: Annotated[float, typer.Option(metavar="S", help="How long to read.")] = 5.0,
     as_json: AsJson = False,
 ) -> None:
-    """Read and decode for a while, and say how fast and how well that went."""
+    """Read and decode for a while, and say how fast and how well that went.
+
+    Example: tofclip devices test 'sim+timetag://?seed=1' --seconds 1
+    """
     import devices
     from apps.report import report
     from apps.verbs.record import ticking
@@ -80,6 +89,8 @@ def verify(file: Recording, as_json: AsJson = False) -> None:
     """Read a recording from end to end and compare it with its checksums and accounts; exit status 2 if it is damaged.
 
     A recording of a program that was killed is not complete, but as good as any up to its end.
+
+    Example: tofclip devices verify run.h5
     """
     from apps.report import report
     from devices.recording.check import verify as verified
@@ -97,7 +108,10 @@ def repair(
     out: Annotated[Path, typer.Option(metavar="H5", help="The sound copy to write.")],
     as_json: AsJson = False,
 ) -> None:
-    """Copy all that is sound of a damaged or unfinished recording, and mark where something is missing."""
+    """Copy all that is sound of a damaged or unfinished recording, and mark where something is missing.
+
+    Example: tofclip devices repair run.h5 --out sound.h5
+    """
     from apps.files import RECORD_SUFFIXES, require_writable
     from apps.report import report
     from devices.recording.check import repair as repaired

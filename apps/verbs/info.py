@@ -22,7 +22,10 @@ def info(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Any file of ours, or a streak image of others.")],
     as_json: AsJson = False,
 ) -> None:
-    """Say what kind of thing a file holds: shapes, axes, units, text, and how it came about."""
+    """Say what kind of thing a file holds: shapes, axes, units, text, and how it came about.
+
+    Example: tofclip info frames.h5
+    """
     from apps.report import plainly, report
 
     found = plainly({"file": file, **_described(_record_in(file))})

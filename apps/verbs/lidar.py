@@ -44,7 +44,10 @@ def accuracy(
     seed: Annotated[int, typer.Option(metavar="N", help="Of the photons' chance.")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Locate returns in simulated photon histograms and compare the error with the Cramer-Rao bound."""
+    """Locate returns in simulated photon histograms and compare the error with the Cramer-Rao bound.
+
+    Example: tofclip lidar accuracy --photons 100 --background 0.1 --pulse-ps 60 --bin-width-ps 20 --trials 200
+    """
     from dataclasses import asdict
 
     from apps.report import report
@@ -71,7 +74,10 @@ def parallax(
     ] = (-3.0, 3.0, 13),
     as_json: AsJson = False,
 ) -> None:
-    """Find lenslet pitch and focus distance from a shot: at which shear the views agree, gate by gate."""
+    """Find lenslet pitch and focus distance from a shot: at which shear the views agree, gate by gate.
+
+    Example: tofclip lidar parallax shot.tif --camera camera.h5 --out camera_locked.h5
+    """
     from apps.files import RECORD_SUFFIXES, require_writable
     from apps.progress import progress
     from apps.report import report
@@ -107,7 +113,10 @@ def scene(
     fewest_points: Annotated[int, typer.Option(metavar="N", help="Smaller groups are no objects.")] = 40,
     as_json: AsJson = False,
 ) -> None:
-    """List the objects of a scene with range, size and confidence, and draw it from three sides."""
+    """List the objects of a scene with range, size and confidence, and draw it from three sides.
+
+    Example: tofclip lidar scene frames.h5 --out scene.png
+    """
     from apps.figures.scene import scene_figure
     from apps.figures.style import save
     from apps.files import PICTURE_SUFFIXES, require_writable
@@ -156,6 +165,8 @@ def sequence(
     """Make a cloud of each shot by the linear inverse, one shot in memory at a time.
 
     Started again after an interruption, it goes on behind the last cloud in the folder.
+
+    Example: tofclip lidar sequence shots/ --camera camera.h5 --out clouds/
     """
     from time import perf_counter
 

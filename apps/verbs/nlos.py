@@ -63,6 +63,8 @@ def reconstruct(
 
     The space in front of the wall is looked over with voxels of half a wavelength first; then the part that is bright
     is imaged with the voxels asked for.
+
+    Example: tofclip nlos reconstruct wall_frames.h5 --method hybrid --out volume.h5 --png mip.png
     """
     from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, history, require_writable
     from apps.report import report

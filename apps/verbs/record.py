@@ -28,6 +28,8 @@ def record(
     """Record an instrument: its bytes as they come, with clock, accounts and calibration.
 
     However this ends, by Ctrl-C or by a crash, the file holds what came until then and opens as file://H5.
+
+    Example: tofclip record 'sim+timetag://?seed=1' --out run.h5 --seconds 1
     """
     import devices
     from apps.files import RECORD_SUFFIXES, history, require_writable

@@ -55,6 +55,8 @@ def recover(
     """Recover every transient frame of a raw streak image.
 
     Where the camera's sweep is not known, skew, gains and centres are found from the shot itself.
+
+    Example: tofclip recover shot.tif --camera camera.h5 --out frames.h5 --time-zero-ns -10.784
     """
     from apps.figures.preview import preview_figure
     from apps.figures.style import save

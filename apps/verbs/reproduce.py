@@ -30,6 +30,8 @@ def reproduce(
 
     Writes DIR/reproduction.md, which shows everything, and NAME.md, NAME.csv, NAME.png and NAME.json of each study in
     DIR/reproduction. A study that is there already, made with the same settings, is not made again.
+
+    Example: tofclip reproduce table2 --out reproduction --seeds 3
     """
     from apps.files import make_folder
     from apps.report import report
