@@ -44,7 +44,8 @@ def reproduce(
     folder = out / FOLDER
     make_folder(folder)
     library = Library(data)
-    results = [_result(study, library, seeds, folder) for study in studies]
+    possible = [study for study in studies if _is_possible(study, library) or len(studies) == 1]
+    results = [_result(study, library, seeds, folder) for study in possible]
     page = write_page(_all_results(library, seeds, folder), out)
     figures = {result["name"]: _summary(result) for result in results}
     report({"seeds": seeds, **figures}, as_json, [page])
@@ -55,6 +56,14 @@ def _require_folder(data: Path | None) -> None:
 
     if data is not None and not data.is_dir():
         raise InputError(f"{data}: no such folder of recorded data")
+
+
+def _is_possible(study: Study, library: Library) -> bool:
+    """Tell whether the recording that a study needs is there; say what is left out."""
+    if study.recording is None or library.has_recording(study.recording):
+        return True
+    print(f"{study.name}: left out, it needs {study.recording} of the recorded data (--data)", file=sys.stderr)
+    return False
 
 
 def _settings(study: Study, library: Library, seeds: int) -> dict[str, Any]:
@@ -77,10 +86,11 @@ def _result(study: Study, library: Library, seeds: int, folder: Path) -> Result:
     if kept is not None:
         print(f"{study.name}: kept from an earlier run", file=sys.stderr)
         return kept
+    repeats = seeds if study.seeded else 1
     started = time.perf_counter()
-    print(f"{study.name}: {study.title}, about {study.seconds * seeds:.0f} s", file=sys.stderr)
-    with progress(study.name, study.steps * seeds) as advance:
-        outcome = study.work(library, seeds, advance)
+    print(f"{study.name}: {study.title}, about {study.seconds * repeats:.0f} s", file=sys.stderr)
+    with progress(study.name, study.steps * repeats) as advance:
+        outcome = study.work(library, repeats, advance)
     seconds = time.perf_counter() - started
     recorded = "" if library.data is None else f" --data {library.data.name}"
     command = f"tofclip reproduce {study.name} --out {folder.parent.name or '.'}{recorded} --seeds {seeds}"

@@ -66,9 +66,20 @@ def test_scenes_are_rendered_once_and_variants_differ(library):
 
 def test_recorded_light_fields_join_where_their_folder_is_given(shared_data):
     known = Library(shared_data)
-    assert known.has_data("render_letters")
-    assert not known.has_data("nothing")
+    assert known.has_recording("lightfields/render_letters.npz")
+    assert not known.has_recording("lightfields/nothing.npz")
     assert known.light_field("data:render_letters").pictures.shape == (64, 128, 128)
+
+
+def test_the_hand_needs_its_recording_and_explains_it(library, shared_data):
+    (study,) = studies_called("fig4d")
+    with pytest.raises(InputError, match="--data"):
+        study.work(library, 1, lambda _: None)
+    steps: list[int] = []
+    outcome = study.work(Library(shared_data), 1, steps.append)
+    assert sum(steps) == study.steps
+    assert [row.labels for row in outcome.rows] == [("1",), ("2",), ("3",)]
+    assert all(row.mean < 1 for row in outcome.rows)
 
 
 def test_every_study_can_be_called_by_its_tables_and_figures_names():

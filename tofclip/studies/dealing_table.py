@@ -14,7 +14,9 @@ ENCODERS = ("line", "line-spread")
 
 def dealing_table(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Recover with both ways of dealing; the recorded light fields too where they are at hand."""
-    scenes = SCENES | {f"data:{name}": shear for name, shear in RECORDED.items() if library.has_data(name)}
+    scenes = SCENES | {
+        f"data:{name}": shear for name, shear in RECORDED.items() if library.has_recording(f"lightfields/{name}.npz")
+    }
     cases = [
         Case((scene.removeprefix("data:"), NAMES[encoder], f"{ratio:g}"), scene, encoder, ratio, shear)
         for scene, shear in scenes.items()

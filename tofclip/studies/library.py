@@ -47,19 +47,26 @@ class Library:
         """Return what the reference view sees of an occlusion scene when its occluder is gone."""
         return render_view(without_occluder(known_scene(name, self.array)), self.array, (0.0, 0.0))
 
-    def has_data(self, name: str) -> bool:
-        """Tell whether a recorded light field can be read."""
-        return self.data is not None and self._path(name).is_file()
+    def has_recording(self, name: str) -> bool:
+        """Tell whether the folder of recorded data holds a file."""
+        return self.data is not None and (self.data / name).is_file()
 
-    def _path(self, name: str) -> Path:
+    def recording(self, name: str) -> Path:
+        """Return the path of a file of the folder of recorded data.
+
+        Raises
+        ------
+        InputError
+            No folder was given.
+        """
         if self.data is None:
-            raise InputError(f"the recorded light field '{name}' needs the folder of recorded data; name it by --data")
-        return self.data / "lightfields" / f"{name}.npz"
+            raise InputError(f"{name} is recorded data; name the folder that holds it by --data")
+        return self.data / name
 
     def _made(self, name: str) -> LightField:
         scene, _, variant = name.partition(":")
         if scene == "data":
-            return read_light_field(self._path(variant))
+            return read_light_field(self.recording(f"lightfields/{variant}.npz"))
         if variant == "4x4":
             whole = self.light_field(scene)
             middle = np.all((whole.views >= -2) & (whole.views < 2), axis=1)

@@ -94,6 +94,8 @@ class Study:
         (library, seeds, advance) to the outcome; calls `advance` with shares that add up to `steps` per seed.
     steps : int
         Advances for each seed.
+    recording : str or None
+        What it needs of the folder of recorded data; without that it cannot be made.
     """
 
     name: str
@@ -104,3 +106,4 @@ class Study:
     steps: int
     work: Callable[[Library, int, Advance], Outcome]
     seeded: bool = True
+    recording: str | None = None
