@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from apps.help import explain
 from apps.verbs import calibrate, clip, cloud, convert, demo, devices, info, lidar, nlos, record, recover, reproduce
 from tofclip import __version__
 from tofclip.errors import TofclipError
@@ -23,7 +24,12 @@ INTERRUPTED = 130  # 128 + SIGINT, as shells report it
 READER_GONE = 141  # 128 + SIGPIPE
 
 DEBUG_FLAG = "--debug"
-EPILOG = f"Add {DEBUG_FLAG} anywhere to see where an error came from."
+COMPLETION_VARIABLE = "_TOFCLIP_COMPLETE"  # what shells set while they ask typer how a word may go on
+EPILOG = (
+    f"Exit status: 0 done; {FAULTY_INPUT} unusable input, with one line on standard error that says what to do; "
+    f"{INTERRUPTED} interrupted; {DEFECT} a defect of this program. "
+    f"{DEBUG_FLAG} anywhere shows where an error came from."
+)
 
 MAP = f"""\
 tofclip {__version__}: 3D from streak images, through occluders and around corners
@@ -56,19 +62,20 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
 
   tofclip VERB --help explains a verb. Exit status: 0 done, 2 unusable input, 130 interrupted."""
 
-app = typer.Typer(name="tofclip", add_completion=False, pretty_exceptions_enable=False, epilog=EPILOG)
-app.command(epilog=EPILOG)(demo.demo)
-app.command(epilog=EPILOG)(calibrate.calibrate)
-app.command(epilog=EPILOG)(recover.recover)
-app.command(epilog=EPILOG)(cloud.cloud)
+app = typer.Typer(name="tofclip", pretty_exceptions_enable=False, epilog=EPILOG)
+app.command()(demo.demo)
+app.command()(calibrate.calibrate)
+app.command()(recover.recover)
+app.command()(cloud.cloud)
 app.add_typer(lidar.app, name="lidar")
 app.add_typer(nlos.app, name="nlos")
 app.add_typer(clip.app, name="clip")
-app.command(epilog=EPILOG)(reproduce.reproduce)
+app.command()(reproduce.reproduce)
 app.add_typer(devices.app, name="devices")
-app.command(epilog=EPILOG)(record.record)
-app.command(epilog=EPILOG)(convert.convert)
-app.command(epilog=EPILOG)(info.info)
+app.command()(record.record)
+app.command()(convert.convert)
+app.command()(info.info)
+explain(app, EPILOG)
 
 
 @app.callback(invoke_without_command=True)
@@ -103,8 +110,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _report(fault)
     except KeyboardInterrupt:
         status = INTERRUPTED
-    except SystemExit:
-        status = READER_GONE  # typer's answer to a broken pipe, and to nothing else in this mode
+    except SystemExit as end:  # typer's answer to a broken pipe, and the end of shell completion
+        completes = end.code == 0 or COMPLETION_VARIABLE in os.environ
+        status = end.code if completes else READER_GONE
     if status == INTERRUPTED:
         print("tofclip: interrupted; no unfinished file was left behind", file=sys.stderr)
     return int(status or 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -21,3 +22,12 @@ Picture = Annotated[
     Path | None,
     typer.Option("--preview", metavar="PNG", help="Where the picture goes.", show_default="beside --out, .png"),
 ]
+
+
+def completing(*names: str) -> Callable[[str], list[str]]:
+    """Return what completes an option's value in the shell: the names that begin as it does so far."""
+
+    def beginning(incomplete: str) -> list[str]:
+        return [name for name in names if name.startswith(incomplete)]
+
+    return beginning

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.options import AsJson
+from apps.options import AsJson, completing
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -27,7 +27,11 @@ def simulate(
     encoder: Annotated[
         str,
         typer.Option(
-            metavar="NAME", help="line, line-spread, single-pixel, coded-line, coded-aperture, cubic-phase or diffuser."
+            metavar="NAME",
+            help="line, line-spread, single-pixel, coded-line, coded-aperture, cubic-phase or diffuser.",
+            autocompletion=completing(
+                "line", "line-spread", "single-pixel", "coded-line", "coded-aperture", "cubic-phase", "diffuser"
+            ),
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="H5", help="The readings to write.")],
@@ -64,14 +68,31 @@ def recover(
     shear: Annotated[float, typer.Option(metavar="S", help="Depth to focus on, pixels per view step.")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The picture: .h5, .png or .exr.")],
     prior: Annotated[
-        str, typer.Option(metavar="NAME", help="tv, wavelet or l1; or a denoiser: collaborative, bm3d or nlm.")
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="tv, wavelet or l1; or a denoiser: collaborative, bm3d or nlm.",
+            autocompletion=completing("tv", "wavelet", "l1", "collaborative", "bm3d", "nlm"),
+        ),
     ] = "tv",
-    preset: Annotated[str, typer.Option(metavar="NAME", help="fast, or quality: a denoiser finishes.")] = "fast",
+    preset: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="fast, or quality: a denoiser finishes.",
+            autocompletion=completing("fast", "quality"),
+        ),
+    ] = "fast",
     weight: Annotated[
         str, typer.Option(metavar="auto|VALUE", help="Of the prior, relative; auto: cross-validation.")
     ] = "auto",
     data_term: Annotated[
-        str, typer.Option(metavar="NAME", help="squares; huber for bad readings; poisson for few photons.")
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="squares; huber for bad readings; poisson for few photons.",
+            autocompletion=completing("squares", "huber", "poisson"),
+        ),
     ] = "squares",
     truth: Annotated[Path | None, typer.Option(metavar="LIGHTFIELD", help="Light field to score against.")] = None,
     as_json: AsJson = False,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apps.options import AsJson
+from apps.options import AsJson, completing
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
@@ -39,7 +39,9 @@ def reconstruct(
     source: Annotated[Path, typer.Argument(metavar="FILE", help="Recovered frames of a relay wall, or a capture.")],
     out: Annotated[Path, typer.Option(metavar="H5", help="The volume to write.")],
     png: Annotated[Path | None, typer.Option(metavar="PNG", help="Picture of the volume, three views.")] = None,
-    method: Annotated[str, typer.Option(metavar="NAME", help=f"{', '.join(METHODS)}.")] = "backprojection",
+    method: Annotated[
+        str, typer.Option(metavar="NAME", help=f"{', '.join(METHODS)}.", autocompletion=completing(*METHODS))
+    ] = "backprojection",
     wavelength_mm: Annotated[float, typer.Option(metavar="MM", help="Carrier of the virtual pulse.")] = 48.0,
     cycles: Annotated[float, typer.Option(metavar="N", help="Length of the virtual pulse in wavelengths.")] = 3.0,
     voxel_mm: Annotated[float, typer.Option(metavar="MM", help="Distance of neighbouring voxels.")] = 6.0,

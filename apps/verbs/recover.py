@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apps.options import AsJson, Picture, TimeZero
+from apps.options import AsJson, Picture, TimeZero, completing
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
@@ -34,7 +34,14 @@ def recover(
         typer.Option(metavar="PS", help="Duration of a row in ps; overrides the file's own time axis."),
     ] = None,
     time_zero_ns: TimeZero = None,
-    method: Annotated[str, typer.Option(metavar="NAME", help="tv, l1, linear or adjoint.")] = "tv",
+    method: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="tv, l1, linear or adjoint.",
+            autocompletion=completing("tv", "l1", "linear", "adjoint"),
+        ),
+    ] = "tv",
     iterations: Annotated[
         int | None, typer.Option(metavar="N", help="At most so many, for tv and l1.", show_default="the method's")
     ] = None,

@@ -1,0 +1,87 @@
+"""The verbs' pages of the documentation, made from the program itself so that they cannot be out of date."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import typer
+from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
+
+from apps.cli import EPILOG, MAP, app
+from apps.help import told
+
+PROGRAM = "tofclip"
+
+
+def verbs() -> dict[str, TyperCommand]:
+    """Return every verb that computes, by the words that call it, such as ``lidar scene``."""
+    return dict(_found(typer.main.get_command(app), ()))
+
+
+def _found(command: object, words: tuple[str, ...]) -> Iterator[tuple[str, TyperCommand]]:
+    if isinstance(command, TyperGroup):
+        for name, below in command.commands.items():
+            yield from _found(below, (*words, name))
+    elif isinstance(command, TyperCommand):
+        yield " ".join(words), command
+
+
+def write_pages(folder: Path) -> list[Path]:
+    """Write a Markdown page for each verb, and one that lists them.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if missing. Pages of verbs that no longer exist are removed.
+
+    Returns
+    -------
+    list of Path
+        The verbs' pages, then the list.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    pages = {f"{name.replace(' ', '-')}.md": page(name, command) for name, command in verbs().items()}
+    pages["index.md"] = _index(list(pages))
+    for old in folder.glob("*.md"):
+        if old.name not in pages:
+            old.unlink()
+    for name, text in pages.items():
+        path = folder / name
+        if not path.exists() or path.read_text(encoding="utf-8") != text:  # what is the same is not built again
+            path.write_text(text, encoding="utf-8")
+    return [folder / name for name in pages]
+
+
+def page(name: str, command: TyperCommand) -> str:
+    """Return a verb's page in Markdown: what it does, an example, its arguments and options, the exit statuses."""
+    context = typer.Context(command, info_name=f"{PROGRAM} {name}")
+    prose, examples = told(command.callback.__doc__ if command.callback else None)
+    shown = [param for param in command.get_params(context) if not getattr(param, "hidden", False)]
+    arguments = [_entry(one, context) for one in shown if isinstance(one, TyperArgument)]
+    options = [_entry(one, context) for one in shown if isinstance(one, TyperOption)]
+    usage = " ".join([PROGRAM, name, *command.collect_usage_pieces(context)])
+    parts = [f"# {PROGRAM} {name}", *map(_plain, prose), f"```text\n{usage}\n```"]
+    parts += [f"```sh\n{example}\n```" for example in examples]
+    if arguments:
+        parts += ["## Arguments", *arguments]
+    return "\n\n".join(
+        [*parts, "## Options", *options, "## Exit status", _plain(EPILOG.removeprefix("Exit status: ")), ""]
+    )
+
+
+def _entry(param: TyperArgument | TyperOption, context: typer.Context) -> str:
+    """Return one term of a definition list."""
+    name, told_of_it = param.get_help_record(context) or (param.name, "")
+    return f"`{name}`\n: {_plain(told_of_it)}"
+
+
+def _index(pages: list[str]) -> str:
+    names = "\n".join(page.removesuffix(".md") for page in pages)
+    return f"# Verbs\n\n```text\n{MAP}\n```\n\n```{{toctree}}\n:maxdepth: 1\n\n{names}\n```\n"
+
+
+def _plain(text: str) -> str:
+    """Keep Markdown from seeing anything but words."""
+    return re.sub(r"([\\`*_<>$\[\]{}|])", r"\\\1", " ".join(text.split()))
