@@ -14,7 +14,21 @@ from typing import Annotated
 import typer
 
 from apps.help import explain
-from apps.verbs import calibrate, clip, cloud, convert, demo, devices, info, lidar, nlos, record, recover, reproduce
+from apps.verbs import (
+    calibrate,
+    clip,
+    cloud,
+    convert,
+    demo,
+    devices,
+    info,
+    lidar,
+    nlos,
+    occlusion,
+    record,
+    recover,
+    reproduce,
+)
 from tofclip import __version__
 from tofclip.errors import TofclipError
 
@@ -53,6 +67,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   lidar scene        recovered frames to a list of objects and a picture
   lidar sequence     a folder or stack of shots to a sequence of clouds
   nlos reconstruct   recovered frames of a wall to the scene hidden around the corner
+  occlusion          what stands behind an occluder: inactive region, demonstration
   clip               light fields from few readings: simulate a camera, recover a picture
   reproduce          the paper's tables and figures, made again: reproduce all --out DIR
   devices            instruments and their recordings: list, info, test, verify, repair
@@ -70,6 +85,7 @@ app.command()(cloud.cloud)
 app.add_typer(lidar.app, name="lidar")
 app.add_typer(nlos.app, name="nlos")
 app.add_typer(clip.app, name="clip")
+app.add_typer(occlusion.app, name="occlusion")
 app.command()(reproduce.reproduce)
 app.add_typer(devices.app, name="devices")
 app.command()(record.record)

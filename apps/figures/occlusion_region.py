@@ -1,0 +1,85 @@
+"""The inactive region behind an occluder, drawn to scale: how many views see each place."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from apps.figures.style import LINE, NOTHING, SMALL, draw, label, page
+from tofclip.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from tofclip.occlusion import InactiveRegion
+
+VIEWS = 7
+DRAWN_LENGTHS = 2.2  # of the region, behind the occluder
+ENDLESS_DISTANCES = 3.0  # drawn behind an occluder whose region has no end
+CELLS = (240, 480)
+OCCLUDER = "#e8b04a"
+
+
+def region_figure(region: InactiveRegion) -> Figure:
+    """Draw views, occluder and the region from above, in millimetres."""
+    figure = page(9.6, 4.2)
+    draw_region(figure.subplots(), region)
+    return figure
+
+
+def draw_region(axes: Axes, region: InactiveRegion, places: NDArray[Any] | None = None) -> None:
+    """Draw the region from above; z to the right, x upwards.
+
+    Parameters
+    ----------
+    axes : Axes
+    region : InactiveRegion
+    places : (views,) array, optional
+        Of the views on the aperture, m; seven, evenly, if not given.
+    """
+    if places is None:
+        places = np.linspace(-0.5, 0.5, VIEWS) * region.baseline
+    reach = DRAWN_LENGTHS * region.length if region.ends else ENDLESS_DISTANCES * region.distance
+    half = 0.62 * max(region.baseline, region.width)
+    x = np.linspace(-half, half, CELLS[0])[:, np.newaxis, np.newaxis]
+    behind = np.linspace(0, reach, CELLS[1])[:, np.newaxis]
+    share = region.sees(places, x, behind).mean(axis=-1)
+    edges = np.array([region.distance, region.distance + reach, -half, half]) / MILLIMETRE
+    left, right, low, high = edges.tolist()
+    mapped = draw(axes, share[::-1], (left, right, low, high), cmap="bone", vmin=0, vmax=1, aspect="auto")
+    bar = axes.figure.colorbar(mapped, ax=axes, shrink=0.9)
+    bar.set_label("share of the views that see the place", fontsize=SMALL)
+    bar.ax.tick_params(labelsize=SMALL)
+    _draw_lines(axes, region, reach)
+    axes.plot(np.zeros(len(places)), places / MILLIMETRE, "s", color=LINE, ms=7, clip_on=False)
+    axes.plot([left, left], np.array([-0.5, 0.5]) * region.width / MILLIMETRE, color=OCCLUDER, lw=6)
+    axes.set_xlim(-0.03 * right, right)
+    axes.set_facecolor(NOTHING)
+    label(axes, _title(region), "z, away from the views (mm)", "x, along the baseline (mm)")
+
+
+def _draw_lines(axes: Axes, region: InactiveRegion, reach: float) -> None:
+    """Lines of sight from both ends past the occluder's nearer edge, and the region's length."""
+    far = region.distance + reach
+    for side in (-1, 1):
+        slope = side * (region.width - region.baseline) / 2 / region.distance
+        ends = np.array([0, far])
+        axes.plot(
+            ends / MILLIMETRE, (side * region.baseline / 2 + slope * ends) / MILLIMETRE, color=LINE, lw=1, ls="--"
+        )
+    if region.ends:
+        start, stop = region.distance / MILLIMETRE, (region.distance + region.length) / MILLIMETRE
+        axes.annotate("", (stop, 0), (start, 0), arrowprops={"arrowstyle": "<->", "color": OCCLUDER})
+        said = f"inactive, {region.length / MILLIMETRE:.1f} mm"
+        axes.annotate(said, ((start + stop) / 2, 0), (0, 4), textcoords="offset points", ha="center", color=OCCLUDER)
+
+
+def _title(region: InactiveRegion) -> str:
+    sizes = f"L = {region.baseline / MILLIMETRE:g} mm, D = {region.width / MILLIMETRE:g} mm, "
+    sizes += f"d = {region.distance / MILLIMETRE:g} mm"
+    if not region.ends:
+        return f"{sizes}: D \N{GREATER-THAN OR EQUAL TO} L, nothing behind the occluder is promised to be seen"
+    return f"{sizes}: l = d D / (L \N{MINUS SIGN} D) = {region.length / MILLIMETRE:.1f} mm"
