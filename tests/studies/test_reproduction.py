@@ -64,6 +64,12 @@ def test_scenes_are_rendered_once_and_variants_differ(library):
         library.light_field("data:render_letters")
 
 
+def test_a_poster_of_a_scene_is_the_same_in_every_view(library):
+    poster, scene = library.light_field("blocks:flat"), library.light_field("blocks")
+    reference = scene.pictures[np.all(scene.views == 0, axis=1)]
+    np.testing.assert_array_equal(poster.pictures, np.broadcast_to(reference, scene.pictures.shape))
+
+
 def test_recorded_light_fields_join_where_their_folder_is_given(shared_data):
     known = Library(shared_data)
     assert known.has_recording("lightfields/render_letters.npz")

@@ -37,7 +37,8 @@ class Library:
         ----------
         name : str
             A name of `tofclip.simulate.light_fields.SCENES`, ``NAME:EDIT`` with an edit of the flip test,
-            ``NAME:4x4`` for its middle sixteen views, or ``data:NAME`` for a recorded one.
+            ``NAME:4x4`` for its middle sixteen views, ``NAME:flat`` for its reference view as a poster at s = 0, or
+            ``data:NAME`` for a recorded one.
         """
         if name not in self._known:
             self._known[name] = self._made(name)
@@ -72,4 +73,8 @@ class Library:
             middle = np.all((whole.views >= -2) & (whole.views < 2), axis=1)
             return LightField(whole.pictures[middle], whole.views[middle])
         known = known_scene(scene, self.array)
+        if variant == "flat":
+            views = self.array.views
+            poster = render_view(known, self.array, (0.0, 0.0))
+            return LightField(np.broadcast_to(poster, (len(views), *poster.shape)), views)
         return render(edited(known, variant) if variant in EDITS else known, self.array).light_field
