@@ -14,16 +14,18 @@ from tofclip.camera import Camera, Measurement, Rectifier
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.cloud import PointCloud, point_cloud
 from tofclip.lidar.detection import Detection
-from tofclip.lidar.returns import depth
+from tofclip.lidar.returns import Returns
+from tofclip.lidar.search import ReturnSearch
 from tofclip.reconstruct.focus import AT_THE_CALIBRATED_DEPTH, Focus
+from tofclip.reconstruct.task import fitted_to_shot, prepare
 from tofclip.recovery import LinearInverse
-from tofclip.transient import Frames, Streak
+from tofclip.recovery.traces import InverseTraces, patch_order
+from tofclip.transient import Streak
 
 FloatArray = NDArray[np.float64]
 Shot = Callable[[], Streak]
 
 LARGEST_JITTER_BIN = 32
-ALL_RETURNS = Detection()
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,8 @@ class Step:
 class Ranger:
     """Makes clouds of shots of one camera by the linear inverse, which needs no iterations.
 
-    Sweep, operators and inverted Gram matrices are worked out once; frames are written into the same memory again.
+    Sweep, operators, inverted Gram matrices and filters are worked out once. No transient cube is made: pixels are
+    recovered a few at a time, at all instants, and their returns are sought at once (`tofclip.recovery.traces`).
 
     Parameters
     ----------
@@ -62,7 +65,7 @@ class Ranger:
 
     Notes
     -----
-    Memory: the frames, and a (columns, columns) matrix for each shear.
+    Memory: a (columns, columns) matrix for each shear, and for a shot as much again as its readings.
     """
 
     def __init__(
@@ -71,29 +74,66 @@ class Ranger:
         row_times: FloatArray,
         method: LinearInverse | None = None,
         focus: Focus = AT_THE_CALIBRATED_DEPTH,
-        detection: Detection = ALL_RETURNS,
+        detection: Detection | None = None,
     ) -> None:
         focus.require(camera)
         method = LinearInverse() if method is None else method
-        self.camera, self.detection = camera, detection
+        self.camera = camera
         self.times = np.asarray(row_times, dtype=np.float64) - camera.time_zero
         self.rectifier = Rectifier(camera, self.times.size)
         nothing = Measurement(np.empty((0, 0), np.float32), np.empty((0, 0), bool))
         self.pieces = focus.pieces(camera, self.times, nothing)
-        alive = ~camera.dead_columns
-        self._inverses = [method.prepare(camera.operator(piece.shear), alive) for piece in self.pieces]
+        alive, self.pixels = ~camera.dead_columns, patch_order(camera.image_shape)
+        self.inverses = [
+            InverseTraces(method.prepare(camera.operator(piece.shear), alive), self.pixels) for piece in self.pieces
+        ]
         shears = np.repeat([piece.shear for piece in self.pieces], [piece.size for piece in self.pieces])
-        self._frames = Frames(
-            np.zeros((self.times.size, *camera.image_shape), np.float32), self.times, camera, shears=shears
-        )
+        self._search = ReturnSearch(camera, self.times, detection, shears=shears)
+
+    @classmethod
+    def for_shot(cls, shot: Streak, camera: Camera | None = None, focus: Focus = AT_THE_CALIBRATED_DEPTH) -> Ranger:
+        """Prepare for shots like this one; a sweep that is not known is found from it.
+
+        Parameters
+        ----------
+        shot : Streak
+            With a time axis.
+        camera : Camera, optional
+            Defaults to the one that the shot carries.
+        focus : Focus
+
+        Raises
+        ------
+        MissingTimeAxisError, InputError, CalibrationError
+            As for `tofclip.recover`.
+        """
+        known = prepare(shot, camera, LinearInverse(), focus).camera
+        return cls(known if known.sweep is not None else fitted_to_shot(shot, known), shot.times, focus=focus)
+
+    def returns(self, readings: NDArray[np.float32]) -> Returns:
+        """Find the returns in one shot's rectified readings, (columns, rows)."""
+        if readings.shape != (self.camera.slit_width_px, self.times.size):
+            raise ShapeError("readings", (self.camera.slit_width_px, self.times.size), readings.shape)
+        return self._search.returns(_ShotTraces(self, readings))
 
     def cloud(self, readings: NDArray[np.float32]) -> PointCloud:
         """Make the cloud of one shot's rectified readings, (columns, rows)."""
-        if readings.shape != (self.camera.slit_width_px, self.times.size):
-            raise ShapeError("readings", (self.camera.slit_width_px, self.times.size), readings.shape)
-        for piece, inverse in zip(self.pieces, self._inverses, strict=True):
-            inverse.recover(readings[:, piece.frames], out=self._frames.values[piece.frames])
-        return point_cloud(depth(self._frames, detection=self.detection))
+        return point_cloud(self.returns(readings))
+
+
+class _ShotTraces:
+    """Traces of a shot, recovered as they are asked for; see `tofclip.lidar.traces.Traces`."""
+
+    def __init__(self, ranger: Ranger, readings: NDArray[np.float32]) -> None:
+        self.pixels, self._pieces, self._inverses = ranger.pixels, ranger.pieces, ranger.inverses
+        self._weights = [
+            inverse.inverse.weights(readings[:, piece.frames])
+            for piece, inverse in zip(self._pieces, self._inverses, strict=True)
+        ]
+
+    def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
+        for part, inverse, weights in zip(self._pieces, self._inverses, self._weights, strict=True):
+            inverse.fill(weights, piece, traces, part.frames)
 
 
 @dataclass
@@ -159,17 +199,40 @@ def clouds(
     jitter = Jitter(light_over_time(shots[0](), ranger.camera)) if steady else None
     for start in range(first * average, len(shots), average):
         numbers = range(start, min(start + average, len(shots)))
-        total: NDArray[np.float32] | None = None
-        late = np.zeros(len(numbers))
-        for place, number in enumerate(numbers):
-            streak = shots[number]()
-            if jitter is not None:
-                late[place] = jitter.late_bin(light_over_time(streak, ranger.camera))
-            measured = ranger.rectifier.measure(streak.counts, streak.saturated, late=float(late[place]))
-            total = measured.readings if total is None else np.add(total, measured.readings, out=total)
-        if total is not None:
-            total /= len(numbers)
-            yield Step(ranger.cloud(total), numbers, late)
+        cloud, late = averaged([shots[number] for number in numbers], ranger, jitter)
+        yield Step(cloud, numbers, late)
+
+
+def averaged(shots: Sequence[Shot], ranger: Ranger, jitter: Jitter | None) -> tuple[PointCloud, FloatArray]:
+    """Make one cloud of successive shots.
+
+    Parameters
+    ----------
+    shots : sequence of callables
+        At least one; one is in memory at a time.
+    ranger : Ranger
+    jitter : Jitter, optional
+        None: the shots are taken as they come.
+
+    Returns
+    -------
+    PointCloud
+    (shots,) array
+        Rows by which each shot was late, as far as that was asked for.
+    """
+    late = np.zeros(len(shots))
+
+    def readings(place: int) -> NDArray[np.float32]:
+        streak = shots[place]()
+        if jitter is not None:
+            late[place] = jitter.late_bin(light_over_time(streak, ranger.camera))
+        return ranger.rectifier.measure(streak.counts, streak.saturated, late=float(late[place])).readings
+
+    total = readings(0)
+    for place in range(1, len(shots)):
+        total += readings(place)
+    total /= len(shots)
+    return ranger.cloud(total), late
 
 
 def cloud_path(folder: Path, number: int, suffix: str) -> Path:

@@ -5,7 +5,7 @@ kind of thing it is and where it came from. Every class that can be saved turns 
 that the layout of the file is decided here and nowhere else.
 """
 
-from tofclip.storage.files import SIGNATURE, atomic_path, one_line, reading
+from tofclip.storage.files import SIGNATURE, atomic_path, one_line, reading, remove_leftovers
 from tofclip.storage.origin import provenance, sha256_of
 from tofclip.storage.record import Field, Record, Scalar
 
@@ -18,5 +18,6 @@ __all__ = [
     "one_line",
     "provenance",
     "reading",
+    "remove_leftovers",
     "sha256_of",
 ]

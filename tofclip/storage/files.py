@@ -6,7 +6,7 @@ import contextlib
 import errno
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from tofclip.errors import StorageError
@@ -39,6 +39,22 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise StorageError(f"{target}: cannot be written: {_reason(fault)}") from fault
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_leftovers(targets: Iterable[Path]) -> None:
+    """Remove the temporary files of writers of `targets` that were killed before `atomic_path` could.
+
+    Only when nobody writes these targets any more: a writer whose temporary file is gone fails.
+    """
+    wanted: dict[Path, set[str]] = {}
+    for target in targets:
+        wanted.setdefault(target.parent, set()).add(target.name)
+    for folder, names in wanted.items():
+        with contextlib.suppress(OSError):
+            for entry in os.scandir(folder):
+                target_name = Path(entry.name).stem[1:].rpartition(".")[0]
+                if entry.name.startswith(".") and target_name in names:
+                    Path(entry.path).unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

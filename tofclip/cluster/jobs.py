@@ -1,0 +1,150 @@
+"""A job, how it is attempted, and what is told about many of them."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from tofclip.errors import TofclipError
+from tofclip.storage import one_line
+
+
+@dataclass(frozen=True)
+class Job:
+    """Something to be done once.
+
+    Parameters
+    ----------
+    name : str
+        What a message calls it.
+    result : Path
+        The file it makes, whole or not at all; on a cluster, where every worker can write it.
+    work : callable
+        Makes the file; may return a few figures about it. It has to survive pickling: a `functools.partial` of a
+        function of a module with names of files and numbers.
+    """
+
+    name: str
+    result: Path
+    work: Callable[[], Any]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What became of a job.
+
+    Parameters
+    ----------
+    name : str
+    problem : str
+        Empty if it went well.
+    figures : object
+        What its work returned; None as well where the result was there already.
+    process : str
+        Which process did it; empty where none did.
+    peak_bytes : int
+        Most memory that this process has held so far; 0 where the system does not tell.
+    """
+
+    name: str
+    problem: str = ""
+    figures: Any = None
+    process: str = ""
+    peak_bytes: int = 0
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A job that did not make its result, and why, in one line."""
+
+    name: str
+    problem: str
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What became of many jobs.
+
+    Parameters
+    ----------
+    done : int
+        Jobs whose result is there now.
+    failures : tuple of Failure
+        The others.
+    processes : int
+        How many processes took part.
+    peak_bytes : int
+        Most memory that one of them held, its program and libraries included.
+    seconds : float
+    """
+
+    done: int
+    failures: tuple[Failure, ...]
+    processes: int
+    peak_bytes: int
+    seconds: float
+
+    @classmethod
+    def of(cls, reports: Iterable[Report], started: float) -> Summary:
+        """Sum up reports as they come; `started` is a reading of `time.perf_counter`."""
+        done, failures, processes, peak = 0, [], set(), 0
+        for report in reports:
+            if report.problem:
+                failures.append(Failure(report.name, report.problem))
+            else:
+                done += 1
+            processes.add(report.process)
+            peak = max(peak, report.peak_bytes)
+        failures.sort(key=lambda failure: failure.name)
+        return cls(done, tuple(failures), len(processes - {""}), peak, time.perf_counter() - started)
+
+
+def unfinished(jobs: Iterable[Job]) -> list[Job]:
+    """Return the jobs whose result is not there yet."""
+    return [job for job in jobs if not job.result.exists()]
+
+
+def attempt(job: Job) -> Report:
+    """Do a job unless its result is there; whatever goes wrong is told in the report, so that the others go on.
+
+    The libraries of linear algebra get one thread: with more, they round differently, and jobs would give other results
+    on a cluster than here.
+    """
+    problem, figures = "", None
+    try:
+        if not job.result.exists():
+            with _linear_algebra().limit(limits=1, user_api="blas"):
+                figures = job.work()
+    except TofclipError as fault:
+        problem = one_line(fault)
+    except Exception as fault:
+        problem = f"unforeseen {type(fault).__name__}: {one_line(fault)}"
+    return Report(job.name, problem, figures, f"{platform.node()}:{os.getpid()}", peak_memory_bytes())
+
+
+@cache
+def _linear_algebra() -> Any:
+    """What sets the number of threads; looking for the libraries takes longer than some jobs."""
+    import numpy as np
+    import scipy.linalg
+    from threadpoolctl import ThreadpoolController
+
+    _ = np, scipy.linalg  # each brings a library of its own
+    return ThreadpoolController()
+
+
+def peak_memory_bytes() -> int:
+    """Most memory that this process has held so far; 0 where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+    unit = 1024 if sys.platform.startswith("linux") else 1
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
