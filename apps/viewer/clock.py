@@ -1,0 +1,86 @@
+"""Playback: which frame is due at what time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from tofclip.errors import InputError
+
+SLOWEST, FASTEST = 1 / 16, 16.0
+
+
+@dataclass
+class Clock:
+    """Counts frames while it runs; whoever asks brings the time along, in seconds of any steady clock.
+
+    Parameters
+    ----------
+    rate : float
+        Frames per second at speed 1.
+    speed : float
+        Times faster than that.
+    loop : bool
+        Whether the last frame is followed by the first; otherwise the clock stops there.
+    position : float
+        Frame, and how far it has run.
+    """
+
+    rate: float
+    speed: float = 1.0
+    loop: bool = True
+    position: float = 0.0
+    playing: bool = field(default=False, init=False)
+    _asked: float | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not self.rate > 0:
+            raise InputError(f"frames per second must be positive, got {self.rate}")
+
+    @property
+    def frame(self) -> int:
+        """The frame that is due."""
+        return int(self.position)
+
+    def play(self, oldest: int, count: int) -> None:
+        """Run; from the oldest frame on where the last one is reached."""
+        if self.frame >= count - 1:
+            self.position = float(oldest)
+        self.playing, self._asked = True, None
+
+    def pause(self) -> None:
+        """Stand still."""
+        self.playing = False
+
+    def jump(self, frame: int, oldest: int, count: int) -> None:
+        """Go to a frame, or to the nearest that exists."""
+        self.position = float(min(max(frame, oldest), max(count - 1, oldest)))
+        self._asked = None
+
+    def step(self, frames: int, oldest: int, count: int) -> None:
+        """Stand still so many frames further on, or back."""
+        self.pause()
+        self.jump(self.frame + frames, oldest, count)
+
+    def set_speed(self, speed: float) -> None:
+        """Run faster or slower from now on, within bounds."""
+        self.speed = min(max(speed, SLOWEST), FASTEST)
+
+    def tick(self, now: float, oldest: int, count: int) -> int:
+        """Let time pass and return the frame that is due."""
+        passed = 0.0 if self._asked is None else max(0.0, now - self._asked)
+        self._asked = now
+        if self.playing and count > oldest:
+            self._advance(passed * self.rate * self.speed, oldest, count)
+        if self.frame < oldest:  # forgotten meanwhile
+            self.position = float(oldest)
+        return self.frame
+
+    def _advance(self, frames: float, oldest: int, count: int) -> None:
+        self.position += frames
+        if self.position < count:
+            return
+        if self.loop:
+            self.position = oldest + (self.position - oldest) % (count - oldest)
+        else:
+            self.position = float(count - 1)
+            self.pause()

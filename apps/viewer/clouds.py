@@ -1,0 +1,99 @@
+"""Point clouds in files, one or many in a row."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apps.viewer.source import Source, View
+from tofclip.errors import FileFormatError, InputError
+from tofclip.lidar import PointCloud
+from tofclip.units import SPEED_OF_LIGHT
+
+SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz")
+CLOUDS_PER_SECOND = 10.0
+MOST_KEPT = 32
+
+
+class CloudFiles(Source):
+    """Clouds in files, shown one after the other.
+
+    Parameters
+    ----------
+    title : str
+    paths : sequence of Path
+        In order.
+
+    Notes
+    -----
+    Memory: the last 32 clouds looked at.
+    """
+
+    def __init__(self, title: str, paths: Sequence[Path]) -> None:
+        super().__init__(title, CLOUDS_PER_SECOND)
+        self._paths = list(paths)
+        self._kept: OrderedDict[int, View] = OrderedDict()
+        if not self._paths:
+            raise InputError(f"{title}: there is no cloud to show")
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    def view(self, number: int) -> View:
+        if number not in self._kept:
+            self._kept[number] = View(read_cloud(self._paths[number]))
+            if len(self._kept) > MOST_KEPT:
+                self._kept.popitem(last=False)
+        return self._kept[number]
+
+
+def clouds_in(folder: Path) -> list[Path]:
+    """Return the files of a folder that are clouds by their names, in order."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.name[0] != ".")
+
+
+def read_cloud(path: Path) -> PointCloud:
+    """Read a cloud of this program, or another's table of points with at least x, y and z in metres.
+
+    Raises
+    ------
+    InputError, StorageError, FileFormatError
+        The file cannot be read, or holds no positions.
+    """
+    from tofclip.lidar.export import read
+
+    if path.suffix.lower() == ".h5":
+        return PointCloud.load(path)
+    table = read(path)
+    if missing := [axis for axis in "xyz" if axis not in table]:
+        raise FileFormatError(path, f"has no column '{missing[0]}', so it is no cloud of points")
+    xyz = np.stack([table[axis] for axis in "xyz"], axis=-1)
+    return cloud_of(xyz[np.all(np.isfinite(xyz), axis=1)] if len(table) == 3 else xyz, table)
+
+
+def cloud_of(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) -> PointCloud:
+    """Make a cloud of positions; what is not known follows from them, or is 0.
+
+    Parameters
+    ----------
+    xyz : (n, 3) array
+        m.
+    known : mapping of str to (n,) array, optional
+        Columns by their names; ``"brightness"`` counts as intensity.
+    """
+    known = known or {}
+    distance = np.linalg.norm(xyz, axis=1)
+    nothing = np.zeros(len(xyz), np.float32)
+    columns: dict[str, Any] = {
+        "intensity": known.get("intensity", known.get("brightness", nothing)),
+        "confidence": known.get("confidence", nothing),
+        "range": known.get("range", distance),
+        "return_number": known.get("return_number", np.ones(len(xyz), np.uint8)),
+        "time": known.get("time", 2 * distance / SPEED_OF_LIGHT),
+    }
+    return PointCloud(xyz=xyz, **columns)

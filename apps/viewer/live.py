@@ -1,0 +1,122 @@
+"""Shots that come in while one looks."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from itertools import chain
+
+from apps.viewer.linear_path import Readings
+from apps.viewer.shots import ShotSource
+from apps.viewer.source import View
+from tofclip.camera import Camera
+from tofclip.errors import InputError, TofclipError
+from tofclip.storage import one_line
+from tofclip.transient import Streak
+
+MOST_KEPT = 32
+RATE_OVER = 8
+"""Arrivals over which the data rate is averaged."""
+
+
+class LiveShots(ShotSource):
+    """Shots that an iterator delivers, recovered by a thread as they come; the last 32 can be looked at again.
+
+    Parameters
+    ----------
+    title : str
+    shots : iterator of Streak
+        Its end, or a fault of an instrument, ends the source; what came can still be looked at.
+    camera : Camera
+        With its sweep.
+    first : Streak
+        The shot that was needed to find out about the camera; shown as number 0.
+
+    Notes
+    -----
+    Memory: 32 shots' readings and clouds.
+    """
+
+    def __init__(self, title: str, shots: Iterator[Streak], camera: Camera, first: Streak) -> None:
+        super().__init__(title, camera, first.times)
+        self._kept: deque[tuple[Readings, View]] = deque(maxlen=MOST_KEPT)
+        self._arrivals: deque[float] = deque(maxlen=RATE_OVER + 1)
+        self._count, self._trouble = 0, ""
+        self._lock, self._stopping = threading.Lock(), threading.Event()
+        self._ended = False
+        self._take(first)
+        self._thread = threading.Thread(target=self._run, args=(shots,), name="live shots", daemon=True)
+        self._thread.start()
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def oldest(self) -> int:
+        return self._count - len(self._kept)
+
+    @property
+    def is_live(self) -> bool:
+        return not self._ended
+
+    @property
+    def data_rate(self) -> float:
+        with self._lock:
+            if len(self._arrivals) < 2 or self._ended:
+                return 0.0
+            return (len(self._arrivals) - 1) / max(self._arrivals[-1] - self._arrivals[0], 1e-9)
+
+    @property
+    def trouble(self) -> str:
+        return self._trouble
+
+    def view(self, number: int) -> View:
+        return self._entry(number)[1]
+
+    def readings(self, number: int) -> Readings:
+        return self._entry(number)[0]
+
+    def close(self) -> None:
+        self._stopping.set()
+
+    def _entry(self, number: int) -> tuple[Readings, View]:
+        """Return what is kept of a shot, or of the nearest that is."""
+        with self._lock:
+            place = number - (self._count - len(self._kept))
+            return self._kept[min(max(place, 0), len(self._kept) - 1)]
+
+    def _run(self, shots: Iterator[Streak]) -> None:
+        try:
+            for shot in shots:
+                if self._stopping.is_set():
+                    break
+                self._take(shot)
+        except TofclipError as fault:
+            self._trouble = one_line(fault)
+        finally:
+            self._ended = True
+
+    def _take(self, shot: Streak) -> None:
+        readings = self.rectified(shot)
+        entry = (readings, self.linear.view(readings, 0.0, self._all))
+        with self._lock:
+            self._kept.append(entry)
+            self._count += 1
+            self._arrivals.append(time.monotonic())
+
+
+def shots_from(address: str, bin_width: float | None) -> Iterator[Streak]:
+    """Gather shot after shot from an instrument, until it fails."""
+    from devices.transients import read_transient
+
+    while True:
+        yield read_transient(address, bin_width)
+
+
+def first_and_rest(shots: Iterator[Streak], title: str) -> tuple[Streak, Iterator[Streak]]:
+    """Wait for the first shot."""
+    for first in shots:
+        return first, chain(shots)
+    raise InputError(f"{title}: the source ended before it gave anything")

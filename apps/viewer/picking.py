@@ -1,0 +1,113 @@
+"""Which point is meant by a click, what is known about it, and how far it is from another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from apps.viewer.source import Waveform
+from tofclip.lidar import PointCloud
+from tofclip.units import NANOSECOND
+
+WIDEST_MISS = 0.012
+"""rad; a click that misses every point by more, 10 pixels on a usual screen, means none of them."""
+
+CLOSE_MISS = 0.004
+"""rad; of all points missed by less, the nearest one is in front."""
+
+
+@dataclass(frozen=True)
+class Pick:
+    """A point that was chosen.
+
+    Parameters
+    ----------
+    position : (float, float, float)
+        x, y, z in m.
+    range, confidence : float
+        m; the confidence is one standard deviation of the range.
+    intensity : float
+        Counts, referred to 1 m.
+    return_number : int
+    time : float
+        Time of flight, s.
+    pixel : (int, int), optional
+        Row and column that saw it.
+    waveform : Waveform, optional
+        That pixel's signal over time.
+    """
+
+    position: tuple[float, float, float]
+    range: float
+    confidence: float
+    intensity: float
+    return_number: int
+    time: float
+    pixel: tuple[int, int] | None = None
+    waveform: Waveform | None = None
+
+    @property
+    def in_words(self) -> str:
+        """One line for each thing that is known."""
+        x, y, z = self.position
+        lines = [
+            f"x {x:.4f} m, y {y:.4f} m, z {z:.4f} m",
+            f"range {self.range:.4f} m ± {1e3 * self.confidence:.2f} mm",
+            f"intensity {self.intensity:.4g} counts, return {self.return_number}",
+            f"time {self.time / NANOSECOND:.3f} ns",
+        ]
+        if self.pixel is not None:
+            lines.append(f"pixel row {self.pixel[0]}, column {self.pixel[1]}")
+        return "\n".join(lines)
+
+
+def point_on_ray(xyz: NDArray[np.float32], origin: ArrayLike, direction: ArrayLike) -> int | None:
+    """Return the number of the point that a ray from the eye hits, None where it hits none.
+
+    Of the points that the ray misses closely the one nearest to the eye is meant; with none so close, the one missed
+    by the smallest angle.
+
+    Parameters
+    ----------
+    xyz : (n, 3) array
+        m.
+    origin, direction : (3,) array
+        Of the ray, in the same frame.
+    """
+    along = np.asarray(direction, dtype=np.float64)
+    away = xyz - np.asarray(origin, dtype=np.float64)
+    depth = away @ (along / np.linalg.norm(along))
+    square = np.einsum("ij,ij->i", away, away)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        miss = np.sqrt(np.maximum(square - depth**2, 0)) / depth
+    miss[~(depth > 0)] = np.inf  # behind the eye
+    close = np.flatnonzero(miss < CLOSE_MISS)
+    if close.size:
+        return int(close[np.argmin(depth[close])])
+    if miss.size == 0 or miss.min() > WIDEST_MISS:
+        return None
+    return int(np.argmin(miss))
+
+
+def picked(
+    cloud: PointCloud, number: int, pixel: tuple[int, int] | None = None, waveform: Waveform | None = None
+) -> Pick:
+    """Return what is known about point `number` of a cloud."""
+    x, y, z = (float(value) for value in cloud.xyz[number])
+    return Pick(
+        (x, y, z),
+        float(cloud.range[number]),
+        float(cloud.confidence[number]),
+        float(cloud.intensity[number]),
+        int(cloud.return_number[number]),
+        float(cloud.time[number]),
+        pixel,
+        waveform,
+    )
+
+
+def distance(first: Pick, second: Pick) -> float:
+    """Distance of two points, m."""
+    return float(np.linalg.norm(np.subtract(first.position, second.position)))

@@ -1,0 +1,108 @@
+"""Raw streak images in a row, recovered by the linear inverse as they are looked at."""
+
+from __future__ import annotations
+
+import abc
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apps.viewer.linear_path import SHEARS, LinearPath, Readings
+from apps.viewer.source import Abilities, Gate, Source, View, Waveform
+from apps.viewer.transient import depth_picture
+from tofclip.camera import Camera, Rectifier
+from tofclip.transient import Streak
+
+SHOTS_PER_SECOND = 10.0
+MOST_KEPT = 16
+
+
+class ShotSource(Source):
+    """Shots of one camera, wherever they come from; frame `n` is the cloud of shot `n`.
+
+    Parameters
+    ----------
+    title : str
+    camera : Camera
+        With its sweep.
+    row_times : (rows,) array
+        Instant of each row, s.
+    """
+
+    def __init__(self, title: str, camera: Camera, row_times: NDArray[np.float64]) -> None:
+        super().__init__(title, SHOTS_PER_SECOND, Abilities(shears=SHEARS if camera.views > 1 else None))
+        self.linear = LinearPath(camera, row_times - camera.time_zero)
+        self._rectifier = Rectifier(camera, row_times.size)
+        self._views: OrderedDict[int, View] = OrderedDict()
+
+    @abc.abstractmethod
+    def readings(self, number: int) -> Readings:
+        """Return the rectified readings of a shot, (columns, rows)."""
+
+    def rectified(self, streak: Streak) -> Readings:
+        """Take dark level and sweep off a shot."""
+        return self._rectifier.measure(streak.counts, streak.saturated).readings
+
+    def view(self, number: int) -> View:
+        if number not in self._views:
+            self._views[number] = self.linear.view(self.readings(number), 0.0, self._all)
+            if len(self._views) > MOST_KEPT:
+                self._views.popitem(last=False)
+        return self._views[number]
+
+    def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
+        readings = self.readings(number)
+        bright = self.linear.frames(readings, 0.0, self._around_the_light(readings))
+        return {
+            "streak": readings.T,
+            "intensity": bright.values.sum(axis=0),
+            "depth": depth_picture(self.view(number)),
+        }
+
+    def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform:
+        frames = self.linear.frames(self.readings(number), 0.0, self._all)
+        return Waveform(frames.times, frames.values[:, pixel[0], pixel[1]].copy())
+
+    def refocused(self, number: int, shear: float, gate: Gate) -> View:
+        return self.linear.view(self.readings(number), shear, self._all)
+
+    @property
+    def _all(self) -> Gate:
+        return Gate(0, int(self.linear.times.size))
+
+    def _around_the_light(self, readings: Readings) -> Gate:
+        """The 64 frames about the brightest one: a picture of all would cost as much as the cloud."""
+        brightest = int(readings.sum(axis=0).argmax())
+        return Gate(max(0, brightest - 32), min(int(self.linear.times.size), brightest + 32))
+
+
+class StoredShots(ShotSource):
+    """Shots in files, read when they are looked at.
+
+    Parameters
+    ----------
+    title : str
+    shots : sequence of callables
+        Each reads its shot.
+    camera : Camera
+        With its sweep.
+
+    Notes
+    -----
+    Memory: the readings of the last shot, and the last 16 clouds.
+    """
+
+    def __init__(self, title: str, shots: Sequence[Callable[[], Streak]], camera: Camera) -> None:
+        super().__init__(title, camera, shots[0]().times)
+        self._shots = shots
+        self._last: tuple[int, Readings] | None = None
+
+    def __len__(self) -> int:
+        return len(self._shots)
+
+    def readings(self, number: int) -> Readings:
+        if self._last is None or self._last[0] != number:
+            self._last = (number, self.rectified(self._shots[number]()))
+        return self._last[1]

@@ -1,0 +1,172 @@
+"""What can be looked at: anything that gives a cloud for each of its frames."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import InputError
+from tofclip.lidar import PointCloud
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class View:
+    """What a source shows in one frame.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    pixels : (n, 2) int array, optional
+        Row and column of the pixel that saw each point.
+    """
+
+    cloud: PointCloud
+    pixels: NDArray[np.int32] | None = None
+
+
+@dataclass(frozen=True)
+class Waveform:
+    """A pixel's signal over time.
+
+    Parameters
+    ----------
+    times : (n,) array
+        Time of flight, s.
+    counts : (n,) array
+    """
+
+    times: FloatArray
+    counts: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """A surface: vertices (v, 3) in m and corners (f, 3) of each triangle."""
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Frames of a transient from `first` up to, not including, `stop`."""
+
+    first: int
+    stop: int
+
+    @property
+    def frames(self) -> slice:
+        """As an index."""
+        return slice(self.first, self.stop)
+
+
+@dataclass
+class Ways:
+    """How a source shows itself, where it can be shown in several ways.
+
+    Parameters
+    ----------
+    names : tuple of str
+        The ways there are; empty where there is one only.
+    chosen : str
+    threshold : float
+        Share of the brightest voxel below which nothing is shown.
+    """
+
+    names: tuple[str, ...] = ()
+    chosen: str = ""
+    threshold: float = 0.3
+
+
+@dataclass(frozen=True)
+class Abilities:
+    """What a source can do beyond showing its frames.
+
+    Parameters
+    ----------
+    times : (frames,) array, optional
+        Time of flight of each frame, s, of a source whose frames are the instants of one transient.
+    shears : (float, float), optional
+        Least and largest shear of a refocus, pixels per view step; None where it cannot be refocused.
+    """
+
+    times: FloatArray | None = None
+    shears: tuple[float, float] | None = None
+
+
+@dataclass
+class Source(abc.ABC):
+    """A row of frames, numbered from 0.
+
+    Parameters
+    ----------
+    title : str
+        What the page calls it.
+    rate : float
+        Frames per second at natural speed.
+    """
+
+    title: str
+    rate: float
+    abilities: Abilities = field(default_factory=Abilities)
+    ways: Ways = field(default_factory=Ways)
+
+    @abc.abstractmethod
+    def __len__(self) -> int:
+        """Number of frames so far."""
+
+    @abc.abstractmethod
+    def view(self, number: int) -> View:
+        """Return what is to be seen in frame `number`."""
+
+    @property
+    def oldest(self) -> int:
+        """First frame that is still there."""
+        return 0
+
+    @property
+    def is_live(self) -> bool:
+        """Whether frames are added while one looks."""
+        return False
+
+    @property
+    def data_rate(self) -> float:
+        """Frames per second that come in; 0 where nothing does."""
+        return 0.0
+
+    @property
+    def trouble(self) -> str:
+        """What ended a live source early, in a line; empty while all is well."""
+        return ""
+
+    def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
+        """Return pictures of frame `number`, or of a transient's gate, by name: "streak", "intensity", "depth" (m)."""
+        return {}
+
+    def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform | None:
+        """Return the signal of a pixel (row, column) in frame `number`, None where it is not known."""
+        return None
+
+    def refocused(self, number: int, shear: float, gate: Gate) -> View:
+        """Recover the frames of a gate once more, at another shear, pixels per view step."""
+        raise InputError(f"{self.title} holds no readings that could be focused anew")
+
+    def surface(self) -> Triangles | None:
+        """Return the surface to draw instead of points, None where points are shown."""
+        return None
+
+    def close(self) -> None:  # noqa: B027 - most sources hold nothing
+        """Let go of files and instruments."""
+
+
+def nothing() -> PointCloud:
+    """Return a cloud without points."""
+    empty: Any = np.empty(0, np.float32)
+    return PointCloud(np.empty((0, 3), np.float32), empty, empty, empty, np.empty(0, np.uint8), empty)

@@ -1,0 +1,67 @@
+"""Playback over time that the test sets."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from apps.viewer.clock import FASTEST, SLOWEST, Clock
+from tofclip.errors import InputError
+
+
+def test_frames_follow_the_time_and_the_speed() -> None:
+    clock = Clock(8.0, loop=False)
+    clock.play(0, 100)
+    assert [clock.tick(now, 0, 100) for now in (5.0, 5.0625, 5.125, 6.0)] == [0, 0, 1, 8]
+    clock.set_speed(4.0)
+    assert clock.tick(7.0, 0, 100) == 40
+    clock.pause()
+    assert clock.tick(60.0, 0, 100) == 40
+    clock.play(0, 100)  # the pause does not count
+    assert clock.tick(70.0, 0, 100) == 40
+
+
+def test_the_end_stops_it_or_begins_anew() -> None:
+    clock = Clock(10.0, loop=False)
+    clock.play(0, 4)
+    clock.tick(0.0, 0, 4)
+    assert (clock.tick(9.0, 0, 4), clock.playing) == (3, False)
+    clock.play(0, 4)
+    assert clock.frame == 0
+    clock.loop = True
+    clock.tick(10.0, 0, 4)
+    assert (clock.tick(10.55, 0, 4), clock.playing) == (1, True)
+
+
+def test_steps_and_jumps_stay_among_the_frames() -> None:
+    clock = Clock(10.0)
+    clock.jump(3, 0, 5)
+    assert clock.frame == 3
+    clock.play(0, 5)
+    clock.step(-1, 0, 5)
+    assert (clock.frame, clock.playing) == (2, False)
+    clock.step(10, 0, 5)
+    assert clock.frame == 4
+    clock.jump(-7, 2, 5)
+    assert clock.frame == 2
+
+
+def test_frames_that_are_forgotten_are_left() -> None:
+    clock = Clock(10.0)
+    clock.jump(1, 0, 10)
+    assert clock.tick(0.0, 6, 20) == 6
+
+
+@given(st.floats(-1e3, 1e3), st.integers(1, 50), st.lists(st.floats(0, 1e4), min_size=2, max_size=6))
+def test_there_is_no_other_frame_than_those_that_exist(speed: float, count: int, times: list[float]) -> None:
+    clock = Clock(25.0)
+    clock.set_speed(speed)
+    assert SLOWEST <= clock.speed <= FASTEST
+    clock.play(0, count)
+    assert all(0 <= clock.tick(now, 0, count) < count for now in sorted(times))
+
+
+def test_a_clock_that_stands_still_is_refused() -> None:
+    with pytest.raises(InputError, match="positive"):
+        Clock(0.0)

@@ -1,0 +1,273 @@
+"""Every kind of source, opened by its name and held against what was written."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from viewer_scenes import (
+    BIN_WIDTH,
+    FAR,
+    FAR_FRAME,
+    FRAMES,
+    NEAR,
+    NEAR_FRAME,
+    PlaneSource,
+    camera,
+    frames,
+    plane,
+    range_of,
+    streak,
+    volume,
+)
+
+from apps.viewer.live import LiveShots
+from apps.viewer.panes import front_pictures, panes
+from apps.viewer.session import ALL, AROUND, UP_TO, Session
+from apps.viewer.source import Gate, Source
+from apps.viewer.sources import Extras, open_source
+from apps.viewer.volume import PROJECTION, SLICE, SURFACE
+from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError, StorageError
+from tofclip.transient.stack import save_stack
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a user may want to look at."""
+    place = tmp_path_factory.mktemp("looked_at")
+    frames().save(place / "frames.h5")
+    volume().save(place / "volume.h5")
+    camera().save(place / "camera.h5")
+    shots = [streak(seed) for seed in range(3)]
+    shots[0].save(place / "shot.h5")
+    save_stack(shots, place / "stack.h5")
+    (place / "clouds").mkdir()
+    for number in range(4):
+        plane(50, 1 + number).save(place / "clouds" / f"cloud_{number:06d}.ply")
+    return place
+
+
+@pytest.fixture(scope="module")
+def transient(folder: Path) -> Source:
+    return open_source(str(folder / "frames.h5"))
+
+
+def test_frames_become_a_cloud_at_the_ranges_of_the_squares(transient: Source) -> None:
+    view = transient.view(0)
+    assert view.pixels is not None
+    inside = np.zeros((32, 32), bool)
+    inside[NEAR] = inside[FAR] = True
+    assert np.all(inside[tuple(view.pixels.T)])
+    near = view.pixels[:, 0] < 16
+    # The pulse has no noise: a hundredth of a bin of 3 mm.
+    assert np.allclose(view.cloud.range[near], range_of(NEAR_FRAME), atol=3e-5)
+    assert np.allclose(view.cloud.range[~near], range_of(FAR_FRAME), atol=3e-5)
+
+
+def test_time_walks_through_a_transient(transient: Source) -> None:
+    session = Session(transient)
+    assert session.gate == UP_TO
+    whole = len(session.shown(0.0).cloud)
+    assert whole == 36 + 49  # the pixels of both squares: at its end a transient is complete
+    session.jump(NEAR_FRAME + 3)
+    assert len(session.shown(0.0).cloud) == 36
+    session.jump(NEAR_FRAME - 9)
+    assert len(session.shown(0.0).cloud) == 0
+    session.gate = ALL
+    assert len(session.shown(0.0).cloud) == whole
+    session.gate = AROUND
+    session.jump(FAR_FRAME)
+    shown = session.shown(0.0)
+    assert len(shown.cloud) == 49
+    assert shown.pixels is not None
+    assert len(shown.pixels) == 49
+    pictures = session.pictures(shown)
+    assert np.unravel_index(pictures["intensity"].argmax(), (32, 32))[0] >= 18
+    assert pictures["streak"].shape == (FRAMES, 300)
+    assert np.nanmax(pictures["depth"]) == pytest.approx(range_of(FAR_FRAME), abs=1e-3)
+
+
+def test_playing_begins_anew_and_ends_at_the_last_frame(transient: Source) -> None:
+    session = Session(transient)
+    session.play()
+    assert session.shown(10.0).frame == 0
+    assert 0 < session.shown(11.0).frame < FRAMES - 1
+    assert session.shown(1000.0).frame == FRAMES - 1
+    assert not session.clock.playing
+    assert session.label == "REPLAY"
+
+
+def test_a_pick_brings_the_pixels_whole_waveform(transient: Source) -> None:
+    session = Session(transient)
+    shown = session.shown(0.0)
+    number = int(np.argmax(shown.cloud.range))
+    pick = session.pick((0, 0, 0), shown.cloud.xyz[number])
+    assert pick is not None
+    assert pick.waveform is not None
+    assert pick.waveform.times[pick.waveform.counts.argmax()] == pytest.approx(pick.time, abs=BIN_WIDTH)
+    assert pick.waveform.counts.size == FRAMES
+    assert session.distance is None
+    other = session.pick_point(int(np.argmin(shown.cloud.range)))
+    assert session.distance == pytest.approx(np.linalg.norm(np.subtract(pick.position, other.position)))
+    assert session.pick((0, 0, 0), (0, -1, 0.1)) is None  # a miss forgets them
+    assert session.picks == []
+    with pytest.raises(InputError, match="no point"):
+        session.pick_point(10_000)
+
+
+def test_refocusing_moves_the_squares_along_the_slit_and_back(transient: Source) -> None:
+    """A refocus by one shear of light seen at shear 0 displaces the picture by the camera's own figure."""
+    session = Session(transient)
+    session.gate = AROUND
+    session.jump(NEAR_FRAME)
+    sharp = session.shown(0.0)
+    session.shear = 0.0
+    again = session.shown(0.0)
+    session.shear = 1.0
+    moved = session.shown(0.0)
+    assert sharp.pixels is not None
+    assert again.pixels is not None
+    assert moved.pixels is not None
+    bright = again.pixels[again.cloud.intensity > 0.5 * again.cloud.intensity.max()]
+    assert np.allclose(bright.mean(axis=0), sharp.pixels.mean(axis=0), atol=0.7)
+    shift = np.average(moved.pixels, axis=0, weights=moved.cloud.intensity) - np.average(
+        again.pixels, axis=0, weights=again.cloud.intensity
+    )
+    # Only a part of a shear displaces, 3 rows; the rest defocuses, which pulls the mean by some of a pixel.
+    assert np.allclose(shift, -np.array(camera().displacement_per_shear), atol=0.7)
+    session.jump(45)  # between the squares there is no light, and none is invented
+    assert len(session.shown(0.0).cloud) == 0
+
+
+def test_clouds_follow_one_another(folder: Path) -> None:
+    source = open_source(str(folder / "clouds"))
+    session = Session(source)
+    assert len(source) == 4
+    assert [float(np.median(source.view(n).cloud.xyz[:, 2])) for n in range(4)] == [1, 2, 3, 4]
+    assert set(session.pictures(session.shown(0.0))) == {"intensity", "depth"}
+    session.step(1)
+    assert session.shown(0.0).frame == 1
+    with pytest.raises(InputError, match="focused"):
+        source.refocused(0, 1.0, Gate(0, 1))
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".csv", ".npz", ".h5"])
+def test_a_single_cloud_of_every_format(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"cloud{suffix}"
+    plane(30).save(path)
+    assert np.allclose(open_source(str(path)).view(0).cloud.xyz, plane(30).xyz)
+
+
+def test_a_cloud_of_another_program_needs_positions_only(tmp_path: Path) -> None:
+    (tmp_path / "other.csv").write_text("x,y,z\n0.3,0.4,1.2\n")
+    cloud = open_source(str(tmp_path / "other.csv")).view(0).cloud
+    assert cloud.range == pytest.approx([1.3])
+    (tmp_path / "flat.csv").write_text("x,y\n1,2\n")
+    with pytest.raises(FileFormatError, match="no column 'z'"):
+        open_source(str(tmp_path / "flat.csv")).view(0)
+
+
+def test_a_single_shot_is_recovered_as_a_transient(folder: Path) -> None:
+    source = open_source(str(folder / "shot.h5"))
+    assert source.abilities.times is not None
+    ranges = source.view(0).cloud.range
+    for frame in (NEAR_FRAME, FAR_FRAME):
+        close = np.abs(ranges - range_of(frame)) < 3e-3  # a bin
+        assert close.sum() > 25
+
+
+def test_a_stack_of_shots_is_recovered_shot_by_shot(folder: Path) -> None:
+    source = open_source(str(folder / "stack.h5"), Extras(camera=folder / "camera.h5", time_zero=-20e-9))
+    assert len(source) == 3
+    session = Session(source)
+    shown = session.shown(0.0)
+    nearest = range_of(NEAR_FRAME) + 10e-9 * 0.149896  # the other time zero moves everything by 1.5 m
+    later = shown.cloud.range.min()
+    assert later == pytest.approx(nearest + 1.498, abs=0.02)
+    assert set(session.pictures(shown)) == {"streak", "intensity", "depth"}
+    waveform = session.pick_point(0).waveform
+    assert waveform is not None
+    assert waveform.counts.size == FRAMES
+    session.shear = 0.5
+    assert len(session.shown(0.0).cloud) > 0
+
+
+def test_a_volume_as_voxels_surface_projection_and_slices(folder: Path) -> None:
+    source = open_source(str(folder / "volume.h5"))
+    session = Session(source)
+    voxels = session.shown(0.0).cloud
+    assert np.allclose(voxels.xyz.mean(axis=0), (0.05, -0.05, 0.5), atol=0.01)
+    assert np.all(np.linalg.norm(voxels.xyz - [0.05, -0.05, 0.5], axis=1) < 0.04 * np.sqrt(2 * np.log(1 / 0.3)) + 1e-3)
+    source.ways.threshold = 0.8
+    assert 0 < len(session.shown(0.0).cloud) < len(voxels)
+    source.ways.chosen = PROJECTION
+    columns = session.shown(0.0).cloud.xyz[:, :2].round(3).tolist()
+    assert len({tuple(column) for column in columns}) == len(columns)
+    source.ways.chosen = SLICE
+    session.jump(3)
+    assert np.unique(session.shown(0.0).cloud.xyz[:, 2]).size == 1
+    assert session.pictures(session.shown(0.0))["intensity"].shape == volume().grid.shape[1:]
+    source.ways.chosen, source.ways.threshold = SURFACE, np.exp(-0.5)
+    shown = session.shown(0.0)
+    assert shown.surface is not None
+    radius = np.linalg.norm(shown.surface.vertices - [0.05, -0.05, 0.5], axis=1)
+    assert np.allclose(radius, 0.04, atol=0.004)  # one standard deviation, by linear interpolation over 2 cm voxels
+    source.ways.chosen = "hologram"
+    with pytest.raises(InputError, match="hologram"):
+        session.shown(0.0)
+
+
+def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
+    def shots():  # type: ignore[no-untyped-def]
+        yield streak(1)
+        yield streak(2)
+        raise DeviceTimeoutError("nothing came")
+
+    source = LiveShots("test", shots(), camera(), streak(0))
+    session = Session(source)
+    deadline = time.monotonic() + 20
+    while source.is_live and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert (len(source), source.oldest, source.trouble) == (3, 0, "nothing came")
+    assert session.shown(0.0).frame == 2
+    session.step(-1)
+    assert (session.shown(0.0).frame, session.following) == (1, False)
+    session.follow()
+    assert session.shown(0.0).frame == 2
+    assert session.label == "REPLAY"  # nothing comes any more
+    source.close()
+
+
+def test_an_instruments_address() -> None:
+    address = "sim+linospad2://?seed=1&bins=576&seconds=0.2"
+    source = open_source(address)
+    assert source.is_live
+    assert Session(source).label == "LIVE"
+    assert len(source.view(0).cloud) > 100
+    source.close()
+
+
+def test_what_cannot_be_looked_at(tmp_path: Path, folder: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text.txt").write_text("hello")
+    for name, fault in (
+        (tmp_path / "absent.h5", StorageError),
+        (tmp_path / "empty", InputError),
+        (tmp_path / "text.txt", FileFormatError),
+        (folder / "camera.h5", FileFormatError),
+        ("nothing://x", InputError),
+    ):
+        with pytest.raises(fault):
+            open_source(str(name))
+
+
+def test_panes_have_a_handy_size_and_dark_holes() -> None:
+    made = panes(front_pictures(plane(4000)), "viridis")
+    assert made["depth"].dtype == np.uint8
+    assert all(200 <= max(image.shape) <= 420 for image in made.values()) or made["depth"].shape[0] == 128
+    empty = panes(front_pictures(PlaneSource().view(0).cloud), "viridis")["depth"]
+    assert (empty == (32, 36, 44)).all(axis=-1).mean() > 0.9
+    tall = panes({"streak": np.ones((1016, 1344), np.float32)}, "viridis")["streak"]
+    assert max(tall.shape) <= 420

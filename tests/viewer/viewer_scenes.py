@@ -1,0 +1,83 @@
+"""Small things to look at, with known truth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from apps.viewer.clouds import cloud_of
+from apps.viewer.source import Gate, Source, View
+from nlos import Grid, Volume
+from tofclip.camera import Camera, SkewSweep
+from tofclip.lidar import PointCloud
+from tofclip.transient import Frames, Streak
+from tofclip.units import SPEED_OF_LIGHT
+
+CENTRES_PX = np.array([30.4, 70.0, 110.7, 150.0, 190.2, 230.0, 269.6])
+ANGLES = np.deg2rad([-43.0, -26.0, -13.0, 0.5, 23.0, 37.0, 48.0])
+IMAGE_SHAPE = (32, 32)
+FRAMES = 96
+BIN_WIDTH = 20e-12
+NEAR_FRAME, FAR_FRAME = 30, 62
+NEAR, FAR = np.s_[8:14, 9:15], np.s_[18:25, 17:24]
+
+
+def camera() -> Camera:
+    """Seven views whose light of range 0 would arrive 10 ns before the first row."""
+    at_rest = SkewSweep(CENTRES_PX, np.zeros(7), np.zeros(7))
+    return Camera(
+        CENTRES_PX, ANGLES, IMAGE_SHAPE, slit_width_px=300, sweep=at_rest, focal_length_px=140.0, time_zero=-10e-9
+    )
+
+
+def frames() -> Frames:
+    """A square at the upper left, later one at the lower right, each as long as a pulse of 60 ps."""
+    values = np.zeros((FRAMES, *IMAGE_SHAPE), np.float32)
+    sigma = 60e-12 / BIN_WIDTH / 2.355
+    for frame, place in ((NEAR_FRAME, NEAR), (FAR_FRAME, FAR)):
+        pulse = 100 * np.exp(-(((np.arange(FRAMES) - frame) / sigma) ** 2) / 2)
+        values[:, place[0], place[1]] += pulse[:, np.newaxis, np.newaxis].astype(np.float32)
+    return Frames(values, np.arange(FRAMES) * BIN_WIDTH + 10e-9, camera())
+
+
+def range_of(frame: int) -> float:
+    """Range whose light arrives in a frame, m."""
+    return (frame * BIN_WIDTH + 10e-9) * SPEED_OF_LIGHT / 2
+
+
+def streak(seed: int = 3) -> Streak:
+    """The shot of these frames, with Poisson noise."""
+    expected = camera().operator()(np.moveaxis(frames().values, 0, -1)).T + 20.0
+    counts = np.random.default_rng(seed).poisson(expected).astype(np.float32)
+    return Streak(counts, camera=camera()).with_bin_width(BIN_WIDTH)
+
+
+def plane(points: int, distance: float = 2.0, seed: int = 0) -> PointCloud:
+    """Points scattered over a plane across the line of sight, 1 m wide."""
+    random = np.random.default_rng(seed)
+    xyz = np.column_stack([random.uniform(-0.5, 0.5, (points, 2)), np.full(points, distance)])
+    return cloud_of(xyz.astype(np.float32), {"intensity": random.uniform(1, 9, points).astype(np.float32)})
+
+
+def volume() -> Volume:
+    """A bright ball of 4 cm about (0.05, -0.05, 0.5), in a box of 2 cm voxels."""
+    grid = Grid.box((-0.2, 0.2), (-0.2, 0.2), (0.3, 0.7), 0.02)
+    z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
+    square = (x - 0.05) ** 2 + (y + 0.05) ** 2 + (z - 0.5) ** 2
+    return Volume(np.exp(-square / (2 * 0.04**2)).astype(np.float32), grid)
+
+
+class PlaneSource(Source):
+    """Frame `n` is a plane at 2 m + n cm."""
+
+    def __init__(self, count: int = 5, points: int = 40) -> None:
+        super().__init__("planes", 10.0)
+        self._count, self._points = count, points
+
+    def __len__(self) -> int:
+        return self._count
+
+    def view(self, number: int) -> View:
+        return View(plane(self._points, 2 + number / 100))
+
+    def refocused(self, number: int, shear: float, gate: Gate) -> View:
+        return View(plane(self._points, 2 + shear))
