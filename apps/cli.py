@@ -41,7 +41,7 @@ DEBUG_FLAG = "--debug"
 COMPLETION_VARIABLE = "_TOFCLIP_COMPLETE"  # what shells set while they ask typer how a word may go on
 EPILOG = (
     f"Exit status: 0 done; {FAULTY_INPUT} unusable input, with one line on standard error that says what to do; "
-    f"{INTERRUPTED} interrupted; {DEFECT} a defect of this program. "
+    f"{INTERRUPTED} interrupted; {DEFECT} some of a sequence failed, or a defect of this program. "
     f"{DEBUG_FLAG} anywhere shows where an error came from."
 )
 

@@ -23,6 +23,16 @@ Picture = Annotated[
     typer.Option("--preview", metavar="PNG", help="Where the picture goes.", show_default="beside --out, .png"),
 ]
 
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="WHERE",
+        help="Share a sequence among workers: local, local:N or tcp://HOST:PORT.",
+        show_default="one after the other, here",
+    ),
+]
+
 
 def completing(*names: str) -> Callable[[str], list[str]]:
     """Return what completes an option's value in the shell: the names that begin as it does so far."""

@@ -8,23 +8,30 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apps.options import AsJson
+from apps.options import AsJson, Cluster
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
+    from tofclip.batch import Clouds
     from tofclip.lidar import PointCloud, Returns
-    from tofclip.transient import Frames
 
 FORMATS = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".h5")
 DEPTH_PICTURE = ".exr"
 
 
 def cloud(
-    frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="Recovered frames (HDF5).")],
+    frames: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FRAMES", help="Recovered frames (HDF5). A sequence: a folder or a quoted pattern of them."
+        ),
+    ],
     out: Annotated[
         Path,
         typer.Option(
-            metavar="FILE", help="Ends in .ply, .pcd, .csv, .npz, .las, .laz, .h5, or .exr for a depth picture."
+            metavar="FILE",
+            help="Ends in .ply, .pcd, .csv, .npz, .las, .laz, .h5, or .exr for a depth picture; of a sequence: a "
+            "folder.",
         ),
     ],
     drop_outliers: Annotated[
@@ -34,52 +41,62 @@ def cloud(
         float | None,
         typer.Option(metavar="MM", help="One point for each cube of this side.", show_default="all points"),
     ] = None,
+    suffix: Annotated[str, typer.Option(metavar=".EXT", help="Format of the clouds of a sequence.")] = ".ply",
+    cluster: Cluster = None,
     as_json: AsJson = False,
 ) -> None:
     """Find each pixel's returns and place them in space: x right, y down, z forward, in metres.
 
+    Of a sequence, clouds that are in the folder already are kept; frames of which none can be made are listed at the
+    end, and the exit status is 1.
+
     Example: tofclip cloud frames.h5 --out scene.ply
+
+    Example: tofclip cloud 'frames/*.h5' --out clouds/ --cluster local
     """
+    from tofclip.batch import Clouds, is_sequence
+    from tofclip.errors import InputError
+
+    clouds = Clouds(drop_outliers, None if voxel_mm is None else voxel_mm * MILLIMETRE)
+    if is_sequence(frames):
+        _clouds_of_sequence(clouds, frames, out, suffix, (cluster, as_json))
+        return
+    if cluster is not None:
+        raise InputError(f"{frames}: --cluster is for a sequence: a folder or a quoted pattern of frames")
+    _cloud_of_one(clouds, frames, out, as_json)
+
+
+def require_format(suffix: str, *further: str) -> None:
+    """Refuse an ending that names no format of clouds."""
+    from tofclip.errors import InputError
+
+    if suffix not in (*FORMATS, *further):
+        raise InputError(f"no cloud format is called '{suffix}'; use one of {', '.join((*FORMATS, *further))}")
+
+
+def _clouds_of_sequence(clouds: Clouds, frames: Path, out: Path, suffix: str, how: tuple[str | None, bool]) -> None:
+    from apps.sequences import finish, run_all
+    from tofclip.batch import files_in
+
+    require_format(suffix, DEPTH_PICTURE)
+    cluster, as_json = how
+    jobs = clouds.jobs(files_in(frames), out, suffix)
+    points: list[int] = []
+    summary = run_all("placing", jobs, cluster, lambda report: points.append(report.figures or 0))
+    finish(summary, len(jobs), as_json, out, {"points": sum(points)})
+
+
+def _cloud_of_one(clouds: Clouds, frames: Path, out: Path, as_json: bool) -> None:
     from apps.files import history, require_writable
+    from tofclip.batch.clouds import save_cloud
     from tofclip.transient import Frames
 
     require_writable(out, *FORMATS, DEPTH_PICTURE, inputs=(frames,))
     recovered = Frames.load(frames)
     past = history({"verb": "cloud"}, frames, earlier=recovered.provenance)
-    points, returns = _found(replace(recovered, provenance=past), str(frames))
-    if drop_outliers or voxel_mm is not None:
-        points = _tidied(points, drop_outliers, voxel_mm)
-    if out.suffix.lower() == DEPTH_PICTURE:
-        from tofclip.lidar.depth_exr import save_depth
-
-        save_depth(returns, out)
-    else:
-        points.save(out)
+    points, returns = clouds.found(replace(recovered, provenance=past), str(frames))
+    save_cloud(points, returns, out)
     _report(points, returns, as_json, out)
-
-
-def _tidied(points: PointCloud, drop_outliers: bool, voxel_mm: float | None) -> PointCloud:
-    from tofclip.lidar.processing import downsampled, without_outliers
-
-    cleaned = without_outliers(points) if drop_outliers else points
-    return cleaned if voxel_mm is None else downsampled(cleaned, voxel_mm * MILLIMETRE)
-
-
-def save_cloud(frames: Frames, out: Path) -> Path:
-    """Write the point cloud of frames that were just recovered, and return where."""
-    points, _ = _found(frames, "the recovered frames")
-    points.save(out)
-    return out
-
-
-def _found(frames: Frames, origin: str) -> tuple[PointCloud, Returns]:
-    from tofclip.errors import InputError
-    from tofclip.lidar import depth, point_cloud
-
-    returns = depth(frames)
-    if len(returns) == 0:
-        raise InputError(f"{origin}: no return stands out of the background, so there is no point to write")
-    return replace(point_cloud(returns), provenance=frames.provenance), returns
 
 
 def _report(points: PointCloud, returns: Returns, as_json: bool, out: Path) -> None:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apps.options import AsJson, TimeZero
+from apps.options import AsJson, Cluster, TimeZero
 from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.lidar.sequence import Ranger
-    from tofclip.transient import Streak
-    from tofclip.transient.stack import StreakStack
+    from tofclip.cluster import Report
 
 app = typer.Typer()
 
@@ -144,7 +141,8 @@ def scene(
 @app.command()
 def sequence(
     shots: Annotated[
-        Path, typer.Argument(metavar="SHOTS", help="A folder of streak images, or an HDF5 stack of them.")
+        Path,
+        typer.Argument(metavar="SHOTS", help="A folder or quoted pattern of streak images, or an HDF5 stack of them."),
     ],
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the clouds go; those already there are kept.")],
     camera: Annotated[
@@ -160,86 +158,38 @@ def sequence(
     keep_jitter: Annotated[
         bool, typer.Option("--keep-jitter", help="Do not find how late each shot comes against the first.")
     ] = False,
+    cluster: Cluster = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a cloud of each shot by the linear inverse, one shot in memory at a time.
 
-    Started again after an interruption, it goes on behind the last cloud in the folder.
+    Started again after an interruption, it makes the clouds that are missing in the folder. Shots of which none can be
+    made are listed at the end, and the exit status is 1.
 
     Example: tofclip lidar sequence shots/ --camera camera.h5 --out clouds/
     """
-    from time import perf_counter
+    from apps.sequences import finish, run_all
+    from apps.verbs.cloud import require_format
+    from tofclip.batch import Ranging, shots_in
 
-    from apps.files import make_folder
-    from apps.progress import progress
-    from apps.report import report
-    from apps.verbs.cloud import FORMATS
-    from tofclip.errors import InputError
-    from tofclip.lidar.sequence import cloud_path, clouds, clouds_done
-
-    if suffix not in FORMATS:
-        raise InputError(f"no cloud format is called '{suffix}'; use one of {', '.join(FORMATS)}")
-    make_folder(out)
-    sources = _shots(shots, bin_width_ps)
-    ranger = _ranger(sources[0](), camera, time_zero_ns, focus)
-    done = clouds_done(out, suffix)
-    points, late, started = 0, [], perf_counter()
-    with progress("ranging", len(sources) - done * average) as advance:
-        for step in clouds(sources, ranger, average, not keep_jitter, done):
-            step.cloud.save(cloud_path(out, step.shots[0] // average, suffix))
-            points += len(step.cloud)
-            late.extend(step.late_bin.tolist())
-            advance(len(step.shots))
-    seconds = perf_counter() - started
-    report(
-        {
-            "shots": len(late),
-            "clouds_before": done,
-            "points": points,
-            "shots_per_second": len(late) / seconds,
-            "jitter_rms_bins": (sum(one**2 for one in late) / len(late)) ** 0.5 if late else 0.0,
-        },
-        as_json,
-        [out],
-    )
-
-
-def _shots(source: Path, bin_width_ps: float | None) -> list[Callable[[], Streak]]:
-    """One function for each shot, which reads it."""
-    from functools import partial
-
-    from tofclip.errors import InputError
-    from tofclip.io import read_streak
-    from tofclip.transient.stack import StreakStack
-
+    require_format(suffix)
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
-    if source.is_dir():
-        files = sorted(path for path in source.iterdir() if path.is_file() and not path.name.startswith("."))
-        if not files:
-            raise InputError(f"{source}: the folder holds no shot")
-        return [partial(read_streak, path, width) for path in files]
-    stack = StreakStack(source)
-    if width is None:
-        return [partial(stack.shot, number) for number in range(len(stack))]
-    return [partial(_timed, stack, number, width) for number in range(len(stack))]
+    zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
+    jobs = Ranging(camera, zero, focus, average, not keep_jitter).jobs(shots_in(shots, width), out, suffix)
+    points: list[int] = []
+    late: list[float] = []
 
+    def watch(report: Report) -> None:
+        if report.figures is not None:
+            points.append(report.figures[0])
+            late.extend(report.figures[1])
 
-def _timed(stack: StreakStack, number: int, bin_width: float) -> Streak:
-    return stack.shot(number).with_bin_width(bin_width)
-
-
-def _ranger(first: Streak, camera: Path | None, time_zero_ns: float | None, focus: str) -> Ranger:
-    """Prepare for the shots of one camera; a sweep that is not known is found from the first shot."""
-    from tofclip.camera import Camera
-    from tofclip.errors import InputError
-    from tofclip.lidar.sequence import Ranger
-    from tofclip.reconstruct import SharpestFocus, fitted_to_shot, focus_named, prepare
-
-    chosen = focus_named(focus)
-    if isinstance(chosen, SharpestFocus):
-        raise InputError("a sequence has one focus for all shots: depth-locked or fixed:S")
-    task = prepare(first, None if camera is None else Camera.load(camera), "linear")
-    known = task.camera if time_zero_ns is None else task.camera.replace(time_zero=time_zero_ns * NANOSECOND)
-    if known.sweep is None:
-        known = fitted_to_shot(first, known)
-    return Ranger(known, first.times, focus=chosen)
+    summary = run_all("ranging", jobs, cluster, watch)
+    jitter = (sum(one**2 for one in late) / len(late)) ** 0.5 if late else 0.0
+    figures = {
+        "shots": len(late),
+        "shots_per_second": len(late) / summary.seconds,
+        "points": sum(points),
+        "jitter_rms_bins": jitter,
+    }
+    finish(summary, len(jobs), as_json, out, figures)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apps.options import AsJson, Picture, TimeZero, completing
+from apps.options import AsJson, Cluster, Picture, TimeZero, completing
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.reconstruct import Task
-    from tofclip.recovery import Method
+    from tofclip.batch import Recovery
     from tofclip.transient import Frames, Streak
 
 
@@ -22,10 +20,11 @@ def recover(
         str,
         typer.Argument(
             metavar="STREAK",
-            help="HPD-TA TIFF, ITEX, LIFT archive, our HDF5, or a source such as sim+linospad2://?seed=1.",
+            help="HPD-TA TIFF, ITEX, LIFT archive, our HDF5, or a source such as sim+linospad2://?seed=1. "
+            "A sequence: a folder, a quoted pattern, or an HDF5 stack.",
         ),
     ],
-    out: Annotated[Path, typer.Option(metavar="H5", help="The frames to write.")],
+    out: Annotated[Path, typer.Option(metavar="H5", help="The frames to write; of a sequence: their folder.")],
     camera: Annotated[
         Path | None, typer.Option(metavar="H5", help="Made by calibrate.", show_default="the one inside STREAK")
     ] = None,
@@ -57,55 +56,108 @@ def recover(
         Path | None, typer.Option(metavar="PLY", help="A point cloud to write as well.", show_default="none")
     ] = None,
     preview: Picture = None,
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=V,V",
+            help="Of a sequence: every combination of these values of method, iterations, weight or focus, each in a "
+            "folder of its own; may be given again.",
+            show_default="none",
+        ),
+    ] = None,
+    cluster: Cluster = None,
     as_json: AsJson = False,
 ) -> None:
-    """Recover every transient frame of a raw streak image.
+    """Recover every transient frame of a raw streak image, or of each one of a sequence.
 
     Where the camera's sweep is not known, skew, gains and centres are found from the shot itself.
 
+    Of a sequence, what is in the folder already is kept: started again, a run goes on where it stopped. Shots that
+    cannot be recovered are listed at the end, and the exit status is 1.
+
     Example: tofclip recover shot.tif --camera camera.h5 --out frames.h5 --time-zero-ns -10.784
     """
+    from tofclip.batch import Recovery, is_sequence
+
+    zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
+    width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
+    recovery = Recovery(method, iterations, None, focus, camera, zero)
+    if is_sequence(streak):
+        _refuse_for_sequence(cloud, preview)
+        _recover_sequence(recovery, (streak, width), out, sweep or [], (cluster, as_json))
+        return
+    _refuse_for_single(streak, cluster, sweep)
+    _recover_single(recovery, (streak, width), out, (preview or out.with_suffix(".png"), cloud), as_json)
+
+
+def _refuse_for_sequence(cloud: Path | None, preview: Path | None) -> None:
+    from tofclip.errors import InputError
+
+    if cloud is not None:
+        raise InputError("--cloud is for one shot; give the folder of frames to tofclip cloud")
+    if preview is not None:
+        raise InputError("--preview is for one shot")
+
+
+def _refuse_for_single(streak: str, cluster: str | None, sweep: list[str] | None) -> None:
+    from tofclip.errors import InputError
+
+    if cluster is not None or sweep:
+        option = "--sweep" if cluster is None else "--cluster"
+        raise InputError(f"{streak}: {option} is for a sequence: a folder, a quoted pattern or an HDF5 stack of shots")
+
+
+def _recover_sequence(
+    recovery: Recovery, shots: tuple[str, float | None], out: Path, sweep: list[str], how: tuple[str | None, bool]
+) -> None:
+    from apps.sequences import finish, run_all
+    from tofclip.batch import shots_in, variants
+
+    cluster, as_json = how
+    found = shots_in(*shots)
+    swept = variants(recovery, dict(map(_values, sweep)))
+    jobs = [job for label, variant in swept.items() for job in variant.jobs(found, out / label)]
+    finish(run_all("recovering", jobs, cluster), len(jobs), as_json, out)
+
+
+def _values(text: str) -> tuple[str, list[str]]:
+    name, _, values = text.partition("=")
+    return name, values.split(",")
+
+
+def _recover_single(
+    recovery: Recovery,
+    shot: tuple[str, float | None],
+    out: Path,
+    further: tuple[Path, Path | None],
+    as_json: bool,
+) -> None:
+    """Recover one shot, with a picture of it and, where asked for, a cloud."""
     from apps.figures.preview import preview_figure
     from apps.figures.style import save
     from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
     from apps.progress import progress
     from apps.verbs.cloud import FORMATS as CLOUD_SUFFIXES
-    from apps.verbs.cloud import save_cloud
-    from tofclip.reconstruct import focus_named, method_named
+    from tofclip.batch import Clouds
+    from tofclip.batch.recovery import with_history
 
-    inputs = tuple(Path(name) for name in (streak, camera) if name is not None and not _is_address(name))
-    preview = preview or out.with_suffix(".png")
+    preview, cloud = further
+    inputs = tuple(Path(name) for name in (shot[0], recovery.camera) if name is not None and not _is_address(name))
     require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
     require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
     if cloud is not None:
         require_writable(cloud, *CLOUD_SUFFIXES, inputs=inputs)
-    chosen = method_named(method) if iterations is None else method_named(method, iterations=iterations)
-    sharp = focus_named(focus)
-    task = replace(_prepared(streak, camera, bin_width_ps, time_zero_ns, chosen), focus=sharp)
-    sharp.require(task.camera)
+    task = recovery.task(_shot(*shot))
     with progress("recovering", task.work) as advance:
-        frames = _with_history(task.run(advance), task, inputs)
+        frames = with_history(task.run(advance), task, *inputs)
     frames.save(out)
     save(preview_figure(task.streak, frames), preview)
     written = [out, preview]
     if cloud is not None:
-        written.append(save_cloud(frames, cloud))
+        points, _ = Clouds().found(frames, "the recovered frames")
+        points.save(cloud)
+        written.append(cloud)
     _report(frames, as_json, written)
-
-
-def _prepared(
-    streak: str, camera: Path | None, bin_width_ps: float | None, time_zero_ns: float | None, method: Method
-) -> Task:
-    """Read the inputs and check them against each other."""
-    from tofclip.camera import Camera
-    from tofclip.reconstruct import prepare
-
-    known = None if camera is None else Camera.load(camera)
-    shot = _shot(streak, None if bin_width_ps is None else bin_width_ps * PICOSECOND)
-    task = prepare(shot, known, method)
-    if time_zero_ns is None:
-        return task
-    return replace(task, camera=task.camera.replace(time_zero=time_zero_ns * NANOSECOND))
 
 
 def _is_address(name: str | Path) -> bool:
@@ -121,18 +173,6 @@ def _shot(streak: str, bin_width: float | None) -> Streak:
     from tofclip.io import read_streak
 
     return read_streak(streak, bin_width)
-
-
-def _with_history(frames: Frames, task: Task, inputs: tuple[Path, ...]) -> Frames:
-    from apps.files import history
-
-    settings = {
-        "verb": "recover",
-        "method": repr(task.method),
-        "focus": str(task.focus),
-        "time_zero_s": task.camera.time_zero,
-    }
-    return replace(frames, provenance=history(settings, *inputs, earlier=frames.provenance))
 
 
 def _report(frames: Frames, as_json: bool, written: list[Path]) -> None:

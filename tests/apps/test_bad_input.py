@@ -34,7 +34,7 @@ def of_bytes(path: Path, content: bytes) -> Path:
 
 STREAKS: dict[str, tuple[Maker, str]] = {
     "absent": (lambda files, new: new / "absent.tif", "no such file"),
-    "a folder": (lambda files, new: new, "is a folder"),
+    "an empty folder": (lambda files, new: new, "there is no file"),
     "truncated TIFF": (lambda files, new: cut_short(files / "streak.tif", new / "bad.tif"), "truncated"),
     "truncated HDF5": (lambda files, new: cut_short(files / "streak.h5", new / "bad.h5"), "damaged or incomplete"),
     "empty": (lambda files, new: of_bytes(new / "bad.tif", b""), "is empty"),

@@ -110,8 +110,9 @@ def test_a_sequence_is_made_and_goes_on(run: Run, tmp_path: Path) -> None:
     assert first.status == 0, first.err
     assert json.loads(first.out)["shots"] == 3
     (out / "cloud_000002.ply").unlink()
-    again = json.loads(run("lidar", "sequence", shots, "--out", out, "--json").out)
-    assert (again["shots"], again["clouds_before"]) == (1, 2)
+    again = json.loads(run("lidar", "sequence", shots, "--out", out, "--focus", "depth-locked", "--json").out)
+    assert (again["shots"], again["results"], again["kept_from_before"]) == (1, 1, 2)
+    assert run("lidar", "sequence", shots, "--out", out).status == 2  # another focus
     save_stack(streaks, tmp_path / "stack.h5")
     CAMERA.save(tmp_path / "camera.h5")
     words = (
@@ -127,7 +128,7 @@ def test_a_sequence_is_made_and_goes_on(run: Run, tmp_path: Path) -> None:
     )
     assert run(*words).status == 2  # a stack carries no camera
     assert run(*words, "--camera", tmp_path / "camera.h5", "--bin-width-ps", "100").status == 0
-    assert sorted(path.name for path in (tmp_path / "more").iterdir()) == ["cloud_000000.npz", "cloud_000001.npz"]
+    assert sorted(path.name for path in (tmp_path / "more").glob("*.npz")) == ["cloud_000000.npz", "cloud_000001.npz"]
     (tmp_path / "empty").mkdir()
     for unusable in ((tmp_path / "empty",), (shots, "--suffix", ".xyz"), (shots, "--focus", "stack:0:1:3")):
         assert run("lidar", "sequence", *unusable, "--out", out).status == 2

@@ -14,7 +14,7 @@ import pytest
 from tofclip import Streak
 from tofclip.camera import Camera, Rectifier, SkewSweep, measure
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
-from tofclip.lidar.sequence import Jitter, Ranger, cloud_path, clouds, clouds_done, light_over_time
+from tofclip.lidar.sequence import Jitter, Ranger, clouds, light_over_time
 from tofclip.reconstruct import DepthLocked
 from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate
 from tofclip.simulate.shapes import checkerboard
@@ -98,13 +98,6 @@ def test_memory_does_not_grow_with_the_sequence(ranger, tmp_path):
         tracemalloc.stop()
     # 36 shots more; threads overlap differently from run to run, which moves the peak by the size of a shot or two
     assert peaks[2] - peaks[1] < 5 * shot().counts.nbytes
-
-
-def test_clouds_in_a_folder_are_counted_up_to_the_first_gap(tmp_path):
-    for number in (0, 1, 3):
-        cloud_path(tmp_path, number, ".ply").touch()
-    assert clouds_done(tmp_path, ".ply") == 2
-    assert clouds_done(tmp_path, ".npz") == 0
 
 
 def test_a_rectifier_does_what_interpolation_does():

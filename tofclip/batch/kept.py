@@ -68,7 +68,7 @@ def digest(record: Record) -> str:
     return found.hexdigest()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class KeptInverse:
     """The linear inverse, whose Gram matrices are inverted once for each operator that is kept.
 
@@ -79,6 +79,9 @@ class KeptInverse:
 
     method: LinearInverse
     name = "linear"
+
+    def __repr__(self) -> str:
+        return repr(self.method)
 
     def recover(
         self,

@@ -60,11 +60,13 @@ class Ranging:
         The folder is made, and claimed for these settings (`tofclip.cluster.claim`). What is prepared for all shots is
         kept there; a run that goes on uses it again.
         """
-        camera = None if self.camera is None else sha256_of(self.camera)
-        claim(folder, {"verb": "lidar sequence", **asdict(self), "camera": camera, "suffix": suffix})
         plan, readers = folder.resolve() / PLAN, list(shots.values())
-        if not plan.exists():
-            self.plan(readers[0]()).save(plan)
+        made = None if plan.exists() else self.plan(readers[0]())
+        camera = None if self.camera is None else sha256_of(self.camera)
+        settings = {"verb": "lidar sequence", **asdict(self), "camera": camera, "suffix": suffix}
+        claim(folder, settings | {"bin_width": readers[0].bin_width})
+        if made is not None:
+            made.save(plan)
         version, jobs = sha256_of(plan), []
         for number in range(-(-len(readers) // self.average)):
             some = tuple(readers[number * self.average : (number + 1) * self.average])

@@ -73,7 +73,7 @@ class Recovery:
 
         The folder is made, and claimed for these settings (`tofclip.cluster.claim`).
         """
-        claim(folder, self.settings())
+        claim(folder, self.settings() | {"bin_width": next(iter(shots.values())).bin_width})
         here = self if self.camera is None else replace(self, camera=self.camera.resolve())
         paths = result_paths(shots, folder, FRAMES_SUFFIX)
         return [Job(name, paths[name], partial(recover_shot, here, shot, paths[name])) for name, shot in shots.items()]
@@ -93,11 +93,11 @@ def recover_shot(recovery: Recovery, shot: Shot, result: Path) -> None:
     if task.camera.sweep is not None:  # otherwise it is fitted to the shot, and another for each
         method = KeptInverse(task.method) if isinstance(task.method, LinearInverse) else task.method
         task = replace(task, camera=kept(task.camera), method=method)
-    with_history(task.run(), task, recovery.solver()).save(result)
+    with_history(task.run(), task).save(result)
 
 
-def with_history(frames: Frames, task: Task, method: Method, *inputs: Path) -> Frames:
+def with_history(frames: Frames, task: Task, *inputs: Path) -> Frames:
     """Return frames that tell how they came about."""
-    told = {"method": repr(method), "focus": str(task.focus), "time_zero_s": task.camera.time_zero}
+    told = {"method": repr(task.method), "focus": str(task.focus), "time_zero_s": task.camera.time_zero}
     past = provenance({"verb": "recover", **told}, *inputs) | {"earlier": dict(frames.provenance)}
     return replace(frames, provenance=past)

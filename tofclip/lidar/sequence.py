@@ -240,14 +240,6 @@ def cloud_path(folder: Path, number: int, suffix: str) -> Path:
     return folder / f"cloud_{number:06d}{suffix}"
 
 
-def clouds_done(folder: Path, suffix: str) -> int:
-    """Count the clouds of a sequence that are there without a gap from the first on."""
-    number = 0
-    while cloud_path(folder, number, suffix).exists():
-        number += 1
-    return number
-
-
 def _edges(light: FloatArray) -> FloatArray:
     """Changes of the root of the light: near objects outshine far ones, and a constant says nothing."""
     rise = np.diff(np.sqrt(np.maximum(light - np.median(light), 0)), prepend=0.0)

@@ -1,0 +1,87 @@
+"""Run the jobs of a sequence under a progress bar, say what became of them, and end with 1 if some failed."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from tofclip.cluster import Job, Report, Summary
+
+SOME_FAILED = 1
+BYTES_PER_MIB = 1 << 20
+
+
+def run_all(
+    title: str, jobs: Sequence[Job], cluster: str | None, watch: Callable[[Report], object] = lambda _: None
+) -> Summary:
+    """Do what is not done yet, with a bar that tells the time left.
+
+    Parameters
+    ----------
+    title : str
+        Of the bar.
+    jobs : sequence of Job
+    cluster : str, optional
+        Where; one after the other in this process by default.
+    watch : callable, optional
+        Called with each report.
+    """
+    from apps.progress import progress
+    from tofclip.cluster import run, unfinished
+
+    missing = unfinished(jobs)
+    with progress(title, len(missing)) as advance:
+
+        def note(report: Report) -> None:
+            watch(report)
+            advance(1)
+
+        return run(missing, cluster, note)
+
+
+def finish(summary: Summary, total: int, as_json: bool, out: Path, figures: Mapping[str, Any] | None = None) -> None:
+    """Print the figures of a sequence and its failures.
+
+    Parameters
+    ----------
+    summary : Summary
+    total : int
+        Jobs of the sequence, those included that were done by an earlier run.
+    as_json : bool
+    out : Path
+        Where the results are.
+    figures : mapping, optional
+        Further ones.
+
+    Raises
+    ------
+    typer.Exit
+        With status 1: there were failures.
+    """
+    from apps.report import report
+
+    attempted = summary.done + len(summary.failures)
+    told = {
+        "results": summary.done,
+        "kept_from_before": total - attempted,
+        "failed": len(summary.failures),
+        "seconds": summary.seconds,
+        "results_per_second": summary.done / summary.seconds,
+        "processes": summary.processes,
+        "peak_memory_mib_per_process": summary.peak_bytes / BYTES_PER_MIB,
+        **(figures or {}),
+    }
+    if as_json:
+        failures = [{"name": failure.name, "problem": failure.problem} for failure in summary.failures]
+        report({**told, "failures": failures}, as_json=True)
+    else:
+        report(told, as_json=False, written=[out])
+        for failure in summary.failures:
+            print(f"failed: {failure.name}: {failure.problem}", file=sys.stderr)
+    if summary.failures:
+        raise typer.Exit(SOME_FAILED)

@@ -1,0 +1,98 @@
+"""The verbs on sequences: what they write, say and return."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from apps.cli import main
+from tofclip import Frames
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]):
+    def call(*words: object) -> tuple[int, str, str]:
+        capsys.readouterr()
+        return main([str(word) for word in words]), *capsys.readouterr()
+
+    return call
+
+
+@pytest.fixture
+def few(recorded: Path, tmp_path: Path) -> Path:
+    """Two good shots and a broken one."""
+    folder = tmp_path / "shots"
+    folder.mkdir()
+    for number in (0, 2):
+        shutil.copy(recorded / "shots" / f"shot{number}.h5", folder)
+    (folder / "shot1.h5").write_text("no picture")
+    return folder
+
+
+def test_shots_to_frames_to_clouds_on_a_cluster(run, scheduler, few, tmp_path):
+    frames, clouds = tmp_path / "frames", tmp_path / "clouds"
+    words = ("recover", few, "--out", frames, "--method", "linear", "--cluster", scheduler)
+    status, out, err = run(*words)
+    assert status == 1
+    assert "results                      2" in out
+    assert err.splitlines()[-1].startswith("failed: shot1: ")
+    assert sorted(path.name for path in frames.glob("*.h5")) == ["shot0.h5", "shot2.h5"]
+    shutil.copy(few / "shot0.h5", few / "shot1.h5")
+    status, out, _ = run(*words, "--json")
+    told = json.loads(out)
+    assert status == 0
+    assert (told["results"], told["kept_from_before"], told["failures"]) == (1, 2, [])
+    assert told["peak_memory_mib_per_process"] > 10
+    status, out, _ = run("cloud", frames / "*.h5", "--out", clouds, "--cluster", scheduler, "--json")
+    assert status == 0
+    assert json.loads(out)["points"] > 300  # two plates of 9 x 9 pixels, three times, thinned by their dark fields
+    assert len(list(clouds.glob("*.ply"))) == 3
+
+
+def test_a_sequence_here_is_that_of_single_shots(run, few, tmp_path):
+    (few / "shot1.h5").unlink()
+    method = ("--method", "l1", "--iterations", "3")
+    assert run("recover", few, "--out", tmp_path / "many", *method)[0] == 0
+    assert run("recover", few / "shot2.h5", "--out", tmp_path / "one.h5", *method)[0] == 0
+    one, other = Frames.load(tmp_path / "one.h5"), Frames.load(tmp_path / "many" / "shot2.h5")
+    assert (one.values == other.values).all()
+    assert one.provenance["settings"] == other.provenance["settings"]
+
+
+def test_a_sweep_has_a_folder_for_each_combination(run, recorded, tmp_path):
+    words = ("recover", recorded / "shots" / "shot[0].h5", "--out", tmp_path / "out", "--method", "l1")
+    assert run(*words, "--sweep", "iterations=1,2", "--sweep", "weight=1e-3")[0] == 0
+    found = {path.parent.name for path in (tmp_path / "out").rglob("shot0.h5")}
+    assert found == {"iterations=1,weight=1e-3", "iterations=2,weight=1e-3"}
+    assert run(*words, "--sweep", "iterations")[0] == 2
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("recover", "{shots}/shot0.h5", "--out", "{tmp}/frames.h5", "--cluster", "local:1"),
+        ("recover", "{shots}/shot0.h5", "--out", "{tmp}/frames.h5", "--sweep", "iterations=1"),
+        ("recover", "{shots}", "--out", "{tmp}/out", "--cloud", "{tmp}/cloud.ply"),
+        ("recover", "{shots}", "--out", "{tmp}/out", "--preview", "{tmp}/frames.png"),
+        ("recover", "{shots}", "--out", "{tmp}/out", "--camera", "{tmp}/absent.h5"),
+        ("recover", "{shots}", "--out", "{tmp}/out", "--cluster", "a cloud"),
+        ("cloud", "{shots}/shot0.h5", "--out", "{tmp}/cloud.ply", "--cluster", "local:1"),
+        ("cloud", "{shots}", "--out", "{tmp}/out", "--suffix", ".xyz"),
+        ("lidar", "sequence", "{shots}", "--out", "{tmp}/out", "--cluster", "elsewhere"),
+    ],
+)
+def test_unusable_wishes_end_in_one_line(run, recorded, tmp_path, words):
+    status, out, err = run(*(word.format(shots=recorded / "shots", tmp=tmp_path) for word in words))
+    assert (status, out, err.count("\n")) == (2, "", 1)
+
+
+def test_ranging_on_a_cluster(run, scheduler, recorded, tmp_path):
+    words = ("lidar", "sequence", recorded / "shots.h5", "--out", tmp_path / "out", "--camera", recorded / "camera.h5")
+    status, out, err = run(*words, "--cluster", scheduler, "--json")
+    assert (status, err) == (0, "")
+    told = json.loads(out)
+    assert (told["shots"], told["results"], told["processes"]) == (6, 6, 2)
+    assert told["jitter_rms_bins"] < 0.15
