@@ -13,7 +13,7 @@ ENCODERS = ("line", "line-spread")
 
 
 def dealing_table(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover with both ways of dealing; the recorded light fields too where they are at hand."""
+    """Recover with both ways of dealing; others' light fields too where they are at hand, as figures only."""
     scenes = SCENES | {
         f"data:{name}": shear for name, shear in RECORDED.items() if library.has_recording(f"lightfields/{name}.npz")
     }
@@ -25,7 +25,7 @@ def dealing_table(library: Library, seeds: int, advance: Advance) -> Outcome:
     ]
     solved = solve(cases, library, seeds, advance)
     panels = []
-    for first in range(0, len(solved), len(RATIOS)):
+    for first in range(0, len(SCENES) * len(ENCODERS) * len(RATIOS), len(RATIOS)):
         line = solved[first : first + len(RATIOS)]
         scene, camera, _ = line[0].case.labels
         shown = (one.panel(f"SR = {one.case.labels[2]}") for one in line)

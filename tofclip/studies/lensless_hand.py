@@ -27,8 +27,7 @@ def lensless_hand(library: Library, seeds: int, advance: Advance) -> Outcome:
         Panel(f"every {pitch}. pixel\n{100 * one.relative_residual:.2f} %", one.scene[window])
         for pitch, one in zip(PITCHES_PX, recoveries, strict=True)
     ]
-    measured = (Panel("PSF", recording.point_spread), Panel("readings", recording.readings))
-    return Outcome(("every n-th pixel",), "relative residual, %", rows, ((*measured, *shown),))
+    return Outcome(("every n-th pixel",), "relative residual, %", rows, (tuple(shown),))
 
 
 def _lit(scene: NDArray[np.float32]) -> tuple[slice, slice]:
