@@ -166,7 +166,7 @@ def test_around_the_corner(run: Run, files: Path, tmp_path: Path, folder: Path) 
     def reconstruct(source: Path, *flags: object) -> Outcome:
         return run("nlos", "reconstruct", source, "--out", folder / "volume.h5", *flags)
 
-    assert_refused(reconstruct(files / "streak.h5"), "holds a streak record, expected frames or capture")
+    assert_refused(reconstruct(files / "streak.h5"), "holds a streak record, expected capture or frames")
     assert_refused(reconstruct(tmp_path / "absent.h5"), "no such file")
     assert_refused(reconstruct(files / "wall.h5", "--method", "guess"), "unknown method 'guess'")
     assert_refused(reconstruct(files / "wall.h5", "--png", folder / "mip.bmp"), "must end in .png")

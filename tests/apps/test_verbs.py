@@ -169,14 +169,14 @@ class TestConvertAndNlos:
         assert stored.provenance["settings"]["verb"] == "nlos reconstruct"
 
     def test_a_capture_is_taken_as_it_is(self, run: Run, tmp_path: Path) -> None:
-        x, y = np.meshgrid(np.linspace(-0.3, 0.3, 24), np.linspace(-0.3, 0.3, 24))
-        wall = np.stack([x, y, 0 * x], axis=-1)  # spaced by less than half the wavelength: no grating lobes
+        x, y = np.meshgrid(np.linspace(-0.3, 0.3, 48), np.linspace(-0.3, 0.3, 48))
+        wall = np.stack([x, y, 0 * x], axis=-1)  # spaced by less than half the pulse's shortest wave: no grating lobes
         hidden = np.array([0.1, -0.05, 0.3])
         path = np.linalg.norm(hidden) + np.linalg.norm(wall - hidden, axis=-1)
         bins = np.arange(200)[:, np.newaxis, np.newaxis]
         signal = np.exp(-(((bins - path / (SPEED_OF_LIGHT * 10e-12)) / 2) ** 2) / 2)
         Capture(signal, wall, np.zeros(3), 10e-12).save(tmp_path / "capture.h5")
-        words = ["nlos", "reconstruct", tmp_path / "capture.h5", "--out", tmp_path / "volume.h5"]
+        words = ["nlos", "reconstruct", tmp_path / "capture.h5", "--out", tmp_path / "volume.h5", "--everywhere"]
         found = object_of(run, *words, "--voxel-mm", 20, "--wavelength-mm", 60)
         # Within a voxel across; along z the pulse of three cycles is 18 cm of path long, peaked within a voxel.
         assert [found["peak_m"][axis] for axis in "xyz"] == pytest.approx(hidden, abs=0.025)

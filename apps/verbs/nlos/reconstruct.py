@@ -2,147 +2,211 @@
 
 from __future__ import annotations
 
+import sys
 import time
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.options import AsJson, completing
-from tofclip.units import MILLIMETRE
+from apps.nlos_methods import METHODS, ImagingSettings
+from apps.nlos_settings import SettingsFile, setting, takes
+from apps.options import AsJson
 
 if TYPE_CHECKING:
-    from nlos import Capture, Grid, Volume
-    from nlos.method import Reconstructor
+    from apps.nlos_files import Results
 
-PULSED = {"backprojection": "Backprojection", "rsd": "PlanarRSD", "hybrid": "Hybrid"}
-"""Methods of `nlos` that image with a virtual pulse, and their classes."""
-
-PLAIN = {"filtered-backprojection": "FilteredBackprojection", "lct": "LightCone", "fk": "FKMigration"}
-"""Methods without one."""
-
-METHODS = (*PULSED, *PLAIN)
-
-app = typer.Typer()
+SOME_FAILED = 1
+SETTINGS_SUFFIX = ".toml"
+FOLDER_SETTINGS = ".settings.toml"
+HEADING = "tofclip nlos reconstruct CAPTURE --settings THIS --out VOLUME"
 
 
-@app.callback(invoke_without_command=True)
-def _without_verb(context: typer.Context) -> None:
-    """Image the scene hidden around a corner."""
-    if context.invoked_subcommand is None:
-        print(context.get_help())
+@dataclass(frozen=True)
+class ReconstructSettings(ImagingSettings):
+    """How a capture is imaged and written."""
+
+    method: str | None = setting("NAME", f"One of {', '.join(METHODS)}.", shown="the quickest that suits the capture")
+    point_fraction: float = setting(
+        "SHARE", "Voxels with this share of the brightest become points of .ply, .pcd, .csv.", 0.3
+    )
 
 
-@app.command()
+@takes(ReconstructSettings)
 def reconstruct(
-    source: Annotated[Path, typer.Argument(metavar="FILE", help="Recovered frames of a relay wall, or a capture.")],
-    out: Annotated[Path, typer.Option(metavar="H5", help="The volume to write.")],
-    png: Annotated[Path | None, typer.Option(metavar="PNG", help="Picture of the volume, three views.")] = None,
-    method: Annotated[
-        str, typer.Option(metavar="NAME", help=f"{', '.join(METHODS)}.", autocompletion=completing(*METHODS))
-    ] = "backprojection",
-    wavelength_mm: Annotated[float, typer.Option(metavar="MM", help="Carrier of the virtual pulse.")] = 48.0,
-    cycles: Annotated[float, typer.Option(metavar="N", help="Length of the virtual pulse in wavelengths.")] = 3.0,
-    voxel_mm: Annotated[float, typer.Option(metavar="MM", help="Distance of neighbouring voxels.")] = 6.0,
-    near_m: Annotated[
-        float | None,
-        typer.Option(metavar="M", help="First depth.", show_default="one voxel beyond the middle of the wall's relief"),
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="CAPTURE", help="Recovered frames of a relay wall, a capture, or a folder."),
+    ],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="The volume to write, .h5, .vti, .npz, .exr or .ply; or a folder.")
+    ],
+    png: Annotated[
+        Path | None,
+        typer.Option(metavar="PNG", help="Picture of the volume, three views.", show_default="only in a folder"),
     ] = None,
-    far_m: Annotated[
-        float | None, typer.Option(metavar="M", help="Last depth.", show_default="as far as the record reaches")
+    settings: SettingsFile = None,
+    suffix: Annotated[
+        list[str] | None,
+        typer.Option(metavar=".EXT", help="Format of the volumes in a folder; may be repeated.", show_default=".h5"),
     ] = None,
-    everywhere: Annotated[
-        bool, typer.Option("--everywhere", help="Fill all the space in front of the wall with such voxels; slow.")
-    ] = False,
     as_json: AsJson = False,
+    **flags: Any,
 ) -> None:
     """Image the hidden scene from the transients on a relay wall.
 
-    backprojection takes every wall, laser and grid, and is slow; hybrid gives the same picture in about a second, rsd
-    too if the wall is planar and evenly scanned. These three see through a virtual pulse. filtered-backprojection,
-    lct (light-cone transform) and fk (f-k migration) do without; the last two want a confocal scan of a planar wall.
+    rsd is quick and for planar, evenly scanned walls, hybrid nearly as quick and for any wall; backprojection takes
+    every wall, laser and grid, and is slow. These three see through a virtual pulse and give the same picture.
+    filtered-backprojection, lct (light-cone transform) and fk (f-k migration) do without; the last two want a confocal
+    scan of a planar wall.
 
     The space in front of the wall is looked over with voxels of half a wavelength first; then the part that is bright
-    is imaged with the voxels asked for.
+    is imaged with the voxels asked for. The settings that were told or found are written beside the volume (.toml);
+    given back by --settings they make the same volume.
 
-    Example: tofclip nlos reconstruct wall_frames.h5 --method hybrid --out volume.h5 --png mip.png
+    Of a folder every capture is imaged into the folder --out. Captures whose results are there already are skipped.
+    If some fail, the others are done all the same, and the exit status is 1.
+
+    Example: tofclip nlos reconstruct capture.h5 --out volume.h5 --png volume.png
     """
-    from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, history, require_writable
+    from apps.nlos_files import Results, is_folder_of_captures
+    from apps.nlos_settings import told
     from apps.report import report
 
-    wavelength = wavelength_mm * MILLIMETRE
-    imaging = _method(method, wavelength, cycles)
-    require_writable(out, *RECORD_SUFFIXES, inputs=(source,))
-    if png is not None:
-        require_writable(png, *PICTURE_SUFFIXES, inputs=(source,))
-    capture = _capture(source)
-    started = time.perf_counter()
-    grid = _grid(imaging, capture, (voxel_mm * MILLIMETRE, wavelength / 2), (near_m, far_m), everywhere)
-    volume = _imaged("imaging", imaging, capture, grid)
-    seconds = time.perf_counter() - started
-    settings = {"verb": "nlos reconstruct", "method": repr(imaging), "voxel_mm": voxel_mm}
-    replace(volume, provenance=history(settings, source, earlier=capture.provenance)).save(out)
-    if png is not None:
-        volume.save_picture(png)
-    figures = {
-        "method": method,
-        "voxels": volume.grid.shape,
-        "wall_points": len(capture.points),
-        "seconds": seconds,
-        "voxels_per_second": volume.grid.size / seconds,
-        "peak_m": dict(zip("xyz", volume.brightest(), strict=True)),
-    }
-    report(figures, as_json, [out] if png is None else [out, png])
+    wanted = told(ReconstructSettings, settings, flags)
+    _require_sense(wanted)
+    if is_folder_of_captures(source):
+        _reconstruct_folder(source, out, wanted, suffix or [".h5"], as_json)
+        return
+    results = Results([out], png, out.with_suffix(SETTINGS_SUFFIX))
+    results.require_writable(source, *([] if settings is None else [settings]))
+    report(_reconstructed(source, results, wanted), as_json, results.all)
 
 
-def _method(name: str, wavelength: float, cycles: float) -> Reconstructor:
-    """Build the method of that name."""
-    import nlos
+def _require_sense(settings: ReconstructSettings) -> None:
+    """Refuse settings that no capture could make sense of, before any is read."""
+    from apps.nlos_methods import QUICKEST_FIRST, built, names_in, require_taken
     from tofclip.errors import InputError
 
-    if name in PULSED:
-        pulsed: Reconstructor = getattr(nlos, PULSED[name])(wavelength=wavelength, cycles=cycles)
-        return pulsed
-    if name in PLAIN:
-        plain: Reconstructor = getattr(nlos, PLAIN[name])()
-        return plain
-    raise InputError(f"unknown method '{name}'; choose one of {', '.join(METHODS)}")
+    if not 0 <= settings.point_fraction <= 1:
+        raise InputError(f"point_fraction is a share between 0 and 1, got {settings.point_fraction}")
+    names = QUICKEST_FIRST if settings.method is None else names_in(settings.method)
+    if settings.method is not None and len(names) > 1:
+        raise InputError(f"one method is asked for, got '{settings.method}'; nlos compare takes several")
+    require_taken(settings, names)
+    for name in names:
+        built(name, settings if settings.wavelength_mm is not None else replace(settings, wavelength_mm=1.0))
 
 
-def _imaged(title: str, imaging: Reconstructor, capture: Capture, grid: Grid) -> Volume:
-    """Image the hidden scene under a progress bar that counts look-ups or voxels, whichever the method does."""
-    from apps.progress import progress
+def _reconstructed(source: Path, results: Results, wanted: ReconstructSettings) -> dict[str, Any]:
+    """Image one capture, write its results, and return the figures."""
+    from apps.nlos_files import with_history, write_volume
+    from apps.nlos_imaging import box_of, boxed, imaged, prepared, scales_of, warnings_in_a_line
+    from apps.nlos_methods import built, quickest, spelt_out
+    from apps.nlos_settings import plain, save
+    from nlos.io import read_capture
+    from tofclip.units import MILLIMETRE
 
-    lookups = getattr(imaging, "lookups", None)
-    with progress(title, lookups(capture, grid) if lookups else grid.size) as advance:
-        return imaging.reconstruct(capture, grid, advance)
+    capture = prepared(read_capture(source), wanted)
+    started = time.perf_counter()
+    scales = scales_of(wanted, capture)
+    found = replace(wanted, **scales._asdict())
+    method = found.method or quickest(found, capture, box_of(found, capture, scales.voxel_mm * MILLIMETRE)[1])
+    found = replace(spelt_out(found, [method]), method=method)
+    imaging = built(method, found)
+    with warnings_in_a_line():
+        found, grid = boxed(found, capture, imaging)
+        volume = imaged("imaging", imaging, capture, grid)
+    seconds = time.perf_counter() - started
+    volume = with_history(volume, source, {"verb": "nlos reconstruct", **plain(found)})
+    for path in results.volumes:
+        write_volume(volume, path, found.point_fraction)
+    if results.picture is not None:
+        volume.save_picture(results.picture)
+    save(found, results.settings, HEADING)
+    return {
+        "method": method,
+        "wavelength_mm": found.wavelength_mm,
+        "voxel_mm": found.voxel_mm,
+        "voxels": grid.shape,
+        "wall_points": len(capture.points),
+        "seconds": seconds,
+        "voxels_per_second": grid.size / seconds,
+        "peak_m": dict(zip("xyz", volume.brightest(), strict=True)),
+    }
 
 
-def _grid(
-    imaging: Reconstructor,
-    capture: Capture,
-    voxels: tuple[float, float],
-    depths: tuple[float | None, float | None],
-    everywhere: bool,
-) -> Grid:
-    """Choose fine voxels: all the space in front of the wall, or what coarse ones find bright there."""
-    from nlos import Grid
+def _reconstruct_folder(
+    source: Path, out: Path, wanted: ReconstructSettings, suffixes: Sequence[str], as_json: bool
+) -> None:
+    """Image every capture of a folder whose results are not there yet."""
+    from apps.files import make_folder
+    from apps.nlos_files import captures_in, require_apart
+    from apps.report import report
 
-    fine, coarse = voxels
-    if everywhere or fine >= coarse:
-        return Grid.in_front_of(capture, fine, *depths)
-    overview = Grid.in_front_of(capture, coarse, *depths)
-    return Grid.around(_imaged("looking over", imaging, capture, overview), fine)
+    _require_formats(suffixes)
+    require_apart(source, out)
+    sources = captures_in(source)
+    make_folder(out)
+    _keep_to(out / FOLDER_SETTINGS, wanted)
+    imaged, skipped, failed = [], [], {}
+    for number, path in enumerate(sources, 1):
+        results = _results_in(out, path.stem, suffixes)
+        if results.up_to_date(path):
+            skipped.append(path.name)
+            continue
+        if sys.stderr.isatty():
+            print(f"{path.name}, {number} of {len(sources)}", file=sys.stderr)
+        try:
+            imaged.append({"capture": path.name, **_reconstructed(path, results, wanted)})
+        except Exception as fault:  # the other captures are none the worse for it
+            failed[path.name] = _reason(fault)
+    for name, reason in failed.items():
+        print(f"tofclip: failed: {name}: {reason}", file=sys.stderr)
+    counts = {"captures": len(sources), "imaged": len(imaged), "skipped": len(skipped), "failed": len(failed)}
+    lists = {"imaged": imaged, "skipped": skipped, "failed": failed} if as_json else {}
+    report({**counts, **lists}, as_json, [out])
+    if failed:
+        raise typer.Exit(SOME_FAILED)
 
 
-def _capture(source: Path) -> Capture:
-    """Read a capture, or take one out of recovered frames."""
-    from nlos import Capture
-    from tofclip.storage import Record
-    from tofclip.transient import Frames
+def _require_formats(suffixes: Sequence[str]) -> None:
+    from apps.nlos_files import VOLUME_SUFFIXES
+    from tofclip.errors import InputError
 
-    record = Record.load(source, "frames", "capture")
-    if record.kind == "capture":
-        return Capture.from_record(record)
-    return Capture.from_frames(Frames.from_record(record))
+    for suffix in suffixes:
+        if suffix not in VOLUME_SUFFIXES:
+            raise InputError(f"no format of volumes is called '{suffix}'; use one of {', '.join(VOLUME_SUFFIXES)}")
+
+
+def _results_in(folder: Path, stem: str, suffixes: Sequence[str]) -> Results:
+    from apps.nlos_files import Results
+
+    volumes = [folder / f"{stem}{suffix}" for suffix in suffixes]
+    return Results(volumes, folder / f"{stem}.png", folder / f"{stem}{SETTINGS_SUFFIX}")
+
+
+def _keep_to(file: Path, wanted: ReconstructSettings) -> None:
+    """Refuse to mix results of different settings in one folder."""
+    from apps.nlos_settings import plain, save, told
+    from tofclip.errors import InputError
+
+    if not file.exists():
+        save(wanted, file, "tofclip nlos reconstruct FOLDER --settings THIS --out RESULTS")
+        return
+    before, now = plain(told(ReconstructSettings, file, {})), plain(wanted)
+    for name in sorted(before.keys() | now.keys()):
+        if before.get(name) != now.get(name):
+            raise InputError(
+                f"{file.parent}: the results there were made with {name} = {before.get(name, 'not told')}, now it is "
+                f"{now.get(name, 'not told')}; choose another folder"
+            )
+
+
+def _reason(fault: Exception) -> str:
+    from tofclip.errors import TofclipError
+    from tofclip.storage import one_line
+
+    return one_line(fault) if isinstance(fault, TofclipError) else f"unforeseen {type(fault).__name__}: {fault}"

@@ -1,0 +1,106 @@
+"""Captures on disk and what is written of them: one capture, or a folder of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, history, require_writable
+from tofclip.errors import InputError, StorageError
+
+if TYPE_CHECKING:
+    from nlos import Volume
+
+CAPTURE_SUFFIXES = (".h5", ".hdf5", ".npz", ".mat")
+EXPORT_SUFFIXES = (".vti", ".npz", ".exr", ".ply", ".pcd", ".csv")
+VOLUME_SUFFIXES = (*RECORD_SUFFIXES, *EXPORT_SUFFIXES)
+GEOMETRY = "geometry.toml"
+"""Makes a folder of renderings one capture; see `nlos.io`."""
+
+
+@dataclass(frozen=True)
+class Results:
+    """Names of what is written of one capture.
+
+    Parameters
+    ----------
+    volumes : sequence of Path
+        The volume, in the format that each suffix names.
+    picture : Path or None
+    settings : Path
+        Written last: where it stands, the others are whole.
+    """
+
+    volumes: Sequence[Path]
+    picture: Path | None
+    settings: Path
+
+    @property
+    def all(self) -> list[Path]:
+        """Every file, in the order of writing."""
+        return [*self.volumes, *([] if self.picture is None else [self.picture]), self.settings]
+
+    def require_writable(self, *inputs: Path) -> None:
+        """Refuse names that cannot be written, or that would overwrite an input."""
+        for volume in self.volumes:
+            require_writable(volume, *VOLUME_SUFFIXES, inputs=inputs)
+        if self.picture is not None:
+            require_writable(self.picture, *PICTURE_SUFFIXES, inputs=inputs)
+        require_writable(self.settings, inputs=inputs)
+
+    def up_to_date(self, source: Path) -> bool:
+        """Whether all are there and younger than the capture that they came from."""
+        if not all(path.is_file() for path in self.all):
+            return False
+        return self.settings.stat().st_mtime >= source.stat().st_mtime
+
+
+def is_folder_of_captures(source: Path) -> bool:
+    """Whether a path names a folder, and one that is not itself a capture."""
+    return source.is_dir() and not (source / GEOMETRY).is_file()
+
+
+def captures_in(folder: Path) -> list[Path]:
+    """List the captures of a folder: files that may hold one, and folders of renderings.
+
+    Raises
+    ------
+    InputError
+        There is none, or two would have results of the same name.
+    """
+    found = sorted(
+        path
+        for path in folder.iterdir()
+        if not path.name.startswith(".") and (path.suffix.lower() in CAPTURE_SUFFIXES or (path / GEOMETRY).is_file())
+    )
+    if not found:
+        raise InputError(f"{folder}: no capture is in there ({', '.join(CAPTURE_SUFFIXES)}, or folders of renderings)")
+    names: dict[str, Path] = {}
+    for path in found:
+        other = names.setdefault(path.stem, path)
+        if other is not path:
+            raise InputError(f"{folder}: {other.name} and {path.name} would have results of one name; rename one")
+    return found
+
+
+def write_volume(volume: Volume, path: Path, fraction: float) -> None:
+    """Write a volume in the format that the suffix names."""
+    if path.suffix.lower() in RECORD_SUFFIXES:
+        volume.save(path)
+    else:
+        volume.export(path, fraction)
+
+
+def with_history(volume: Volume, source: Path, settings: dict[str, object]) -> Volume:
+    """Tell in a volume's provenance which file it was made of, and how."""
+    return replace(volume, provenance=history(settings, source, earlier=volume.provenance))
+
+
+def require_apart(source: Path, out: Path) -> None:
+    """Refuse to write results of a folder into that folder, where they would be taken for captures."""
+    if out.exists() and not out.is_dir():
+        raise StorageError(f"{out}: is a file; a folder of captures needs a folder for its results")
+    if out.resolve() == source.resolve():
+        raise InputError(f"{out}: is the folder of the captures; choose another one for the results")

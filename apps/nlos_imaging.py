@@ -1,0 +1,145 @@
+"""From a capture and what is told about its imaging to a volume: every open setting found, every step under a bar."""
+
+from __future__ import annotations
+
+import math
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+from apps.nlos_methods import Imaging, ImagingSettings
+from apps.progress import progress
+from tofclip.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from nlos import Capture, Grid, Volume
+    from nlos.geometry import FloatArray
+    from nlos.method import Reconstructor
+
+VOXELS_PER_WAVELENGTH = 8
+MOST_VOXELS_PER_SIDE = 256
+"""A default voxel is not so small that more would fit along the longest side of the wall."""
+
+SIGMAS_PER_WAVELENGTH = 4
+DIGITS = 2
+"""Of the default wavelength in mm, rounded up."""
+
+
+def prepared(capture: Capture, settings: ImagingSettings) -> Capture:
+    """Blank the wall's own light and put bins together, as the settings tell."""
+    from nlos.preparation import binned, without_first_bounce
+
+    if settings.gate_m is not None:
+        capture = without_first_bounce(capture, settings.gate_m)
+    return capture if settings.bins_together == 1 else binned(capture, settings.bins_together)
+
+
+def shortest_wavelength(capture: Capture, cycles: float) -> float:
+    """Carrier of the shortest virtual pulse of so many cycles whose whole band a capture carries, m.
+
+    The band's shortest wave is sampled twice along the wall (four times in a confocal scan, where the path grows on
+    both legs) and twice along the record.
+    """
+    import numpy as np
+
+    from nlos.band import BAND_EDGE, VirtualPulse
+
+    pulse = VirtualPulse(1.0, cycles)
+    highest = 1 + math.sqrt(-2 * math.log(BAND_EDGE)) / (pulse.sigma * pulse.wavenumber)
+    confocal = len(capture.lasers) > 1 and np.array_equal(capture.lasers, capture.points)
+    across = sampling_step(capture) * (4 if confocal else 2)
+    return highest * max(across, 2 * capture.axis.spacing)
+
+
+def sampling_step(capture: Capture) -> float:
+    """Distance of neighbouring wall points, or of the laser spots where one wall point sees them all, m; else 0."""
+    if math.isfinite(capture.spacing):
+        return capture.spacing
+    if capture.laser.ndim == 1:
+        return 0.0
+    # Light runs either way: the spots sample the scene as wall points would.
+    swapped = replace(capture, wall=capture.laser, laser=capture.wall).spacing
+    return swapped if math.isfinite(swapped) else 0.0
+
+
+class Scales(NamedTuple):
+    """Lengths that follow from how finely the wall is sampled, mm."""
+
+    wavelength_mm: float
+    voxel_mm: float
+    sigma_mm: float
+
+
+def scales_of(settings: ImagingSettings, capture: Capture) -> Scales:
+    """Find the lengths that are not told."""
+    wavelength, voxel, sigma = settings.wavelength_mm, settings.voxel_mm, settings.sigma_mm
+    if wavelength is None:
+        wavelength = _rounded_up(shortest_wavelength(capture, settings.cycles) / MILLIMETRE)
+    if voxel is None:
+        widest = float((capture.points.max(axis=0) - capture.points.min(axis=0)).max()) / MILLIMETRE
+        voxel = max(wavelength / VOXELS_PER_WAVELENGTH, widest / MOST_VOXELS_PER_SIDE)
+    return Scales(wavelength, voxel, wavelength / SIGMAS_PER_WAVELENGTH if sigma is None else sigma)
+
+
+def box_of(settings: Imaging, capture: Capture, voxel: float) -> tuple[Imaging, Grid]:
+    """Fill the box that is told, or the space in front of the wall where it is not, with voxels of `voxel` m."""
+    from nlos import Grid
+
+    front = Grid.in_front_of(capture, voxel, settings.near_m, settings.far_m)
+    x = _ends(front.x) if settings.x_m is None else settings.x_m
+    y = _ends(front.y) if settings.y_m is None else settings.y_m
+    near = float(front.z[0]) if settings.near_m is None else settings.near_m
+    far = float(front.z[-1]) if settings.far_m is None else settings.far_m
+    return replace(settings, x_m=x, y_m=y, near_m=near, far_m=far), Grid.box(x, y, (near, far), voxel)
+
+
+def boxed(settings: Imaging, capture: Capture, imaging: Reconstructor) -> tuple[Imaging, Grid]:
+    """Find the voxels: all that the box holds, or the part that coarse voxels show to be bright.
+
+    Half a wavelength is coarse. The settings that come back hold the box itself and find the same voxels once more.
+    """
+    from nlos import Grid
+
+    scales = scales_of(settings, capture)
+    voxel, coarse = scales.voxel_mm * MILLIMETRE, scales.wavelength_mm * MILLIMETRE / 2
+    bounded, _ = box_of(settings, capture, voxel)
+    if not settings.everywhere and voxel < coarse:
+        overview = imaged("looking over", imaging, capture, box_of(bounded, capture, coarse)[1])
+        part = Grid.around(overview, voxel)
+        near, far = _ends(part.z)
+        bounded = replace(bounded, x_m=_ends(part.x), y_m=_ends(part.y), near_m=near, far_m=far)
+    return box_of(replace(bounded, everywhere=True), capture, voxel)
+
+
+def imaged(title: str, imaging: Reconstructor, capture: Capture, grid: Grid) -> Volume:
+    """Image the hidden scene under a progress bar that counts look-ups or voxels, whichever the method does."""
+    from nlos.exposure import exposures
+
+    imaging.supports(capture, grid).require()
+    lookups = getattr(imaging, "lookups", None)
+    total = lookups(capture, grid) if lookups else grid.size * len(exposures(capture))
+    with progress(title, total) as advance:
+        return imaging.reconstruct(capture, grid, advance)
+
+
+@contextmanager
+def warnings_in_a_line() -> Iterator[None]:
+    """Print what the methods warn of on standard error, each warning once and on one line."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield
+    for text in dict.fromkeys(str(one.message) for one in caught):
+        print(f"tofclip: warning: {' '.join(text.split())}", file=sys.stderr)
+
+
+def _ends(axis: FloatArray) -> tuple[float, float]:
+    return float(axis[0]), float(axis[-1])
+
+
+def _rounded_up(value: float) -> float:
+    step = math.floor(math.log10(value)) - DIGITS + 1
+    # A value that is round already stays, whatever its last bit.
+    return float(round(math.ceil(value / 10**step - 1e-9) * 10**step, max(0, -step)))

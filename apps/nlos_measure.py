@@ -1,0 +1,85 @@
+"""What a method costs, and how good its image is."""
+
+from __future__ import annotations
+
+import time
+import tracemalloc
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from apps.nlos_imaging import imaged
+
+if TYPE_CHECKING:
+    from apps.nlos_truth import HiddenTruth
+    from nlos import Capture, Grid, Volume
+    from nlos.method import Reconstructor
+
+FIRST_VOXELS = 8
+TRUTH_REACH = 0.04
+"""m; light so close to a hidden thing counts as its own, if voxels are not larger."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A volume and what it cost.
+
+    Parameters
+    ----------
+    volume : Volume
+    seconds : float
+        Wall-clock time of the imaging, without compiling.
+    peak_bytes : int
+        Most memory that its arrays held at a time, the volume included and the capture not.
+    """
+
+    volume: Volume
+    seconds: float
+    peak_bytes: int
+
+
+def measured(name: str, imaging: Reconstructor, capture: Capture, grid: Grid) -> Measured:
+    """Image the hidden scene, and measure time and memory.
+
+    A few voxels are imaged first, so that loading the compiled loops is not counted.
+    """
+    from nlos import Grid
+
+    few = slice(FIRST_VOXELS)
+    imaging.reconstruct(capture, Grid(grid.x[few], grid.y[few], grid.z[:1]))
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        started = time.perf_counter()
+        volume = imaged(name, imaging, capture, grid)
+        seconds = time.perf_counter() - started
+        peak = tracemalloc.get_traced_memory()[1] - before
+    finally:
+        tracemalloc.stop()
+    return Measured(volume, seconds, peak)
+
+
+def sharpness(volume: Volume) -> float:
+    """How far the light of the front view is gathered: 1 where it is even, the number of pixels where one has it all.
+
+    ``pixels * sum(I^2) / sum(I)^2``: the first sharpness of R. A. Muller and A. Buffington, J. Opt. Soc. Am. 64, 1200
+    (1974), made free of scale. It compares images of one scene on one grid; it does not tell right from wrong.
+    """
+    front = volume.maximum_projection().brightness.astype(np.float64)
+    total = float(front.sum())
+    return front.size * float(np.sum(front**2)) / total**2 if total > 0 else float("nan")
+
+
+def truth_figures(volume: Volume, truth: HiddenTruth) -> dict[str, Any]:
+    """Share of the energy near hidden things, and how much brighter voxels are there than elsewhere."""
+    axes = (volume.grid.x, volume.grid.y, volume.grid.z)
+    reach = max([TRUTH_REACH, *(float(axis[1] - axis[0]) for axis in axes if axis.size > 1)])
+    near, magnitude = truth.near(volume.grid, reach), volume.magnitude.astype(np.float64)
+    energy = float(np.sum(magnitude**2))
+    around, elsewhere = (float(magnitude[some].mean()) if some.any() else float("nan") for some in (near, ~near))
+    return {
+        "energy_near_truth": float(np.sum(magnitude[near] ** 2)) / energy if energy > 0 else float("nan"),
+        "contrast_to_truth": around / elsewhere if elsewhere > 0 else float("nan"),
+        "truth_reach_m": reach,
+    }

@@ -1,0 +1,73 @@
+"""The hidden scene that a simulated capture shows: it travels inside the capture's file, for others to compare with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import InputError
+from tofclip.storage import SIGNATURE, Field, Record
+
+if TYPE_CHECKING:
+    from nlos import Capture, Grid
+
+KIND = "hidden_scene"
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenTruth:
+    """Where hidden things scatter light.
+
+    Parameters
+    ----------
+    positions : (n, 3) array
+        Points, or the centres of facets, m.
+    spacing : float
+        Distance of neighbouring facets, m; 0 for points.
+    """
+
+    positions: FloatArray
+    spacing: float
+
+    def record_with(self, capture: Capture) -> Record:
+        """Put the truth into the record of its capture."""
+        own = {"positions": Field(self.positions, "m", ("point", "xyz"))}
+        return replace(capture.to_record(), children={KIND: Record(KIND, own, {"spacing_m": self.spacing})})
+
+    @classmethod
+    def inside(cls, path: Path) -> HiddenTruth | None:
+        """Read the truth that a capture's file carries; None where there is none."""
+        if not path.is_file():
+            return None
+        with open(path, "rb") as file:
+            if file.read(len(SIGNATURE)) != SIGNATURE:
+                return None
+        return cls._of(path)
+
+    @classmethod
+    def _of(cls, path: Path) -> HiddenTruth | None:
+        from tofclip.errors import FileFormatError
+
+        try:
+            found = Record.load(path).children.get(KIND)
+        except FileFormatError:  # another laboratory's HDF5
+            return None
+        if found is None:
+            return None
+        return cls(found.array("positions", np.float64, 2, "m"), float(found.attribute("spacing_m")))
+
+    def near(self, grid: Grid, reach: float) -> NDArray[np.bool_]:
+        """Voxels (z, y, x) whose centres lie within `reach` m of something hidden."""
+        from scipy.spatial import cKDTree
+
+        if reach <= 0:
+            raise InputError(f"the reach about hidden things must be positive, got {reach} m")
+        z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
+        voxels = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+        found, _ = cKDTree(self.positions).query(voxels, distance_upper_bound=reach)
+        return np.asarray(np.isfinite(found).reshape(grid.shape))

@@ -1,0 +1,146 @@
+"""`tofclip nlos compare`: several methods on one capture, side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from apps.nlos_methods import METHODS, ImagingSettings
+from apps.nlos_settings import SettingsFile, setting, takes
+from apps.options import AsJson
+
+if TYPE_CHECKING:
+    from apps.nlos_measure import Measured
+    from apps.nlos_truth import HiddenTruth
+    from nlos import Capture, Grid
+    from nlos.method import Reconstructor
+
+HEADING = "tofclip nlos compare CAPTURE --settings THIS --out PICTURE"
+
+
+@dataclass(frozen=True)
+class CompareSettings(ImagingSettings):
+    """What is compared on one capture."""
+
+    methods: str | None = setting(
+        "A,B,...", f"Of {', '.join(METHODS)}; the first is the reference.", shown="all that suit the capture"
+    )
+
+
+@takes(CompareSettings)
+def compare(
+    source: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Recovered frames of a relay wall, or a capture.")],
+    out: Annotated[Path, typer.Option(metavar="PNG", help="The picture to write.")],
+    volumes: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for the volumes, one file per method.")
+    ] = None,
+    settings: SettingsFile = None,
+    as_json: AsJson = False,
+    **flags: Any,
+) -> None:
+    """Image one capture by several methods, and show images, time, memory and figures of merit side by side.
+
+    The correlation is that of the front views with the first method's. The sharpness says how far the light of the
+    front view is gathered, which is good only where it is gathered in the right place: captures of nlos simulate carry
+    the truth, and for them the share of energy near hidden things and the contrast against the rest are told.
+
+    The settings that were told or found are written beside the picture (.toml) and give the same comparison.
+
+    Example: tofclip nlos compare capture.h5 --methods hybrid,backprojection --out compare.png
+    """
+    from apps.figures.nlos_compare import compare_figure
+    from apps.figures.style import save as save_figure
+    from apps.files import PICTURE_SUFFIXES, make_folder, require_writable
+    from apps.nlos_files import with_history
+    from apps.nlos_imaging import prepared, warnings_in_a_line
+    from apps.nlos_settings import plain, save, told
+    from apps.nlos_truth import HiddenTruth
+    from apps.report import report
+    from nlos.io import read_capture
+
+    wanted = told(CompareSettings, settings, flags)
+    inputs = (source,) if settings is None else (source, settings)
+    beside = out.with_suffix(".toml")
+    require_writable(out, *PICTURE_SUFFIXES, inputs=inputs)
+    require_writable(beside, inputs=inputs)
+    _require_sense(wanted)
+    if volumes is not None:
+        make_folder(volumes)
+    capture = prepared(read_capture(source), wanted)
+    truth = HiddenTruth.inside(source)
+    with warnings_in_a_line():
+        found, grid, methods, left_out = _chosen(wanted, capture)
+        runs = _measured(methods, capture, grid)
+    figures = _figures(runs, truth)
+    save_figure(compare_figure({name: run.volume for name, run in runs.items()}, figures, truth), out)
+    written = [out, beside]
+    for name, run in runs.items() if volumes is not None else ():
+        written.append(Path(volumes or "") / f"{name}.h5")
+        with_history(run.volume, source, {"verb": "nlos compare", **plain(found)}).save(written[-1])
+    save(found, beside, HEADING)
+    if as_json:
+        report({"voxels": grid.shape, "methods": figures, "left_out": left_out}, as_json)
+        return
+    report({"voxels": grid.shape, **figures, **{name: f"no: {why}" for name, why in left_out.items()}}, False, written)
+
+
+def _require_sense(settings: CompareSettings) -> None:
+    from apps.nlos_methods import built, names_in, require_taken
+
+    names = tuple(METHODS) if settings.methods is None else names_in(settings.methods)
+    require_taken(settings, names)
+    for name in names:
+        built(name, settings if settings.wavelength_mm is not None else replace(settings, wavelength_mm=1.0))
+
+
+def _chosen(
+    wanted: CompareSettings, capture: Capture
+) -> tuple[CompareSettings, Grid, dict[str, Reconstructor], dict[str, str]]:
+    """Choose methods and voxels; of methods that nobody named, those that do not suit are left out, with the reason."""
+    from apps.nlos_imaging import box_of, boxed, scales_of
+    from apps.nlos_methods import built, names_in, spelt_out
+    from tofclip.errors import InputError
+    from tofclip.units import MILLIMETRE
+
+    scales = scales_of(wanted, capture)
+    found = replace(wanted, **scales._asdict())
+    _, whole = box_of(found, capture, scales.voxel_mm * MILLIMETRE)
+    names = tuple(METHODS) if found.methods is None else names_in(found.methods)
+    support = {name: built(name, found).supports(capture, whole) for name in names}
+    left_out = {name: one.reason for name, one in support.items() if not one}
+    if left_out and (found.methods is not None or len(left_out) == len(names)):
+        name, reason = next(iter(left_out.items()))
+        raise InputError(f"{name} does not suit this capture: {reason}")
+    chosen = [name for name in names if name not in left_out]
+    found = replace(spelt_out(found, chosen), methods=",".join(chosen))
+    methods = {name: built(name, found) for name in chosen}
+    found, grid = boxed(found, capture, methods[chosen[0]])
+    return found, grid, methods, left_out
+
+
+def _measured(methods: Mapping[str, Reconstructor], capture: Capture, grid: Grid) -> dict[str, Measured]:
+    from apps.nlos_measure import measured
+
+    return {name: measured(name, imaging, capture, grid) for name, imaging in methods.items()}
+
+
+def _figures(runs: Mapping[str, Measured], truth: HiddenTruth | None) -> dict[str, dict[str, Any]]:
+    """Figures of every method; the first is the reference."""
+    from apps.nlos_measure import sharpness, truth_figures
+    from nlos.studies.adjoint import correlation
+
+    reference = next(iter(runs.values())).volume
+    return {
+        name: {
+            "seconds": run.seconds,
+            "peak_mib": run.peak_bytes / 2**20,
+            "correlation": correlation(run.volume, reference),
+            "sharpness": sharpness(run.volume),
+            **({} if truth is None else truth_figures(run.volume, truth)),
+        }
+        for name, run in runs.items()
+    }
