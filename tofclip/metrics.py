@@ -46,6 +46,24 @@ def nmse_energy(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> fl
     return float(np.sum((h - g) ** 2)) / energy
 
 
+def correlation(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
+    """Pearson's correlation of two pictures, whatever their scales; 0 where the estimate is one even tone.
+
+    Arguments as in `nmse`.
+
+    Raises
+    ------
+    ShapeError, InputError
+        The shapes differ, the border leaves nothing, or the truth is constant.
+    """
+    h, g = _inner_pair(estimate, truth, border_px)
+    h, g = h - h.mean(), g - g.mean()
+    if not g.any():
+        raise InputError("the truth is constant: nothing can correlate with it")
+    spread = float(np.linalg.norm(h) * np.linalg.norm(g))
+    return float(np.sum(h * g)) / spread if spread > 0 else 0.0
+
+
 def _inner_pair(
     estimate: ArrayLike, truth: ArrayLike, border_px: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -23,7 +23,7 @@ def letter(name: str) -> list[Outline]:
     Parameters
     ----------
     name : str
-        ``"A"``, ``"C"``, ``"L"`` or ``"U"``.
+        ``"A"``, ``"C"``, ``"L"``, ``"U"`` or ``"V"``.
     """
     if name not in LETTERS:
         raise InputError(f"no outline is known for '{name}'; known are {', '.join(LETTERS)}")
@@ -106,4 +106,8 @@ def _letter_a() -> list[Outline]:
     return [np.array(outer), np.array([(0.5, 0.24), (0.6, 0.58), (0.4, 0.58)])]
 
 
-LETTERS = {"A": _letter_a(), "C": _letter_c(), "L": _letter_l(), "U": _letter_u()}
+def _letter_v() -> list[Outline]:
+    return [np.array([(0, 0), (0.28, 0), (0.5, 0.6), (0.72, 0), (1, 0), (0.64, 1), (0.36, 1)])]
+
+
+LETTERS = {"A": _letter_a(), "C": _letter_c(), "L": _letter_l(), "U": _letter_u(), "V": _letter_v()}

@@ -28,6 +28,8 @@ class CameraArray:
         Distance at which all pictures agree (s = 0), m.
     samples : int
         Rays on a side of each pixel.
+    view_rows : int, optional
+        Rows of cameras, numbered alike; as many as `view_count` if not given.
 
     Raises
     ------
@@ -41,17 +43,28 @@ class CameraArray:
     view_step: float = 0.0125
     focus: float = 1.0
     samples: int = 2
+    view_rows: int | None = None
 
     def __post_init__(self) -> None:
-        lengths = (*self.image_shape, self.view_count, self.focal_length_px, self.view_step, self.focus, self.samples)
+        counts = (*self.image_shape, *self._view_counts, self.samples)
+        lengths = (*counts, self.focal_length_px, self.view_step, self.focus)
         if not all(np.isfinite(length) and length > 0 for length in lengths):
             raise InputError("every count and length of a camera array must be positive")
 
     @property
+    def _view_counts(self) -> tuple[int, int]:
+        """Cameras down and across."""
+        return (self.view_count if self.view_rows is None else self.view_rows), self.view_count
+
+    @property
     def views(self) -> NDArray[np.float64]:
         """(v, u) of each camera in raster order, (views, 2)."""
-        numbers = np.arange(self.view_count) - self.view_count // 2
-        return np.stack(np.meshgrid(numbers, numbers, indexing="ij"), axis=-1).reshape(-1, 2).astype(np.float64)
+        numbers = (np.arange(count) - count // 2 for count in self._view_counts)
+        return np.stack(np.meshgrid(*numbers, indexing="ij"), axis=-1).reshape(-1, 2).astype(np.float64)
+
+    def place(self, view: View) -> NDArray[np.float64]:
+        """Where the camera at (v, u) stands, (x, y, z) in metres; fractions are places between the array's."""
+        return np.array([view[1] * self.view_step, view[0] * self.view_step, 0.0])
 
     def shear(self, depth: ArrayLike) -> NDArray[np.float64]:
         """Shear s in pixels per view step of points at `depth` metres along z (supplement Note 1, s = 0 at focus)."""
@@ -94,7 +107,7 @@ class CameraArray:
             As long as the way from the camera to the plane in focus.
         """
         rows, columns = self.image_shape
-        origin = np.array([view[1] * self.view_step, view[0] * self.view_step, 0.0])
+        origin = self.place(view)
         y, x = (_sample_places(count, samples) * self.focus / self.focal_length_px for count in (rows, columns))
         at_focus = np.stack(np.broadcast_arrays(x, y[:, np.newaxis], self.focus), axis=-1)
         return origin, at_focus.reshape(-1, 3) - origin

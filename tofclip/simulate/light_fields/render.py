@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -93,15 +94,49 @@ def shear_map(scene: Scene, array: CameraArray, view: View = (0.0, 0.0)) -> Arra
     return np.where(seen, array.shear(depth), np.inf).reshape(array.image_shape).astype(np.float32)
 
 
-def _cast(scene: Scene, origin: Array, directions: Array) -> tuple[Array, Array]:
-    """Distance to the nearest surface along each ray and the light that comes back from it."""
-    nearest, brightness = np.full(len(directions), np.inf), np.zeros(len(directions))
-    light = np.array(scene.light) / np.linalg.norm(scene.light)
-    for body in scene.bodies:
+@dataclass(frozen=True)
+class Sight:
+    """What rays meet first.
+
+    Parameters
+    ----------
+    distance : (rays,) array
+        In lengths of the ray's direction; infinite where it meets nothing.
+    body : (rays,) int array
+        Number of the body, meaningless where there is none.
+    normal : (rays, 3) array
+        Of length 1, towards the ray's origin.
+    place : (rays, 2) array
+        On the body's pattern.
+    """
+
+    distance: Array
+    body: Array
+    normal: Array
+    place: Array
+
+
+def look(bodies: Sequence[Body], origin: Array, directions: Array) -> Sight:
+    """Follow rays from (3,) `origin` along (rays, 3) `directions`, all with z > 0, to the nearest surface."""
+    count = len(directions)
+    nearest, number = np.full(count, np.inf), np.zeros(count, np.intp)
+    normal, place = np.zeros((count, 3)), np.zeros((count, 2))
+    for index, body in enumerate(bodies):
         rays = body.candidates(origin, directions)
         found = body.hits(origin, directions[rays])
         closer = found.distance < nearest[rays]
         seen = rays[closer]
-        nearest[seen] = found.distance[closer]
-        brightness[seen] = body.material.radiance(found.place[closer], found.normal[closer], directions[seen], light)
-    return nearest, brightness
+        nearest[seen], number[seen] = found.distance[closer], index
+        normal[seen], place[seen] = found.normal[closer], found.place[closer]
+    return Sight(nearest, number, normal, place)
+
+
+def _cast(scene: Scene, origin: Array, directions: Array) -> tuple[Array, Array]:
+    """Distance to the nearest surface along each ray and the light that comes back from it."""
+    sight = look(scene.bodies, origin, directions)
+    brightness = np.zeros(len(directions))
+    light = np.array(scene.light) / np.linalg.norm(scene.light)
+    for index, body in enumerate(scene.bodies):
+        own = np.flatnonzero(np.isfinite(sight.distance) & (sight.body == index))
+        brightness[own] = body.material.radiance(sight.place[own], sight.normal[own], directions[own], light)
+    return sight.distance, brightness

@@ -1,0 +1,181 @@
+"""Time of flight in light fields: which instant brings which light to which pixel of each view, lamps and shadows
+included.
+
+Light goes from a lamp to a surface and on to a view; a lamp that something else shades adds nothing. Interreflections
+are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.arrays import run_blocks
+from tofclip.errors import InputError, ShapeError
+from tofclip.operators.shear import View
+from tofclip.simulate.light_fields.array import CameraArray
+from tofclip.simulate.light_fields.bodies import Body
+from tofclip.simulate.light_fields.render import look
+from tofclip.simulate.render import FWHM_PER_SIGMA, gathered, share_rows
+from tofclip.units import SPEED_OF_LIGHT
+
+Array = NDArray[Any]
+
+SHADOW_MARGIN = 1e-6  # relative distance before a surface at which rounding no longer makes it shade itself
+
+
+@dataclass(frozen=True)
+class PulsedScene:
+    """Bodies and the lamps that flash at time zero, all with the same power.
+
+    Parameters
+    ----------
+    bodies : tuple of Body
+        Matt: of a glossy one only the matt part sends light back.
+    lamps : (lamps, 3) array
+        Where they stand, m; all before the bodies.
+
+    Raises
+    ------
+    InputError, ShapeError
+        There is no body, or the lamps are no list of places.
+    """
+
+    bodies: tuple[Body, ...]
+    lamps: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if not self.bodies:
+            raise InputError("a scene needs at least one body")
+        if self.lamps.ndim != 2 or self.lamps.shape[1] != 3 or not len(self.lamps):
+            raise ShapeError("the lamps' places", "(lamps, 3)", self.lamps.shape)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Bins of time, and how long the instrument's answer to an instant is.
+
+    Parameters
+    ----------
+    start : float
+        Middle of the first bin, s after the lamps' flash.
+    bin_width : float
+        s.
+    bins : int
+    pulse_fwhm : float
+        Full width at half maximum of lamp and detector together, a Gaussian, s.
+
+    Raises
+    ------
+    InputError
+        A duration is not positive.
+    """
+
+    start: float
+    bin_width: float
+    bins: int
+    pulse_fwhm: float
+
+    def __post_init__(self) -> None:
+        durations = (self.bin_width, self.bins, self.pulse_fwhm)
+        if not (np.isfinite(self.start) and all(np.isfinite(one) and one > 0 for one in durations)):
+            raise InputError("bins, their width and the pulse must be positive, the start finite")
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Middle of each bin, s."""
+        return np.linspace(self.start, self.start + (self.bins - 1) * self.bin_width, self.bins)
+
+    @classmethod
+    def covering(cls, near: float, far: float, bin_width: float, pulse_fwhm: float) -> Clock:
+        """Return a clock for surfaces from `near` to `far` metres away, lamps beside the views."""
+        start = 2 * near / SPEED_OF_LIGHT
+        return cls(start, bin_width, int(np.ceil(2 * (far - near) / SPEED_OF_LIGHT / bin_width)) + 1, pulse_fwhm)
+
+
+def flash(scene: PulsedScene, array: CameraArray, clock: Clock) -> NDArray[np.float32]:
+    """Return what every view sees at every instant, (views, rows, columns, bins).
+
+    A surface of reflectance 1 that faces all lamps from the distance of the array's focus has brightness 1, summed
+    over time. Memory beyond the result is about 1 kB for each ray of a view and thread.
+    """
+    from threadpoolctl import threadpool_limits
+
+    views = array.views
+    pictures = np.empty((len(views), *array.image_shape, clock.bins), np.float32)
+
+    def some(which: slice) -> None:
+        for number in range(which.start, which.stop):
+            pictures[number] = flash_view(scene, array, clock, (views[number, 0], views[number, 1]))
+
+    with threadpool_limits(1, "blas"):  # the threads are used for views
+        run_blocks(some, len(views), 1)
+    return pictures
+
+
+def flash_view(scene: PulsedScene, array: CameraArray, clock: Clock, view: View) -> Array:
+    """Return what the camera at (v, u) sees at every instant, (rows, columns, bins) float32."""
+    origin, directions = array.rays(view, array.samples)
+    sight = look(scene.bodies, origin, directions)
+    seen = np.flatnonzero(np.isfinite(sight.distance))
+    normal, reflectance = sight.normal[seen], _reflectance(scene, sight.body[seen], sight.place[seen])
+    points = origin + sight.distance[seen, np.newaxis] * directions[seen]
+    back = np.linalg.norm(points - origin, axis=1)
+    pixel = _pixels(array)[seen]
+    total = np.zeros((*array.image_shape, clock.bins))
+    for lamp in scene.lamps:
+        lit = irradiance(scene.bodies, lamp, points, normal) * reflectance
+        bright = lit > 0
+        way = np.linalg.norm(points[bright] - lamp, axis=1) + back[bright]
+        total += _sorted_by_time(pixel[bright], way / SPEED_OF_LIGHT, lit[bright], clock, total.shape)
+    share = array.focus**2 / len(scene.lamps) / array.samples**2
+    return (share * total).astype(np.float32)
+
+
+def _reflectance(scene: PulsedScene, body: Array, place: Array) -> Array:
+    found = np.zeros(body.size)
+    for number, one in enumerate(scene.bodies):
+        own = body == number
+        found[own] = one.material.reflectance(place[own])
+    return found
+
+
+def irradiance(bodies: tuple[Body, ...], lamp: Array, points: Array, normal: Array) -> Array:
+    """Return how strongly one lamp lights points: cosine over distance squared, nothing in shadow.
+
+    Parameters
+    ----------
+    bodies : tuple of Body
+        What may stand in the way.
+    lamp : (3,) array
+    points, normal : (points, 3) arrays
+        On surfaces, m; and where these face, length 1.
+    """
+    rays = points - lamp
+    distance = np.linalg.norm(rays, axis=1)
+    facing = -np.einsum("ij,ij->i", rays, normal) / distance
+    candidates = np.flatnonzero(facing > 0)
+    nearest = look(bodies, lamp, rays[candidates]).distance
+    light = np.zeros(len(points))
+    lit = candidates[nearest > 1 - SHADOW_MARGIN]
+    light[lit] = facing[lit] / distance[lit] ** 2
+    return light
+
+
+def _sorted_by_time(pixel: Array, time: Array, light: Array, clock: Clock, shape: tuple[int, ...]) -> Array:
+    """Put each ray's light on the bins over which its pulse is spread."""
+    sigma = np.full(time.shape, clock.pulse_fwhm / FWHM_PER_SIGMA / clock.bin_width)
+    first, shares = share_rows((time - clock.start) / clock.bin_width, sigma)
+    bins = first[:, np.newaxis] + np.arange(shares.shape[1])
+    inside = (bins >= 0) & (bins < clock.bins)
+    cell = pixel[:, np.newaxis] * clock.bins + bins
+    return gathered(cell[inside], (shares * light[:, np.newaxis])[inside], shape)
+
+
+def _pixels(array: CameraArray) -> Array:
+    """Raster number of the pixel to which each ray belongs."""
+    numbers = np.arange(int(np.prod(array.image_shape))).reshape(array.image_shape)
+    return numbers.repeat(array.samples, axis=0).repeat(array.samples, axis=1).ravel()
