@@ -16,6 +16,8 @@ FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
 SAMPLES_PER_BIN = 64  # of a pulse that was summed over bins
 SIGNIFICANT = 0.01  # below this share of its peak a pulse says nothing about where it is
 
+Table = tuple[NDArray[np.float64], tuple[float, float, float, float]]
+
 
 @dataclass(frozen=True)
 class Pulse:
@@ -137,6 +139,18 @@ class Pulse:
     def support(self) -> tuple[float, float]:
         """First and last instant, s after the arrival, at which the pulse matters."""
         return self.extent(SIGNIFICANT)
+
+    def table(self, level: float = SIGNIFICANT) -> Table:
+        """Return what the compiled loops take.
+
+        Returns
+        -------
+        curve : (n, 2) array
+            Samples and their slopes, per second.
+        scale : tuple
+            Samples per second, origin, and `extent` of `level`.
+        """
+        return np.stack([self.samples, self.slope], axis=1), (1 / self.spacing, self.origin, *self.extent(level))
 
     def extent(self, level: float) -> tuple[float, float]:
         """Return when the curve first rises through `level` of its peak and last falls through it, s after arrival."""

@@ -1,10 +1,4 @@
-"""Returns: when light came back to each pixel, how much, and how surely.
-
-A recovered frame is no photon count: it went through an inverse problem, whose errors are spread over pixels and bins
-and are nearly even in time. For such errors the least-squares fit of the pulse is the maximum-likelihood estimate, so
-candidates are judged by the matched filter and refined by Gauss-Newton steps of that fit, below a bin. Histograms of
-counted photons are for `tofclip.lidar.photons`, whose estimator is the maximum-likelihood one there.
-"""
+"""Returns: when light came back to each pixel, how much, and how surely."""
 
 from __future__ import annotations
 
@@ -15,18 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import run_blocks
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
-from tofclip.lidar.detection import Detection
-from tofclip.lidar.pulse import Pulse
-from tofclip.transient import Frames
-from tofclip.units import SPEED_OF_LIGHT
-
-REFERENCE_RANGE = 1.0  # m; an intensity is what the same surface would send back from here
-PIXELS_PER_BLOCK = 128  # their traces fit the second-level cache
-SHARPENING = 2.0  # of the filter that looks for candidates; it costs a tenth of the matched filter's sensitivity
-SHORTEST_PULSE_BINS = 2.0  # anything shorter falls between the samples
 
 
 @dataclass(frozen=True)
@@ -101,110 +85,3 @@ class Returns:
         upwards = np.argsort(self.intensity, kind="stable")  # the last one written wins
         picture[self.y[upwards], self.x[upwards]] = getattr(self, name)[upwards]
         return picture
-
-
-def depth(
-    frames: Frames,
-    camera: Camera | None = None,
-    detection: Detection | None = None,
-    pulse: Pulse | None = None,
-) -> Returns:
-    """Find each pixel's returns in a transient cube.
-
-    Parameters
-    ----------
-    frames : Frames
-        Brightness (time, y, x) on any increasing time axis. The source is co-located: range is ``c * time / 2``.
-    camera : Camera, optional
-        Takes the place of the camera inside `frames`.
-    detection : Detection, optional
-        What counts as a return.
-    pulse : Pulse, optional
-        Shape of a single return; by default a Gaussian as wide as ``camera.pulse_fwhm``. Two returns of similar
-        strength are told apart from 1.3 widths on.
-
-    Raises
-    ------
-    InputError
-        Fewer than three frames, or a camera for another picture size.
-    """
-    camera = frames.camera if camera is None else camera
-    detection = Detection() if detection is None else detection
-    if camera.image_shape != frames.values.shape[1:]:
-        raise ShapeError("frames", f"(time, y, x) with (y, x) = {camera.image_shape}", frames.values.shape)
-    if frames.times.size < 3:
-        raise InputError(f"a return needs at least three frames to be found in, got {frames.times.size}")
-    if pulse is None:
-        pulse = Pulse.gaussian(max(camera.pulse_fwhm, SHORTEST_PULSE_BINS * frames.bin_width))
-    pixel, time, signal, deviation = _listed(*_search(frames, pulse, detection))
-    distance = SPEED_OF_LIGHT * time / 2
-    intensity = signal * (distance / REFERENCE_RANGE) ** 2
-    kept = (time > 0) & detection.significant(pixel, time, intensity, pulse.fwhm)
-    y, x = np.divmod(pixel[kept], camera.image_shape[1])
-    return Returns(
-        y=y.astype(np.int32),
-        x=x.astype(np.int32),
-        range=distance[kept],
-        intensity=intensity[kept].astype(np.float32),
-        confidence=(SPEED_OF_LIGHT * deviation[kept] / 2).astype(np.float32),
-        return_number=_rank_within(pixel[kept]),
-        time=time[kept],
-        camera=camera,
-        shear=np.interp(time[kept], frames.times, frames.shears),
-        provenance=frames.provenance,
-    )
-
-
-def _search(frames: Frames, pulse: Pulse, detection: Detection) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Candidates of every pixel: (pixels, most returns, 3) of instant, counts, deviation, and how many are filled."""
-    from tofclip.lidar.kernels import find_returns
-
-    traces = frames.values.reshape(frames.times.size, -1).astype(np.float32, copy=False)
-    pixels = traces.shape[1]
-    found = np.empty((pixels, detection.most_returns, 3))
-    counts = np.empty(pixels, np.int64)
-    sharp, matched = (_filters(frames.times, shape) for shape in (pulse.compressed(SHARPENING), pulse))
-    shape = (pulse.samples, pulse.slope, pulse.spacing, pulse.origin, *pulse.support)
-    limits = (pulse.fwhm, float(detection.signal_to_noise), float(detection.share_of_pixel))
-
-    def work(piece: slice) -> None:
-        block = np.ascontiguousarray(traces[:, piece].T)
-        find_returns(block, frames.times, sharp, matched, shape, limits, found[piece], counts[piece])
-
-    run_blocks(work, pixels, PIXELS_PER_BLOCK)
-    return found, counts
-
-
-def _filters(times: NDArray[np.float64], pulse: Pulse) -> NDArray[np.float32]:
-    """Unit-energy filter for a return at each bin, (width, bins); the time axis may be uneven.
-
-    Where the axis cuts off most of the pulse the energy stays below one: little would be known of such a return.
-    """
-    before, after = pulse.support
-    half = int(np.ceil(max(-before, after) / np.diff(times).min()))
-    filters = np.zeros((2 * half + 1, times.size))
-    for row, shift in enumerate(range(-half, half + 1)):
-        here = np.arange(max(0, -shift), min(times.size, times.size - shift))
-        filters[row, here] = pulse(times[here + shift] - times[here])
-    energy = np.sum(filters**2, axis=0)
-    filters /= np.sqrt(np.maximum(energy, np.median(energy) / 2))
-    return filters.astype(np.float32)
-
-
-def _listed(
-    found: NDArray[np.float64], counts: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Turn padded candidates into pixel number, instant, counts and deviation, in raster and time order."""
-    filled = np.arange(found.shape[1]) < counts[:, np.newaxis]
-    pixel = np.nonzero(filled)[0]
-    time, signal, deviation = np.moveaxis(found[filled], -1, 0)
-    order = np.lexsort((time, pixel))
-    return pixel[order], time[order], signal[order], deviation[order]
-
-
-def _rank_within(pixel: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """Number the entries of each pixel from 1; equal pixels lie side by side."""
-    position = np.arange(pixel.size)
-    starts_here = np.r_[True, pixel[1:] != pixel[:-1]][: pixel.size]
-    start = np.maximum.accumulate(np.where(starts_here, position, 0))
-    return (position - start + 1).astype(np.uint8)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import time
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +16,9 @@ from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator, SparseMatrix, squared_norm
 from tofclip.recovery.loop import Progress, Result, silent
 from tofclip.recovery.method import Array, Mask, checked_readings, full_block, write_frames
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 DENSE_FRAMES = 4 * LANES  # the dense matrix is read from memory once for so many frames
 NORM_ITERATIONS = 15  # the damping need not be known better than to a percent
@@ -105,25 +111,42 @@ class PreparedInverse:
         out : (frames, rows, columns) array of the operator's type, optional
             Where the frames are written; for shot after shot, fresh memory would cost a quarter of the time.
         """
-        from threadpoolctl import threadpool_limits
-
         readings = checked_readings(self.operator, readings, None)
         shape = (readings.shape[1], *self.operator.shape_in)
         frames = np.empty(shape, self.operator.dtype) if out is None else out
         if frames.shape != shape or frames.dtype != self.operator.dtype or not frames.flags.c_contiguous:
             raise ShapeError("out", f"{shape}, contiguous, {self.operator.dtype}", (*frames.shape, frames.dtype))
+        weights = self.weights(readings)
 
-        def solve(piece: slice) -> None:
-            weights = self.inverse_gram @ readings[:, piece]
-            for part in blocks(piece.stop - piece.start):
-                whole = slice(piece.start + part.start, piece.start + part.stop)
-                write_frames(self.operator.adjoint(full_block(weights, part)), frames, whole)
+        def project(piece: slice) -> None:
+            block = weights[piece.start // LANES]
+            write_frames(self.operator.adjoint(block if len(frames) > 1 else block[:, :1]), frames, piece)
             progress(piece.stop - piece.start)
 
-        # The blocks already keep every core busy: BLAS threads of its own would wait for, and spin against, ours.
-        with threadpool_limits(1, "blas"):
-            run_blocks(solve, readings.shape[1], DENSE_FRAMES)
+        run_blocks(project, readings.shape[1])
         return Result(frames)
+
+    def weights(self, readings: Array) -> Array:
+        """Return ``(A A' + mu I)^-1 f``, (blocks, readings, LANES): the adjoint of each block is `LANES` pictures.
+
+        Frames beyond the last one are zero.
+
+        Parameters
+        ----------
+        readings : (readings, frames) array, finite
+        """
+        frames = readings.shape[1]
+        weights = np.zeros((-(-frames // LANES), self.inverse_gram.shape[0], LANES), self.operator.dtype)
+
+        def solve(piece: slice) -> None:
+            solved = self.inverse_gram @ readings[:, piece]
+            for part in blocks(piece.stop - piece.start):
+                weights[(piece.start + part.start) // LANES, :, : part.stop - part.start] = solved[:, part]
+
+        # The blocks already keep every core busy: BLAS threads of its own would wait for, and spin against, ours.
+        with one_blas_thread():
+            run_blocks(solve, frames, DENSE_FRAMES)
+        return weights
 
 
 @dataclass(frozen=True)
@@ -156,6 +179,20 @@ class Adjoint:
     def work(self, frames: int) -> int:
         """Return how many frame iterations `recover` reports at most."""
         return frames
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """The linear-algebra libraries that are loaded; looking for them takes longer than a block."""
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+def one_blas_thread() -> AbstractContextManager[Any]:
+    """Keep matrix products on the threads that call them."""
+    limited: AbstractContextManager[Any] = _blas().limit(limits=1, user_api="blas")
+    return limited
 
 
 def _best_scale(operator: LinearOperator, readings: Array) -> np.floating:

@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from tofclip.arrays import LANES
+from tofclip.operators.kernels import sparse_times_block
 
 TILE = 32
 
@@ -63,6 +64,27 @@ def lanes_to_frames(block, frames):
         for lane in range(frames.shape[0]):
             for pixel in range(first, last):
                 frames[lane, pixel] = block[pixel, lane]
+
+
+@compiled
+def traces_of_pixels(tile_starts, columns, values, weights, traces, span):
+    """``traces[:, span[0] + t] = M @ weights[t // LANES, :, t % LANES]`` for a sparse matrix M in column tiles.
+
+    Parameters
+    ----------
+    tile_starts, columns, values
+        See `tofclip.operators.sparse.Tiles`; a row for each trace.
+    weights : (blocks, M's columns, LANES) array
+    traces : (M's rows, time) array, of which the columns from ``span[0]`` to below ``span[1]`` are overwritten
+    """
+    part = np.empty((traces.shape[0], LANES), traces.dtype)
+    for block in range(weights.shape[0]):
+        sparse_times_block(tile_starts, columns, values, weights[block], part)
+        first = span[0] + block * LANES
+        last = min(first + LANES, span[1])
+        for row in range(part.shape[0]):
+            for column in range(first, last):
+                traces[row, column] = part[row, column - first]
 
 
 @compiled

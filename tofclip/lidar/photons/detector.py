@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofclip.arrays import blocks, run_blocks
 from tofclip.errors import InputError, ShapeError
-from tofclip.lidar.pulse import Pulse
+from tofclip.lidar.pulse import Pulse, Table
 from tofclip.units import SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float64]
@@ -107,10 +106,9 @@ class PhotonDetector:
         return self.pulse.binned(self.bin_width)
 
     @cached_property
-    def kernel_pulse(self) -> tuple[Any, ...]:
+    def kernel_pulse(self) -> Table:
         """The binned pulse as the compiled loops take it."""
-        shape = self.shape
-        return shape.samples, shape.slope, shape.spacing, shape.origin, *shape.extent(FAINT)
+        return self.shape.table(FAINT)
 
     @property
     def times(self) -> FloatArray:
@@ -205,7 +203,7 @@ class PhotonDetector:
             rows = np.full(sought.size, -1)
             rows[sought] = np.where(photons[sought] > 0, level, -1)
             table = self._table(known)
-            arguments = table, self.first_offset, self.kernel_pulse, self.times
+            arguments = table, self.first_offset, self.kernel_pulse[1], self.times
             take_strongest(rest, free, dither, rows, *arguments, peaks, numbers)
         return peaks, numbers
 
@@ -230,7 +228,7 @@ class PhotonDetector:
         found = np.full((*peaks.shape, 3), np.nan)
 
         def work(piece: slice) -> None:
-            locate(counts[piece], peaks[piece], numbers[piece], self.kernel_pulse, self.times, found[piece])
+            locate(counts[piece], peaks[piece], numbers[piece], *self.kernel_pulse, self.times, found[piece])
 
         run_blocks(work, counts.shape[0], HISTOGRAMS_PER_BLOCK)
         arrival, photons, deviation = np.moveaxis(found, -1, 0)

@@ -1,6 +1,6 @@
 """The compiled search for returns in histograms of photons.
 
-Peaks, positions below a bin and overlapping returns are treated by the steps of `tofclip.lidar.kernels`; here is what
+Positions below a bin and overlapping returns are treated by the steps of `tofclip.lidar.fit.kernels`; here is what
 Poisson statistics add.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tofclip.lidar.kernels import pulse_at, refine, unexplained, window
+from tofclip.lidar.fit.kernels import pulse_at, refine, unexplained, window
 
 POISSON = (0.0, 1.0)  # the variance of a bin is what is expected in it
 ROUNDS = 16  # the weights change with the estimate, which takes some rounds more than the plain fit
@@ -52,7 +52,7 @@ def best_scores_of_scattered(photons, bins, noise, weights, first, best):
 
 
 @njit(nogil=True, cache=True)
-def take_strongest(rest, free, dither, level, table, first, pulse, times, peaks, numbers):
+def take_strongest(rest, free, dither, level, table, first, scale, times, peaks, numbers):
     """Find the strongest return of each histogram and take its bins out, for the next one to be sought in the rest.
 
     Parameters
@@ -69,8 +69,8 @@ def take_strongest(rest, free, dither, level, table, first, pulse, times, peaks,
         Threshold and filter weights.
     first : int
         Bin of the first weight relative to the return's.
-    pulse, times
-        As in `tofclip.lidar.kernels`.
+    scale, times
+        As in `tofclip.lidar.fit.kernels`.
     peaks : (n, most returns) int64 array, changed
     numbers : (n,) int64 array, changed
     """
@@ -83,13 +83,13 @@ def take_strongest(rest, free, dither, level, table, first, pulse, times, peaks,
             continue
         peaks[row, numbers[row]] = best
         numbers[row] += 1
-        begin, end = window(times, times[best], pulse)
+        begin, end = window(times, times[best], scale)
         rest[row, begin:end] = 0
         free[row] -= end - begin
 
 
 @njit(nogil=True, cache=True)
-def locate(histograms, peaks, numbers, pulse, times, found):
+def locate(histograms, peaks, numbers, curve, scale, times, found):
     """Refine the returns of each histogram to the likelihood's maximum.
 
     Parameters
@@ -97,29 +97,29 @@ def locate(histograms, peaks, numbers, pulse, times, found):
     histograms : (n, bins) float64 array
     peaks, numbers
         As `take_strongest` left them.
-    pulse, times
-        As in `tofclip.lidar.kernels`.
+    curve, scale, times
+        As in `tofclip.lidar.fit.kernels`.
     found : (n, most returns, 3) float64 array
         Overwritten with arrival, photons and standard deviation of the arrival where there is a return.
     """
     estimate = np.empty((peaks.shape[1], 2))
     for row in range(histograms.shape[0]):
         trace, number = histograms[row], numbers[row]
-        background = quiet_rate(trace, times, peaks[row, :number], pulse)
+        background = quiet_rate(trace, times, peaks[row, :number], scale)
         for k in range(number):
             estimate[k, 0] = times[peaks[row, k]]
-            estimate[k, 1] = first_height(trace, times, background, pulse, estimate[k, 0])
-        refine(trace, times, background, pulse, estimate[:number], POISSON, ROUNDS)
+            estimate[k, 1] = first_height(trace, times, background, curve, scale, estimate[k, 0])
+        refine(trace, times, background, curve, scale, estimate[:number], POISSON, ROUNDS)
         for k in range(number):
-            summarise(trace, times, background, pulse, estimate[:number], k, found[row, k])
+            summarise(trace, times, background, curve, scale, estimate[:number], k, found[row, k])
 
 
 @njit(nogil=True, cache=True)
-def quiet_rate(trace, times, peaks, pulse):
+def quiet_rate(trace, times, peaks, scale):
     """Background photons of a bin, from the bins that no return reaches."""
     free = np.ones(trace.size, np.bool_)
     for peak in peaks:
-        first, last = window(times, times[peak], pulse)
+        first, last = window(times, times[peak], scale)
         free[first:last] = False
     photons = bins = 0.0
     for i in range(trace.size):
@@ -130,25 +130,25 @@ def quiet_rate(trace, times, peaks, pulse):
 
 
 @njit(nogil=True, cache=True)
-def first_height(trace, times, background, pulse, arrival):
+def first_height(trace, times, background, curve, scale, arrival):
     """Height of a return from the photons around it; never less than half a photon's."""
-    first, last = window(times, arrival, pulse)
+    first, last = window(times, arrival, scale)
     area = excess = 0.0
     for i in range(first, last):
-        area += pulse_at(times[i] - arrival, pulse)[0]
+        area += pulse_at(times[i] - arrival, curve, scale)[0]
         excess += trace[i] - background
     return max(excess, HALF_A_PHOTON) / max(area, 1e-3)
 
 
 @njit(nogil=True, cache=True)
-def summarise(trace, times, background, pulse, estimate, k, found):
+def summarise(trace, times, background, curve, scale, estimate, k, found):
     """Arrival, photons and the arrival's Cramer-Rao deviation at the estimate."""
     arrival, height = estimate[k, 0], estimate[k, 1]
-    first, last = window(times, arrival, pulse)
+    first, last = window(times, arrival, scale)
     pp = pd = dd = total = 0.0
     for i in range(first, last):
-        p, d = pulse_at(times[i] - arrival, pulse)
-        weight = 1 / (trace[i] - unexplained(trace, times, background, pulse, estimate, i, -1))
+        p, d = pulse_at(times[i] - arrival, curve, scale)
+        weight = 1 / (trace[i] - unexplained(trace, times, background, curve, scale, estimate, i, -1))
         pp += weight * p * p
         pd += weight * p * d
         dd += weight * d * d
