@@ -20,10 +20,10 @@ STEPS = 256
 OUTERMOST = (1.0, 99.0)
 """Percentiles between which colours are spread where nobody sets limits: a glint does not darken the rest."""
 
-BRIGHT = 90.0
+BRIGHT = 85.0
 """Percentile of the intensity from which points are drawn in full light."""
 
-DARKEST = 0.1
+DARKEST = 0.15
 GAMMA = 0.8
 
 MOST_RANKED = 100_000
@@ -84,9 +84,9 @@ class Colouring:
     """
 
     quantity: str = "range"
-    palette: str = "viridis"
+    palette: str = "turbo"
     limits: tuple[float, float] | None = None
-    equalised: bool = False
+    equalised: bool = True
     shaded: bool = True
 
     def __post_init__(self) -> None:

@@ -1,0 +1,104 @@
+"""Two ways to draw points into an array: by the graphics library where it works, by NumPy everywhere."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apps.viewer.raster import BACKGROUND, rastered
+from apps.viewer.viewpoint import DOWN, Viewpoint
+
+if TYPE_CHECKING:
+    from apps.viewer.session import Shown
+
+Image = NDArray[np.uint8]
+LONGEST_PROBE = 60.0
+"""Seconds; loading the library takes three on a slow machine."""
+
+PROBE = """
+import pyvista
+plotter = pyvista.Plotter(off_screen=True, window_size=(64, 64))
+plotter.add_mesh(pyvista.Sphere())
+raise SystemExit(0 if plotter.screenshot(return_img=True).std() > 0 else 1)
+"""
+
+
+class Renderer(Protocol):
+    """Draws what is shown."""
+
+    name: str
+
+    def draw(self, shown: Shown, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int) -> Image:
+        """Return a picture of `shape` rows and columns, (rows, columns, 3); points are `point_px` wide."""
+        ...
+
+
+class PyvistaRenderer:
+    """Draws off screen with VTK, every picture in the same window."""
+
+    name = "pyvista"
+
+    def __init__(self) -> None:
+        self._plotter: Any = None
+
+    def draw(self, shown: Shown, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int) -> Image:
+        import pyvista
+
+        if self._plotter is None:
+            self._plotter = pyvista.Plotter(off_screen=True)
+            self._plotter.set_background([value / 255 for value in BACKGROUND])
+        plotter, camera = self._plotter, self._plotter.camera
+        plotter.window_size = (shape[1], shape[0])
+        add_to_plotter(plotter, shown, point_px)
+        camera.position, camera.focal_point = viewpoint.eye.tolist(), viewpoint.target.tolist()
+        camera.up, camera.view_angle = (-DOWN).tolist(), float(np.rad2deg(viewpoint.field_of_view))
+        plotter.renderer.reset_camera_clipping_range()
+        return np.ascontiguousarray(plotter.screenshot(return_img=True)[..., :3])
+
+
+class RasterRenderer:
+    """Draws with NumPy; the frame around comes from matplotlib, as always."""
+
+    name = "matplotlib"
+
+    def draw(self, shown: Shown, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int) -> Image:
+        return rastered(shown.cloud.xyz, shown.colours, viewpoint, shape, point_px)
+
+
+def add_to_plotter(plotter: Any, shown: Shown, point_px: int) -> None:
+    """Put points, or the surface, into a pyvista plotter."""
+    import pyvista
+
+    plotter.remove_actor("shown", render=False)
+    if shown.surface is not None:
+        faces = np.column_stack([np.full(len(shown.surface.faces), 3), shown.surface.faces]).ravel()
+        plotter.add_mesh(pyvista.PolyData(shown.surface.vertices, faces), color="#d8d2c4", name="shown", specular=0.3)
+    elif len(shown.cloud):
+        points = pyvista.PolyData(shown.cloud.xyz)
+        points["colour"] = shown.colours
+        look = {"rgb": True, "point_size": point_px, "lighting": False, "name": "shown"}
+        plotter.add_mesh(points, scalars="colour", **look)
+
+
+def best_renderer() -> Renderer:
+    """Return the graphics library's where it works."""
+    return PyvistaRenderer() if graphics_work() else RasterRenderer()
+
+
+def graphics_work(probe: str = PROBE) -> bool:
+    """Whether VTK can draw here. Where it cannot it ends its process, so another one tries."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", probe],
+            capture_output=True,
+            timeout=LONGEST_PROBE,
+            check=False,
+            stdin=subprocess.DEVNULL,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return done.returncode == 0
