@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from nlos.geometry import Grid
     from nlos.hybrid import Hybrid
     from nlos.propagation.propagate import propagate
+    from nlos.refinement.refine import Refinement
     from nlos.rsd.planar import PlanarRSD
     from nlos.volume import Volume
 
@@ -38,6 +39,7 @@ __all__ = [
     "Hybrid",
     "LightCone",
     "PlanarRSD",
+    "Refinement",
     "Volume",
     "propagate",
 ]
@@ -51,6 +53,7 @@ _HOMES = {
     "Hybrid": "nlos.hybrid",
     "LightCone": "nlos.confocal.light_cone",
     "PlanarRSD": "nlos.rsd.planar",
+    "Refinement": "nlos.refinement.refine",
     "Volume": "nlos.volume",
     "propagate": "nlos.propagation.propagate",
 }

@@ -7,6 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from nlos import Capture, Grid, Hybrid
+from nlos.refinement.model import WallModel
 from tofclip.errors import InputError, ShapeError, TofclipError
 from tofclip.operators import (
     BlockDiagonal,
@@ -175,6 +177,24 @@ def identity(dtype: type) -> LinearOperator:
     return Identity((3, 5), dtype)
 
 
+def hidden_to_wall(laser: object, dtype: type) -> LinearOperator:
+    """A hidden volume of odd sides, seen from a curved wall with a point missing."""
+    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.3, 0.3, 3))
+    wall = np.stack([x, y, 0.1 * x**2 - 0.05 * y], axis=-1)
+    wall[1, 3] = np.nan
+    capture = Capture(np.ones((20, 3, 5)), wall, wall if laser is None else laser, 200e-12)
+    grid = Grid.box((-0.25, 0.2), (-0.1, 0.2), (0.5, 0.7), (0.15, 0.15, 0.1))
+    return WallModel(Hybrid(0.8, 4), capture, grid).operator(dtype)
+
+
+def hidden_to_lit_wall(dtype: type) -> LinearOperator:
+    return hidden_to_wall([0.1, 0.05, 0.0], dtype)
+
+
+def hidden_to_scanned_wall(dtype: type) -> LinearOperator:
+    return hidden_to_wall(None, dtype)
+
+
 BUILDERS: list[Callable[[type], LinearOperator]] = [
     line_projection,
     sparse_matrix,
@@ -206,6 +226,8 @@ BUILDERS: list[Callable[[type], LinearOperator]] = [
     sheared_views,
     reshape,
     identity,
+    hidden_to_lit_wall,
+    hidden_to_scanned_wall,
 ]
 BATCHES = [(), (1,), (3,), (32,), (33,)]
 

@@ -41,7 +41,10 @@ class NonnegativeSparsity:
 
         number = current.dtype.type
         total = np.empty(current.shape[-1])
-        nonnegative_shrinkage(current, previous, momentum, gradient, number(step), number(step * self.weight), total)
+        # Every pixel is on its own: a block of volumes is one of tall pictures.
+        pixels = (array.reshape(-1, *array.shape[-2:]) for array in (current, previous))
+        slope = gradient.reshape(-1, *gradient.shape[-2:])
+        nonnegative_shrinkage(*pixels, momentum, slope, number(step), number(step * self.weight), total)
         return self.weight * total
 
 

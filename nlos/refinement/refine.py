@@ -1,0 +1,112 @@
+"""`nlos.Refinement`: the hybrid, iterated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from nlos.capture import Capture
+from nlos.exposure import unfolded_band
+from nlos.geometry import Grid
+from nlos.hybrid import Hybrid
+from nlos.method import Progress, Support, silent
+from nlos.plane import step
+from nlos.refinement.model import WallModel
+from nlos.sampling import warn_of_aliasing
+from nlos.volume import Volume
+from tofclip.recovery import Method, Sparse
+from tofclip.recovery.light_field_variation import LightFieldVariation
+
+FINEST_PER_WAVELENGTH = 5.0
+"""Voxels per carrier wavelength in depth: a point between two of them is then off by less than 1.3 rad."""
+
+
+def variation(grid: Grid, weight: float = 2e-2, iterations: int = 60) -> LightFieldVariation:
+    """Return the prior of even surfaces with sharp borders: total variation along x, y and z alike.
+
+    Parameters
+    ----------
+    grid : Grid
+        What will be imaged on; evenly spaced.
+    weight, iterations
+        As of `tofclip.recovery.TotalVariation`.
+    """
+    across = step(grid.x) if grid.x.size > 1 else 1.0
+    along = step(grid.z) if grid.z.size > 1 else across
+    return LightFieldVariation(weight, iterations, grid=(grid.z.size, 1), angular=across / along)
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """The hidden albedo that explains a capture best, among those that a prior prefers.
+
+    Minimises ``1/2 |A h - f|^2 + prior(h)`` over h >= 0 by FISTA, with f the wall's phasors and A the hybrid's own way
+    from a volume to the wall; A'f is the real part of the hybrid's field. The albedo is real and not negative, so that
+    the phase of f tells where within a wave a point lies: voxels have to resolve the carrier in depth.
+
+    Every step costs some ten hybrid images. Memory: some 40 bytes per plane wave and frequency and thread, and twelve
+    volumes.
+
+    Parameters
+    ----------
+    hybrid : Hybrid
+        Its wavelength, cycles, tolerance and virtual plane.
+    prior : Method
+        A proximal method of `tofclip.recovery`; `Sparse` is l1, `variation` total variation.
+    """
+
+    hybrid: Hybrid
+    prior: Method = field(default_factory=lambda: Sparse(weight=2e-2, iterations=60))
+
+    def supports(self, capture: Capture, grid: Grid) -> Support:
+        """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with ``.reason``."""
+        return self.hybrid.supports(capture, grid) and self._depth_support(grid)
+
+    def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
+        """Image the hidden scene.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+        progress : callable, optional
+            Called with the number of voxels after every iteration.
+
+        Returns
+        -------
+        Volume
+            Albedo up to one factor, float32, not negative.
+
+        Raises
+        ------
+        InputError
+            `supports` says no.
+        """
+        self.supports(capture, grid).require()
+        warn_of_aliasing(capture, unfolded_band(capture, grid, self.hybrid.pulse))
+        model = WallModel(self.hybrid, capture, grid)
+        result = self.prior.recover(
+            model.operator(), model.readings(), progress=lambda done: progress(done * grid.size)
+        )
+        settings = {
+            "method": "refinement",
+            "wavelength_m": self.hybrid.wavelength,
+            "cycles": self.hybrid.cycles,
+            "prior": self.prior.name,
+            "iterations": result.iterations,
+            "stopped_because": result.stopped_because,
+        }
+        albedo = (result.frames[0] * model.outward).astype(np.float32)
+        return Volume(albedo, grid, {**capture.provenance, "imaging": settings})
+
+    def _depth_support(self, grid: Grid) -> Support:
+        coarsest = float(np.diff(grid.z).max()) if grid.z.size > 1 else 0.0
+        allowed = self.hybrid.wavelength / FINEST_PER_WAVELENGTH
+        # Voxels drawn exactly at the limit must not be refused for a rounding error.
+        if coarsest > allowed * (1 + 1e-6):
+            return Support(
+                f"voxels {coarsest:.3g} m apart in depth are too coarse to refine with waves of "
+                f"{self.hybrid.wavelength:.3g} m: use at most {allowed:.3g} m"
+            )
+        return Support()
