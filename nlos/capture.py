@@ -173,10 +173,14 @@ class Capture:
         return float(np.median(cKDTree(places).query(places[:: len(places) // MEASURED_POINTS + 1], 2)[0][:, 1]))
 
     def traces(self, selection: slice = slice(None)) -> NDArray[np.float32]:
-        """Signals of some valid wall points, in the order of `points`, shape (points, t)."""
-        columns = np.flatnonzero(self.valid)[selection]
-        by_point = self.signal.reshape(self.signal.shape[0], -1)[:, columns].T
-        return np.ascontiguousarray(by_point)
+        """Signals of some valid wall points, in the order of `points`, shape (points, t).
+
+        All signals of a complete wall are not copied: then time is the slow axis in memory.
+        """
+        in_time = self.signal.reshape(self.signal.shape[0], -1)
+        if selection == slice(None) and self.valid.all():
+            return in_time.T
+        return np.ascontiguousarray(in_time[:, np.flatnonzero(self.valid)[selection]].T)
 
     @classmethod
     def from_frames(cls, frames: Frames) -> Capture:

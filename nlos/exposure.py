@@ -41,7 +41,10 @@ class Exposure:
 
     def phasors(self, capture: Capture, band: Band) -> NDArray[np.complex64]:
         """Return the phasors of the members, shape (n, frequencies)."""
-        return np.asarray(band.phasors(capture.traces()[self.members]), np.complex64)
+        traces = capture.traces()
+        return np.asarray(
+            band.phasors(traces if len(self.members) == len(traces) else traces[self.members]), np.complex64
+        )
 
 
 def exposures(capture: Capture) -> list[Exposure]:
@@ -72,22 +75,22 @@ def unfolded_band(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Band:
     Evenly spaced frequencies repeat a signal with their period; where the paths of the grid go beyond the record, the
     record is continued with silence.
     """
-    axis = capture.axis
+    outward, back = leg(capture.lasers, grid), leg(capture.points, grid)
+    return band_without_echo(capture.axis, pulse, outward[0] + back[0], outward[1] + back[1])
+
+
+def band_without_echo(axis: TimeAxis, pulse: VirtualPulse, shortest: float, longest: float) -> Band:
+    """Return the pulse's band over a period in which paths from `shortest` to `longest` (m) meet the record once."""
     tail = Band(pulse, axis).tail_bins * axis.spacing
-    shortest, longest = _paths(capture, grid)
     period = max(longest - (axis.start - tail), axis.paths[-1] + tail - shortest)
     bins = max(axis.bins, int(np.ceil(period / axis.spacing)) - 2 * Band(pulse, axis).tail_bins)
     return Band(pulse, TimeAxis(bins, axis.bin_width, axis.start))
 
 
-def _paths(capture: Capture, grid: Grid) -> tuple[float, float]:
-    """Bounds of the path from a laser spot over a voxel to a wall point, m."""
+def leg(ends: FloatArray, grid: Grid) -> tuple[float, float]:
+    """Bounds of the way between any of some points (n, 3) and any voxel, m."""
     axes = (grid.x, grid.y, grid.z)
     low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
-    least, most = [], []
-    for ends in (capture.points, capture.lasers):
-        outside = np.maximum(np.maximum(low - ends, ends - high), 0)
-        across = np.maximum(np.abs(ends - low), np.abs(high - ends))
-        least.append(float(np.linalg.norm(outside, axis=1).min()))
-        most.append(float(np.linalg.norm(across, axis=1).max()))
-    return sum(least), sum(most)
+    outside = np.maximum(np.maximum(low - ends, ends - high), 0)
+    across = np.maximum(np.abs(ends - low), np.abs(high - ends))
+    return float(np.linalg.norm(outside, axis=1).min()), float(np.linalg.norm(across, axis=1).max())

@@ -24,6 +24,9 @@ from tofclip.errors import InputError
 ZONES, STRICT_ZONES = 2.0, 4.0
 """Room on the virtual plane beside the straight ways, in Fresnel zones; the second below `STRICT`."""
 
+PASSAGE_SHARE = 0.6
+"""Of the error allowed, what the way from the wall to the plane may take."""
+
 STRICT = 3e-3
 """Tolerance."""
 
@@ -115,7 +118,7 @@ class Hybrid:
         warn_of_aliasing(capture, band)
         total = np.zeros(grid.shape, np.complex64)
         for part, way in self._ways(capture, grid):
-            on_plane = carried(capture, part, way.plane, band, self.propagation).values
+            on_plane = carried(capture, part, way.plane, band, self.propagation, PASSAGE_SHARE * self.tolerance).values
             diffract(way, on_plane * np.float32(np.prod(way.plane.steps)), source_of(part, band), total, progress)
         settings = {
             "method": "hybrid",

@@ -7,6 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
+from nlos.rsd.kernels import TAPS
+
 compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "reassoc", "arcp"}, error_model="numpy")
 inlined = njit(inline="always")
 
@@ -141,3 +143,87 @@ def _add_shifted(signal, now, later, total):
     total[signal.size] += later * signal[signal.size - 1]
     for i in range(1, signal.size):
         total[i] += now * signal[i] + later * signal[i - 1]
+
+
+@compiled
+def tabulate(over_nodes, node, share, reach, table):
+    """Interpolate functions of the lateral wavenumber at the plane waves of one quadrant.
+
+    Parameters
+    ----------
+    over_nodes : (nodes, n) float32 array
+    node : (columns, rows) int64 array
+        First node about every plane wave; indices along x and y from 0 on.
+    share : (columns, rows, TAPS) float32 array
+    reach : (some columns,) int64 array
+        Largest index along y that counts in every column.
+    table : (n, columns, 2 * highest + 1) float32 array
+        Along y all indices from the most negative on; overwritten as far as waves count.
+    """
+    count = np.uint64(over_nodes.shape[1])
+    highest = table.shape[2] // 2
+    flat, sums = over_nodes.reshape(-1), np.empty(over_nodes.shape[1], np.float32)
+    for column in range(reach.size):
+        for row in range(reach[column] + 1):
+            first = np.uint64(node[column, row]) * count
+            sums[:] = 0
+            for tap in range(TAPS):
+                weight = share[column, row, tap]
+                for m in range(count):
+                    sums[m] += weight * flat[first + m]
+                first += count
+            for m in range(over_nodes.shape[1]):
+                table[m, column, highest + row] = sums[m]
+        for m in range(over_nodes.shape[1]):
+            above, below = table[m, column, highest:], table[m, column, : highest + 1]
+            for row in range(1, reach[column] + 1):
+                below[highest - row] = above[row]
+
+
+@compiled
+def join_terms(spectra, table, reach, shift_x, shift_y, cell, joined):
+    """Add ``sum_m table[m] * spectra[m]``, moved by an offset in space, to the plane waves of a flat spectrum.
+
+    Parameters
+    ----------
+    spectra : (m, columns, 2 * rows) float32 array
+        Real and imaginary parts in turns; columns and rows in the order of Fourier transforms.
+    table : (2 * m, n + 1, 2 * highest + 1) float32 array
+        Real parts of all terms, then imaginary parts; along y all indices from the most negative on.
+    reach : (n + 1,) int64 array
+        Largest index along y that counts in every column.
+    shift_x, shift_y : complex64 array
+        Phases of all indices from the most negative on; ``2 * highest + 1`` along y.
+    cell : (columns, rows) int64 array
+        Where every plane wave goes; the middle one has indices 0.
+    joined : (cells,) complex64 array
+        Added to.
+    """
+    terms, columns, rows = spectra.shape[0], spectra.shape[1], spectra.shape[2] // 2
+    highest = shift_y.size // 2
+    line = np.empty(2 * shift_y.size, np.float32)
+    for x in range(1 - reach.size, reach.size):
+        column = abs(x)
+        lowest, end = highest - reach[column], highest + reach[column] + 1
+        line[2 * lowest : 2 * end] = 0
+        for m in range(terms):
+            # A spectrum shorter than the line repeats itself.
+            y, row = lowest, (lowest - highest) % rows
+            while y < end:
+                count = min(rows - row, end - y)
+                factors = table[m, column, y : y + count], table[terms + m, column, y : y + count]
+                values = spectra[m, x % columns, 2 * row : 2 * (row + count)]
+                _add_products(factors[0], factors[1], values, line[2 * y : 2 * (y + count)])
+                y, row = y + count, 0
+        along, to = shift_x[shift_x.size // 2 + x], cell[cell.shape[0] // 2 + x]
+        for y in range(lowest, end):
+            joined[to[y]] += complex(line[2 * y], line[2 * y + 1]) * along * shift_y[y]
+
+
+@compiled
+def _add_products(real, imaginary, values, sums):
+    """Add the products of complex numbers, the factors' parts apart and the others' in turns."""
+    for y in range(np.uint64(real.size)):
+        a, b, c, d = real[y], imaginary[y], values[2 * y], values[2 * y + 1]
+        sums[2 * y] += a * c - b * d
+        sums[2 * y + 1] += a * d + b * c

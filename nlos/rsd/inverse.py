@@ -8,16 +8,23 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.rsd.spectrum import PlaneWaves
+from nlos.rsd.window import VECTOR
 
-_PLANNING = threading.Lock()  # FFTW plans one transform at a time
-
-ALIGNED = 8
-"""complex64 numbers in 64 bytes, what vector instructions like to start at."""
-
+PLANNING = threading.Lock()
+"""FFTW plans one transform at a time."""
 
 PRODUCT_RATE = 10
 """How many operations of a matrix product take as long as one of a pruned Fourier transform; measured."""
+
+
+class Indices(Protocol):
+    """Plane waves, known by their indices along y and x; these reach as far below 0 as above."""
+
+    @property
+    def row(self) -> NDArray[np.int64]: ...
+
+    @property
+    def column(self) -> NDArray[np.int64]: ...
 
 
 class Inverse(Protocol):
@@ -37,17 +44,20 @@ class Inverse(Protocol):
         ...
 
 
-def inverse(waves: PlaneWaves, lattice: tuple[int, int], wanted: tuple[int, int], terms: int) -> Inverse:
+def inverse(waves: Indices, lattice: tuple[float, float], wanted: tuple[int, int], terms: int) -> Inverse:
     """Choose the quicker way: few voxels of a long period by matrix products, many by Fourier transforms.
 
-    Parameters are those of `InverseTransform`.
+    Parameters are those of `InverseTransform`; a period that is no whole number of voxels leaves matrix products only.
     """
     columns, rows = (2 * int(np.max(index)) + 1 for index in (waves.column, waves.row))
+    high, wide = (int(length) for length in lattice)
+    if (high, wide) != lattice:
+        return InverseProduct(waves, lattice, wanted, terms)
     products = 8 * columns * wanted[0] * (rows + wanted[1])
     transforms = 5 * (columns * lattice[0] * np.log2(lattice[0] + 1) + wanted[0] * lattice[1] * np.log2(lattice[1] + 1))
     if products < PRODUCT_RATE * transforms:
         return InverseProduct(waves, lattice, wanted, terms)
-    return InverseTransform(waves, lattice, wanted, terms)
+    return InverseTransform(waves, (high, wide), wanted, terms)
 
 
 class InverseProduct:
@@ -56,7 +66,7 @@ class InverseProduct:
     Parameters are those of `InverseTransform`.
     """
 
-    def __init__(self, waves: PlaneWaves, lattice: tuple[int, int], wanted: tuple[int, int], terms: int) -> None:
+    def __init__(self, waves: Indices, lattice: tuple[float, float], wanted: tuple[int, int], terms: int) -> None:
         rows, columns = (int(np.max(index)) for index in (waves.row, waves.column))
         self.cell = (waves.column + columns) * (2 * rows + 1) + waves.row + rows
         self.carrier = np.ones(wanted[1], np.complex64)
@@ -79,7 +89,7 @@ class InverseTransform:
 
     Parameters
     ----------
-    waves : PlaneWaves
+    waves : Indices
     lattice : (int, int)
         Voxels in a period along y and x.
     wanted : (int, int)
@@ -88,7 +98,7 @@ class InverseTransform:
         Spectra at most.
     """
 
-    def __init__(self, waves: PlaneWaves, lattice: tuple[int, int], wanted: tuple[int, int], terms: int) -> None:
+    def __init__(self, waves: Indices, lattice: tuple[int, int], wanted: tuple[int, int], terms: int) -> None:
         import pyfftw
 
         high, wide = lattice
@@ -105,7 +115,7 @@ class InverseTransform:
         self._images: NDArray[np.complex64] = pyfftw.zeros_aligned(images, np.complex64)
         middle: NDArray[np.complex64] = pyfftw.zeros_aligned((high, wide), np.complex64)
         self._columns, self._rows, self._middle = columns, rows, middle
-        with _PLANNING:
+        with PLANNING:
             backward = {"direction": "FFTW_BACKWARD", "axes": (1,), "flags": ("FFTW_MEASURE",)}
             self._along_y = pyfftw.FFTW(self.spectra[0, :columns], middle[:, :columns].T, **backward)
             self._along_x = pyfftw.FFTW(middle[:rows], self._images[0, :rows], **backward)
@@ -122,4 +132,4 @@ class InverseTransform:
 
 
 def _padded(count: int) -> int:
-    return -(-count // ALIGNED) * ALIGNED
+    return -(-count // VECTOR) * VECTOR

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.rsd.kernels import TAPS, interpolation, sample_waves
+from nlos.rsd.window import Window
 
 FloatArray = NDArray[np.float64]
 
@@ -41,6 +42,11 @@ class Waves:
     continued: bool
 
     @property
+    def numbers(self) -> FloatArray:
+        """Wavenumbers, rad/m."""
+        return self.first + self.step * np.arange(self.count, dtype=np.float64)
+
+    @property
     def highest(self) -> float:
         """Largest wavenumber, rad/m."""
         return self.first + self.step * (self.count - 1)
@@ -52,15 +58,13 @@ class Transfer:
 
     It is the Hankel transform ``2 pi * int g(sqrt(rho^2 + z^2)) * window(rho) * J_0(q * rho) * rho d rho``. Since the
     window, not a period, ends the wave, a convolution through it is as exact as one with the sampled wave, wherever
-    source and target are nearer to each other than `reach`; and since it depends on q alone, few values make it up.
+    source and target are nearer to each other than the window's reach; and since it depends on q alone, few values make
+    it up.
 
     Parameters
     ----------
     waves : Waves
-    reach : float
-        Radius up to which the window is 1, m.
-    edge : float
-        Radius from which on it is 0, m.
+    window : Window
     lateral : float
         Largest lateral wavenumber q wanted, rad/m.
     finest : float
@@ -68,15 +72,20 @@ class Transfer:
     """
 
     waves: Waves
-    reach: float
-    edge: float
+    window: Window
     lateral: float
     finest: float
 
     @cached_property
     def node_step(self) -> float:
         """Distance of neighbouring nodes in q, rad/m."""
-        return np.pi / (self.edge * OVERSAMPLING)
+        return np.pi / (self.window.edge * OVERSAMPLING)
+
+    @cached_property
+    def nodes(self) -> FloatArray:
+        """Lateral wavenumbers of the nodes, rad/m."""
+        # The transfer function is even in q: nodes on both sides of 0 serve the interpolation there.
+        return self.node_step * np.arange(-(TAPS // 2), np.ceil(self.lateral / self.node_step) + TAPS // 2 + 1)
 
     @cached_property
     def _radii(self) -> tuple[FloatArray, FloatArray]:
@@ -86,7 +95,7 @@ class Transfer:
         """
         fastest = self.waves.highest + self.lateral
         h = min(2 * np.pi / (fastest * RADII_PER_PERIOD), self.finest)
-        t = np.arange(-8.0, self.edge / h + 1)
+        t = np.arange(-8.0, self.window.edge / h + 1)
         radii = h * np.logaddexp(0, t)
         return radii, 2 * np.pi * radii * h / (1 + np.exp(-t))
 
@@ -96,11 +105,9 @@ class Transfer:
         from scipy.special import erfc, j0
 
         radii, weights = self._radii
-        ramp = (radii - self.reach) / (self.edge - self.reach)
-        window = np.where(ramp <= 1, erfc(WINDOW_STEEPNESS * (2 * ramp - 1)) / 2, 0)
-        # The transfer function is even in q: nodes on both sides of 0 serve the interpolation there.
-        nodes = self.node_step * np.arange(-(TAPS // 2), np.ceil(self.lateral / self.node_step) + TAPS // 2 + 1)
-        return np.asarray(j0(np.outer(nodes, radii)) * (weights * window), np.float32)
+        ramp = (radii - self.window.reach) / (self.window.edge - self.window.reach)
+        falling = np.where(ramp <= 1, erfc(WINDOW_STEEPNESS * (2 * ramp - 1)) / 2, 0)
+        return np.asarray(j0(np.outer(self.nodes, radii)) * (weights * falling), np.float32)
 
     def interpolation(self, lateral: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Find lateral wavenumbers among the nodes: the first node to take, and the weights of `TAPS` from it on."""

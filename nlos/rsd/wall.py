@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,53 @@ from tofclip.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
+SAME_PLACE = 0.02
+"""Coordinates nearer to each other than this fraction of the widest gap are one."""
+
+
+@dataclass(frozen=True, eq=False)
+class WallLattice:
+    """Wall points above the places of an even lattice, at whatever depth; some places may stay empty.
+
+    Parameters
+    ----------
+    x, y : (n,) array
+        Coordinates of the places, m.
+    row, column : (points,) int array
+        Place of every wall point.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    row: NDArray[np.intp]
+    column: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, points: FloatArray) -> WallLattice:
+        """Find the lattice that wall points (n, 3) stand above.
+
+        Raises
+        ------
+        InputError
+            There is none, or two points stand in one place.
+        """
+        x, column = _lattice(points[:, 0], "x")
+        y, row = _lattice(points[:, 1], "y")
+        if np.unique(row * x.size + column).size < len(points):
+            raise InputError("two wall points stand in one place; use the hybrid method, which takes them as they are")
+        return cls(x, y, row, column)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Places along (y, x)."""
+        return self.y.size, self.x.size
+
+    @cached_property
+    def complete(self) -> bool:
+        """Whether the points are all places in C order."""
+        places = self.row * self.x.size + self.column
+        return places.size == self.x.size * self.y.size and bool(np.all(np.diff(places) == 1))
+
 
 @dataclass(frozen=True, eq=False)
 class PlanarWall:
@@ -20,13 +68,11 @@ class PlanarWall:
     Parameters
     ----------
     plane : Plane
-    row, column : (points,) int array
-        Place of every wall point.
+    lattice : WallLattice
     """
 
     plane: Plane
-    row: NDArray[np.intp]
-    column: NDArray[np.intp]
+    lattice: WallLattice
 
     @classmethod
     def of(cls, points: FloatArray) -> PlanarWall:
@@ -37,22 +83,22 @@ class PlanarWall:
         InputError
             They stand on none, or not on a plane z = const.
         """
-        x, column = _lattice(points[:, 0], "x")
-        y, row = _lattice(points[:, 1], "y")
-        depth = float(points[:, 2].mean())
+        lattice = WallLattice.of(points)
+        plane = Plane(lattice.x, lattice.y, float(points[:, 2].mean()))
         relief = float(np.ptp(points[:, 2]))
-        finest = min(float(x[1] - x[0]), float(y[1] - y[0]))
-        if relief > 2 * EVENNESS * finest:
+        if relief > 2 * EVENNESS * min(plane.steps):
             raise InputError(
                 f"the wall is not a plane z = const: it is {relief:.3g} m deep; use the hybrid method, which carries "
                 "its signals onto one"
             )
-        return cls(Plane(x, y, depth), row, column)
+        return cls(plane, lattice)
 
     def field(self, phasors: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Put phasors (points, frequencies) into their places, shape (y, x, frequencies)."""
+        if self.lattice.complete:
+            return phasors.reshape(*self.plane.shape, -1)
         values = np.zeros((*self.plane.shape, phasors.shape[1]), np.complex64)
-        values[self.row, self.column] = phasors
+        values[self.lattice.row, self.lattice.column] = phasors
         return values
 
 
@@ -60,9 +106,11 @@ def _lattice(coordinates: FloatArray, name: str) -> tuple[FloatArray, NDArray[np
     """Even axis that all coordinates lie on, and the place of each."""
     ordered = np.sort(coordinates)
     gaps = np.diff(ordered)
-    steps = int(np.count_nonzero(gaps > gaps.max() / 2)) if gaps.size else 0
-    if steps == 0:
+    # Points of one column differ by far less than columns, even where some columns between are missing.
+    apart = gaps[gaps > SAME_PLACE * gaps.max(initial=0)]
+    if apart.size == 0:
         raise InputError(f"the wall's points need at least two different {name}")
+    steps = round(float((ordered[-1] - ordered[0]) / np.median(apart)))
     axis = np.linspace(ordered[0], ordered[-1], steps + 1)
     place = np.rint((coordinates - axis[0]) / (axis[1] - axis[0])).astype(np.intp)
     if np.max(np.abs(coordinates - axis[place])) > EVENNESS * (axis[1] - axis[0]):

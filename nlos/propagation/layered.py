@@ -1,0 +1,91 @@
+"""From a wall in relief to a plane by Fourier transforms: a few convolutions per frequency."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.propagation.analysis import LatticeAnalysis
+from nlos.propagation.kernels import join_terms, tabulate
+from nlos.propagation.passage import Passage
+from nlos.rsd.inverse import inverse
+from tofclip.arrays import run_blocks
+
+IntArray = NDArray[np.int64]
+
+
+def layered_sum(passage: Passage, phasors: NDArray[np.complex64]) -> NDArray[np.complex64]:
+    """Return ``sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|`` on a plane, within the passage's tolerance.
+
+    Per frequency some two to ten Fourier transforms of the wall, weighted by functions of its depth, and one back.
+
+    Parameters
+    ----------
+    passage : Passage
+    phasors : (n, frequencies) complex64 array
+
+    Returns
+    -------
+    (y, x, frequencies) complex64 array
+    """
+    from threadpoolctl import threadpool_limits
+
+    field = np.empty((*passage.plane.shape, phasors.shape[1]), np.complex64)
+    relief = passage.relief
+    with threadpool_limits(1, "blas"):
+        most = max(relief.counts)
+        _ = passage.places, passage.shifts
+        spare: list[_Bench] = []
+
+        def work(some: slice) -> None:
+            bench = spare.pop() if spare else _Bench(passage, most)
+            for number in range(some.start, some.stop):
+                bench.carry(number, phasors, field)
+            spare.append(bench)
+
+        run_blocks(work, len(relief.groups), size=1)
+    return field
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Indices of all plane waves within a rectangle, column by column."""
+
+    row: IntArray
+    column: IntArray
+
+    @classmethod
+    def within(cls, reach: tuple[int, int]) -> _Grid:
+        column, row = np.meshgrid(*(np.arange(-n, n + 1) for n in reach[::-1]), indexing="ij")
+        return cls(row.ravel(), column.ravel())
+
+
+class _Bench:
+    """One thread's memory, and what it does there."""
+
+    def __init__(self, passage: Passage, terms: int) -> None:
+        self.passage = passage
+        self.analysis = LatticeAnalysis(passage.wall, passage.lattice, passage.reach[1], terms)
+        rows, columns = (2 * reach + 1 for reach in passage.reach)
+        wanted = passage.plane.shape
+        self.inverse = inverse(_Grid.within(passage.reach), passage.plane_lattice, wanted, 1)
+        self.cell = self.inverse.cell.reshape(columns, rows)
+        self.table = np.empty((2 * terms, passage.reach[1] + 1, rows), np.float32)
+
+    def carry(self, number: int, phasors: NDArray[np.complex64], field: NDArray[np.complex64]) -> None:
+        """Carry one group of frequencies."""
+        passage = self.passage
+        group, terms = passage.relief.groups[number], passage.relief.terms(number)
+        values = np.ascontiguousarray(phasors[:, group].T)
+        node, share = passage.places
+        shift_y, shift_x = passage.shifts
+        spectrum = self.inverse.spectra[0].reshape(-1)
+        for i, frequency in enumerate(range(group.start, group.stop)):
+            reach = passage.rows_within(frequency)
+            tabulate(terms.over_waves[i], node, share, reach, self.table)
+            spectra = self.analysis.spectra(values[i], terms.over_points, reach.size - 1)
+            spectrum[:] = 0
+            join_terms(spectra.view(np.float32), self.table, reach, shift_x, shift_y, self.cell, spectrum)
+            np.multiply(self.inverse.images(1)[0], self.inverse.carrier, out=field[..., frequency])

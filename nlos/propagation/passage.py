@@ -1,0 +1,193 @@
+"""What a way from a wall in relief to a plane by Fourier transforms consists of: lattices, plane waves, and terms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.plane import Plane, step
+from nlos.propagation.relief import Relief
+from nlos.rsd.transfer import Transfer, Waves
+from nlos.rsd.wall import WallLattice
+from nlos.rsd.window import Window, convenient, farthest_apart, shortest_periods
+from tofclip.errors import InputError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+LONGER = 1.25
+"""Times the shortest period, that a lattice may be longer to suit both wall and plane."""
+
+WHOLE = 1e-3
+"""Points by which the far end of a plane may be off the lattice."""
+
+FINEST = 5e-4
+"""Tolerance down to which Fourier transforms keep it; measured."""
+
+PREPARATION, CALL, TRANSFORM, PRODUCT = 0.02, 2e-5, 3e-9, 2e-10
+"""Seconds on one core, roughly: for all transfer functions, and per term, lattice place, and term of a direct sum."""
+
+FADED = 0.75
+"""Waves that fade from the nearest wall point to the plane to this power of the tolerance are left out; measured."""
+
+GRAZING = 2.0
+"""Room for grazing waves, in spreads of the window: near the wall they are a larger share than in the scene."""
+
+
+@dataclass(frozen=True, eq=False)
+class Passage:
+    """How fields get from the points of a wall to a plane before it.
+
+    Parameters
+    ----------
+    points : (n, 3) array
+        m.
+    wall : WallLattice
+        Their places.
+    plane : Plane
+    waves : Waves
+    strength : (frequencies,) array
+        Share of each frequency in the pulse.
+    tolerance : float
+        Relative error allowed.
+    """
+
+    points: FloatArray
+    wall: WallLattice
+    plane: Plane
+    waves: Waves
+    strength: FloatArray
+    tolerance: float
+
+    @classmethod
+    def of(
+        cls, points: FloatArray, plane: Plane, waves: Waves, strength: FloatArray, tolerance: float
+    ) -> Passage | None:
+        """Return the passage from wall points (n, 3), or None if they stand above no lattice."""
+        try:
+            wall = WallLattice.of(points)
+        except InputError:
+            return None
+        return cls(points, wall, plane, waves, strength / strength.max(), tolerance)
+
+    @cached_property
+    def quicker(self) -> bool:
+        """Whether Fourier transforms lead to the plane faster than a direct sum, and within the tolerance."""
+        relief = float(np.ptp(self._distances))
+        terms = 4 + (self.waves.first + self.waves.highest) / 2 * relief / (2 * np.pi)
+        layers = PREPARATION + self.waves.count * terms * (CALL + TRANSFORM * np.prod(self.lattice))
+        direct = PRODUCT * self.waves.count * len(self.points) * np.prod(self.plane.shape)
+        return self.tolerance >= FINEST and bool(layers < direct)
+
+    @cached_property
+    def _distances(self) -> FloatArray:
+        distances: FloatArray = self.plane.z - self.points[:, 2]
+        return distances
+
+    @cached_property
+    def _farthest(self) -> tuple[float, float]:
+        return farthest_apart(Plane(self.wall.x, self.wall.y, 0.0), self.plane.y, self.plane.x)
+
+    @cached_property
+    def _lattices(self) -> tuple[tuple[int, float], tuple[int, float]]:
+        """Places of the wall and of the plane in a period along y, and along x."""
+        y, x = (
+            common_period(side, step(wall), step(plane), plane.size)
+            for side, wall, plane in zip(
+                shortest_periods(self._farthest), (self.wall.y, self.wall.x), (self.plane.y, self.plane.x), strict=True
+            )
+        )
+        return y, x
+
+    @cached_property
+    def lattice(self) -> tuple[int, int]:
+        """Places of the wall in a period along y and x."""
+        return self._lattices[0][0], self._lattices[1][0]
+
+    @cached_property
+    def plane_lattice(self) -> tuple[float, float]:
+        """Points of the plane in a period along y and x."""
+        return self._lattices[0][1], self._lattices[1][1]
+
+    @cached_property
+    def steps(self) -> tuple[float, float]:
+        """Distance of neighbouring plane waves along y and x, rad/m."""
+        y, x = (
+            2 * np.pi / (count * step(axis))
+            for count, axis in zip(self.lattice, (self.wall.y, self.wall.x), strict=True)
+        )
+        return y, x
+
+    @cached_property
+    def _window(self) -> Window:
+        y, x = (2 * np.pi / spacing for spacing in self.steps)
+        return Window.within(self._farthest, (y, x))
+
+    @cached_property
+    def limits(self) -> FloatArray:
+        """Largest lateral wavenumber that counts at each frequency, rad/m."""
+        k = self.waves.numbers
+        fading = FADED * np.log(1 / self.tolerance) / float(self._distances.min())
+        grazing = GRAZING * self._window.spread(self.tolerance)
+        limits: FloatArray = np.maximum(np.sqrt(k**2 + fading**2), k + grazing)
+        return limits
+
+    @cached_property
+    def reach(self) -> tuple[int, int]:
+        """Largest indices of plane waves along y and x."""
+        y, x = (int(self.limits[-1] / spacing) for spacing in self.steps)
+        return y, x
+
+    @cached_property
+    def relief(self) -> Relief:
+        """The transfer functions from all depths."""
+        finest = max(float(self._distances.min()), step(self.wall.x) / 2)
+        transfer = Transfer(self.waves, self._window, float(self.limits[-1]), finest)
+        return Relief(transfer, self._distances, self.limits, self.strength, self.tolerance)
+
+    def rows_within(self, frequency: int) -> IntArray:
+        """Largest index along y that counts in every column from 0 on."""
+        across = self.steps[1] * np.arange(int(self.limits[frequency] / self.steps[1]) + 1)
+        room = np.sqrt(np.maximum(self.limits[frequency] ** 2 - across**2, 0))
+        rows: IntArray = np.minimum(room / self.steps[0], self.reach[0]).astype(np.int64)
+        return rows
+
+    @cached_property
+    def places(self) -> tuple[IntArray, NDArray[np.float32]]:
+        """Nodes of the transfer functions about the plane waves of a quadrant, (columns, rows), and their weights."""
+        y, x = (spacing * np.arange(reach + 1) for spacing, reach in zip(self.steps, self.reach, strict=True))
+        lateral = np.hypot(x[:, np.newaxis], y)
+        # Corners outside every frequency's circle are never looked up.
+        node, share = self.relief.transfer.interpolation(np.minimum(lateral, self.limits[-1]).ravel())
+        return node.reshape(lateral.shape), share.reshape(*lateral.shape, -1)
+
+    @cached_property
+    def shifts(self) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+        """Plane waves along y and x at the plane's first point, 0 at the wall's; divided by the lattice's period."""
+        y, x = (
+            (spacing / (2 * np.pi) * np.exp(1j * spacing * (plane[0] - wall[0]) * np.arange(-reach, reach + 1))).astype(
+                np.complex64
+            )
+            for spacing, plane, wall, reach in zip(
+                self.steps, (self.plane.y, self.plane.x), (self.wall.y, self.wall.x), self.reach, strict=True
+            )
+        )
+        return y, x
+
+
+def common_period(side: float, wall: float, plane: float, count: int) -> tuple[int, float]:
+    """Return a period of at least `side` in steps of the wall and in steps of the plane.
+
+    Whole numbers of both if there are such, so that Fourier transforms lead there and back; else of the wall's.
+    """
+    shortest = convenient(side / wall)
+    length = shortest
+    while length * wall <= LONGER * side:
+        places = length * wall / plane
+        if abs(places - round(places)) * count < WHOLE * places:
+            return length, float(round(places))
+        length = convenient(length + 1)
+    return shortest, shortest * wall / plane

@@ -1,0 +1,186 @@
+"""How waves depend on the depth of the wall point that they come from, as short sums of products."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.rsd.transfer import Transfer
+from tofclip.arrays import blocks, run_blocks
+
+FloatArray = NDArray[np.float64]
+
+FREQUENCIES_AT_A_TIME = 4
+"""Neighbouring frequencies that share their functions of depth."""
+
+INTERPOLATION_SHARE, TERMS_SHARE = 0.2, 0.15
+"""Of the error allowed, what interpolation between depths and leaving out terms may take."""
+
+FLAT = 1e-5
+"""Depths closer than this are one, m."""
+
+CARRIER = 0.4
+"""Wavenumber along z, relative to the band's highest, about which the waves vary least with depth."""
+
+RESOLVED = 1e-10
+"""Combinations of depths that hold less than this share of the wall points are none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """``K_k(q, d_p) ~ sum_m over_waves[k, q, m] * over_points[m, p]`` at some frequencies.
+
+    Parameters
+    ----------
+    over_waves : (frequencies, nodes, 2 * m) float32 array
+        At the nodes of the transfer functions: all real, then all imaginary parts.
+    over_points : (m, points) complex64 array
+    """
+
+    over_waves: NDArray[np.float32]
+    over_points: NDArray[np.complex64]
+
+
+@dataclass(frozen=True, eq=False)
+class Relief:
+    """The transfer functions from wall points at many distances to one plane.
+
+    They are known at Chebyshev nodes of the distance. The fewest products that make them up at the distances that
+    occur, weighted as they occur, come from an eigenvalue problem per group of frequencies: about one for each half
+    turn that the waves differ by over the relief, and one for each piece of a wall of flat pieces.
+
+    Parameters
+    ----------
+    transfer : Transfer
+    distances : (points,) array
+        Along z, m.
+    limits : (frequencies,) array
+        Largest lateral wavenumber that counts at each frequency, rad/m.
+    strength : (frequencies,) array
+        Share of each frequency in the pulse; decides what may be neglected.
+    tolerance : float
+        Relative error allowed.
+    """
+
+    transfer: Transfer
+    distances: FloatArray
+    limits: FloatArray
+    strength: FloatArray
+    tolerance: float
+
+    @cached_property
+    def groups(self) -> list[slice]:
+        """Frequencies that are treated together."""
+        return list(blocks(self.limits.size, FREQUENCIES_AT_A_TIME))
+
+    @cached_property
+    def _span(self) -> tuple[float, float]:
+        """Middle and half the extent of the distances, m."""
+        low, high = float(self.distances.min()), float(self.distances.max())
+        return (low + high) / 2, (high - low) / 2
+
+    @cached_property
+    def nodes(self) -> FloatArray:
+        """Distances at which the transfer functions are sampled, m."""
+        middle, half = self._span
+        if half < FLAT:
+            return np.array([middle])
+        count = nodes_needed(
+            self.transfer.waves.numbers, self.strength, middle, half, INTERPOLATION_SHARE * self.tolerance
+        )
+        return middle + half * np.cos(np.pi * (np.arange(count) + 0.5) / count)
+
+    @property
+    def _carrier(self) -> float:
+        """Wavenumber along z that is taken out of all waves, rad/m; they have 0 to their own."""
+        return CARRIER * self.transfer.waves.highest
+
+    @cached_property
+    def _shapes(self) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+        """Functions of distance, orthonormal over the wall's points: from nodes (nodes, n), and at points (n, points).
+
+        A wall of few depths has few.
+        """
+        middle, half = self._span
+        count = self.nodes.size
+        angles = np.arccos(np.clip((self.distances - middle) / max(half, FLAT), -1, 1))
+        at_nodes = np.cos(np.outer(np.arange(count), np.pi * (np.arange(count) + 0.5) / count)) * (2 / count)
+        at_nodes[0] /= 2
+        weights = np.cos(np.outer(angles, np.arange(count))) @ at_nodes
+        values, vectors = np.linalg.eigh(weights.T @ weights / len(weights))
+        kept = values > RESOLVED * values[-1]
+        root = np.sqrt(values[kept])
+        from_nodes = vectors[:, kept] * root * np.exp(-1j * self._carrier * self.nodes)[:, np.newaxis]
+        at_points = (weights @ (vectors[:, kept] / root)).T * np.exp(1j * self._carrier * self.distances)
+        return from_nodes.astype(np.complex64), at_points.astype(np.complex64)
+
+    @cached_property
+    def _table(self) -> NDArray[np.complex64]:
+        """Transfer functions as combinations of `_shapes`, shape (n, nodes, frequencies)."""
+        samples = np.empty((self.nodes.size, self.transfer.nodes.size, self.limits.size), np.complex64)
+        _ = self.transfer.prepared
+
+        def sample(some: slice) -> None:
+            for i in range(some.start, some.stop):
+                parts = self.transfer.at(float(self.nodes[i]), np.zeros(2))
+                samples[i].real, samples[i].imag = parts[:, 0], parts[:, 1]
+
+        run_blocks(sample, len(samples), size=1)
+        flat = self._shapes[0].T @ samples.reshape(len(samples), -1)
+        table: NDArray[np.complex64] = flat.reshape(-1, *samples.shape[1:])
+        return table
+
+    def _of(self, group: slice) -> NDArray[np.complex64]:
+        """Transfer functions of a group, shape (frequencies, nodes, n)."""
+        return np.ascontiguousarray(self._table[..., group].T)
+
+    def _energy(self, group: slice) -> tuple[FloatArray, NDArray[np.complex128]]:
+        """Energies, increasing, and combinations of `_shapes` (n, n) that carry them."""
+        lateral = np.maximum(self.transfer.nodes, 0)
+        counting = lateral * (lateral <= self.limits[group, np.newaxis])
+        weights = np.sqrt(counting) * self.strength[group, np.newaxis]
+        table = self._of(group) * weights[..., np.newaxis].astype(np.float32)
+        flat = table.reshape(-1, table.shape[-1])
+        values, vectors = np.linalg.eigh((flat.conj().T @ flat).astype(np.complex128))
+        return np.maximum(values, 0), vectors
+
+    @cached_property
+    def _leading(self) -> list[NDArray[np.complex128]]:
+        """Combinations (n, m) of every group that have to be kept."""
+        energies = [self._energy(group) for group in self.groups]
+        every = np.sort(np.concatenate([values for values, _ in energies]))
+        allowed = (TERMS_SHARE * self.tolerance) ** 2 * every.sum()
+        weakest = every[np.searchsorted(np.cumsum(every), allowed)]
+        return [vectors[:, values >= weakest] for values, vectors in energies]
+
+    @property
+    def counts(self) -> list[int]:
+        """Number of terms of every group."""
+        return [vectors.shape[1] for vectors in self._leading]
+
+    def terms(self, number: int) -> Terms:
+        """Return the terms of one group."""
+        kept = self._leading[number].astype(np.complex64)
+        over_waves = self._of(self.groups[number]) @ kept
+        parts = np.concatenate([over_waves.real, over_waves.imag], axis=-1)
+        return Terms(parts, kept.conj().T @ self._shapes[1])
+
+
+def nodes_needed(wavenumbers: FloatArray, strength: FloatArray, middle: float, half: float, error: float) -> int:
+    """Return how many Chebyshev nodes of the distance interpolate waves to a relative error.
+
+    Enough for the phase, which runs through ``k * half`` about its middle (Jacobi-Anger expansion), and for the fall
+    with distance, which is singular at distance 0.
+    """
+    from scipy.special import jv
+
+    orders = np.arange(4, 400)
+    carrier = CARRIER * wavenumbers[-1]
+    phases = half * np.maximum(carrier, wavenumbers - carrier)
+    rest = 2 * np.abs(jv(orders, phases[:, np.newaxis])) * strength[:, np.newaxis]
+    phase = int(np.flatnonzero(np.append(rest.max(axis=0), 1) > error)[:-1].max(initial=-1)) + 5
+    fall = np.arccosh(middle / half)
+    return max(phase, int(np.ceil(np.log(1 / error) / fall)) + 1)

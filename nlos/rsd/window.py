@@ -1,0 +1,79 @@
+"""How far waves are followed, and periodic lattices in which their images keep off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.plane import Plane
+
+FloatArray = NDArray[np.float64]
+Sides = tuple[float, float]
+
+REACH = 0.88
+"""Where the window begins to fall at least, relative to the largest distance of a source and a target."""
+
+EDGE, WIDEST_EDGE = 0.25, 0.5
+"""Width of the window's edge, relative to the largest distance along one axis."""
+
+QUICK_FACTORS = (1, 3, 5, 15, 25)
+"""Of these times a power of 2, single-precision Fourier transforms take half as long as of other lengths; measured."""
+
+VECTOR = 8
+"""complex64 numbers in 64 bytes: where vector instructions like rows to start."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """A circle about every source, outside of which its wave is cut off smoothly.
+
+    Parameters
+    ----------
+    reach, edge : float
+        Radii up to which waves are whole, and from which on they are gone, m.
+    """
+
+    reach: float
+    edge: float
+
+    @classmethod
+    def within(cls, farthest: Sides, periods: Sides) -> Window:
+        """Return the widest window that lets no image of a source in a periodic lattice meet a target.
+
+        Parameters
+        ----------
+        farthest : (float, float)
+            As `farthest_apart` gives it.
+        periods : (float, float)
+            Along y and x, m; at least `shortest_periods`.
+        """
+        corner, along = float(np.hypot(*farthest)), max(farthest)
+        room = min(period - far for period, far in zip(periods, farthest, strict=True))
+        reach = min(corner, room - EDGE * along)
+        return cls(reach, min(room, reach + WIDEST_EDGE * along))
+
+    def spread(self, tolerance: float) -> float:
+        """Lateral wavenumbers by which the window's edge spreads grazing waves, rad/m; measured on point scenes."""
+        return float(np.log10(tolerance) ** 2 / 2 / (self.edge - self.reach))
+
+
+def farthest_apart(sources: Plane, y: FloatArray, x: FloatArray) -> Sides:
+    """Return the largest distance of a source on a plane from a target along y and along x, m."""
+    pairs = ((y, sources.y), (x, sources.x))
+    along_y, along_x = (float(max(abs(a[-1] - b[0]), abs(a[0] - b[-1]))) for a, b in pairs)
+    return along_y, along_x
+
+
+def shortest_periods(farthest: Sides) -> Sides:
+    """Return the shortest periods along y and x in which a window has room, m."""
+    edge = REACH * float(np.hypot(*farthest)) + EDGE * max(farthest)
+    y, x = (edge + far for far in farthest)
+    return y, x
+
+
+def convenient(count: float) -> int:
+    """Next length that Fourier transforms are quick at."""
+    lengths = (factor * 2 * VECTOR << power for factor in QUICK_FACTORS for power in range(20))
+    return min(length for length in lengths if length >= count)

@@ -1,0 +1,122 @@
+"""From walls in relief to a plane by Fourier transforms, against the direct sum."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scene_shapes import SHAPES, shaped_wall
+
+from nlos.band import Band, VirtualPulse
+from nlos.plane import Plane
+from nlos.propagation.direct import direct_sum
+from nlos.propagation.layered import layered_sum
+from nlos.propagation.passage import Passage, common_period
+from nlos.rsd.transfer import Waves
+from nlos.rsd.window import convenient
+from nlos.time_axis import TimeAxis
+
+BAND = Band(VirtualPulse(0.25, 4.24), TimeAxis(512, 32e-12))
+K = BAND.wavenumbers
+WAVES = Waves(float(K[0]), float(K[1] - K[0]), K.size, continued=False)
+STEP = 2 / 31  # of walls with 32 points along a side
+FITTING = Plane(STEP * np.arange(-20, 24), STEP * np.arange(-21, 18), 0.4)
+OTHER = Plane(np.linspace(-1.3, 1.1, 37), np.linspace(-0.8, 1.5, 29), 0.42)
+
+
+def points_of(wall: np.ndarray) -> np.ndarray:
+    return wall[np.isfinite(wall).all(axis=-1)]
+
+
+@cache
+def phasors(count: int) -> np.ndarray:
+    """Independent numbers: no symmetry of a scene hides an error."""
+    random = np.random.default_rng(2)
+    values = random.normal(size=(count, K.size)) + 1j * random.normal(size=(count, K.size))
+    return (values * BAND.weights / BAND.weights.max()).astype(np.complex64)
+
+
+def passage(points: np.ndarray, plane: Plane, tolerance: float) -> Passage:
+    found = Passage.of(points, plane, WAVES, BAND.weights, tolerance)
+    assert found is not None
+    return found
+
+
+def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+
+
+@pytest.mark.parametrize("plane", [FITTING, OTHER], ids=["fitting", "other"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_it_is_the_direct_sum_within_the_tolerance(shape: str, plane: Plane) -> None:
+    points = points_of(shaped_wall(shape, 32))
+    exact = direct_sum(points, phasors(len(points)), plane, K)
+    for tolerance in (1e-2, 1e-3):
+        found = layered_sum(passage(points, plane, tolerance), phasors(len(points)))
+        assert found.dtype == np.complex64
+        assert relative_error(found, exact) < tolerance
+
+
+def test_few_depths_take_few_terms() -> None:
+    """One for a planar wall, two for two plates, whatever their distance; more for a smooth relief."""
+    counts = {shape: passage(points_of(shaped_wall(shape, 32)), FITTING, 1e-2).relief.counts for shape in SHAPES}
+    assert set(counts["planar"]) == {1}
+    assert max(counts["plates"]) == 2
+    strict = passage(points_of(shaped_wall("relief", 32)), FITTING, 1e-3).relief.counts
+    assert sum(counts["cylinder"]) < sum(counts["relief"]) < sum(strict)
+
+
+def test_any_order_and_missing_points() -> None:
+    random = np.random.default_rng(7)
+    points = random.permutation(shaped_wall("relief", 32).reshape(-1, 3))[:900]
+    found = layered_sum(passage(points, FITTING, 1e-2), phasors(900))
+    assert relative_error(found, direct_sum(points, phasors(900), FITTING, K)) < 1e-2
+
+
+def test_coarse_walls_and_coarse_planes_repeat_their_spectra() -> None:
+    """Points up to two wavelengths apart, on either side."""
+    coarse = shaped_wall("wavy", 11).reshape(-1, 3)
+    sparse = Plane(FITTING.x[::4], FITTING.y[::3], FITTING.z)
+    fine = shaped_wall("wavy", 32).reshape(-1, 3)
+    for points, plane in ((coarse, FITTING), (coarse, sparse), (fine, sparse)):
+        values = phasors(len(points))
+        found = layered_sum(passage(points, plane, 1e-2), values)
+        assert relative_error(found, direct_sum(points, values, plane, K)) < 1e-2
+
+
+def test_it_is_linear() -> None:
+    points = points_of(shaped_wall("cylinder", 32))
+    way, random = passage(points, FITTING, 1e-2), np.random.default_rng(1)
+    first, second = phasors(len(points)), random.normal(size=(len(points), K.size)).astype(np.complex64)
+    both = layered_sum(way, 2 * first - 3j * second)
+    assert relative_error(2 * layered_sum(way, first) - 3j * layered_sum(way, second), both) < 1e-5
+
+
+def test_scattered_points_stand_above_no_lattice() -> None:
+    random = np.random.default_rng(3)
+    scattered = random.uniform([-1, -1, 0], [1, 1, 0.2], (100, 3))
+    twice = np.concatenate([shaped_wall("wavy", 5).reshape(-1, 3)] * 2)
+    for points in (scattered, twice):
+        assert Passage.of(points, FITTING, WAVES, BAND.weights, 1e-2) is None
+
+
+def test_large_problems_take_it_and_small_or_strict_ones_do_not() -> None:
+    large, small = (shaped_wall("relief", count).reshape(-1, 3) for count in (64, 9))
+    plane = Plane(np.linspace(-1, 1, 64), np.linspace(-1, 1, 64), 0.4)
+    assert passage(large, plane, 1e-2).quicker
+    assert not passage(small, plane, 1e-2).quicker
+    assert not passage(large, plane, 1e-4).quicker
+
+
+def test_periods_suit_wall_and_plane() -> None:
+    assert [convenient(count) for count in (3, 17, 100, 129, 161, 300, 321, 385, 481)] == [
+        16, 32, 128, 160, 192, 320, 384, 400, 512,
+    ]  # fmt: skip
+    assert common_period(4.9, 0.1, 0.1, 30) == (64, 64.0)
+    assert common_period(4.9, 0.1, 0.2, 30) == (64, 32.0)
+    assert common_period(4.9, 0.1, 0.12, 30) == (64, pytest.approx(64 / 1.2))
+    assert common_period(3.9, 0.1, 0.12, 30) == (48, 40.0)
+    length, places = common_period(4.9, 0.1, 0.0777, 30)
+    assert length == 64
+    assert places == pytest.approx(6.4 / 0.0777)
