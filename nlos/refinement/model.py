@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -58,23 +59,28 @@ class HiddenToWall(LinearOperator):
         self._strength = (np.sqrt(band.weights) * area).astype(self.dtype)
 
     def _forward(self, block: Array) -> Array:
-        result = np.empty((*self.shape_out, block.shape[-1]), self.dtype)
-        for frame in range(block.shape[-1]):  # each is a volume, too large to gain from company
-            on_plane = self._depths.to_plane(block[..., frame])
-            waves = on_plane.reshape(-1, self.wavenumbers.size).conj()
-            phasors = spherical_sum(self.plane.points.reshape(-1, 3), waves, self.points, self.wavenumbers).conj()
-            result[:, frame] = (phasors * self._strength).view(self.dtype).ravel()
-        return result
+        return self._each(self._phasors, block)
 
     def _adjoint(self, block: Array) -> Array:
-        result = np.empty((*self.shape_in, block.shape[-1]), self.dtype)
-        for frame in range(block.shape[-1]):
-            phasors = np.ascontiguousarray(block[:, frame]).view(self._kind).reshape(len(self.points), -1)
-            waves = spherical_sum(
-                self.points, phasors * self._strength, self.plane.points.reshape(-1, 3), self.wavenumbers
-            )
-            result[..., frame] = self._depths.to_volume(waves.reshape(*self.plane.shape, -1))
-        return result
+        return self._each(self._volume, block)
+
+    def _phasors(self, volume: Array) -> Array:
+        waves = self._depths.to_plane(volume).reshape(-1, self.wavenumbers.size).conj()
+        phasors = spherical_sum(self.plane.points.reshape(-1, 3), waves, self.points, self.wavenumbers).conj()
+        return np.asarray(phasors * self._strength).view(self.dtype).ravel()
+
+    def _volume(self, readings: Array) -> Array:
+        phasors = readings.view(self._kind).reshape(len(self.points), -1) * self._strength
+        waves = spherical_sum(self.points, phasors, self.plane.points.reshape(-1, 3), self.wavenumbers)
+        return self._depths.to_volume(waves.reshape(*self.plane.shape, -1))
+
+    def _each(self, work: Callable[[Array], Array], block: Array) -> Array:
+        """Treat every frame alone: each is a volume, too large to gain from company."""
+        from threadpoolctl import threadpool_limits
+
+        # Depths and targets share the cores already: BLAS threads of its own would fight with ours.
+        with threadpool_limits(1, "blas"):
+            return np.stack([work(np.ascontiguousarray(frame)) for frame in np.moveaxis(block, -1, 0)], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
