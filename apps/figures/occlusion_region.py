@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from apps.figures.style import LINE, NOTHING, SMALL, draw, label, page
+from apps.figures.style import LINE, NOTHING, colour_bar, draw, label, page
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
     from tofclip.occlusion import InactiveRegion
 
@@ -21,6 +20,7 @@ DRAWN_LENGTHS = 2.2  # of the region, behind the occluder
 ENDLESS_DISTANCES = 3.0  # drawn behind an occluder whose region has no end
 CELLS = (240, 480)
 OCCLUDER = "#e8b04a"
+BEHIND_TEXT = {"facecolor": NOTHING, "edgecolor": "none", "pad": 1.5}
 
 
 def region_figure(region: InactiveRegion) -> Figure:
@@ -30,19 +30,19 @@ def region_figure(region: InactiveRegion) -> Figure:
     return figure
 
 
-def draw_region(axes: Axes, region: InactiveRegion, places: NDArray[Any] | None = None) -> None:
-    """Draw the region from above; z to the right, x upwards.
+def draw_region(axes: Axes, region: InactiveRegion, least_reach: float = 0.0) -> None:
+    """Draw the region from above with seven views; z to the right, x upwards.
 
     Parameters
     ----------
     axes : Axes
     region : InactiveRegion
-    places : (views,) array, optional
-        Of the views on the aperture, m; seven, evenly, if not given.
+    least_reach : float
+        Draw at least so far behind the occluder, m.
     """
-    if places is None:
-        places = np.linspace(-0.5, 0.5, VIEWS) * region.baseline
-    reach = DRAWN_LENGTHS * region.length if region.ends else ENDLESS_DISTANCES * region.distance
+    places = np.linspace(-0.5, 0.5, VIEWS) * region.baseline
+    usual = DRAWN_LENGTHS * region.length if region.ends else ENDLESS_DISTANCES * region.distance
+    reach = max(usual, least_reach)
     half = 0.62 * max(region.baseline, region.width)
     x = np.linspace(-half, half, CELLS[0])[:, np.newaxis, np.newaxis]
     behind = np.linspace(0, reach, CELLS[1])[:, np.newaxis]
@@ -50,9 +50,7 @@ def draw_region(axes: Axes, region: InactiveRegion, places: NDArray[Any] | None 
     edges = np.array([region.distance, region.distance + reach, -half, half]) / MILLIMETRE
     left, right, low, high = edges.tolist()
     mapped = draw(axes, share[::-1], (left, right, low, high), cmap="bone", vmin=0, vmax=1, aspect="auto")
-    bar = axes.figure.colorbar(mapped, ax=axes, shrink=0.9)
-    bar.set_label("share of the views that see the place", fontsize=SMALL)
-    bar.ax.tick_params(labelsize=SMALL)
+    colour_bar(axes, mapped, "share of the views that see the place")
     _draw_lines(axes, region, reach)
     axes.plot(np.zeros(len(places)), places / MILLIMETRE, "s", color=LINE, ms=7, clip_on=False)
     axes.plot([left, left], np.array([-0.5, 0.5]) * region.width / MILLIMETRE, color=OCCLUDER, lw=6)
@@ -66,15 +64,14 @@ def _draw_lines(axes: Axes, region: InactiveRegion, reach: float) -> None:
     far = region.distance + reach
     for side in (-1, 1):
         slope = side * (region.width - region.baseline) / 2 / region.distance
-        ends = np.array([0, far])
-        axes.plot(
-            ends / MILLIMETRE, (side * region.baseline / 2 + slope * ends) / MILLIMETRE, color=LINE, lw=1, ls="--"
-        )
+        z = np.array([0, far])
+        x = side * region.baseline / 2 + slope * z
+        axes.plot(z / MILLIMETRE, x / MILLIMETRE, color=LINE, lw=1, ls="--")
     if region.ends:
         start, stop = region.distance / MILLIMETRE, (region.distance + region.length) / MILLIMETRE
         axes.annotate("", (stop, 0), (start, 0), arrowprops={"arrowstyle": "<->", "color": OCCLUDER})
-        said = f"inactive, {region.length / MILLIMETRE:.1f} mm"
-        axes.annotate(said, ((start + stop) / 2, 0), (0, 4), textcoords="offset points", ha="center", color=OCCLUDER)
+        said = f"l = {region.length / MILLIMETRE:.1f} mm, hidden"
+        axes.annotate(said, (start, 0), (8, 7), textcoords="offset points", color=OCCLUDER, bbox=BEHIND_TEXT)
 
 
 def _title(region: InactiveRegion) -> str:

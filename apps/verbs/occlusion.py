@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from apps.options import AsJson
 from tofclip.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tofclip.occlusion.experiment import Experiment
+    from tofclip.occlusion.probe import Probe
+
+SCENE_NAMES = ("v-letter", "plate", "tree", "bush", "trellis", "board")
+"""Those of `tofclip.occlusion.scenes`, named here so that help appears without loading them."""
 
 app = typer.Typer()
 
@@ -51,3 +59,74 @@ def region(
     length = found.length if found.ends or as_json else "without end"
     figures = {"inactive_length_m": length, "promised": promise}
     report(figures, as_json, [] if out is None else [out])
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results; made if missing.")],
+    scene: Annotated[str, typer.Option(metavar="NAME", help=f"{', '.join(SCENE_NAMES)}.")] = SCENE_NAMES[0],
+    illumination: Annotated[
+        str, typer.Option(metavar="NAME", help="diodes, one beside each view; oblique; co-located, a single one.")
+    ] = "diodes",
+    encoder: Annotated[
+        str, typer.Option(metavar="NAME", help="line; or single-pixel, which needs a million photons.")
+    ] = "line",
+    sampling_ratio: Annotated[float, typer.Option(metavar="SR", help="Readings over pixels of one picture.")] = 0.5,
+    side_px: Annotated[int, typer.Option(metavar="N", help="Rows and columns of the picture.")] = 128,
+    photons: Annotated[float, typer.Option(metavar="N", help="Of the brightest reading at its brightest.")] = 2000.0,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of line angles and photons.")] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate a scene behind an occluder, see through it, and compare with other cameras and with the truth.
+
+    Seven views in a row of 15 mm look past an occluder at 50 mm; rays are cast from lamps to surfaces to views. Small
+    targets on the axis at 0.8, 1.2 and 2 times the inactive length test the formula. Writes occlusion.png and
+    occlusion.gif.
+
+    Example: tofclip occlusion demo --scene plate --out occlusion-output
+    """
+    import time
+
+    from apps.figures.occlusion import occlusion_figure, save_film
+    from apps.figures.style import save
+    from apps.files import make_folder
+    from apps.report import report
+    from tofclip.occlusion.experiment import Experiment, Settings
+    from tofclip.occlusion.probe import FACTORS, probe
+    from tofclip.occlusion.scenes import occlusion_scene
+
+    started = time.perf_counter()
+    settings = Settings(side_px, encoder, sampling_ratio, illumination, photons, seed)
+    chosen = occlusion_scene(scene)
+    experiment = Experiment(chosen, settings)
+    experiment.rig.camera  # noqa: B018 - refuses what no camera can be built from, before anything is written
+    make_folder(out)
+    factors = FACTORS if chosen.region.ends else ()
+    probes = [probe(chosen.occluder, chosen.region, factor, seed) for factor in factors]
+    written = [out / "occlusion.png", out / "occlusion.gif"]
+    save(occlusion_figure(experiment, probes), written[0])
+    save_film(experiment, written[1])
+    report({**_figures(experiment, probes), "seconds": time.perf_counter() - started}, as_json, written)
+
+
+def _figures(experiment: Experiment, probes: Sequence[Probe]) -> dict[str, Any]:
+    """What is said about a run; correlations are with the target as seen with its occluder taken away."""
+    from tofclip.metrics import correlation, nmse
+
+    scene, truth = experiment.scene, experiment.truth
+    own = (scene.distance, correlation(experiment.target, truth), experiment.promised)
+    targets = [own, *((one.distance, one.correlation, one.expected_visible) for one in probes)]
+    names = ("distance_m", "correlation", "expected_visible")
+    separated = experiment.separated
+    plain = 0.0 if separated is None else correlation(separated.plain, truth)
+    return {
+        "scene": scene.name,
+        "inactive_length_m": scene.region.length,
+        "targets": [dict(zip(names, one, strict=True)) for one in sorted(targets)],
+        "nmse": nmse(experiment.target, truth),
+        "correlation": own[1],
+        "correlation_without_model_of_occluder": plain,
+        "correlation_single_view": correlation(experiment.single_view, experiment.single_view_truth),
+        "correlation_light_field_camera": correlation(experiment.conventional, truth),
+        "readings": experiment.rig.camera.readings,
+    }

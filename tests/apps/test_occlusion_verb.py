@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 from pathlib import Path
+from typing import Any
 
 import matplotlib.image
 import pytest
 from small_instrument import Run
+
+from apps.cli import main
+from apps.verbs.occlusion import SCENE_NAMES
+from tofclip.occlusion.scenes import SCENES
 
 
 def test_the_inactive_length_of_the_papers_experiment(run: Run, tmp_path: Path) -> None:
@@ -33,3 +40,64 @@ def test_lengths_that_make_no_sense_are_refused(run: Run, tmp_path: Path) -> Non
 
 def test_alone_it_shows_its_verbs(run: Run) -> None:
     assert "region" in run("occlusion").out
+
+
+@pytest.fixture(scope="module")
+def demonstrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("occlusion") / "made"
+    words = ["occlusion", "demo", "--scene", "plate", "--side-px", "40", "--sampling-ratio", "1", "--out", str(folder)]
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert main([*words, "--json"]) == 0
+    return folder, json.loads(out.getvalue())
+
+
+def test_the_demonstration_agrees_with_the_formula(demonstrated: tuple[Path, dict[str, Any]]) -> None:
+    _, told = demonstrated
+    assert told["inactive_length_m"] == pytest.approx(0.1 / 3)
+    assert len(told["targets"]) == 4
+    for target in told["targets"]:
+        assert (target["correlation"] >= 0.8) == target["expected_visible"]
+        assert target["expected_visible"] == (target["distance_m"] > 0.05 + told["inactive_length_m"])
+    assert told["nmse"] < 0.3
+    others = ("single_view", "light_field_camera", "without_model_of_occluder")
+    assert all(told["correlation"] > told[f"correlation_{name}"] for name in others)
+
+
+def test_the_demonstration_leaves_a_picture_and_a_film(demonstrated: tuple[Path, dict[str, Any]]) -> None:
+    from PIL import Image
+
+    folder, _ = demonstrated
+    assert sorted(path.name for path in folder.iterdir()) == ["occlusion.gif", "occlusion.png"]
+    assert matplotlib.image.imread(folder / "occlusion.png").std() > 0.05
+    with Image.open(folder / "occlusion.gif") as film:
+        assert film.n_frames > 10
+
+
+def test_behind_a_board_nothing_is_promised(run: Run, tmp_path: Path) -> None:
+    words = ("--scene", "board", "--side-px", 32, "--out", tmp_path)
+    told = json.loads(run("occlusion", "demo", *words, "--json").out)
+    assert told["inactive_length_m"] is None
+    assert told["targets"] == [{"distance_m": pytest.approx(0.12), "correlation": 0.0, "expected_visible": False}]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--scene", "fog"),
+        ("--illumination", "moon"),
+        ("--encoder", "abacus"),
+        ("--side-px", 4),
+        ("--photons", 0),
+        ("--sampling-ratio", -1),
+    ],
+)
+def test_what_cannot_be_demonstrated_is_refused_before_anything_is_written(
+    run: Run, tmp_path: Path, words: tuple[Any, ...]
+) -> None:
+    outcome = run("occlusion", "demo", *words, "--out", tmp_path / "made")
+    assert (outcome.status, outcome.out, outcome.err.count("\n")) == (2, "", 1)
+    assert not (tmp_path / "made").exists()
+
+
+def test_the_names_of_the_scenes_are_those_that_exist() -> None:
+    assert tuple(SCENES) == SCENE_NAMES

@@ -118,6 +118,11 @@ class Experiment:
         lamp = float(np.linalg.norm(self.rig.lamps, axis=1).max())
         return Clock.covering(near, float(np.hypot(far, lamp)), BIN_WIDTH, PULSE)
 
+    @property
+    def promised(self) -> bool:
+        """Whether the formula promises that the target's middle is seen, and a lamp gets there as views do."""
+        return self.scene.behind > self.scene.region.length and self.settings.illumination != "co-located"
+
     @cached_property
     def pictures(self) -> Array:
         """What every view sees at every instant, without noise, (views, rows, columns, bins)."""

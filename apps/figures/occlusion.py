@@ -1,0 +1,199 @@
+"""The demonstration of seeing through an occluder, in one picture and in a short film."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from apps.figures.occlusion_region import BEHIND_TEXT, OCCLUDER, draw_region
+from apps.figures.style import LINE, NOTHING, SMALL, draw, label, page
+from tofclip.metrics import correlation
+from tofclip.storage import atomic_path
+from tofclip.units import MILLIMETRE, PICOSECOND
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from tofclip.occlusion.experiment import Experiment
+    from tofclip.occlusion.probe import Probe
+
+SEEN, UNSEEN = "#57c84d", "#ff5a5f"
+BEYOND = 1.15  # of the target's distance behind the occluder is drawn
+FAINTEST, HEADROOM = 1e-4, 12.0  # of the strongest instant: where the drawing begins, and where its captions stand
+FRAME_MS, LAST_FRAME_MS = 120, 2500
+DARK = 0.02  # of a return's brightest instant: the film passes over fainter ones
+
+
+def occlusion_figure(experiment: Experiment, probes: Sequence[Probe]) -> Figure:
+    """Draw the geometry, the returns in time, and what three cameras make of the target, beside the truth.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    probes : sequence of Probe
+        Small targets on the axis, drawn with a tick or a cross.
+    """
+    figure = page(13, 7)
+    figure.suptitle(_headline(experiment), fontsize=SMALL + 5)
+    halves: Any = figure.subfigures(2, 1, height_ratios=[1.15, 1])
+    upper, lower = halves
+    plan, time = upper.subplots(1, 2, width_ratios=[1.8, 1])
+    _draw_plan(plan, experiment, probes)
+    _draw_history(time, experiment)
+    for axes, (title, picture, truth) in zip(lower.subplots(1, 6), _pictures(experiment), strict=True):
+        brightest = picture.max() if truth is None else truth.max()
+        draw(axes, picture, vmin=0, vmax=max(float(brightest), 1e-12))
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(title, fontsize=SMALL + 1)
+        if truth is not None and truth is not picture:
+            found = correlation(picture, truth)
+            axes.set_xlabel(f"correlation {found:.2f}", fontsize=SMALL + 2, color=SEEN if found >= 0.8 else UNSEEN)
+    return figure
+
+
+def _headline(experiment: Experiment) -> str:
+    readings, side = experiment.rig.camera.readings, experiment.settings.side_px
+    views = len(experiment.rig.array.views)
+    pixels = " \N{MULTIPLICATION SIGN} ".join(map(str, (views, side, side)))
+    title = experiment.scene.title
+    return f"{title[0].upper()}{title[1:]}, seen with {readings} readings instead of {pixels} pixels"
+
+
+def _pictures(experiment: Experiment) -> list[tuple[str, NDArray[Any], NDArray[Any] | None]]:
+    """Title, picture, and the truth it is compared with and scaled to; None: scaled to itself."""
+    truth, separated = experiment.truth, experiment.separated
+    occluder = 0 * truth if separated is None else separated.occluder
+    everything = experiment.pictures[len(experiment.pictures) // 2].sum(axis=-1)
+    refocused = experiment.conventional
+    # what a light-field camera shows of the target is drawn as bright as the haze allows
+    scaled = refocused * (truth.max() / max(float(refocused.max()), 1e-12))
+    return [
+        ("one view,\nall its light", everything, None),
+        ("a light-field camera,\nall pixels, refocused behind", scaled, truth),
+        (
+            "one view with time of flight,\nas many pixels as readings",
+            experiment.single_view,
+            experiment.single_view_truth,
+        ),
+        ("ToF-CLIP: the first return,\nthe occluder", occluder, None),
+        ("ToF-CLIP: the second return,\nwhat stands behind", experiment.target, truth),
+        ("truth:\nthe occluder taken away", truth, truth),
+    ]
+
+
+def _draw_plan(axes: Axes, experiment: Experiment, probes: Sequence[Probe]) -> None:
+    """The scene from above: which views see which place, the target, and small targets on the axis."""
+    scene = experiment.scene
+    draw_region(axes, scene.region, BEYOND * scene.behind)
+    halves = [abs(body.centre[0]) + float(body.shape.half[0]) for body in scene.target]
+    z, half = scene.distance / MILLIMETRE, max(halves) / MILLIMETRE
+    low, high = axes.get_ylim()
+    axes.plot([z, z], [-half, half], color=OCCLUDER, lw=4, alpha=0.9)
+    note: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "bbox": BEHIND_TEXT}
+    axes.annotate("target", (z, high), (-6, -6), va="top", color=OCCLUDER, **note)
+    for number, one in enumerate(probes):
+        colour, mark = (SEEN, "o") if one.recovered else (UNSEEN, "X")
+        place = one.distance / MILLIMETRE
+        axes.plot(place, 0, mark, color=colour, mec="black", ms=10, zorder=5)
+        said = f"at {one.factor:g} l: correlation {one.correlation:.2f}"
+        line = {"arrowstyle": "-", "color": colour, "lw": 0.8, "shrinkB": 5}
+        below = (16, -34 - 14 * number)
+        axes.annotate(said, (place, 0), below, arrowprops=line, fontsize=SMALL, color=colour, **note)
+    axes.set_ylim(low, high)
+
+
+def _draw_history(axes: Axes, experiment: Experiment) -> None:
+    """All light over time, with the gates of the returns."""
+    readings = experiment.readings
+    times = readings.clock.times / PICOSECOND
+    history = np.maximum(readings.history / readings.history.max(), FAINTEST)
+    axes.set_facecolor(NOTHING)
+    axes.semilogy(times, history, color="white", lw=1.5, drawstyle="steps-mid")
+    for found, name, colour in zip(readings.returns(), ("occluder", "target"), (OCCLUDER, LINE), strict=False):
+        gate = times[found.bins]
+        axes.axvspan(float(gate[0]), float(gate[-1]), color=colour, alpha=0.3)
+        peak = gate[np.argmax(history[found.bins])]
+        said = f"{name}\n{found.distance / MILLIMETRE:.1f} mm"
+        axes.text(float(peak), HEADROOM, said, ha="center", va="top", fontsize=SMALL, color="white")
+    axes.set_ylim(FAINTEST, 2 * HEADROOM)
+    label(axes, "light of all readings together", "time after the flash (ps)", "relative to the brightest instant")
+
+
+def save_film(experiment: Experiment, path: Path) -> None:
+    """Write a GIF: light reaches the occluder, then what stands behind it.
+
+    Each return is shown at its own brightness; the recovered pictures light up as the readings of their gates do.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image
+
+    figure = page(8, 3.2)
+    figure.set_layout_engine("none")
+    canvas: Any = FigureCanvasAgg(figure)
+    drawn, frames = [], _film(experiment)
+    images, cursor, title = _first_frame(figure, experiment)
+    for frame in frames:
+        for image, picture in zip(images, frame.pictures, strict=True):
+            image.set_data(picture)
+        cursor.set_xdata([frame.time, frame.time])
+        title.set_text(frame.title)
+        canvas.draw()
+        drawn.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
+    durations = [FRAME_MS] * (len(drawn) - 1) + [LAST_FRAME_MS]
+    with atomic_path(path) as temporary:
+        drawn[0].save(temporary, save_all=True, append_images=drawn[1:], duration=durations, loop=0)
+
+
+class Frame(NamedTuple):
+    """An instant of the film.
+
+    Attributes
+    ----------
+    time : float
+        ps after the flash.
+    title : str
+    pictures : two (rows, columns) arrays
+        Of the middle view and of the recovery, from 0 to 1.
+    """
+
+    time: float
+    title: str
+    pictures: tuple[NDArray[Any], NDArray[Any]]
+
+
+def _film(experiment: Experiment) -> list[Frame]:
+    """Every instant that is not dark; at last the whole of the second return."""
+    separated, returns = experiment.separated, experiment.readings.returns()
+    parts = [0 * experiment.truth] if separated is None else [separated.occluder, separated.target]
+    history, middle = experiment.readings.history, experiment.pictures[len(experiment.pictures) // 2]
+    times, frames = experiment.clock.times / PICOSECOND, []
+    for found, recovered in zip(returns, parts, strict=True):
+        lit = history / history[found.bins].max()
+        scales = [max(float(top), 1e-12) for top in (middle[..., found.bins].max(), np.quantile(recovered, 0.999))]
+        for instant in np.arange(found.bins.start, found.bins.stop)[lit[found.bins] > DARK]:
+            pictures = middle[..., instant] / scales[0], lit[instant] * recovered / scales[1]
+            frames.append(Frame(float(times[instant]), f"{times[instant]:.0f} ps after the flash", pictures))
+    brightest = experiment.truth.max()
+    behind = middle[..., returns[-1].bins].sum(axis=-1) if separated is not None else 0 * experiment.truth
+    last = "all of the second return together" if separated is not None else "nothing comes from behind the occluder"
+    return [*frames, Frame(frames[-1].time, last, (behind / brightest, experiment.target / brightest))]
+
+
+def _first_frame(figure: Figure, experiment: Experiment) -> tuple[list[Any], Any, Any]:
+    """Lay the film out; return what changes: the two pictures, the instant's line, and the title."""
+    left, right, time = figure.subplots(1, 3, gridspec_kw={"left": 0.02, "right": 0.98, "bottom": 0.16, "top": 0.8})
+    images = []
+    for axes, name in ((left, "what one view sees"), (right, "ToF-CLIP")):
+        images.append(draw(axes, 0 * experiment.truth, vmin=0, vmax=1))
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(name, fontsize=SMALL + 2)
+    _draw_history(time, experiment)
+    time.set_title("light of all readings", fontsize=SMALL + 2)
+    time.set_ylabel("")
+    time.tick_params(axis="y", labelleft=False)
+    return images, time.axvline(0, color=UNSEEN, lw=2), figure.suptitle("", fontsize=SMALL + 4)
