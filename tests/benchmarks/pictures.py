@@ -1,15 +1,18 @@
 """How good pictures of CLIP are on recorded and rendered light fields, without telling the recovery anything.
 
-Run with ``python tests/benchmarks/pictures.py --data DIR [--seeds N] [--only WORDS] [--json]``; DIR/lightfields holds
-the NPZ files. NMSE in per cent of shift-and-add of the true views, 12 pixels at the border left out: mean and spread
-over seeds of the angles or codes. Seconds are medians: of the search for the prior's weight, and of the solve itself.
+Run with ``python tests/benchmarks/pictures.py --data DIR [--seeds N] [--only WORDS] [--oracle] [--json]``, where
+DIR/lightfields holds the NPZ files. NMSE in per cent of shift-and-add of the true views, 12 pixels at the border left
+out: mean and spread over seeds of the angles or codes. Seconds are medians: of the search for the prior's weight, and
+of the solve itself. ``--oracle`` also recovers with weights over two decades around the one found, and tells the least
+NMSE of all.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,11 @@ from tofclip.io.light_fields import read_light_field
 from tofclip.metrics import nmse
 
 BORDER_PX = 12
+FACTORS = 10 ** np.linspace(-1, 1, 9)
+LINE = (
+    "{case:46}{nmse_percent:8} +- {spread:<6} limit {limit:<6} best weight {oracle_percent:<8}"
+    "search {seconds_weight} s, solve {seconds} s"
+)
 
 
 @dataclass(frozen=True)
@@ -48,39 +56,56 @@ SHEETS = {
 """Limits in per cent; those of the last two are what the trials of total variation with the best weight reached."""
 
 
-def scored(path: Path, shear: float, setup: Setup, preset: str, bad: float) -> tuple[float, float, float]:
-    """Return NMSE in per cent, seconds of the search for the weight, and seconds of the solve."""
+@dataclass(frozen=True)
+class Score:
+    """NMSE in per cent with the weight found, the least with any weight tried, and seconds."""
+
+    percent: float
+    oracle: float
+    seconds_weight: float
+    seconds: float
+
+
+def scored(
+    path: Path, shear: float, setup: Setup, settings: ClipRecovery, bad: float, factors: Sequence[float]
+) -> Score:
+    """Recover once as a user would, and again with the weight found times each of the factors."""
     light_field = read_light_field(path)
-    recovery = ClipRecovery(preset=preset, data_term="huber" if bad else "squares")
-    found = recovery.recover(spoilt(measure(light_field, setup), None, bad), shear)
-    percent = 100 * nmse(found.picture, light_field.refocus(shear), BORDER_PX)
-    return percent, found.seconds_weight, found.seconds
+    truth, measured = light_field.refocus(shear), spoilt(measure(light_field, setup), None, bad)
+    found = settings.recover(measured, shear)
+    percent = 100 * nmse(found.picture, truth, BORDER_PX)
+    others = (replace(settings, weight=found.weight * factor).recover(measured, shear).picture for factor in factors)
+    oracle = min([percent, *(100 * nmse(picture, truth, BORDER_PX) for picture in others)])
+    return Score(percent, oracle, found.seconds_weight, found.seconds)
 
 
-def rows(folder: Path, seeds: int, only: str) -> list[dict[str, Any]]:
+def rows(folder: Path, seeds: int, only: str, factors: Sequence[float]) -> list[dict[str, Any]]:
     """Score every case whose description contains `only`, telling each as it is done."""
     found = []
     for name, sheet in SHEETS.items():
         for encoder, preset, bad, limits in sheet.cases:
+            settings = ClipRecovery(preset=preset, data_term="huber" if bad else "squares")
             for ratio, limit in limits.items():
                 label = f"{name} {encoder} {preset} SR {ratio:g}" + (f" bad {bad:.0%}" if bad else "")
                 if only not in label:
                     continue
                 path = folder / "lightfields" / f"{name}.npz"
-                each = [scored(path, sheet.shear, Setup(encoder, ratio, seed), preset, bad) for seed in range(seeds)]
-                percent, weighing, solving = np.array(each).T
-                row = {
-                    "case": label,
-                    "nmse_percent": round(float(percent.mean()), 2),
-                    "spread": round(float(percent.std(ddof=1)), 2) if seeds > 1 else 0.0,
-                    "limit": limit,
-                    "seconds_weight": round(float(np.median(weighing)), 2),
-                    "seconds": round(float(np.median(solving)), 2),
-                }
-                print("{case:46}{nmse_percent:8} +- {spread:<6} limit {limit:<6}".format(**row), end="", flush=True)
-                print(f"weight {row['seconds_weight']} s, solve {row['seconds']} s", flush=True)
-                found.append(row)
+                setups = [Setup(encoder, ratio, seed) for seed in range(seeds)]
+                scores = [scored(path, sheet.shear, setup, settings, bad, factors) for setup in setups]
+                found.append(row := {"case": label, "limit": limit, **_summary(scores)})
+                print(LINE.format(**row), flush=True)
     return found
+
+
+def _summary(scores: list[Score]) -> dict[str, float]:
+    percent, oracle = [one.percent for one in scores], [one.oracle for one in scores]
+    return {
+        "nmse_percent": round(float(np.mean(percent)), 2),
+        "spread": round(float(np.std(percent, ddof=1)), 2) if len(scores) > 1 else 0.0,
+        "oracle_percent": round(float(np.mean(oracle)), 2),
+        "seconds_weight": round(float(np.median([one.seconds_weight for one in scores])), 2),
+        "seconds": round(float(np.median([one.seconds for one in scores])), 2),
+    }
 
 
 def main() -> None:
@@ -89,9 +114,10 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--only", default="")
+    parser.add_argument("--oracle", action="store_true")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    found = rows(arguments.data, arguments.seeds, arguments.only)
+    found = rows(arguments.data, arguments.seeds, arguments.only, FACTORS if arguments.oracle else ())
     if arguments.json:
         print(json.dumps({"seeds": arguments.seeds, "rows": found}))
 

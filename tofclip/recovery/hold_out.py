@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import thread_count
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator
 from tofclip.recovery.iterative import ProximalMethod
@@ -71,14 +74,17 @@ def choose_weight(method: ProximalMethod, operator: LinearOperator, readings: Ar
         Of the deal.
     """
     held = folds(readings.size, run, seed)
+    parts = np.split(held, held.shape[1], axis=1)
     column = readings[:, np.newaxis]
 
+    def unpredicted(trial: ProximalMethod, out: NDArray[np.bool_]) -> float:
+        picture = trial.recover(operator, column, ~out).frames[0]
+        return float(trial.data_term(column, out).value(operator(picture)[:, np.newaxis])[0])
+
     def error(weight: float) -> float:
-        trial, total = replace(method, weight=weight), 0.0
-        for out in np.split(held, held.shape[1], axis=1):
-            picture = trial.recover(operator, column, ~out).frames[0]
-            total += float(method.data_term(column, out).value(operator(picture)[:, np.newaxis])[0])
-        return total
+        # the compiled loops of one picture keep one core busy and release the interpreter
+        with ThreadPoolExecutor(min(thread_count(), len(parts))) as pool:
+            return sum(pool.map(partial(unpredicted, replace(method, weight=weight)), parts))
 
     return _downhill(error)
 
