@@ -15,6 +15,7 @@ import typer
 
 from apps.help import explain
 from apps.verbs import (
+    bench,
     calibrate,
     clip,
     cloud,
@@ -70,12 +71,13 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   occlusion          what stands behind an occluder: inactive region, demonstration
   clip               light fields from few readings: simulate a camera, recover a picture
   reproduce          the paper's tables and figures, made again: reproduce all --out DIR
+  bench              how fast and how large all this is on this machine
   devices            instruments and their recordings: list, info, test, verify, repair
   record             an instrument's bytes, to be replayed exactly
   convert            any readable streak image to this program's own HDF5
   info               what a file holds
 
-  tofclip VERB --help explains a verb. Exit status: 0 done, 2 unusable input, 130 interrupted."""
+  tofclip VERB --help explains a verb. Exit status: 0 done, 1 some failed, 2 unusable input, 130 interrupted."""
 
 app = typer.Typer(name="tofclip", pretty_exceptions_enable=False, epilog=EPILOG)
 app.command()(demo.demo)
@@ -87,6 +89,7 @@ app.add_typer(nlos.app, name="nlos")
 app.add_typer(clip.app, name="clip")
 app.add_typer(occlusion.app, name="occlusion")
 app.command()(reproduce.reproduce)
+app.command()(bench.bench)
 app.add_typer(devices.app, name="devices")
 app.command()(record.record)
 app.command()(convert.convert)

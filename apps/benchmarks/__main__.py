@@ -1,0 +1,19 @@
+"""One case at one size: ``python -m apps.benchmarks CASE SIZE`` prints its figures as JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+from apps.benchmarks.measure import measure
+from apps.benchmarks.registry import cases_called
+
+
+def main() -> None:
+    """Measure what the command line names."""
+    name, size = sys.argv[1:]
+    print(json.dumps(measure(cases_called(name)[0], int(size))))
+
+
+if __name__ == "__main__":
+    main()

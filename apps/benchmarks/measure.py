@@ -1,0 +1,63 @@
+"""Run one case at one size in this process, which is fresh: time, memory, floor and peers."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from typing import Any
+
+from apps.benchmarks.case import AbsentPeerError, Action, Case
+from tofclip.cluster.jobs import peak_memory_bytes
+
+FEWEST, MOST = 3, 31
+SECONDS = 1.0
+"""Repeats go on for so long, or until there are `MOST`."""
+
+FLOOR_SECONDS = 0.3
+BYTES_PER_MIB = 1 << 20
+
+
+def measure(case: Case, size: int) -> dict[str, Any]:
+    """Return the figures of a case at one size.
+
+    Returns
+    -------
+    dict
+        ``seconds`` (median, least and greatest of the repeats after one that warms up), ``per_second``, ``peak_mib`` of
+        the process with its libraries and inputs, ``own_mib`` of that only while the action ran, ``floor_seconds``,
+        ``times_floor``, and ``peers``: seconds, or why there are none.
+    """
+    ready = case.prepare(size)
+    before = peak_memory_bytes()
+    ready.action()
+    peak = peak_memory_bytes()
+    seconds = repeated(ready.action, SECONDS)
+    ready.floor()
+    floor = statistics.median(repeated(ready.floor, FLOOR_SECONDS)) / ready.floor_share
+    median = statistics.median(seconds)
+    return {
+        "seconds": {"median": median, "least": min(seconds), "greatest": max(seconds), "repeats": len(seconds)},
+        "per_second": ready.amount / median,
+        "peak_mib": peak / BYTES_PER_MIB,
+        "own_mib": (peak - before) / BYTES_PER_MIB,
+        "floor_seconds": floor,
+        "times_floor": median / floor,
+        "peers": {name: _told(peer) for name, peer in ready.peers.items()},
+    }
+
+
+def repeated(action: Action, seconds: float) -> list[float]:
+    """Time an action again and again."""
+    found: list[float] = []
+    while len(found) < FEWEST or (sum(found) < seconds and len(found) < MOST):
+        began = time.perf_counter()
+        action()
+        found.append(time.perf_counter() - began)
+    return found
+
+
+def _told(peer: Any) -> dict[str, Any]:
+    try:
+        return {"seconds": peer()}
+    except AbsentPeerError as absence:
+        return {"absent": str(absence)}

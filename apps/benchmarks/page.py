@@ -1,0 +1,112 @@
+"""The page of a run's figures, in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+HEAD = """\
+# Benchmarks
+
+Made by `{command}`; do not edit. Every figure comes from one run on one machine:
+
+{machine}
+
+Each size and number of threads is a fresh process. Times are medians after one warm-up, with the least and the greatest
+of the repeats; memory is the peak of the process with its libraries and inputs, and how much of it the work itself
+added. *Floor* is what the work cannot do without, measured beside it on the same data and threads; *growth* the power
+of the size with which the time grows between the first and the last size.
+"""
+
+TITLES = {
+    "recovery": "Recovery of shots (7 views, 1344 slit pixels, 174 x 174 pixels)",
+    "clip": "Light fields from few readings (8 x 8 views)",
+    "depth": "Ranges (the demo's instrument)",
+    "streaming": "Shots to clouds (the demo's instrument)",
+    "rsd": "Around the corner: phasor fields",
+    "propagation": "Around the corner: propagation",
+    "confocal": "Around the corner: confocal",
+    "backprojection": "Around the corner: back-projection",
+    "decode": "Instruments",
+}
+COLUMNS = ("", "size", "threads", "time", "rate", "memory", "floor", "x floor", "growth")
+
+
+def page(figures: Mapping[str, Any], command: str) -> str:
+    """Return the page of the figures that a run of `command` gave."""
+    parts = [HEAD.format(command=command, machine=_machine(figures["machine"])).rstrip()]
+    for group, title in TITLES.items():
+        entries = [entry for entry in figures["entries"] if entry["name"].partition("-")[0] == group]
+        if entries:
+            parts.append(_section(title, entries))
+    return "\n\n".join(parts) + "\n"
+
+
+def _machine(known: Mapping[str, Any]) -> str:
+    libraries = ", ".join(f"{name} {version}" for name, version in known["libraries"].items())
+    return "\n".join(
+        [
+            f"* {known['processor']}, {known['cores']} cores, {known['memory_gib']} GiB, {known['system']}",
+            f"* devices: {', '.join(known['devices'])}",
+            f"* tofclip {known['tofclip']}, Python {known['python']}, {libraries}",
+        ]
+    )
+
+
+def _section(title: str, entries: Iterable[Mapping[str, Any]]) -> str:
+    lines, notes = [_row(COLUMNS), _row(["---"] * len(COLUMNS))], []
+    for entry in entries:
+        lines.extend(_row(_cells(entry, run)) for run in entry["runs"])
+        notes.append(f"* {entry['title']}: sizes are {entry['size']}, the floor is {entry['floor']}.{_peers(entry)}")
+    return "\n".join([f"## {title}", "", *lines, "", *notes])
+
+
+def _row(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _cells(entry: Mapping[str, Any], run: Mapping[str, Any]) -> list[str]:
+    first = [entry["title"], str(run["size"]), str(run["threads"])]
+    if "problem" in run:
+        return [*first, run["problem"], "", "", "", "", ""]
+    time = run["seconds"]
+    spread = f"{_seconds(time['median'])} ({_seconds(time['least'])} to {_seconds(time['greatest'])})"
+    last = run is entry["runs"][-1]
+    return [
+        *first,
+        spread,
+        f"{_digits(run['per_second'])} {entry['unit']}/s",
+        f"{run['peak_mib']:.0f} MiB, own {run['own_mib']:.0f}",
+        _seconds(run["floor_seconds"]),
+        f"{run['times_floor']:.2f}",
+        f"{entry['growth']:.1f}" if last and entry["growth"] is not None else "",
+    ]
+
+
+def _peers(entry: Mapping[str, Any]) -> str:
+    """Sentences about other programs, of the runs in which they were asked for."""
+    told: dict[str, list[str]] = {}
+    absent: dict[str, str] = {}
+    for run in entry["runs"]:
+        for name, found in run.get("peers", {}).items():
+            if "seconds" in found:
+                ratio = found["seconds"] / run["seconds"]["median"]
+                size = f"{run['size']}, {run['threads']} threads" if run["threads"] > 1 else f"{run['size']}, 1 thread"
+                told.setdefault(name, []).append(f"{_seconds(found['seconds'])} at {size} ({ratio:.1f} times ours)")
+            else:
+                absent[name] = found["absent"]
+    sentences = [f" {name}: {'; '.join(found)}." for name, found in told.items()]
+    sentences += [f" Not compared: {reason}." for name, reason in absent.items() if name not in told]
+    return "".join(sentences)
+
+
+def _seconds(value: float) -> str:
+    for unit, scale in (("s", 1.0), ("ms", 1e-3)):
+        if value >= scale:
+            return f"{_digits(value / scale)} {unit}"
+    return f"{_digits(value / 1e-6)} us"
+
+
+def _digits(value: float) -> str:
+    """Three digits that count, without powers of ten."""
+    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"

@@ -1,0 +1,93 @@
+"""Other programs that do the same. They run in a Python of their own, named by `--peers`, where they are installed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apps.benchmarks.case import AbsentPeerError
+
+if TYPE_CHECKING:
+    from nlos import Capture, Grid
+
+PEERS_VARIABLE = "TOFCLIP_PEERS"
+
+YTAL = """
+import sys, time
+import numpy as np
+from tal.io.capture_data import NLOSCaptureData
+from tal.enums import CameraSystem, HFormat, GridFormat, VolumeFormat
+from tal.reconstruct import pf
+stored = np.load(sys.argv[1])
+data = NLOSCaptureData()
+data.H = stored["signal"].transpose(0, 2, 1).astype(np.float32)
+data.H_format, data.sensor_grid_format, data.laser_grid_format = HFormat.T_Sx_Sy, GridFormat.X_Y_3, GridFormat.X_Y_3
+data.sensor_grid_xyz = stored["wall"].transpose(1, 0, 2).astype(np.float32)
+data.laser_grid_xyz = stored["laser"].reshape(1, 1, 3).astype(np.float32)
+data.sensor_xyz = data.laser_xyz = np.zeros(3, np.float32)
+data.delta_t, data.t_start, data.t_accounts_first_and_last_bounces = float(stored["spacing"]), 0.0, False
+data.volume_format, data.scene_info = VolumeFormat.X_Y_Z_3, {}
+volume = np.stack(np.meshgrid(stored["x"], stored["y"], stored["z"], indexing="ij"), -1).astype(np.float32)
+start = time.perf_counter()
+pf.solve(data, float(stored["wavelength"]), float(stored["cycles"]), CameraSystem.DIRECT_LIGHT, volume)
+print("seconds", time.perf_counter() - start)
+"""
+
+ASTRA = """
+import sys, time
+import astra, numpy as np
+stored = np.load(sys.argv[1])
+picture, angles = stored["picture"], stored["angles"]
+volume = astra.create_vol_geom(*picture.shape)
+sinogram = astra.create_proj_geom("parallel", 1.0, int(1.5 * picture.shape[0]), angles)
+projector = astra.create_projector("linear", sinogram, volume)
+astra.create_sino(picture, projector)
+start = time.perf_counter()
+astra.create_sino(picture, projector)
+print("seconds", time.perf_counter() - start)
+"""
+
+
+def astra_seconds(picture: NDArray[np.float32], angles: NDArray[np.float64]) -> float:
+    """Seconds of ASTRA's parallel projections of a picture, linear interpolation, processor."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "picture.npz"
+        np.savez(path, picture=picture, angles=angles)
+        return seconds_told(ASTRA, "ASTRA", str(path))
+
+
+def ytal_seconds(capture: Capture, grid: Grid, wavelength: float, cycles: float) -> float:
+    """Seconds of y-tal's phasor fields on the same arrays, its solve call alone."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "capture.npz"
+        arrays: dict[str, Any] = {"signal": capture.signal, "wall": capture.wall, "laser": capture.laser}
+        arrays |= {"x": grid.x, "y": grid.y, "z": grid.z}
+        arrays |= {"spacing": capture.axis.spacing, "wavelength": wavelength, "cycles": cycles}
+        np.savez(path, **arrays)
+        return seconds_told(YTAL, "y-tal", str(path))
+
+
+def seconds_told(script: str, name: str, *words: str) -> float:
+    """Run a script in the peers' Python and return the seconds that its last lines tell.
+
+    Raises
+    ------
+    AbsentPeerError
+        No such Python was named, or the peer is not installed there or does not run.
+    """
+    python = os.environ.get(PEERS_VARIABLE)
+    if not python:
+        raise AbsentPeerError(f"{name}: --peers names no Python that has it")
+    clean = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run([python, "-c", script, *words], capture_output=True, text=True, check=False, env=clean)
+    told = [line.split() for line in done.stdout.splitlines() if line.startswith("seconds ")]
+    if done.returncode or not told:
+        problem = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+        raise AbsentPeerError(f"{name}: {problem}")
+    return float(told[-1][1])

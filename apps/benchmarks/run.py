@@ -1,0 +1,92 @@
+"""Run cases, each size and number of threads in a fresh process, and put the figures together."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from apps.benchmarks.case import Case
+from apps.benchmarks.machine import machine
+from apps.benchmarks.peers import PEERS_VARIABLE
+from tofclip.arrays import THREADS_VARIABLE, thread_count
+
+LONGEST_SECONDS = 120
+
+
+def run_cases(cases: Sequence[Case], peers: str | None, advance: Callable[[int], None]) -> dict[str, Any]:
+    """Measure cases one after the other.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+    peers : str, optional
+        Python in which other programs are installed.
+    advance : callable
+        Called with 1 after each process; there are `processes` of them.
+
+    Returns
+    -------
+    dict
+        ``machine`` and ``entries``, one for each case.
+    """
+    return {"machine": machine(), "entries": [_entry(case, peers, advance) for case in cases]}
+
+
+def processes(cases: Sequence[Case]) -> int:
+    """Return how many processes `run_cases` starts."""
+    return sum(len(case.sizes) + len(threads()) - 1 for case in cases)
+
+
+def threads() -> list[int]:
+    """Return the numbers of threads that are compared: 1 and all, which is 2 on the smallest machines."""
+    return sorted({1, thread_count()})
+
+
+def _entry(case: Case, peers: str | None, advance: Callable[[int], None]) -> dict[str, Any]:
+    *fewer, most = threads()
+    runs = []
+    for size in case.sizes:
+        for count in [*fewer, most] if size == case.sizes[-1] else [most]:
+            wanted = peers if count == most else None  # a peer is asked once for each size
+            runs.append({"size": size, "threads": count, **_measured(case, size, count, wanted)})
+            advance(1)
+    return {
+        "name": case.name,
+        "title": case.title,
+        "size": case.size,
+        "unit": case.unit,
+        "floor": case.floor,
+        "runs": runs,
+        "growth": _growth(runs, most),
+    }
+
+
+def _measured(case: Case, size: int, count: int, peers: str | None) -> dict[str, Any]:
+    """Figures of a fresh process, or ``problem``: why there are none."""
+    environment = {**os.environ, THREADS_VARIABLE: str(count), PEERS_VARIABLE: peers or ""}
+    command = [sys.executable, "-m", "apps.benchmarks", case.name, str(size)]
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, env=environment, timeout=LONGEST_SECONDS
+        )
+    except subprocess.TimeoutExpired:
+        return {"problem": f"took more than {LONGEST_SECONDS} s"}
+    if done.returncode:
+        return {"problem": (done.stderr.strip().splitlines() or [f"ended with status {done.returncode}"])[-1]}
+    figures: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return figures
+
+
+def _growth(runs: Sequence[dict[str, Any]], count: int) -> float | None:
+    """Power of the size with which the time grows, between the least and the greatest size."""
+    known = [run for run in runs if run["threads"] == count and "seconds" in run]
+    if len(known) < 2:
+        return None
+    first, last = known[0], known[-1]
+    times = last["seconds"]["median"] / first["seconds"]["median"]
+    return math.log(times) / math.log(last["size"] / first["size"])

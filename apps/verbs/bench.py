@@ -1,0 +1,78 @@
+"""`tofclip bench`: how fast and how large this program's parts are on this machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from apps.options import AsJson
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+def bench(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="recovery, clip, depth, streaming, rsd, propagation, confocal, backprojection, decode, or one of a "
+            "group, as recovery-l1.",
+        ),
+    ] = "all",
+    page: Annotated[
+        Path | None, typer.Option(metavar="MD", help="A page of the figures to write.", show_default="none")
+    ] = None,
+    peers: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PYTHON",
+            help="A Python that has other programs to compare with: pip install y-tal pyfftw astra-toolbox.",
+            show_default="none",
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure time and memory, each against what the work cannot do without; all of it takes less than ten minutes.
+
+    Other programs slow it down: close them. TOFCLIP_THREADS bounds the number of threads.
+
+    Example: tofclip bench recovery
+
+    Example: tofclip bench --page benchmarks.md --json
+    """
+    from apps.benchmarks.page import page as made_page
+    from apps.benchmarks.registry import cases_called
+    from apps.benchmarks.run import processes, run_cases
+    from apps.files import require_writable
+    from apps.progress import progress
+    from apps.report import report
+    from tofclip.storage import atomic_path
+
+    cases = cases_called(name)
+    if page is not None:
+        require_writable(page, ".md")
+    with progress("measuring", processes(cases)) as advance:
+        figures = run_cases(cases, None if peers is None else str(peers), advance)
+    if page is not None:
+        command = "tofclip bench" if name == "all" else f"tofclip bench {name}"
+        with atomic_path(page) as temporary:
+            temporary.write_text(made_page(figures, command), encoding="utf-8")
+    if as_json:
+        report(figures, as_json=True)
+    else:
+        report(_told(figures), as_json=False, written=[] if page is None else [page])
+
+
+def _told(figures: Mapping[str, Any]) -> dict[str, str]:
+    """One line for each case, of its greatest size on all threads."""
+    found = {}
+    for entry in figures["entries"]:
+        run = entry["runs"][-1]
+        found[entry["name"]] = run.get("problem") or (
+            f"{run['seconds']['median']:.4g} s at {run['size']} {entry['size']}, {run['times_floor']:.2f} times "
+            f"{entry['floor']}, {run['peak_mib']:.0f} MiB"
+        )
+    return found
