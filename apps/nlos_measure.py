@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-import tracemalloc
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,13 +30,18 @@ class Measured:
     volume : Volume
     seconds : float
         Wall-clock time of the imaging, without compiling.
-    peak_bytes : int
-        Most memory that its arrays held at a time, the volume included and the capture not.
+    peak_bytes : int or None
+        Most memory that the program took at a time beyond what it had before; None where the system does not tell.
     """
 
     volume: Volume
     seconds: float
-    peak_bytes: int
+    peak_bytes: int | None
+
+    @property
+    def costs(self) -> dict[str, float | None]:
+        """Time and memory by the names that reports use."""
+        return {"seconds": self.seconds, "peak_mib": None if self.peak_bytes is None else self.peak_bytes / 2**20}
 
 
 def measured(name: str, imaging: Reconstructor, capture: Capture, grid: Grid) -> Measured:
@@ -48,16 +53,31 @@ def measured(name: str, imaging: Reconstructor, capture: Capture, grid: Grid) ->
 
     few = slice(FIRST_VOXELS)
     imaging.reconstruct(capture, Grid(grid.x[few], grid.y[few], grid.z[:1]))
-    tracemalloc.start()
+    before = _memory_from_now()
+    started = time.perf_counter()
+    volume = imaged(name, imaging, capture, grid)
+    seconds = time.perf_counter() - started
+    peak = _memory("VmHWM")
+    return Measured(volume, seconds, None if before is None or peak is None else max(0, peak - before))
+
+
+def _memory_from_now() -> int | None:
+    """Let the system forget the most memory that this program ever took; return what it takes now, bytes."""
     try:
-        before = tracemalloc.get_traced_memory()[0]
-        started = time.perf_counter()
-        volume = imaged(name, imaging, capture, grid)
-        seconds = time.perf_counter() - started
-        peak = tracemalloc.get_traced_memory()[1] - before
-    finally:
-        tracemalloc.stop()
-    return Measured(volume, seconds, peak)
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # Linux only: see proc(5)
+    except OSError:
+        return None
+    return _memory("VmRSS")
+
+
+def _memory(entry: str) -> int | None:
+    """Return an entry of Linux's account of this program's memory, bytes."""
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
+    except OSError:
+        return None
+    found = next((line for line in lines if line.startswith(f"{entry}:")), None)
+    return None if found is None else int(found.split()[1]) * 1024
 
 
 def sharpness(volume: Volume) -> float:

@@ -144,5 +144,5 @@ def _is_number(value: Any) -> bool:
 def _as_toml(value: Any) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(map(_as_toml, value))}]"
-    # TOML's basic strings and numbers are JSON's, apart from escapes of half a character.
-    return json.dumps(value, ensure_ascii=False)
+    # TOML's basic strings and numbers are JSON's, but for the delete character, and for escapes of half a character.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -29,6 +29,9 @@ OUTLINE_PIXELS = 400
 POINT_RADIUS = 0.03
 """m; the circle about a hidden point."""
 
+CORNER = 0.5
+"""By so much of a facet the stairs of slanting edges are smoothed, as a standard deviation."""
+
 Plane = tuple[str, str]
 """The axes to the right and downwards."""
 
@@ -79,13 +82,16 @@ def draw_view(axes: Axes, volume: Volume, plane: Plane, truth: HiddenTruth | Non
 
 def draw_outline(axes: Axes, truth: HiddenTruth, plane: Plane) -> None:
     """Draw the border of everything hidden, seen along the third axis."""
+    from scipy.ndimage import gaussian_filter
+
     places = truth.positions[:, ["xyz".index(name) for name in plane]]
     radius = truth.spacing / 2 if truth.spacing else POINT_RADIUS
     low, high = places.min(axis=0) - 3 * radius, places.max(axis=0) + 3 * radius
     step = float((high - low).max()) / OUTLINE_PIXELS
     right, down = (np.arange(first, last + step, step) for first, last in zip(low, high, strict=True))
     inside = _inside(places, right, down, radius, round_ones=not truth.spacing)
-    axes.contour(right, down, inside, [0.5], colors=LINE, linewidths=1.0)
+    smooth = gaussian_filter(inside, truth.spacing * CORNER / step)
+    axes.contour(right, down, smooth, [0.5], colors=LINE, linewidths=1.0)
 
 
 def _inside(
@@ -106,7 +112,8 @@ def _inside(
 
 
 def _cost(figures: Mapping[str, Any]) -> str:
-    return f"{figures['seconds']:.2g} s, {figures['peak_mib']:.0f} MiB"
+    memory = "" if figures["peak_mib"] is None else f", {figures['peak_mib']:.0f} MiB"
+    return f"{figures['seconds']:.2g} s{memory}"
 
 
 def _merit(figures: Mapping[str, Any]) -> str:

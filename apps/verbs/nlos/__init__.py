@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import typer
 
-from apps.verbs.nlos import compare, info, reconstruct, simulate
+from apps.verbs.nlos import compare, demo, info, reconstruct, simulate
 
 app = typer.Typer()
 app.command()(reconstruct.reconstruct)
 app.command()(compare.compare)
 app.command()(simulate.simulate)
 app.command()(info.info)
+app.command()(demo.demo)
 
 
 @app.callback(invoke_without_command=True)

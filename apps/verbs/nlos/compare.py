@@ -136,8 +136,7 @@ def _figures(runs: Mapping[str, Measured], truth: HiddenTruth | None) -> dict[st
     reference = next(iter(runs.values())).volume
     return {
         name: {
-            "seconds": run.seconds,
-            "peak_mib": run.peak_bytes / 2**20,
+            **run.costs,
             "correlation": correlation(run.volume, reference),
             "sharpness": sharpness(run.volume),
             **({} if truth is None else truth_figures(run.volume, truth)),

@@ -1,0 +1,110 @@
+"""The demonstration around a corner in one picture: the room, what the wall shows, and images beside the truth."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from apps.figures.nlos_compare import Plane, draw_outline, draw_view
+from apps.figures.style import LINE, SMALL, draw, label, outer_edges, page
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from apps.nlos_measure import Measured
+    from apps.nlos_truth import HiddenTruth
+    from apps.verbs.nlos.demo import DemoRun
+    from nlos import Capture
+
+OUT, BACK, DEVICE = "#d1495b", "#2e6f95", "#8d949b"
+WALL_COLOUR, INK = "#c9cdd2", "#20242c"
+DEVICE_PLACE, SCREEN, SCREEN_ENDS = (1.65, 0.75), 1.16, (0.68, 1.45)
+"""x and z, m; the screen stands between the device and everything hidden, and in no way of light."""
+
+WALL_POINT, HIDDEN_POINT = -0.8, (0.27, 1.15)
+"""x of a wall point and x, z of a hidden point, between which a way of light is drawn, m."""
+
+PANEL_HEIGHT = 0.63
+"""Of the panels that hold no image, relative to their width: that of an image."""
+
+LIT = 0.02
+"""The record is shown from where a row holds this share of its brightest bin."""
+
+
+def demo_figure(run: DemoRun) -> Figure:
+    """Draw the room from above, one row's streak, and the images: flat, hybrid, back-projection, hybrid from above."""
+    figure = page(13, 6.6)
+    panels = figure.subplots(2, 3)
+    _draw_room(panels[0, 0], run)
+    _draw_streak(panels[0, 1], run.capture)
+    hybrid, slow, flat = (run.images[name] for name in ("hybrid", "backprojection", "flat"))
+    longer = f"{slow.seconds / hybrid.seconds:.2g} times as long"
+    _draw_image(panels[0, 2], flat, run.truth, ("x", "y"), "3. hybrid, had the wall been taken for flat")
+    _draw_image(panels[1, 0], hybrid, run.truth, ("x", "y"), f"4. hybrid: {_in_words(hybrid.seconds)}")
+    _draw_image(panels[1, 1], slow, run.truth, ("x", "y"), f"5. back-projection: {_in_words(slow.seconds)}, {longer}")
+    _draw_image(panels[1, 2], hybrid, run.truth, ("x", "z"), "6. hybrid, seen from above")
+    return figure
+
+
+def _draw_room(axes: Axes, run: DemoRun) -> None:
+    """Top view with the wall at the upper edge: who sees what, and the way of light."""
+    middle = run.capture.wall[run.capture.wall.shape[0] // 2]
+    x, z = middle[:, 0], middle[:, 2]
+    behind = float(z.min()) - 0.14
+    axes.fill_between(x, z, behind, color=WALL_COLOUR)
+    axes.plot(x, z, color=INK, lw=2)
+    draw_outline(axes, run.truth, ("x", "z"))
+    seen = int(np.argmin(np.abs(x - WALL_POINT)))
+    spot, point = (float(run.capture.laser[0]), float(run.capture.laser[2])), (float(x[seen]), float(z[seen]))
+    for start, end, colour, style in (
+        (DEVICE_PLACE, spot, DEVICE, "--"),
+        (spot, HIDDEN_POINT, OUT, "-"),
+        (HIDDEN_POINT, point, BACK, "-"),
+        (point, DEVICE_PLACE, DEVICE, "--"),
+    ):
+        axes.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.5, "ls": style})
+    axes.plot([SCREEN] * 2, SCREEN_ENDS, color=INK, lw=5, solid_capstyle="butt")
+    axes.plot(*DEVICE_PLACE, "s", color=INK, ms=8)
+    for place, text in (
+        ((1.45, 1.08), "laser,\ncamera"),
+        ((0.67, 1.44), "screen"),
+        ((-0.16, -0.12), "laser spot"),
+        ((-0.31, 1.05), "3"),
+        ((0.25, 1.34), "D"),
+    ):
+        axes.annotate(text, place, fontsize=SMALL)
+    axes.set(xlim=(-1.1, 2.0), ylim=(1.6, behind), aspect="equal", anchor="C")
+    label(axes, "1. the room from above: a curved wall", "x (m)", "z, away from the wall (m)")
+
+
+def _draw_streak(axes: Axes, capture: Capture) -> None:
+    """What the middle row of the wall shows over the path length."""
+    row = capture.signal[:, capture.wall.shape[0] // 2]
+    lit = np.flatnonzero(row.max(axis=1) > LIT * row.max())
+    paths = capture.axis.paths[lit[0] : lit[-1] + 1]
+    left, right = outer_edges(capture.wall[0, :, 0])
+    first, last = outer_edges(paths)
+    draw(axes, row[lit[0] : lit[-1] + 1], (left, right, last, first), aspect="auto")
+    axes.set_box_aspect(PANEL_HEIGHT)
+    for place, text in (((-0.78, 1.98), "3"), ((0.72, 2.4), "D")):
+        axes.annotate(text, place, color="white", fontsize=SMALL)
+    label(
+        axes,
+        f"2. one row of the wall: up to {row.max():.0f} photons in a bin",
+        "x on the wall (m)",
+        "path spot - hidden - wall (m)",
+    )
+
+
+def _draw_image(axes: Axes, image: Measured, truth: HiddenTruth, plane: Plane, title: str) -> None:
+    draw_view(axes, image.volume, plane, truth)
+    downwards = "y, down (m)" if plane[1] == "y" else "z, away from the wall (m)"
+    label(axes, title, "x (m)", downwards)
+    axes.plot([], [], color=LINE, label="truth")
+    axes.legend(fontsize=SMALL, loc="upper right", framealpha=0.3, labelcolor="white", facecolor=INK)
+
+
+def _in_words(seconds: float) -> str:
+    return f"{seconds:.1f} s" if seconds >= 1 else f"{seconds:.2f} s"

@@ -1,0 +1,98 @@
+"""Settings: from files and flags to what a verb works with, and back into a file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from apps.nlos_scene import SceneSettings
+from apps.nlos_settings import plain, save, setting, told
+from apps.verbs.nlos.compare import CompareSettings
+from apps.verbs.nlos.reconstruct import ReconstructSettings
+from tofclip.errors import FileFormatError, InputError, StorageError
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One setting of every type."""
+
+    name: str | None = setting("TEXT", "A text.")
+    length_m: float | None = setting("M", "A length.")
+    count: int = setting("N", "A number.", 2)
+    whole: bool = setting(None, "A choice.", False)
+    ends_m: tuple[float, float] | None = setting("M M", "A pair.")
+
+
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
+SAMPLES = st.builds(
+    Sample,
+    name=st.none() | st.text(st.characters(exclude_categories=["Cs"])),
+    length_m=st.none() | NUMBERS,
+    count=st.integers(-(2**63), 2**63 - 1),
+    whole=st.booleans(),
+    ends_m=st.none() | st.tuples(NUMBERS, NUMBERS),
+)
+
+
+@given(sample=SAMPLES)
+def test_what_is_written_is_read_back_to_the_last_bit(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> None:
+    path = tmp_path_factory.getbasetemp() / "sample.toml"
+    save(sample, path, "a sample")
+    assert repr(told(Sample, path, {})) == repr(sample)  # as text, for -0.0 equals 0.0
+
+
+def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text("length_m = 3\ncount = 5\nends_m = [1, 2.5]\n")
+    found = told(Sample, path, {"count": 7, "name": None, "whole": False})
+    assert found == Sample(length_m=3.0, count=7, ends_m=(1.0, 2.5))
+    assert isinstance(found.length_m, float)
+    assert told(Sample, None, {}) == Sample()
+    assert plain(Sample(count=3)) == {"count": 3, "whole": False}
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("lenght_m = 1", "did you mean 'length_m'"),
+        ("zzz = 1", "known are name, length_m, count, whole, ends_m"),
+        ("length_m = 'one'", "length_m must be a finite number, got 'one'"),
+        ("length_m = true", "length_m must be a finite number"),
+        ("length_m = nan", "length_m must be a finite number"),
+        ("count = 1.5", "count must be a whole number"),
+        ("whole = 1", "whole must be true or false"),
+        ("name = 1", "name must be a text in quotes"),
+        ("ends_m = [1, 2, 3]", "ends_m must be a list of 2 finite numbers"),
+        ("ends_m = 1", "ends_m must be a list of 2 finite numbers"),
+        ("[table]\na = 1", "no setting is called 'table'"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(text: str, complaint: str, tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"settings\.toml") as caught:
+        told(Sample, path, {})
+    assert complaint in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"length_m = = 1", b"name = '\xff'"])
+def test_files_that_are_no_toml(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "settings.toml"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match="is no TOML file of settings"):
+        told(Sample, path, {})
+    with pytest.raises(StorageError, match="no such file"):
+        told(Sample, tmp_path / "absent.toml", {})
+
+
+@pytest.mark.parametrize("kind", [ReconstructSettings, CompareSettings, SceneSettings])
+def test_every_setting_can_be_told_by_a_file(kind: type, tmp_path: Path) -> None:
+    """Values of each field's own type go out and come back."""
+    examples = {"float": 0.5, "int": 3, "str": "a", "bool": True, "tuple[float, float]": (0.5, 1.5)}
+    values = {field.name: examples[str(field.type).removesuffix(" | None")] for field in fields(kind)}
+    save(kind(**values), tmp_path / "all.toml", "all of them")
+    assert told(kind, tmp_path / "all.toml", {}) == kind(**values)
