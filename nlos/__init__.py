@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from nlos.propagation.propagate import propagate
     from nlos.refinement.refine import Refinement
     from nlos.rsd.planar import PlanarRSD
+    from nlos.video import TransientImaging, TransientVideo
     from nlos.volume import Volume
 
 __all__ = [
@@ -40,6 +41,8 @@ __all__ = [
     "LightCone",
     "PlanarRSD",
     "Refinement",
+    "TransientImaging",
+    "TransientVideo",
     "Volume",
     "propagate",
 ]
@@ -54,6 +57,8 @@ _HOMES = {
     "LightCone": "nlos.confocal.light_cone",
     "PlanarRSD": "nlos.rsd.planar",
     "Refinement": "nlos.refinement.refine",
+    "TransientImaging": "nlos.video",
+    "TransientVideo": "nlos.video",
     "Volume": "nlos.volume",
     "propagate": "nlos.propagation.propagate",
 }

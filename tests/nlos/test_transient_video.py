@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from relay_walls import curved_wall, planar_wall
+
+import nlos.video
+from nlos import Capture, Grid, Hybrid, PlanarRSD, TransientImaging
+from nlos.method import MEMORY_LIMIT_BYTES
+from nlos.simulate import PointScene
+from nlos.time_axis import TimeAxis
+from nlos.video import TransientVideo
+from tofclip.errors import InputError, ShapeError
+from tofclip.units import SPEED_OF_LIGHT
+
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")  # small walls are coarse ones
+LASER = np.array([0.12, 0.05, 0.0])
+POINTS = np.array([[0.15, -0.2, 0.6], [-0.2, 0.15, 0.95]])
+ARRIVALS = np.linalg.norm(POINTS - LASER, axis=1) / SPEED_OF_LIGHT
+AXIS = TimeAxis(300, 24e-12, 0.4)
+GRID = Grid(np.linspace(-0.4, 0.4, 17), np.linspace(-0.4, 0.4, 17), [0.5, 0.6, 0.7, 0.8, 0.95, 1.1])
+METHODS = {"rsd": PlanarRSD(0.15, 4), "hybrid": Hybrid(0.15, 4)}
+
+
+def seen(method: str, points: np.ndarray = POINTS) -> Capture:
+    wall = planar_wall(19, 21) if method == "rsd" else curved_wall(19, 21)
+    return PointScene(points).seen_from(wall, LASER, AXIS, 40e-12)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_hidden_point_lights_up_when_the_flash_reaches_it(method: str) -> None:
+    imaging, capture = TransientImaging(METHODS[method]), seen(method, POINTS[:1])
+    times = ARRIVALS[0] + 100e-12 * np.arange(-16, 17)
+    done: list[int] = []
+    video = imaging.video(capture, GRID, times, done.append)
+    assert video.values.shape == (33, *GRID.shape)
+    assert video.values.dtype == np.float32
+    assert sum(done) == GRID.size
+    # The brightest of all voxels and instants is the point when the flash passes.
+    instant, *voxel = np.unravel_index(video.values.argmax(), video.values.shape)
+    assert (instant, *voxel) == (16, *GRID.nearest(POINTS[0]))
+    # The wave is a pulse: 3.5 standard deviations of its envelope earlier and later the point is dark.
+    there = video.values[(slice(None), *voxel)]
+    away = np.abs(times - ARRIVALS[0]) * SPEED_OF_LIGHT > 3.5 * METHODS[method].pulse.sigma
+    assert there[away].max() < 0.05 * there.max()
+    # Its width is that of the envelope; jitter adds to it in squares.
+    width = np.sqrt(np.sum((times - ARRIVALS[0]) ** 2 * there**2) / np.sum(there**2)) * SPEED_OF_LIGHT
+    assert width == pytest.approx(METHODS[method].pulse.sigma / np.sqrt(2), rel=0.1)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_voxel_at_its_own_time_is_the_image_of_the_method(method: str) -> None:
+    imaging, capture = TransientImaging(METHODS[method]), seen(method)
+    voxels = [(1, 4, 11), (4, 11, 4), (3, 8, 8), (0, 0, 16)]
+    places = np.array([[GRID.x[x], GRID.y[y], GRID.z[z]] for z, y, x in voxels])
+    times = np.linalg.norm(places - LASER, axis=1) / SPEED_OF_LIGHT
+    values = imaging.video(capture, GRID, times).values
+    image = METHODS[method].reconstruct(capture, GRID).values
+    for i, voxel in enumerate(voxels):
+        assert values[(i, *voxel)] == pytest.approx(image[voxel], abs=1e-2 * float(image.max()))
+
+
+def test_front_views_are_the_brightest_along_z(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nlos.video, "INSTANTS_AT_A_TIME", 3)  # 7 instants in three pieces
+    imaging, capture = TransientImaging(METHODS["hybrid"]), seen("hybrid")
+    times = np.linspace(ARRIVALS[0], ARRIVALS[1], 7)
+    front, whole = imaging.front_views(capture, GRID, times), imaging.video(capture, GRID, times)
+    assert front.values.shape == (7, 17, 17)
+    np.testing.assert_allclose(front.values, whole.values.max(axis=1), rtol=1e-5)
+    for i, point in ((0, POINTS[0]), (6, POINTS[1])):
+        _, y, x = GRID.nearest(point)
+        assert np.unravel_index(front.values[i].argmax(), front.values[i].shape) == (y, x)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_gate_shows_what_lights_up_while_it_is_open(method: str) -> None:
+    imaging, capture = TransientImaging(METHODS[method]), seen(method)
+    around = 1.5 * METHODS[method].pulse.sigma / SPEED_OF_LIGHT
+    image = METHODS[method].reconstruct(capture, GRID).values
+    for arrival, bright, dark in ((ARRIVALS[0], *POINTS), (ARRIVALS[1], *POINTS[::-1])):
+        gated = imaging.gated(capture, GRID, arrival - around, arrival + around)
+        peak = gated.values[GRID.nearest(bright)]
+        # erf(1.5) = 0.966 of the flash passes, of which this is the square root.
+        assert peak == pytest.approx(image[GRID.nearest(bright)], rel=0.05)
+        assert gated.values[GRID.nearest(dark)] < 0.2 * image[GRID.nearest(dark)]
+        assert gated.provenance["imaging"]["gate_opens_s"] == arrival - around
+
+
+def test_long_after_the_record_nothing_echoes() -> None:
+    imaging, capture = TransientImaging(METHODS["rsd"]), seen("rsd")
+    late = imaging.video(capture, GRID, [ARRIVALS[0], 40e-9]).values
+    # The band's edge, where the pulse's spectrum is cut at 1 %, rings that far.
+    assert late[1].max() < 2e-2 * late[0].max()
+
+
+def test_a_video_comes_back_from_its_file(tmp_path: Path) -> None:
+    imaging, capture = TransientImaging(METHODS["rsd"]), seen("rsd")
+    for make in (imaging.video, imaging.front_views):
+        video = make(capture, GRID, ARRIVALS)
+        video.save(tmp_path / "video.h5")
+        loaded = TransientVideo.load(tmp_path / "video.h5")
+        assert np.array_equal(loaded.values, video.values)
+        assert np.array_equal(loaded.times, ARRIVALS)
+        assert np.array_equal(loaded.grid.z, GRID.z)
+        assert loaded.provenance["imaging"]["method"] == "transient imaging by PlanarRSD"
+
+
+def test_what_cannot_be_filmed_is_refused() -> None:
+    imaging, capture = TransientImaging(METHODS["rsd"]), seen("rsd")
+    scanned = replace(capture, laser=capture.wall)
+    with pytest.raises(InputError, match="need one laser spot"):
+        imaging.video(scanned, GRID, ARRIVALS)
+    with pytest.raises(InputError, match="behind the hindmost"):
+        imaging.front_views(capture, Grid(GRID.x, GRID.y, GRID.z - 2), ARRIVALS)
+    with pytest.raises(InputError, match=r"GiB allowed: ask for fewer"):
+        imaging.video(capture, GRID, np.zeros(MEMORY_LIMIT_BYTES // (4 * GRID.size) + 1))
+    with pytest.raises(ShapeError, match="instants"):
+        imaging.video(capture, GRID, [])
+    with pytest.raises(InputError, match="must be finite"):
+        imaging.video(capture, GRID, [np.nan])
+    with pytest.raises(InputError, match="open before it closes"):
+        imaging.gated(capture, GRID, 2e-9, 1e-9)
+    with pytest.raises(ShapeError, match="transient video"):
+        TransientVideo(np.zeros((2, 3, 3), np.float32), np.zeros(2), GRID)
