@@ -10,9 +10,7 @@ import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
 from apps.cli import EPILOG, MAP, app
-from apps.help import told
-
-PROGRAM = "tofclip"
+from apps.help import PROGRAM, told
 
 
 def verbs() -> dict[str, TyperCommand]:

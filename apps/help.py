@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import typer
 
+PROGRAM = "tofclip"
 EXAMPLE = "Example:"
 WIDTH = 72  # of an example, so that it fits the narrowest usual terminal with its indentation
 

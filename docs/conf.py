@@ -22,6 +22,7 @@ exclude_patterns = ["_build", "reproduction/*.md"]  # those are parts of reprodu
 myst_enable_extensions = ["deflist"]
 myst_heading_anchors = 3
 
+smartquotes = False  # they would turn -- of an option into a dash
 default_role = "py:obj"
 autodoc_default_options = {"members": True}
 autodoc_typehints = "none"  # the docstrings tell shapes and units, which types cannot
