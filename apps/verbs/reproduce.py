@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import sys
 import time
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.options import AsJson
+from apps.options import AsJson, Cluster
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from apps.reproduction import Result
+    from tofclip.cluster import Summary
     from tofclip.studies.library import Library
-    from tofclip.studies.outcome import Study
+    from tofclip.studies.outcome import Advance, Study
 
 
 def reproduce(
@@ -24,18 +28,21 @@ def reproduce(
         Path | None, typer.Option(metavar="DIR", help="Recorded data: DIR/lightfields/*.npz are studied as well.")
     ] = None,
     seeds: Annotated[int, typer.Option(metavar="N", min=1, help="Repeats with other angles, codes and noise.")] = 3,
+    cluster: Cluster = None,
     as_json: AsJson = False,
 ) -> None:
     """Make tables and figures of the paper again, its figures beside ours.
 
     Writes DIR/reproduction.md, which shows everything, and NAME.md, NAME.csv, NAME.png and NAME.json of each study in
-    DIR/reproduction. A study that is there already, made with the same settings, is not made again.
+    DIR/reproduction. A study that is there already, made with the same settings, is not made again. On a cluster each
+    study is a task; its seeds stay together, since the weight chosen with the first one holds for all.
 
     Example: tofclip reproduce table2 --out reproduction --seeds 3
     """
     from apps.files import make_folder
     from apps.report import report
     from apps.reproduction import FOLDER, write_page
+    from apps.sequences import finish
     from tofclip.studies.library import Library
     from tofclip.studies.registry import studies_called
 
@@ -45,10 +52,15 @@ def reproduce(
     make_folder(folder)
     library = Library(data)
     possible = [study for study in studies if _is_possible(study, library) or len(studies) == 1]
-    results = [_result(study, library, seeds, folder) for study in possible]
+    summary = None if cluster is None else _shared(possible, library, seeds, folder, cluster)
+    failed = set() if summary is None else {failure.name for failure in summary.failures}
+    results = [_result(study, library, seeds, folder) for study in possible if study.name not in failed]
     page = write_page(_all_results(library, seeds, folder), out)
     figures = {result["name"]: _summary(result) for result in results}
-    report({"seeds": seeds, **figures}, as_json, [page])
+    if summary is None:
+        report({"seeds": seeds, **figures}, as_json, [page])
+        return
+    finish(summary, len(possible), as_json, page, {"seeds": seeds, **figures})
 
 
 def _require_folder(data: Path | None) -> None:
@@ -74,30 +86,68 @@ def _settings(study: Study, library: Library, seeds: int) -> dict[str, Any]:
     return {"name": study.name, "seeds": seeds, "data": recorded, "version": __version__}
 
 
+def _shared(studies: Sequence[Study], library: Library, seeds: int, folder: Path, cluster: str) -> Summary:
+    """Have the studies that are not there yet made by workers."""
+    from apps.reproduction import kept_result
+    from apps.sequences import run_all
+    from tofclip.cluster import Job
+
+    data = None if library.data is None else library.data.resolve()
+    jobs = []
+    for study in studies:
+        path = folder.resolve() / f"{study.name}.json"
+        if kept_result(path, _settings(study, library, seeds)) is None:
+            path.unlink(missing_ok=True)  # of other settings, or damaged
+            jobs.append(Job(study.name, path, partial(make_study, study.name, data, seeds, path.parent)))
+    return run_all("reproducing", jobs, cluster)
+
+
+def make_study(name: str, data: Path | None, seeds: int, folder: Path) -> None:
+    """Make a study again and write it; light fields are rendered or read once in a process."""
+    from tofclip.studies.registry import studies_called
+
+    (study,) = studies_called(name)
+    _made(study, _library(data), seeds, folder, lambda _: None)
+
+
+@cache
+def _library(data: Path | None) -> Library:
+    from tofclip.studies.library import Library
+
+    return Library(data)
+
+
 def _result(study: Study, library: Library, seeds: int, folder: Path) -> Result:
     """Return a study's result, made now unless the folder has it."""
-    from apps.figures.reproduction import reproduction_figure
-    from apps.figures.style import save
     from apps.progress import progress
-    from apps.reproduction import kept_result, result_of, write_result
+    from apps.reproduction import kept_result
 
-    settings = _settings(study, library, seeds)
-    kept = kept_result(folder / f"{study.name}.json", settings)
+    kept = kept_result(folder / f"{study.name}.json", _settings(study, library, seeds))
     if kept is not None:
         print(f"{study.name}: kept from an earlier run", file=sys.stderr)
         return kept
     repeats = seeds if study.seeded else 1
-    started = time.perf_counter()
     print(f"{study.name}: {study.title}, about {study.seconds * repeats:.0f} s", file=sys.stderr)
     with progress(study.name, study.steps * repeats) as advance:
-        outcome = study.work(library, repeats, advance)
+        result = _made(study, library, seeds, folder, advance)
+    print(f"{study.name}: {result['seconds']:.0f} s", file=sys.stderr)
+    return result
+
+
+def _made(study: Study, library: Library, seeds: int, folder: Path, advance: Advance) -> Result:
+    """Make a study, and write its picture, its tables, and at last the file that tells that it is finished."""
+    from apps.figures.reproduction import reproduction_figure
+    from apps.figures.style import save
+    from apps.reproduction import result_of, write_result
+
+    started = time.perf_counter()
+    outcome = study.work(library, seeds if study.seeded else 1, advance)
     seconds = time.perf_counter() - started
     recorded = "" if library.data is None else f" --data {library.data.name}"
     command = f"tofclip reproduce {study.name} --out {folder.parent.name or '.'}{recorded} --seeds {seeds}"
     save(reproduction_figure(study.title, outcome), folder / f"{study.name}.png")
-    result = result_of(study, outcome, settings, command, seconds)
+    result = result_of(study, outcome, _settings(study, library, seeds), command, seconds)
     write_result(result, folder)
-    print(f"{study.name}: {seconds:.0f} s", file=sys.stderr)
     return result
 
 

@@ -96,3 +96,30 @@ def test_ranging_on_a_cluster(run, scheduler, recorded, tmp_path):
     told = json.loads(out)
     assert (told["shots"], told["results"], told["processes"]) == (6, 6, 2)
     assert told["jitter_rms_bins"] < 0.15
+
+
+def test_studies_on_a_cluster(run, scheduler, tmp_path):
+    words = ("reproduce", "table1", "--out", tmp_path / "made", "--seeds", "1", "--cluster", scheduler, "--json")
+    folder = tmp_path / "made" / "reproduction"
+    folder.mkdir(parents=True)
+    (folder / "table1.json").write_text("{")  # damaged: made again
+    status, out, err = run(*words)
+    assert (status, json.loads(out)["results"]) == (0, 1), err
+    assert {path.name for path in folder.iterdir()} == {f"table1.{ending}" for ending in ("md", "csv", "png", "json")}
+    assert "tofclip reproduce table1" in (tmp_path / "made" / "reproduction.md").read_text()
+    made = (folder / "table1.json").stat().st_mtime_ns
+    told = json.loads(run(*words)[1])
+    assert (told["results"], told["kept_from_before"], told["table1"]["rows"] > 0) == (0, 1, True)
+    assert (folder / "table1.json").stat().st_mtime_ns == made
+
+
+def test_a_study_that_fails_on_a_cluster(run, scheduler, tmp_path):
+    recording = tmp_path / "data" / "diffusercam" / "psf_hand_300x400.npz"
+    recording.parent.mkdir(parents=True)
+    recording.write_text("no archive")
+    words = ("reproduce", "fig4d", "--data", tmp_path / "data", "--out", tmp_path / "made", "--cluster", scheduler)
+    status, out, _ = run(*words, "--json")
+    assert status == 1
+    (failure,) = json.loads(out)["failures"]
+    assert failure["name"] == "fig4d"
+    assert "psf_hand_300x400.npz" in failure["problem"]
