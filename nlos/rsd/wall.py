@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,16 +36,16 @@ class WallLattice:
     column: NDArray[np.intp]
 
     @classmethod
-    def of(cls, points: FloatArray) -> WallLattice:
-        """Find the lattice that wall points (n, 3) stand above.
+    def of(cls, points: FloatArray, evenness: float = EVENNESS) -> WallLattice:
+        """Find the lattice that wall points (n, 3) stand above; they may be off it by a fraction of its step.
 
         Raises
         ------
         InputError
             There is none, or two points stand in one place.
         """
-        x, column = _lattice(points[:, 0], "x")
-        y, row = _lattice(points[:, 1], "y")
+        x, column = _lattice(points[:, 0], "x", evenness)
+        y, row = _lattice(points[:, 1], "y", evenness)
         if np.unique(row * x.size + column).size < len(points):
             raise InputError("two wall points stand in one place; use the hybrid method, which takes them as they are")
         return cls(x, y, row, column)
@@ -75,34 +76,34 @@ class PlanarWall:
     lattice: WallLattice
 
     @classmethod
-    def of(cls, points: FloatArray) -> PlanarWall:
-        """Find the lattice that wall points (n, 3) stand on.
+    def of(cls, points: FloatArray, evenness: float = EVENNESS) -> PlanarWall:
+        """Find the lattice that wall points (n, 3) stand on; they may be off it by a fraction of its step.
 
         Raises
         ------
         InputError
             They stand on none, or not on a plane z = const.
         """
-        lattice = WallLattice.of(points)
+        lattice = WallLattice.of(points, evenness)
         plane = Plane(lattice.x, lattice.y, float(points[:, 2].mean()))
         relief = float(np.ptp(points[:, 2]))
-        if relief > 2 * EVENNESS * min(plane.steps):
+        if relief > 2 * evenness * min(plane.steps):
             raise InputError(
                 f"the wall is not a plane z = const: it is {relief:.3g} m deep; use the hybrid method, which carries "
                 "its signals onto one"
             )
         return cls(plane, lattice)
 
-    def field(self, phasors: NDArray[np.complex64]) -> NDArray[np.complex64]:
-        """Put phasors (points, frequencies) into their places, shape (y, x, frequencies)."""
+    def field(self, samples: NDArray[Any]) -> NDArray[Any]:
+        """Put phasors (points, frequencies), or signals (points, t), into their places, shape (y, x, ...)."""
         if self.lattice.complete:
-            return phasors.reshape(*self.plane.shape, -1)
-        values = np.zeros((*self.plane.shape, phasors.shape[1]), np.complex64)
-        values[self.lattice.row, self.lattice.column] = phasors
+            return samples.reshape(*self.plane.shape, -1)
+        values = np.zeros((*self.plane.shape, samples.shape[1]), samples.dtype)
+        values[self.lattice.row, self.lattice.column] = samples
         return values
 
 
-def _lattice(coordinates: FloatArray, name: str) -> tuple[FloatArray, NDArray[np.intp]]:
+def _lattice(coordinates: FloatArray, name: str, evenness: float) -> tuple[FloatArray, NDArray[np.intp]]:
     """Even axis that all coordinates lie on, and the place of each."""
     ordered = np.sort(coordinates)
     gaps = np.diff(ordered)
@@ -113,7 +114,7 @@ def _lattice(coordinates: FloatArray, name: str) -> tuple[FloatArray, NDArray[np
     steps = round(float((ordered[-1] - ordered[0]) / np.median(apart)))
     axis = np.linspace(ordered[0], ordered[-1], steps + 1)
     place = np.rint((coordinates - axis[0]) / (axis[1] - axis[0])).astype(np.intp)
-    if np.max(np.abs(coordinates - axis[place])) > EVENNESS * (axis[1] - axis[0]):
+    if np.max(np.abs(coordinates - axis[place])) > evenness * (axis[1] - axis[0]):
         raise InputError(
             f"the wall's points are not evenly spaced along {name}; use the hybrid method, which takes them as they are"
         )
