@@ -83,7 +83,7 @@ class LightCone:
         bins = scan.signal.shape[2]
         squares = (bins * scan.spacing) ** 2 / bins
         values = self._deconvolved(scan, squares)
-        depth_position = (grid.z - scan.lattice.z) ** 2 / squares - 0.5
+        depth_position = (grid.z - scan.plane.z) ** 2 / squares - 0.5
         # Depths between the wall and the first sample read the first.
         image = onto_grid(values, scan, grid, np.clip(depth_position, 0, bins - 1))
         progress(grid.size)
@@ -148,7 +148,7 @@ def _paraboloid(scan: ConfocalScan, squares: float, shape: tuple[int, int, int])
     """
     from scipy.fft import dctn
 
-    y, x = (length * np.arange(n // 2 + 1) for length, n in zip(scan.lattice.steps, shape[:2], strict=True))
+    y, x = (length * np.arange(n // 2 + 1) for length, n in zip(scan.plane.steps, shape[:2], strict=True))
     late = (y[:, np.newaxis] ** 2 + x**2) / squares
     whole = np.floor(late)
     share = (late - whole)[..., np.newaxis]

@@ -75,7 +75,7 @@ class FKMigration:
         self.supports(capture, grid).require()
         scan = ConfocalScan.of(capture, grid)
         energy = _energy(_migrated(self._spectrum(scan), scan), scan.signal.shape[2])
-        image = onto_grid(energy, scan, grid, (grid.z - scan.lattice.z) / scan.spacing)
+        image = onto_grid(energy, scan, grid, (grid.z - scan.plane.z) / scan.spacing)
         progress(grid.size)
         settings = {"method": "fk", "falloff": self.falloff}
         return Volume(image, grid, {**capture.provenance, "imaging": settings})
@@ -100,7 +100,7 @@ def _migrated(spectrum: NDArray[np.complex64], scan: ConfocalScan) -> NDArray[np
     period = padded(bins)
     ky, kx = (
         np.fft.fftfreq(n, step(axis)) * period * scan.spacing
-        for n, axis in zip(spectrum.shape[:2], (scan.lattice.y, scan.lattice.x), strict=True)
+        for n, axis in zip(spectrum.shape[:2], (scan.plane.y, scan.plane.x), strict=True)
     )
     delay = 2 * np.pi * (bins // 2) / period
 

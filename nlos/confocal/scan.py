@@ -8,11 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.capture import Capture
-from nlos.confocal.lattice import OFF_LATTICE, Lattice
 from nlos.geometry import FloatArray, Grid
 from nlos.kernels import delayed_reading
 from nlos.method import Support, common_support
+from nlos.plane import Plane, step
+from nlos.rsd.wall import PlanarWall
 from tofclip.errors import InputError
+
+OFF_LATTICE = 0.02
+"""Points may be off the lattice by this fraction of its step."""
 
 MEMORY_LIMIT_BYTES = 4 << 30
 """Larger transforms are refused before anything is allocated."""
@@ -27,30 +31,28 @@ NOTHING_TO_MOVE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ConfocalScan:
-    """Signals on a lattice of wall points.
+    """Signals on a lattice of wall points; where a point is missing, it is dark.
 
     Parameters
     ----------
     signal : (y, x, t) float32 array
         What every wall point saw; bin i stands for the distance ``i * spacing`` from it.
-    lattice : Lattice
+    plane : Plane
+        The wall points.
     spacing : float
         Distance per bin, m: half the path.
     """
 
     signal: NDArray[np.float32]
-    lattice: Lattice
+    plane: Plane
     spacing: float
 
     @classmethod
     def of(cls, capture: Capture, grid: Grid) -> ConfocalScan:
         """Sort a capture onto its lattice, from distance 0 as far as any voxel of the grid is from any wall point."""
-        lattice = Lattice.of(capture.points)
-        if lattice is None:
-            raise InputError("the capture's wall points form no lattice")
-        traces = _from_distance_zero(capture, _useful_bins(capture, lattice, grid))
-        signal = traces[lattice.order].reshape(lattice.y.size, lattice.x.size, traces.shape[1])
-        return cls(signal, lattice, capture.axis.spacing / 2)
+        wall = PlanarWall.of(capture.points, OFF_LATTICE)
+        traces = _from_distance_zero(capture, _useful_bins(capture, wall.plane, grid))
+        return cls(wall.field(traces), wall.plane, capture.axis.spacing / 2)
 
     def weighted(self, falloff: float) -> NDArray[np.float32]:
         """Undo the loss of brightness with distance d by the factor d^falloff; the farthest bin keeps its scale."""
@@ -63,12 +65,11 @@ def confocal_support(capture: Capture, grid: Grid) -> Support:
     basic = common_support(capture, grid)
     if not basic:
         return basic
-    lattice = Lattice.of(capture.points)
-    if lattice is None:
-        return Support(
-            "the wall points must fill an evenly spaced lattice x, y on a plane z = const; use another method"
-        )
-    return Support(_laser_problem(capture, lattice) or _reach_problem(lattice, grid) or _size_problem(capture))
+    try:
+        plane = PlanarWall.of(capture.points, OFF_LATTICE).plane
+    except InputError as problem:
+        return Support(f"a lattice of points on a plane is needed: {problem}")
+    return Support(_laser_problem(capture, plane) or _reach_problem(plane, grid) or _size_problem(capture, plane))
 
 
 def padded(count: int) -> int:
@@ -93,23 +94,23 @@ def onto_grid(
 ) -> NDArray[np.float32]:
     """Read an image (y, x, depth) on the padded lattice at the voxels of a grid, shape (z, y, x)."""
     image = interpolated(values, depth_position, 2)
-    image = interpolated(image, scan.lattice.column(grid.x), 1)
-    return np.ascontiguousarray(np.moveaxis(interpolated(image, scan.lattice.row(grid.y), 0), 2, 0))
+    row, column = ((wanted - axis[0]) / step(axis) for wanted, axis in ((grid.y, scan.plane.y), (grid.x, scan.plane.x)))
+    return np.ascontiguousarray(np.moveaxis(interpolated(interpolated(image, column, 1), row, 0), 2, 0))
 
 
-def _laser_problem(capture: Capture, lattice: Lattice) -> str:
+def _laser_problem(capture: Capture, plane: Plane) -> str:
     if len(capture.lasers) != len(capture.points):
         return "a confocal scan is needed, where every wall point is its own laser spot; use another method"
     apart = float(np.abs(capture.lasers - capture.points).max())
-    if apart > OFF_LATTICE * min(lattice.steps):
+    if apart > OFF_LATTICE * min(plane.steps):
         return (
             f"a confocal scan is needed, but lasers are up to {apart:.3g} m from their wall points; use another method"
         )
     return ""
 
 
-def _reach_problem(lattice: Lattice, grid: Grid) -> str:
-    for name, axis, wanted in (("x", lattice.x, grid.x), ("y", lattice.y, grid.y)):
+def _reach_problem(plane: Plane, grid: Grid) -> str:
+    for name, axis, wanted in (("x", plane.x, grid.x), ("y", plane.y, grid.y)):
         margin = (axis[-1] - axis[0]) / 2
         low, high = axis[0] - margin, axis[-1] + margin
         if wanted[0] < low or wanted[-1] > high:
@@ -120,24 +121,25 @@ def _reach_problem(lattice: Lattice, grid: Grid) -> str:
     return ""
 
 
-def _size_problem(capture: Capture) -> str:
+def _size_problem(capture: Capture, plane: Plane) -> str:
+    places = plane.x.size * plane.y.size
     bins = capture.axis.bins + max(0, int(capture.start / capture.axis.spacing))
-    needed = 8 * len(capture.points) * bins * BYTES_PER_SAMPLE
+    needed = 8 * places * bins * BYTES_PER_SAMPLE
     if needed <= MEMORY_LIMIT_BYTES:
         return ""
     return (
-        f"{len(capture.points)} wall points with {bins} bins need {needed / 2**30:.1f} GiB, more than the "
+        f"{places} wall points with {bins} bins need {needed / 2**30:.1f} GiB, more than the "
         f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: put time bins together or leave wall points out"
     )
 
 
-def _useful_bins(capture: Capture, lattice: Lattice, grid: Grid) -> int:
+def _useful_bins(capture: Capture, plane: Plane, grid: Grid) -> int:
     """Bins from path 0 to the end of the record, or as far as light of the grid can come from."""
     across = [
         max(abs(voxel - point) for voxel in (wanted[0], wanted[-1]) for point in (axis[0], axis[-1]))
-        for axis, wanted in ((lattice.x, grid.x), (lattice.y, grid.y))
+        for axis, wanted in ((plane.x, grid.x), (plane.y, grid.y))
     ]
-    farthest = float(np.hypot(np.hypot(*across), grid.z[-1] - lattice.z))
+    farthest = float(np.hypot(np.hypot(*across), grid.z[-1] - plane.z))
     recorded = int(np.ceil(capture.axis.paths[-1] / capture.axis.spacing)) + 1
     return max(2, min(recorded, int(np.ceil(2 * farthest / capture.axis.spacing)) + 2))
 
