@@ -67,7 +67,6 @@ def _headline(experiment: Experiment) -> str:
 def _pictures(experiment: Experiment) -> list[tuple[str, NDArray[Any], NDArray[Any] | None]]:
     """Title, picture, and the truth it is compared with and scaled to; None: scaled to itself."""
     truth, separated = experiment.truth, experiment.separated
-    occluder = 0 * truth if separated is None else separated.occluder
     everything = experiment.pictures[len(experiment.pictures) // 2].sum(axis=-1)
     refocused = experiment.conventional
     # what a light-field camera shows of the target is drawn as bright as the haze allows
@@ -80,8 +79,8 @@ def _pictures(experiment: Experiment) -> list[tuple[str, NDArray[Any], NDArray[A
             experiment.single_view,
             experiment.single_view_truth,
         ),
-        ("ToF-CLIP: the first return,\nthe occluder", occluder, None),
-        ("ToF-CLIP: the second return,\nwhat stands behind", experiment.target, truth),
+        ("ToF-CLIP: the first return,\nthe occluder", separated.occluder, None),
+        ("ToF-CLIP: the second return,\nwhat stands behind", separated.target, truth),
         ("truth:\nthe occluder taken away", truth, truth),
     ]
 
@@ -169,7 +168,7 @@ class Frame(NamedTuple):
 def _film(experiment: Experiment) -> list[Frame]:
     """Every instant that is not dark; at last the whole of the second return."""
     separated, returns = experiment.separated, experiment.readings.returns()
-    parts = [0 * experiment.truth] if separated is None else [separated.occluder, separated.target]
+    parts = [separated.occluder, separated.target][: len(returns)]
     history, middle = experiment.readings.history, experiment.pictures[len(experiment.pictures) // 2]
     times, frames = experiment.clock.times / PICOSECOND, []
     for found, recovered in zip(returns, parts, strict=True):
@@ -179,9 +178,10 @@ def _film(experiment: Experiment) -> list[Frame]:
             pictures = middle[..., instant] / scales[0], lit[instant] * recovered / scales[1]
             frames.append(Frame(float(times[instant]), f"{times[instant]:.0f} ps after the flash", pictures))
     brightest = experiment.truth.max()
-    behind = middle[..., returns[-1].bins].sum(axis=-1) if separated is not None else 0 * experiment.truth
-    last = "all of the second return together" if separated is not None else "nothing comes from behind the occluder"
-    return [*frames, Frame(frames[-1].time, last, (behind / brightest, experiment.target / brightest))]
+    behind, last = separated.plain, "nothing comes from behind the occluder"
+    if separated.sees_target:
+        behind, last = middle[..., returns[1].bins].sum(axis=-1), "all of the second return together"
+    return [*frames, Frame(frames[-1].time, last, (behind / brightest, separated.target / brightest))]
 
 
 def _first_frame(figure: Figure, experiment: Experiment) -> tuple[list[Any], Any, Any]:
@@ -196,4 +196,8 @@ def _first_frame(figure: Figure, experiment: Experiment) -> tuple[list[Any], Any
     time.set_title("light of all readings", fontsize=SMALL + 2)
     time.set_ylabel("")
     time.tick_params(axis="y", labelleft=False)
-    return images, time.axvline(0, color=UNSEEN, lw=2), figure.suptitle("", fontsize=SMALL + 4)
+    return (
+        images,
+        time.axvline(experiment.clock.start / PICOSECOND, color=UNSEEN, lw=2),
+        figure.suptitle("", fontsize=SMALL + 4),
+    )

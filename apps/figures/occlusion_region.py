@@ -75,7 +75,7 @@ def _draw_lines(axes: Axes, region: InactiveRegion, reach: float) -> None:
 
 
 def _title(region: InactiveRegion) -> str:
-    sizes = f"L = {region.baseline / MILLIMETRE:g} mm, D = {region.width / MILLIMETRE:g} mm, "
+    sizes = f"L = {region.baseline / MILLIMETRE:g} mm, D = {region.width / MILLIMETRE:.3g} mm, "
     sizes += f"d = {region.distance / MILLIMETRE:g} mm"
     if not region.ends:
         return f"{sizes}: D \N{GREATER-THAN OR EQUAL TO} L, nothing behind the occluder is promised to be seen"

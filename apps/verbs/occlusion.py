@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tofclip.occlusion.experiment import Experiment
     from tofclip.occlusion.probe import Probe
 
-SCENE_NAMES = ("v-letter", "plate", "tree", "bush", "trellis", "board")
+SCENE_NAMES = ("v-letter", "plate", "person", "tree", "bush", "trellis", "board")
 """Those of `tofclip.occlusion.scenes`, named here so that help appears without loading them."""
 
 app = typer.Typer()
@@ -64,7 +64,7 @@ def region(
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results; made if missing.")],
-    scene: Annotated[str, typer.Option(metavar="NAME", help=f"{', '.join(SCENE_NAMES)}.")] = SCENE_NAMES[0],
+    scene: Annotated[str, typer.Option(metavar="NAME", help=f"{', '.join(SCENE_NAMES)}.")] = "tree",
     illumination: Annotated[
         str, typer.Option(metavar="NAME", help="diodes, one beside each view; oblique; co-located, a single one.")
     ] = "diodes",
@@ -114,18 +114,17 @@ def _figures(experiment: Experiment, probes: Sequence[Probe]) -> dict[str, Any]:
     from tofclip.metrics import correlation, nmse
 
     scene, truth = experiment.scene, experiment.truth
-    own = (scene.distance, correlation(experiment.target, truth), experiment.promised)
+    own = (scene.distance, correlation(experiment.separated.target, truth), experiment.promised)
     targets = [own, *((one.distance, one.correlation, one.expected_visible) for one in probes)]
     names = ("distance_m", "correlation", "expected_visible")
-    separated = experiment.separated
-    plain = 0.0 if separated is None else correlation(separated.plain, truth)
+    found = experiment.separated
     return {
         "scene": scene.name,
         "inactive_length_m": scene.region.length,
         "targets": [dict(zip(names, one, strict=True)) for one in sorted(targets)],
-        "nmse": nmse(experiment.target, truth),
+        "nmse": nmse(found.target, truth),
         "correlation": own[1],
-        "correlation_without_model_of_occluder": plain,
+        "correlation_without_model_of_occluder": correlation(found.plain, truth),
         "correlation_single_view": correlation(experiment.single_view, experiment.single_view_truth),
         "correlation_light_field_camera": correlation(experiment.conventional, truth),
         "readings": experiment.rig.camera.readings,

@@ -12,7 +12,7 @@ from tofclip.metrics import correlation, nmse
 from tofclip.occlusion.experiment import ILLUMINATIONS, Experiment, Settings
 from tofclip.occlusion.probe import probe
 from tofclip.occlusion.readings import TimedReadings, encoded
-from tofclip.occlusion.recovery import covered, model_behind
+from tofclip.occlusion.recovery import covered, model_behind, separate
 from tofclip.occlusion.region import InactiveRegion
 from tofclip.occlusion.scenes import BEHIND, DISTANCE, SCENES, occlusion_scene, upright_bar
 from tofclip.units import SPEED_OF_LIGHT
@@ -42,8 +42,12 @@ def test_the_mean_time_of_flight_on_the_axis(plate):
 def test_a_single_return_is_not_split(plate):
     alone = replace(plate.readings, values=plate.readings.values * (plate.clock.times < 0.55e-9))
     assert len(alone.returns()) == 1
+    assert not separate(alone).target.any()
     assert alone.returns()[0].distance == pytest.approx(DISTANCE, rel=0.02)
-    assert replace(alone, values=0 * alone.values).returns() == ()
+    dark = replace(alone, values=0 * alone.values)
+    assert dark.returns() == ()
+    with pytest.raises(InputError, match="no light"):
+        separate(dark)
 
 
 def test_the_model_of_hidden_pixels_and_shadows_agrees_with_cast_rays(plate):
@@ -78,7 +82,7 @@ def test_a_cover_is_what_is_as_bright_as_the_occluder_whatever_piles_up_at_the_b
 
 def test_what_one_view_cannot_see_all_views_recover(plate):
     found = plate.separated
-    assert found is not None
+    assert found.sees_target
     ours, plainly = (correlation(one, plate.truth) for one in (found.target, found.plain))
     assert ours > 0.9 > plainly
     assert ours > correlation(plate.single_view, plate.single_view_truth)
@@ -91,8 +95,9 @@ def test_what_one_view_cannot_see_all_views_recover(plate):
 def test_behind_a_board_nothing_is_found_and_nothing_invented():
     board = Experiment(occlusion_scene("board"), SMALL)
     assert not board.scene.region.ends
-    assert board.separated is None
-    assert not board.target.any()
+    assert not board.separated.sees_target
+    assert not board.separated.target.any()
+    assert board.separated.occluder.any()
     assert not board.single_view.any()
 
 

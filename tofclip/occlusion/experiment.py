@@ -150,14 +150,9 @@ class Experiment:
         return self.settings.photons / float(light.max())
 
     @cached_property
-    def separated(self) -> Separated | None:
-        """Occluder and target from the readings; None where nothing came from behind the occluder."""
+    def separated(self) -> Separated:
+        """Occluder and target from the readings."""
         return separate(self.readings)
-
-    @cached_property
-    def target(self) -> Array:
-        """The recovered target, (rows, columns); dark where nothing came from behind the occluder."""
-        return np.zeros(self.truth.shape, np.float32) if self.separated is None else self.separated.target
 
     @cached_property
     def single_view(self) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.clip_recovery import ITERATIONS, RELATIVE_CHANGE, ClipRecovery
+from tofclip.errors import InputError
 from tofclip.occlusion.readings import Rig, TimedReadings
 from tofclip.operators import Diagonal, LinearOperator, Stack
 from tofclip.operators.shear import LinearShear, View
@@ -39,13 +40,19 @@ class Separated:
     plain : (rows, columns) float32 array
         The target by the model that knows of no occluder.
     distances : tuple of float
-        Of the two, as the times of flight tell, m.
+        Of what sent light back, as the times of flight tell, m: occluder and target, or the occluder alone, and then
+        the target's pictures are dark.
     """
 
     occluder: Array
     target: Array
     plain: Array
-    distances: tuple[float, float]
+    distances: tuple[float, ...]
+
+    @property
+    def sees_target(self) -> bool:
+        """Whether anything came from behind the occluder."""
+        return len(self.distances) > 1
 
 
 def covered(occluder: Array) -> Array:
@@ -80,27 +87,43 @@ def model_behind(rig: Rig, cover: Array, shears: tuple[float, float]) -> LinearO
     return Stack(parts) @ Diagonal(lit)
 
 
-def separate(readings: TimedReadings, weight: float = WEIGHT) -> Separated | None:
-    """Recover occluder and target from their returns; None if only one thing sends light back.
+def separate(readings: TimedReadings, weight: float = WEIGHT) -> Separated:
+    """Recover occluder and target from their returns.
 
     Parameters
     ----------
     readings : TimedReadings
     weight : float
         Of total variation, relative to the largest value of A'f.
+
+    Raises
+    ------
+    InputError
+        Nothing sends light back.
     """
     returns = readings.returns()
-    if len(returns) < 2:
-        return None
-    near, far = (float(readings.rig.array.shear(one.distance)) for one in returns)
+    if not returns:
+        raise InputError("no light comes back; is the clock set to the scene's distances?")
+    distances = tuple(one.distance for one in returns)
+    shears = [float(readings.rig.array.shear(distance)) for distance in distances]
     usual = ClipRecovery(weight=weight)
-    occluder = usual.recover(readings.measurement(returns[0].bins), near).picture
-    plain = usual.recover(readings.measurement(returns[1].bins), far).picture
+    pictures = [
+        usual.recover(readings.measurement(one.bins), shear).picture for one, shear in zip(returns, shears, strict=True)
+    ]
+    occluder = pictures[0]
+    if len(returns) == 1:
+        return Separated(occluder, 0 * occluder, 0 * occluder, distances)
+    target = _behind(readings, covered(occluder), (shears[0], shears[1]), returns[1].bins, weight)
+    return Separated(occluder, target, pictures[1], distances)
+
+
+def _behind(readings: TimedReadings, cover: Array, shears: tuple[float, float], bins: slice, weight: float) -> Array:
+    """Recover what a return brings from behind a cover."""
     weighting = readings.rig.camera.weighting()
-    model = weighting @ model_behind(readings.rig, covered(occluder), (near, far))
-    gated = weighting(readings.gated(returns[1].bins))[:, np.newaxis]
-    target = TotalVariation(weight, ITERATIONS, RELATIVE_CHANGE).recover(model, gated).frames[0]
-    return Separated(occluder, target, plain, (returns[0].distance, returns[1].distance))
+    model = weighting @ model_behind(readings.rig, cover, shears)
+    gated = weighting(readings.gated(bins))[:, np.newaxis]
+    picture: Array = TotalVariation(weight, ITERATIONS, RELATIVE_CHANGE).recover(model, gated).frames[0]
+    return picture
 
 
 def _moved(cover: Array, shear: float, view: View) -> Array:

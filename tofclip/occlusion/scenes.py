@@ -114,6 +114,11 @@ def _behind_plate() -> OcclusionScene:
     return OcclusionScene("plate", "a word behind a plate", (bar,), _word("CLIP", 40e-3, 18e-3), _region(6e-3))
 
 
+def _figure_behind_plate() -> OcclusionScene:
+    bar = _plate(6e-3, 20e-3, plain(OCCLUDER), z=DISTANCE)
+    return OcclusionScene("person", "a figure behind a plate", (bar,), _figure(), _region(6e-3))
+
+
 def _tree() -> OcclusionScene:
     """A trunk with branches, a mannequin behind it."""
     bark, z = plain(OCCLUDER), DISTANCE
@@ -162,14 +167,16 @@ def _leaf() -> NDArray[Any]:
 
 
 def _board() -> OcclusionScene:
-    """As wide as the views are apart: the formula promises nothing."""
-    board = _plate(BASELINE, 40e-3, plain(OCCLUDER), z=DISTANCE)
-    return OcclusionScene("board", "a disc behind a board", (board,), _disc(), _region(BASELINE))
+    """Wider than the views are apart: the formula promises nothing."""
+    width = 21e-3
+    board = _plate(width, 60e-3, plain(OCCLUDER), z=DISTANCE)
+    return OcclusionScene("board", "a disc behind a board", (board,), _disc(), _region(width))
 
 
 SCENES: dict[str, Callable[[], OcclusionScene]] = {
     "v-letter": _v_letter,
     "plate": _behind_plate,
+    "person": _figure_behind_plate,
     "tree": _tree,
     "bush": _bush,
     "trellis": _trellis,
