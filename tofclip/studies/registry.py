@@ -6,7 +6,9 @@ from tofclip.errors import InputError
 from tofclip.studies import (
     area_sensors,
     dealing_table,
+    flash_occlusion,
     flip_test,
+    inactive_region,
     iteration_table,
     lensless_hand,
     light_field_processing,
@@ -25,6 +27,8 @@ STUDIES: tuple[Study, ...] = (
     *whole_light_fields.STUDIES,
     *spoilt_readings.STUDIES,
     occlusion.STUDY,
+    flash_occlusion.STUDY,
+    inactive_region.STUDY,
     *representation.STUDIES,
     area_sensors.STUDY,
     lensless_hand.STUDY,
