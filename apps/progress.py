@@ -11,12 +11,15 @@ from types import FrameType
 
 Advance = Callable[[int], None]
 
+_screen = threading.Lock()
+
 
 @contextlib.contextmanager
 def progress(title: str, total: int) -> Iterator[Advance]:
     """Yield a function to call with the amount of work just done, from any thread.
 
-    The bar is drawn on standard error, and only on a terminal. After Ctrl-C the function raises in every thread that
+    The bar is drawn on standard error, and only on a terminal; inside another bar, or off the main thread as on a
+    cluster's worker, there is none. After Ctrl-C the function raises in every thread that
     calls it, so that none goes on computing for nothing.
     """
     with _interruption() as interrupted, _bar(title, total) as draw:
@@ -31,9 +34,19 @@ def progress(title: str, total: int) -> Iterator[Advance]:
 
 @contextlib.contextmanager
 def _bar(title: str, total: int) -> Iterator[Advance]:
-    if not sys.stderr.isatty():
+    watched = sys.stderr.isatty() and threading.current_thread() is threading.main_thread()
+    if not watched or not _screen.acquire(blocking=False):
         yield lambda _: None
         return
+    try:
+        with _drawn_bar(title, total) as draw:
+            yield draw
+    finally:
+        _screen.release()
+
+
+@contextlib.contextmanager
+def _drawn_bar(title: str, total: int) -> Iterator[Advance]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 

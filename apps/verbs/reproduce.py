@@ -98,7 +98,9 @@ def _shared(studies: Sequence[Study], library: Library, seeds: int, folder: Path
         path = folder.resolve() / f"{study.name}.json"
         if kept_result(path, _settings(study, library, seeds)) is None:
             path.unlink(missing_ok=True)  # of other settings, or damaged
-            jobs.append(Job(study.name, path, partial(make_study, study.name, data, seeds, path.parent)))
+            work = partial(make_study, study.name, data, seeds, path.parent)
+            beside = tuple(path.with_suffix(suffix) for suffix in (".md", ".csv", ".png"))
+            jobs.append(Job(study.name, path, work, beside))
     return run_all("reproducing", jobs, cluster)
 
 

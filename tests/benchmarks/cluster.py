@@ -43,7 +43,7 @@ def workers(number: int) -> Iterator[LocalCluster]:
     with LocalCluster(
         n_workers=number,
         threads_per_worker=1,
-        dashboard_address=None,
+        dashboard_address="127.0.0.1:0",
         silence_logs=logging.CRITICAL,
         env={"TOFCLIP_THREADS": "1"},
     ) as cluster:

@@ -30,7 +30,7 @@ def scheduler() -> Iterator[str]:
         distributed.LocalCluster(
             n_workers=2,
             threads_per_worker=1,
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
             env={"TOFCLIP_THREADS": "1"},
         ) as cluster,

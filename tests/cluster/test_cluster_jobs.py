@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -70,7 +71,9 @@ def test_leftovers_of_killed_writers_go_and_other_hidden_files_stay(tmp_path):
     (tmp_path / ".000.txt.abcd_123.txt").write_text("half")
     (tmp_path / ".999.txt.abcd_123.txt").write_text("another run's")
     (tmp_path / ".profile").write_text("a user's")
-    run(squares(tmp_path, 1))
+    (tmp_path / ".000.png.abcd_123.png").write_text("half a picture")
+    (job,) = squares(tmp_path, 1)
+    run([replace(job, beside=(tmp_path / "000.png",))])
     assert sorted(contents(tmp_path)) == [".999.txt.abcd_123.txt", ".profile", "000.txt"]
 
 

@@ -6,9 +6,13 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from apps.cli import main
+from nlos import Volume
+from nlos.simulate import PointScene
+from nlos.time_axis import TimeAxis
 from tofclip import Frames
 
 
@@ -123,3 +127,24 @@ def test_a_study_that_fails_on_a_cluster(run, scheduler, tmp_path):
     (failure,) = json.loads(out)["failures"]
     assert failure["name"] == "fig4d"
     assert "psf_hand_300x400.npz" in failure["problem"]
+
+
+def test_captures_on_a_cluster_are_imaged_as_here(run, scheduler, tmp_path):
+    captures = tmp_path / "captures"
+    captures.mkdir()
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 12), np.linspace(-0.5, 0.5, 12))
+    wall = np.stack([x, y, 0.1 * x**2], axis=-1)
+    for number in range(3):
+        scene = PointScene([[0.1 * number, 0.0, 0.6]])
+        scene.seen_from(wall, [0.1, 0.0, 0.0], TimeAxis(256, 32e-12), 150e-12).save(captures / f"{number}.h5")
+    (captures / "broken.h5").write_text("no capture")
+    words = ("nlos", "reconstruct", captures, "--method", "hybrid", "--wavelength-mm", "300", "--voxel-mm", "60")
+    here, there = tmp_path / "here", tmp_path / "there"
+    assert run(*words, "--out", here)[0] == 1
+    status, out, err = run(*words, "--out", there, "--cluster", scheduler, "--json")
+    told = json.loads(out)
+    assert (status, told["imaged"][0]["capture"], list(told["failed"])) == (1, "0.h5", ["broken.h5"]), err
+    for number in range(3):
+        one, other = (Volume.load(folder / f"{number}.h5") for folder in (here, there))
+        np.testing.assert_array_equal(other.values, one.values)
+    assert run("nlos", "reconstruct", captures / "0.h5", "--out", tmp_path / "v.h5", "--cluster", scheduler)[0] == 2

@@ -29,11 +29,14 @@ class Job:
     work : callable
         Makes the file; may return a few figures about it. It has to survive pickling: a `functools.partial` of a
         function of a module with names of files and numbers.
+    beside : tuple of Path
+        Further files that it writes, before the result.
     """
 
     name: str
     result: Path
     work: Callable[[], Any]
+    beside: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)

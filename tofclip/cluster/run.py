@@ -37,7 +37,7 @@ def run(jobs: Sequence[Job], cluster: str | None = None, watch: Callable[[Report
     try:
         return Summary.of(_watched(_reports(jobs, cluster), watch), started)
     finally:
-        remove_leftovers(job.result for job in jobs)
+        remove_leftovers(path for job in jobs for path in (job.result, *job.beside))
 
 
 def _watched(reports: Iterator[Report], watch: Callable[[Report], object] | None) -> Iterator[Report]:

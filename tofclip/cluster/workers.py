@@ -69,7 +69,7 @@ def _on_this_machine(distributed: Any, number: int) -> Iterator[Client]:
             n_workers=number,
             threads_per_worker=1,
             processes=True,
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",  # nobody else may look
             silence_logs=logging.CRITICAL,
             env={THREADS_VARIABLE: threads},
         ) as cluster,

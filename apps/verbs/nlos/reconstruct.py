@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,10 +15,11 @@ import typer
 
 from apps.nlos_methods import METHODS, ImagingSettings
 from apps.nlos_settings import SettingsFile, setting, takes
-from apps.options import AsJson
+from apps.options import AsJson, Cluster
 
 if TYPE_CHECKING:
     from apps.nlos_files import Results
+    from tofclip.cluster import Job, Report
 
 SOME_FAILED = 1
 SETTINGS_SUFFIX = ".toml"
@@ -28,7 +31,9 @@ HEADING = "tofclip nlos reconstruct CAPTURE --settings THIS --out VOLUME"
 class ReconstructSettings(ImagingSettings):
     """How a capture is imaged and written."""
 
-    method: str | None = setting("NAME", f"One of {', '.join(METHODS)}.", shown="the quickest that suits the capture")
+    method: str | None = setting(
+        "NAME", f"One of {', '.join(METHODS)}.", shown="the quickest that suits the capture", choices=METHODS
+    )
     point_fraction: float = setting(
         "SHARE", "Voxels with this share of the brightest become points of .ply, .pcd, .csv.", 0.3
     )
@@ -52,6 +57,7 @@ def reconstruct(
         list[str] | None,
         typer.Option(metavar=".EXT", help="Format of the volumes in a folder; may be repeated.", show_default=".h5"),
     ] = None,
+    cluster: Cluster = None,
     as_json: AsJson = False,
     **flags: Any,
 ) -> None:
@@ -74,12 +80,15 @@ def reconstruct(
     from apps.nlos_files import Results, is_folder_of_captures
     from apps.nlos_settings import told
     from apps.report import report
+    from tofclip.errors import InputError
 
     wanted = told(ReconstructSettings, settings, flags)
     _require_sense(wanted)
     if is_folder_of_captures(source):
-        _reconstruct_folder(source, out, wanted, suffix or [".h5"], as_json)
+        _reconstruct_folder(source, out, wanted, suffix or [".h5"], (cluster, as_json))
         return
+    if cluster is not None:
+        raise InputError(f"{source}: --cluster is for a folder of captures")
     results = Results([out], png, out.with_suffix(SETTINGS_SUFFIX))
     results.require_writable(source, *([] if settings is None else [settings]))
     report(_reconstructed(source, results, wanted), as_json, results.all)
@@ -139,37 +148,64 @@ def _reconstructed(source: Path, results: Results, wanted: ReconstructSettings) 
 
 
 def _reconstruct_folder(
-    source: Path, out: Path, wanted: ReconstructSettings, suffixes: Sequence[str], as_json: bool
+    source: Path, out: Path, wanted: ReconstructSettings, suffixes: Sequence[str], how: tuple[str | None, bool]
 ) -> None:
     """Image every capture of a folder whose results are not there yet."""
     from apps.files import make_folder
     from apps.nlos_files import captures_in, require_apart
     from apps.report import report
+    from apps.sequences import run_all
+    from tofclip.cluster import run
 
+    cluster, as_json = how
     _require_formats(suffixes)
     require_apart(source, out)
     sources = captures_in(source)
     make_folder(out)
     _keep_to(out / FOLDER_SETTINGS, wanted)
-    imaged, skipped, failed = [], [], {}
-    for number, path in enumerate(sources, 1):
-        results = _results_in(out, path.stem, suffixes)
-        if results.up_to_date(path):
-            skipped.append(path.name)
-            continue
-        if sys.stderr.isatty():
-            print(f"{path.name}, {number} of {len(sources)}", file=sys.stderr)
-        try:
-            imaged.append({"capture": path.name, **_reconstructed(path, results, wanted)})
-        except Exception as fault:  # the other captures are none the worse for it
-            failed[path.name] = _reason(fault)
+    jobs, skipped = _jobs(sources, out, wanted, suffixes)
+    imaged: list[dict[str, Any]] = []
+
+    def note(report: Report) -> None:
+        if report.figures is not None:
+            imaged.append({"capture": report.name, **report.figures})
+
+    # Here every capture has a bar of its own; on a cluster there is one for all.
+    summary = run(jobs, None, note) if cluster is None else run_all("imaging", jobs, cluster, note)
+    imaged.sort(key=lambda one: str(one["capture"]))
+    failed = {failure.name: failure.problem for failure in summary.failures}
     for name, reason in failed.items():
         print(f"tofclip: failed: {name}: {reason}", file=sys.stderr)
-    counts = {"captures": len(sources), "imaged": len(imaged), "skipped": len(skipped), "failed": len(failed)}
+    counts = {"captures": len(sources), "imaged": summary.done, "skipped": len(skipped), "failed": len(failed)}
     lists = {"imaged": imaged, "skipped": skipped, "failed": failed} if as_json else {}
     report({**counts, **lists}, as_json, [out])
     if failed:
         raise typer.Exit(SOME_FAILED)
+
+
+def _jobs(
+    sources: Sequence[Path], out: Path, wanted: ReconstructSettings, suffixes: Sequence[str]
+) -> tuple[list[Job], list[str]]:
+    """Return one job for each capture without results, and the names of the others."""
+    from tofclip.cluster import Job
+
+    jobs, skipped = [], []
+    for path in sources:
+        results = _results_in(out.resolve(), path.stem, suffixes)
+        if results.up_to_date(path):
+            skipped.append(path.name)
+            continue
+        results.settings.unlink(missing_ok=True)  # it says that results are whole, and these are of an older capture
+        work = partial(_imaged_of_many, path.resolve(), results, wanted)
+        jobs.append(Job(path.name, results.settings, work, tuple(results.all[:-1])))
+    return jobs, skipped
+
+
+def _imaged_of_many(source: Path, results: Results, wanted: ReconstructSettings) -> dict[str, Any]:
+    """Image one capture, here or on a worker, and tell a person which one it is."""
+    if sys.stderr.isatty() and threading.current_thread() is threading.main_thread():
+        print(source.name, file=sys.stderr)
+    return _reconstructed(source, results, wanted)
 
 
 def _require_formats(suffixes: Sequence[str]) -> None:
@@ -203,10 +239,3 @@ def _keep_to(file: Path, wanted: ReconstructSettings) -> None:
                 f"{file.parent}: the results there were made with {name} = {before.get(name, 'not told')}, now it is "
                 f"{now.get(name, 'not told')}; choose another folder"
             )
-
-
-def _reason(fault: Exception) -> str:
-    from tofclip.errors import TofclipError
-    from tofclip.storage import one_line
-
-    return one_line(fault) if isinstance(fault, TofclipError) else f"unforeseen {type(fault).__name__}: {fault}"
