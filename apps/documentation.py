@@ -12,6 +12,10 @@ from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 from apps.cli import EPILOG, MAP, app
 from apps.help import PROGRAM, told
 
+COMPLETION = """\
+`tofclip --install-completion` teaches the shell that it is called from (bash, zsh or fish) to complete verbs, options and
+names of methods with the tab key; `tofclip --show-completion` only shows what it would install."""
+
 
 def verbs() -> dict[str, TyperCommand]:
     """Return every verb that computes, by the words that call it, such as ``lidar scene``."""
@@ -77,7 +81,7 @@ def _entry(param: TyperArgument | TyperOption, context: typer.Context) -> str:
 
 def _index(pages: list[str]) -> str:
     names = "\n".join(page.removesuffix(".md") for page in pages)
-    return f"# Verbs\n\n```text\n{MAP}\n```\n\n```{{toctree}}\n:maxdepth: 1\n\n{names}\n```\n"
+    return f"# Verbs\n\n```text\n{MAP}\n```\n\n{COMPLETION}\n\n```{{toctree}}\n:maxdepth: 1\n\n{names}\n```\n"
 
 
 def _plain(text: str) -> str:

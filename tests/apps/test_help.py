@@ -128,6 +128,7 @@ def test_a_page_for_each_verb(tmp_path: Path) -> None:
     assert len(pages) == len(VERBS) + 1
     listed = (tmp_path / "index.md").read_text()
     assert all(f"\n{path.stem}\n" in listed for path in pages[:-1])
+    assert "tofclip --install-completion" in listed
 
 
 def test_pages_that_are_the_same_stay_untouched(tmp_path: Path) -> None:
