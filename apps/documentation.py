@@ -13,8 +13,8 @@ from apps.cli import EPILOG, MAP, app
 from apps.help import PROGRAM, told
 
 COMPLETION = """\
-`tofclip --install-completion` teaches the shell that it is called from (bash, zsh or fish) to complete verbs, options and
-names of methods with the tab key; `tofclip --show-completion` only shows what it would install."""
+`tofclip --install-completion` teaches the shell that it is called from (bash, zsh or fish) to complete verbs, options
+and names of methods with the tab key; `tofclip --show-completion` only shows what it would install."""
 
 
 def verbs() -> dict[str, TyperCommand]:
