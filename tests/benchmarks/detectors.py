@@ -1,8 +1,8 @@
-"""How fast photons become transients: words of LinoSPAD2, time tags, and both into histograms.
+"""The long run of LinoSPAD2's path: words in real time through buffer, decoder and histogram.
 
-Run with ``python tests/benchmarks/detectors.py [--repeats N] [--steady S] [--json]``. Medians of the repeats, with the
-least and the greatest. ``--steady 60`` is the long run of the acceptance: words arrive in real time, at half of the
-required rates, through buffer, decoder and histogram; nothing may be dropped and memory must not grow.
+Run with ``python tests/benchmarks/detectors.py [--steady S] [--json]``; ``--steady 60`` is the acceptance's. Words
+arrive at half of the required rate; nothing may be dropped and memory must not grow. How fast each part is alone,
+`tofclip bench decode` tells.
 """
 
 from __future__ import annotations
@@ -10,27 +10,22 @@ from __future__ import annotations
 import argparse
 import json
 import resource
-import statistics
 import time
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from devices.codec import Records, as_bytes
-from devices.histogram import BinAxis, StampHistogram, TagHistogram
+from devices.codec import as_bytes
+from devices.histogram import BinAxis, StampHistogram
 from devices.ledger import Ledger
-from devices.linospad2.codec import STAMP, LinoSpad2Codec
+from devices.linospad2.codec import LinoSpad2Codec
 from devices.linospad2.simulation import LASER_PERIOD, uneven_board
 from devices.source import Info
 from devices.stream import Arrival, Buffering, StreamSource
-from devices.timetag.codec import RECORD
 from tofclip.arrays import thread_count
 from tofclip.storage import Record
 
 MEGA = 1e6
-PHOTONS = 8_000_000
 STEADY_RATE = 25e6
 """Time stamps per second in the long run: half of the 50 million that are asked for."""
 
@@ -40,17 +35,6 @@ FILLED = 0.6
 Figures = dict[str, float]
 
 
-def rates(amount: float, action: Callable[[], object], repeats: int) -> Figures:
-    """Median, least and greatest of `amount` per second."""
-    action()  # compile, and touch memory
-    found = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        action()
-        found.append(amount / (time.perf_counter() - begin))
-    return {"median": statistics.median(found), "least": min(found), "greatest": max(found)}
-
-
 def words(filled: float, cycles: int) -> bytes:
     """Random words of which a share holds a time stamp."""
     codec, random = LinoSpad2Codec(), np.random.default_rng(0)
@@ -58,47 +42,6 @@ def words(filled: float, cycles: int) -> bytes:
     stream |= (random.random(stream.shape) < filled).astype(np.uint32) << 31
     stream[:, 64 * codec.timestamps :] = 0
     return stream.astype("<u4").tobytes()
-
-
-def decoding(repeats: int) -> dict[str, Figures]:
-    """Words to records, in MB/s of words."""
-    codec, found = LinoSpad2Codec(), {}
-    for filled in (0.05, 0.5, 1.0):
-        data = as_bytes(words(filled, 240))
-        found[f"LinoSPAD2 decode, {filled:.0%} filled (MB/s)"] = rates(
-            len(data) / MEGA, partial(codec.decode, data, 0), repeats
-        )
-    return found
-
-
-def stamps() -> Records:
-    """Time stamps in the order of the stream."""
-    random = np.random.default_rng(1)
-    records = np.zeros(PHOTONS, STAMP)
-    records["pixel"] = np.arange(PHOTONS) // 100 * 4 % 256 + random.integers(0, 4, PHOTONS)
-    records["code"] = random.integers(0, 1 << 27, PHOTONS)
-    return records
-
-
-def tags() -> Records:
-    """Time tags of three detectors and the laser."""
-    records = np.zeros(PHOTONS, RECORD)
-    records["time_ticks"] = np.arange(PHOTONS) * 3
-    records["channels"] = np.random.default_rng(2).choice([1, 2, 4, 8], PHOTONS)
-    return records
-
-
-def histogramming(repeats: int) -> dict[str, Figures]:
-    """Records to histograms, in millions per second."""
-    sensor = StampHistogram(BinAxis(20e-12, 576, 0.0, LASER_PERIOD), uneven_board(0))
-    tagger = TagHistogram(BinAxis(1e-9, 512), 0, (1, 2, 3), 1 / 128e6)
-    in_order, tagged = stamps(), tags()
-    shuffled = np.random.default_rng(3).permutation(in_order)
-    return {
-        "time stamps in stream order (M/s)": rates(PHOTONS / MEGA, lambda: sensor.add(in_order), repeats),
-        "time stamps at random (M/s)": rates(PHOTONS / MEGA, lambda: sensor.add(shuffled), repeats),
-        "time tags (M/s)": rates(PHOTONS / MEGA, lambda: tagger.add(tagged), repeats),
-    }
 
 
 class SteadyFeed:
@@ -165,19 +108,13 @@ def resident_mib() -> float:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--steady", type=float, default=10.0, metavar="S")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    figures = {**decoding(options.repeats), **histogramming(options.repeats)}
-    long_run = steady(options.steady)
-    if options.json:
-        print(json.dumps({"threads": thread_count(), **figures, "steady": long_run}))
-        return
-    print(f"{thread_count()} threads")
-    for name, found in figures.items():
-        print(f"{name:40} {found['median']:9.1f}   ({found['least']:.1f} .. {found['greatest']:.1f})")
-    print("steady:", ", ".join(f"{name} {value:.6g}" for name, value in long_run.items()))
+    figures = {"threads": thread_count(), **steady(options.steady)}
+    print(
+        json.dumps(figures) if options.json else "\n".join(f"{name:20} {value:.6g}" for name, value in figures.items())
+    )
 
 
 if __name__ == "__main__":
