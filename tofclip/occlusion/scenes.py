@@ -24,7 +24,7 @@ BASELINE = 15e-3
 DISTANCE = 50e-3
 BEHIND = 70e-3
 OCCLUDER = 0.6
-"""Reflectance of every occluder."""
+"""Reflectance of all occluders but the tree."""
 
 LEAVES, BUSH_RADIUS = 60, 8.5e-3
 LEAF_CLEARANCE = 3.7e-3, 0.5e-3
@@ -120,9 +120,9 @@ def _figure_behind_plate() -> OcclusionScene:
 
 
 def _tree() -> OcclusionScene:
-    """A trunk with branches, a mannequin behind it."""
-    bark, z = plain(OCCLUDER), DISTANCE
-    trunk = upright_bar(4.5e-3)
+    """A trunk with branches and rough bark, a mannequin behind it."""
+    bark, z = mottled(0.25, 0.85, 14, seed=5), DISTANCE
+    trunk = _plate(4.5e-3, 40e-3, bark, z=z)
     branches = (
         _plate(11e-3, 1.3e-3, bark, x=side * 6e-3, y=y, z=z + 1e-3).turned(-side * tilt)
         for side, y, tilt in ((1, -4.6e-3, 0.5), (-1, -3.9e-3, 0.6), (1, 4.4e-3, 0.4), (-1, 6e-3, 0.5))
