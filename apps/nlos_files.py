@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, history, require_writable
+from nlos.export import POINT_SUFFIXES, WRITERS
 from tofclip.errors import InputError, StorageError
 
 if TYPE_CHECKING:
     from nlos import Volume
 
 CAPTURE_SUFFIXES = (".h5", ".hdf5", ".npz", ".mat")
-EXPORT_SUFFIXES = (".vti", ".npz", ".exr", ".ply", ".pcd", ".csv")
-VOLUME_SUFFIXES = (*RECORD_SUFFIXES, *EXPORT_SUFFIXES)
+VOLUME_SUFFIXES = (*RECORD_SUFFIXES, *WRITERS, *POINT_SUFFIXES)
 GEOMETRY = "geometry.toml"
 """Makes a folder of renderings one capture; see `nlos.io`."""
 

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from nlos.time_axis import TimeAxis
 
 SCANS = ("single", "confocal")
+WALLS = ("planar", "cylinder", "wavy", "relief", "plates")
+"""Named here as well as in `nlos.simulate`, which is too heavy to be imported for a verb's help."""
+
 MATERIALS = ("matte", "retroreflecting")
 RESPONSE_SIGMAS = 6
 """Room for the instrument's response behind the farthest path, in standard deviations."""
@@ -33,12 +36,14 @@ class SceneSettings:
     mesh: str | None = setting("FILE", "Triangle mesh (.ply, .obj, .stl) in m, in the wall's frame.", shown="none")
     depth_m: float = setting("M", "Depth of the letters.", 1.0)
     height_m: float = setting("M", "Height of a capital letter.", 0.7)
-    material: str = setting("NAME", f"Of letters or mesh: {' or '.join(MATERIALS)}.", "matte")
+    material: str = setting("NAME", f"Of letters or mesh: {' or '.join(MATERIALS)}.", "matte", choices=MATERIALS)
     facet_mm: float = setting("MM", "Size of the facets that letters or mesh are cut into.", 25.0)
-    wall: str = setting("NAME", "planar, cylinder, wavy, relief (hills) or plates (two, hanging apart).", "cylinder")
+    wall: str = setting(
+        "NAME", "planar, cylinder, wavy, relief (hills) or plates (two, hanging apart).", "cylinder", choices=WALLS
+    )
     wall_points: int = setting("N", "Rows of wall points, and columns.", 48)
     wall_width_m: float = setting("M", "Width and height of the wall.", 2.0)
-    scan: str = setting("NAME", "single (one laser spot) or confocal.", "single")
+    scan: str = setting("NAME", "single (one laser spot) or confocal.", "single", choices=SCANS)
     laser_m: tuple[float, float] = setting(
         "X Y", "Where the laser spot is, in m; the nearest wall point is taken.", (0.0, 0.0)
     )

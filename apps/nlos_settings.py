@@ -12,13 +12,14 @@ import inspect
 import json
 import math
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
 
+from apps.options import completing
 from tofclip.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:
@@ -35,7 +36,9 @@ Settings = TypeVar("Settings", bound="DataclassInstance")
 Verb = TypeVar("Verb", bound=Callable[..., None])
 
 
-def setting(metavar: str | None, meaning: str, default: Any = None, shown: str | None = None) -> Any:
+def setting(
+    metavar: str | None, meaning: str, default: Any = None, shown: str | None = None, choices: Iterable[str] = ()
+) -> Any:
     """Declare a setting.
 
     Parameters
@@ -46,9 +49,12 @@ def setting(metavar: str | None, meaning: str, default: Any = None, shown: str |
         What it is where nobody tells; None if it has to be found, or may be absent.
     shown : str, optional
         The default in words, for the help.
+    choices : iterable of str
+        Names that shells offer to complete.
     """
-    in_help = {"metavar": metavar, "help": meaning, "show_default": str(default) if shown is None else shown}
-    return dataclasses.field(default=default, metadata=in_help)
+    option = {"metavar": metavar, "help": meaning, "show_default": str(default) if shown is None else shown}
+    completed = {"autocompletion": completing(*choices)} if choices else {}
+    return dataclasses.field(default=default, metadata={**option, **completed})
 
 
 def takes(kind: type[DataclassInstance]) -> Callable[[Verb], Verb]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,7 +27,10 @@ class CompareSettings(ImagingSettings):
     """What is compared on one capture."""
 
     methods: str | None = setting(
-        "A,B,...", f"Of {', '.join(METHODS)}; the first is the reference.", shown="all that suit the capture"
+        "A,B,...",
+        f"Of {', '.join(METHODS)}; the first is the reference.",
+        shown="all that suit the capture",
+        choices=METHODS,
     )
 
 
@@ -54,38 +57,35 @@ def compare(
     """
     from apps.figures.nlos_compare import compare_figure
     from apps.figures.style import save as save_figure
-    from apps.files import PICTURE_SUFFIXES, make_folder, require_writable
-    from apps.nlos_files import with_history
     from apps.nlos_imaging import prepared, warnings_in_a_line
-    from apps.nlos_settings import plain, save, told
+    from apps.nlos_settings import save, told
     from apps.nlos_truth import HiddenTruth
-    from apps.report import report
     from nlos.io import read_capture
 
     wanted = told(CompareSettings, settings, flags)
-    inputs = (source,) if settings is None else (source, settings)
-    beside = out.with_suffix(".toml")
-    require_writable(out, *PICTURE_SUFFIXES, inputs=inputs)
-    require_writable(beside, inputs=inputs)
+    written = [out, out.with_suffix(".toml")]
+    _require_writable(written, volumes, (source,) if settings is None else (source, settings))
     _require_sense(wanted)
-    if volumes is not None:
-        make_folder(volumes)
-    capture = prepared(read_capture(source), wanted)
-    truth = HiddenTruth.inside(source)
+    capture, truth = prepared(read_capture(source), wanted), HiddenTruth.inside(source)
     with warnings_in_a_line():
         found, grid, methods, left_out = _chosen(wanted, capture)
         runs = _measured(methods, capture, grid)
     figures = _figures(runs, truth)
     save_figure(compare_figure({name: run.volume for name, run in runs.items()}, figures, truth), out)
-    written = [out, beside]
-    for name, run in runs.items() if volumes is not None else ():
-        written.append(Path(volumes or "") / f"{name}.h5")
-        with_history(run.volume, source, {"verb": "nlos compare", **plain(found)}).save(written[-1])
-    save(found, beside, HEADING)
-    if as_json:
-        report({"voxels": grid.shape, "methods": figures, "left_out": left_out}, as_json)
-        return
-    report({"voxels": grid.shape, **figures, **{name: f"no: {why}" for name, why in left_out.items()}}, False, written)
+    if volumes is not None:
+        written += _save_volumes(runs, volumes, source, found)
+    save(found, written[1], HEADING)
+    _report(grid, figures, left_out, as_json, written)
+
+
+def _require_writable(pictures: Sequence[Path], volumes: Path | None, inputs: tuple[Path, ...]) -> None:
+    from apps.files import PICTURE_SUFFIXES, make_folder, require_writable
+
+    picture, settings = pictures
+    require_writable(picture, *PICTURE_SUFFIXES, inputs=inputs)
+    require_writable(settings, inputs=inputs)
+    if volumes is not None:
+        make_folder(volumes)
 
 
 def _require_sense(settings: CompareSettings) -> None:
@@ -143,3 +143,43 @@ def _figures(runs: Mapping[str, Measured], truth: HiddenTruth | None) -> dict[st
         }
         for name, run in runs.items()
     }
+
+
+def _save_volumes(
+    runs: Mapping[str, Measured], folder: Path, source: Path, settings: CompareSettings
+) -> Iterator[Path]:
+    """Write each method's volume, and name the files."""
+    from apps.nlos_files import with_history
+    from apps.nlos_settings import plain
+
+    for name, run in runs.items():
+        path = folder / f"{name}.h5"
+        with_history(run.volume, source, {"verb": "nlos compare", "method": name, **plain(settings)}).save(path)
+        yield path
+
+
+def _report(
+    grid: Grid,
+    figures: Mapping[str, Mapping[str, Any]],
+    left_out: Mapping[str, str],
+    as_json: bool,
+    written: Sequence[Path],
+) -> None:
+    from apps.report import report
+
+    if as_json:
+        report({"voxels": grid.shape, "methods": figures, "left_out": left_out}, as_json)
+        return
+    lines = {name: _in_a_line(one) for name, one in figures.items()}
+    reasons = {name: f"no: {reason}" for name, reason in left_out.items()}
+    report({"voxels": grid.shape, **lines, **reasons}, as_json, written)
+
+
+def _in_a_line(figures: Mapping[str, Any]) -> str:
+    """Put a method's figures into columns that stand below those of other methods."""
+    memory = "" if figures["peak_mib"] is None else f"{figures['peak_mib']:7.0f} MiB"
+    line = f"{figures['seconds']:8.2f} s{memory}  correlation {figures['correlation']:6.3f}"
+    line += f"  sharpness {figures['sharpness']:5.2f}"
+    if "energy_near_truth" in figures:
+        line += f"  near truth {figures['energy_near_truth']:4.0%}  contrast {figures['contrast_to_truth']:5.1f}"
+    return line
