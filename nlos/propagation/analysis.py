@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.rsd.inverse import PLANNING
+from nlos.rsd.kernels import transpose
 from nlos.rsd.wall import WallLattice
 
 if TYPE_CHECKING:
@@ -38,21 +39,21 @@ class LatticeAnalysis:
         import pyfftw
 
         high, wide = lattice
-        self._lattice, self._shape = lattice, wall.shape
+        self._wide, self._shape = wide, wall.shape
         rows, columns = wall.shape
         self._place = None if wall.complete else wall.row * columns + wall.column
-        self._points: NDArray[np.complex64] = pyfftw.zeros_aligned((rows, wide), np.complex64)
-        self._middle: NDArray[np.complex64] = pyfftw.zeros_aligned((wide, high), np.complex64)
-        widest = self._columns(reach)
-        self._spectra: NDArray[np.complex64] = pyfftw.zeros_aligned((terms, min(2 * widest, wide), high), np.complex64)
+        most = min(2 * self._columns(reach), wide)
+        shapes = ((rows, wide), (rows, wide), (most, high), (terms, most, high))
+        arrays = [pyfftw.zeros_aligned(shape, np.complex64) for shape in shapes]
+        self._points, self._lines, self._middle, self._spectra = arrays
         with PLANNING:
-            self._along_x = pyfftw.FFTW(self._points, self._middle[:, :rows].T, axes=(1,), flags=("FFTW_MEASURE",))
+            self._along_x = pyfftw.FFTW(self._points, self._lines, axes=(1,), flags=("FFTW_MEASURE",))
         self._along_y: dict[int, pyfftw.FFTW] = {}
 
     def _columns(self, reach: int) -> int:
         """How many columns from index 0 on are transformed; as many before it, unless these are all."""
         needed = -(-(reach + 1) // COLUMNS_AT_A_TIME) * COLUMNS_AT_A_TIME
-        return needed if 2 * needed < self._lattice[1] else self._lattice[1]
+        return needed if 2 * needed < self._wide else self._wide
 
     def spectra(
         self, values: NDArray[np.complex64], weights: NDArray[np.complex64], reach: int
@@ -71,17 +72,17 @@ class LatticeAnalysis:
             Columns and rows in the order of Fourier transforms, first 0 and last -1; an index beyond them is found
             modulo their number. Valid until the next call.
         """
-        columns = self._columns(reach)
-        plan = self._plan(columns)
-        ends = (slice(0, columns), slice(self._lattice[1] - columns, None)) if columns < self._lattice[1] else ()
+        columns, (rows, wide) = self._columns(reach), self._lines.shape
+        ends = (slice(0, columns), slice(wide - columns, wide)) if columns < wide else (slice(0, wide),)
+        plan = self._plan(len(ends) * columns)
         for term, weight in enumerate(weights):
             self._spread(values, weight)
             self._along_x.execute()
-            for number, some in enumerate(ends or (slice(None),)):
-                out = self._spectra[term, number * columns : (number + 1) * columns]
-                plan.update_arrays(self._middle[some], out)
-                plan.execute()
-        return self._spectra[: len(weights), : 2 * columns if ends else columns]
+            for number, end in enumerate(ends):
+                transpose(self._lines[:, end], self._middle[number * columns : (number + 1) * columns, :rows])
+            plan.update_arrays(self._middle[: len(ends) * columns], self._spectra[term, : len(ends) * columns])
+            plan.execute()
+        return self._spectra[: len(weights), : len(ends) * columns]
 
     def _spread(self, values: NDArray[np.complex64], weight: NDArray[np.complex64]) -> None:
         """Put weighted values into their places."""

@@ -8,12 +8,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos.rsd.kernels import transpose
 from nlos.rsd.window import VECTOR
 
 PLANNING = threading.Lock()
 """FFTW plans one transform at a time."""
 
-PRODUCT_RATE = 10
+PRODUCT_RATE = 3
 """How many operations of a matrix product take as long as one of a pruned Fourier transform; measured."""
 
 
@@ -37,7 +38,7 @@ class Inverse(Protocol):
     """What every column of an image has still to be multiplied by."""
 
     spectra: NDArray[np.complex64]
-    """Memory for the spectra, term by term."""
+    """Memory for the spectra, term by term; 0 where no plane wave goes."""
 
     def images(self, terms: int) -> NDArray[np.complex64]:
         """Transform the first `terms` of `spectra`; the result (term, y, x) is valid until the next call."""
@@ -107,28 +108,29 @@ class InverseTransform:
         # Unfolded columns are shifted so that none is negative; `carrier` takes the shift back.
         self._shift = reach if 2 * reach + 1 < wide else 0
         column = (waves.column + self._shift) % wide
-        self.cell: NDArray[np.int64] = column * high + waves.row % high
+        self.cell: NDArray[np.int64] = column * _padded(high) + waves.row % high
         self.carrier = np.exp(-2j * np.pi * self._shift / wide * np.arange(wanted[1])).astype(np.complex64)
-        rows, self._wanted = wanted[0], wanted
-        spectra, images = ((terms, _padded(n), length) for n, length in ((columns, high), (rows, wide)))
-        self.spectra: NDArray[np.complex64] = pyfftw.zeros_aligned(spectra, np.complex64)
-        self._images: NDArray[np.complex64] = pyfftw.zeros_aligned(images, np.complex64)
-        middle: NDArray[np.complex64] = pyfftw.zeros_aligned((high, wide), np.complex64)
-        self._columns, self._rows, self._middle = columns, rows, middle
+        self._wanted = wanted
+        shapes = ((terms, columns, high), (columns, high), (wanted[0], wide), (terms, wanted[0], wide))
+        arrays = [pyfftw.zeros_aligned((*shape[:-1], _padded(shape[-1])), np.complex64) for shape in shapes]
+        self.spectra: NDArray[np.complex64] = arrays[0]
+        self._lines, self._middle, self._images = arrays[1:]
+        self._high, self._wide = high, wide
         with PLANNING:
             backward = {"direction": "FFTW_BACKWARD", "axes": (1,), "flags": ("FFTW_MEASURE",)}
-            self._along_y = pyfftw.FFTW(self.spectra[0, :columns], middle[:, :columns].T, **backward)
-            self._along_x = pyfftw.FFTW(middle[:rows], self._images[0, :rows], **backward)
-        middle[:] = 0
+            self._along_y = pyfftw.FFTW(self.spectra[0, :, :high], self._lines[:, :high], **backward)
+            self._along_x = pyfftw.FFTW(self._middle[:, :wide], self._images[0, :, :wide], **backward)
 
     def images(self, terms: int) -> NDArray[np.complex64]:
         """Transform the first `terms` of `spectra`; the result (term, y, x) is valid until the next call."""
+        columns, rows = len(self._lines), self._wanted[0]
         for term in range(terms):
-            self._along_y.update_arrays(self.spectra[term, : self._columns], self._middle[:, : self._columns].T)
+            self._along_y.update_arrays(self.spectra[term, :, : self._high], self._lines[:, : self._high])
             self._along_y.execute()
-            self._along_x.update_arrays(self._middle[: self._rows], self._images[term, : self._rows])
+            transpose(self._lines[:, :rows], self._middle[:, :columns])
+            self._along_x.update_arrays(self._middle[:, : self._wide], self._images[term, :, : self._wide])
             self._along_x.execute()
-        return self._images[:terms, : self._wanted[0], : self._wanted[1]]
+        return self._images[:terms, :, : self._wanted[1]]
 
 
 def _padded(count: int) -> int:

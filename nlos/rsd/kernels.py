@@ -9,6 +9,9 @@ from numba import njit
 
 compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "reassoc", "arcp"}, error_model="numpy")
 
+SQUARE = 16
+"""Side of the squares that matrices are transposed in: two cache lines of complex64."""
+
 TAPS = 6
 """Nodes that the interpolation along the radius takes."""
 
@@ -117,14 +120,28 @@ def _interpolate(nodes, node, share, first, transfer):
 
 
 @compiled
-def scatter(terms, cell, begin, spectra):
-    """Add terms (some waves, 2, m) of the plane waves from `begin` on to ``spectra[m, cell[wave]]``.
+def transpose(source, target):
+    """Copy ``target[i, j] = source[j, i]``, in squares that stay in cache."""
+    rows, columns = target.shape
+    for top in range(0, rows, SQUARE):
+        for left in range(0, columns, SQUARE):
+            for i in range(top, min(top + SQUARE, rows)):
+                for j in range(left, min(left + SQUARE, columns)):
+                    target[i, j] = source[j, i]
 
-    Waves folded into one another meet in one cell.
+
+@compiled
+def scatter(terms, cell, begin, folded, spectra):
+    """Put terms (m, some waves, 2) of the plane waves from `begin` on into ``spectra[m, cell[wave]]``.
+
+    Waves that are `folded` into one another meet in one cell, and add up.
     """
-    for m in range(terms.shape[2]):
-        for b in range(terms.shape[0]):
-            spectra[m, cell[begin + b]] += complex(terms[b, 0, m], terms[b, 1, m])
+    for m in range(terms.shape[0]):
+        for b in range(terms.shape[1]):
+            term = complex(terms[m, b, 0], terms[m, b, 1])
+            if folded:
+                term += spectra[m, cell[begin + b]]
+            spectra[m, cell[begin + b]] = term
 
 
 @compiled

@@ -117,7 +117,9 @@ class _Bench:
         self.nodes = way.transfer.interpolation(waves.lateral)
         self.products = np.zeros((WAVES_AT_A_TIME, 2, frequencies), np.float32)
         self.weights = np.zeros((2, frequencies), np.float32)
-        self.firsts = np.searchsorted(waves.limits, waves.lateral[::WAVES_AT_A_TIME])
+        starts = np.arange(0, waves.lateral.size, WAVES_AT_A_TIME)
+        self.firsts = np.searchsorted(waves.limits, np.minimum.reduceat(waves.lateral, starts))
+        self.folded = np.unique(self.inverse.cell).size < waves.lateral.size
 
     def image(self, spectrum: NDArray[np.float32], light: Illumination, depth: float, field: NDArray[Any]) -> None:
         """Add one depth plane."""
@@ -132,9 +134,10 @@ class _Bench:
     def _carry(self, spectrum: NDArray[np.float32], transfer: NDArray[np.float32], sums: NDArray[np.float32]) -> None:
         """Leave the spectra of all terms in the inverse transform's memory."""
         spectra = self.inverse.spectra[: sums.shape[1]].reshape(sums.shape[1], -1)
-        spectra[:] = 0
+        if self.folded:
+            spectra[:] = 0
         for some, first in zip(blocks(len(spectrum), WAVES_AT_A_TIME), self.firsts, strict=True):
             products = self.products[: some.stop - some.start]
             transferred(spectrum, transfer, *self.nodes, some.start, first, self.weights, products)
-            terms = products.reshape(-1, sums.shape[0])[:, first:] @ sums[first:]
-            scatter(terms.reshape(len(products), 2, -1), self.inverse.cell, some.start, spectra)
+            terms = sums[first:].T @ products.reshape(-1, sums.shape[0])[:, first:].T
+            scatter(terms.reshape(-1, len(products), 2), self.inverse.cell, some.start, self.folded, spectra)

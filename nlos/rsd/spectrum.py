@@ -15,9 +15,16 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
+TILE = 8
+"""Side of a square of plane waves that stand together: a cache line of a spectrum."""
+
+
 @dataclass(frozen=True, eq=False)
 class PlaneWaves:
-    """The plane waves of a periodic lattice that carry anything, ordered by lateral wavenumber.
+    """The plane waves of a periodic lattice that carry anything.
+
+    Neighbours stand together in tiles, with those mirrored in the axes and in the diagonal, so that they are quickly
+    put into a spectrum; tiles are ordered by their distance from the middle, and their waves by lateral wavenumber.
 
     Parameters
     ----------
@@ -46,8 +53,10 @@ class PlaneWaves:
         # Rounded, so that waves mirrored in an axis or in the diagonal stand together.
         lateral = np.round(lateral, 9).ravel()
         inside = np.flatnonzero(lateral <= self.limits[-1])
-        order = inside[np.argsort(lateral[inside], kind="stable")]
-        return rows[order // columns.size], columns[order % columns.size], lateral[order]
+        lateral, row, column = lateral[inside], rows[inside // columns.size], columns[inside % columns.size]
+        tiles = np.sort(np.stack([abs(row), abs(column)]) // TILE, axis=0)
+        order = np.lexsort((lateral, *tiles, np.hypot(*tiles)))
+        return row[order], column[order], lateral[order]
 
     @property
     def row(self) -> IntArray:
@@ -61,7 +70,7 @@ class PlaneWaves:
 
     @property
     def lateral(self) -> FloatArray:
-        """Lateral wavenumber of every wave, rad/m, increasing."""
+        """Lateral wavenumber of every wave, rad/m."""
         return self._ordered[2]
 
     def first_frequency(self, lateral: float) -> int:
