@@ -124,11 +124,12 @@ class Rectifier:
             raise ShapeError("a streak image of this camera", self._raw_row.shape, counts.shape)
         signal = np.ascontiguousarray(counts - np.float32(dark_level(counts) if dark is None else dark))
         bad = np.zeros(counts.shape, bool) if saturated is None else np.ascontiguousarray(saturated)
+        near_bad = _spread_to_pixels_before(bad)
         readings, good = np.empty(counts.shape[::-1], np.float32), np.empty(counts.shape[::-1], bool)
 
         def work(piece: slice) -> None:
             positions = self._raw_row[:, piece], self._raw_column[:, piece]
-            sample(signal, bad, *positions, late, readings[piece], good[piece])
+            sample(signal, bad, near_bad, *positions, np.float32(late), readings[piece], good[piece])
 
         run_blocks(work, counts.shape[1], COLUMNS_PER_BLOCK)
         good &= ~self.camera.dead_columns[:, np.newaxis]
@@ -137,3 +138,11 @@ class Rectifier:
         if not np.any((readings > 0) & good):
             raise InputError("nothing rises above the dark level; was there any light?")
         return Measurement(readings, good)
+
+
+def _spread_to_pixels_before(bad: Mask) -> Mask:
+    """Mark the pixels that are bad or have a bad one below, beside, or below and beside them."""
+    near = bad.copy()
+    near[:-1] |= bad[1:]
+    near[:, :-1] |= near[:, 1:]
+    return near

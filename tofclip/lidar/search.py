@@ -107,11 +107,11 @@ class ReturnSearch:
         """Pixel number, instant, counts and deviation of every candidate, in raster and time order."""
         from tofclip.lidar.kernels import find_returns
 
-        total, (sharp, matched) = traces.pixels.size, self._filters
+        total = traces.pixels.size
+        fixed = self.times, self._filters, self.pulse.table()
         found = np.empty((total, self.detection.most_returns, 3))
         counts = np.zeros(total, np.int64)
         limits = self.pulse.fwhm, float(self.detection.signal_to_noise), float(self.detection.share_of_pixel)
-        table = self.pulse.table()
 
         def work(piece: slice) -> None:
             memory = np.empty((PIXELS_AT_ONCE, self.times.size), np.float32)
@@ -119,7 +119,7 @@ class ReturnSearch:
                 some = slice(piece.start + part.start, piece.start + part.stop)
                 block = memory[: some.stop - some.start]
                 traces.fill(some, block)
-                find_returns(block, traces.pixels[some], self.times, sharp, matched, *table, limits, found, counts)
+                find_returns(block, traces.pixels[some], *fixed, limits, found, counts)
 
         run_blocks(work, total, PIXELS_PER_BLOCK)
         filled = np.arange(found.shape[1]) < counts[:, np.newaxis]
@@ -127,9 +127,10 @@ class ReturnSearch:
         return np.nonzero(filled)[0], time, signal, deviation
 
     @cached_property
-    def _filters(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The sharp filter that shows candidates, and the matched one that judges them."""
-        return _filter(self.times, self.pulse.compressed(SHARPENING)), _filter(self.times, self.pulse)
+    def _filters(self) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float]]:
+        """The sharp filter that shows candidates, the matched one that judges them, and their gains."""
+        sharp, matched = (_filter(self.times, shape) for shape in (self.pulse.compressed(SHARPENING), self.pulse))
+        return sharp, matched, (float(sharp.sum(axis=0).max()), float(matched.sum(axis=0).max()))
 
 
 def depth(
@@ -164,14 +165,16 @@ def depth(
 def _filter(times: FloatArray, pulse: Pulse) -> NDArray[np.float32]:
     """Unit-energy filter for a return at each bin, (width, bins); the time axis may be uneven.
 
-    Where the axis cuts off most of the pulse the energy stays below one: little would be known of such a return.
+    What a measured pulse has below zero is noise and left out. Where the axis cuts off most of the pulse the energy
+    stays below one: little would be known of such a return.
     """
     before, after = pulse.support
-    half = int(np.ceil(max(-before, after) / np.diff(times).min()))
-    filters = np.zeros((2 * half + 1, times.size))
-    for row, shift in enumerate(range(-half, half + 1)):
+    reach = int(np.ceil(max(-before, after) / np.diff(times).min()))
+    half = 2 * (reach // 2 + 1)  # the compiled loop takes four weights at a time
+    filters = np.zeros((2 * half, times.size))
+    for row, shift in enumerate(range(-half, half)):
         here = np.arange(max(0, -shift), min(times.size, times.size - shift))
-        filters[row, here] = pulse(times[here + shift] - times[here])
+        filters[row, here] = np.maximum(pulse(times[here + shift] - times[here]), 0)
     energy = np.sum(filters**2, axis=0)
     filters /= np.sqrt(np.maximum(energy, np.median(energy) / 2))
     return filters.astype(np.float32)

@@ -16,7 +16,7 @@ from tofclip.operators.sparse import Tiles
 from tofclip.recovery.direct import PreparedInverse
 from tofclip.recovery.method import Array
 
-PATCH_ROWS, PATCH_COLUMNS = 8, 16  # the readings that such a patch looks at stay in the second-level cache
+PATCH_ROWS, PATCH_COLUMNS = 8, 8  # the readings that such a patch looks at stay in the second-level cache
 
 
 def patch_order(image_shape: tuple[int, int]) -> NDArray[np.int64]:

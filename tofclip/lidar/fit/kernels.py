@@ -11,16 +11,20 @@ import numpy as np
 from numba import njit
 
 EVEN = (1.0, 0.0)  # variance of a bin, as constant and factor of its expected brightness: the same everywhere
-CONVERGED_BINS = 1e-4
+CONVERGED_BINS = 1e-3  # the next step would be smaller by far
+
+# Without counts of the arrays' owners, which cost a lock for every array that is handed on; nothing here allocates.
+compiled = njit(nogil=True, cache=True, error_model="numpy", _nrt=False)
+inlined = njit(inline="always")  # called for every bin: handing over the arrays would cost more than the work
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def window(times, arrival, scale):
     """First bin and the bin after the last one that a return at `arrival` reaches."""
     return first_from(times, arrival + scale[2]), first_from(times, arrival + scale[3])
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def first_from(times, instant):
     """First bin at `instant` or later: where it were if bins were even, and from there step by step."""
     share = (instant - times[0]) / (times[-1] - times[0])
@@ -32,21 +36,20 @@ def first_from(times, instant):
     return bin_number
 
 
-@njit(nogil=True, cache=True)
+@inlined
 def pulse_at(time, curve, scale):
     """Pulse and its slope at `time` after the arrival, by linear interpolation; zero outside the samples."""
     position = time * scale[0] + scale[1]
-    if position < 0 or position >= curve.shape[0] - 1:
-        return 0.0, 0.0
-    left = int(position)
-    share = position - left
-    return (
-        (1 - share) * curve[left, 0] + share * curve[left + 1, 0],
-        (1 - share) * curve[left, 1] + share * curve[left + 1, 1],
-    )
+    p = d = 0.0
+    if 0 <= position < curve.shape[0] - 1:
+        left = int(position)
+        share = position - left
+        p = (1 - share) * curve[left, 0] + share * curve[left + 1, 0]
+        d = (1 - share) * curve[left, 1] + share * curve[left + 1, 1]
+    return p, d
 
 
-@njit(nogil=True, cache=True)
+@inlined
 def unexplained(trace, times, background, curve, scale, estimate, i, without):
     """Bin i less the background and all returns except number `without` (-1: less all of them)."""
     rest = trace[i] - background
@@ -56,39 +59,48 @@ def unexplained(trace, times, background, curve, scale, estimate, i, without):
     return rest
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def refine(trace, times, background, curve, scale, estimate, variance, rounds):
     """Least-squares arrival and height of every return, by Gauss-Newton steps on one return at a time.
 
     Taking turns, each against what the others leave, undoes the pull of returns that overlap. A bin weighs as much as
     its variance, ``variance[0] + variance[1] * expected``, is small. With `EVEN` that is the plain fit; with ``(0, 1)``
-    and photon counts it is Fisher scoring, which ends at the Poisson likelihood's maximum. A return whose neighbours
-    and which itself moved no more is left alone.
+    and photon counts it is Fisher scoring, which ends at the Poisson likelihood's maximum. A return that moved no more
+    and that no moving one reaches is left alone.
+
+    `estimate` is (returns, 3): arrival, height, and by how many bins it moved last, which is overwritten.
     """
-    moved = np.full(estimate.shape[0], np.inf)
+    estimate[:, 2] = np.inf
     for _ in range(rounds):
         largest = 0.0
         for k in range(estimate.shape[0]):
-            if is_unsettled(estimate, k, moved, scale):
-                moved[k] = gauss_newton_step(trace, times, background, curve, scale, estimate, k, variance)
-                largest = max(largest, moved[k])
+            concerned, own, moving = neighbours(estimate, k, curve, scale)
+            if moving >= CONVERGED_BINS:
+                gauss_newton_step(trace, times, background, curve, scale, concerned, own, variance)
+                largest = max(largest, estimate[k, 2])
         if largest < CONVERGED_BINS:
             break
 
 
-@njit(nogil=True, cache=True)
-def is_unsettled(estimate, k, moved, scale):
-    """Whether return k, or one that overlaps it, moved when last looked at."""
-    reach = 2 * (scale[3] - scale[2])
-    unsettled = False
+@compiled
+def neighbours(estimate, k, curve, scale):
+    """Return k with all others if one of them reaches it, else alone; its place there; and the most one of them moved.
+
+    One reaches the other if it has light in bins that count for the other.
+    """
+    before, after = scale[1] / scale[0] + scale[3], (curve.shape[0] - 1 - scale[1]) / scale[0] - scale[2]
+    crowded, moving = False, estimate[k, 2]
     for other in range(estimate.shape[0]):
-        unsettled |= moved[other] >= CONVERGED_BINS and abs(estimate[other, 0] - estimate[k, 0]) < reach
-    return unsettled
+        later = estimate[other, 0] - estimate[k, 0]
+        if other != k and -after < later < before:
+            crowded = True
+            moving = max(moving, estimate[other, 2])
+    return (estimate, k, moving) if crowded else (estimate[k : k + 1], 0, moving)
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def gauss_newton_step(trace, times, background, curve, scale, estimate, k, variance):
-    """Improve return k in place; return by how many bins it moved (at most one)."""
+    """Improve return k of `estimate` in place, and enter there by how many bins it moved (at most one)."""
     arrival, height = estimate[k, 0], estimate[k, 1]
     first, last = window(times, arrival, scale)
     pp = pd = dd = pr = dr = 0.0
@@ -102,79 +114,87 @@ def gauss_newton_step(trace, times, background, curve, scale, estimate, k, varia
         pr += weight * p * rest
         dr += weight * d * rest
     determinant = pp * dd - pd * pd
+    estimate[k, 2] = 0.0
     if determinant <= 0:
-        return 0.0
+        return
     height = (dd * pr - pd * dr) / determinant
     if height <= 0:
         estimate[k, 1] = 0.0
-        return 0.0
+        return
     bin_width = (times[-1] - times[0]) / (times.size - 1)
     step = -(pp * dr - pd * pr) / (determinant * height)  # model: height * p(t - arrival), whose slope is -height * d
     step = min(max(step, -bin_width), bin_width)
-    estimate[k, 0], estimate[k, 1] = arrival + step, height
-    return abs(step) / bin_width
+    estimate[k, 0], estimate[k, 1], estimate[k, 2] = arrival + step, height, abs(step) / bin_width
 
 
-@njit(nogil=True, cache=True)
-def describe(trace, times, background, noise, curve, scale, estimate, least, found):
+@compiled
+def describe(trace, times, background, noise, curve, scale, estimate, least, profile, found):
     """Write instant, sum and standard deviation of every return that proves itself; return their number.
 
     It has to lie on the time axis and to respond, height times root of the pulse's energy, by more than `least`.
+    `profile`, (bins, 3), is overwritten.
     """
     number = 0
     for k in range(estimate.shape[0]):
         arrival, height = estimate[k, 0], estimate[k, 1]
         if height <= 0 or arrival < times[0] or arrival > times[-1]:
             continue
+        concerned, own, _ = neighbours(estimate, k, curve, scale)
         first, last = window(times, arrival, scale)
         pp = pd = dd = 0.0
         for i in range(first, last):
             p, d = pulse_at(times[i] - arrival, curve, scale)
+            rest = unexplained(trace, times, background, curve, scale, concerned, i, own) - height * p
+            profile[i, 0], profile[i, 1], profile[i, 2] = p, d, rest
             pp += p * p
             pd += p * d
             dd += d * d
         if height * np.sqrt(pp) <= least or pp * dd <= pd * pd:
             continue
-        total, deviation = sum_and_deviation(trace, times, background, noise, curve, scale, estimate, k, (pp, pd, dd))
+        total, deviation = sum_and_deviation(profile[first:last], height, noise, pp, pd, dd)
         found[number, 0], found[number, 1], found[number, 2] = arrival, total, deviation
         number += 1
     return number
 
 
-@njit(nogil=True, cache=True)
-def nearest_first(found):
-    """Sort a few returns by their instant, in place; they nearly are."""
-    for last in range(1, found.shape[0]):
-        place = last
-        while place > 0 and found[place - 1, 0] > found[place, 0]:
-            for column in range(found.shape[1]):
-                value = found[place, column]
-                found[place, column] = found[place - 1, column]
-                found[place - 1, column] = value
-            place -= 1
-
-
-@njit(nogil=True, cache=True)
-def sum_and_deviation(trace, times, background, noise, curve, scale, estimate, k, products):
-    """Sum of return k over its bins, and the standard deviation of its arrival.
+@compiled
+def sum_and_deviation(profile, height, noise, pp, pd, dd):
+    """Sum of a return over its bins, and the standard deviation of its arrival.
 
     The variance of a bin is taken as ``noise^2 + dispersion * brightness`` (quasi-Poisson). The dispersion is what
     makes the expected sum of squared residuals, ``sum_i variance_i (1 - h_i)`` with the fit's leverages h, equal to
-    the one found; the variances are then carried through the least-squares fit. `products` holds the sums of squared
-    pulse, pulse times slope, and squared slope.
+    the one found; the variances are then carried through the least-squares fit.
+
+    Parameters
+    ----------
+    profile : (bins, 3) array
+        Pulse, slope and residual in each bin that the return reaches.
+    height, noise : float
+    pp, pd, dd : float
+        Sums of squared pulse, pulse times slope, and squared slope.
     """
-    arrival, height = estimate[k, 0], estimate[k, 1]
-    pp, pd, dd = products
     across_energy = dd - pd * pd / pp
     total = misfit = unfitted = weighted = 0.0
-    first, last = window(times, arrival, scale)
-    for i in range(first, last):
-        p, d = pulse_at(times[i] - arrival, curve, scale)
+    for i in range(profile.shape[0]):
+        p, d, residual = profile[i, 0], profile[i, 1], profile[i, 2]
         across = d - p * pd / pp  # the part of the slope that a change of height cannot mimic
         total += height * p
-        misfit += unexplained(trace, times, background, curve, scale, estimate, i, -1) ** 2 - noise * noise
+        misfit += residual * residual - noise * noise
         unfitted += height * p * (1 - p * p / pp - across * across / across_energy)
         weighted += across * across * height * p
     misfit += 2 * noise * noise  # two of the bins' worth of noise went into the fit
     variance = noise * noise * across_energy + max(misfit, 0.0) / max(unfitted, 1e-3 * total) * weighted
     return total, np.sqrt(variance) / (across_energy * height)
+
+
+@compiled
+def sort_rows(table):
+    """Sort a few rows by their first column, in place."""
+    for last in range(1, table.shape[0]):
+        place = last
+        while place > 0 and table[place - 1, 0] > table[place, 0]:
+            for column in range(table.shape[1]):
+                value = table[place, column]
+                table[place, column] = table[place - 1, column]
+                table[place - 1, column] = value
+            place -= 1

@@ -102,7 +102,7 @@ def locate(histograms, peaks, numbers, curve, scale, times, found):
     found : (n, most returns, 3) float64 array
         Overwritten with arrival, photons and standard deviation of the arrival where there is a return.
     """
-    estimate = np.empty((peaks.shape[1], 2))
+    estimate = np.empty((peaks.shape[1], 3))
     for row in range(histograms.shape[0]):
         trace, number = histograms[row], numbers[row]
         background = quiet_rate(trace, times, peaks[row, :number], scale)
