@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from hidden_point import confocal_capture, curved_capture
 from small_instrument import (
     ANGLES,
     BACKGROUND,
@@ -76,3 +77,15 @@ def files(tmp_path_factory: pytest.TempPathFactory, camera: Camera, streak: Stre
     for name, picture in focus_pictures().items():
         tifffile.imwrite(folder / f"{name}.tif", picture)
     return folder
+
+
+@pytest.fixture(scope="session")
+def curved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A hidden point before a curved wall."""
+    return curved_capture(tmp_path_factory.mktemp("curved") / "capture.h5")
+
+
+@pytest.fixture(scope="session")
+def confocal(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same point before a planar wall, scanned confocally."""
+    return confocal_capture(tmp_path_factory.mktemp("confocal") / "capture.h5")

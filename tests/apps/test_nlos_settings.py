@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apps.nlos_scene import SceneSettings
+from apps.nlos_scene import WALLS, SceneSettings
 from apps.nlos_settings import plain, save, setting, told
 from apps.verbs.nlos.compare import CompareSettings
 from apps.verbs.nlos.reconstruct import ReconstructSettings
@@ -87,6 +87,12 @@ def test_files_that_are_no_toml(content: bytes, tmp_path: Path) -> None:
         told(Sample, path, {})
     with pytest.raises(StorageError, match="no such file"):
         told(Sample, tmp_path / "absent.toml", {})
+
+
+def test_walls_are_those_of_the_simulation() -> None:
+    from nlos import simulate
+
+    assert tuple(simulate.WALLS) == WALLS
 
 
 @pytest.mark.parametrize("kind", [ReconstructSettings, CompareSettings, SceneSettings])

@@ -1,0 +1,87 @@
+"""`tofclip nlos reconstruct FOLDER`: many captures, some broken, some done already."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hidden_point import object_of
+from small_instrument import Run
+
+from nlos import Volume
+from tofclip.storage import SIGNATURE
+
+
+@pytest.fixture
+def folder(curved: Path, tmp_path: Path) -> Path:
+    folder = tmp_path / "captures"
+    folder.mkdir()
+    for name in ("a.h5", "c.h5"):
+        shutil.copy(curved, folder / name)
+    (folder / "b.h5").write_bytes(SIGNATURE + b"and nothing more")
+    (folder / "notes.txt").write_text("no capture")
+    return folder
+
+
+def words(folder: Path) -> list[object]:
+    return ["reconstruct", folder, "--out", folder.parent / "out", "--voxel-mm", 60]
+
+
+def test_the_broken_one_is_listed_and_the_others_are_whole(run: Run, folder: Path) -> None:
+    outcome = run("nlos", *words(folder), "--suffix", ".h5", "--suffix", ".vti", "--json")
+    assert outcome.status == 1
+    assert outcome.err.startswith("tofclip: failed: b.h5: ")
+    found = json.loads(outcome.out)
+    assert [one["capture"] for one in found["imaged"]] == ["a.h5", "c.h5"]
+    assert list(found["failed"]) == ["b.h5"]
+    expected = {f"{name}{suffix}" for name in "ac" for suffix in (".h5", ".vti", ".png", ".toml")}
+    assert {path.name for path in (folder.parent / "out").iterdir()} == expected | {".settings.toml"}
+    assert Volume.load(folder.parent / "out" / "a.h5").provenance["inputs"][0]["name"] == "a.h5"
+
+
+def test_what_is_finished_is_skipped(run: Run, folder: Path, curved: Path) -> None:
+    run("nlos", *words(folder))
+    out = folder.parent / "out"
+    before = (out / "a.h5").stat().st_mtime_ns
+    shutil.copy(curved, folder / "b.h5")
+    (out / "c.toml").unlink()  # as if interrupted before it was finished
+    found = object_of(run, *words(folder))
+    assert (found["skipped"], [one["capture"] for one in found["imaged"]]) == (["a.h5"], ["b.h5", "c.h5"])
+    assert (out / "a.h5").stat().st_mtime_ns == before
+    later = (out / "a.toml").stat().st_mtime + 10
+    os.utime(folder / "a.h5", (later, later))  # the capture was written anew
+    assert [one["capture"] for one in object_of(run, *words(folder))["imaged"]] == ["a.h5"]
+
+
+def test_results_of_other_settings_are_not_mixed_in(run: Run, folder: Path) -> None:
+    (folder / "b.h5").unlink()
+    object_of(run, *words(folder))
+    refused = run("nlos", *words(folder), "--cycles", 4)
+    assert refused.status == 2
+    assert "made with cycles = 3.0, now it is 4.0" in refused.err
+
+
+def test_an_interruption_leaves_whole_results(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from apps.verbs.nlos import reconstruct
+
+    original: Callable[..., dict[str, Any]] = reconstruct._reconstructed
+
+    def interrupted(source: Path, *others: Any) -> dict[str, Any]:
+        if source.name == "c.h5":
+            raise KeyboardInterrupt
+        return original(source, *others)
+
+    monkeypatch.setattr(reconstruct, "_reconstructed", interrupted)
+    outcome = run("nlos", *words(folder))
+    assert (outcome.status, outcome.out) == (130, "")
+    assert {path.name for path in (folder.parent / "out").iterdir()} == {
+        ".settings.toml",
+        "a.h5",
+        "a.png",
+        "a.toml",
+    }
