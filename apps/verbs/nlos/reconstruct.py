@@ -19,6 +19,7 @@ from apps.options import AsJson, Cluster
 
 if TYPE_CHECKING:
     from apps.nlos_files import Results
+    from nlos import Capture, Volume
     from tofclip.cluster import Job, Report
 
 SOME_FAILED = 1
@@ -112,22 +113,14 @@ def _require_sense(settings: ReconstructSettings) -> None:
 def _reconstructed(source: Path, results: Results, wanted: ReconstructSettings) -> dict[str, Any]:
     """Image one capture, write its results, and return the figures."""
     from apps.nlos_files import with_history, write_volume
-    from apps.nlos_imaging import box_of, boxed, imaged, prepared, scales_of, warnings_in_a_line
-    from apps.nlos_methods import built, quickest, spelt_out
+    from apps.nlos_imaging import prepared, warnings_in_a_line
     from apps.nlos_settings import plain, save
     from nlos.io import read_capture
-    from tofclip.units import MILLIMETRE
 
     capture = prepared(read_capture(source), wanted)
     started = time.perf_counter()
-    scales = scales_of(wanted, capture)
-    found = replace(wanted, **scales._asdict())
-    method = found.method or quickest(found, capture, box_of(found, capture, scales.voxel_mm * MILLIMETRE)[1])
-    found = replace(spelt_out(found, [method]), method=method)
-    imaging = built(method, found)
     with warnings_in_a_line():
-        found, grid = boxed(found, capture, imaging)
-        volume = imaged("imaging", imaging, capture, grid)
+        found, volume = _imaged(capture, wanted)
     seconds = time.perf_counter() - started
     volume = with_history(volume, source, {"verb": "nlos reconstruct", **plain(found)})
     for path in results.volumes:
@@ -136,15 +129,30 @@ def _reconstructed(source: Path, results: Results, wanted: ReconstructSettings) 
         volume.save_picture(results.picture)
     save(found, results.settings, HEADING)
     return {
-        "method": method,
+        "method": found.method,
         "wavelength_mm": found.wavelength_mm,
         "voxel_mm": found.voxel_mm,
-        "voxels": grid.shape,
+        "voxels": volume.grid.shape,
         "wall_points": len(capture.points),
         "seconds": seconds,
-        "voxels_per_second": grid.size / seconds,
+        "voxels_per_second": volume.grid.size / seconds,
         "peak_m": dict(zip("xyz", volume.brightest(), strict=True)),
     }
+
+
+def _imaged(capture: Capture, wanted: ReconstructSettings) -> tuple[ReconstructSettings, Volume]:
+    """Find what is not told, and image the capture."""
+    from apps.nlos_imaging import box_of, boxed, imaged, scales_of
+    from apps.nlos_methods import built, quickest, spelt_out
+    from tofclip.units import MILLIMETRE
+
+    scales = scales_of(wanted, capture)
+    found = replace(wanted, **scales._asdict())
+    method = found.method or quickest(found, capture, box_of(found, capture, scales.voxel_mm * MILLIMETRE)[1])
+    found = replace(spelt_out(found, [method]), method=method)
+    imaging = built(method, found)
+    found, grid = boxed(found, capture, imaging)
+    return found, imaged("imaging", imaging, capture, grid)
 
 
 def _reconstruct_folder(
