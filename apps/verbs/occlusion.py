@@ -68,12 +68,15 @@ def demo(
     illumination: Annotated[
         str, typer.Option(metavar="NAME", help="diodes, one beside each view; oblique; co-located, a single one.")
     ] = "diodes",
-    encoder: Annotated[
-        str, typer.Option(metavar="NAME", help="line; or single-pixel, which needs a million photons.")
-    ] = "line",
+    encoder: Annotated[str, typer.Option(metavar="NAME", help="line or single-pixel.")] = "line",
     sampling_ratio: Annotated[float, typer.Option(metavar="SR", help="Readings over pixels of one picture.")] = 0.5,
     side_px: Annotated[int, typer.Option(metavar="N", help="Rows and columns of the picture.")] = 128,
-    photons: Annotated[float, typer.Option(metavar="N", help="Of the brightest reading at its brightest.")] = 2000.0,
+    photons: Annotated[
+        float | None,
+        typer.Option(
+            metavar="N", help="Of the brightest reading at its brightest.", show_default="2000; single-pixel 1000000"
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of line angles and photons.")] = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -91,22 +94,40 @@ def demo(
     from apps.figures.style import save
     from apps.files import make_folder
     from apps.report import report
-    from tofclip.occlusion.experiment import Experiment, Settings
-    from tofclip.occlusion.probe import FACTORS, probe
+    from tofclip.errors import InputError
+    from tofclip.occlusion.experiment import USUAL_PHOTONS, Experiment, Settings
     from tofclip.occlusion.scenes import occlusion_scene
 
     started = time.perf_counter()
-    settings = Settings(side_px, encoder, sampling_ratio, illumination, photons, seed)
-    chosen = occlusion_scene(scene)
-    experiment = Experiment(chosen, settings)
+    if encoder not in USUAL_PHOTONS:
+        raise InputError(f"unknown encoder '{encoder}'; take one of {', '.join(USUAL_PHOTONS)}")
+    usual = USUAL_PHOTONS[encoder] if photons is None else photons
+    settings = Settings(side_px, encoder, sampling_ratio, illumination, usual, seed)
+    experiment = Experiment(occlusion_scene(scene), settings)
     experiment.rig.camera  # noqa: B018 - refuses what no camera can be built from, before anything is written
     make_folder(out)
-    factors = FACTORS if chosen.region.ends else ()
-    probes = [probe(chosen.occluder, chosen.region, factor, seed) for factor in factors]
+    probes = _look(experiment)
     written = [out / "occlusion.png", out / "occlusion.gif"]
     save(occlusion_figure(experiment, probes), written[0])
     save_film(experiment, written[1])
     report({**_figures(experiment, probes), "seconds": time.perf_counter() - started}, as_json, written)
+
+
+def _look(experiment: Experiment) -> list[Probe]:
+    """Cast the rays, recover, and try small targets inside the inactive region and beyond, if it ends."""
+    from apps.progress import progress
+    from tofclip.occlusion.probe import FACTORS, probe
+
+    scene, probes = experiment.scene, []
+    factors = FACTORS if scene.region.ends else ()
+    with progress("looking past", 2 + len(factors)) as advance:
+        for part in ("readings", "separated"):
+            getattr(experiment, part)
+            advance(1)
+        for factor in factors:
+            probes.append(probe(scene.occluder, scene.region, factor, experiment.settings.seed))
+            advance(1)
+    return probes
 
 
 def _figures(experiment: Experiment, probes: Sequence[Probe]) -> dict[str, Any]:

@@ -33,6 +33,9 @@ MARGIN = 20e-3  # before the occluder and behind the target, m
 OBLIQUE_LAMP = (-55e-3, -25e-3, 0.0)
 ILLUMINATIONS = ("diodes", "oblique", "co-located")
 
+USUAL_PHOTONS = {"line": 2e3, "single-pixel": 1e6}
+"""Of the brightest reading: one of a single pixel gathers half the picture's light and tells little of it."""
+
 
 @dataclass(frozen=True)
 class Settings:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tofclip.metrics import nmse
-from tofclip.occlusion.experiment import Experiment, Settings
+from tofclip.occlusion.experiment import USUAL_PHOTONS, Experiment, Settings
 from tofclip.occlusion.scenes import occlusion_scene
 from tofclip.studies.cases import NAMES, in_parallel
 from tofclip.studies.library import Library
@@ -14,8 +14,6 @@ SCENES = ("tree", "person", "bush", "plate")
 """As the paper's: a mannequin behind a tree and behind a plate, a word behind a bush and behind a plate."""
 
 RATIOS = (1.0, 0.5)
-PHOTONS = {"line": 2e3, "single-pixel": 1e6}
-"""Of the brightest reading: one of a single pixel gathers half the picture's light and tells little of it."""
 
 
 def flash_occlusion(library: Library, seeds: int, advance: Advance) -> Outcome:
@@ -27,7 +25,7 @@ def flash_occlusion(library: Library, seeds: int, advance: Advance) -> Outcome:
         scene, encoder, ratio = case
         done = []
         for seed in range(seeds):
-            settings = Settings(side, encoder, ratio, photons=PHOTONS[encoder], seed=seed)
+            settings = Settings(side, encoder, ratio, photons=USUAL_PHOTONS[encoder], seed=seed)
             done.append(Experiment(occlusion_scene(scene), settings))
             _ = done[-1].separated
             advance(1)
