@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from apps.benchmarks.case import Case, Prepared
+from apps.benchmarks.peers import lensless_seconds
 from tofclip.clip_measurement import Setup, measure
 from tofclip.clip_recovery import ClipRecovery
 from tofclip.light_field import LightField
@@ -37,7 +38,8 @@ def recovery(encoder: str, side: int) -> Prepared:
         for _ in range(needed):
             model.adjoint(model(picture))
 
-    return Prepared(lambda: method.recover(measurement, SHEAR), products, 1)
+    peers = {"LenslessPiCam": partial(lensless_seconds, side, needed)} if encoder == "diffuser" else {}
+    return Prepared(lambda: method.recover(measurement, SHEAR), products, 1, peers)
 
 
 FLOOR = "the products of its iterations alone"
@@ -60,5 +62,14 @@ CASES = (
         "pictures",
         FLOOR,
         partial(recovery, "single-pixel"),
+    ),
+    Case(
+        "clip-2d",
+        "CLIP-2D (diffuser), half as many readings as pixels; the peer takes as many iterations of one view",
+        "pixels a side",
+        SIDES,
+        "pictures",
+        FLOOR,
+        partial(recovery, "diffuser"),
     ),
 )

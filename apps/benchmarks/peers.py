@@ -53,6 +53,30 @@ astra.create_sino(picture, projector)
 print("seconds", time.perf_counter() - start)
 """
 
+LENSLESS = """
+import sys, time
+import numpy as np
+from lensless import FISTA
+stored = np.load(sys.argv[1])
+spread, readings, iterations = stored["spread"], stored["readings"], int(stored["iterations"])
+method = FISTA(spread[np.newaxis, :, :, np.newaxis])
+method.set_data(readings[np.newaxis, :, :, np.newaxis])
+method.apply(n_iter=1, disp_iter=None, plot=False, save=False)
+start = time.perf_counter()
+method.apply(n_iter=iterations, disp_iter=None, plot=False, save=False)
+print("seconds", time.perf_counter() - start)
+"""
+
+
+def lensless_seconds(side: int, iterations: int) -> float:
+    """Seconds of as many iterations of LenslessPiCam's FISTA on a picture of that size and one view."""
+    random = np.random.default_rng(0)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "readings.npz"
+        spread, readings = (random.random((side, side), np.float32) for _ in range(2))
+        np.savez(path, spread=spread, readings=readings, iterations=iterations)
+        return seconds_told(LENSLESS, "LenslessPiCam", str(path))
+
 
 def astra_seconds(picture: NDArray[np.float32], angles: NDArray[np.float64]) -> float:
     """Seconds of ASTRA's parallel projections of a picture, linear interpolation, processor."""

@@ -29,7 +29,7 @@ def bench(
         Path | None,
         typer.Option(
             metavar="PYTHON",
-            help="A Python that has other programs to compare with: pip install y-tal pyfftw astra-toolbox.",
+            help="A Python that has other programs to compare with: pip install y-tal pyfftw astra-toolbox lensless.",
             show_default="none",
         ),
     ] = None,

@@ -143,7 +143,7 @@ def test_peers_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_names() -> None:
     assert len(registry.cases_called("all")) == len(registry.CASES)
-    assert [case.name for case in registry.cases_called("clip")] == ["clip-1d", "clip-0d"]
+    assert [case.name for case in registry.cases_called("clip")] == ["clip-1d", "clip-0d", "clip-2d"]
     assert all(group in str(bench.__annotations__["name"]) for group in TITLES)
     with pytest.raises(InputError, match="recovery, clip"):
         registry.cases_called("nothing")

@@ -113,6 +113,23 @@ def test_workers_of_another_version_are_refused(scheduler, monkeypatch):
         pass
 
 
+def test_workers_without_this_program_are_refused(scheduler, monkeypatch):
+    def missing() -> str:
+        raise ModuleNotFoundError("No module named 'tofclip'")
+
+    monkeypatch.setattr("tofclip.cluster.workers._version", missing)
+    with pytest.raises(InputError, match="have no tofclip"), workers(scheduler):
+        pass
+
+
+def test_a_scheduler_without_workers_is_refused(monkeypatch):
+    distributed = pytest.importorskip("distributed", reason="dask.distributed is an extra")
+    monkeypatch.setattr("tofclip.cluster.workers.WAIT_SECONDS", 0.3)
+    nobody = distributed.LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0", silence_logs=50)
+    with nobody, pytest.raises(InputError, match="has no worker"), workers(nobody.scheduler_address):
+        pass
+
+
 def test_a_folder_belongs_to_its_settings(tmp_path):
     folder = tmp_path / "new" / "results"
     claim(folder, {"method": "tv", "camera": Path("camera.h5"), "weight": None})

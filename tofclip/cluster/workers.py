@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from tofclip.arrays import THREADS_VARIABLE, thread_count
-from tofclip.errors import InputError, MissingDependencyError, TofclipError
+from tofclip.errors import InputError, MissingDependencyError
 from tofclip.version import __version__
 
 if TYPE_CHECKING:
@@ -96,8 +96,6 @@ def _greet(client: Client, where: str) -> None:
         found = set(client.run(_version).values())
     except TimeoutError as fault:
         raise InputError(f"{where}: the scheduler has no worker; start some with 'dask worker {where}'") from fault
-    except TofclipError:
-        raise
     except Exception as fault:
         raise InputError(f"{where}: its workers have no tofclip {__version__}: {fault}") from fault
     if found != {__version__}:
