@@ -11,7 +11,7 @@ from nlos.band import Band
 from nlos.capture import Capture
 from nlos.exposure import exposures
 from nlos.geometry import Grid
-from nlos.hybrid import Hybrid
+from nlos.hybrid import PASSAGE_SHARE, Hybrid
 from nlos.propagation.propagate import carried
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.planar import PlanarRSD, waves_of
@@ -44,5 +44,5 @@ def outgoing_field(method: Method, capture: Capture, way: Diffraction, band: Ban
     (part,) = exposures(capture)
     if isinstance(method, PlanarRSD):
         return PlanarWall.of(capture.points).field(part.phasors(capture, band))
-    values = carried(capture, part, way.plane, band, method.propagation).values
+    values = carried(capture, part, way.plane, band, method.propagation, PASSAGE_SHARE * method.tolerance).values
     return values * np.float32(np.prod(way.plane.steps))

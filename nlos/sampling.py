@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 
 import numpy as np
 
 from nlos.band import Band
 from nlos.capture import Capture
+
+PACKAGE = __name__.partition(".")[0]
 
 
 class AliasingWarning(UserWarning):
@@ -29,5 +32,16 @@ def warn_of_aliasing(capture: Capture, band: Band) -> None:
             f"the virtual pulse: false images may appear; use points at most {finest:.3g} m apart, or a wavelength "
             f"{capture.spacing / finest:.2g} times longer",
             AliasingWarning,
-            stacklevel=3,
+            stacklevel=_levels_to_caller(),
         )
+
+
+def _levels_to_caller() -> int:
+    """How far up the first line stands that is not this package's: what the user wrote."""
+    level = 1
+    frame = inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == PACKAGE:
+        frame = frame.f_back
+        level += 1
+    # The first frame here is this function's own, which `warnings` does not see.
+    return max(level - 1, 1)

@@ -10,13 +10,16 @@ from nlos.capture import Capture
 from nlos.exposure import unfolded_band
 from nlos.geometry import Grid
 from nlos.hybrid import Hybrid
-from nlos.method import Progress, Support, silent
+from nlos.method import MEMORY_LIMIT_BYTES, Progress, Support, silent
 from nlos.plane import step
 from nlos.refinement.model import WallModel
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
 from tofclip.recovery import Method, Sparse
 from tofclip.recovery.light_field_variation import LightFieldVariation
+
+VOLUMES_HELD = 12
+"""float32 volumes that the solver holds at once, with the duals of total variation."""
 
 FINEST_PER_WAVELENGTH = 5.0
 """Voxels per carrier wavelength in depth: a point between two of them is then off by less than 1.3 rad."""
@@ -61,7 +64,7 @@ class Refinement:
 
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with ``.reason``."""
-        return self.hybrid.supports(capture, grid) and self._depth_support(grid)
+        return self.hybrid.supports(capture, grid) and self._depth_support(grid) and _size_support(grid)
 
     def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Image the hidden scene.
@@ -110,3 +113,13 @@ class Refinement:
                 f"{self.hybrid.wavelength:.3g} m: use at most {allowed:.3g} m"
             )
         return Support()
+
+
+def _size_support(grid: Grid) -> Support:
+    needed = 4 * VOLUMES_HELD * grid.size
+    if needed > MEMORY_LIMIT_BYTES:
+        return Support(
+            f"{grid.size} voxels need {needed / 2**30:.1f} GiB to refine, more than the {MEMORY_LIMIT_BYTES >> 30} GiB "
+            "allowed: use larger voxels or a smaller box"
+        )
+    return Support()
