@@ -29,6 +29,8 @@ from apps.verbs import (
     record,
     recover,
     reproduce,
+    stream,
+    view,
 )
 from tofclip import __version__
 from tofclip.errors import TofclipError
@@ -63,11 +65,16 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   calibrate          find a camera's views in four pictures of a point source
   recover            streak image to one picture per instant
   cloud              recovered frames to a point cloud
+  view               look at any of these, or an instrument: a page, a window, a picture, a film
+  stream             an instrument's shots, a folder's or a stack's to clouds while they come, with latencies
   lidar accuracy     how well counted photons tell a range, beside the theoretical limit
   lidar parallax     a shot to how the views move with range, for recover --focus depth-locked
   lidar scene        recovered frames to a list of objects and a picture
   lidar sequence     a folder or stack of shots to a sequence of clouds
-  nlos reconstruct   recovered frames of a wall to the scene hidden around the corner
+  nlos reconstruct   recovered frames of a wall, or a folder of them, to what is hidden around the corner
+  nlos compare       several methods on one capture, side by side, with time and memory
+  nlos simulate      the capture of a known hidden scene; nlos info: what a capture can show
+  nlos demo          a hidden 3D before a curved wall, imaged quickly and slowly
   occlusion          what stands behind an occluder: inactive region, demonstration
   clip               light fields from few readings: simulate a camera, recover a picture
   reproduce          the paper's tables and figures, made again: reproduce all --out DIR
@@ -84,6 +91,8 @@ app.command()(demo.demo)
 app.command()(calibrate.calibrate)
 app.command()(recover.recover)
 app.command()(cloud.cloud)
+app.command()(view.view)
+app.command()(stream.stream)
 app.add_typer(lidar.app, name="lidar")
 app.add_typer(nlos.app, name="nlos")
 app.add_typer(clip.app, name="clip")

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.viewer.colouring import palette
+from apps.viewer.colouring import STEPS, Scale, palette
 from tofclip.lidar import PointCloud
 
 BRIGHTEST = 99.7  # percent: a glint does not darken the rest
@@ -21,22 +21,22 @@ Picture = NDArray[np.float32]
 Image = NDArray[np.uint8]
 
 
-def panes(pictures: Mapping[str, Picture], colours: str) -> dict[str, Image]:
+def panes(pictures: Mapping[str, Picture], scale: Scale) -> dict[str, Image]:
     """Turn pictures into images of a handy size.
 
     Parameters
     ----------
     pictures : mapping of str to (rows, columns) array
         ``"depth"`` is in m, NaN where there is nothing; all others are brightness.
-    colours : str
-        Palette of the depth.
+    scale : Scale
+        Colours of the depth: the same as the scene's where these tell the range, and else as many, evenly.
 
     Returns
     -------
     dict of str to (rows, columns, 3) uint8 array
     """
     return {
-        name: sized(coloured_depth(picture, colours) if name == "depth" else coloured_light(picture))
+        name: sized(coloured_depth(picture, scale) if name == "depth" else coloured_light(picture))
         for name, picture in pictures.items()
     }
 
@@ -66,15 +66,16 @@ def coloured_light(picture: Picture) -> Image:
     return palette("inferno")[(255 * toned).astype(np.intp)]
 
 
-def coloured_depth(picture: Picture, colours: str) -> Image:
+def coloured_depth(picture: Picture, scale: Scale) -> Image:
     """Colour a picture of distances; NaN becomes a dark grey."""
     image = np.empty((*picture.shape, 3), np.uint8)
     image[:] = NOTHING
     there = np.isfinite(picture)
     if there.any():
-        low, high = np.percentile(picture[there], (1, 99))
-        share = np.clip((picture[there] - low) / max(float(high - low), 1e-9), 0, 1)
-        image[there] = palette(colours)[(255 * share).astype(np.intp)]
+        if scale.quantity != "range":
+            low, high = np.percentile(picture[there], (1, 99))
+            scale = Scale("range", "m", scale.palette, np.linspace(low, max(high, low + 1e-9), STEPS))
+        image[there] = scale.colours(picture[there])
     return image
 
 

@@ -56,7 +56,7 @@ class Still:
 
     def draw(self, shown: Shown) -> Figure:
         """Put what is shown into the figure, and return it."""
-        image = self._renderer.draw(shown, self.viewpoint, SHAPE, _point_px(len(shown.cloud)))
+        image = self._renderer.draw(shown, self.viewpoint, SHAPE, point_px(len(shown.cloud)))
         self._image.set_data(image)
         note = "" if self._renderer.name == "pyvista" else "   drawn by matplotlib: no working graphics library here"
         self._words.set_text(f"{self._title}, frame {shown.frame}: {len(shown.cloud)} points{note}")
@@ -134,6 +134,6 @@ def _say_length(axes: Any, column: NDArray[Any], row: NDArray[Any], name: str, l
     axes.text(float(column.mean()), float(row.mean()), f"{name} {length:.3g} m", **words)
 
 
-def _point_px(points: int) -> int:
-    """Side of a drawn point: larger where there are few."""
+def point_px(points: int) -> int:
+    """Return the side of a drawn point: larger where there are few."""
     return 6 if points < FEW_POINTS else 3 if points < MANY_POINTS else 2

@@ -77,6 +77,11 @@ class Session:
             self.clock.loop = False
 
     @property
+    def latest(self) -> Shown | None:
+        """What was drawn last."""
+        return self._shown
+
+    @property
     def label(self) -> str:
         """``"LIVE"`` while the newest frame of an instrument is shown, ``"REPLAY"`` otherwise."""
         return "LIVE" if self.following and self.source.is_live else "REPLAY"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -264,10 +265,11 @@ def test_what_cannot_be_looked_at(tmp_path: Path, folder: Path) -> None:
 
 
 def test_panes_have_a_handy_size_and_dark_holes() -> None:
-    made = panes(front_pictures(plane(4000)), "viridis")
+    scale = Session(PlaneSource()).shown(0.0).scale
+    made = panes(front_pictures(plane(4000)), scale)
     assert made["depth"].dtype == np.uint8
     assert all(200 <= max(image.shape) <= 420 for image in made.values()) or made["depth"].shape[0] == 128
-    empty = panes(front_pictures(PlaneSource().view(0).cloud), "viridis")["depth"]
+    empty = panes(front_pictures(PlaneSource().view(0).cloud), replace(scale, quantity="height"))["depth"]
     assert (empty == (32, 36, 44)).all(axis=-1).mean() > 0.9
-    tall = panes({"streak": np.ones((1016, 1344), np.float32)}, "viridis")["streak"]
+    tall = panes({"streak": np.ones((1016, 1344), np.float32)}, scale)["streak"]
     assert max(tall.shape) <= 420

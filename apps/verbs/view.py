@@ -1,0 +1,136 @@
+"""`tofclip view`: look at clouds, transients, hidden volumes, raw shots and instruments."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from apps.options import AsJson, TimeZero
+from tofclip.units import NANOSECOND, PICOSECOND
+
+if TYPE_CHECKING:
+    from apps.viewer.session import Session
+
+
+def view(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SOURCE",
+            help="Frames, cloud, volume, raw shot, a folder or stack of clouds or shots, or an instrument's address.",
+        ),
+    ],
+    camera: Annotated[
+        Path | None,
+        typer.Option(metavar="H5", help="For raw shots; made by calibrate.", show_default="the one inside SOURCE"),
+    ] = None,
+    bin_width_ps: Annotated[
+        float | None, typer.Option(metavar="PS", help="For raw shots: duration of a row in ps.")
+    ] = None,
+    time_zero_ns: TimeZero = None,
+    port: Annotated[
+        int | None, typer.Option(min=1, max=65535, metavar="N", help="Of the page.", show_default="a free one")
+    ] = None,
+    host: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="Where the page is served; beyond loopback a token guards it.")
+    ] = "127.0.0.1",
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the page's address; open nothing.")] = False,
+    desktop: Annotated[bool, typer.Option("--desktop", help="Open a window instead of a page.")] = False,
+    png: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="Write a picture, without a screen.", show_default="none")
+    ] = None,
+    mp4: Annotated[
+        Path | None, typer.Option(metavar="MP4", help="Write a film, without a screen.", show_default="none")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Look at a source: on a page of the browser, in a window, as a picture or as a film.
+
+    The page is served to this computer only. Through ssh: ssh -L 8080:localhost:8080 HOST, then
+    tofclip view SOURCE --port 8080 --no-browser there, and http://localhost:8080 here. On the page, ? shows the keys.
+
+    Example: tofclip view frames.h5 --png scene.png
+    """
+    from apps.viewer.session import Session
+    from apps.viewer.sources import Extras, open_source
+
+    _check_outputs(desktop, png, mp4, source, camera)
+    started = time.perf_counter()
+    known = Extras(
+        camera,
+        None if bin_width_ps is None else bin_width_ps * PICOSECOND,
+        None if time_zero_ns is None else time_zero_ns * NANOSECOND,
+    )
+    with contextlib.closing(open_source(source, known)) as opened:
+        session = Session(opened)
+        if png is not None:
+            _draw_picture(session, png, started, as_json)
+        elif mp4 is not None:
+            _draw_film(session, mp4, started, as_json)
+        elif desktop:
+            _open_window(session)
+        else:
+            _serve(session, host, port, no_browser, as_json)
+
+
+def _check_outputs(desktop: bool, png: Path | None, mp4: Path | None, *inputs: str | Path | None) -> None:
+    from apps.files import require_writable
+    from tofclip.errors import InputError
+
+    if desktop + (png is not None) + (mp4 is not None) > 1:
+        raise InputError("choose one of --desktop, --png and --mp4")
+    files = tuple(Path(name) for name in inputs if name is not None and "://" not in str(name))
+    for out, suffix in ((png, ".png"), (mp4, ".mp4")):
+        if out is not None:
+            require_writable(out, suffix, inputs=files)
+
+
+def _draw_picture(session: Session, out: Path, started: float, as_json: bool) -> None:
+    from apps.report import report
+    from apps.viewer.picture import save_picture
+    from apps.viewer.render import best_renderer
+
+    shown, renderer = session.shown(0.0), best_renderer()
+    save_picture(session.source.title, shown, renderer, out)
+    report(_figures(len(shown.cloud), renderer.name, started), as_json, [out])
+
+
+def _draw_film(session: Session, out: Path, started: float, as_json: bool) -> None:
+    from apps.progress import progress
+    from apps.report import report
+    from apps.viewer.film import frames_of, save_film
+    from apps.viewer.render import best_renderer
+
+    renderer, pictures = best_renderer(), len(frames_of(session))
+    with progress("filming", pictures) as advance:
+        points = save_film(session, renderer, out, advance)
+    report(_figures(points, renderer.name, started) | {"pictures": pictures}, as_json, [out])
+
+
+def _figures(points: int, backend: str, started: float) -> dict[str, Any]:
+    return {"points": points, "backend": backend, "seconds": time.perf_counter() - started}
+
+
+def _open_window(session: Session) -> None:
+    from apps.viewer.desktop import open_window
+
+    open_window(session)
+
+
+def _serve(session: Session, host: str, port: int | None, no_browser: bool, as_json: bool) -> None:
+    from apps.report import report
+    from apps.viewer.door import Door
+    from apps.viewer.page import Page
+
+    with contextlib.closing(Page(session, Door.at(host), port)) as page:
+        report({"address": page.address}, as_json)
+        sys.stdout.flush()  # whoever reads the address waits for it
+        if not no_browser:
+            webbrowser.open(page.address)
+        page.run()

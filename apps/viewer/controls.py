@@ -1,0 +1,134 @@
+"""The panel of controls: labels that stay, and what each of them does to the session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from apps.viewer.clock import FASTEST, SLOWEST
+from apps.viewer.looks import Looks
+from apps.viewer.session import GATES, Session, Shown
+from apps.viewer.words import Status
+
+if TYPE_CHECKING:
+    import viser
+
+Post = Callable[[Callable[[], None]], None]
+
+SPEEDS = ("1/16", "1/8", "1/4", "1/2", "1", "2", "4", "8", "16")
+STEPS = {"|<": -(10**9), "-10": -10, "-1": -1, "+1": 1, "+10": 10, ">|": 10**9}
+WIDEST_GATE = 200
+
+
+class Controls:
+    """Playback, time gate, refocus and ways of showing; how points look is in `Looks`.
+
+    Parameters
+    ----------
+    server : ViserServer
+    session : Session
+    post : callable
+        Takes what is to be done by the thread that owns the session.
+    first : Shown
+    """
+
+    def __init__(self, server: viser.ViserServer, session: Session, post: Post, first: Shown) -> None:
+        self._gui, self._session, self._post = server.gui, session, post
+        self._status = self._gui.add_html("")
+        self._playback()
+        if session.source.abilities.times is not None:
+            self._time_gate()
+        if session.source.abilities.shears is not None:
+            self._refocus(*session.source.abilities.shears)
+        if session.source.ways.names:
+            self._ways()
+        self._looks = Looks(server, session, post, first)
+
+    @property
+    def point_size(self) -> float:
+        """Side of a point, m."""
+        return self._looks.point_size
+
+    def show(self, shown: Shown) -> None:
+        """Bring the controls up to date with what is shown."""
+        last = max(1, len(self._session.source) - 1)
+        if self._frame.max != last:
+            self._frame.max = last
+        self._frame.value = shown.frame
+        self._looks.show(shown)
+
+    def tell(self, status: Status) -> None:
+        """Say where one is."""
+        if self._status.content != status.html:
+            self._status.content = status.html
+
+    def _playback(self) -> None:
+        session, gui = self._session, self._gui
+        last = max(1, len(session.source) - 1)
+        self._frame: Any = gui.add_slider("frame", 0, last, 1, min(session.clock.frame, last))
+        self._on(self._frame, session.jump)
+        live = ("play", "pause", "live") if session.source.is_live else ("play", "pause")
+        self._on(gui.add_button_group("playback", live), self._run)
+        self._on(gui.add_button_group("step", tuple(STEPS)), lambda word: session.step(STEPS[word]))
+        self._on(gui.add_dropdown("speed", SPEEDS, initial_value="1"), self._set_speed)
+        self._on(gui.add_checkbox("loop", session.clock.loop), self._set_loop)
+
+    def _time_gate(self) -> None:
+        gui = self._gui
+        hint = "which points of the transient are shown: those whose light has come back by the current frame, ..."
+        self._on(gui.add_dropdown("time gate", GATES, initial_value=self._session.gate, hint=hint), self._set_gate)
+        hint = "frames before and after the current one, for 'around the frame'"
+        half = gui.add_slider("half gate", 1, WIDEST_GATE, 1, self._session.half_gate, hint=hint)
+        self._on(half, self._set_half_gate)
+
+    def _refocus(self, least: float, most: float) -> None:
+        hint = "recovers the gate once more by the linear inverse, at this shear in pixels per view step; 0: as it was"
+        slider = self._gui.add_slider("refocus", least, most, 0.1, 0.0, hint=hint)
+        self._on(slider, self._set_shear)
+
+    def _ways(self) -> None:
+        ways, gui = self._session.source.ways, self._gui
+        self._on(gui.add_dropdown("show as", ways.names, initial_value=ways.chosen), self._set_way)
+        hint = "share of the brightest voxel below which nothing is shown"
+        self._on(gui.add_slider("threshold", 0.02, 0.98, 0.01, ways.threshold, hint=hint), self._set_threshold)
+
+    def _run(self, word: str) -> None:
+        {"play": self._session.play, "pause": self._session.pause, "live": self._session.follow}[word]()
+
+    def _set_speed(self, word: str) -> None:
+        over, _, under = word.partition("/")
+        self._session.clock.set_speed(float(np.clip(float(over) / float(under or 1), SLOWEST, FASTEST)))
+
+    def _set_loop(self, loop: bool) -> None:
+        self._session.clock.loop = loop
+
+    def _set_gate(self, gate: str) -> None:
+        self._session.gate = gate
+
+    def _set_half_gate(self, frames: int) -> None:
+        self._session.half_gate = frames
+
+    def _set_shear(self, shear: float) -> None:
+        self._session.shear = None if shear == 0 else shear
+
+    def _set_way(self, way: str) -> None:
+        self._session.source.ways.chosen = way
+
+    def _set_threshold(self, threshold: float) -> None:
+        self._session.source.ways.threshold = threshold
+
+    def _on(self, handle: Any, act: Callable[[Any], None]) -> None:
+        on_user(handle, self._post, act)
+
+
+def on_user(handle: Any, post: Post, act: Callable[[Any], None]) -> None:
+    """Have `act` called with a control's new value when a user, not this program, has changed it."""
+
+    def changed(event: Any) -> None:
+        if event.client is not None:
+            value = event.target.value
+            post(lambda: act(value))
+
+    (handle.on_update if hasattr(handle, "on_update") else handle.on_click)(changed)

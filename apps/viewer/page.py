@@ -1,0 +1,176 @@
+"""The page: what is shown, kept up to date in every browser that looks at it."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from apps.viewer.controls import Controls
+from apps.viewer.door import Door
+from apps.viewer.keeping import Keeping
+from apps.viewer.marks import Marks
+from apps.viewer.panes import panes
+from apps.viewer.rates import Pace, Rate
+from apps.viewer.server import address_of, echoes, start_server, stop_server
+from apps.viewer.session import Session, Shown
+from apps.viewer.viewpoint import Viewpoint, in_front_of
+from apps.viewer.words import Status, page_title
+from tofclip.errors import TofclipError
+
+TICK = 1 / 60
+"""s between two looks at the clock."""
+
+STATUS_EVERY, PANES_EVERY = 0.25, 0.3
+"""s; words and flat pictures need not follow every frame."""
+
+PANEL_PX, PICTURES_PX = 330, 260
+SURFACE_COLOUR = (216, 210, 196)
+
+
+class Page:
+    """Serves a session. One thread, in `run`, owns the session; whatever the browsers ask for waits in a queue.
+
+    Parameters
+    ----------
+    session : Session
+    door : Door
+    port : int, optional
+
+    Raises
+    ------
+    InputError, MissingDependencyError
+        As `start_server`.
+    """
+
+    def __init__(self, session: Session, door: Door, port: int | None = None) -> None:
+        self.session = session
+        self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._stopping = threading.Event()
+        first = session.shown(time.monotonic())
+        self.viewpoint = in_front_of(first.cloud.xyz)
+        self.server = start_server(door, port)
+        self.address = address_of(self.server, door)
+        self._pace, self._frames = Pace(), Rate()
+        self._echo = echoes(self.server, lambda: self.post(lambda: self._pace.answered(time.monotonic())))
+        self._prepare()
+        self.controls = Controls(self.server, session, self.post, first)
+        self._marks = Marks(self.server, session, self.post)
+        self._keeping = Keeping(self.server, session, self.post, self.viewpoint)
+        self._pictures: dict[str, Any] = {}
+        self._drawn: Shown | None = None
+        self._status_at = self._panes_at = 0.0
+        self._paned: Shown | None = None
+
+    def post(self, command: Callable[[], None]) -> None:
+        """Have a command carried out by the thread that owns the session."""
+        self._commands.put(command)
+
+    def run(self) -> None:
+        """Keep the page up to date until `close`, or Ctrl-C."""
+        while not self._stopping.is_set():
+            self.update(time.monotonic())
+            self._stopping.wait(TICK)
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._stopping.set()
+        stop_server(self.server)
+
+    def update(self, now: float) -> None:
+        """Carry out commands, and send what has changed."""
+        try:
+            while not self._commands.empty():
+                self._commands.get_nowait()()
+            shown = self.session.shown(now) if self._pace.may_send(now) else self._drawn
+            if shown is not None and shown is not self._drawn:
+                self._draw(shown, now)
+            self._tell(now)
+        except TofclipError as fault:
+            self._complain(fault)
+
+    def _prepare(self) -> None:
+        server = self.server
+        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        server.gui.set_panel_label(page_title(self.session.source.title))
+        server.gui.main_panel.dock_right()
+        server.gui.main_panel.set_width(PANEL_PX)
+        server.scene.set_up_direction("-y")
+        look_from(server.initial_camera, self.viewpoint)
+        server.scene.add_frame("/camera", axes_length=0.1, axes_radius=0.003)
+        server.on_client_connect(lambda _: self.post(self._greet))
+
+    def _greet(self) -> None:
+        """A page that has just opened is not waited for: it has a history to catch up with."""
+        self._pace = Pace(self._pace.drawn)
+        self._panes_at, self._paned = 0.0, None
+
+    def _draw(self, shown: Shown, now: float) -> None:
+        server = self.server
+        with server.atomic():
+            self._draw_scene(shown)
+            self.controls.show(shown)
+            self._echo()
+        server.flush()
+        self._drawn = shown
+        self._frames.add(now)
+        self._pace.sent(now, len(server.get_clients()))
+
+    def _draw_scene(self, shown: Shown) -> None:
+        scene = self.server.scene
+        if shown.surface is not None:
+            faces, vertices = shown.surface.faces, shown.surface.vertices
+            scene.add_mesh_simple("/surface", vertices, faces, color=SURFACE_COLOUR, side="double")
+        elif self._drawn is not None and self._drawn.surface is not None:
+            scene.remove_by_name("/surface")
+        size, points = self.controls.point_size, shown.cloud.xyz
+        if shown.surface is not None:
+            points = points[:0]
+        colours: Any = shown.colours if len(points) else (0, 0, 0)  # the page complains about no colours at all
+        look: dict[str, Any] = {"point_shape": "square", "point_shading": "flat", "precision": "float32"}
+        scene.add_point_cloud("/points", points, colours, point_size=size, **look)
+
+    def _tell(self, now: float) -> None:
+        """Bring words and flat pictures up to date, now and then."""
+        shown = self._drawn
+        if shown is None:
+            return
+        if now - self._status_at > STATUS_EVERY:
+            self._status_at = now
+            self.controls.tell(self._status(shown, now))
+        if now - self._panes_at > PANES_EVERY and shown is not self._paned:
+            self._panes_at, self._paned = now, shown
+            self._show_panes(shown)
+
+    def _status(self, shown: Shown, now: float) -> Status:
+        source = self.session.source
+        rates = (source.data_rate, self._frames.per_second(now), self._pace.drawn.per_second(now))
+        return Status(
+            self.session.label, shown.frame, len(source), len(shown.cloud), *rates, self._pace.latency, source.trouble
+        )
+
+    def _show_panes(self, shown: Shown) -> None:
+        images = panes(self.session.pictures(shown), shown.scale)
+        if not self._pictures:
+            panel = self.server.gui.add_panel()
+            with panel.add_tab("pictures"):
+                self._pictures = {name: self.server.gui.add_image(one, label=name) for name, one in images.items()}
+            panel.dock_left()
+            panel.set_width(PICTURES_PX)
+            return
+        for name, image in images.items():
+            self._pictures[name].image = image
+
+    def _complain(self, fault: TofclipError) -> None:
+        for client in self.server.get_clients().values():
+            client.add_notification("that cannot be", str(fault), auto_close_seconds=6.0, color="red")
+
+
+def look_from(camera: Any, viewpoint: Viewpoint) -> None:
+    """Move a camera of the page, or the one that pages start with, to a viewpoint."""
+    camera.position, camera.look_at = viewpoint.eye, viewpoint.target
+    camera.fov = max(viewpoint.field_of_view, float(np.deg2rad(5.0)))

@@ -1,0 +1,167 @@
+"""The viewer in a headless browser on this machine: updates a second, latency, and how soon a large cloud is seen.
+
+    python tests/benchmarks/viewer.py [--json] [--seconds 10] [--points 15625]
+
+Needs playwright and chromium. The browser draws with a software renderer, on the same cores as the program.
+
+* updates: frames that differ, as the page's own document shows them, per second;
+* latency: from the moment a frame is handed to the server to the moment at which the page shows its number;
+* large: a PLY file of a million points, from opening it to all of it being drawn in a tab that was open already.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import statistics
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from playwright.sync_api import sync_playwright
+
+from apps.viewer.clouds import cloud_of
+from apps.viewer.door import Door
+from apps.viewer.page import Page
+from apps.viewer.server import echoes
+from apps.viewer.session import Session, Shown
+from apps.viewer.source import Source, View
+from apps.viewer.sources import open_source
+
+FLAGS = (
+    "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run "
+    "--disable-background-networking --disable-component-update --disable-sync"
+)
+WINDOW = {"width": 1100, "height": 640}
+LARGE = 1_000_000
+FRAMES = 200
+
+WATCH = """
+window.seenFrames = [];
+new MutationObserver((changes) => {
+  const slider = document.querySelector('[role=slider]');
+  const frame = slider ? Number(slider.getAttribute('aria-valuenow')) : NaN;
+  const last = window.seenFrames[window.seenFrames.length - 1];
+  if (!last || last[0] !== frame) window.seenFrames.push([frame, Date.now() / 1000]);
+}).observe(document.body, {subtree: true, attributes: true, attributeFilter: ['aria-valuenow']});
+"""
+
+
+class Waves(Source):
+    """A sheet of points that moves: every frame is another cloud."""
+
+    def __init__(self, points: int) -> None:
+        super().__init__("waves", 60.0)
+        side = round(points**0.5)
+        x, y = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side))
+        self._views = [View(_wave(x, y, 2 * np.pi * number / FRAMES)) for number in range(FRAMES)]
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def view(self, number: int) -> View:
+        return self._views[number]
+
+
+class Timed(Page):
+    """A page that remembers when each frame was handed over."""
+
+    def __init__(self, *arguments: Any) -> None:
+        self.handed: list[tuple[int, float]] = []
+        super().__init__(*arguments)
+
+    def _draw(self, shown: Shown, now: float) -> None:
+        self.handed.append((shown.frame, time.time()))
+        super()._draw(shown, now)
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--points", type=int, default=15_625)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--json", action="store_true")
+    asked = parser.parse_args()
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS.split())
+        figures = {**_streamed(browser, asked.points, asked.seconds), **_large(browser)}
+        browser.close()
+    print(json.dumps(figures) if asked.json else "\n".join(f"{name:28} {value:g}" for name, value in figures.items()))
+
+
+def _wave(x: Any, y: Any, phase: float) -> Any:
+    z = 3 + 0.2 * np.sin(4 * x + phase) * np.cos(3 * y)
+    return cloud_of(np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32), {"intensity": z.ravel()})
+
+
+def _served(page: Page) -> threading.Thread:
+    thread = threading.Thread(target=page.run, daemon=True)
+    thread.start()
+    return thread
+
+
+def _streamed(browser: Any, points: int, seconds: float) -> dict[str, float]:
+    page = Timed(Session(Waves(points)), Door())
+    _served(page)
+    tab = browser.new_page(viewport=WINDOW)
+    tab.goto(page.address)
+    tab.locator("#frame-number").wait_for(timeout=60_000)
+    time.sleep(2)  # the tab has caught up
+    tab.evaluate(WATCH)
+    page.post(page.session.play)
+    time.sleep(1)
+    begin, handed = len(tab.evaluate("window.seenFrames")), len(page.handed)
+    started = time.time()
+    time.sleep(seconds)
+    seen = tab.evaluate("window.seenFrames")[begin:]
+    passed = time.time() - started
+    sent = page.handed[handed - 1 :]
+    latencies = _latencies(sent, seen)
+    tab.close()
+    page.close()
+    return {
+        "points": points,
+        "updates_per_second": len(seen) / passed,
+        "frames_sent_per_second": len(sent) / passed,
+        "latency_median_ms": 1e3 * statistics.median(latencies),
+        "latency_worst_tenth_ms": 1e3 * float(np.quantile(latencies, 0.9)),
+    }
+
+
+def _latencies(sent: list[tuple[int, float]], seen: list[list[float]]) -> list[float]:
+    """Time from handing a frame over to seeing its number; a number comes round again only after seconds."""
+    found = []
+    for frame, at in seen:
+        earlier = [then for number, then in sent if number == frame and then <= at]
+        if earlier:
+            found.append(at - earlier[-1])
+    return found
+
+
+def _large(browser: Any) -> dict[str, float]:
+    tab = browser.new_page(viewport=WINDOW)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "large.ply"
+        xyz = np.random.default_rng(0).uniform(-1, 1, (LARGE, 3)).astype(np.float32) + np.float32([0, 0, 3])
+        cloud_of(xyz).save(path)
+        started = time.perf_counter()
+        session = Session(open_source(str(path)))
+        page = Page(session, Door())
+        ready = time.perf_counter()
+        drawn = threading.Event()
+        echoes(page.server, drawn.set)
+        _served(page)
+        tab.goto(page.address)
+        drawn.wait(60)
+        done = time.perf_counter()
+        tab.close()
+        page.close()
+    return {"large_points": LARGE, "large_read_s": ready - started, "large_seen_s": done - started}
+
+
+if __name__ == "__main__":
+    main()

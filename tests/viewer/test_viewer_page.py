@@ -1,0 +1,233 @@
+"""The page in a browser: what a user sees, clicks and takes along."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from viewer_scenes import frames, volume
+
+from apps.viewer.door import Door
+from apps.viewer.page import Page
+from apps.viewer.session import AROUND, Session
+from apps.viewer.transient import TransientSource
+from apps.viewer.volume import SURFACE, VolumeSource
+from tofclip.lidar import PointCloud
+
+playwright = pytest.importorskip(
+    "playwright.sync_api", reason="the page is driven by playwright: pip install playwright"
+)
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = (
+    "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run "
+    "--disable-background-networking --disable-component-update --disable-sync"
+)
+PATIENCE_MS = 30_000  # a software renderer on a busy machine draws twice a second
+SCENE = "canvas[data-engine]"
+HARMLESS = ("THREE.Clock", "GPU stall", "GroupMarkerNotSet", "Automatic fallback to software WebGL")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    if CHROMIUM is None:
+        pytest.skip("there is no chromium here (on Debian: apt-get install chromium)")
+    with playwright.sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS.split())
+        yield opened
+        opened.close()
+
+
+class Seen:
+    """A served session and the tab that looks at it."""
+
+    def __init__(self, browser: Any, session: Session) -> None:
+        self.page, self.complaints = Page(session, Door()), []
+        self._thread = threading.Thread(target=self.page.run, daemon=True)
+        self._thread.start()
+        self.tab = browser.new_page(viewport={"width": 1100, "height": 640})
+        self.tab.set_default_timeout(PATIENCE_MS)
+        self.tab.on("console", self._listen)
+        self.tab.on("pageerror", lambda fault: self.complaints.append(str(fault)))
+        self.tab.goto(self.page.address)
+        self.tab.locator("#frame-number").wait_for()
+        notice = self.tab.locator("[class*=Notification-closeButton]")  # that the renderer is a slow one
+        notice.first.wait_for()
+        notice.first.click()
+
+    def _listen(self, line: Any) -> None:
+        if line.type in ("error", "warning") and not any(word in line.text for word in HARMLESS):
+            self.complaints.append(line.text)
+
+    def row(self, label: str) -> Any:
+        """The control with a label."""
+        return self.tab.locator(
+            f'xpath=//label[normalize-space()="{label}"]/ancestor::div[contains(@class,"Flex-root")][1]'
+        )
+
+    def type(self, label: str, value: str, field: int = -1) -> None:
+        """Type into a number's box; a slider's is its last one."""
+        box = self.row(label).locator("input:not([type=hidden])").nth(field)
+        box.fill(value)
+        box.press("Tab")
+
+    def choose(self, label: str, option: str) -> None:
+        """Choose from a list."""
+        self.row(label).locator("input:not([type=hidden])").first.click()
+        self.tab.get_by_role("option", name=option, exact=True).click()
+
+    def press(self, button: str) -> None:
+        self.tab.get_by_role("button", name=button, exact=True).click()
+
+    def number(self, place: str) -> int:
+        return int(self.tab.locator(place).inner_text())
+
+    def close(self) -> None:
+        self.tab.close()
+        self.page.close()
+        self._thread.join(10)
+
+
+def until(met: Callable[[], bool], what: str) -> None:
+    """Wait for something to become so."""
+    deadline = time.monotonic() + PATIENCE_MS / 1e3
+    while not met():
+        assert time.monotonic() < deadline, f"waited in vain until {what}"
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def seen(browser: Any) -> Iterator[Seen]:
+    opened = Seen(browser, Session(TransientSource("frames <b>.h5", frames())))
+    yield opened
+    opened.close()
+
+
+def picture(seen: Seen) -> np.ndarray:
+    """What the scene looks like on the page."""
+    return imread(io.BytesIO(seen.tab.locator(SCENE).screenshot()))[..., :3]
+
+
+def test_it_loads(seen: Seen) -> None:
+    until(lambda: seen.number("#points") == 85, "all points are shown")
+    assert seen.number("#frame-number") == 95
+    assert seen.tab.locator("#label").inner_text() == "REPLAY"
+    assert "frames <b>.h5" in seen.tab.locator("body").inner_text()  # no file name becomes HTML
+    until(lambda: picture(seen).std() > 0.02, "the scene is drawn")
+    assert seen.tab.get_by_text("range (m)").is_visible()
+    until(lambda: seen.tab.locator("img").count() >= 3, "streak, intensity and depth are shown")
+
+
+def test_play_pause_and_step(seen: Seen) -> None:
+    seen.press("play")
+    until(lambda: 0 < seen.number("#frame-number") < 95, "the frame advances")
+    seen.press("pause")
+    until(lambda: not seen.page.session.clock.playing, "it stands still")
+    seen.press("|<")
+    until(lambda: seen.number("#frame-number") == 0, "the first frame is shown")
+    seen.press("+10")
+    until(lambda: seen.number("#frame-number") == 10, "ten frames further on")
+    seen.type("frame", "40")
+    until(lambda: seen.number("#frame-number") == 40, "the frame that was typed is shown")
+    assert seen.number("#points") == 36  # of the nearer square
+    seen.tab.keyboard.press("End")
+    until(lambda: seen.number("#points") == 85, "all points are shown again")
+
+
+def test_recolour(seen: Seen) -> None:
+    before = picture(seen)
+    seen.choose("colour", "intensity")
+    until(lambda: "intensity (counts)" in seen.tab.locator("#scale").inner_text(), "the scale says so")
+    seen.choose("palette", "inferno")
+    until(lambda: bool(np.abs(picture(seen) - before).max() > 0.2), "the colours are others")
+    seen.choose("colour", "range")
+    until(lambda: "range (m)" in seen.tab.locator("#scale").inner_text(), "they come back")
+
+
+def test_filter(seen: Seen) -> None:
+    seen.tab.get_by_text("filters", exact=True).click()
+    seen.type("range", "1.6", field=1)  # the squares are at 1.59 m and 1.68 m
+    until(lambda: seen.number("#points") == 36, "the farther square is left out")
+    seen.press("reset filters")
+    until(lambda: seen.number("#points") == 85, "it is back")
+
+
+def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
+    shown = seen.page.session.latest
+    assert shown is not None
+    canvas = seen.tab.locator(SCENE).bounding_box()
+    assert canvas is not None
+    near = shown.cloud.xyz[shown.cloud.range < 1.63].mean(axis=0, keepdims=True)
+    row, column, _ = seen.page.viewpoint.project(near, (round(canvas["height"]), round(canvas["width"])))
+    seen.tab.mouse.click(canvas["x"] + column[0], canvas["y"] + row[0])
+    words = seen.tab.locator("#picked")
+    until(lambda: "range 1.58" in words.inner_text(), "the point is described")
+    assert "pixel row 1" in words.inner_text()
+    until(lambda: seen.tab.locator(".uplot canvas").count() == 1, "its waveform is drawn")
+    far = shown.cloud.xyz[shown.cloud.range > 1.63].mean(axis=0, keepdims=True)
+    row, column, _ = seen.page.viewpoint.project(far, (round(canvas["height"]), round(canvas["width"])))
+    seen.tab.mouse.click(canvas["x"] + column[0], canvas["y"] + row[0])
+    until(lambda: "distance 0." in words.inner_text(), "the distance of both is told")
+
+
+def test_refocus(seen: Seen) -> None:
+    seen.choose("time gate", AROUND)
+    seen.type("frame", "30")
+    until(lambda: seen.number("#points") == 36, "the gate is shown")
+    before = seen.page.session.latest
+    seen.type("refocus", "1")
+    until(lambda: seen.page.session.shear == 1.0 and seen.page.session.latest is not before, "it is recovered anew")
+    after = seen.page.session.latest
+    assert before is not None
+    assert after is not None
+    assert after.pixels is not None
+    assert after.pixels[:, 0].mean() > before.pixels[:, 0].mean() + 1
+    seen.type("refocus", "0")
+    until(lambda: seen.page.session.shear is None, "it is as it was")
+
+
+def test_screenshot_export_and_bookmark(seen: Seen, tmp_path: Path) -> None:
+    with seen.tab.expect_download() as download:
+        seen.press("screenshot")
+    download.value.save_as(tmp_path / "shot.png")
+    drawn = imread(tmp_path / "shot.png")[..., :3]
+    assert min(drawn.shape[:2]) > 300
+    assert drawn.std() > 0.01
+    with seen.tab.expect_download() as download:
+        seen.press("export")
+    download.value.save_as(tmp_path / "shown.ply")
+    assert len(PointCloud.load(tmp_path / "shown.ply")) == seen.number("#points")
+    seen.press("bookmark")
+    until(lambda: seen.row("view from").locator("input").first.input_value() == "view 1", "the view is remembered")
+    seen.choose("view from", "start")
+
+
+def test_a_question_mark_shows_the_keys(seen: Seen) -> None:
+    seen.tab.evaluate("document.activeElement.blur()")  # into a box, a question mark is typed
+    seen.tab.keyboard.press("?")
+    seen.tab.get_by_text("play or pause").first.wait_for()
+    seen.press("close")
+
+
+def test_nothing_was_complained_about(seen: Seen) -> None:
+    assert seen.complaints == []
+
+
+def test_a_volume_as_a_surface(browser: Any) -> None:
+    seen = Seen(browser, Session(VolumeSource("ball", volume())))
+    try:
+        until(lambda: seen.number("#points") > 10, "voxels are shown")
+        seen.choose("show as", SURFACE)
+        seen.type("threshold", "0.6")
+        until(lambda: seen.page.session.source.ways.threshold == 0.6, "the threshold is set")
+        until(lambda: picture(seen).std() > 0.02, "the surface is drawn")
+        assert seen.complaints == []
+    finally:
+        seen.close()
