@@ -7,6 +7,7 @@ Besides what a source itself takes, its address may say how to gather (`GATHERIN
 * ``frames``: of a camera, to add up; 1 by default;
 * ``bins``, ``start_ps``, ``period_ps``: number of histogram bins, middle of the first one after the laser's pulse, and
   the laser's period, where the source does not know it;
+* ``records``: photons of a shot, where a source is read shot after shot; 100 000 by default;
 * ``sync``, ``pixels``: channel of the laser's pulses and channels of the line's pixels of a time tagger, ``0`` and
   ``1,2,3`` by default.
 """
@@ -15,6 +16,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import groupby
+from math import inf
+from operator import itemgetter
+from sys import maxsize
 from time import monotonic
 from urllib.parse import quote, urlencode
 
@@ -32,7 +37,7 @@ from tofclip.errors import DeviceTimeoutError, InputError
 from tofclip.storage import Record, provenance
 from tofclip.transient import Streak
 
-GATHERING = ("seconds", "frames", "bins", "start_ps", "period_ps", "sync", "pixels")
+GATHERING = ("seconds", "frames", "bins", "start_ps", "period_ps", "records", "sync", "pixels")
 BIN_WIDTH = 20e-12
 """Width of a histogram's bins where nobody gives another, s."""
 
@@ -57,6 +62,7 @@ class Gathering:
     pixels : tuple of int
     bin_width : float or None
         s. None: `BIN_WIDTH` for photons, and the camera's own time axis for frames.
+    records : int
     """
 
     seconds: float = 10.0
@@ -67,6 +73,7 @@ class Gathering:
     sync: int = 0
     pixels: tuple[int, ...] = (1, 2, 3)
     bin_width: float | None = None
+    records: int = 100_000
 
     @classmethod
     def of(cls, uri: Uri, bin_width: float | None) -> Gathering:
@@ -82,9 +89,10 @@ class Gathering:
             uri.value("sync", int, standard.sync),
             pixels,
             bin_width,
+            uri.value("records", int, standard.records),
         )
-        if not (0 < found.seconds < float("inf") and found.frames >= 1):
-            raise InputError(f"'{uri.text}': seconds and frames must be positive")
+        if not (0 < found.seconds < inf and found.frames >= 1 and found.records >= 1):
+            raise InputError(f"'{uri.text}': seconds, frames and records must be positive")
         return found
 
     def axis(self, known_period: float | None) -> BinAxis:
@@ -134,7 +142,7 @@ def read_transient(address: str, bin_width: float | None = None) -> Streak:
     uri = Uri.parse(address)
     gathering = Gathering.of(uri, bin_width)
     with open_source(_own(uri)) as source:
-        streak = _gathered(source, gathering)
+        streak = _gathered(_batches(source, gathering.seconds), source.calibration, gathering)
         known = source.calibration
         past = {**provenance({"address": address, "bin_width_s": bin_width}), "source": source.info.as_dict()}
         source.stop()
@@ -144,22 +152,63 @@ def read_transient(address: str, bin_width: float | None = None) -> Streak:
     return replace(streak, camera=_camera(known), source=address, provenance=past)
 
 
-def _gathered(source: Source, gathering: Gathering) -> Streak:
-    batches = _batches(source, gathering.seconds)
+def read_transients(address: str, bin_width: float | None = None) -> Iterator[Streak]:
+    """Read a source until it ends, and yield one streak image after the other.
+
+    One is made of each ``frames`` pictures of a camera or ``records`` photons, as the address says; the last one may
+    have fewer. The source is opened once, and closed with the generator. Memory: a batch of the source, and a streak
+    image.
+
+    Parameters
+    ----------
+    address, bin_width
+        As for `read_transient`. Reading ends after ``seconds`` only where the address gives them.
+
+    Raises
+    ------
+    InputError, DeviceError
+        As for `read_transient`.
+    """
+    uri = Uri.parse(address)
+    gathering = Gathering.of(uri, bin_width)
+    with open_source(_own(uri)) as source:
+        known = source.calibration
+        camera = _camera(known)
+        batches = _batches(source, gathering.seconds if "seconds" in uri.values else inf)
+        for number, parts in groupby(_cut(batches, gathering), itemgetter(0)):
+            streak = _gathered((part for _, part in parts), known, gathering)
+            yield replace(streak, camera=camera, source=f"{address} shot {number}")
+
+
+def _cut(batches: Iterator[Batch], gathering: Gathering) -> Iterator[tuple[int, Batch]]:
+    """Cut batches where shots end, and say to which shot each part belongs."""
+    done = 0
+    for batch in batches:
+        names = batch.records.dtype.names or ()
+        size = {"counts": gathering.frames, "histogram": maxsize}.get(names[-1], gathering.records)
+        start = 0
+        while start < len(batch):
+            end = min(len(batch), start + size - done % size)
+            yield done // size, Batch(batch.records[start:end], batch.first + start, batch.after_gap and start == 0)
+            done += end - start
+            start = end
+
+
+def _gathered(batches: Iterator[Batch], calibration: Record | None, gathering: Gathering) -> Streak:
     first = next(batches, None)
     if first is None:
         raise InputError("the source ended before it gave anything")
     names = first.records.dtype.names or ()
     if "counts" in names:
-        return _sum_of_frames(first, batches, source.calibration, gathering)
+        return _sum_of_frames(first, batches, calibration, gathering)
     if "histogram" in names:
-        return _ready_histograms([first, *batches], source.calibration or Record("none"), gathering)
-    histogram = _histogram(names, source.calibration, gathering)
+        return _ready_histograms([first, *batches], calibration or Record("none"), gathering)
+    histogram = _histogram(names, calibration, gathering)
     while first is not None:
         if isinstance(histogram, TagHistogram):
             histogram.add(first.records, first.after_gap)
         elif isinstance(histogram, TimeHistogram):
-            histogram.add(first.records["channel"], times_of(first.records, source.calibration or Record("none")))
+            histogram.add(first.records["channel"], times_of(first.records, calibration or Record("none")))
         else:
             histogram.add(first.records)
         first = next(batches, None)

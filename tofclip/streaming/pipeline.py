@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from numpy import float32
@@ -39,7 +39,7 @@ class StreamedCloud:
 
 def stream_clouds(
     shots: Iterable[Streak], ranger: Ranger | None = None, held: int = 1, policy: Policy = "block"
-) -> Iterator[StreamedCloud]:
+) -> Generator[StreamedCloud, None, None]:
     """Yield the cloud of every shot by the linear inverse, as soon as it is made.
 
     A shot is rectified, its returns are found, and they are placed in space, each on a thread of its own, while the

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from threading import Thread
@@ -58,7 +58,7 @@ class Passage:
 
 def in_stages(
     source: Iterable[Any], stages: Sequence[Stage], held: int = 1, policy: Policy = "block"
-) -> Iterator[Passage]:
+) -> Generator[Passage, None, None]:
     """Yield what becomes of everything that `source` brings, in order.
 
     Each stage runs on a thread of its own, and so does the source. When the consumer is slow the stages wait for it,
