@@ -2,7 +2,8 @@
 
 Run with ``python tests/benchmarks/streaming.py [--shots N] [--flat N] [--json]``. The shots are three simulated ones of
 1016 rows over and over, 128 x 128 pixels behind 1344 slit pixels, brought from memory at first as fast as they are
-taken, which tells the rate, and then at three quarters of it, as an instrument would, which tells the latency. `--flat` streams so many small shots and compares peak memory after a tenth of them and at the end.
+taken, which tells the rate, and then at three quarters of it, as an instrument would, which tells the latency.
+`--flat` streams so many small shots and compares peak memory after a tenth of them and at the end.
 """
 
 from __future__ import annotations
