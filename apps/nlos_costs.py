@@ -14,6 +14,9 @@ SUM_BYTES, MAGNITUDE_BYTES = 8, 4
 LAPLACIAN_COPIES = 4
 """Volumes in float32 that the filtered back-projection holds beside its sum."""
 
+COPIES = 2
+"""Signals and spectra are held before and after they are transformed."""
+
 
 def memory_of(imaging: Reconstructor, capture: Capture, grid: Grid) -> int:
     """Estimate the most bytes that a method's arrays hold at a time, the volume included and the capture not.
@@ -28,10 +31,11 @@ def memory_of(imaging: Reconstructor, capture: Capture, grid: Grid) -> int:
     if isinstance(imaging, LightCone | FKMigration):
         return volume + 8 * len(capture.points) * capture.axis.bins * BYTES_PER_SAMPLE
     if isinstance(imaging, FilteredBackprojection):
-        return volume + LAPLACIAN_COPIES * MAGNITUDE_BYTES * grid.size + TABLE_BYTES
+        signals = min(TABLE_BYTES, SUM_BYTES * len(capture.points) * capture.axis.bins)
+        return volume + LAPLACIAN_COPIES * MAGNITUDE_BYTES * grid.size + COPIES * signals
     if isinstance(imaging, Backprojection):
-        return volume + TABLE_BYTES
-    return volume + capture.signal.nbytes + _spectra(imaging, capture, grid)
+        return volume + COPIES * TABLE_BYTES
+    return volume + capture.signal.nbytes + COPIES * _spectra(imaging, capture, grid)
 
 
 def _spectra(imaging: Reconstructor, capture: Capture, grid: Grid) -> int:

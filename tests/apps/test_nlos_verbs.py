@@ -320,3 +320,16 @@ def test_a_recording_under_its_default_settings_warns_of_nothing(shared_data: Pa
         warn_of_aliasing(capture, Band(VirtualPulse(wavelength), capture.axis))
     with pytest.warns(AliasingWarning):
         warn_of_aliasing(capture, Band(VirtualPulse(0.9 * wavelength), capture.axis))
+
+
+def test_memory_is_foretold_within_a_factor(run: Run, confocal: Path, tmp_path: Path) -> None:
+    """The estimate is within a factor of 4 of what is measured, and 32 MiB that libraries take when they are loaded."""
+    box = ["--voxel-mm", 12, "--everywhere"]
+    foretold = object_of(run, "info", confocal, *box[:2])["methods"]
+    words = ["compare", confocal, "--methods", "rsd,lct,fk", *box, "--out", tmp_path / "compare.png"]
+    measured = object_of(run, *words)["methods"]
+    for name, figures in measured.items():
+        if figures["peak_mib"] is None:
+            pytest.skip("this system does not tell how much memory a program took")
+        assert foretold[name]["memory_mib"] < 4 * figures["peak_mib"] + 32
+        assert figures["peak_mib"] < 4 * foretold[name]["memory_mib"] + 32
