@@ -1,17 +1,15 @@
-"""The demonstration of seeing through an occluder, in one picture and in a short film."""
+"""The demonstration of seeing through an occluder, in one picture."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from apps.figures.occlusion_region import BEHIND_TEXT, OCCLUDER, draw_region
 from apps.figures.style import LINE, NOTHING, SMALL, draw, label, page
 from tofclip.metrics import correlation
-from tofclip.storage import atomic_path
 from tofclip.units import MILLIMETRE, PICOSECOND
 
 if TYPE_CHECKING:
@@ -25,8 +23,6 @@ if TYPE_CHECKING:
 SEEN, UNSEEN = "#57c84d", "#ff5a5f"
 BEYOND = 1.15  # of the target's distance behind the occluder is drawn
 FAINTEST, HEADROOM = 1e-4, 12.0  # of the strongest instant: where the drawing begins, and where its captions stand
-FRAME_MS, LAST_FRAME_MS = 120, 2500
-DARK = 0.02  # of a return's brightest instant: the film passes over fainter ones
 
 
 def occlusion_figure(experiment: Experiment, probes: Sequence[Probe]) -> Figure:
@@ -44,7 +40,7 @@ def occlusion_figure(experiment: Experiment, probes: Sequence[Probe]) -> Figure:
     upper, lower = halves
     plan, time = upper.subplots(1, 2, width_ratios=[1.8, 1])
     _draw_plan(plan, experiment, probes)
-    _draw_history(time, experiment)
+    draw_history(time, experiment)
     for axes, (title, picture, truth) in zip(lower.subplots(1, 6), _pictures(experiment), strict=True):
         brightest = picture.max() if truth is None else truth.max()
         draw(axes, picture, vmin=0, vmax=max(float(brightest), 1e-12))
@@ -106,7 +102,7 @@ def _draw_plan(axes: Axes, experiment: Experiment, probes: Sequence[Probe]) -> N
     axes.set_ylim(low, high)
 
 
-def _draw_history(axes: Axes, experiment: Experiment) -> None:
+def draw_history(axes: Axes, experiment: Experiment) -> None:
     """All light over time, with the gates of the returns."""
     readings = experiment.readings
     times = readings.clock.times / PICOSECOND
@@ -121,83 +117,3 @@ def _draw_history(axes: Axes, experiment: Experiment) -> None:
         axes.text(float(peak), HEADROOM, said, ha="center", va="top", fontsize=SMALL, color="white")
     axes.set_ylim(FAINTEST, 2 * HEADROOM)
     label(axes, "light of all readings together", "time after the flash (ps)", "relative to the brightest instant")
-
-
-def save_film(experiment: Experiment, path: Path) -> None:
-    """Write a GIF: light reaches the occluder, then what stands behind it.
-
-    Each return is shown at its own brightness; the recovered pictures light up as the readings of their gates do.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from PIL import Image
-
-    figure = page(8, 3.2)
-    figure.set_layout_engine("none")
-    canvas: Any = FigureCanvasAgg(figure)
-    drawn, frames = [], _film(experiment)
-    images, cursor, title = _first_frame(figure, experiment)
-    for frame in frames:
-        for image, picture in zip(images, frame.pictures, strict=True):
-            image.set_data(picture)
-        cursor.set_xdata([frame.time, frame.time])
-        title.set_text(frame.title)
-        canvas.draw()
-        drawn.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
-    durations = [FRAME_MS] * (len(drawn) - 1) + [LAST_FRAME_MS]
-    with atomic_path(path) as temporary:
-        drawn[0].save(temporary, save_all=True, append_images=drawn[1:], duration=durations, loop=0)
-
-
-class Frame(NamedTuple):
-    """An instant of the film.
-
-    Attributes
-    ----------
-    time : float
-        ps after the flash.
-    title : str
-    pictures : two (rows, columns) arrays
-        Of the middle view and of the recovery, from 0 to 1.
-    """
-
-    time: float
-    title: str
-    pictures: tuple[NDArray[Any], NDArray[Any]]
-
-
-def _film(experiment: Experiment) -> list[Frame]:
-    """Every instant that is not dark; at last the whole of the second return."""
-    separated, returns = experiment.separated, experiment.readings.returns()
-    parts = [separated.occluder, separated.target][: len(returns)]
-    history, middle = experiment.readings.history, experiment.pictures[len(experiment.pictures) // 2]
-    times, frames = experiment.clock.times / PICOSECOND, []
-    for found, recovered in zip(returns, parts, strict=True):
-        lit = history / history[found.bins].max()
-        scales = [max(float(top), 1e-12) for top in (middle[..., found.bins].max(), np.quantile(recovered, 0.999))]
-        for instant in np.arange(found.bins.start, found.bins.stop)[lit[found.bins] > DARK]:
-            pictures = middle[..., instant] / scales[0], lit[instant] * recovered / scales[1]
-            frames.append(Frame(float(times[instant]), f"{times[instant]:.0f} ps after the flash", pictures))
-    brightest = experiment.truth.max()
-    behind, last = separated.plain, "nothing comes from behind the occluder"
-    if separated.sees_target:
-        behind, last = middle[..., returns[1].bins].sum(axis=-1), "all of the second return together"
-    return [*frames, Frame(frames[-1].time, last, (behind / brightest, separated.target / brightest))]
-
-
-def _first_frame(figure: Figure, experiment: Experiment) -> tuple[list[Any], Any, Any]:
-    """Lay the film out; return what changes: the two pictures, the instant's line, and the title."""
-    left, right, time = figure.subplots(1, 3, gridspec_kw={"left": 0.02, "right": 0.98, "bottom": 0.16, "top": 0.8})
-    images = []
-    for axes, name in ((left, "what one view sees"), (right, "ToF-CLIP")):
-        images.append(draw(axes, 0 * experiment.truth, vmin=0, vmax=1))
-        axes.set(xticks=[], yticks=[])
-        axes.set_title(name, fontsize=SMALL + 2)
-    _draw_history(time, experiment)
-    time.set_title("light of all readings", fontsize=SMALL + 2)
-    time.set_ylabel("")
-    time.tick_params(axis="y", labelleft=False)
-    return (
-        images,
-        time.axvline(experiment.clock.start / PICOSECOND, color=UNSEEN, lw=2),
-        figure.suptitle("", fontsize=SMALL + 4),
-    )

@@ -78,21 +78,26 @@ def demo(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of line angles and photons.")] = 0,
+    moving: Annotated[
+        bool, typer.Option("--moving", help="A second film: the target walks past; half a minute more.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Simulate a scene behind an occluder, see through it, and compare with other cameras and with the truth.
 
     Seven views in a row of 15 mm look past an occluder at 50 mm; rays are cast from lamps to surfaces to views. Small
-    targets on the axis at 0.8, 1.2 and 2 times the inactive length test the formula. Writes occlusion.png and
-    occlusion.gif.
+    targets on the axis at 0.8, 1.2 and 2 times the inactive length test the formula. Writes occlusion.png,
+    occlusion.gif, a film of the flash, and with --moving occlusion_moving.gif.
 
     Example: tofclip occlusion demo --scene plate --out occlusion-output
     """
     import time
 
-    from apps.figures.occlusion import occlusion_figure, save_film
+    from apps.figures.occlusion import occlusion_figure
+    from apps.figures.occlusion_film import STEPS, save_flash, save_walk
     from apps.figures.style import save
     from apps.files import make_folder
+    from apps.progress import progress
     from apps.report import report
     from tofclip.errors import InputError
     from tofclip.occlusion.experiment import USUAL_PHOTONS, Experiment, Settings
@@ -109,7 +114,11 @@ def demo(
     probes = _look(experiment)
     written = [out / "occlusion.png", out / "occlusion.gif"]
     save(occlusion_figure(experiment, probes), written[0])
-    save_film(experiment, written[1])
+    save_flash(experiment, written[1])
+    if moving:
+        written.append(out / "occlusion_moving.gif")
+        with progress("walking", STEPS) as advance:
+            save_walk(experiment, written[2], advance)
     report({**_figures(experiment, probes), "seconds": time.perf_counter() - started}, as_json, written)
 
 

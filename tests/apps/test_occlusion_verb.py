@@ -13,8 +13,9 @@ import pytest
 from small_instrument import Run
 
 from apps.cli import main
+from apps.figures import occlusion_film
 from apps.verbs.occlusion import SCENE_NAMES
-from tofclip.occlusion.scenes import SCENES
+from tofclip.occlusion.scenes import SCENES, occlusion_scene
 
 
 def test_the_inactive_length_of_the_papers_experiment(run: Run, tmp_path: Path) -> None:
@@ -45,9 +46,10 @@ def test_alone_it_shows_its_verbs(run: Run) -> None:
 @pytest.fixture(scope="module")
 def demonstrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     folder = tmp_path_factory.mktemp("occlusion") / "made"
-    words = ["occlusion", "demo", "--scene", "plate", "--side-px", "40", "--sampling-ratio", "1", "--out", str(folder)]
-    with contextlib.redirect_stdout(io.StringIO()) as out:
-        assert main([*words, "--json"]) == 0
+    words = ["occlusion", "demo", "--scene", "plate", "--side-px", "40", "--sampling-ratio", "1", "--moving"]
+    with contextlib.redirect_stdout(io.StringIO()) as out, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(occlusion_film, "STEPS", 3)
+        assert main([*words, "--out", str(folder), "--json"]) == 0
     return folder, json.loads(out.getvalue())
 
 
@@ -67,10 +69,20 @@ def test_the_demonstration_leaves_a_picture_and_a_film(demonstrated: tuple[Path,
     from PIL import Image
 
     folder, _ = demonstrated
-    assert sorted(path.name for path in folder.iterdir()) == ["occlusion.gif", "occlusion.png"]
+    assert sorted(path.name for path in folder.iterdir()) == ["occlusion.gif", "occlusion.png", "occlusion_moving.gif"]
     assert matplotlib.image.imread(folder / "occlusion.png").std() > 0.05
-    with Image.open(folder / "occlusion.gif") as film:
-        assert film.n_frames > 10
+    # three steps to the right and one on the way back; the flash has some six bright instants at each return
+    for name, fewest, most in (("occlusion_moving.gif", 4, 4), ("occlusion.gif", 10, 20)):
+        with Image.open(folder / name) as film:
+            assert fewest <= film.n_frames <= most
+            assert film.info["loop"] == 0
+
+
+def test_in_the_film_the_target_moves_from_left_to_right_and_the_occluder_stays() -> None:
+    scene = occlusion_scene("plate")
+    moved = scene.with_target_moved(0.01)
+    assert moved.target[0].centre[0] == pytest.approx(scene.target[0].centre[0] + 0.01)
+    assert moved.occluder is scene.occluder
 
 
 def test_behind_a_board_nothing_is_promised(run: Run, tmp_path: Path) -> None:

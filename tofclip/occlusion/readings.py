@@ -108,10 +108,11 @@ class TimedReadings:
 
         history = np.concatenate([[0.0], self.history, [0.0]])
         peaks, found = find_peaks(history, prominence=PROMINENT * history.max())
-        strongest = np.sort(peaks[np.argsort(found["prominences"])[-2:]]) - 1
-        pairs = pairwise(strongest.tolist())
-        ends = [0, *(int(low + np.argmin(self.history[low:high])) for low, high in pairs), self.clock.bins]
-        return tuple(self._return(slice(a, b)) for a, b in pairwise(ends)) if peaks.size else ()
+        if not peaks.size:
+            return ()
+        strongest = np.sort(peaks[np.argsort(found["prominences"])[-2:]])
+        between = (int(low + np.argmin(history[low:high])) - 1 for low, high in pairwise(strongest.tolist()))
+        return tuple(self._return(slice(*ends)) for ends in pairwise([0, *between, self.clock.bins]))
 
     def _return(self, bins: slice) -> Return:
         weight = np.maximum(self.history[bins], 0)

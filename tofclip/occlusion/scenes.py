@@ -57,6 +57,10 @@ class OcclusionScene:
         """From the views to the target, m."""
         return self.region.distance + self.behind
 
+    def with_target_moved(self, across: float) -> OcclusionScene:
+        """Return the scene with its target so many metres further right."""
+        return replace(self, target=tuple(body.shifted(across, 0.0) for body in self.target))
+
 
 def occlusion_scene(name: str) -> OcclusionScene:
     """Return a scene of `SCENES`.

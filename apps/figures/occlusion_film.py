@@ -1,0 +1,146 @@
+"""Films of seeing through an occluder: a flash as it travels, and a target that walks past behind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from apps.figures.occlusion import UNSEEN, draw_history
+from apps.figures.style import SMALL, draw, page
+from tofclip.storage import atomic_path
+from tofclip.units import MILLIMETRE, PICOSECOND
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from tofclip.occlusion.experiment import Experiment
+
+FRAME_MS, LAST_FRAME_MS = 120, 2500
+DARK = 0.02  # of a return's brightest instant: the film passes over fainter ones
+STEPS, REACH, STEP_MS = 14, 18e-3, 180
+"""Of a target that walks: how many, how far to either side (m), and how long each is shown."""
+
+LAYOUT = {"left": 0.02, "right": 0.98, "bottom": 0.16, "top": 0.8}
+
+
+class Frame(NamedTuple):
+    """An instant of the flash.
+
+    Attributes
+    ----------
+    time : float
+        ps after the flash.
+    title : str
+    pictures : two (rows, columns) arrays
+        Of the middle view and of the recovery, from 0 to 1.
+    """
+
+    time: float
+    title: str
+    pictures: tuple[NDArray[Any], NDArray[Any]]
+
+
+def save_flash(experiment: Experiment, path: Path) -> None:
+    """Write a GIF: light reaches the occluder, then what stands behind it.
+
+    Each return is shown at its own brightness; the recovered pictures light up as the readings of their gates do.
+    """
+    figure, frames = _canvas(8, 3.2), _flash(experiment)
+    left, right, time = figure.subplots(1, 3, gridspec_kw=LAYOUT)
+    images = _empty((left, right), ("what one view sees", "ToF-CLIP"), experiment)
+    draw_history(time, experiment)
+    time.set_title("light of all readings", fontsize=SMALL + 2)
+    time.set_ylabel("")
+    time.tick_params(axis="y", labelleft=False)
+    cursor = time.axvline(experiment.clock.start / PICOSECOND, color=UNSEEN, lw=2)
+
+    def drawn() -> Iterator[Any]:
+        for frame in frames:
+            cursor.set_xdata([frame.time, frame.time])
+            yield _shot(figure, images, frame.pictures, frame.title)
+
+    _write(path, list(drawn()), [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS])
+
+
+def save_walk(experiment: Experiment, path: Path, advance: Callable[[int], None]) -> None:
+    """Write a GIF: the target walks past behind the occluder, each step flashed, measured and recovered anew.
+
+    Calls ``advance(1)`` after each of `STEPS`.
+    """
+    figure = _canvas(9.4, 2.9)
+    names = ("one view, all its light", "one view, the second return", "ToF-CLIP", "truth")
+    images = _empty(figure.subplots(1, 4, gridspec_kw={**LAYOUT, "bottom": 0.02}), names, experiment)
+    brightest, drawn = float(experiment.truth.max()), []
+    for number, across in enumerate(np.linspace(-REACH, REACH, STEPS)):
+        settings = replace(experiment.settings, seed=experiment.settings.seed + number)
+        there = type(experiment)(experiment.scene.with_target_moved(float(across)), settings)
+        everything = there.pictures[len(there.pictures) // 2].sum(axis=-1)
+        seen = everything * (brightest / everything.max())
+        pictures = seen, there.single_view, there.separated.target, there.truth
+        title = f"target {across / MILLIMETRE:+.0f} mm from the axis, {there.scene.behind / MILLIMETRE:.0f} mm behind"
+        drawn.append(_shot(figure, images, [one / brightest for one in pictures], title))
+        advance(1)
+    _write(path, [*drawn, *drawn[-2:0:-1]], [STEP_MS] * (2 * STEPS - 2))
+
+
+def _canvas(width: float, height: float) -> Figure:
+    """Make a figure whose drawing can be read back, in inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure = page(width, height)
+    figure.set_layout_engine("none")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _empty(panels: Sequence[Axes], names: Sequence[str], experiment: Experiment) -> list[Any]:
+    """Lay out pictures of a film and return what changes in them."""
+    side = experiment.settings.side_px
+    images = []
+    for axes, name in zip(panels, names, strict=True):
+        images.append(draw(axes, 0 * experiment.truth, (0, side, side, 0), vmin=0, vmax=1))
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(name, fontsize=SMALL + 2)
+    return images
+
+
+def _shot(figure: Figure, images: Sequence[Any], pictures: Sequence[NDArray[Any]], title: str) -> Any:
+    """Put pictures from 0 to 1 into their places and return the figure as an image."""
+    from PIL import Image
+
+    for image, picture in zip(images, pictures, strict=True):
+        image.set_data(picture)
+    figure.suptitle(title, fontsize=SMALL + 4)
+    canvas: Any = figure.canvas
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+
+
+def _write(path: Path, images: list[Any], durations_ms: list[int]) -> None:
+    with atomic_path(path) as temporary:
+        images[0].save(temporary, save_all=True, append_images=images[1:], duration=durations_ms, loop=0)
+
+
+def _flash(experiment: Experiment) -> list[Frame]:
+    """Every instant that is not dark; at last the whole of the second return."""
+    separated, returns = experiment.separated, experiment.readings.returns()
+    parts = [separated.occluder, separated.target][: len(returns)]
+    history, middle = experiment.readings.history, experiment.pictures[len(experiment.pictures) // 2]
+    times, frames = experiment.clock.times / PICOSECOND, []
+    for found, recovered in zip(returns, parts, strict=True):
+        lit = history / history[found.bins].max()
+        scales = [max(float(top), 1e-12) for top in (middle[..., found.bins].max(), np.quantile(recovered, 0.999))]
+        for instant in np.arange(found.bins.start, found.bins.stop)[lit[found.bins] > DARK]:
+            pictures = middle[..., instant] / scales[0], lit[instant] * recovered / scales[1]
+            frames.append(Frame(float(times[instant]), f"{times[instant]:.0f} ps after the flash", pictures))
+    brightest = experiment.truth.max()
+    behind, last = separated.plain, "nothing comes from behind the occluder"
+    if separated.sees_target:
+        behind, last = middle[..., returns[1].bins].sum(axis=-1), "all of the second return together"
+    return [*frames, Frame(frames[-1].time, last, (behind / brightest, separated.target / brightest))]
