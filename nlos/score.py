@@ -1,0 +1,59 @@
+"""How well a volume shows hidden points that are known, as in a simulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from nlos.volume import Volume
+from tofclip.errors import InputError, ShapeError
+
+RADIUS = 0.04
+"""m; the usual measure for waves of some 12 cm."""
+
+
+@dataclass(frozen=True)
+class PointScore:
+    """Share and contrast of what lies near hidden points.
+
+    Parameters
+    ----------
+    energy : float
+        Share of the energy of the intensity ``|u|^2``, u the volume's values: of the sum of ``|u|^4``. That of ``|u|``
+        itself would mostly tell how far the sidelobes of the virtual pulse reach: for a wavelength of 0.125 m and a
+        wall of 2 m it is 0.2 to 0.3 where the energy of the intensity is 0.55 to 0.66.
+    contrast : float
+        Mean magnitude of the voxels near a point, over that of all others. It grows with the empty space imaged.
+    """
+
+    energy: float
+    contrast: float
+
+
+def point_score(volume: Volume, points: Any, radius: float = RADIUS) -> PointScore:
+    """Compare the voxels within `radius` (m) of hidden points (n, 3), m, with all others.
+
+    Unlike peak over mean it is not fooled by a bright spot in the wrong place.
+
+    Raises
+    ------
+    ShapeError, InputError
+        The points are not (n, 3); no voxel, or every one, lies near a point; or the volume is dark.
+    """
+    from scipy.spatial import cKDTree
+
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ShapeError("hidden points", "(n, 3)", points.shape)
+    z, y, x = np.meshgrid(volume.grid.z, volume.grid.y, volume.grid.x, indexing="ij")
+    distance, _ = cKDTree(points).query(np.stack([x, y, z], axis=-1), distance_upper_bound=radius)
+    near = np.isfinite(distance)
+    if not near.any() or near.all():
+        raise InputError(f"some voxels must lie within {radius} m of a hidden point, and some not")
+    magnitude = volume.magnitude.astype(np.float64)
+    if not magnitude[~near].any():
+        raise InputError("the volume is dark away from the hidden points: their contrast has no measure")
+    energy = magnitude**4
+    return PointScore(float(energy[near].sum() / energy.sum()), float(magnitude[near].mean() / magnitude[~near].mean()))
