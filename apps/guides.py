@@ -10,6 +10,7 @@ import contextlib
 import os
 import re
 import shlex
+import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -22,7 +23,8 @@ from tofclip.storage import atomic_path
 
 BLOCKS = re.compile(r"^```(sh|python)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PICTURES = re.compile(r"!\[[^\]]*\]\((pictures/[^)]+)\)")
-COLOURS = 256  # of a picture in the documentation: a quarter of the size, off by less than 16 of 255 anywhere
+LARGEST_WHOLE = 150_000  # bytes of a picture that is kept as it is
+COLOURS = 256  # of a larger one: a quarter of the size, off by less than 16 of 255 anywhere
 
 
 def steps(guide: Path) -> list[tuple[str, str]]:
@@ -84,6 +86,10 @@ def _keep(picture: Path, place: Path) -> None:
     from PIL import Image
 
     place.parent.mkdir(parents=True, exist_ok=True)
+    if picture.stat().st_size <= LARGEST_WHOLE:
+        with atomic_path(place) as temporary:
+            shutil.copyfile(picture, temporary)
+        return
     with Image.open(picture) as whole, atomic_path(place) as temporary:
         few = whole.convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
         few.save(temporary, format="PNG", optimize=True)

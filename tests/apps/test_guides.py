@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 import tofclip
 from apps.documentation import verbs
@@ -96,6 +97,19 @@ def test_pictures_of_a_guide_are_kept_beside_it(tmp_path: Path) -> None:
     make_pictures(guide, inputs)
     assert [path.name for path in (tmp_path / "pictures" / "small").iterdir()] == ["square.png"]
     assert not (tmp_path / "pictures" / "other.png").exists()
+
+
+def test_large_pictures_are_kept_in_few_colours(tmp_path: Path) -> None:
+    guide = tmp_path / "large.md"
+    guide.write_text(
+        "```python\nimport numpy as np\nfrom matplotlib.image import imsave\n"
+        "imsave('noise.png', np.random.default_rng(0).random((256, 256, 3)))\n```\n\n"
+        "![Noise](pictures/large/noise.png)\n"
+    )
+    (tmp_path / "inputs").mkdir()
+    make_pictures(guide, tmp_path / "inputs")
+    with Image.open(tmp_path / "pictures" / "large" / "noise.png") as image:
+        assert (image.mode, image.size) == ("P", (256, 256))
 
 
 def test_a_step_that_fails_is_named(tmp_path: Path) -> None:
