@@ -40,11 +40,12 @@ def test_the_walk_through(run: Run, files: Path, tmp_path: Path, monkeypatch: py
     write_light_field(tmp_path / "light_field.npz")
     monkeypatch.chdir(tmp_path)
     walk = commands("tofclip ")
-    assert len(walk) == 14
+    assert len(walk) == 19
     for command in walk:
         outcome = run(*shlex.split(command)[1:])
         assert (outcome.status, outcome.err) == (0, ""), command
     expected = "camera.h5 camera.png frames.h5 frames.png mip.png scene.ply volume.h5 wall.h5 wall_frames.h5"
+    expected += " scene.png clouds occlusion-output nlos-demo-output"
     assert {*expected.split(), "readings.h5", "picture.png", "run.h5", "photons.h5", "photons.ply"} <= {
         path.name for path in tmp_path.iterdir()
     }
