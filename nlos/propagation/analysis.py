@@ -43,9 +43,10 @@ class LatticeAnalysis:
         rows, columns = wall.shape
         self._place = None if wall.complete else wall.row * columns + wall.column
         most = min(2 * self._columns(reach), wide)
-        shapes = ((rows, wide), (rows, wide), (most, high), (terms, most, high))
+        shapes = ((rows, wide), (rows, wide), (most, high), (terms * most, high))
         arrays = [pyfftw.zeros_aligned(shape, np.complex64) for shape in shapes]
-        self._points, self._lines, self._middle, self._spectra = arrays
+        self._points, self._lines, self._middle = arrays[:3]
+        self._spectra: NDArray[np.complex64] = arrays[3]
         with PLANNING:
             self._along_x = pyfftw.FFTW(self._points, self._lines, axes=(1,), flags=("FFTW_MEASURE",))
         self._along_y: dict[int, pyfftw.FFTW] = {}
@@ -74,15 +75,18 @@ class LatticeAnalysis:
         """
         columns, (rows, wide) = self._columns(reach), self._lines.shape
         ends = (slice(0, columns), slice(wide - columns, wide)) if columns < wide else (slice(0, wide),)
-        plan = self._plan(len(ends) * columns)
-        for term, weight in enumerate(weights):
+        count = len(ends) * columns
+        plan, middle = self._plan(count), self._middle[:count]
+        # In one piece, whatever its size: compiled loops are quicker then.
+        spectra = self._spectra[: len(weights) * count].reshape(len(weights), count, -1)
+        for spectrum, weight in zip(spectra, weights, strict=True):
             self._spread(values, weight)
             self._along_x.execute()
             for number, end in enumerate(ends):
-                transpose(self._lines[:, end], self._middle[number * columns : (number + 1) * columns, :rows])
-            plan.update_arrays(self._middle[: len(ends) * columns], self._spectra[term, : len(ends) * columns])
+                transpose(self._lines[:, end], middle[number * columns : (number + 1) * columns, :rows])
+            plan.update_arrays(middle, spectrum)
             plan.execute()
-        return self._spectra[: len(weights), : len(ends) * columns]
+        return spectra
 
     def _spread(self, values: NDArray[np.complex64], weight: NDArray[np.complex64]) -> None:
         """Put weighted values into their places."""
@@ -99,6 +103,6 @@ class LatticeAnalysis:
 
         if columns not in self._along_y:
             with PLANNING:
-                arrays = self._middle[:columns], self._spectra[0, :columns]
+                arrays = self._middle[:columns], self._spectra[:columns]
                 self._along_y[columns] = pyfftw.FFTW(*arrays, axes=(1,), flags=("FFTW_MEASURE",))
         return self._along_y[columns]

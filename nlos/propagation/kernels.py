@@ -12,6 +12,8 @@ from nlos.rsd.kernels import TAPS
 compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "reassoc", "arcp"}, error_model="numpy")
 inlined = njit(inline="always")
 
+ONE, NEXT = np.float32(1), np.uint64(1)
+
 LANES = 64
 """Points of the plane treated together: four full vectors of 512 bits."""
 
@@ -146,84 +148,84 @@ def _add_shifted(signal, now, later, total):
 
 
 @compiled
-def tabulate(over_nodes, node, share, reach, table):
-    """Interpolate functions of the lateral wavenumber at the plane waves of one quadrant.
+def join_terms(spectra, over_nodes, spacing, reach, shift_x, shift_y, cell_x, cell_y, joined):
+    """Add ``sum_m factor_m(q) * spectra[m]``, moved by an offset in space, to the plane waves of a flat spectrum.
 
-    Parameters
-    ----------
-    over_nodes : (nodes, n) float32 array
-    node : (columns, rows) int64 array
-        First node about every plane wave; indices along x and y from 0 on.
-    share : (columns, rows, TAPS) float32 array
-    reach : (some columns,) int64 array
-        Largest index along y that counts in every column.
-    table : (n, columns, 2 * highest + 1) float32 array
-        Along y all indices from the most negative on; overwritten as far as waves count.
-    """
-    count = np.uint64(over_nodes.shape[1])
-    highest = table.shape[2] // 2
-    flat, sums = over_nodes.reshape(-1), np.empty(over_nodes.shape[1], np.float32)
-    for column in range(reach.size):
-        for row in range(reach[column] + 1):
-            first = np.uint64(node[column, row]) * count
-            sums[:] = 0
-            for tap in range(TAPS):
-                weight = share[column, row, tap]
-                for m in range(count):
-                    sums[m] += weight * flat[first + m]
-                first += count
-            for m in range(over_nodes.shape[1]):
-                table[m, column, highest + row] = sums[m]
-        for m in range(over_nodes.shape[1]):
-            above, below = table[m, column, highest:], table[m, column, : highest + 1]
-            for row in range(1, reach[column] + 1):
-                below[highest - row] = above[row]
-
-
-@compiled
-def join_terms(spectra, table, reach, shift_x, shift_y, cell, joined):
-    """Add ``sum_m table[m] * spectra[m]``, moved by an offset in space, to the plane waves of a flat spectrum.
+    The factors depend on the lateral wavenumber alone and are interpolated once for a column and its mirror image.
 
     Parameters
     ----------
     spectra : (m, columns, 2 * rows) float32 array
         Real and imaginary parts in turns; columns and rows in the order of Fourier transforms.
-    table : (2 * m, n + 1, 2 * highest + 1) float32 array
-        Real parts of all terms, then imaginary parts; along y all indices from the most negative on.
-    reach : (n + 1,) int64 array
-        Largest index along y that counts in every column.
+    over_nodes : (nodes, n) float32 array
+        Factors at the nodes: the real parts of all m terms, then the imaginary parts, then anything.
+    spacing : (2,) float64 array
+        Distance of neighbouring waves along x and y, in nodes.
+    reach : (some columns,) int64 array
+        Largest index along y that counts in every column from 0 on.
     shift_x, shift_y : complex64 array
-        Phases of all indices from the most negative on; ``2 * highest + 1`` along y.
-    cell : (columns, rows) int64 array
-        Where every plane wave goes; the middle one has indices 0.
+        Phases of all indices from the most negative on.
+    cell_x, cell_y : int64 array
+        Where plane waves go: the sum of the numbers of their indices.
     joined : (cells,) complex64 array
         Added to.
     """
-    terms, columns, rows = spectra.shape[0], spectra.shape[1], spectra.shape[2] // 2
     highest = shift_y.size // 2
+    factors = np.empty((over_nodes.shape[1], shift_y.size), np.float32)
     line = np.empty(2 * shift_y.size, np.float32)
-    for x in range(1 - reach.size, reach.size):
-        column = abs(x)
-        lowest, end = highest - reach[column], highest + reach[column] + 1
-        line[2 * lowest : 2 * end] = 0
-        for m in range(terms):
-            # A spectrum shorter than the line repeats itself.
-            y, row = lowest, (lowest - highest) % rows
-            while y < end:
-                count = min(rows - row, end - y)
-                factors = table[m, column, y : y + count], table[terms + m, column, y : y + count]
-                values = spectra[m, x % columns, 2 * row : 2 * (row + count)]
-                _add_products(factors[0], factors[1], values, line[2 * y : 2 * (y + count)])
-                y, row = y + count, 0
-        along, to = shift_x[shift_x.size // 2 + x], cell[cell.shape[0] // 2 + x]
-        for y in range(lowest, end):
-            joined[to[y]] += complex(line[2 * y], line[2 * y + 1]) * along * shift_y[y]
+    for column in range(reach.size):
+        tall = reach[column]
+        _interpolate_factors(over_nodes, column * spacing[0], spacing[1], tall, 2 * spectra.shape[0], factors)
+        for x in range(-column, column + 1, max(1, 2 * column)):
+            _add_terms(spectra, x % spectra.shape[1], factors, tall, line)
+            along, to = shift_x[shift_x.size // 2 + x], cell_x[cell_x.size // 2 + x]
+            for y in range(highest - tall, highest + tall + 1):
+                joined[to + cell_y[y]] += complex(line[2 * y], line[2 * y + 1]) * along * shift_y[y]
 
 
 @compiled
-def _add_products(real, imaginary, values, sums):
-    """Add the products of complex numbers, the factors' parts apart and the others' in turns."""
-    for y in range(np.uint64(real.size)):
-        a, b, c, d = real[y], imaginary[y], values[2 * y], values[2 * y + 1]
-        sums[2 * y] += a * c - b * d
-        sums[2 * y + 1] += a * d + b * c
+def _interpolate_factors(over_nodes, across, spacing, tall, wanted, factors):
+    """Interpolate the factors of a column from index 0 to `tall` between six nodes (Lagrange), and mirror them."""
+    count, middle = np.uint64(over_nodes.shape[1]), factors.shape[1] // 2
+    flat, sums = over_nodes.reshape(-1), np.empty(over_nodes.shape[1], np.float32)
+    for row in range(tall + 1):
+        place = math.sqrt(across * across + (row * spacing) ** 2) + TAPS // 2
+        first = int(place) - TAPS // 2 + 1
+        t0 = np.float32(place - first)
+        t1, t2, t3, t4, t5 = t0 - ONE, t0 - 2 * ONE, t0 - 3 * ONE, t0 - 4 * ONE, t0 - 5 * ONE
+        near, far, middle_two = t0 * t1, t4 * t5, t2 * t3
+        a0, a5 = t1 * middle_two * far / np.float32(-120), near * middle_two * t4 / np.float32(120)
+        a1, a4 = t0 * middle_two * far / np.float32(24), near * middle_two * t5 / np.float32(-24)
+        a2, a3 = near * t3 * far / np.float32(-12), near * t2 * far / np.float32(12)
+        n0 = np.uint64(first) * count
+        n1, n2 = n0 + count, n0 + np.uint64(2) * count
+        n3, n4, n5 = n2 + count, n2 + np.uint64(2) * count, n2 + np.uint64(3) * count
+        for m in range(count):
+            early = a0 * flat[n0 + m] + a1 * flat[n1 + m] + a2 * flat[n2 + m]
+            sums[m] = early + a3 * flat[n3 + m] + a4 * flat[n4 + m] + a5 * flat[n5 + m]
+        for m in range(wanted):
+            factors[m, middle + row] = sums[m]
+    for m in range(wanted):
+        for row in range(1, tall + 1):
+            factors[m, middle - row] = factors[m, middle + row]
+
+
+@compiled
+def _add_terms(spectra, column, factors, tall, line):
+    """Leave the sum of all terms of a column in the middle of `line`; a spectrum shorter than it repeats itself."""
+    terms, rows, highest = spectra.shape[0], spectra.shape[2] // 2, factors.shape[1] // 2
+    # Flat arrays and unsigned indices: an index that might be negative would keep the loop from becoming vector code.
+    values, real = spectra.reshape(-1), factors.reshape(-1)
+    imaginary = real[terms * factors.shape[1] :]
+    line[2 * (highest - tall) : 2 * (highest + tall + 1)] = 0
+    for m in range(terms):
+        y, row = highest - tall, -tall % rows
+        while y <= highest + tall:
+            count = min(rows - row, highest + tall + 1 - y)
+            at, to = np.uint64(m * factors.shape[1] + y), np.uint64(2 * y)
+            of = np.uint64(2 * ((m * spectra.shape[1] + column) * rows + row))
+            for i in range(np.uint64(count)):
+                a, b, c, d = real[at + i], imaginary[at + i], values[of + i + i], values[of + i + i + NEXT]
+                line[to + i + i] += a * c - b * d
+                line[to + i + i + NEXT] += a * d + b * c
+            y, row = y + count, 0

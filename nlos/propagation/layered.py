@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.propagation.analysis import LatticeAnalysis
-from nlos.propagation.kernels import join_terms, tabulate
+from nlos.propagation.kernels import join_terms
 from nlos.propagation.passage import Passage
+from nlos.rsd.blas import one_thread
 from nlos.rsd.inverse import inverse
 from tofclip.arrays import run_blocks
 
@@ -30,13 +31,11 @@ def layered_sum(passage: Passage, phasors: NDArray[np.complex64]) -> NDArray[np.
     -------
     (y, x, frequencies) complex64 array
     """
-    from threadpoolctl import threadpool_limits
-
     field = np.empty((*passage.plane.shape, phasors.shape[1]), np.complex64)
     relief = passage.relief
-    with threadpool_limits(1, "blas"):
+    with one_thread():
         most = max(relief.counts)
-        _ = passage.places, passage.shifts
+        _ = passage.shifts
         spare: list[_Bench] = []
 
         def work(some: slice) -> None:
@@ -71,21 +70,21 @@ class _Bench:
         rows, columns = (2 * reach + 1 for reach in passage.reach)
         wanted = passage.plane.shape
         self.inverse = inverse(_Grid.within(passage.reach), passage.plane_lattice, wanted, 1)
-        self.cell = self.inverse.cell.reshape(columns, rows)
-        self.table = np.empty((2 * terms, passage.reach[1] + 1, rows), np.float32)
+        cell = self.inverse.cell.reshape(columns, rows)
+        self.cells = cell[:, 0], cell[0] - cell[0, 0]
+        self.spacing = np.array(passage.steps[::-1]) / passage.relief.transfer.node_step
 
     def carry(self, number: int, phasors: NDArray[np.complex64], field: NDArray[np.complex64]) -> None:
         """Carry one group of frequencies."""
         passage = self.passage
         group, terms = passage.relief.groups[number], passage.relief.terms(number)
         values = np.ascontiguousarray(phasors[:, group].T)
-        node, share = passage.places
         shift_y, shift_x = passage.shifts
         spectrum = self.inverse.spectra[0].reshape(-1)
         for i, frequency in enumerate(range(group.start, group.stop)):
             reach = passage.rows_within(frequency)
-            tabulate(terms.over_waves[i], node, share, reach, self.table)
             spectra = self.analysis.spectra(values[i], terms.over_points, reach.size - 1)
             spectrum[:] = 0
-            join_terms(spectra.view(np.float32), self.table, reach, shift_x, shift_y, self.cell, spectrum)
+            parts = spectra.view(np.float32)
+            join_terms(parts, terms.over_waves[i], self.spacing, reach, shift_x, shift_y, *self.cells, spectrum)
             np.multiply(self.inverse.images(1)[0], self.inverse.carrier, out=field[..., frequency])

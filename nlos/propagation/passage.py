@@ -156,15 +156,6 @@ class Passage:
         return rows
 
     @cached_property
-    def places(self) -> tuple[IntArray, NDArray[np.float32]]:
-        """Nodes of the transfer functions about the plane waves of a quadrant, (columns, rows), and their weights."""
-        y, x = (spacing * np.arange(reach + 1) for spacing, reach in zip(self.steps, self.reach, strict=True))
-        lateral = np.hypot(x[:, np.newaxis], y)
-        # Corners outside every frequency's circle are never looked up.
-        node, share = self.relief.transfer.interpolation(np.minimum(lateral, self.limits[-1]).ravel())
-        return node.reshape(lateral.shape), share.reshape(*lateral.shape, -1)
-
-    @cached_property
     def shifts(self) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
         """Plane waves along y and x at the plane's first point, 0 at the wall's; divided by the lattice's period."""
         y, x = (

@@ -114,7 +114,9 @@ class InverseTransform:
         shapes = ((terms, columns, high), (columns, high), (wanted[0], wide), (terms, wanted[0], wide))
         arrays = [pyfftw.zeros_aligned((*shape[:-1], _padded(shape[-1])), np.complex64) for shape in shapes]
         self.spectra: NDArray[np.complex64] = arrays[0]
-        self._lines, self._middle, self._images = arrays[1:]
+        self._lines: NDArray[np.complex64] = arrays[1]
+        self._middle: NDArray[np.complex64] = arrays[2]
+        self._images: NDArray[np.complex64] = arrays[3]
         self._high, self._wide = high, wide
         with PLANNING:
             backward = {"direction": "FFTW_BACKWARD", "axes": (1,), "flags": ("FFTW_MEASURE",)}

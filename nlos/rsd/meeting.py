@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.method import Progress, silent
+from nlos.rsd.blas import one_thread
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.illumination import Illumination, constant, split
 from nlos.rsd.inverse import inverse
@@ -87,9 +88,7 @@ def diffract(
     progress : callable, optional
         Called with the number of voxels just done.
     """
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(1, "blas"):
+    with one_thread():
         spectrum = way.plane_waves.analysed(values, way.plane, (float(way.grid.y[0]), float(way.grid.x[0])))
         spectrum /= np.float32(np.prod(way.plane_waves.period))
         lights = [source.on_plane(way, float(depth)) for depth in way.grid.z]
