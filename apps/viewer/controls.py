@@ -51,18 +51,15 @@ class Controls:
         """Side of a point, m."""
         return self._looks.point_size
 
-    def show(self, shown: Shown) -> None:
-        """Bring the controls up to date with what is shown."""
+    def show(self, shown: Shown, status: Status) -> None:
+        """Bring words and controls up to date with what is shown."""
+        if self._status.content != status.html:
+            self._status.content = status.html
         last = max(1, len(self._session.source) - 1)
         if self._frame.max != last:
             self._frame.max = last
         self._frame.value = shown.frame
         self._looks.show(shown)
-
-    def tell(self, status: Status) -> None:
-        """Say where one is."""
-        if self._status.content != status.html:
-            self._status.content = status.html
 
     def _playback(self) -> None:
         session, gui = self._session, self._gui

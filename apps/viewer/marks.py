@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import viser
 
 COLOURS = ((255, 80, 80), (80, 220, 255))
-RADIUS_SHARE = 0.003
+RADIUS_SHARE = 0.006
 """Of the distance."""
 
 

@@ -25,8 +25,11 @@ from tofclip.errors import TofclipError
 TICK = 1 / 60
 """s between two looks at the clock."""
 
-STATUS_EVERY, PANES_EVERY = 0.25, 0.3
-"""s; words and flat pictures need not follow every frame."""
+STATUS_EVERY, PANES_EVERY = 0.25, 0.5
+"""s; words, controls and flat pictures need not follow every frame: they cost the browser more than the points do."""
+
+ASPECT = 0.9
+"""Width over height of the scene between two panels, on a usual screen."""
 
 PANEL_PX, PICTURES_PX = 330, 260
 SURFACE_COLOUR = (216, 210, 196)
@@ -50,9 +53,9 @@ class Page:
     def __init__(self, session: Session, door: Door, port: int | None = None) -> None:
         self.session = session
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._stopping = threading.Event()
+        self._stopping, self._woken = threading.Event(), threading.Event()
         first = session.shown(time.monotonic())
-        self.viewpoint = in_front_of(first.cloud.xyz)
+        self.viewpoint = in_front_of(first.cloud.xyz, ASPECT)
         self.server = start_server(door, port)
         self.address = address_of(self.server, door)
         self._pace, self._frames = Pace(), Rate()
@@ -69,16 +72,19 @@ class Page:
     def post(self, command: Callable[[], None]) -> None:
         """Have a command carried out by the thread that owns the session."""
         self._commands.put(command)
+        self._woken.set()
 
     def run(self) -> None:
         """Keep the page up to date until `close`, or Ctrl-C."""
         while not self._stopping.is_set():
+            self._woken.clear()
             self.update(time.monotonic())
-            self._stopping.wait(TICK)
+            self._woken.wait(TICK)
 
     def close(self) -> None:
         """Stop serving."""
         self._stopping.set()
+        self._woken.set()
         stop_server(self.server)
 
     def update(self, now: float) -> None:
@@ -113,7 +119,6 @@ class Page:
         server = self.server
         with server.atomic():
             self._draw_scene(shown)
-            self.controls.show(shown)
             self._echo()
         server.flush()
         self._drawn = shown
@@ -141,7 +146,7 @@ class Page:
             return
         if now - self._status_at > STATUS_EVERY:
             self._status_at = now
-            self.controls.tell(self._status(shown, now))
+            self.controls.show(shown, self._status(shown, now))
         if now - self._panes_at > PANES_EVERY and shown is not self._paned:
             self._panes_at, self._paned = now, shown
             self._show_panes(shown)

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 WINDOW = 2.0
 """s over which frames are counted."""
 
-LONGEST_WAIT = 0.5
+ON_THE_WAY = 2
+
+LONGEST_WAIT = 1.0
 """s after which a page that does not answer is no longer waited for."""
 
 
@@ -31,24 +33,29 @@ class Rate:
 
 @dataclass
 class Pace:
-    """Holds the next frame back until every page has drawn the last one, so that none piles up on a slow line."""
+    """Holds frames back until every page has drawn an earlier one, so that none pile up on a slow line.
+
+    Two are on their way at most: while one is drawn, the next travels.
+    """
 
     drawn: Rate = field(default_factory=Rate)
     latency: float = float("nan")
-    _sent: float = float("-inf")
-    _waiting: int = 0
+    _sent: deque[float] = field(default_factory=deque)
+    _pages: int = 0
 
     def sent(self, now: float, pages: int) -> None:
         """Note that a frame was sent to so many pages."""
-        self._sent, self._waiting = now, pages
+        self._pages = pages
+        self._sent.extend([now] * pages)
 
     def answered(self, now: float) -> None:
-        """Note that a page has drawn the last frame."""
-        if self._waiting > 0:
-            self._waiting -= 1
-            self.latency = now - self._sent
+        """Note that a page has drawn a frame."""
+        if self._sent:
+            self.latency = now - self._sent.popleft()
             self.drawn.add(now)
 
     def may_send(self, now: float) -> bool:
         """Whether the next frame can go."""
-        return self._waiting <= 0 or now - self._sent > LONGEST_WAIT
+        if self._sent and now - self._sent[0] > LONGEST_WAIT:
+            self._sent.clear()
+        return len(self._sent) < ON_THE_WAY * max(1, self._pages)

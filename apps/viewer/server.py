@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http
 import io
+import itertools
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     import viser
 
 FIRST_PORT = 8080
-ECHO = "tofclip-drawn"
+ECHO, ECHOES = "tofclip-drawn", 4
 POLICY_VIOLATION = 1008  # RFC 6455, 7.4.1
 _STARTING = threading.Lock()
 
@@ -80,13 +81,19 @@ def echoes(server: viser.ViserServer, answered: Callable[[], None]) -> Callable[
     from viser import _messages
 
     def heard(_: int, message: Any) -> None:
-        if message.request_uuid == ECHO:
+        if message.request_uuid.startswith(ECHO):
             answered()
 
     server._websock_server.register_handler(_messages.LocalStorageGetItemResponseMessage, heard)
     # Among all messages to the page that are kept in order, this is the one that is answered and changes nothing.
-    question = _messages.LocalStorageGetItemRequestMessage(key=ECHO, request_uuid=ECHO)
-    return lambda: server._websock_server.queue_message(question)
+    # A question replaces an earlier one of its name that has not left yet: frames on their way need different ones.
+    names = itertools.cycle(f"{ECHO}-{number}" for number in range(ECHOES))
+
+    def ask() -> None:
+        name = next(names)
+        server._websock_server.queue_message(_messages.LocalStorageGetItemRequestMessage(name, name))
+
+    return ask
 
 
 def _require_free(host: str, port: int) -> None:

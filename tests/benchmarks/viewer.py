@@ -4,8 +4,10 @@
 
 Needs playwright and chromium. The browser draws with a software renderer, on the same cores as the program.
 
-* updates: frames that differ, as the page's own document shows them, per second;
-* latency: from the moment a frame is handed to the server to the moment at which the page shows its number;
+* updates: frames that the page says it has, in the step of its loop that draws them, per second;
+* processor: time that the program, and the browser with its software renderer, need for an update; these do not
+  depend on what else the machine does;
+* latency: from the moment a frame is handed to the server until the page's answer that it has it is back;
 * large: a PLY file of a million points, from opening it to all of it being drawn in a tab that was open already.
 """
 
@@ -13,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 import statistics
 import tempfile
@@ -40,16 +43,6 @@ WINDOW = {"width": 1100, "height": 640}
 LARGE = 1_000_000
 FRAMES = 200
 
-WATCH = """
-window.seenFrames = [];
-new MutationObserver((changes) => {
-  const slider = document.querySelector('[role=slider]');
-  const frame = slider ? Number(slider.getAttribute('aria-valuenow')) : NaN;
-  const last = window.seenFrames[window.seenFrames.length - 1];
-  if (!last || last[0] !== frame) window.seenFrames.push([frame, Date.now() / 1000]);
-}).observe(document.body, {subtree: true, attributes: true, attributeFilter: ['aria-valuenow']});
-"""
-
 
 class Waves(Source):
     """A sheet of points that moves: every frame is another cloud."""
@@ -68,14 +61,16 @@ class Waves(Source):
 
 
 class Timed(Page):
-    """A page that remembers when each frame was handed over."""
+    """A page that remembers when each frame was handed over, and when the browser answered that it had it."""
 
     def __init__(self, *arguments: Any) -> None:
-        self.handed: list[tuple[int, float]] = []
+        self.handed: list[float] = []
+        self.answered: list[float] = []
         super().__init__(*arguments)
+        echoes(self.server, lambda: self.answered.append(time.perf_counter()))
 
     def _draw(self, shown: Shown, now: float) -> None:
-        self.handed.append((shown.frame, time.time()))
+        self.handed.append(time.perf_counter())
         super()._draw(shown, now)
 
 
@@ -111,25 +106,43 @@ def _streamed(browser: Any, points: int, seconds: float) -> dict[str, float]:
     tab.goto(page.address)
     tab.locator("#frame-number").wait_for(timeout=60_000)
     time.sleep(2)  # the tab has caught up
-    tab.evaluate(WATCH)
+    page.handed.clear()
+    page.answered.clear()
     page.post(page.session.play)
     time.sleep(1)
-    begin, handed = len(tab.evaluate("window.seenFrames")), len(page.handed)
-    started = time.time()
+    begin = len(page.answered)
+    program, family = time.process_time(), _processor_seconds()
     time.sleep(seconds)
-    seen = tab.evaluate("window.seenFrames")[begin:]
-    passed = time.time() - started
-    sent = page.handed[handed - 1 :]
-    latencies = _latencies(sent, seen)
+    program, family = time.process_time() - program, _processor_seconds() - family
+    latencies = [1e3 * (then - now) for now, then in zip(page.handed, page.answered, strict=False)][begin:]
+    updates = len(page.answered) - begin
     tab.close()
     page.close()
     return {
         "points": points,
-        "updates_per_second": len(seen) / passed,
-        "frames_sent_per_second": len(sent) / passed,
-        "latency_median_ms": 1e3 * statistics.median(latencies),
-        "latency_worst_tenth_ms": 1e3 * float(np.quantile(latencies, 0.9)),
+        "updates_per_second": updates / seconds,
+        "program_processor_ms": 1e3 * program / updates,
+        "browser_processor_ms": 1e3 * (family - program) / updates,
+        "latency_median_ms": statistics.median(latencies),
+        "latency_worst_tenth_ms": float(np.quantile(latencies, 0.9)),
     }
+
+
+def _processor_seconds() -> float:
+    """Processor time of this program and of all that it has started, s."""
+    parents, used = {}, {}
+    for entry in Path("/proc").iterdir():
+        try:
+            words = (entry / "stat").read_text().rpartition(")")[2].split()
+        except (OSError, IndexError):
+            continue
+        if entry.name.isdecimal() and len(words) > 12:
+            parents[int(entry.name)] = int(words[1])
+            used[int(entry.name)] = (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+    family = {os.getpid()}
+    while more := {child for child, parent in parents.items() if parent in family} - family:
+        family |= more
+    return sum(used.get(one, 0.0) for one in family)
 
 
 def _latencies(sent: list[tuple[int, float]], seen: list[list[float]]) -> list[float]:
