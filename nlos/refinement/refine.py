@@ -48,7 +48,7 @@ class Refinement:
     from a volume to the wall; A'f is the real part of the hybrid's field. The albedo is real and not negative, so that
     the phase of f tells where within a wave a point lies: voxels have to resolve the carrier in depth.
 
-    Every step costs some ten hybrid images. Memory: some 40 bytes per plane wave and frequency and thread, and twelve
+    Every step costs some four hybrid images. Memory: some 40 bytes per plane wave and frequency and thread, and twelve
     volumes.
 
     Parameters
