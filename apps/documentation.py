@@ -60,17 +60,22 @@ def page(name: str, command: TyperCommand) -> str:
     """Return a verb's page in Markdown: what it does, an example, its arguments and options, the exit statuses."""
     context = typer.Context(command, info_name=f"{PROGRAM} {name}")
     prose, examples = told(command.callback.__doc__ if command.callback else None)
-    shown = [param for param in command.get_params(context) if not getattr(param, "hidden", False)]
-    arguments = [_entry(one, context) for one in shown if isinstance(one, TyperArgument)]
-    options = [_entry(one, context) for one in shown if isinstance(one, TyperOption)]
     usage = " ".join([PROGRAM, name, *command.collect_usage_pieces(context)])
     parts = [f"# {PROGRAM} {name}", *map(_plain, prose), f"```text\n{usage}\n```"]
     parts += [f"```sh\n{example}\n```" for example in examples]
-    if arguments:
-        parts += ["## Arguments", *arguments]
-    return "\n\n".join(
-        [*parts, "## Options", *options, "## Exit status", _plain(EPILOG.removeprefix("Exit status: ")), ""]
-    )
+    for heading, entries in _panels(command, context).items():
+        parts += [f"## {_plain(heading)}", *entries]
+    return "\n\n".join([*parts, "## Exit status", _plain(EPILOG.removeprefix("Exit status: ")), ""])
+
+
+def _panels(command: TyperCommand, context: typer.Context) -> dict[str, list[str]]:
+    """Return what is told of arguments and options, under the headings that they have in the help."""
+    panels: dict[str, list[str]] = {}
+    for param in command.get_params(context):
+        if isinstance(param, TyperArgument | TyperOption) and not param.hidden:
+            usual = "Arguments" if isinstance(param, TyperArgument) else "Options"
+            panels.setdefault(param.rich_help_panel or usual, []).append(_entry(param, context))
+    return panels
 
 
 def _entry(param: TyperArgument | TyperOption, context: typer.Context) -> str:

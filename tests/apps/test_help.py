@@ -143,3 +143,11 @@ def test_what_a_page_says() -> None:
     assert "`--reach-mm MM`\n: Points this close belong together. \\[default: 40.0\\]" in text
     assert "## Arguments\n\n`FRAMES" in text
     assert "## Arguments" not in page("devices list", VERBS["devices list"])
+
+
+def test_a_page_keeps_the_headings_of_the_help() -> None:
+    text = page("nlos info", VERBS["nlos info"])
+    headings = [line for line in text.splitlines() if line.startswith("## ")]
+    assert headings[:2] == ["## Arguments", "## Options"]
+    assert headings[2].startswith("## Settings")
+    assert text.index("## Options") < text.index("`--json`") < text.index("## Settings") < text.index("`--cycles")
