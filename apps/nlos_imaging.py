@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from apps.nlos_methods import Imaging, ImagingSettings
+from apps.nlos_methods import Imaging, ImagingSettings, built, quickest
 from apps.progress import progress
 from tofclip.units import MILLIMETRE
 
@@ -96,10 +96,12 @@ def box_of(settings: Imaging, capture: Capture, voxel: float) -> tuple[Imaging, 
     return replace(settings, x_m=x, y_m=y, near_m=near, far_m=far), Grid.box(x, y, (near, far), voxel)
 
 
-def boxed(settings: Imaging, capture: Capture, imaging: Reconstructor) -> tuple[Imaging, Grid]:
+def boxed(settings: Imaging, capture: Capture) -> tuple[Imaging, Grid]:
     """Find the voxels: all that the box holds, or the part that coarse voxels show to be bright.
 
-    Half a wavelength is coarse. The settings that come back hold the box itself and find the same voxels once more.
+    Half a wavelength is coarse. The quickest method with a virtual pulse looks, whichever images later: lct and fk make
+    up for the loss of light with distance, and would take the noise of the farthest depths for the brightest things.
+    The settings that come back hold the box itself and find the same voxels once more.
     """
     from nlos import Grid
 
@@ -107,8 +109,9 @@ def boxed(settings: Imaging, capture: Capture, imaging: Reconstructor) -> tuple[
     voxel, coarse = scales.voxel_mm * MILLIMETRE, scales.wavelength_mm * MILLIMETRE / 2
     bounded, _ = box_of(settings, capture, voxel)
     if not settings.everywhere and voxel < coarse:
-        overview = imaged("looking over", imaging, capture, box_of(bounded, capture, coarse)[1])
-        part = Grid.around(overview, voxel)
+        _, whole = box_of(bounded, capture, coarse)
+        scout = built(quickest(settings, capture, whole), settings)
+        part = Grid.around(imaged("looking over", scout, capture, whole), voxel)
         near, far = _ends(part.z)
         bounded = replace(bounded, x_m=_ends(part.x), y_m=_ends(part.y), near_m=near, far_m=far)
     return box_of(replace(bounded, everywhere=True), capture, voxel)

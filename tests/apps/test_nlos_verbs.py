@@ -6,6 +6,7 @@ import os
 import shlex
 import signal
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +149,20 @@ class TestReconstruct:
         kept = (tmp_path / "volume.toml").read_text()
         assert ("falloff = 4" in kept) == (method in ("lct", "fk"))
         assert "sigma_mm" not in kept
+
+    @pytest.mark.parametrize("method", ["lct", "fk"])
+    def test_noise_of_the_farthest_depths_is_not_looked_at(self, run: Run, tmp_path: Path, method: str) -> None:
+        """With the factor d^4 by which these methods brighten, photons of chance far away outshine the point."""
+        words = ["simulate", *SCENE, "--wall", "planar", "--scan", "confocal", "--wall-points", 24, "--seed", 1]
+        object_of(run, *words, "--peak-counts", 10, "--background", 0.5, "--out", tmp_path / "short.h5")
+        short = Capture.load(tmp_path / "short.h5")
+        later = np.random.default_rng(1).poisson(0.5, (300, *short.signal.shape[1:]))
+        replace(short, signal=np.concatenate([short.signal, later])).save(tmp_path / "long.h5")
+        words = ["reconstruct", tmp_path / "long.h5", "--method", method, "--voxel-mm", 25]
+        found = object_of(run, *words, "--out", tmp_path / "volume.h5")
+        assert [found["peak_m"][axis] for axis in "xyz"] == pytest.approx(POINT, abs=0.05)
+        # Where the method itself had looked, the box would end at 1.54 m.
+        assert Volume.load(tmp_path / "volume.h5").grid.z[-1] < 1.0
 
     @pytest.mark.parametrize("suffix", [".vti", ".npz", ".exr", ".ply"])
     def test_formats(self, run: Run, curved: Path, tmp_path: Path, suffix: str) -> None:

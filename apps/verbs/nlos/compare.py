@@ -117,9 +117,8 @@ def _chosen(
         raise InputError(f"{name} does not suit this capture: {reason}")
     chosen = [name for name in names if name not in left_out]
     found = replace(spelt_out(found, chosen), methods=",".join(chosen))
-    methods = {name: built(name, found) for name in chosen}
-    found, grid = boxed(found, capture, methods[chosen[0]])
-    return found, grid, methods, left_out
+    found, grid = boxed(found, capture)
+    return found, grid, {name: built(name, found) for name in chosen}, left_out
 
 
 def _measured(methods: Mapping[str, Reconstructor], capture: Capture, grid: Grid) -> dict[str, Measured]:

@@ -69,8 +69,8 @@ def reconstruct(
     filtered-backprojection, lct (light-cone transform) and fk (f-k migration) do without; the last two want a confocal
     scan of a planar wall.
 
-    The space in front of the wall is looked over with voxels of half a wavelength first; then the part that is bright
-    is imaged with the voxels asked for. The settings that were told or found are written beside the volume (.toml);
+    The space in front of the wall is looked over with voxels of half a wavelength first, by the quickest of the first
+    three; then the part that is bright is imaged with the voxels asked for. The settings that were told or found are written beside the volume (.toml);
     given back by --settings they make the same volume. (To the last bit by backprojection, filtered-backprojection,
     lct and fk; rsd and hybrid plan their Fourier transforms anew in every run of the program, which changes values by
     a ten-millionth.)
@@ -152,9 +152,8 @@ def _imaged(capture: Capture, wanted: ReconstructSettings) -> tuple[ReconstructS
     found = replace(wanted, **scales._asdict())
     method = found.method or quickest(found, capture, box_of(found, capture, scales.voxel_mm * MILLIMETRE)[1])
     found = replace(spelt_out(found, [method]), method=method)
-    imaging = built(method, found)
-    found, grid = boxed(found, capture, imaging)
-    return found, imaged("imaging", imaging, capture, grid)
+    found, grid = boxed(found, capture)
+    return found, imaged("imaging", built(method, found), capture, grid)
 
 
 def _reconstruct_folder(
