@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.options import AsJson, Cluster
+from apps.options import AsJson, Cluster, completing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,8 +21,17 @@ if TYPE_CHECKING:
     from tofclip.studies.outcome import Advance, Study
 
 
+def _names(incomplete: str) -> list[str]:
+    """Complete the name of a study in the shell."""
+    from tofclip.studies.registry import STUDIES
+
+    return completing("all", *(name for study in STUDIES for name in (study.name, *study.also)))(incomplete)
+
+
 def reproduce(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="table2, fig12, ...; all for every one.")],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="table2, fig12, ...; all for every one.", autocompletion=_names)
+    ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for tables and pictures; made if missing.")],
     data: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Recorded data: DIR/lightfields/*.npz are studied as well.")
