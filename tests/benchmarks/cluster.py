@@ -30,7 +30,7 @@ from tofclip.batch import Ranging, shots_in
 from tofclip.cluster import Summary, run
 from tofclip.simulate import default_instrument, default_scene, simulate
 
-ROWS = 508
+ROWS = 254
 DISTINCT = 10
 SUFFIX = ".npz"
 SMALL_DISK_SHARE = 0.6

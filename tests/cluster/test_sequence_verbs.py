@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
+import tofclip
 from apps.cli import main
 from nlos import Volume
 from nlos.simulate import PointScene
 from nlos.time_axis import TimeAxis
 from tofclip import Frames
+
+ROOT = Path(tofclip.__file__).parents[1]
 
 
 @pytest.fixture
@@ -148,3 +157,27 @@ def test_captures_on_a_cluster_are_imaged_as_here(run, scheduler, tmp_path):
         one, other = (Volume.load(folder / f"{number}.h5") for folder in (here, there))
         np.testing.assert_array_equal(other.values, one.values)
     assert run("nlos", "reconstruct", captures / "0.h5", "--out", tmp_path / "v.h5", "--cluster", scheduler)[0] == 2
+
+
+def test_ctrl_c_ends_the_workers_and_leaves_whole_results(recorded, tmp_path):
+    shots, out = tmp_path / "shots", tmp_path / "out"
+    shots.mkdir()
+    for number in range(40):
+        (shots / f"{number:02d}.h5").symlink_to(recorded / "shots" / "shot0.h5")
+    slow = ("--method", "tv", "--iterations", "3000", "--focus", "depth-locked", "--cluster", "local:1")
+    words = ("recover", shots, "--out", out, "--camera", recorded / "camera.h5", *slow)
+    command = [sys.executable, "-m", "apps", *map(str, words)]
+    # A terminal sends Ctrl-C to a whole group of processes.
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True, cwd=ROOT)
+    try:
+        while process.poll() is None and len(psutil.Process(process.pid).children()) < 2:  # a worker and a tracker
+            time.sleep(0.05)
+        time.sleep(1)
+        workers = psutil.Process(process.pid).children(recursive=True)
+        os.killpg(process.pid, signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert (process.returncode, err) == (130, "tofclip: interrupted; no unfinished file was left behind\n")
+    assert psutil.wait_procs(workers, timeout=10)[1] == []
+    assert all(path.name == "settings.json" or len(Frames.load(path).times) for path in out.iterdir())

@@ -141,6 +141,9 @@ def test_names_of_inputs(recorded, tmp_path):
     pattern = str(tmp_path / "days" / "**" / "*.*")
     assert list(files_in(pattern)) == ["a/one", "b/one", "b/two"]
     assert list(files_in(tmp_path / "days" / "b")) == ["one", "two"]
+    (tmp_path / "days" / "link.h5").symlink_to(tmp_path / "days" / "b" / "one.h5")
+    assert list(files_in(tmp_path / "days")) == ["link"]
+    (tmp_path / "days" / "link.h5").unlink()
     (tmp_path / "days" / "b" / "two.h5").touch()
     with pytest.raises(InputError, match="have one name"):
         files_in(pattern)

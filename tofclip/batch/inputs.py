@@ -85,7 +85,7 @@ def shots_in(source: str | Path, bin_width: float | None = None) -> dict[str, Sh
     path = Path(source)
     if path.is_dir() or not path.exists():
         return {name: FileShot(file, bin_width) for name, file in files_in(source).items()}
-    path = path.resolve()
+    path = path.absolute()
     numbers = range(len(StreakStack(path)))
     return {f"{path.stem}_{number:06d}": StackShot(path, number, bin_width) for number in numbers}
 
@@ -110,7 +110,7 @@ def files_in(source: str | Path) -> dict[str, Path]:
         found = [Path(name) for name in glob.glob(str(source), recursive=True)]
     else:
         raise StorageError(f"{source}: no such folder or pattern")
-    files = sorted(path.resolve() for path in found if path.is_file() and not path.name.startswith("."))
+    files = sorted(path.absolute() for path in found if path.is_file() and not path.name.startswith("."))
     if not files:
         raise InputError(f"{source}: there is no file")
     common = Path(os.path.commonpath([path.parent for path in files]))

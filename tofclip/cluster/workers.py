@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import signal
+import threading
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -63,19 +65,18 @@ def local_workers(where: str) -> int:
 def _on_this_machine(distributed: Any, number: int) -> Iterator[Client]:
     """Start processes of one job at a time that share the cores, each minded by another that replaces it if it dies."""
     threads = str(max(1, thread_count() // number))
-    with (
-        _quiet(),
-        distributed.LocalCluster(
-            n_workers=number,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address="127.0.0.1:0",  # nobody else may look
-            silence_logs=logging.CRITICAL,
-            env={THREADS_VARIABLE: threads},
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        yield client
+    with _quiet():
+        with _unheard_by_children():
+            cluster = distributed.LocalCluster(
+                n_workers=number,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address="127.0.0.1:0",  # nobody else may look
+                silence_logs=logging.CRITICAL,
+                env={THREADS_VARIABLE: threads},
+            )
+        with cluster, distributed.Client(cluster) as client:
+            yield client
 
 
 @contextlib.contextmanager
@@ -105,6 +106,19 @@ def _greet(client: Client, where: str) -> None:
 
 def _version() -> str:
     return __version__
+
+
+@contextlib.contextmanager
+def _unheard_by_children() -> Iterator[None]:
+    """Keep processes that are started now from hearing Ctrl-C, which a terminal sends to all: they are ended from here."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager
