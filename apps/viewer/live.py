@@ -6,7 +6,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from itertools import chain
 
 from apps.viewer.linear_path import Readings
 from apps.viewer.shots import ShotSource
@@ -17,6 +16,9 @@ from tofclip.storage import one_line
 from tofclip.transient import Streak
 
 MOST_KEPT = 32
+LONGEST_STOP = 10.0
+"""s for the shot under way and for letting go of the instrument."""
+
 RATE_OVER = 8
 """Arrivals over which the data rate is averaged."""
 
@@ -28,7 +30,8 @@ class LiveShots(ShotSource):
     ----------
     title : str
     shots : iterator of Streak
-        Its end, or a fault of an instrument, ends the source; what came can still be looked at.
+        Its end, or a fault of an instrument, ends the source; what came can still be looked at. A generator lets go of
+        its instrument when it is dropped then.
     camera : Camera
         With its sweep.
     first : Streak
@@ -80,6 +83,7 @@ class LiveShots(ShotSource):
 
     def close(self) -> None:
         self._stopping.set()
+        self._thread.join(LONGEST_STOP)
 
     def _entry(self, number: int) -> tuple[Readings, View]:
         """Return what is kept of a shot, or of the nearest that is."""
@@ -107,16 +111,8 @@ class LiveShots(ShotSource):
             self._arrivals.append(time.monotonic())
 
 
-def shots_from(address: str, bin_width: float | None) -> Iterator[Streak]:
-    """Gather shot after shot from an instrument, until it fails."""
-    from devices.transients import read_transient
-
-    while True:
-        yield read_transient(address, bin_width)
-
-
 def first_and_rest(shots: Iterator[Streak], title: str) -> tuple[Streak, Iterator[Streak]]:
     """Wait for the first shot."""
     for first in shots:
-        return first, chain(shots)
+        return first, shots
     raise InputError(f"{title}: the source ended before it gave anything")

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 SMALLEST_POINT, LARGEST_POINT = 0.1, 50.0
 """mm."""
 
-FEW = 1000
-"""Points whose neighbours are looked for."""
+FEW = 20_000
+"""Points among which neighbours are looked for."""
 
 SIDES = ("range", "intensity", "x", "y", "z")
 
@@ -134,9 +134,10 @@ def _handy_size(first: Shown) -> float:
         return 5.0
     from scipy.spatial import cKDTree
 
-    asked = first.cloud.xyz[:: max(1, len(first.cloud) // FEW)]
-    apart, _ = cKDTree(first.cloud.xyz).query(asked, 2)
-    side = 1e3 * float(np.median(apart[:, 1]))
+    thinned = first.cloud.xyz[:: max(1, len(first.cloud) // FEW)]
+    apart, _ = cKDTree(thinned).query(thinned, 2)
+    # Of points on surfaces, n times as many are sqrt(n) times closer.
+    side = 1e3 * float(np.median(apart[:, 1]) * np.sqrt(len(thinned) / len(first.cloud)))
     return round(min(max(side, SMALLEST_POINT), LARGEST_POINT), 1)
 
 

@@ -120,12 +120,12 @@ def _shots(title: str, shots: Sequence[Callable[[], Streak]], extras: Extras) ->
 
 def _instrument(address: str, extras: Extras) -> Source:
     """An instrument that goes on, or a recording, which is gathered once."""
-    from apps.viewer.live import LiveShots, first_and_rest, shots_from
-    from devices.transients import read_transient
+    from apps.viewer.live import LiveShots, first_and_rest
+    from devices.transients import read_transient, read_transients
 
     if address.lower().startswith("file://"):
         return _shots(address, [lambda: read_transient(address, extras.bin_width)], extras)
-    first, rest = first_and_rest(shots_from(address, extras.bin_width), address)
+    first, rest = first_and_rest(read_transients(address, extras.bin_width), address)
     return LiveShots(address, rest, _camera_of(first, extras), first)
 
 
