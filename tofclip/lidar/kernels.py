@@ -11,7 +11,7 @@ from numba import njit
 from tofclip.lidar.fit.kernels import EVEN, compiled, describe, refine, sort_rows, window
 
 ROUNDS = 8  # Gauss-Newton from near the top has converged after two; more for returns that overlap
-HOPELESS = 0.5  # of the share of the strongest return that a candidate needs: the fit does not make up for so much
+HOPELESS = 0.7  # of the share of the strongest return that a candidate needs: the fit does not make up for so much
 GROUP = 32  # bins of which one bound on their peaks is kept
 TOGETHER = 4  # weights of a filter that are applied in one pass
 

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 EVEN = (1.0, 0.0)  # variance of a bin, as constant and factor of its expected brightness: the same everywhere
-CONVERGED_BINS = 1e-3  # the next step would be smaller by far
+CONVERGED_BINS = 5e-3  # the next step would be smaller by far
 
 # Without counts of the arrays' owners, which cost a lock for every array that is handed on; nothing here allocates.
 compiled = njit(nogil=True, cache=True, error_model="numpy", _nrt=False)
