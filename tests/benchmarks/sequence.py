@@ -2,9 +2,9 @@
 
 Run with ``python tests/benchmarks/sequence.py [--shots N] [--iterative] [--json]``. The shots are three simulated ones
 over and over, 128 x 128 pixels behind 1344 slit pixels, read from memory; each becomes a cloud by the linear inverse.
-Peak memory is that of the process before the iterative path; to see that it stays, compare ``--shots 20`` with ``--shots
-200``. Processor time counts all threads, so that a busy machine changes it little. ``--iterative`` times one shot by
-total variation as well.
+Peak memory is that of the process before the iterative path; to see that it stays, compare ``--shots 20`` with
+``--shots 200``. Processor time counts all threads, so that a busy machine changes it little. ``--iterative`` times one
+shot by total variation as well.
 """
 
 from __future__ import annotations
