@@ -105,14 +105,16 @@ def _draw(
     brightest: float | None = 1.0,
 ) -> AxesImage:
     """Draw a picture (rows, columns) with the first coordinate to the right and the second downwards."""
-    left, right = _edges(coordinates[0])
-    upper, lower = _edges(coordinates[1])
-    extent = (left, right, lower, upper)
-    lowest = None if brightest is None else 0.0
-    drawn = axes.imshow(picture, COLOURS, vmin=lowest, vmax=brightest, extent=extent, interpolation="nearest")
+    lowest, edges = None if brightest is None else 0.0, extent(*coordinates)
+    drawn = axes.imshow(picture, COLOURS, vmin=lowest, vmax=brightest, extent=edges, interpolation="nearest")
     axes.set_xlabel(labels[0])
     axes.set_ylabel(labels[1])
     return drawn
+
+
+def extent(right: NDArray[np.float64], down: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """Left, right, lower and upper edge of a picture with axes to the right and downwards, m, as matplotlib has it."""
+    return (*_edges(right), *_edges(down)[::-1])
 
 
 def _edges(axis: NDArray[np.float64]) -> tuple[float, float]:

@@ -87,6 +87,12 @@ class TransientVideo:
         """Write the video to an HDF5 file, whole or not at all."""
         self.to_record().save(path)
 
+    def save_film(self, path: str | Path) -> None:
+        """Draw the front view at every instant into a GIF, with axes in metres."""
+        from nlos.film import save_film
+
+        save_film(self, path)
+
     @classmethod
     def load(cls, path: str | Path) -> TransientVideo:
         """Read a video that `save` wrote."""

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from relay_walls import curved_wall, planar_wall
 
 import nlos.video
@@ -106,6 +107,28 @@ def test_a_video_comes_back_from_its_file(tmp_path: Path) -> None:
         assert np.array_equal(loaded.times, ARRIVALS)
         assert np.array_equal(loaded.grid.z, GRID.z)
         assert loaded.provenance["imaging"]["method"] == "transient imaging by PlanarRSD"
+
+
+def test_the_film_shows_the_point_where_it_is(tmp_path: Path) -> None:
+    values = np.zeros((3, *GRID.shape), np.float32)
+    values[1, 2, 3, 12] = 1.0  # y -0.25, x 0.2
+    video = TransientVideo(values, 1e-9 * np.arange(3), GRID)
+    for film in (video, TransientVideo(values.max(axis=1), video.times, GRID)):
+        film.save_film(tmp_path / "film.gif")
+        with Image.open(tmp_path / "film.gif") as stored:
+            assert stored.n_frames == 3
+            stored.seek(1)
+            lit = np.asarray(stored.convert("RGB")).astype(int)
+            stored.seek(0)
+            dark = np.asarray(stored.convert("RGB")).astype(int)
+        # Only the title, in the uppermost rows, and the voxel change: nothing jumps.
+        rows, columns = np.nonzero(np.abs(lit - dark).max(axis=-1)[60:] > 60)
+        assert np.ptp(rows) == pytest.approx(np.ptp(columns), abs=2)  # square
+        # The axes fill the left 70 % of the width and most of the height; the voxel is a quarter of the way down.
+        assert rows.mean() + 60 < lit.shape[0] / 3
+        assert 0.4 * lit.shape[1] < columns.mean() < 0.65 * lit.shape[1]
+    with pytest.raises(InputError, match=r"must end in \.gif"):
+        video.save_film(tmp_path / "film.mp4")
 
 
 def test_what_cannot_be_filmed_is_refused() -> None:

@@ -1,0 +1,75 @@
+"""The film of a transient video: its front view at every instant, with axes in metres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.picture import COLOURS, extent
+from nlos.video import TransientVideo
+from tofclip.errors import InputError
+from tofclip.storage import atomic_path
+
+SIZE_INCHES = (5.6, 5.0)
+DOTS_PER_INCH = 80
+INSTANT_MS, LAST_INSTANT_MS = 80, 1000
+NANOSECOND = 1e-9
+
+
+def save_film(video: TransientVideo, path: str | Path) -> None:
+    """Write a GIF that looks along +z from the wall, x to the right and y down; all instants share one scale.
+
+    Memory for all pictures of the film, 0.2 MB each.
+
+    Parameters
+    ----------
+    video : TransientVideo
+        With depth or without.
+    path : path-like
+        Ends in .gif.
+
+    Raises
+    ------
+    InputError
+        Another suffix.
+    """
+    from PIL import Image
+
+    target = Path(path)
+    if target.suffix.lower() != ".gif":
+        raise InputError(f"{target}: a film's name must end in .gif")
+    first, *others = (Image.fromarray(picture).quantize(dither=Image.Dither.NONE) for picture in _pictures(video))
+    durations = [INSTANT_MS] * len(others) + [LAST_INSTANT_MS]
+    with atomic_path(target) as temporary:
+        first.save(temporary, format="GIF", save_all=True, append_images=others, duration=durations, loop=0)
+
+
+def _pictures(video: TransientVideo) -> list[NDArray[np.uint8]]:
+    """Every instant drawn, (rows, columns, 3)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    front = video.values if video.values.ndim == 3 else video.values.max(axis=1)
+    figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, layout="constrained")
+    canvas, axes = FigureCanvasAgg(figure), figure.add_subplot()
+    edges = extent(video.grid.x, video.grid.y)
+    drawn = axes.imshow(front[0], COLOURS, vmin=0, vmax=float(front.max()) or 1.0, extent=edges)
+    drawn.set_interpolation("nearest")
+    axes.set(xlabel="x (m)", ylabel="y (m), down", title=_title(video.times[-1]))
+    figure.colorbar(drawn, ax=axes, label="brightness")
+    # The layout settles at the first drawing and then stays, so that nothing jumps.
+    canvas.draw()
+    figure.set_layout_engine("none")
+    pictures = []
+    for picture, time in zip(front, video.times, strict=True):
+        drawn.set_data(picture)
+        axes.set_title(_title(time))
+        canvas.draw()
+        pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    return pictures
+
+
+def _title(time: float) -> str:
+    return f"{time / NANOSECOND:.2f} ns after the flash left the wall"
