@@ -23,7 +23,7 @@ class PointScore:
     energy : float
         Share of the energy of the intensity ``|u|^2``, u the volume's values: of the sum of ``|u|^4``. That of ``|u|``
         itself would mostly tell how far the sidelobes of the virtual pulse reach: for a wavelength of 0.125 m and a
-        wall of 2 m it is 0.2 to 0.3 where the energy of the intensity is 0.55 to 0.66.
+        wall of 2 m it is 0.2 to 0.3 where the energy of the intensity is 0.5 to 0.7.
     contrast : float
         Mean magnitude of the voxels near a point, over that of all others. It grows with the empty space imaged.
     """
