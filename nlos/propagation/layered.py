@@ -30,8 +30,9 @@ def layered_sum(passage: Passage, phasors: NDArray[np.complex64]) -> NDArray[np.
     Returns
     -------
     (y, x, frequencies) complex64 array
+        In memory, frequency after frequency.
     """
-    field = np.empty((*passage.plane.shape, phasors.shape[1]), np.complex64)
+    field = np.empty((phasors.shape[1], *passage.plane.shape), np.complex64)
     relief = passage.relief
     with one_thread():
         most = max(relief.counts)
@@ -45,7 +46,7 @@ def layered_sum(passage: Passage, phasors: NDArray[np.complex64]) -> NDArray[np.
             spare.append(bench)
 
         run_blocks(work, len(relief.groups), size=1)
-    return field
+    return np.moveaxis(field, 0, -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,4 +88,4 @@ class _Bench:
             spectrum[:] = 0
             parts = spectra.view(np.float32)
             join_terms(parts, terms.over_waves[i], self.spacing, reach, shift_x, shift_y, *self.cells, spectrum)
-            np.multiply(self.inverse.images(1)[0], self.inverse.carrier, out=field[..., frequency])
+            np.multiply(self.inverse.images(1)[0], self.inverse.carrier, out=field[frequency])

@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 FREQUENCIES_AT_A_TIME = 6
 """Neighbouring frequencies that share their functions of depth."""
 
-INTERPOLATION_SHARE, TERMS_SHARE = 0.2, 0.15
+INTERPOLATION_SHARE, TERMS_SHARE = 0.2, 0.2
 """Of the error allowed, what interpolation between depths and leaving out terms may take."""
 
 FLAT = 1e-5

@@ -23,7 +23,7 @@ WAVES_AT_A_TIME = 256
 
 PLANES_AT_A_TIME = 4
 
-ILLUMINATION_SHARE = 0.2
+ILLUMINATION_SHARE = 0.25
 """Of the error allowed, what splitting the illumination may take; where little is hidden it weighs more."""
 
 
@@ -91,7 +91,13 @@ def diffract(
     with one_thread():
         spectrum = way.plane_waves.analysed(values, way.plane, (float(way.grid.y[0]), float(way.grid.x[0])))
         spectrum /= np.float32(np.prod(way.plane_waves.period))
-        lights = [source.on_plane(way, float(depth)) for depth in way.grid.z]
+        lights = [constant(1)] * way.grid.z.size
+
+        def light(planes: slice) -> None:
+            for i in range(planes.start, planes.stop):
+                lights[i] = source.on_plane(way, float(way.grid.z[i]))
+
+        run_blocks(light, len(lights), size=PLANES_AT_A_TIME)
         most = max(light.coefficients.shape[1] for light in lights)
         _ = way.transfer.prepared
         spare: list[_Bench] = []
