@@ -110,7 +110,7 @@ def _version() -> str:
 
 @contextlib.contextmanager
 def _unheard_by_children() -> Iterator[None]:
-    """Keep processes that are started now from hearing Ctrl-C, which a terminal sends to all: they are ended from here."""
+    """Keep processes started now from hearing Ctrl-C: a terminal sends it to all, and we end them ourselves."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

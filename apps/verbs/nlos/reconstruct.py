@@ -70,10 +70,10 @@ def reconstruct(
     scan of a planar wall.
 
     The space in front of the wall is looked over with voxels of half a wavelength first, by the quickest of the first
-    three; then the part that is bright is imaged with the voxels asked for. The settings that were told or found are written beside the volume (.toml);
-    given back by --settings they make the same volume. (To the last bit by backprojection, filtered-backprojection,
-    lct and fk; rsd and hybrid plan their Fourier transforms anew in every run of the program, which changes values by
-    a ten-millionth.)
+    three; then the part that is bright is imaged with the voxels asked for. The settings that were told or found are
+    written beside the volume (.toml); given back by --settings they make the same volume. (To the last bit by
+    backprojection, filtered-backprojection, lct and fk; rsd and hybrid plan their Fourier transforms anew in every run
+    of the program, which changes values by a ten-millionth.)
 
     Of a folder every capture is imaged into the folder --out. Captures whose results are there already are skipped.
     If some fail, the others are done all the same, and the exit status is 1.
