@@ -23,6 +23,7 @@ def machine() -> dict[str, Any]:
         "memory_gib": memory_gib(),
         "system": f"{platform.system()} {platform.machine()}",
         "devices": devices_present(),
+        "load": load(),
         "python": platform.python_version(),
         "tofclip": __version__,
         "libraries": {name: importlib.metadata.version(name) for name in LIBRARIES},
@@ -44,6 +45,14 @@ def memory_gib() -> float | None:
     try:
         return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / (1 << 30), 1)
     except (AttributeError, ValueError, OSError):
+        return None
+
+
+def load() -> float | None:
+    """Return how many other processes wanted a core, on average over the last minute; None where it is not told."""
+    try:
+        return round(os.getloadavg()[0], 1)
+    except (AttributeError, OSError):
         return None
 
 

@@ -13,6 +13,9 @@ FEWEST, MOST = 3, 31
 SECONDS = 1.0
 """Repeats go on for so long, or until there are `MOST`."""
 
+SLOW_SECONDS = 2.0
+"""What takes longer is measured once."""
+
 FLOOR_SECONDS = 0.3
 BYTES_PER_MIB = 1 << 20
 
@@ -49,10 +52,13 @@ def measure(case: Case, size: int) -> dict[str, Any]:
 def repeated(action: Action, seconds: float) -> list[float]:
     """Time an action again and again."""
     found: list[float] = []
-    while len(found) < FEWEST or (sum(found) < seconds and len(found) < MOST):
+    while len(found) < MOST:
         began = time.perf_counter()
         action()
         found.append(time.perf_counter() - began)
+        enough = len(found) >= FEWEST or found[0] > SLOW_SECONDS
+        if enough and sum(found) >= seconds:
+            break
     return found
 
 

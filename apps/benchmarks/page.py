@@ -48,6 +48,7 @@ def _machine(known: Mapping[str, Any]) -> str:
         [
             f"* {known['processor']}, {known['cores']} cores, {known['memory_gib']} GiB, {known['system']}",
             f"* devices: {', '.join(known['devices'])}",
+            f"* other processes that wanted a core in the minute before: {known['load']}",
             f"* tofclip {known['tofclip']}, Python {known['python']}, {libraries}",
         ]
     )

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from nlos import Capture, Grid
 
 PEERS_VARIABLE = "TOFCLIP_PEERS"
+LONGEST_SECONDS = 60
 
 YTAL = """
 import sys, time
@@ -109,7 +110,11 @@ def seconds_told(script: str, name: str, *words: str) -> float:
     if not python:
         raise AbsentPeerError(f"{name}: --peers names no Python that has it")
     clean = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    done = subprocess.run([python, "-c", script, *words], capture_output=True, text=True, check=False, env=clean)
+    command = [python, "-c", script, *words]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=clean, timeout=LONGEST_SECONDS)
+    except subprocess.TimeoutExpired as fault:
+        raise AbsentPeerError(f"{name}: takes more than {LONGEST_SECONDS} s") from fault
     told = [line.split() for line in done.stdout.splitlines() if line.startswith("seconds ")]
     if done.returncode or not told:
         problem = (done.stderr.strip().splitlines() or ["no reason given"])[-1]

@@ -7,6 +7,7 @@ import math
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,6 +17,20 @@ from apps.benchmarks.peers import PEERS_VARIABLE
 from tofclip.arrays import THREADS_VARIABLE, thread_count
 
 LONGEST_SECONDS = 120
+ALL_SECONDS = 580
+"""What has not begun by then is left out, so that a run takes less than ten minutes on any machine."""
+
+
+class Clock:
+    """Counts down `ALL_SECONDS`."""
+
+    def __init__(self) -> None:
+        self._end = time.monotonic() + ALL_SECONDS
+
+    @property
+    def left(self) -> float:
+        """Seconds that are left, not negative."""
+        return max(0.0, self._end - time.monotonic())
 
 
 def run_cases(cases: Sequence[Case], peers: str | None, advance: Callable[[int], None]) -> dict[str, Any]:
@@ -34,7 +49,8 @@ def run_cases(cases: Sequence[Case], peers: str | None, advance: Callable[[int],
     dict
         ``machine`` and ``entries``, one for each case.
     """
-    return {"machine": machine(), "entries": [_entry(case, peers, advance) for case in cases]}
+    clock = Clock()
+    return {"machine": machine(), "entries": [_entry(case, peers, clock, advance) for case in cases]}
 
 
 def processes(cases: Sequence[Case]) -> int:
@@ -47,13 +63,13 @@ def threads() -> list[int]:
     return sorted({1, thread_count()})
 
 
-def _entry(case: Case, peers: str | None, advance: Callable[[int], None]) -> dict[str, Any]:
+def _entry(case: Case, peers: str | None, clock: Clock, advance: Callable[[int], None]) -> dict[str, Any]:
     *fewer, most = threads()
     runs = []
     for size in case.sizes:
         for count in [*fewer, most] if size == case.sizes[-1] else [most]:
             wanted = peers if count == most else None  # a peer is asked once for each size
-            runs.append({"size": size, "threads": count, **_measured(case, size, count, wanted)})
+            runs.append({"size": size, "threads": count, **_measured(case, (size, count), wanted, clock)})
             advance(1)
     return {
         "name": case.name,
@@ -66,16 +82,18 @@ def _entry(case: Case, peers: str | None, advance: Callable[[int], None]) -> dic
     }
 
 
-def _measured(case: Case, size: int, count: int, peers: str | None) -> dict[str, Any]:
-    """Figures of a fresh process, or ``problem``: why there are none."""
+def _measured(case: Case, extent: tuple[int, int], peers: str | None, clock: Clock) -> dict[str, Any]:
+    """Figures of a fresh process for a size and a number of threads, or ``problem``: why there are none."""
+    size, count = extent
+    longest = min(LONGEST_SECONDS, clock.left)
+    if longest == 0:
+        return {"problem": f"left out: the others took {ALL_SECONDS} s"}
     environment = {**os.environ, THREADS_VARIABLE: str(count), PEERS_VARIABLE: peers or ""}
     command = [sys.executable, "-m", "apps.benchmarks", case.name, str(size)]
     try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, check=False, env=environment, timeout=LONGEST_SECONDS
-        )
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=longest)
     except subprocess.TimeoutExpired:
-        return {"problem": f"took more than {LONGEST_SECONDS} s"}
+        return {"problem": f"took more than {longest:.0f} s"}
     if done.returncode:
         return {"problem": (done.stderr.strip().splitlines() or [f"ended with status {done.returncode}"])[-1]}
     figures: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])

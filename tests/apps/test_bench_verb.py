@@ -102,6 +102,9 @@ def test_a_case_that_fails_is_told_and_stops_nothing(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("apps.benchmarks.run.LONGEST_SECONDS", 0.01)
     figures = run_cases([broken], None, lambda _: None)
     assert "took more than" in figures["entries"][0]["runs"][0]["problem"]
+    monkeypatch.setattr("apps.benchmarks.run.ALL_SECONDS", 0)
+    figures = run_cases([broken], None, lambda _: None)
+    assert "left out" in figures["entries"][0]["runs"][0]["problem"]
 
 
 def test_the_page_tells_growth_spread_and_peers() -> None:
@@ -127,6 +130,7 @@ def test_the_page_tells_growth_spread_and_peers() -> None:
     assert "y-tal: 30 ms at 64, 2 threads (3.0 times ours); 450 ms at 128, 1 thread (3.0 times ours);" in text
     assert "Not compared: ASTRA: --peers names no Python." in text
     assert "cores" in text
+    assert "wanted a core in the minute before: " in text
 
 
 def test_peers_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,6 +143,9 @@ def test_peers_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(AbsentPeerError, match="No module named 'no_such_peer'"):
         seconds_told("import no_such_peer", "other")
     assert seconds_told("print('seconds', 0.25)", "other") == 0.25
+    monkeypatch.setattr("apps.benchmarks.peers.LONGEST_SECONDS", 0.01)
+    with pytest.raises(AbsentPeerError, match="takes more than"):
+        seconds_told("import time; time.sleep(5)", "other")
 
 
 def test_names() -> None:
