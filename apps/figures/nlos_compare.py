@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-    from apps.nlos_truth import HiddenTruth
+    from apps.nlos.truth import HiddenTruth
     from nlos import Volume
 
 COLUMN_INCHES = 3.2

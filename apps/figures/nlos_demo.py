@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from apps.nlos_measure import Measured
-    from apps.nlos_truth import HiddenTruth
+    from apps.nlos.measure import Measured
+    from apps.nlos.truth import HiddenTruth
     from apps.verbs.nlos.demo import DemoRun
     from nlos import Capture
 

@@ -10,7 +10,7 @@ import pytest
 from hidden_point import POINT, object_of
 from small_instrument import Run
 
-from apps.nlos_truth import HiddenTruth
+from apps.nlos.truth import HiddenTruth
 from nlos import Capture, Volume
 
 PNG = b"\x89PNG"
@@ -48,7 +48,7 @@ def test_its_settings_give_the_same_comparison(run: Run, confocal: Path, tmp_pat
 
 
 def test_memory_is_that_of_the_method() -> None:
-    from apps.nlos_measure import _memory_from_now, measured
+    from apps.nlos.measure import _memory_from_now, measured
     from nlos import Grid
 
     if _memory_from_now() is None:
@@ -102,7 +102,7 @@ def test_memory_is_foretold_within_a_factor(run: Run, confocal: Path, tmp_path: 
 
 
 def test_figures_of_merit_of_volumes_that_need_no_computing() -> None:
-    from apps.nlos_measure import sharpness, truth_figures
+    from apps.nlos.measure import sharpness, truth_figures
     from nlos import Grid
 
     grid = Grid(np.arange(4) * 0.03, np.arange(3) * 0.03, [1.0, 1.03])

@@ -13,7 +13,7 @@ import pytest
 from hidden_point import object_of
 from small_instrument import Run
 
-from apps.nlos_files import Results
+from apps.nlos.files import Results
 from nlos import Volume
 from tofclip.storage import SIGNATURE
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apps.nlos_scene import WALLS, SceneSettings
-from apps.nlos_settings import plain, save, setting, told
+from apps.nlos.scene import WALLS, SceneSettings
+from apps.nlos.settings import plain, save, setting, told
 from apps.verbs.nlos.compare import CompareSettings
 from apps.verbs.nlos.reconstruct import ReconstructSettings
 from tofclip.errors import FileFormatError, InputError, StorageError

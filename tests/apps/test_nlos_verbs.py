@@ -17,7 +17,7 @@ from small_instrument import Run
 from test_program import LONGEST_WAIT_S, PROGRAM, ROOT, wait_for
 
 from apps.help import told as told_by
-from apps.nlos_truth import HiddenTruth
+from apps.nlos.truth import HiddenTruth
 from apps.verbs.nlos import app
 from nlos import Capture, Volume
 from nlos.export import Mesh
@@ -105,7 +105,7 @@ class TestInfo:
         assert shorter.err.count("\n") == 1
 
     def test_one_wall_point_and_many_lasers_are_sampled_by_the_lasers(self, confocal: Path) -> None:
-        from apps.nlos_imaging import sampling_step
+        from apps.nlos.imaging import sampling_step
 
         capture = Capture.load(confocal)
         alone = np.broadcast_to(capture.wall[3, 4], capture.wall.shape)
@@ -247,7 +247,7 @@ def _one_voxel() -> Any:
 def test_a_recording_under_its_default_settings_warns_of_nothing(shared_data: Path) -> None:
     import warnings
 
-    from apps.nlos_imaging import shortest_wavelength
+    from apps.nlos.imaging import shortest_wavelength
     from nlos.band import Band, VirtualPulse
     from nlos.io import read_capture
     from nlos.sampling import warn_of_aliasing

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos_methods import METHODS, ImagingSettings
-from apps.nlos_settings import SettingsFile, setting, takes
+from apps.nlos.methods import METHODS, ImagingSettings
+from apps.nlos.settings import SettingsFile, setting, takes
 from apps.options import AsJson
 
 if TYPE_CHECKING:
-    from apps.nlos_measure import Measured
-    from apps.nlos_truth import HiddenTruth
+    from apps.nlos.measure import Measured
+    from apps.nlos.truth import HiddenTruth
     from nlos import Capture, Grid
     from nlos.method import Reconstructor
 
@@ -57,9 +57,9 @@ def compare(
     """
     from apps.figures.nlos_compare import compare_figure
     from apps.figures.style import save as save_figure
-    from apps.nlos_imaging import prepared, warnings_in_a_line
-    from apps.nlos_settings import save, told
-    from apps.nlos_truth import HiddenTruth
+    from apps.nlos.imaging import prepared, warnings_in_a_line
+    from apps.nlos.settings import save, told
+    from apps.nlos.truth import HiddenTruth
     from nlos.io import read_capture
 
     wanted = told(CompareSettings, settings, flags)
@@ -89,7 +89,7 @@ def _require_writable(pictures: Sequence[Path], volumes: Path | None, inputs: tu
 
 
 def _require_sense(settings: CompareSettings) -> None:
-    from apps.nlos_methods import built, names_in, require_taken
+    from apps.nlos.methods import built, names_in, require_taken
 
     names = tuple(METHODS) if settings.methods is None else names_in(settings.methods)
     require_taken(settings, names)
@@ -101,8 +101,8 @@ def _chosen(
     wanted: CompareSettings, capture: Capture
 ) -> tuple[CompareSettings, Grid, dict[str, Reconstructor], dict[str, str]]:
     """Choose methods and voxels; of methods that nobody named, those that do not suit are left out, with the reason."""
-    from apps.nlos_imaging import box_of, boxed, scales_of
-    from apps.nlos_methods import built, names_in, spelt_out
+    from apps.nlos.imaging import box_of, boxed, scales_of
+    from apps.nlos.methods import built, names_in, spelt_out
     from tofclip.errors import InputError
     from tofclip.units import MILLIMETRE
 
@@ -122,14 +122,14 @@ def _chosen(
 
 
 def _measured(methods: Mapping[str, Reconstructor], capture: Capture, grid: Grid) -> dict[str, Measured]:
-    from apps.nlos_measure import measured
+    from apps.nlos.measure import measured
 
     return {name: measured(name, imaging, capture, grid) for name, imaging in methods.items()}
 
 
 def _figures(runs: Mapping[str, Measured], truth: HiddenTruth | None) -> dict[str, dict[str, Any]]:
     """Figures of every method; the first is the reference."""
-    from apps.nlos_measure import sharpness, truth_figures
+    from apps.nlos.measure import sharpness, truth_figures
     from nlos.studies.adjoint import correlation
 
     reference = next(iter(runs.values())).volume
@@ -148,8 +148,8 @@ def _save_volumes(
     runs: Mapping[str, Measured], folder: Path, source: Path, settings: CompareSettings
 ) -> Iterator[Path]:
     """Write each method's volume, and name the files."""
-    from apps.nlos_files import with_history
-    from apps.nlos_settings import plain
+    from apps.nlos.files import with_history
+    from apps.nlos.settings import plain
 
     for name, run in runs.items():
         path = folder / f"{name}.h5"

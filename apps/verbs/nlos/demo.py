@@ -14,8 +14,8 @@ from apps.options import AsJson
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from apps.nlos_measure import Measured
-    from apps.nlos_truth import HiddenTruth
+    from apps.nlos.measure import Measured
+    from apps.nlos.truth import HiddenTruth
     from nlos import Capture, Grid
 
 WALL, WALL_POINTS = "cylinder", 64
@@ -85,7 +85,7 @@ def demo(
 def _run(seed: int) -> DemoRun:
     """The whole way, from a scene to three images."""
     from apps.files import history
-    from apps.nlos_measure import measured
+    from apps.nlos.measure import measured
     from nlos import Backprojection, Grid, Hybrid
 
     capture, truth = _simulated(seed)
@@ -103,8 +103,8 @@ def _run(seed: int) -> DemoRun:
 def _simulated(seed: int) -> tuple[Capture, HiddenTruth]:
     import numpy as np
 
-    from apps.nlos_scene import spot_on
-    from apps.nlos_truth import HiddenTruth
+    from apps.nlos.scene import spot_on
+    from apps.nlos.truth import HiddenTruth
     from nlos.simulate import HiddenScene, Lambert, Surface, counted, relay_wall
     from nlos.time_axis import TimeAxis
 
@@ -124,7 +124,7 @@ def _flattened(capture: Capture) -> Capture:
 
 
 def _figures(run: DemoRun) -> dict[str, Any]:
-    from apps.nlos_measure import truth_figures
+    from apps.nlos.measure import truth_figures
     from nlos.studies.adjoint import correlation
 
     reference = run.images["backprojection"]

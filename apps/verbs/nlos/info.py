@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos_methods import METHODS, ImagingSettings
-from apps.nlos_settings import SettingsFile, takes
+from apps.nlos.methods import METHODS, ImagingSettings
+from apps.nlos.settings import SettingsFile, takes
 from apps.options import AsJson
 
 if TYPE_CHECKING:
@@ -36,9 +36,9 @@ def info(
 
     Example: tofclip nlos info capture.h5
     """
-    from apps.nlos_imaging import box_of, prepared, scales_of
-    from apps.nlos_settings import told
-    from apps.nlos_truth import HiddenTruth
+    from apps.nlos.imaging import box_of, prepared, scales_of
+    from apps.nlos.settings import told
+    from apps.nlos.truth import HiddenTruth
     from apps.report import report
     from nlos.io import read_capture
     from tofclip.units import MILLIMETRE
@@ -69,7 +69,7 @@ def info(
 
 
 def _wall(capture: Capture) -> dict[str, Any]:
-    from apps.nlos_imaging import sampling_step
+    from apps.nlos.imaging import sampling_step
     from nlos.rsd.wall import PlanarWall
     from tofclip.errors import InputError
 
@@ -117,7 +117,7 @@ def _record(capture: Capture) -> dict[str, Any]:
 
 def _usable(capture: Capture, grid: Grid, cycles: float) -> dict[str, float]:
     """Bounds of the carrier: what is sampled finely enough, and what still resolves something, mm."""
-    from apps.nlos_imaging import shortest_wavelength
+    from apps.nlos.imaging import shortest_wavelength
     from tofclip.units import MILLIMETRE
 
     low, high = capture.points.min(axis=0), capture.points.max(axis=0)
@@ -142,8 +142,8 @@ def _resolution(capture: Capture, grid: Grid, found: ImagingSettings) -> dict[st
 
 
 def _suitability(name: str, found: ImagingSettings, capture: Capture, grid: Grid) -> dict[str, Any]:
-    from apps.nlos_costs import memory_of
-    from apps.nlos_methods import built
+    from apps.nlos.costs import memory_of
+    from apps.nlos.methods import built
 
     imaging = built(name, found)
     support = imaging.supports(capture, grid)

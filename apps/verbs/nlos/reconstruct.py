@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos_methods import METHODS, ImagingSettings
-from apps.nlos_settings import SettingsFile, setting, takes
+from apps.nlos.methods import METHODS, ImagingSettings
+from apps.nlos.settings import SettingsFile, setting, takes
 from apps.options import AsJson, Cluster
 
 if TYPE_CHECKING:
-    from apps.nlos_files import Results
+    from apps.nlos.files import Results
     from nlos import Capture, Volume
     from tofclip.cluster import Job, Report
 
@@ -80,8 +80,8 @@ def reconstruct(
 
     Example: tofclip nlos reconstruct capture.h5 --out volume.h5 --png volume.png
     """
-    from apps.nlos_files import Results, is_folder_of_captures
-    from apps.nlos_settings import told
+    from apps.nlos.files import Results, is_folder_of_captures
+    from apps.nlos.settings import told
     from apps.report import report
     from tofclip.errors import InputError
 
@@ -99,7 +99,7 @@ def reconstruct(
 
 def _require_sense(settings: ReconstructSettings) -> None:
     """Refuse settings that no capture could make sense of, before any is read."""
-    from apps.nlos_methods import QUICKEST_FIRST, built, names_in, require_taken
+    from apps.nlos.methods import QUICKEST_FIRST, built, names_in, require_taken
     from tofclip.errors import InputError
 
     if not 0 <= settings.point_fraction <= 1:
@@ -114,9 +114,9 @@ def _require_sense(settings: ReconstructSettings) -> None:
 
 def _reconstructed(source: Path, results: Results, wanted: ReconstructSettings) -> dict[str, Any]:
     """Image one capture, write its results, and return the figures."""
-    from apps.nlos_files import with_history, write_volume
-    from apps.nlos_imaging import prepared, warnings_in_a_line
-    from apps.nlos_settings import plain, save
+    from apps.nlos.files import with_history, write_volume
+    from apps.nlos.imaging import prepared, warnings_in_a_line
+    from apps.nlos.settings import plain, save
     from nlos.io import read_capture
 
     capture = prepared(read_capture(source), wanted)
@@ -144,8 +144,8 @@ def _reconstructed(source: Path, results: Results, wanted: ReconstructSettings) 
 
 def _imaged(capture: Capture, wanted: ReconstructSettings) -> tuple[ReconstructSettings, Volume]:
     """Find what is not told, and image the capture."""
-    from apps.nlos_imaging import box_of, boxed, imaged, scales_of
-    from apps.nlos_methods import built, quickest, spelt_out
+    from apps.nlos.imaging import box_of, boxed, imaged, scales_of
+    from apps.nlos.methods import built, quickest, spelt_out
     from tofclip.units import MILLIMETRE
 
     scales = scales_of(wanted, capture)
@@ -161,7 +161,7 @@ def _reconstruct_folder(
 ) -> None:
     """Image every capture of a folder whose results are not there yet."""
     from apps.files import make_folder
-    from apps.nlos_files import captures_in, require_apart
+    from apps.nlos.files import captures_in, require_apart
     from apps.report import report
     from apps.sequences import run_all
     from tofclip.cluster import run
@@ -218,7 +218,7 @@ def _imaged_of_many(source: Path, results: Results, wanted: ReconstructSettings)
 
 
 def _require_formats(suffixes: Sequence[str]) -> None:
-    from apps.nlos_files import VOLUME_SUFFIXES
+    from apps.nlos.files import VOLUME_SUFFIXES
     from tofclip.errors import InputError
 
     for suffix in suffixes:
@@ -227,7 +227,7 @@ def _require_formats(suffixes: Sequence[str]) -> None:
 
 
 def _results_in(folder: Path, stem: str, suffixes: Sequence[str]) -> Results:
-    from apps.nlos_files import Results
+    from apps.nlos.files import Results
 
     volumes = [folder / f"{stem}{suffix}" for suffix in suffixes]
     return Results(volumes, folder / f"{stem}.png", folder / f"{stem}{SETTINGS_SUFFIX}")
@@ -235,7 +235,7 @@ def _results_in(folder: Path, stem: str, suffixes: Sequence[str]) -> Results:
 
 def _keep_to(file: Path, wanted: ReconstructSettings) -> None:
     """Refuse to mix results of different settings in one folder."""
-    from apps.nlos_settings import plain, save, told
+    from apps.nlos.settings import plain, save, told
     from tofclip.errors import InputError
 
     if not file.exists():

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from apps.nlos_scene import SceneSettings
-from apps.nlos_settings import SettingsFile, takes
+from apps.nlos.scene import SceneSettings
+from apps.nlos.settings import SettingsFile, takes
 from apps.options import AsJson
 
 HEADING = "tofclip nlos simulate --settings THIS --out CAPTURE"
@@ -31,8 +31,8 @@ def simulate(
     Example: tofclip nlos simulate --letters T --wall cylinder --wall-points 32 --out capture.h5
     """
     from apps.files import RECORD_SUFFIXES, history, require_writable
-    from apps.nlos_scene import simulated
-    from apps.nlos_settings import plain, save, told
+    from apps.nlos.scene import simulated
+    from apps.nlos.settings import plain, save, told
     from apps.report import report
 
     chosen = told(SceneSettings, settings, flags)

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
-from apps.nlos_methods import Imaging, ImagingSettings, built, quickest
+from apps.nlos.methods import Imaging, ImagingSettings, built, quickest
 from apps.progress import progress
 from tofclip.units import MILLIMETRE
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apps.nlos_settings import setting
+from apps.nlos.settings import setting
 from tofclip.errors import InputError
 from tofclip.units import MILLIMETRE, PICOSECOND
 
 if TYPE_CHECKING:
-    from apps.nlos_truth import HiddenTruth
+    from apps.nlos.truth import HiddenTruth
     from nlos import Capture
     from nlos.geometry import FloatArray
     from nlos.simulate import HiddenScene, PointScene, Surface
@@ -82,7 +82,7 @@ def hidden(settings: SceneSettings) -> tuple[HiddenScene | PointScene, HiddenTru
     """Build what is hidden, and say where it is."""
     import numpy as np
 
-    from apps.nlos_truth import HiddenTruth
+    from apps.nlos.truth import HiddenTruth
     from nlos.simulate import HiddenScene, PointScene
 
     told = [name for name in ("letters", "points", "mesh") if getattr(settings, name) is not None]

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apps.nlos_imaging import imaged
+from apps.nlos.imaging import imaged
 
 if TYPE_CHECKING:
-    from apps.nlos_truth import HiddenTruth
+    from apps.nlos.truth import HiddenTruth
     from nlos import Capture, Grid, Volume
     from nlos.method import Reconstructor
 

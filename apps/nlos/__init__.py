@@ -1,0 +1,1 @@
+"""Imaging around corners for the command line: settings, defaults, measures."""
