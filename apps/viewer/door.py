@@ -148,7 +148,7 @@ def refused_message(data: Any) -> str:
         return "too large"
     try:
         content = msgspec.msgpack.decode(data)
-    except (msgspec.DecodeError, RecursionError):
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return "no message"
     kind = content.get("type") if isinstance(content, dict) else None
     if not isinstance(kind, str) or kind not in MESSAGES:

@@ -21,6 +21,9 @@ RADIUS_SHARE = 0.006
 """Of the distance."""
 
 
+NO_SHADOWS: Any = {"cast_shadow": False, "receive_shadow": False}
+
+
 class Marks:
     """Listens to clicks on points.
 
@@ -57,7 +60,7 @@ class Marks:
             if number < len(picks):
                 position = picks[number].position
                 radius = RADIUS_SHARE * max(float(np.linalg.norm(position)), 0.1)
-                scene.add_icosphere(name, radius=radius, color=colour, position=position)
+                scene.add_icosphere(name, radius=radius, color=colour, position=position, **NO_SHADOWS)
             elif scene.get_handle_by_name(name) is not None:
                 scene.remove_by_name(name)
         if len(picks) == 2:

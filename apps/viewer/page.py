@@ -13,7 +13,7 @@ import numpy as np
 from apps.viewer.controls import Controls
 from apps.viewer.door import Door
 from apps.viewer.keeping import Keeping
-from apps.viewer.marks import Marks
+from apps.viewer.marks import NO_SHADOWS, Marks
 from apps.viewer.panes import panes
 from apps.viewer.rates import Pace, Rate
 from apps.viewer.server import address_of, echoes, start_server, stop_server
@@ -31,7 +31,8 @@ STATUS_EVERY, PANES_EVERY = 0.25, 0.5
 ASPECT = 0.9
 """Width over height of the scene between two panels, on a usual screen."""
 
-PANEL_PX, PICTURES_PX = 330, 260
+PANEL_PX, PICTURES_PX = 345, 260
+LOOK: dict[str, Any] = {"point_shape": "square", "point_shading": "flat", "precision": "float32"}
 SURFACE_COLOUR = (216, 210, 196)
 
 
@@ -106,8 +107,15 @@ class Page:
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_PX)
         server.scene.set_up_direction("-y")
+        # Shadows and reflections say nothing here, and take a software renderer ten seconds to prepare for.
+        server.scene.configure_default_lights(enabled=True, cast_shadow=False)
+        server.scene.configure_environment_map(hdri=None)
         look_from(server.initial_camera, self.viewpoint)
         server.scene.add_frame("/camera", axes_length=0.1, axes_radius=0.003)
+        # The page makes a new material for every frame's points, and forgets the compiled shader with the last old one.
+        # Two points that stay keep it: compiling it again for every frame would take twenty times as long as drawing.
+        staying = np.zeros((2, 3), np.float32)
+        server.scene.add_point_cloud("/camera/staying", staying, staying, point_size=1e-4, **LOOK)
         server.on_client_connect(lambda _: self.post(self._greet))
 
     def _greet(self) -> None:
@@ -129,15 +137,14 @@ class Page:
         scene = self.server.scene
         if shown.surface is not None:
             faces, vertices = shown.surface.faces, shown.surface.vertices
-            scene.add_mesh_simple("/surface", vertices, faces, color=SURFACE_COLOUR, side="double")
+            scene.add_mesh_simple("/surface", vertices, faces, color=SURFACE_COLOUR, side="double", **NO_SHADOWS)
         elif self._drawn is not None and self._drawn.surface is not None:
             scene.remove_by_name("/surface")
         size, points = self.controls.point_size, shown.cloud.xyz
         if shown.surface is not None:
             points = points[:0]
         colours: Any = shown.colours if len(points) else (0, 0, 0)  # the page complains about no colours at all
-        look: dict[str, Any] = {"point_shape": "square", "point_shading": "flat", "precision": "float32"}
-        scene.add_point_cloud("/points", points, colours, point_size=size, **look)
+        scene.add_point_cloud("/points", points, colours, point_size=size, **LOOK)
 
     def _tell(self, now: float) -> None:
         """Bring words and flat pictures up to date, now and then."""

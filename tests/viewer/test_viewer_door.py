@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import msgspec
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
@@ -105,6 +105,7 @@ def test_messages_that_are_refused() -> None:
 
 
 @given(st.binary(max_size=300))
+@example(b"\xa3\x00\x00\x80")  # a text that is none
 def test_noise_is_no_message(data: bytes) -> None:
     assert refused_message(data)
 
@@ -160,6 +161,7 @@ def test_the_server_keeps_the_rules_for_messages(server: viser.ViserServer) -> N
     port = server.get_port()
     for wrong in (message("ShareUrlRequest"), message("GuiUpdateMessage", LARGEST_MESSAGE), b"\xff\xff"):
         assert close_code(port, wrong) == 1008
+    assert close_code(port, message("GuiUpdateMessage")) in (1008, 1011)  # a command without what belongs to it
     # Larger than any message: the connection ends before all of it has come, perhaps without a word.
     assert close_code(port, message(PICTURE, LARGEST_PICTURE + 1)) in (1006, 1009)
     with pytest.raises(InvalidStatus):

@@ -242,12 +242,16 @@ def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
 
 
 def test_an_instruments_address() -> None:
-    address = "sim+linospad2://?seed=1&bins=576&seconds=0.2"
-    source = open_source(address)
+    source = open_source("sim+remoteex://?seed=1&scene=small&frame_rate=20")
     assert source.is_live
     assert Session(source).label == "LIVE"
-    assert len(source.view(0).cloud) > 100
+    deadline = time.monotonic() + 20
+    while len(source) < 3 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert len(source.view(2).cloud) > 100
+    assert source.data_rate > 0
     source.close()
+    assert not source.is_live
 
 
 def test_what_cannot_be_looked_at(tmp_path: Path, folder: Path) -> None:
