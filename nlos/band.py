@@ -24,6 +24,9 @@ BAND_EDGE = 0.01
 TAIL_WIDTHS = 4.0
 """Room for the pulse before and after the record, in standard deviations of its envelope."""
 
+BLOCK_BINS = 64
+"""Bins that are reduced to the few shapes of waves in the band before the Fourier transform."""
+
 SAMPLES_PER_WAVELENGTH = 64
 """Samples of a filtered signal per carrier wavelength: linear interpolation then errs by 1e-3 rms for 3 cycles."""
 
@@ -165,18 +168,31 @@ class Band:
         -------
         (points, frequencies) complex64 or complex128 array
         """
-        # So few frequencies of the whole spectrum are summed as fast by a matrix product, which takes traces in any
-        # order of memory and needs no room.
         real = traces.dtype.type
-        parts = traces @ self._analysis[: traces.shape[1]].view(np.float64).astype(real)
-        filtered: NDArray[Any] = parts.view(np.result_type(real, np.complex64))
+        bins = traces.shape[1]
+        shapes, coefficients = self._analysis(bins, 8 * float(np.finfo(real).eps))
+        shapes, in_time = shapes.astype(real), traces.T
+        short = np.empty((len(coefficients), len(traces)), real)
+        for block, first in enumerate(range(0, bins, BLOCK_BINS)):
+            some = in_time[first : first + BLOCK_BINS]
+            np.matmul(shapes[: len(some)].T, some, out=short[block * shapes.shape[1] :][: shapes.shape[1]])
+        filtered: NDArray[Any] = (short.T @ coefficients.astype(real)).view(np.result_type(real, np.complex64))
         return filtered
 
-    @cached_property
-    def _analysis(self) -> NDArray[np.complex128]:
-        """``G_k * exp(-1j * k * L_i)``, shape (t, frequencies)."""
-        analysis: NDArray[np.complex128] = np.exp(-1j * np.outer(self.axis.paths, self.wavenumbers))
-        return analysis * self.weights
+    def _analysis(self, bins: int, precision: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Matrices of two steps of a Fourier transform at the band's frequencies.
+
+        Within a block of bins a narrow band's waves are made up of few shapes (bins, n), whatever their phases; the
+        second matrix (blocks * n, 2 * frequencies) has what `phasors` are made of, real and imaginary parts in turns.
+        """
+        phases = np.outer(self.axis.spacing * np.arange(BLOCK_BINS), self.wavenumbers)
+        waves = np.exp(-1j * phases)
+        shapes, strengths, _ = np.linalg.svd(np.concatenate([waves.real, waves.imag], axis=1), full_matrices=False)
+        shapes = shapes[:, strengths > precision * strengths[0]]
+        starts = self.axis.start + self.axis.spacing * np.arange(0, bins, BLOCK_BINS)
+        turns = self.weights * np.exp(-1j * np.outer(starts, self.wavenumbers))
+        coefficients = turns[:, np.newaxis] * (shapes.T @ waves)
+        return shapes, coefficients.reshape(-1, self.wavenumbers.size).view(np.float64)
 
     def waveforms(self, phasors: NDArray[Any]) -> Waveforms:
         """Return ``sum_k P_k * exp(1j * k * L)`` on an axis of path lengths L fine enough for linear interpolation."""

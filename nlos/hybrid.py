@@ -112,7 +112,7 @@ class Hybrid:
         return Volume(np.abs(complex_field.values), grid, complex_field.provenance)
 
     def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
-        """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in the signal."""
+        """Return the complex sum whose magnitude `reconstruct` gives, complex64; linear within the tolerance."""
         self.supports(capture, grid).require()
         band = unfolded_band(capture, grid, self.pulse)
         warn_of_aliasing(capture, band)

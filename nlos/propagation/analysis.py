@@ -14,7 +14,7 @@ from nlos.rsd.wall import WallLattice
 if TYPE_CHECKING:
     import pyfftw
 
-COLUMNS_AT_A_TIME = 16
+COLUMNS_AT_A_TIME = 8
 """Plans for Fourier transforms of so many columns more."""
 
 

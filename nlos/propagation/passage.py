@@ -50,7 +50,7 @@ class Passage:
     plane : Plane
     waves : Waves
     strength : (frequencies,) array
-        Share of each frequency in the pulse.
+        How strong the field is at each frequency; decides what may be neglected.
     tolerance : float
         Relative error allowed.
     """
@@ -71,7 +71,7 @@ class Passage:
             wall = WallLattice.of(points)
         except InputError:
             return None
-        return cls(points, wall, plane, waves, strength / strength.max(), tolerance)
+        return cls(points, wall, plane, waves, strength, tolerance)
 
     @cached_property
     def quicker(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
@@ -19,6 +20,9 @@ from nlos.rsd.planar import require_tolerance, waves_of
 from tofclip.errors import InputError
 
 Propagation = Literal["spectral", "time"]
+
+SAMPLED_POINTS = 1024
+"""Enough wall points to tell the strength of a frequency from."""
 
 
 def propagate(
@@ -78,10 +82,18 @@ def carried(
         traces = np.ascontiguousarray(capture.traces()[part.members])
         return PlaneField(delayed_sum(points, traces, plane, band, part.passes), plane, wavenumbers)
     phasors = part.phasors(capture, band)
-    passage = Passage.of(points, plane, waves_of(part, band, continued=False), band.weights, tolerance)
+    passage = Passage.of(points, plane, waves_of(part, band, continued=False), strength(phasors), tolerance)
     if passage is not None and passage.quicker:
         return PlaneField(layered_sum(passage, phasors), plane, wavenumbers)
     return PlaneField(direct_sum(points, phasors, plane, wavenumbers), plane, wavenumbers)
+
+
+def strength(phasors: NDArray[np.complex64]) -> NDArray[np.float64]:
+    """Estimate how strong phasors (points, frequencies) are at each frequency, relative to the strongest."""
+    some = np.abs(phasors[:: len(phasors) // SAMPLED_POINTS + 1])
+    energy = np.mean(some.astype(np.float64) ** 2, axis=0)
+    relative: NDArray[np.float64] = np.sqrt(energy / energy.max()) if energy.any() else np.ones(energy.size)
+    return relative
 
 
 def require_propagation(propagation: str) -> None:

@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 FREQUENCIES_AT_A_TIME = 6
 """Neighbouring frequencies that share their functions of depth."""
 
-INTERPOLATION_SHARE, TERMS_SHARE = 0.2, 0.2
+INTERPOLATION_SHARE, TERMS_SHARE = 0.2, 0.4
 """Of the error allowed, what interpolation between depths and leaving out terms may take."""
 
 FLAT = 1e-5
@@ -63,7 +63,7 @@ class Relief:
     limits : (frequencies,) array
         Largest lateral wavenumber that counts at each frequency, rad/m.
     strength : (frequencies,) array
-        Share of each frequency in the pulse; decides what may be neglected.
+        How strong the field is at each frequency; decides what may be neglected.
     tolerance : float
         Relative error allowed.
     """
@@ -159,7 +159,7 @@ class Relief:
         every = np.sort(np.concatenate([values for values, _ in energies]))
         allowed = (TERMS_SHARE * self.tolerance) ** 2 * every.sum()
         weakest = every[np.searchsorted(np.cumsum(every), allowed)]
-        return [vectors[:, values >= weakest] for values, vectors in energies]
+        return [vectors[:, values >= min(weakest, values[-1])] for values, vectors in energies]
 
     @property
     def counts(self) -> list[int]:

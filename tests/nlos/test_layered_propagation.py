@@ -13,6 +13,7 @@ from nlos.plane import Plane
 from nlos.propagation.direct import direct_sum
 from nlos.propagation.layered import layered_sum
 from nlos.propagation.passage import Passage, common_period
+from nlos.propagation.propagate import strength
 from nlos.rsd.transfer import Waves
 from nlos.rsd.window import convenient
 from nlos.time_axis import TimeAxis
@@ -91,6 +92,18 @@ def test_it_is_linear() -> None:
     first, second = phasors(len(points)), random.normal(size=(len(points), K.size)).astype(np.complex64)
     both = layered_sum(way, 2 * first - 3j * second)
     assert relative_error(2 * layered_sum(way, first) - 3j * layered_sum(way, second), both) < 1e-5
+
+
+def test_silence_and_a_single_frequency_pass() -> None:
+    points = points_of(shaped_wall("relief", 32))
+    values = np.zeros_like(phasors(len(points)))
+    assert strength(values).tolist() == [1.0] * K.size
+    assert not layered_sum(passage(points, FITTING, 1e-2), values).any()
+    values[:, 9] = phasors(len(points))[:, 9]
+    assert np.flatnonzero(strength(values)).tolist() == [9]
+    way = Passage.of(points, FITTING, WAVES, strength(values), 1e-2)
+    assert way is not None
+    assert relative_error(layered_sum(way, values), direct_sum(points, values, FITTING, K)) < 1e-2
 
 
 def test_scattered_points_stand_above_no_lattice() -> None:
