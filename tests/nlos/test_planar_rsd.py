@@ -140,7 +140,8 @@ def test_masked_wall_points_and_their_order_do_not_matter() -> None:
     shuffled = np.random.default_rng(5).permutation(len(masked.points))
     listed = replace(masked, wall=masked.points[shuffled], signal=masked.traces().T[:, shuffled])
     found = METHOD.phasor_field(listed, GRID).values
-    assert np.array_equal(METHOD.phasor_field(masked, GRID).values, found)
+    # float32 sums in another order.
+    assert relative_error(METHOD.phasor_field(masked, GRID).values, found) < 1e-6
     assert relative_error(found, exact_phasor_field(masked, GRID, METHOD.pulse).values) < 1e-2
 
 
