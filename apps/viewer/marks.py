@@ -65,7 +65,7 @@ class Marks:
                 scene.remove_by_name(name)
         if len(picks) == 2:
             ends = np.array([[picks[0].position, picks[1].position]], np.float32)
-            scene.add_line_segments("/picks/between", ends, (255, 255, 255), thickness=2.0)
+            scene.add_line_segments("/picks/between", ends, (255, 255, 255), thickness=2.0, thickness_units="screen")
         elif scene.get_handle_by_name("/picks/between") is not None:
             scene.remove_by_name("/picks/between")
 

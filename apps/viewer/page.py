@@ -32,6 +32,9 @@ ASPECT = 0.9
 """Width over height of the scene between two panels, on a usual screen."""
 
 PANEL_PX, PICTURES_PX = 345, 260
+AMBIENT = 2.0
+"""Light from everywhere, so that no side of a surface is black."""
+
 LOOK: dict[str, Any] = {"point_shape": "square", "point_shading": "flat", "precision": "float32"}
 SURFACE_COLOUR = (216, 210, 196)
 
@@ -110,6 +113,7 @@ class Page:
         # Shadows and reflections say nothing here, and take a software renderer ten seconds to prepare for.
         server.scene.configure_default_lights(enabled=True, cast_shadow=False)
         server.scene.configure_environment_map(hdri=None)
+        server.scene.add_light_ambient("/light", intensity=AMBIENT)
         look_from(server.initial_camera, self.viewpoint)
         server.scene.add_frame("/camera", axes_length=0.1, axes_radius=0.003)
         # The page makes a new material for every frame's points, and forgets the compiled shader with the last old one.

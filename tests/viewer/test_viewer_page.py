@@ -160,7 +160,7 @@ def test_filter(seen: Seen) -> None:
 
 
 def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
-    shown = seen.page.session.latest
+    shown, before = seen.page.session.latest, picture(seen)
     assert shown is not None
     canvas = seen.tab.locator(SCENE).bounding_box()
     assert canvas is not None
@@ -175,6 +175,8 @@ def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
     row, column, _ = seen.page.viewpoint.project(far, (round(canvas["height"]), round(canvas["width"])))
     seen.tab.mouse.click(canvas["x"] + column[0], canvas["y"] + row[0])
     until(lambda: "distance 0." in words.inner_text(), "the distance of both is told")
+    until(lambda: bool(np.abs(picture(seen) - before).max() > 0.3), "both are marked")
+    assert np.abs(picture(seen) - before).mean() < 0.05  # marks are small: two balls and a line
 
 
 def test_refocus(seen: Seen) -> None:
