@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -147,7 +148,9 @@ def test_an_input_is_not_overwritten(run: Run, recording: Path) -> None:
 def test_ctrl_c_leaves_a_whole_recording(tmp_path: Path) -> None:
     path = tmp_path / "run.h5"
     command = [sys.executable, "-m", "apps", "record", SIM, "--out", str(path)]
-    recorder = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, env=os.environ)
+    # A shell that puts the tests into the background has them ignore Ctrl-C, and children inherit that.
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    recorder = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, env=os.environ, preexec_fn=heed)
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and not (path.exists() and verify(path).records):
         time.sleep(0.05)
