@@ -144,6 +144,15 @@ def test_files_say_their_units(tmp_path):
         np.testing.assert_array_equal(arrays["z_m"], cloud.xyz[:, 2])
 
 
+def test_numpy_reads_the_same_numbers_from_text(tmp_path):
+    cloud = random_cloud(50, 3)
+    cloud.save(tmp_path / "scene.csv")
+    table = np.genfromtxt(tmp_path / "scene.csv", delimiter=",", names=True, dtype=np.float64)
+    np.testing.assert_allclose(np.stack([table["x_m"], table["y_m"], table["z_m"]], axis=1), cloud.xyz, rtol=1e-6)
+    np.testing.assert_allclose(table["intensity_count"], cloud.intensity, rtol=1e-6)
+    np.testing.assert_allclose(table["range_m"], cloud.range, rtol=1e-6)
+
+
 def test_saving_is_all_or_nothing(tmp_path, monkeypatch):
     path = tmp_path / "scene.ply"
     random_cloud(5, 0).save(path)
