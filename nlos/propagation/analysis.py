@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.rsd.inverse import PLANNING
+from nlos.rsd.inverse import PLANNING, PLANS
 from nlos.rsd.kernels import transpose
 from nlos.rsd.wall import WallLattice
 
@@ -48,7 +48,7 @@ class LatticeAnalysis:
         self._points, self._lines, self._middle = arrays[:3]
         self._spectra: NDArray[np.complex64] = arrays[3]
         with PLANNING:
-            self._along_x = pyfftw.FFTW(self._points, self._lines, axes=(1,), flags=("FFTW_MEASURE",))
+            self._along_x = pyfftw.FFTW(self._points, self._lines, axes=(1,), flags=PLANS)
         self._along_y: dict[int, pyfftw.FFTW] = {}
 
     def _columns(self, reach: int) -> int:
@@ -104,5 +104,5 @@ class LatticeAnalysis:
         if columns not in self._along_y:
             with PLANNING:
                 arrays = self._middle[:columns], self._spectra[:columns]
-                self._along_y[columns] = pyfftw.FFTW(*arrays, axes=(1,), flags=("FFTW_MEASURE",))
+                self._along_y[columns] = pyfftw.FFTW(*arrays, axes=(1,), flags=PLANS)
         return self._along_y[columns]

@@ -12,6 +12,8 @@ from nlos.rsd.kernels import transpose
 from nlos.rsd.window import VECTOR
 
 PLANNING = threading.Lock()
+# Measured plans are no faster here, and differ from run to run, and with them the last bits of an image.
+PLANS = ("FFTW_ESTIMATE",)
 """FFTW plans one transform at a time."""
 
 PRODUCT_RATE = 3
@@ -119,7 +121,7 @@ class InverseTransform:
         self._images: NDArray[np.complex64] = arrays[3]
         self._high, self._wide = high, wide
         with PLANNING:
-            backward = {"direction": "FFTW_BACKWARD", "axes": (1,), "flags": ("FFTW_MEASURE",)}
+            backward = {"direction": "FFTW_BACKWARD", "axes": (1,), "flags": PLANS}
             self._along_y = pyfftw.FFTW(self.spectra[0, :, :high], self._lines[:, :high], **backward)
             self._along_x = pyfftw.FFTW(self._middle[:, :wide], self._images[0, :, :wide], **backward)
 
