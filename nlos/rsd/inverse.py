@@ -12,9 +12,10 @@ from nlos.rsd.kernels import transpose
 from nlos.rsd.window import VECTOR
 
 PLANNING = threading.Lock()
-# Measured plans are no faster here, and differ from run to run, and with them the last bits of an image.
-PLANS = ("FFTW_ESTIMATE",)
 """FFTW plans one transform at a time."""
+
+PLANS = ("FFTW_ESTIMATE",)
+"""Plans that are measured are no faster here, and differ from run to run, as the last bits of an image would."""
 
 PRODUCT_RATE = 3
 """How many operations of a matrix product take as long as one of a pruned Fourier transform; measured."""
