@@ -16,8 +16,8 @@ from nlos.kernels import add_backprojection
 from nlos.method import Progress, Support, common_support, silent
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
-from tofclip.arrays import blocks, run_blocks
 from tofclip.errors import InputError
+from tofclip.threads import blocks, run_blocks
 
 TABLE_BYTES = 32 << 20
 """Filtered signals held at a time."""

@@ -21,9 +21,9 @@ from nlos.outgoing import outgoing_field, outgoing_way
 from nlos.rsd.planar import PlanarRSD
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
-from tofclip.arrays import blocks, run_blocks
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
+from tofclip.threads import blocks, run_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
 INSTANTS_AT_A_TIME = 32

@@ -1,46 +1,100 @@
-from __future__ import annotations
+"""Arrays of other libraries: recognised, fetched, put back, refused."""
 
-import threading
-
+import array_api_strict
+import numpy as np
 import pytest
 
-from tofclip.arrays import LANES, THREADS_VARIABLE, blocks, run_blocks, thread_count
-from tofclip.errors import InputError
+from tofclip import arrays
+from tofclip.arrays import Place, is_numpy, namespace, place_named, require_numpy, to_numpy
+from tofclip.errors import InputError, MissingDependencyError
+
+VALUES = np.arange(6, dtype=np.float32).reshape(2, 3)
+STRICT = Place("array_api_strict", array_api_strict.Device("CPU_DEVICE"))
 
 
-def test_blocks_cover_everything_once():
-    pieces = list(blocks(2 * LANES + 5))
-    assert [i for piece in pieces for i in range(piece.start, piece.stop)] == list(range(2 * LANES + 5))
-    assert all(piece.stop - piece.start <= LANES for piece in pieces)
+def torch_cpu():
+    pytest.importorskip("torch", reason="PyTorch is optional")
+    return place_named("torch:cpu")
 
 
-@pytest.mark.parametrize("threads", ["1", "2"])
-def test_every_block_runs_on_no_more_threads_than_allowed(monkeypatch, threads):
-    monkeypatch.setenv(THREADS_VARIABLE, threads)
-    seen, names = [], set()
-
-    def work(piece: slice) -> None:
-        seen.append(piece.start)
-        names.add(threading.current_thread().name)
-
-    run_blocks(work, 10 * LANES)
-    assert sorted(seen) == list(range(0, 10 * LANES, LANES))
-    assert len(names) <= int(threads)
+@pytest.fixture(params=[lambda: STRICT, torch_cpu], ids=["array-api-strict", "torch"])
+def place(request):
+    return request.param()
 
 
-@pytest.mark.parametrize("threads", ["1", "2"])
-def test_the_first_fault_is_raised(monkeypatch, threads):
-    monkeypatch.setenv(THREADS_VARIABLE, threads)
-
-    def work(piece: slice) -> None:
-        raise InputError(f"block {piece.start}")
-
-    with pytest.raises(InputError, match="block 0"):
-        run_blocks(work, 4 * LANES)
+def test_lists_and_numbers_are_numpys():
+    assert all(is_numpy(values) for values in (VALUES, VALUES[0, 0], [1.0, 2.0], 3))
 
 
-@pytest.mark.parametrize("value", ["0", "-1", "two", "1.5"])
-def test_a_nonsensical_thread_count_is_refused(monkeypatch, value):
-    monkeypatch.setenv(THREADS_VARIABLE, value)
-    with pytest.raises(InputError, match=THREADS_VARIABLE):
-        thread_count()
+def test_there_and_back(place):
+    there = place.put(VALUES)
+    assert not is_numpy(there)
+    assert Place.of(there) == place
+    assert not place.has_compiled_loops
+    back = to_numpy(there)
+    assert back.dtype == VALUES.dtype
+    np.testing.assert_array_equal(back, VALUES)
+
+
+@pytest.mark.parametrize("values", [VALUES[::-1], VALUES.T, np.broadcast_to(VALUES[0], (4, 3))])
+def test_values_that_lie_oddly_in_memory(place, values):
+    np.testing.assert_array_equal(to_numpy(place.put(values)), values)
+
+
+def test_what_is_there_already_is_not_copied(place):
+    there = place.put(VALUES)
+    assert place.put(there) is there
+
+
+def test_the_functions_of_the_standard(place):
+    there = place.put(VALUES)
+    np.testing.assert_allclose(to_numpy(namespace(there).sum(there, axis=0)), VALUES.sum(axis=0))
+
+
+def test_numpy_is_the_place_of_numpys_arrays(place):
+    assert Place.of(VALUES) == Place() == place_named("cpu")
+    assert Place().put(VALUES) is VALUES
+    np.testing.assert_array_equal(Place().put(place.put(VALUES)), VALUES)
+    assert Place().has_compiled_loops
+
+
+def test_libraries_do_not_mix(place):
+    with pytest.raises(InputError, match="numpy.* do not work together"):
+        namespace(place.put(VALUES), VALUES)
+
+
+def test_compiled_loops_refuse_what_is_not_numpys(place):
+    require_numpy("the search", VALUES, [1.0])
+    with pytest.raises(InputError, match="the search works on NumPy arrays, not on"):
+        require_numpy("the search", VALUES, place.put(VALUES))
+
+
+def test_a_tensor_with_a_gradient():
+    torch = pytest.importorskip("torch", reason="PyTorch is optional")
+    np.testing.assert_array_equal(to_numpy(torch.ones(3, requires_grad=True) * 2), [2, 2, 2])
+
+
+@pytest.fixture
+def no_graphics(monkeypatch):
+    monkeypatch.setattr(arrays, "GRAPHICS_LIBRARIES", ("a_library_that_nobody_has",))
+
+
+@pytest.mark.usefixtures("no_graphics")
+def test_without_a_graphics_processor():
+    assert place_named("auto") == Place()
+    for name in ("cuda", "cuda:1"):
+        with pytest.raises(MissingDependencyError, match="use --device cpu"):
+            place_named(name)
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:one", "torch", "", "numpy:cpu"])
+def test_names_that_are_no_device(name):
+    with pytest.raises(InputError, match="is no device"):
+        place_named(name)
+
+
+def test_a_device_that_pytorch_does_not_have():
+    pytest.importorskip("torch", reason="PyTorch is optional")
+    for name in ("cuda:99", "nonsense"):
+        with pytest.raises(MissingDependencyError, match="use --device cpu"):
+            place_named(f"torch:{name}")

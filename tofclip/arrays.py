@@ -1,60 +1,183 @@
-"""Blocks and threads: how a batch of pictures is cut up and shared between the processor's cores.
+"""Arrays of other libraries and on other devices: what they are, where they live, and how values get there and back.
 
-The compiled kernels of this package are serial and release the interpreter lock; whoever has many frames cuts them
-into blocks and runs the blocks on a few Python threads. There is no second thread pool (OpenMP, numba's) to fight with.
+The compiled loops of this package work on NumPy arrays. Whatever is written with the functions of the array API
+standard (https://data-apis.org/array-api) works on the arrays of any library that follows it: CuPy and PyTorch on a
+graphics processor, PyTorch and array-api-strict on this one. What accepts such arrays answers in the library and on
+the device of the one that came in; what has only compiled loops refuses them (`require_numpy`).
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+import importlib
+from dataclasses import dataclass
+from typing import Any
 
-from tofclip.errors import InputError
+import numpy as np
+from numpy.typing import NDArray
 
-LANES = 32
-"""Frames per block: a row of a block is two full vectors of 512 bits, and a 174 x 174 picture stays in cache."""
+from tofclip.errors import InputError, MissingDependencyError
 
-THREADS_VARIABLE = "TOFCLIP_THREADS"
+Array = Any
+"""An array of any library that follows the array API standard."""
+
+GRAPHICS_LIBRARIES = ("cupy", "torch")
+"""Those that can use a graphics processor, the preferred one first."""
 
 
-def thread_count() -> int:
-    """Threads to use: the environment's ``TOFCLIP_THREADS``, else one for each core this process may run on.
+def is_numpy(array: Array) -> bool:
+    """Say whether `array` is NumPy's, or something that NumPy makes an array of, such as a list of numbers."""
+    return isinstance(array, np.ndarray | np.generic) or not hasattr(array, "__dlpack__")
+
+
+def namespace(*arrays: Array) -> Any:
+    """Return the functions of the array API standard for the library that all `arrays` are of.
 
     Raises
     ------
     InputError
-        The variable is not a positive whole number.
+        The arrays are of different libraries, or of one that does not follow the standard.
     """
-    wanted = os.environ.get(THREADS_VARIABLE, "")
-    if not wanted:
-        affinity = getattr(os, "sched_getaffinity", None)
-        return len(affinity(0)) if affinity else os.cpu_count() or 1
-    if not wanted.isdecimal() or int(wanted) < 1:
-        raise InputError(f"{THREADS_VARIABLE} must be a positive whole number, got '{wanted}'")
-    return int(wanted)
+    from array_api_compat import array_namespace
 
-
-def blocks(total: int, size: int = LANES) -> Iterator[slice]:
-    """Cut ``range(total)`` into slices of at most `size`."""
-    for start in range(0, total, size):
-        yield slice(start, min(start + size, total))
-
-
-def run_blocks(work: Callable[[slice], None], total: int, size: int = LANES) -> None:
-    """Call `work` on every block of ``range(total)``, on `thread_count` threads; the first exception is raised.
-
-    An interruption (Ctrl-C) waits for the blocks under way and starts no further ones.
-    """
-    pieces = list(blocks(total, size))
-    threads = min(thread_count(), len(pieces))
-    if threads <= 1:
-        for piece in pieces:
-            work(piece)
-        return
-    pool = ThreadPoolExecutor(threads, thread_name_prefix="tofclip")
     try:
-        for _ in pool.map(work, pieces):
-            pass
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        return array_namespace(*arrays)
+    except TypeError as problem:
+        kinds = " and ".join(sorted({_library(array) for array in arrays}))
+        raise InputError(f"arrays of {kinds} do not work together; put all into one library") from problem
+
+
+def to_numpy(array: Array) -> NDArray[Any]:
+    """Return the values as a NumPy array, fetched from wherever they are; a NumPy array comes back as it is."""
+    if hasattr(array, "detach"):  # PyTorch: what was computed from a tensor with a gradient carries that along
+        array = array.detach().cpu()
+    elif hasattr(array, "get") and not is_numpy(array):  # CuPy copies nothing from the device unless told to
+        array = array.get()
+    values: NDArray[Any] = np.asarray(array)
+    return values
+
+
+def require_numpy(what: str, *arrays: Array) -> None:
+    """Refuse arrays of other libraries.
+
+    Parameters
+    ----------
+    what : str
+        What works on NumPy arrays only, as the message's subject.
+
+    Raises
+    ------
+    InputError
+        One of `arrays` is not NumPy's.
+    """
+    for array in arrays:
+        if not is_numpy(array):
+            raise InputError(f"{what} works on NumPy arrays, not on {_library(array)}'s; use tofclip.arrays.to_numpy")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where arrays live: a library and one of its devices.
+
+    Parameters
+    ----------
+    library : str
+        ``numpy``, ``cupy``, ``torch`` or another that follows the standard, by the name it is imported by.
+    device : object, optional
+        As the library has it; by default its own choice.
+    """
+
+    library: str = "numpy"
+    device: Any = None
+
+    @classmethod
+    def of(cls, array: Array) -> Place:
+        """Return where `array` lives."""
+        if is_numpy(array):
+            return cls()
+        from array_api_compat import device
+
+        return cls(_library(array), device(array))
+
+    @property
+    def has_compiled_loops(self) -> bool:
+        """Whether this package's compiled loops work on arrays from here."""
+        return self.library == "numpy"
+
+    def put(self, values: Array) -> Array:
+        """Return `values`, of any library, as an array that lives here, with the type they have."""
+        if self.library == "numpy":
+            return to_numpy(values)
+        if not is_numpy(values) and Place.of(values) == self:
+            return values
+        library = importlib.import_module(self.library)
+        # PyTorch warns of memory that it may not write to, and refuses steps backwards.
+        contiguous = np.require(to_numpy(values), requirements=["C", "W"])
+        return namespace(library.asarray([0.0])).asarray(contiguous, device=self.device)
+
+    def __str__(self) -> str:
+        return self.library if self.device is None else f"{self.library}:{self.device}"
+
+
+def place_named(name: str) -> Place:
+    """Return the place that a user asks for.
+
+    Parameters
+    ----------
+    name : str
+        ``cpu`` for NumPy and the compiled loops; ``cuda`` or ``cuda:1`` for a graphics processor, through CuPy or else
+        PyTorch; ``auto`` for a graphics processor where there is one, and ``cpu`` where there is none; or a library
+        with its own name of a device, such as ``torch:cpu`` or ``torch:mps``.
+
+    Raises
+    ------
+    InputError
+        Nothing is called that.
+    MissingDependencyError
+        The library is not installed, or finds no such device.
+    """
+    if name == "cpu":
+        return Place()
+    if name == "auto":
+        return next((place for library in GRAPHICS_LIBRARIES if (place := _graphics(library, 0))), Place())
+    kind, _, which = name.partition(":")
+    if kind == "cuda" and (which.isdecimal() or name == "cuda"):
+        number = int(which or 0)
+        for library in GRAPHICS_LIBRARIES:
+            if place := _graphics(library, number):
+                return place
+        raise MissingDependencyError(
+            f"no CUDA device {number} was found through CuPy or PyTorch; install tofclip[cuda], or use --device cpu"
+        )
+    if kind == "torch" and which:
+        return _torch_device(which)
+    raise InputError(f"'{name}' is no device; use cpu, cuda, cuda:1, auto or torch:DEVICE")
+
+
+def _library(array: Array) -> str:
+    return type(array).__module__.partition(".")[0]
+
+
+def _graphics(library: str, number: int) -> Place | None:
+    """CUDA device `number` through `library`, or None where that cannot be had."""
+    try:
+        module = importlib.import_module(library)
+        if library == "torch":
+            found = module.cuda.is_available() and number < module.cuda.device_count()
+            return Place(library, module.device("cuda", number)) if found else None
+        found = number < module.cuda.runtime.getDeviceCount()
+        return Place(library, module.cuda.Device(number)) if found else None
+    except Exception:
+        return None
+
+
+def _torch_device(name: str) -> Place:
+    try:
+        import torch
+    except ImportError as problem:
+        raise MissingDependencyError("PyTorch is not installed; pip install torch, or use --device cpu") from problem
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as problem:
+        raise MissingDependencyError(f"PyTorch finds no device '{name}' here; use --device cpu") from problem
+    return Place("torch", device)

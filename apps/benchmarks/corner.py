@@ -19,7 +19,7 @@ from nlos.plane import Plane
 from nlos.sampling import AliasingWarning
 from nlos.simulate import PointScene, relay_wall
 from nlos.time_axis import TimeAxis
-from tofclip.arrays import run_blocks, thread_count
+from tofclip.threads import run_blocks, thread_count
 
 CYCLES = 4.24
 BINS, BIN_WIDTH = 512, 32e-12

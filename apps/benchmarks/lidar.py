@@ -8,11 +8,11 @@ import numpy as np
 
 from apps.benchmarks.case import Case, Prepared
 from apps.benchmarks.recovery import dense_products, operator, readings
-from tofclip.arrays import run_blocks
 from tofclip.lidar import depth
 from tofclip.lidar.sequence import Jitter, Ranger, averaged, light_over_time
 from tofclip.simulate import default_instrument, default_scene, simulate, true_frames
 from tofclip.simulate.instrument import Instrument
+from tofclip.threads import run_blocks
 
 ROWS = (254, 1016)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tofclip import __version__
-from tofclip.arrays import thread_count
+from tofclip.threads import thread_count
 
 LIBRARIES = ("numpy", "scipy", "numba", "pyfftw", "h5py", "scikit-image")
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from apps.benchmarks.case import Case, Prepared
 from apps.benchmarks.peers import astra_seconds
-from tofclip.arrays import LANES, blocks, run_blocks
 from tofclip.camera import Camera
 from tofclip.operators import LineProjection
 from tofclip.recovery import Adjoint, LinearInverse, Method, Sparse, TotalVariation
 from tofclip.recovery.direct import DENSE_FRAMES
+from tofclip.threads import LANES, blocks, run_blocks
 
 ITERATIONS = 30
 FRAMES = (256, 1016)

@@ -14,7 +14,7 @@ from typing import Any
 from apps.benchmarks.case import Case
 from apps.benchmarks.machine import machine
 from apps.benchmarks.peers import PEERS_VARIABLE
-from tofclip.arrays import THREADS_VARIABLE, thread_count
+from tofclip.threads import THREADS_VARIABLE, thread_count
 
 LONGEST_SECONDS = 120
 ALL_SECONDS = 580

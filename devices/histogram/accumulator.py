@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import run_blocks, thread_count
 from tofclip.camera import Camera
 from tofclip.errors import InputError
+from tofclip.threads import run_blocks, thread_count
 from tofclip.transient import Streak
 
 MOST_CELLS = 1 << 26

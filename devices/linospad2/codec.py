@@ -34,9 +34,9 @@ from devices.linospad2.kernels import (
     decode_stamps,
     encode_stamps,
 )
-from tofclip.arrays import run_blocks
 from tofclip.errors import InputError
 from tofclip.storage import Scalar
+from tofclip.threads import run_blocks
 
 PIXELS = PIXEL_CONVERTERS * ADDRESSES
 FIRMWARES = ("2212b", "2212s")

@@ -13,8 +13,8 @@ from nlos.confocal.scan import ConfocalScan, confocal_support, onto_grid, padded
 from nlos.geometry import FloatArray, Grid
 from nlos.method import Progress, Support, silent
 from nlos.volume import Volume
-from tofclip.arrays import run_blocks, thread_count
 from tofclip.errors import InputError
+from tofclip.threads import run_blocks, thread_count
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

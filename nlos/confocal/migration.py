@@ -14,8 +14,8 @@ from nlos.geometry import Grid
 from nlos.method import Progress, Support, silent
 from nlos.plane import step
 from nlos.volume import Volume
-from tofclip.arrays import run_blocks, thread_count
 from tofclip.errors import InputError
+from tofclip.threads import run_blocks, thread_count
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from nlos.plane import Plane
 from nlos.propagation.kernels import LANES, STEPS, add_spherical_waves
-from tofclip.arrays import run_blocks
+from tofclip.threads import run_blocks
 
 FloatArray = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from nlos.propagation.kernels import join_terms
 from nlos.propagation.passage import Passage
 from nlos.rsd.blas import one_thread
 from nlos.rsd.inverse import inverse
-from tofclip.arrays import run_blocks
+from tofclip.threads import run_blocks
 
 IntArray = NDArray[np.int64]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.rsd.transfer import Transfer
-from tofclip.arrays import blocks, run_blocks
+from tofclip.threads import blocks, run_blocks
 
 FloatArray = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from nlos.band import Band
 from nlos.plane import Plane
 from nlos.propagation.kernels import shift_and_sum
-from tofclip.arrays import run_blocks
+from tofclip.threads import run_blocks
 
 FloatArray = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from nlos.depths import Depths
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.illumination import Illumination
 from nlos.rsd.meeting import Source
-from tofclip.arrays import run_blocks, thread_count
+from tofclip.threads import run_blocks, thread_count
 
 Array = NDArray[Any]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.propagation.kernels import LANES, STEPS, add_spherical_waves
-from tofclip.arrays import blocks, run_blocks
+from tofclip.threads import blocks, run_blocks
 
 Array = NDArray[Any]
 FloatArray = NDArray[np.float64]

@@ -14,7 +14,7 @@ from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.illumination import Illumination, constant, split
 from nlos.rsd.inverse import inverse
 from nlos.rsd.kernels import illuminate, scatter, transferred
-from tofclip.arrays import blocks, run_blocks
+from tofclip.threads import blocks, run_blocks
 
 FloatArray = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.plane import Plane
-from tofclip.arrays import run_blocks
+from tofclip.threads import run_blocks
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

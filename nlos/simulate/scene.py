@@ -14,8 +14,8 @@ from nlos.simulate.kernels import expose
 from nlos.simulate.surfaces import FloatArray, Surface
 from nlos.simulate.walls import wall_normals
 from nlos.time_axis import TimeAxis
-from tofclip.arrays import run_blocks
 from tofclip.errors import InputError
+from tofclip.threads import run_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
 OVERSAMPLING = 4

@@ -22,8 +22,8 @@ from devices.linospad2.codec import LinoSpad2Codec
 from devices.linospad2.simulation import LASER_PERIOD, uneven_board
 from devices.source import Info
 from devices.stream import Arrival, Buffering, StreamSource
-from tofclip.arrays import thread_count
 from tofclip.storage import Record
+from tofclip.threads import thread_count
 
 MEGA = 1e6
 STEADY_RATE = 25e6

@@ -31,7 +31,7 @@ from nlos.plane import Plane
 from nlos.sampling import AliasingWarning
 from nlos.simulate import PointScene
 from nlos.time_axis import TimeAxis
-from tofclip.arrays import thread_count
+from tofclip.threads import thread_count
 
 CYCLES = 4.24
 LASER = np.array([0.1, 0.05, 0.02])

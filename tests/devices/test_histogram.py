@@ -14,9 +14,9 @@ from devices.histogram import Accumulator, BinAxis, StampHistogram, TagHistogram
 from devices.linospad2.calibration import CLOCK_PERIOD, CODES, BoardCalibration
 from devices.linospad2.codec import STAMP, STAMP_WITH_COUNTER
 from devices.timetag.codec import DELTA, RECORD
-from tofclip.arrays import THREADS_VARIABLE
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
+from tofclip.threads import THREADS_VARIABLE
 
 unhurried = settings(deadline=None)  # the first call compiles
 PS = 1e-12

@@ -16,8 +16,8 @@ from devices.linospad2.calibration import CODES, BoardCalibration, load_calibrat
 from devices.linospad2.codec import FIRMWARES, MOST_TIMESTAMPS, LinoSpad2Codec
 from devices.linospad2.sidecar import read_sidecar
 from devices.registry import codec_named
-from tofclip.arrays import THREADS_VARIABLE
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
+from tofclip.threads import THREADS_VARIABLE
 
 unhurried = settings(deadline=None)  # the first call compiles
 

@@ -7,7 +7,6 @@ import pytest
 import scipy.optimize
 import scipy.sparse
 
-from tofclip.arrays import LANES
 from tofclip.operators import LineProjection, SparseMatrix, squared_norm
 from tofclip.recovery import (
     Fista,
@@ -20,6 +19,7 @@ from tofclip.recovery import (
     iterate,
     silent,
 )
+from tofclip.threads import LANES
 
 
 def identity(shape: tuple[int, int], dtype: type = np.float64) -> SparseMatrix:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofclip.arrays import LANES
 from tofclip.recovery import NonnegativeTotalVariation
+from tofclip.threads import LANES
 
 
 def denoise(picture: np.ndarray, weight: float, calls: int = 400, dtype: type = np.float64) -> tuple[np.ndarray, float]:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import run_blocks
 from tofclip.camera.model import Camera
 from tofclip.errors import CalibrationError, InputError, ShapeError
+from tofclip.threads import run_blocks
 
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]

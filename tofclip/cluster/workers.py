@@ -9,8 +9,8 @@ import threading
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from tofclip.arrays import THREADS_VARIABLE, thread_count
 from tofclip.errors import InputError, MissingDependencyError
+from tofclip.threads import THREADS_VARIABLE, thread_count
 from tofclip.version import __version__
 
 if TYPE_CHECKING:

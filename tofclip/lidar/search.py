@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import blocks, run_blocks
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.detection import Detection
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.returns import Returns
 from tofclip.lidar.traces import FrameTraces, Traces
+from tofclip.threads import blocks, run_blocks
 from tofclip.transient import Frames
 from tofclip.units import SPEED_OF_LIGHT
 

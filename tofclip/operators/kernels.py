@@ -22,8 +22,8 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from tofclip.arrays import LANES
 from tofclip.operators.radon import FRACTION_BITS
+from tofclip.threads import LANES
 
 UNROLL = 2  # independent accumulators, which hide the latency of the fused multiply-add
 INDEX = ir.IntType(64)

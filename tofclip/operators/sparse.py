@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import LANES, run_blocks
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators.base import Array, LinearOperator, Shape
+from tofclip.threads import LANES, run_blocks
 
 if TYPE_CHECKING:
     import scipy.sparse

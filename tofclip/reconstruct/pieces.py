@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import blocks
 from tofclip.camera import Camera, Measurement
 from tofclip.operators import LinearOperator
 from tofclip.reconstruct.focus import Piece
 from tofclip.recovery import Method, Progress, Result, relative_residual, silent
 from tofclip.recovery.iterative import ProximalMethod
+from tofclip.threads import blocks
 
 Array = NDArray[Any]
 

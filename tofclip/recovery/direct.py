@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import LANES, blocks, run_blocks
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator, SparseMatrix, squared_norm
 from tofclip.recovery.loop import Progress, Result, silent
 from tofclip.recovery.method import Array, Mask, checked_readings, full_block, write_frames
+from tofclip.threads import LANES, blocks, run_blocks
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController

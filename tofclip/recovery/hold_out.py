@@ -10,11 +10,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import thread_count
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator
 from tofclip.recovery.iterative import ProximalMethod
 from tofclip.recovery.method import Array
+from tofclip.threads import thread_count
 
 FIRST = 10**-1.75
 """Relative weight that is tried first."""

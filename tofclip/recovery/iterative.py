@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofclip.arrays import run_blocks
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, squared_norm
 from tofclip.recovery.data_terms import DataTermMaker, LeastSquares
@@ -16,6 +15,7 @@ from tofclip.recovery.fista import Fista
 from tofclip.recovery.loop import History, Progress, Result, Stopping, iterate, silent
 from tofclip.recovery.method import Array, Mask, checked_readings, full_block, write_frames
 from tofclip.recovery.proximal import NonnegativeSparsity, NonnegativeTotalVariation, Regulariser
+from tofclip.threads import run_blocks
 
 NORM_ITERATIONS = 15
 NORM_MARGIN = 1.02  # 15 power iterations on a nonnegative matrix are within 1 % of the largest eigenvalue

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tofclip.arrays import LANES
 from tofclip.operators.kernels import sparse_times_block
+from tofclip.threads import LANES
 
 TILE = 32
 

@@ -11,10 +11,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import LANES, blocks
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator
 from tofclip.recovery.loop import Progress, Result, silent
+from tofclip.threads import LANES, blocks
 
 Array = NDArray[Any]
 Mask = NDArray[np.bool_] | None

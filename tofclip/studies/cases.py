@@ -10,12 +10,12 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import thread_count
 from tofclip.clip_measurement import ClipMeasurement, Setup, measure, spoilt
 from tofclip.clip_recovery import ClipRecovery
 from tofclip.metrics import nmse
 from tofclip.studies.library import Library
 from tofclip.studies.outcome import Advance, Panel, Row
+from tofclip.threads import thread_count
 
 BORDER_PX = 12
 """Pixels that are not scored: views leave the picture there."""

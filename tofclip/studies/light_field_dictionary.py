@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import blocks
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
 from tofclip.light_field import LightField
+from tofclip.threads import blocks
 
 Array = NDArray[Any]
 

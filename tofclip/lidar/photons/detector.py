@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tofclip.arrays import blocks, run_blocks
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.pulse import Pulse, Table
+from tofclip.threads import blocks, run_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float64]

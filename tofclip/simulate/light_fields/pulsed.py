@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import run_blocks
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators.shear import View
 from tofclip.simulate.light_fields.array import CameraArray
 from tofclip.simulate.light_fields.bodies import Body
 from tofclip.simulate.light_fields.render import look
 from tofclip.simulate.render import FWHM_PER_SIGMA, gathered, share_rows
+from tofclip.threads import run_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
 Array = NDArray[Any]

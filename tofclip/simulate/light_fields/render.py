@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import run_blocks
 from tofclip.errors import InputError
 from tofclip.light_field import LightField
 from tofclip.operators.shear import View
 from tofclip.simulate.light_fields.array import CameraArray
 from tofclip.simulate.light_fields.bodies import Body
+from tofclip.threads import run_blocks
 
 Array = NDArray[Any]
 

@@ -1,0 +1,60 @@
+"""Blocks and threads: how a batch of pictures is cut up and shared between the processor's cores.
+
+The compiled kernels of this package are serial and release the interpreter lock; whoever has many frames cuts them
+into blocks and runs the blocks on a few Python threads. There is no second thread pool (OpenMP, numba's) to fight with.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+from tofclip.errors import InputError
+
+LANES = 32
+"""Frames per block: a row of a block is two full vectors of 512 bits, and a 174 x 174 picture stays in cache."""
+
+THREADS_VARIABLE = "TOFCLIP_THREADS"
+
+
+def thread_count() -> int:
+    """Threads to use: the environment's ``TOFCLIP_THREADS``, else one for each core this process may run on.
+
+    Raises
+    ------
+    InputError
+        The variable is not a positive whole number.
+    """
+    wanted = os.environ.get(THREADS_VARIABLE, "")
+    if not wanted:
+        affinity = getattr(os, "sched_getaffinity", None)
+        return len(affinity(0)) if affinity else os.cpu_count() or 1
+    if not wanted.isdecimal() or int(wanted) < 1:
+        raise InputError(f"{THREADS_VARIABLE} must be a positive whole number, got '{wanted}'")
+    return int(wanted)
+
+
+def blocks(total: int, size: int = LANES) -> Iterator[slice]:
+    """Cut ``range(total)`` into slices of at most `size`."""
+    for start in range(0, total, size):
+        yield slice(start, min(start + size, total))
+
+
+def run_blocks(work: Callable[[slice], None], total: int, size: int = LANES) -> None:
+    """Call `work` on every block of ``range(total)``, on `thread_count` threads; the first exception is raised.
+
+    An interruption (Ctrl-C) waits for the blocks under way and starts no further ones.
+    """
+    pieces = list(blocks(total, size))
+    threads = min(thread_count(), len(pieces))
+    if threads <= 1:
+        for piece in pieces:
+            work(piece)
+        return
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="tofclip")
+    try:
+        for _ in pool.map(work, pieces):
+            pass
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
