@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apps.viewer.source import FloatArray, Gate, View
 from tofclip.camera import Camera
-from tofclip.lidar import Detection, depth, point_cloud
+from tofclip.lidar import Detection, Returns, depth, point_cloud
 from tofclip.lidar.detection import BRIGHT_QUANTILE
 from tofclip.lidar.processing import selected
 from tofclip.recovery import LinearInverse
@@ -72,7 +72,7 @@ class LinearPath:
         least_intensity : float
             Weaker returns are left out: a dark gate does not tell by itself that it is dark. Counts, referred to 1 m.
         """
-        found = view_of(self.frames(readings, shear, self._wide_enough(gate)))
+        found = view_of(depth(self.frames(readings, shear, self._wide_enough(gate))))
         return found if least_intensity <= 0 else brighter(found, least_intensity)
 
     def _wide_enough(self, gate: Gate) -> Gate:
@@ -90,9 +90,8 @@ class LinearPath:
             return self._prepared[key]
 
 
-def view_of(frames: Frames) -> View:
-    """Locate the returns of frames and keep which pixel saw them."""
-    returns = depth(frames)
+def view_of(returns: Returns) -> View:
+    """Place returns in space and keep which pixel saw them."""
     return View(point_cloud(returns), np.stack([returns.y, returns.x], axis=-1))
 
 

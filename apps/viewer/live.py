@@ -6,13 +6,16 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
+from contextlib import closing
 
-from apps.viewer.linear_path import Readings
+from apps.viewer.linear_path import Readings, view_of
 from apps.viewer.shots import ShotSource
 from apps.viewer.source import View
 from tofclip.camera import Camera
 from tofclip.errors import InputError, TofclipError
+from tofclip.lidar.sequence import Ranger
 from tofclip.storage import one_line
+from tofclip.streaming import Stage, in_stages
 from tofclip.transient import Streak
 
 MOST_KEPT = 32
@@ -24,7 +27,10 @@ RATE_OVER = 8
 
 
 class LiveShots(ShotSource):
-    """Shots that an iterator delivers, recovered by a thread as they come; the last 32 can be looked at again.
+    """Shots that an iterator delivers, made into clouds as they come; the last 32 can be looked at again.
+
+    Reading, rectifying and ranging are stages side by side (`tofclip.streaming`). Shots that come faster than that are
+    dropped, the oldest that waits first, so that what one sees is never late.
 
     Parameters
     ----------
@@ -47,9 +53,11 @@ class LiveShots(ShotSource):
         self._kept: deque[tuple[Readings, View]] = deque(maxlen=MOST_KEPT)
         self._arrivals: deque[float] = deque(maxlen=RATE_OVER + 1)
         self._count, self._trouble = 0, ""
+        self._latency, self._lost = float("nan"), 0
+        self._ranger = Ranger(camera, first.times)
         self._lock, self._stopping = threading.Lock(), threading.Event()
         self._ended = False
-        self._take(first)
+        self._keep(self._ranged(self.rectified(first)))
         self._thread = threading.Thread(target=self._run, args=(shots,), name="live shots", daemon=True)
         self._thread.start()
 
@@ -72,6 +80,14 @@ class LiveShots(ShotSource):
             return (len(self._arrivals) - 1) / max(self._arrivals[-1] - self._arrivals[0], 1e-9)
 
     @property
+    def latency(self) -> float:
+        return self._latency
+
+    @property
+    def lost(self) -> int:
+        return self._lost
+
+    @property
     def trouble(self) -> str:
         return self._trouble
 
@@ -92,19 +108,23 @@ class LiveShots(ShotSource):
             return self._kept[min(max(place, 0), len(self._kept) - 1)]
 
     def _run(self, shots: Iterator[Streak]) -> None:
+        stages = Stage("rectify", self.rectified), Stage("range", self._ranged)
         try:
-            for shot in shots:
-                if self._stopping.is_set():
-                    break
-                self._take(shot)
+            with closing(in_stages(shots, stages, policy="drop_oldest")) as made:
+                for kept, passage in enumerate(made):
+                    if self._stopping.is_set():
+                        break
+                    self._latency, self._lost = passage.latency, passage.number - kept
+                    self._keep(passage.value)
         except TofclipError as fault:
             self._trouble = one_line(fault)
         finally:
             self._ended = True
 
-    def _take(self, shot: Streak) -> None:
-        readings = self.rectified(shot)
-        entry = (readings, self.linear.view(readings, 0.0, self._all))
+    def _ranged(self, readings: Readings) -> tuple[Readings, View]:
+        return readings, view_of(self._ranger.returns(readings))
+
+    def _keep(self, entry: tuple[Readings, View]) -> None:
         with self._lock:
             self._kept.append(entry)
             self._count += 1

@@ -164,9 +164,18 @@ class Page:
 
     def _status(self, shown: Shown, now: float) -> Status:
         source = self.session.source
-        rates = (source.data_rate, self._frames.per_second(now), self._pace.drawn.per_second(now))
         return Status(
-            self.session.label, shown.frame, len(source), len(shown.cloud), *rates, self._pace.latency, source.trouble
+            self.session.label,
+            shown.frame,
+            len(source),
+            len(shown.cloud),
+            source.data_rate,
+            self._frames.per_second(now),
+            self._pace.drawn.per_second(now),
+            self._pace.latency,
+            source.latency,
+            source.lost,
+            source.trouble,
         )
 
     def _show_panes(self, shown: Shown) -> None:

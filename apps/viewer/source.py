@@ -142,6 +142,16 @@ class Source(abc.ABC):
         return 0.0
 
     @property
+    def latency(self) -> float:
+        """Time from when a live shot was there until it could be shown, s; NaN where nothing comes in."""
+        return float("nan")
+
+    @property
+    def lost(self) -> int:
+        """Shots that came in too fast and were dropped."""
+        return 0
+
+    @property
     def trouble(self) -> str:
         """What ended a live source early, in a line; empty while all is well."""
         return ""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from apps.viewer.linear_path import SHEARS, LinearPath, Readings, least_intensity, view_of
 from apps.viewer.source import Abilities, Gate, Source, View, Waveform
-from tofclip.lidar import PointCloud
+from tofclip.lidar import PointCloud, depth
 from tofclip.transient import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -65,7 +65,7 @@ class TransientSource(Source):
 
     @functools.cached_property
     def _whole(self) -> View:
-        return view_of(self.frames)
+        return view_of(depth(self.frames))
 
     @functools.cached_property
     def _readings(self) -> Readings:

@@ -28,6 +28,10 @@ class Status:
         Frames per second that come in, that are sent to the page, and that it has drawn.
     latency : float
         From here to the page and back, s; NaN where nobody looks.
+    cloud_latency : float
+        From when a shot came in until its cloud was there, s; NaN where none comes in.
+    lost : int
+        Shots that came in too fast and were dropped.
     trouble : str
     """
 
@@ -39,6 +43,8 @@ class Status:
     frame_rate: float
     display_rate: float
     latency: float
+    cloud_latency: float = float("nan")
+    lost: int = 0
     trouble: str = ""
 
     @property
@@ -46,12 +52,14 @@ class Status:
         """The line, with ids for scripts."""
         colour = "#e5484d" if self.label == "LIVE" else "#3e8ed0"
         latency = f", there and back {1e3 * self.latency:.0f} ms" if np.isfinite(self.latency) else ""
+        lost = f", {self.lost} dropped" if self.lost else ""
+        coming = f"<br>shot to cloud {1e3 * self.cloud_latency:.0f} ms{lost}" if np.isfinite(self.cloud_latency) else ""
         trouble = f"<div style='color:#e5484d'>{html.escape(self.trouble)}</div>" if self.trouble else ""
         return (
             f"<div style='{STYLE}'><b id='label' style='color:{colour}'>{self.label}</b> "
             f"frame <b id='frame-number'>{self.frame}</b> of {self.frames}, <span id='points'>{self.points}</span> "
             f"points<br><span id='rates'>data {self.data_rate:.1f}/s, frames {self.frame_rate:.1f}/s, display "
-            f"{self.display_rate:.1f}/s{latency}</span>{trouble}</div>"
+            f"{self.display_rate:.1f}/s{latency}{coming}</span>{trouble}</div>"
         )
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from viewer_scenes import (
     BIN_WIDTH,
     FAR,
@@ -31,6 +34,7 @@ from apps.viewer.source import Gate, Source
 from apps.viewer.sources import Extras, open_source
 from apps.viewer.volume import PROJECTION, SLICE, SURFACE
 from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError, StorageError
+from tofclip.transient import Streak
 from tofclip.transient.stack import save_stack
 
 
@@ -238,6 +242,35 @@ def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
     session.follow()
     assert session.shown(0.0).frame == 2
     assert session.label == "REPLAY"  # nothing comes any more
+    source.close()
+
+
+def test_live_shots_that_come_too_fast_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    busy, came, go_on = threading.Event(), threading.Event(), threading.Event()
+
+    def shots() -> Iterator[Streak]:
+        for seed in range(12):
+            yield streak(seed)
+            busy.wait(20)
+        came.set()
+
+    def slowly(self: LiveShots, shot: Streak) -> NDArray[np.float32]:
+        if threading.current_thread() is not threading.main_thread():
+            busy.set()
+            go_on.wait(20)
+        return rectified(self, shot)
+
+    rectified = LiveShots.rectified
+    monkeypatch.setattr(LiveShots, "rectified", slowly)
+    source = LiveShots("test", shots(), camera(), streak(0))
+    assert came.wait(20)
+    go_on.set()
+    deadline = time.monotonic() + 20
+    while source.is_live and time.monotonic() < deadline:
+        time.sleep(0.01)
+    # one was being rectified, and one more could wait
+    assert (len(source), source.lost) == (3, 10)
+    assert 0 < source.latency < 20
     source.close()
 
 
