@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tofclip import arrays
-from tofclip.arrays import Place, is_numpy, namespace, place_named, require_numpy, to_numpy
+from tofclip.arrays import InEachPlace, Place, as_type, is_numpy, namespace, place_named, require_numpy, to_numpy, zeros
 from tofclip.errors import InputError, MissingDependencyError
 
 VALUES = np.arange(6, dtype=np.float32).reshape(2, 3)
@@ -59,7 +59,7 @@ def test_numpy_is_the_place_of_numpys_arrays(place):
 
 
 def test_libraries_do_not_mix(place):
-    with pytest.raises(InputError, match="numpy.* do not work together"):
+    with pytest.raises(InputError, match=r"numpy.* do not work together"):
         namespace(place.put(VALUES), VALUES)
 
 
@@ -67,6 +67,37 @@ def test_compiled_loops_refuse_what_is_not_numpys(place):
     require_numpy("the search", VALUES, [1.0])
     with pytest.raises(InputError, match="the search works on NumPy arrays, not on"):
         require_numpy("the search", VALUES, place.put(VALUES))
+
+
+def test_types_are_changed_where_the_array_is(place):
+    there = place.put(VALUES)
+    assert as_type(there, np.float32) is there
+    double = as_type(there, np.float64)
+    assert Place.of(double) == place
+    assert to_numpy(double).dtype == np.float64
+    np.testing.assert_array_equal(to_numpy(double), VALUES)
+
+
+def test_numpys_are_made_contiguous_with_their_type():
+    changed = as_type(VALUES.T, np.float64)
+    assert changed.flags.c_contiguous
+    np.testing.assert_array_equal(changed, VALUES.T)
+
+
+def test_zeros_are_like_what_they_are_for(place):
+    for like in (VALUES, place.put(VALUES)):
+        nothing = zeros((2, 1), like)
+        assert Place.of(nothing) == Place.of(like)
+        assert to_numpy(nothing).dtype == VALUES.dtype
+        np.testing.assert_array_equal(to_numpy(nothing), [[0], [0]])
+
+
+def test_what_is_set_up_in_a_place_is_set_up_once(place):
+    asked = []
+    copies = InEachPlace(lambda where: asked.append(where) or where.put(VALUES))
+    for array in (place.put(VALUES), VALUES, place.put(VALUES[0])):
+        assert Place.of(copies.beside(array)) == Place.of(array)
+    assert asked == [place, Place()]
 
 
 def test_a_tensor_with_a_gradient():

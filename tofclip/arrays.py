@@ -9,13 +9,16 @@ the device of the one that came in; what has only compiled loops refuses them (`
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from tofclip.errors import InputError, MissingDependencyError
+
+T = TypeVar("T")
 
 Array = Any
 """An array of any library that follows the array API standard."""
@@ -54,6 +57,26 @@ def to_numpy(array: Array) -> NDArray[Any]:
         array = array.get()
     values: NDArray[Any] = np.asarray(array)
     return values
+
+
+def as_type(array: Array, dtype: DTypeLike) -> Array:
+    """Return `array` in a NumPy type, in the library and on the device where it is; as it is if it has that type.
+
+    NumPy's come back contiguous, as compiled loops need them.
+    """
+    if is_numpy(array):
+        return np.ascontiguousarray(array, dtype)
+    xp = namespace(array)
+    return xp.astype(array, getattr(xp, np.dtype(dtype).name), copy=False)
+
+
+def zeros(shape: tuple[int, ...], like: Array) -> Array:
+    """Return zeros of the type of `like`, where `like` is."""
+    if is_numpy(like):
+        return np.zeros(shape, like.dtype)
+    from array_api_compat import device
+
+    return namespace(like).zeros(shape, dtype=like.dtype, device=device(like))
 
 
 def require_numpy(what: str, *arrays: Array) -> None:
@@ -118,6 +141,28 @@ class Place:
         return self.library if self.device is None else f"{self.library}:{self.device}"
 
 
+class InEachPlace(Generic[T]):
+    """What is set up once in each place where it is needed, such as the copy of an array.
+
+    Parameters
+    ----------
+    make : callable
+        Sets it up in the `Place` that it is given.
+    """
+
+    def __init__(self, make: Callable[[Place], T]) -> None:
+        self._make = make
+        self._made: dict[str, T] = {}
+
+    def beside(self, array: Array) -> T:
+        """Return what belongs where `array` lives."""
+        place = Place.of(array)
+        name = str(place)  # not every library's devices can be looked up in a dictionary
+        if name not in self._made:
+            self._made[name] = self._make(place)
+        return self._made[name]
+
+
 def place_named(name: str) -> Place:
     """Return the place that a user asks for.
 
@@ -126,7 +171,7 @@ def place_named(name: str) -> Place:
     name : str
         ``cpu`` for NumPy and the compiled loops; ``cuda`` or ``cuda:1`` for a graphics processor, through CuPy or else
         PyTorch; ``auto`` for a graphics processor where there is one, and ``cpu`` where there is none; or a library
-        with its own name of a device, such as ``torch:cpu`` or ``torch:mps``.
+        with its own name of a device, such as ``torch:cpu`` or ``torch:xpu``.
 
     Raises
     ------
@@ -176,8 +221,10 @@ def _torch_device(name: str) -> Place:
     except ImportError as problem:
         raise MissingDependencyError("PyTorch is not installed; pip install torch, or use --device cpu") from problem
     try:
-        device = torch.device(name)
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as problem:
-        raise MissingDependencyError(f"PyTorch finds no device '{name}' here; use --device cpu") from problem
+        # Sums are taken in double precision, which some devices do not have. The array knows its device's number.
+        device = torch.zeros(1, dtype=torch.float64, device=name).device
+    except (RuntimeError, AssertionError, NotImplementedError, TypeError) as problem:
+        raise MissingDependencyError(
+            f"PyTorch finds no device '{name}' with float64 here; use --device cpu"
+        ) from problem
     return Place("torch", device)

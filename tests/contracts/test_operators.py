@@ -1,4 +1,7 @@
-"""The contract of linear operators: every operator of the package is listed here and passes all of it."""
+"""The contract of linear operators: every operator of the package is listed here and passes all of it.
+
+On NumPy's arrays all of them, those that are portable on the arrays of other libraries as well.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import pytest
 
 from nlos import Capture, Grid, Hybrid
 from nlos.refinement.model import WallModel
+from tofclip.arrays import Place, is_numpy, to_numpy
 from tofclip.errors import InputError, ShapeError, TofclipError
 from tofclip.operators import (
     BlockDiagonal,
@@ -195,19 +199,39 @@ def hidden_to_scanned_wall(dtype: type) -> LinearOperator:
     return hidden_to_wall(None, dtype)
 
 
-BUILDERS: list[Callable[[type], LinearOperator]] = [
+def views_of_their_own(dtype: type) -> LinearOperator:
+    return BlockDiagonal([LineProjection((5, 7), 9 + k, [4.0], [0.1 * k], [1.0], dtype) for k in range(3)])
+
+
+def views_on_one_slit(dtype: type) -> LinearOperator:
+    return Integration([LineProjection((5, 7), 9, [4.0], [0.1 * k], [1.0], dtype) for k in range(3)])
+
+
+def unseen_pixels_and_empty_readings(dtype: type) -> LinearOperator:
+    return LineProjection((5, 7), 40, [20.0, 43.0], [0.3, 0.0], [1.0, 2.0], dtype)
+
+
+PORTABLE: list[Callable[[type], LinearOperator]] = [
     line_projection,
     sparse_matrix,
     many_tiles,
-    view_selection,
     diagonal,
     composition,
     stack,
     adjoint,
     normal,
+    radon_projection,
+    views_of_their_own,
+    views_on_one_slit,
+    unseen_pixels_and_empty_readings,
+    reshape,
+    identity,
+]
+BUILDERS: list[Callable[[type], LinearOperator]] = [
+    *PORTABLE,
+    view_selection,
     linear_shear,
     fourier_shear,
-    radon_projection,
     hadamard_codes,
     random_codes,
     mean_weighting,
@@ -224,16 +248,32 @@ BUILDERS: list[Callable[[type], LinearOperator]] = [
     weighted_views,
     masked_views,
     sheared_views,
-    reshape,
-    identity,
     hidden_to_lit_wall,
     hidden_to_scanned_wall,
 ]
 BATCHES = [(), (1,), (3,), (32,), (33,)]
 
 every_operator = pytest.mark.parametrize("build", BUILDERS, ids=lambda build: build.__name__)
+everywhere = pytest.mark.parametrize(
+    ("build", "library"),
+    [(build, "numpy") for build in BUILDERS]
+    + [(build, library) for build in PORTABLE for library in ("array_api_strict", "torch")],
+    ids=lambda value: value if isinstance(value, str) else value.__name__,
+)
 both_types = pytest.mark.parametrize("dtype", [np.float32, np.float64])
 every_batch = pytest.mark.parametrize("batch", BATCHES, ids=str)
+
+
+def put(library: str, *arrays: np.ndarray) -> tuple[object, ...]:
+    """The same values as arrays of a library."""
+    pytest.importorskip(library, reason="only where it is installed")
+    return tuple(Place(library).put(array) for array in arrays)
+
+
+def fetched(library: str, array: object) -> np.ndarray:
+    """Values of a result, which has to be of the library that the operand was of."""
+    assert Place.of(array).library == library
+    return to_numpy(array)
 
 
 def tolerance(dtype: type) -> float:
@@ -247,54 +287,58 @@ def random_pair(operator: LinearOperator, batch: tuple[int, ...]) -> tuple[np.nd
     return rng.random((*operator.shape_in, *batch)), rng.random((*operator.shape_out, *batch))
 
 
-@every_operator
+@everywhere
 @both_types
 @every_batch
-def test_adjoint_matches_forward(build, dtype, batch):
+def test_adjoint_matches_forward(build, library, dtype, batch):
     operator = build(dtype)
     x, y = random_pair(operator, batch)
-    forward, backward = np.vdot(operator(x), y), np.vdot(x, operator.adjoint(y))
-    scale = np.linalg.norm(operator(x)) * np.linalg.norm(y)
+    x_there, y_there = put(library, x, y)
+    seen, back = fetched(library, operator(x_there)), fetched(library, operator.adjoint(y_there))
+    forward, backward = np.vdot(seen, y), np.vdot(x, back)
+    scale = np.linalg.norm(seen) * np.linalg.norm(y)
     assert abs(forward - backward) <= tolerance(dtype) * scale, f"adjoint is off by a factor {backward / forward}"
 
 
-@every_operator
+@everywhere
 @both_types
-def test_linear(build, dtype):
+def test_linear(build, library, dtype):
     operator = build(dtype)
     a, _ = random_pair(operator, (3,))
     b = a[::-1] ** 2
-    whole = operator(2.5 * a - 1.5 * b)
-    parts = 2.5 * operator(a) - 1.5 * operator(b)
-    assert np.linalg.norm(whole - parts) <= 10 * tolerance(dtype) * np.linalg.norm(operator(a) + operator(b))
+    of_both, of_a, of_b = (fetched(library, operator(*put(library, x))) for x in (2.5 * a - 1.5 * b, a, b))
+    parts = 2.5 * of_a - 1.5 * of_b
+    assert np.linalg.norm(of_both - parts) <= 10 * tolerance(dtype) * np.linalg.norm(of_a + of_b)
 
 
-@every_operator
+@everywhere
 @both_types
 @every_batch
-def test_result_has_the_stated_shape_and_type(build, dtype, batch):
+def test_result_has_the_stated_shape_and_type(build, library, dtype, batch):
     operator = build(dtype)
-    x, y = random_pair(operator, batch)
-    assert operator(x).shape == (*operator.shape_out, *batch)
-    assert operator.adjoint(y).shape == (*operator.shape_in, *batch)
-    assert operator(x).dtype == operator.adjoint(y).dtype == operator.dtype == dtype
+    x, y = put(library, *random_pair(operator, batch))
+    seen, back = fetched(library, operator(x)), fetched(library, operator.adjoint(y))
+    assert seen.shape == (*operator.shape_out, *batch)
+    assert back.shape == (*operator.shape_in, *batch)
+    assert seen.dtype == back.dtype == operator.dtype == dtype
 
 
-@every_operator
+@everywhere
 @both_types
-def test_every_frame_of_a_batch_is_treated_alone(build, dtype):
+def test_every_frame_of_a_batch_is_treated_alone(build, library, dtype):
     operator = build(dtype)
-    x, y = random_pair(operator, (35,))
+    x, y = put(library, *random_pair(operator, (35,)))
     forward, backward = operator(x), operator.adjoint(y)
     for frame in (0, 31, 32, 34):
-        for whole, alone in ((forward, operator(x[..., frame])), (backward, operator.adjoint(y[..., frame]))):
+        pairs = ((forward, operator(x[..., frame])), (backward, operator.adjoint(y[..., frame])))
+        for whole, alone in ((to_numpy(whole), to_numpy(alone)) for whole, alone in pairs):
             # Relative to the largest value: where terms cancel, a small one is only as exact as they are.
             bound = tolerance(dtype) * np.abs(alone).max()
             np.testing.assert_allclose(whole[..., frame], alone, rtol=tolerance(dtype), atol=bound)
 
 
-@every_operator
-def test_refuses_every_other_shape(build):
+@everywhere
+def test_refuses_every_other_shape(build, library):
     operator = build(np.float32)
     wrong = [
         (),
@@ -305,22 +349,55 @@ def test_refuses_every_other_shape(build):
     ]
     for shape in wrong:
         with pytest.raises(ShapeError, match="must have shape"):
-            operator(np.zeros(shape))
+            operator(*put(library, np.zeros(shape)))
     with pytest.raises(ShapeError, match="must have shape"):
-        operator.adjoint(np.zeros((operator.shape_out[0] + 1, *operator.shape_out[1:])))
+        operator.adjoint(*put(library, np.zeros((operator.shape_out[0] + 1, *operator.shape_out[1:]))))
     with pytest.raises(InputError, match="must be real"):
-        operator(np.zeros(operator.shape_in, complex))
+        operator(*put(library, np.zeros(operator.shape_in, complex)))
+
+
+@everywhere
+def test_leaves_its_input_alone(build, library):
+    operator = build(np.float32)
+    x_before, y_before = (array.astype(np.float32) for array in random_pair(operator, (32,)))
+    x, y = put(library, x_before.copy(), y_before.copy())
+    operator(x)
+    operator.adjoint(y)
+    np.testing.assert_array_equal(to_numpy(x), x_before)
+    np.testing.assert_array_equal(to_numpy(y), y_before)
+
+
+@pytest.mark.parametrize("build", PORTABLE, ids=lambda build: build.__name__)
+@pytest.mark.parametrize("library", ["array_api_strict", "torch"])
+def test_other_libraries_get_what_numpy_gets(build, library):
+    operator = build(np.float32)
+    x, y = (array.astype(np.float32) for array in random_pair(operator, (5,)))
+    x_there, y_there = put(library, x, y)
+    for there, here in ((operator(x_there), operator(x)), (operator.adjoint(y_there), operator.adjoint(y))):
+        # Sums of up to some hundred terms in float32, added in another order.
+        np.testing.assert_allclose(to_numpy(there), here, rtol=1e-5, atol=1e-5 * np.abs(here).max())
+
+
+@pytest.mark.parametrize("library", ["array_api_strict", "torch"])
+def test_entries_that_are_given_twice_and_out_of_order_count_together(library):
+    import scipy.sparse
+
+    matrix = scipy.sparse.csr_array((np.array([1.0, 2, 4, 8]), [3, 0, 3, 1], [0, 3, 4]), shape=(2, 4))
+    assert not matrix.has_canonical_format
+    (picture,) = put(library, np.array([1.0, 10, 100, 1000]))
+    np.testing.assert_array_equal(to_numpy(SparseMatrix(matrix, (4,), (2,))(picture)), [5002, 80])
 
 
 @every_operator
-def test_leaves_its_input_alone(build):
+def test_what_has_only_compiled_loops_refuses_other_arrays(build):
     operator = build(np.float32)
-    x, y = (array.astype(np.float32) for array in random_pair(operator, (32,)))
-    x_before, y_before = x.copy(), y.copy()
-    operator(x)
-    operator.adjoint(y)
-    np.testing.assert_array_equal(x, x_before)
-    np.testing.assert_array_equal(y, y_before)
+    assert operator.portable == (build in PORTABLE)
+    if not operator.portable:
+        x, y = put("array_api_strict", *random_pair(operator, ()))
+        for apply, operand in ((operator, x), (operator.adjoint, y)):
+            with pytest.raises(InputError, match="works on NumPy arrays, not on array_api_strict's"):
+                apply(operand)
+        assert is_numpy(operator(to_numpy(x)))
 
 
 def test_composed_with_the_identity_an_operator_is_itself():

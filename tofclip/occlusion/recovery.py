@@ -130,4 +130,5 @@ def _moved(cover: Array, shear: float, view: View) -> Array:
     """Return a cover as seen from elsewhere; nothing, if it has left the picture."""
     if any(abs(shear * step) >= size for step, size in zip(view, cover.shape, strict=True)):
         return np.zeros_like(cover)
-    return LinearShear(cover.shape, shear, view)(cover)
+    moved: Array = LinearShear(cover.shape, shear, view)(cover)
+    return moved

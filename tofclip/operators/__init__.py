@@ -2,19 +2,17 @@
 
 from tofclip.operators.base import (
     Adjoint,
-    BlockDiagonal,
     Composition,
     Diagonal,
     Identity,
-    Integration,
     LinearOperator,
     Reshape,
-    Stack,
     squared_norm,
 )
 from tofclip.operators.coded_lines import SliceConvolution
 from tofclip.operators.coded_views import MaskedViews, ShearedViews, WeightedViews
 from tofclip.operators.convolution import PointSpreadConvolution
+from tofclip.operators.joined import BlockDiagonal, Integration, Stack
 from tofclip.operators.projection import LineProjection
 from tofclip.operators.radon import RadonProjection
 from tofclip.operators.selection import ViewSelection

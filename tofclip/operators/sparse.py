@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import Array, InEachPlace, Place, is_numpy, namespace
 from tofclip.errors import InputError, ShapeError
-from tofclip.operators.base import Array, LinearOperator, Shape
+from tofclip.operators.base import LinearOperator, Shape
+from tofclip.operators.portable import Product, portable_product
 from tofclip.threads import LANES, run_blocks
 
 if TYPE_CHECKING:
@@ -22,8 +24,9 @@ TILE_BYTES = 1 << 19  # half of a present-day core's second-level cache
 class SparseMatrix(LinearOperator):
     """A CSR matrix and its transpose, applied to blocks of frames.
 
-    Matrix and transpose are cut up on first use, so that forward and adjoint are one gathering product on blocks;
-    memory is 8 bytes per nonzero and side in float32. A lone picture goes through scipy's own product.
+    Matrix and transpose are set up on first use, for each library and device whose arrays come in, so that forward and
+    adjoint are one gathering product on blocks. Memory is 8 bytes per nonzero and side in float32, in each place. A
+    lone NumPy picture goes through scipy's own product.
 
     Parameters
     ----------
@@ -31,6 +34,8 @@ class SparseMatrix(LinearOperator):
         float32 or float64, with as many columns as `shape_in` has elements and rows as `shape_out`.
     shape_in, shape_out : tuple of int
     """
+
+    portable = True
 
     def __init__(self, matrix: scipy.sparse.csr_array, shape_in: Shape, shape_out: Shape) -> None:
         super().__init__(shape_in, shape_out, matrix.dtype)
@@ -50,22 +55,22 @@ class SparseMatrix(LinearOperator):
         return self._given
 
     @cached_property
-    def _rows(self) -> Tiles:
-        return Tiles.of(self.matrix)
+    def _rows(self) -> InEachPlace[Product]:
+        return InEachPlace(lambda place: product_in(place, self.matrix))
 
     @cached_property
-    def _columns(self) -> Tiles:
-        return Tiles.of(self.matrix.T.tocsr())
+    def _columns(self) -> InEachPlace[Product]:
+        return InEachPlace(lambda place: product_in(place, self.matrix.T.tocsr()))
 
     def _forward(self, block: Array) -> Array:
-        if block.shape[-1] == 1:
+        if block.shape[-1] == 1 and is_numpy(block):
             return self._lone_forward(block[..., 0])[..., np.newaxis]
-        return self._product(self._rows, block, self.shape_in, self.shape_out)
+        return _applied(self._rows.beside(block), block, self.shape_out)
 
     def _adjoint(self, block: Array) -> Array:
-        if block.shape[-1] == 1:
+        if block.shape[-1] == 1 and is_numpy(block):
             return self._lone_adjoint(block[..., 0])[..., np.newaxis]
-        return self._product(self._columns, block, self.shape_out, self.shape_in)
+        return _applied(self._columns.beside(block), block, self.shape_in)
 
     def _lone_forward(self, picture: Array) -> Array:
         """Apply to a lone array: there are no neighbouring frames to share a vector instruction with."""
@@ -76,27 +81,48 @@ class SparseMatrix(LinearOperator):
         product: Array = self.matrix.T @ readings.reshape(-1)
         return product.reshape(self.shape_in)
 
-    def _product(self, tiles: Tiles, block: Array, source: Shape, target: Shape) -> Array:
+
+def product_in(place: Place, matrix: scipy.sparse.csr_array) -> Product:
+    """Set up the product with `matrix` for the arrays of a place."""
+    return TiledProduct(matrix) if place.has_compiled_loops else portable_product(matrix, place)
+
+
+def _applied(product: Product, block: Array, target: Shape) -> Array:
+    xp = namespace(block)
+    return xp.reshape(product(xp.reshape(block, (-1, block.shape[-1]))), (*target, -1))
+
+
+class TiledProduct:
+    """The product with a CSR matrix on NumPy arrays, by compiled loops on blocks of frames.
+
+    Parameters
+    ----------
+    matrix : CSR matrix
+    """
+
+    def __init__(self, matrix: scipy.sparse.csr_array) -> None:
+        self._tiles, self._count = Tiles.of(matrix), matrix.shape[0]
+
+    def __call__(self, block: NDArray[Any]) -> NDArray[Any]:
+        """Multiply a (columns, frames) block."""
         from tofclip.operators.kernels import sparse_times_block
 
-        batch, rows = block.shape[-1], int(np.prod(target))
-        flat = block.reshape(-1, batch)
+        rows, batch = self._count, block.shape[-1]
+        result = np.empty((rows, batch), block.dtype)
         if batch == LANES:
-            whole = np.empty((rows, LANES), self.dtype)
-            sparse_times_block(*tiles, flat, whole)
-            return whole.reshape(*target, batch)
-        result = np.empty((rows, batch), self.dtype)
+            sparse_times_block(*self._tiles, block, result)
+            return result
 
         def work(piece: slice) -> None:
             lanes = piece.stop - piece.start
-            padded = np.zeros((flat.shape[0], LANES), self.dtype)
-            padded[:, :lanes] = flat[:, piece]
-            product = np.empty((rows, LANES), self.dtype)
-            sparse_times_block(*tiles, padded, product)
+            padded = np.zeros((block.shape[0], LANES), block.dtype)
+            padded[:, :lanes] = block[:, piece]
+            product = np.empty((rows, LANES), block.dtype)
+            sparse_times_block(*self._tiles, padded, product)
             result[:, piece] = product[:, :lanes]
 
         run_blocks(work, batch)
-        return result.reshape(*target, batch)
+        return result
 
 
 class Tiles(NamedTuple):

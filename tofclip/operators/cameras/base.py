@@ -10,7 +10,8 @@ from typing import ClassVar
 import numpy as np
 
 from tofclip.errors import InputError
-from tofclip.operators.base import BlockDiagonal, Identity, LinearOperator
+from tofclip.operators.base import Identity, LinearOperator
+from tofclip.operators.joined import BlockDiagonal
 from tofclip.operators.shear import View
 
 

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import InputError
-from tofclip.operators.base import Diagonal, LinearOperator, Stack
+from tofclip.operators.base import Diagonal, LinearOperator
 from tofclip.operators.cameras.base import LightFieldCamera
 from tofclip.operators.coded_views import MaskedViews, ShearedViews, WeightedViews, sheared_mask
+from tofclip.operators.joined import Stack
 from tofclip.operators.sensors import DenseSensor
 from tofclip.operators.shear import View
 

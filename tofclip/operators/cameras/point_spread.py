@@ -8,9 +8,10 @@ from typing import ClassVar
 import numpy as np
 
 from tofclip.errors import InputError
-from tofclip.operators.base import Integration, LinearOperator
+from tofclip.operators.base import LinearOperator
 from tofclip.operators.cameras.base import LightFieldCamera
 from tofclip.operators.convolution import PointSpreadConvolution
+from tofclip.operators.joined import Integration
 from tofclip.operators.point_spreads import (
     ApertureElement,
     CodedAperture,

@@ -7,8 +7,9 @@ from typing import ClassVar
 import numpy as np
 
 from tofclip.errors import InputError
-from tofclip.operators.base import LinearOperator, Stack
+from tofclip.operators.base import LinearOperator
 from tofclip.operators.cameras.base import LightFieldCamera
+from tofclip.operators.joined import Stack
 from tofclip.operators.shear import LinearShear, View
 from tofclip.operators.single_pixel import HadamardCodes
 from tofclip.operators.weighting import MeanWeighting
