@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from nlos.filtered import FilteredBackprojection
     from nlos.geometry import Grid
     from nlos.hybrid import Hybrid
+    from nlos.portable.prepared import PreparedImaging
     from nlos.propagation.propagate import propagate
     from nlos.refinement.refine import Refinement
     from nlos.rsd.planar import PlanarRSD
@@ -40,6 +41,7 @@ __all__ = [
     "Hybrid",
     "LightCone",
     "PlanarRSD",
+    "PreparedImaging",
     "Refinement",
     "TransientImaging",
     "TransientVideo",
@@ -56,6 +58,7 @@ _HOMES = {
     "Hybrid": "nlos.hybrid",
     "LightCone": "nlos.confocal.light_cone",
     "PlanarRSD": "nlos.rsd.planar",
+    "PreparedImaging": "nlos.portable.prepared",
     "Refinement": "nlos.refinement.refine",
     "TransientImaging": "nlos.video",
     "TransientVideo": "nlos.video",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.time_axis import TimeAxis
+from tofclip.arrays import Array, Place, is_numpy, namespace, require_numpy, to_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
 
@@ -41,7 +42,8 @@ class Capture:
     Parameters
     ----------
     signal : (t, ...) array
-        Brightness per time bin and wall point, kept as float32. May be negative (background taken off).
+        Brightness per time bin and wall point, kept as float32. May be negative (background taken off). An array of
+        another library stays where it is, and is imaged there by the methods that can; the geometry is NumPy's.
     wall : (..., 3) array
         Wall points, m. Points with a NaN coordinate are left out, whatever their signal holds.
     laser : (3,) or (..., 3) array
@@ -60,7 +62,7 @@ class Capture:
         durations are not in metres or seconds, or the laser spot lies far behind the wall.
     """
 
-    signal: NDArray[np.float32]
+    signal: Array
     wall: FloatArray
     laser: FloatArray
     bin_width: float
@@ -68,7 +70,7 @@ class Capture:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "signal", _real(self.signal, np.float32, "signal"))
+        object.__setattr__(self, "signal", _signal(self.signal))
         object.__setattr__(self, "wall", _real(self.wall, np.float64, "wall"))
         object.__setattr__(self, "laser", _real(self.laser, np.float64, "laser"))
         object.__setattr__(self, "bin_width", float(self.bin_width))
@@ -89,7 +91,7 @@ class Capture:
         self._validate_units()
         if not np.any(self.valid):
             raise InputError("every wall point is NaN: nothing is left to image with")
-        bad = int(np.count_nonzero(~np.isfinite(self.signal[:, self.valid])))
+        bad = _not_finite(self.signal, self.valid)
         if bad:
             raise InputError(
                 f"{bad} samples of the signal are NaN or infinite; set them to 0, or their wall points to NaN"
@@ -142,6 +144,15 @@ class Capture:
         return cls(signal, *pairs, bin_width, start, provenance or {})
 
     @property
+    def place(self) -> Place:
+        """Where the signal lives: library and device."""
+        return Place.of(self.signal)
+
+    def on(self, place: Place) -> Capture:
+        """Return the capture with its signal brought to a place, such as ``tofclip.arrays.place_named("cuda")``."""
+        return replace(self, signal=place.put(self.signal))
+
+    @property
     def axis(self) -> TimeAxis:
         """The time axis."""
         return TimeAxis(self.signal.shape[0], self.bin_width, self.start)
@@ -175,9 +186,11 @@ class Capture:
     def traces(self, selection: slice = slice(None)) -> NDArray[np.float32]:
         """Signals of some valid wall points, in the order of `points`, shape (points, t).
 
-        All signals of a complete wall are not copied: then time is the slow axis in memory.
+        All signals of a complete wall are not copied: then time is the slow axis in memory. Refuses signals of other
+        libraries.
         """
-        in_time = self.signal.reshape(self.signal.shape[0], -1)
+        require_numpy("this treatment of a capture's signal", self.signal)
+        in_time: NDArray[np.float32] = self.signal.reshape(self.signal.shape[0], -1)
         if selection == slice(None) and self.valid.all():
             return in_time.T
         return np.ascontiguousarray(in_time[:, np.flatnonzero(self.valid)[selection]].T)
@@ -206,7 +219,7 @@ class Capture:
         """Return everything that has to be stored."""
         names = ("row", "column") if self.wall.ndim == 3 else tuple(f"wall_{i}" for i in range(self.wall.ndim - 1))
         fields = {
-            "signal": Field(self.signal, "count", ("time", *names)),
+            "signal": Field(to_numpy(self.signal), "count", ("time", *names)),
             "wall": Field(self.wall, "m", (*names, "xyz")),
             "laser": Field(self.laser, "m", ("xyz",) if self.laser.ndim == 1 else (*names, "xyz")),
         }
@@ -234,6 +247,24 @@ class Capture:
     def load(cls, path: str | Path) -> Capture:
         """Read a capture that `save` wrote."""
         return cls.from_record(Record.load(path, "capture"))
+
+
+def _signal(values: Any) -> Array:
+    if is_numpy(values):
+        return _real(values, np.float32, "signal")
+    xp = namespace(values)
+    if not xp.isdtype(values.dtype, ("real floating", "integral", "bool")):
+        raise InputError(f"signal must hold real numbers, got {values.dtype}")
+    return xp.astype(values, xp.float32, copy=False)
+
+
+def _not_finite(signal: Array, valid: NDArray[np.bool_]) -> int:
+    """Count the samples (t, ...) that are NaN or infinite at valid wall points."""
+    if is_numpy(signal):
+        return int(np.count_nonzero(~np.isfinite(signal[:, valid])))
+    xp = namespace(signal)
+    bad = ~xp.isfinite(signal) & Place.of(signal).put(valid)
+    return int(xp.sum(xp.astype(bad, xp.int64)))
 
 
 def _real(values: Any, dtype: type, name: str) -> NDArray[Any]:

@@ -38,16 +38,16 @@ class Depths:
 
     def to_waves(self, values: Array) -> Array:
         """Return the plane waves (waves, frequencies) of a field (y, x, frequencies) on the plane."""
-        along_y, along_x = self._from_plane
+        along_y, along_x = self.from_plane
         half = (along_y @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])
-        spectrum: Array = (along_x @ half).reshape(-1, values.shape[-1])[self._cell]
+        spectrum: Array = (along_x @ half).reshape(-1, values.shape[-1])[self.cell]
         return spectrum * self._share
 
     def to_waves_adjoint(self, spectrum: Array) -> Array:
         """Apply the adjoint of `to_waves`: the field (y, x, frequencies) on the plane."""
-        along_y, along_x = self._from_plane
+        along_y, along_x = self.from_plane
         full = np.zeros((len(along_y) * len(along_x), spectrum.shape[1]), self.dtype)
-        full[self._cell] = spectrum * self._share
+        full[self.cell] = spectrum * self._share
         half = along_x.conj().T @ full.reshape(len(along_y), len(along_x), -1)
         values: Array = along_y.conj().T @ half.reshape(len(along_y), -1)
         return values.reshape(*self.way.plane.shape, -1)
@@ -61,17 +61,17 @@ class Depths:
 
     def to_images(self, terms: Array) -> Array:
         """Return the images (m, y, x) on the voxels of sums (waves, m) of plane waves."""
-        along_y, along_x = self._to_voxels
+        along_y, along_x = self.to_voxels
         spectra = np.zeros((terms.shape[1], len(along_y) * len(along_x)), self.dtype)
-        spectra[:, self._cell] = terms.T
+        spectra[:, self.cell] = terms.T
         images: Array = along_y.T @ spectra.reshape(-1, len(along_y), len(along_x)) @ along_x
         return images
 
     def to_images_adjoint(self, images: Array) -> Array:
         """Apply the adjoint of `to_images`: plane waves (waves, m) of images (m, y, x)."""
-        along_y, along_x = self._to_voxels
+        along_y, along_x = self.to_voxels
         spectra = along_y.conj() @ images @ along_x.conj().T
-        terms: Array = spectra.reshape(len(images), -1)[:, self._cell].T
+        terms: Array = spectra.reshape(len(images), -1)[:, self.cell].T
         return terms
 
     @cached_property
@@ -81,7 +81,7 @@ class Depths:
         return int(np.abs(waves.row).max()), int(np.abs(waves.column).max())
 
     @cached_property
-    def _cell(self) -> NDArray[np.int64]:
+    def cell(self) -> NDArray[np.int64]:
         """Place of every wave in a full rectangle of them."""
         waves, (rows, columns) = self.way.plane_waves, self._reach
         return np.asarray((waves.row + rows) * (2 * columns + 1) + waves.column + columns)
@@ -94,12 +94,12 @@ class Depths:
         return (travels / np.prod(waves.period)).astype(np.zeros(0, self.dtype).real.dtype)
 
     @cached_property
-    def _from_plane(self) -> tuple[Array, Array]:
+    def from_plane(self) -> tuple[Array, Array]:
         """``exp(-1j * q * r)`` along y and along x of the plane's points."""
         return self._waves_at((self.way.plane.y, self.way.plane.x), -1)
 
     @cached_property
-    def _to_voxels(self) -> tuple[Array, Array]:
+    def to_voxels(self) -> tuple[Array, Array]:
         """``exp(+1j * q * r)`` along y and along x of the voxels."""
         return self._waves_at((self.way.grid.y, self.way.grid.x), 1)
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.plane import evenly_spaced, step
+from tofclip.arrays import to_numpy
 from tofclip.errors import InputError
 from tofclip.storage import atomic_path
 
@@ -133,7 +134,7 @@ def _write_vti(volume: Volume, path: Path) -> None:
 def _write_npz(volume: Volume, path: Path) -> None:
     grid = volume.grid
     with open(path, "wb") as file:
-        _save_npz(file, values=volume.values, x_m=grid.x, y_m=grid.y, z_m=grid.z)
+        _save_npz(file, values=to_numpy(volume.values), x_m=grid.x, y_m=grid.y, z_m=grid.z)
 
 
 def _save_npz(file: BinaryIO, **arrays: NDArray[np.generic]) -> None:

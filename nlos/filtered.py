@@ -11,7 +11,7 @@ from nlos.backprojection import TABLE_BYTES, Weighting, smeared
 from nlos.band import Waveforms
 from nlos.capture import Capture
 from nlos.geometry import Grid
-from nlos.method import Progress, Support, common_support, silent
+from nlos.method import Progress, Support, common_support, numpy_support, silent
 from nlos.plane import evenly_spaced, step
 from nlos.volume import Volume
 from tofclip.errors import InputError
@@ -57,6 +57,9 @@ class FilteredBackprojection:
 
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with ``.reason``."""
+        arrays = numpy_support("filtered back-projection", capture)
+        if not arrays:
+            return arrays
         if not all(evenly_spaced(axis) for axis in (grid.x, grid.y, grid.z)):
             return Support("the Laplacian needs evenly spaced voxels along x, y and z")
         return common_support(capture, grid)

@@ -104,7 +104,7 @@ class Grid:
         fraction : float
             What counts as bright, relative to the brightest voxel.
         """
-        indices = np.nonzero(volume.threshold(fraction).values)
+        indices = np.nonzero(volume.threshold(fraction).magnitude)
         if indices[0].size == 0:
             raise InputError("the volume is dark everywhere: there is nothing to look at more closely")
         axes = (volume.grid.z, volume.grid.y, volume.grid.x)

@@ -9,6 +9,7 @@ from typing import Protocol
 from nlos.capture import Capture
 from nlos.geometry import Grid
 from nlos.volume import Volume
+from tofclip.arrays import Place, is_numpy
 from tofclip.errors import InputError
 
 Progress = Callable[[int], None]
@@ -74,3 +75,13 @@ def common_support(capture: Capture, grid: Grid) -> Support:
             f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: use larger voxels or a smaller box"
         )
     return Support()
+
+
+def numpy_support(what: str, capture: Capture) -> Support:
+    """Check that a method of compiled loops, `what` in the message, gets a NumPy array."""
+    if is_numpy(capture.signal):
+        return Support()
+    return Support(
+        f"{what} works on NumPy arrays only, and this capture's signal is on {Place.of(capture.signal)}: "
+        "bring it back with capture.on(Place()), or use PlanarRSD, Hybrid or Backprojection"
+    )

@@ -16,7 +16,7 @@ from nlos.depths import Depths
 from nlos.exposure import band_without_echo, exposures, leg
 from nlos.geometry import FloatArray, Grid
 from nlos.hybrid import Hybrid
-from nlos.method import MEMORY_LIMIT_BYTES, Progress, Support, silent
+from nlos.method import MEMORY_LIMIT_BYTES, Progress, Support, numpy_support, silent
 from nlos.outgoing import outgoing_field, outgoing_way
 from nlos.rsd.planar import PlanarRSD
 from nlos.sampling import warn_of_aliasing
@@ -123,6 +123,9 @@ class TransientImaging:
 
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with ``.reason``."""
+        arrays = numpy_support("imaging in time", capture)
+        if not arrays:
+            return arrays
         spots = exposures(capture)
         if len(spots) > 1 or spots[0].laser is None:
             return Support(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.geometry import Grid
+from tofclip.arrays import Array, Place, is_numpy, namespace, to_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
 
@@ -50,7 +51,8 @@ class Volume:
     Parameters
     ----------
     values : (z, y, x) array
-        Real or complex; float32 or complex64 unless given in double precision.
+        Real or complex; float32 or complex64 unless given in double precision. An array of another library stays where
+        it is; what looks at the volume or writes it fetches a copy.
     grid : Grid
     provenance : mapping
         How it came about.
@@ -61,24 +63,34 @@ class Volume:
         Values and grid disagree, or a value is not a finite number.
     """
 
-    values: NDArray[Any]
+    values: Array
     grid: Grid
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        values = np.asarray(self.values)
-        if values.dtype.kind not in "fc":
-            values = values.astype(np.float32)
-        if values.shape != self.grid.shape:
-            raise ShapeError("volume", f"(z, y, x) = {self.grid.shape}", values.shape)
-        if not np.all(np.isfinite(values)):
+        values = np.ascontiguousarray(self.values) if is_numpy(self.values) else self.values
+        xp = namespace(values)
+        if not xp.isdtype(values.dtype, ("real floating", "complex floating")):
+            values = xp.astype(values, xp.float32)
+        if tuple(values.shape) != self.grid.shape:
+            raise ShapeError("volume", f"(z, y, x) = {self.grid.shape}", tuple(values.shape))
+        if not xp.all(xp.isfinite(values)):
             raise InputError("a volume must not hold NaN or infinity")
-        object.__setattr__(self, "values", np.ascontiguousarray(values))
+        object.__setattr__(self, "values", values)
+
+    @property
+    def place(self) -> Place:
+        """Where the values live: library and device."""
+        return Place.of(self.values)
+
+    def on(self, place: Place) -> Volume:
+        """Return the volume with its values brought to a place; ``Place()`` is NumPy."""
+        return replace(self, values=place.put(self.values))
 
     @property
     def magnitude(self) -> NDArray[Any]:
-        """Brightness, real and not negative, shape (z, y, x)."""
-        return np.asarray(np.abs(self.values))
+        """Brightness, real and not negative, shape (z, y, x); a NumPy array wherever the values live."""
+        return to_numpy(abs(self.values))
 
     def brightest(self) -> tuple[float, float, float]:
         """Position (x, y, z) of the brightest voxel, m."""
@@ -94,9 +106,9 @@ class Volume:
         """Return the volume with every voxel set to 0 that is weaker than `fraction` (0..1) of the brightest."""
         if not 0 <= fraction <= 1:
             raise InputError(f"a threshold is a fraction between 0 and 1, got {fraction}")
-        magnitude = self.magnitude
-        kept = np.where(magnitude >= fraction * magnitude.max(), self.values, 0)
-        return Volume(kept.astype(self.values.dtype), self.grid, self.provenance)
+        xp, magnitude = namespace(self.values), abs(self.values)
+        kept = xp.where(magnitude >= fraction * xp.max(magnitude), self.values, xp.zeros_like(self.values))
+        return Volume(kept, self.grid, self.provenance)
 
     def surface(self, fraction: float = 0.3) -> Mesh:
         """Draw the surface on which the magnitude is `fraction` (0..1) of the largest; save it with ``.save``."""
@@ -141,7 +153,7 @@ class Volume:
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
         axes = {name: Field(getattr(self.grid, name), "m", (name,)) for name in AXES}
-        return Record("volume", {"values": Field(self.values, "", AXES), **axes}, provenance=self.provenance)
+        return Record("volume", {"values": Field(to_numpy(self.values), "", AXES), **axes}, provenance=self.provenance)
 
     @classmethod
     def from_record(cls, record: Record) -> Volume:

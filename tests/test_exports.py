@@ -33,6 +33,7 @@ NAMES = {
         "Hybrid",
         "LightCone",
         "PlanarRSD",
+        "PreparedImaging",
         "Refinement",
         "TransientImaging",
         "TransientVideo",

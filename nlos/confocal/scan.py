@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nlos.capture import Capture
 from nlos.geometry import FloatArray, Grid
 from nlos.kernels import delayed_reading
-from nlos.method import Support, common_support
+from nlos.method import Support, common_support, numpy_support
 from nlos.plane import Plane, step
 from nlos.rsd.wall import PlanarWall
 from tofclip.errors import InputError
@@ -62,7 +62,7 @@ class ConfocalScan:
 
 def confocal_support(capture: Capture, grid: Grid) -> Support:
     """Check what both methods need: a confocal scan on a lattice of a plane, a grid close by, and memory."""
-    basic = common_support(capture, grid)
+    basic = numpy_support("a light-cone transform or f-k migration", capture) and common_support(capture, grid)
     if not basic:
         return basic
     try:

@@ -10,7 +10,7 @@ from nlos.capture import Capture
 from nlos.exposure import unfolded_band
 from nlos.geometry import Grid
 from nlos.hybrid import Hybrid
-from nlos.method import MEMORY_LIMIT_BYTES, Progress, Support, silent
+from nlos.method import MEMORY_LIMIT_BYTES, Progress, Support, numpy_support, silent
 from nlos.plane import step
 from nlos.refinement.model import WallModel
 from nlos.sampling import warn_of_aliasing
@@ -64,7 +64,8 @@ class Refinement:
 
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with ``.reason``."""
-        return self.hybrid.supports(capture, grid) and self._depth_support(grid) and _size_support(grid)
+        arrays = numpy_support("iterative refinement", capture)
+        return arrays and self.hybrid.supports(capture, grid) and self._depth_support(grid) and _size_support(grid)
 
     def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Image the hidden scene.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
@@ -18,6 +19,7 @@ from nlos.rsd.transfer import Waves
 from nlos.rsd.wall import PlanarWall
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
+from tofclip.arrays import is_numpy
 from tofclip.errors import InputError
 
 
@@ -32,7 +34,8 @@ class PlanarRSD:
 
     Errs by less than `tolerance` at depths of a wavelength and more; nearer to the wall, waves that fade within a
     wavelength are missing. Holds the wall's spectrum, 8 bytes per plane wave and frequency (60 MB for 128 x 128
-    points and 120 frequencies), and the volume.
+    points and 120 frequencies), and the volume. A capture of another library's arrays is imaged in that library; see
+    `nlos.portable`.
 
     Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight imaging systems",
     Nat. Commun. 11, 1645 (2020).
@@ -95,25 +98,33 @@ class PlanarRSD:
             `supports` says no.
         """
         complex_field = self.phasor_field(capture, grid, progress)
-        return Volume(np.abs(complex_field.values), grid, complex_field.provenance)
+        return Volume(abs(complex_field.values), grid, complex_field.provenance)
 
     def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in the signal."""
         self.supports(capture, grid).require()
-        total = np.zeros(grid.shape, np.complex64)
         band = unfolded_band(capture, grid, self.pulse)
         warn_of_aliasing(capture, band)
+        if is_numpy(capture.signal):
+            total = self._compiled(capture, grid, band, progress)
+        else:
+            from nlos.portable.prepared import PreparedField
+
+            total = PreparedField(self, capture, grid).of(capture, progress)
+        return Volume(total, grid, {**capture.provenance, "imaging": self.settings})
+
+    @property
+    def settings(self) -> dict[str, str | float]:
+        """What a volume tells of how it was imaged."""
+        return {"method": "rsd", "wavelength_m": self.wavelength, "cycles": self.cycles, "tolerance": self.tolerance}
+
+    def _compiled(self, capture: Capture, grid: Grid, band: Band, progress: Progress) -> NDArray[np.complex64]:
+        total = np.zeros(grid.shape, np.complex64)
         for part in exposures(capture):
             wall = PlanarWall.of(capture.points[part.members])
             values = wall.field(part.phasors(capture, band))
             diffract(self._way(wall.plane, grid, band, part), values, source_of(part, band), total, progress)
-        settings = {
-            "method": "rsd",
-            "wavelength_m": self.wavelength,
-            "cycles": self.cycles,
-            "tolerance": self.tolerance,
-        }
-        return Volume(total, grid, {**capture.provenance, "imaging": settings})
+        return total
 
     def _way(self, plane: Plane, grid: Grid, band: Band, part: Exposure) -> Diffraction:
         return Diffraction(plane, grid, waves_of(part, band, continued=False), self.tolerance)

@@ -1,0 +1,22 @@
+"""Libraries other than NumPy that the tests of portable imaging put captures into."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tofclip.arrays import Place, place_named
+
+LIBRARIES = ("torch", "array_api_strict")
+
+
+def place_of(library: str) -> Place:
+    """Return the library's processor; skip the test where the library is not installed."""
+    module = pytest.importorskip(library)
+    return place_named("torch:cpu") if library == "torch" else Place.of(module.asarray([0.0]))
+
+
+def relative_error(found: Any, expected: np.ndarray) -> float:
+    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
