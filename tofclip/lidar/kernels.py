@@ -12,7 +12,7 @@ from tofclip.lidar.fit.kernels import EVEN, compiled, describe, refine, sort_row
 
 ROUNDS = 8  # Gauss-Newton from near the top has converged after two; more for returns that overlap
 HOPELESS = 0.7  # of the share of the strongest return that a candidate needs: the fit does not make up for so much
-GROUP = 32  # bins of which one bound on their peaks is kept
+GROUP = 32  # bins of which the highest peak is kept
 TOGETHER = 4  # weights of a filter that are applied in one pass
 
 vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy", _nrt=False)
@@ -33,9 +33,9 @@ def find_returns(traces, pixels, times, filters, pulse, limits, found, counts):
     times : (bins,) float64 array
         Instant of each bin, increasing.
     filters : tuple
-        A sharp filter and the matched one, (width, bins) float32 arrays of unit energy, nowhere negative: row w holds
-        the weight of bin ``j + w - width // 2`` for a return at bin j, and the width is a multiple of four. Then
-        the largest sum of the weights for one bin, of either.
+        A sharp filter, (width, bins), and the matched one, (bins, width + 1), float32 arrays of unit energy, nowhere
+        negative: entry w holds the weight of bin ``j + w - width // 2`` for a return at bin j, and the width is a
+        multiple of four. The last column holds the sum over the others. Then the largest such sum, of either.
     pulse : tuple
         See `Pulse.table`.
     limits : (float, float, float)
@@ -48,10 +48,11 @@ def find_returns(traces, pixels, times, filters, pulse, limits, found, counts):
     """
     groups = -(-times.size // GROUP)
     memory = (
+        np.empty(times.size, np.float32),
         np.zeros(groups * GROUP, np.float32),
         np.empty(groups, np.float32),
         np.ones(times.size, np.bool_),
-        np.empty((found.shape[1], 2)),
+        np.empty((found.shape[1], 4)),
         np.empty((found.shape[1], 3)),
         np.empty((times.size, 3)),
     )
@@ -64,13 +65,16 @@ def find_returns(traces, pixels, times, filters, pulse, limits, found, counts):
 def returns_of(trace, times, filters, pulse, limits, memory, found):
     """Find the returns of one trace and return their number; `memory` is overwritten."""
     (sharp, matched, gains), (curve, scale) = filters, pulse
-    score, bounds, free, peaks, estimate, profile = memory
+    score, maxima, bounds, free, peaks, estimate, profile = memory
     correlate(trace, sharp, score)
-    number, background, noise = strongest_peaks(trace, times, matched, gains, scale, limits, score, bounds, free, peaks)
+    keep_maxima(score, maxima)
+    number, background, noise = strongest_peaks(
+        trace, times, matched, gains, scale, limits, maxima, bounds, free, peaks
+    )
     needed, least, kept = 0.0, limits[1] * noise, 0
     for k in range(number):
         j = int(peaks[k, 0])
-        peaks[k, 1] = response(trace, matched, background, j)
+        peaks[k, 1] = max(peaks[k, 1] - background * matched[j, -1], 0.0)
         needed = max(needed, HOPELESS * limits[2] * peaks[k, 1] * times[j] ** 2)
     for k in range(number):
         j, strength = int(peaks[k, 0]), peaks[k, 1]
@@ -101,27 +105,29 @@ def correlate(trace, filters, score):
         else:
             for j in range(here.size):
                 here[j] += one[j] * there[j] + two[j] * there[j + 1] + three[j] * there[j + 2] + four[j] * there[j + 3]
-    for j in range(first):
-        score[j] = response(trace, filters, 0.0, j)
-    for j in range(last, bins):
-        score[j] = response(trace, filters, 0.0, j)
+    for edge in (range(first), range(last, bins)):
+        for j in edge:
+            score[j] = 0
+            for w in range(max(0, half - j), min(width, bins + half - j)):
+                score[j] += filters[w, j] * trace[j + w - half]
 
 
-@compiled
-def response(trace, filters, background, j):
-    """Response of a filter at bin j to what exceeds the background; never below zero."""
-    half = filters.shape[0] // 2
-    first, last = max(0, half - j), min(filters.shape[0], trace.size + half - j)
+@vectorised
+def response(trace, matched, j):
+    """Response of the matched filter at bin j."""
+    width = matched.shape[1] - 1
+    start = j - width // 2
     total = 0.0
-    for w in range(first, last):
-        total += filters[w, j] * (trace[j + w - half] - background)
-    return max(total, 0.0)
+    for w in range(max(0, -start), min(width, trace.size - start)):
+        total += float(matched[j, w]) * float(trace[start + w])
+    return total
 
 
 @compiled
 def top(trace, times, matched, background, j, here):
     """Instant near bin j at which the response, `here` at the bin, is highest: by a parabola in its logarithm."""
-    before, after = response(trace, matched, background, j - 1), response(trace, matched, background, j + 1)
+    before = response(trace, matched, j - 1) - background * matched[j - 1, -1]
+    after = response(trace, matched, j + 1) - background * matched[j + 1, -1]
     if before <= 0 or after <= 0 or here < before or here < after:
         return times[j]
     rise, fall = np.log(here / before), np.log(here / after)
@@ -130,34 +136,33 @@ def top(trace, times, matched, background, j, here):
 
 
 @compiled
-def strongest_peaks(trace, times, matched, gains, scale, limits, score, bounds, free, peaks):
-    """Fill the first column of `peaks` with the bins of the highest peaks that might count.
+def strongest_peaks(trace, times, matched, gains, scale, limits, maxima, bounds, free, peaks):
+    """Fill `peaks` with the highest maxima that might count, in the order of time: bin, response, and bins they claim.
 
-    Returns their number, the background and the noise. Peaks are the local maxima of the score that keep ``limits[0]``
-    from each other; the first and the last bin are none, for whatever rises towards them has its maximum outside. Of
-    each group of bins the highest score bounds what is to be found there; only the group with the highest bound is
-    looked into, and what its best maximum lacks to the bound is taken off. What is left cannot count when not even
-    bins all as bright as the bound says would: because of the noise, or beside the strongest return.
+    Returns their number, the background and the noise. Peaks keep ``limits[0]`` from each other. They are taken from
+    the highest down, until not even bins all as bright as the next one says could count: because of the noise, or
+    beside the strongest return. The response is still that to peak and background together.
 
     Background and noise are those of the bins that no peak claims. Peaks claim their surroundings from the strongest
     down, for as long as half of the bins stay free. `free` is true everywhere, and again afterwards.
     """
-    bound_groups(score, bounds)
     total, square = sums(trace)
     left, number, needed, claiming = trace.size, 0, 0.0, True
     background, noise = level(total, square, left)
+    bound_groups(maxima, 0, bounds.size, bounds)
     while number < peaks.shape[0]:
         group = highest_place(bounds)
         brightest = gains[1] * (bounds[group] / gains[0] - background)
         if bounds[group] <= 0 or brightest <= limits[1] * noise or brightest * times[-1] ** 2 < needed:
             break
-        best = highest_maximum(score, times, limits[0], peaks[:number], group)
-        if best < 0 or score[best] < bounds[group]:
-            bounds[group] = score[best] if best >= 0 else np.float32(0)
-            continue
-        peaks[number, 0] = best
-        number += 1
+        best = group * GROUP
+        while maxima[best] != bounds[group]:
+            best += 1
         first, last = window(times, times[best], scale)
+        strength = response(trace, matched, best)
+        peaks[number, 0], peaks[number, 1], peaks[number, 2], peaks[number, 3] = best, strength, first, last
+        number += 1
+        forget_around(best, times, limits[0], maxima, bounds)
         claiming = claiming and 2 * (left - (last - first)) >= trace.size
         if claiming:
             for i in range(first, last):
@@ -165,26 +170,47 @@ def strongest_peaks(trace, times, matched, gains, scale, limits, score, bounds, 
                 total, square, left = total - value, square - value * value, left - free[i]
                 free[i] = False
             background, noise = level(total, square, left)
-        needed = max(needed, HOPELESS * limits[2] * response(trace, matched, background, best) * times[best] ** 2)
+        needed = max(needed, HOPELESS * limits[2] * (strength - background * matched[best, -1]) * times[best] ** 2)
     for k in range(number):
-        first, last = window(times, times[int(peaks[k, 0])], scale)
-        free[first:last] = True
+        free[int(peaks[k, 2]) : int(peaks[k, 3])] = True
     sort_rows(peaks[:number])
     return number, background, noise
 
 
 @vectorised
-def bound_groups(score, bounds):
-    """Largest score of each group of bins, or 0.
+def keep_maxima(score, maxima):
+    """Copy the inner local maxima above zero, and zero for all other scores; of a level top the last bin."""
+    zero = np.float32(0)
+    maxima[0] = maxima[score.size - 1] = zero
+    before, here, after, kept = score[:-2], score[1:-1], score[2:], maxima[1 : score.size - 1]
+    for j in range(here.size):
+        kept[j] = here[j] if here[j] > zero and here[j] >= before[j] and here[j] > after[j] else zero
 
-    Numbers above zero keep their order when their bits are read as whole numbers, whose maximum is found in vectors.
+
+@vectorised
+def bound_groups(maxima, first, last, bounds):
+    """Largest maximum of each group of bins from `first` to before `last`, or 0.
+
+    Numbers from zero up keep their order when their bits are read as whole numbers, whose maximum is found in vectors.
     """
-    bits, highest_bits = score.view(np.int32), bounds.view(np.int32)
-    for group in range(bounds.size):
+    bits, highest_bits = maxima.view(np.int32), bounds.view(np.int32)
+    for group in range(first, last):
         highest = np.int32(0)
         for j in range(group * GROUP, (group + 1) * GROUP):
             highest = max(highest, bits[j])
         highest_bits[group] = highest
+
+
+@compiled
+def forget_around(best, times, distance, maxima, bounds):
+    """Take away the maxima nearer than `distance` to a bin, and that at the bin itself."""
+    first = last = best
+    while first > 0 and times[best] - times[first - 1] < distance:
+        first -= 1
+    while last < times.size - 1 and times[last + 1] - times[best] < distance:
+        last += 1
+    maxima[first : last + 1] = 0
+    bound_groups(maxima, first // GROUP, last // GROUP + 1, bounds)
 
 
 @vectorised
@@ -213,17 +239,3 @@ def highest_place(values):
         if values[other] > values[place]:
             place = other
     return place
-
-
-@compiled
-def highest_maximum(score, times, distance, peaks, group):
-    """Highest inner maximum of a group that keeps `distance` from all peaks, or -1; of a level top the last bin."""
-    best, height = -1, np.float32(0)
-    for j in range(max(group * GROUP, 1), min((group + 1) * GROUP, times.size - 1)):
-        if score[j] > height and score[j] >= score[j - 1] and score[j] > score[j + 1]:
-            clash = False
-            for k in range(peaks.shape[0]):
-                clash |= abs(times[int(peaks[k, 0])] - times[j]) < distance
-            if not clash:
-                best, height = j, score[j]
-    return best

@@ -128,9 +128,11 @@ class ReturnSearch:
 
     @cached_property
     def _filters(self) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float]]:
-        """The sharp filter that shows candidates, the matched one that judges them, and their gains."""
+        """The sharp filter that shows candidates, the matched one that judges them, and their gains: see the kernels."""
         sharp, matched = (_filter(self.times, shape) for shape in (self.pulse.compressed(SHARPENING), self.pulse))
-        return sharp, matched, (float(sharp.sum(axis=0).max()), float(matched.sum(axis=0).max()))
+        sums = matched.sum(axis=0)
+        with_sums = np.ascontiguousarray(np.concatenate([matched, sums[np.newaxis]]).T)
+        return sharp, with_sums, (float(sharp.sum(axis=0).max()), float(sums.max()))
 
 
 def depth(
