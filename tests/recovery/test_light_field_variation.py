@@ -13,10 +13,9 @@ from tofclip.recovery.proximal import Regulariser
 
 def denoised(prior: Regulariser, noisy: np.ndarray, calls: int = 300) -> tuple[np.ndarray, np.ndarray]:
     """Run the warm-started proximal step on the same point until it has converged."""
-    result, still = np.empty_like(noisy), np.zeros(noisy.shape[-1], noisy.dtype)
+    still = np.zeros(noisy.shape[-1], noisy.dtype)
     for _ in range(calls):
-        result[:] = 0
-        penalty = prior.descend(noisy, result, still, np.zeros_like(noisy), 1.0)
+        result, penalty = prior.descend(noisy, np.zeros_like(noisy), still, np.zeros_like(noisy), 1.0)
     return result, penalty
 
 

@@ -13,10 +13,9 @@ def denoise(picture: np.ndarray, weight: float, calls: int = 400, dtype: type = 
     """Run the warm-started proximal step on the same point until it has converged."""
     block = np.tile(picture.astype(dtype)[..., np.newaxis], (1, 1, LANES))
     prior = NonnegativeTotalVariation(weight)
-    result, still = np.empty_like(block), np.zeros(LANES, dtype)
+    still = np.zeros(LANES, dtype)
     for _ in range(calls):
-        result[:] = 0
-        penalty = prior.descend(block, result, still, np.zeros_like(block), 1.0)
+        result, penalty = prior.descend(block, np.zeros_like(block), still, np.zeros_like(block), 1.0)
     assert np.ptp(result, axis=-1).max() == 0  # every lane the same
     return result[..., 0], float(penalty[0])
 

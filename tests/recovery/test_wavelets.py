@@ -11,9 +11,8 @@ from tofclip.recovery.wavelets import NonnegativeWavelets
 
 
 def step(picture: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray]:
-    result, still = np.zeros_like(picture), np.zeros(picture.shape[-1], picture.dtype)
-    penalty = NonnegativeWavelets(weight).descend(picture, result, still, np.zeros_like(picture), 1.0)
-    return result, penalty
+    before, still = np.zeros_like(picture), np.zeros(picture.shape[-1], picture.dtype)
+    return NonnegativeWavelets(weight).descend(picture, before, still, np.zeros_like(picture), 1.0)
 
 
 @pytest.mark.parametrize("shape", [(32, 32, 1), (37, 45, 3)])

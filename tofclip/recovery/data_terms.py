@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import Array, Place, namespace
 from tofclip.errors import InputError, ShapeError
+from tofclip.recovery.loops import loops_for
 
-Array = NDArray[Any]
-Mask = NDArray[np.bool_] | None
+Mask = Array | None
 
 
 class DataTerm(ABC):
@@ -29,13 +29,14 @@ class DataTerm(ABC):
 
     def __init__(self, readings: Array, good: Mask = None) -> None:
         if good is not None and good.shape != readings.shape:
-            raise ShapeError("the mask of good readings", readings.shape, good.shape)
+            raise ShapeError("the mask of good readings", tuple(readings.shape), tuple(good.shape))
+        xp = namespace(readings)
         self.readings = readings
-        self.good = None if good is None or good.all() else good.astype(readings.dtype)
+        self.good = None if good is None or xp.all(good) else xp.astype(good, readings.dtype)
 
     @abstractmethod
-    def value(self, predicted: Array) -> NDArray[np.float64]:
-        """Return the misfit of each frame, (frames,), for `predicted` of shape (readings, frames)."""
+    def value(self, predicted: Array) -> Array:
+        """Return the misfit of each frame, (frames,) float64, for `predicted` of shape (readings, frames)."""
 
     @abstractmethod
     def weights(self, predicted: Array) -> Array:
@@ -43,8 +44,7 @@ class DataTerm(ABC):
 
     def gradient(self, predicted: Array) -> Array:
         """Return the derivative with respect to `predicted`, same shape."""
-        slope: Array = self.weights(predicted) * (predicted - self.readings)
-        return slope
+        return self.weights(predicted) * (predicted - self.readings)
 
     def _masked(self, values: Array) -> Array:
         return values if self.good is None else values * self.good
@@ -61,16 +61,15 @@ class DataTermMaker(Protocol):
 class LeastSquares(DataTerm):
     """``1/2 |W (predicted - readings)|^2`` for each frame, W = 0 or 1: right for even, Gaussian errors."""
 
-    def value(self, predicted: Array) -> NDArray[np.float64]:
+    def value(self, predicted: Array) -> Array:
         residual = self.gradient(predicted)
-        misfit: NDArray[np.float64] = 0.5 * np.einsum("if,if->f", residual, residual, dtype=np.float64)
-        return misfit
+        return 0.5 * loops_for(residual).squared_sums(residual)
 
     def weights(self, predicted: Array) -> Array:
-        return self._masked(np.ones_like(predicted))
+        return self._masked(namespace(predicted).ones_like(predicted))
 
     def gradient(self, predicted: Array) -> Array:
-        residual: Array = predicted - self.readings
+        residual = predicted - self.readings
         if self.good is not None:
             residual *= self.good
         return residual
@@ -95,15 +94,16 @@ class Huber(DataTerm):
         super().__init__(readings, good)
         self.threshold = threshold
 
-    def value(self, predicted: Array) -> NDArray[np.float64]:
-        size = np.abs(predicted - self.readings)
-        kept = np.minimum(size, self.threshold)
-        misfit: NDArray[np.float64] = self._masked(kept * (size - 0.5 * kept)).sum(axis=0, dtype=np.float64)
-        return misfit
+    def value(self, predicted: Array) -> Array:
+        xp = namespace(predicted)
+        size = xp.abs(predicted - self.readings)
+        kept = xp.minimum(size, self.threshold)
+        return xp.sum(self._masked(kept * (size - 0.5 * kept)), axis=0, dtype=xp.float64)
 
     def weights(self, predicted: Array) -> Array:
-        size = np.abs(predicted - self.readings)
-        return self._masked(self.threshold / np.maximum(size, self.threshold))
+        xp = namespace(predicted)
+        size = xp.abs(predicted - self.readings)
+        return self._masked(self.threshold / xp.maximum(size, self.threshold))
 
 
 class Poisson(DataTerm):
@@ -125,32 +125,34 @@ class Poisson(DataTerm):
     CURVATURE = 4.0  # at the knee, where it is largest
 
     def __init__(self, readings: Array, good: Mask = None, *, deviation: Array) -> None:
-        if readings.min() < 0:
+        if namespace(readings).min(readings) < 0:
             raise InputError("photon counts must not be negative; take the data term of squares")
         super().__init__(readings, good)
-        self.deviation = deviation[:, np.newaxis].astype(readings.dtype)
+        beside = Place.of(readings).put(deviation)
+        self.deviation = namespace(readings).astype(beside, readings.dtype)[:, None]
         self._counted = readings * self.deviation
         self._knee = self.deviation**2 / 2
 
-    def value(self, predicted: Array) -> NDArray[np.float64]:
+    def value(self, predicted: Array) -> Array:
+        xp = namespace(predicted)
         expected = predicted * self.deviation
-        base = np.maximum(expected, self._knee)
-        short = np.minimum(expected - self._knee, 0)
-        loss = base - self._counted * np.log(base)
+        base = xp.maximum(expected, self._knee)
+        short = xp.minimum(expected - self._knee, 0)
+        loss = base - self._counted * xp.log(base)
         loss += (1 - self._counted / self._knee) * short + self._counted / self._knee**2 * short**2 / 2
-        best = self._counted - self._counted * np.log(np.maximum(self._counted, 1e-30))
-        misfit: NDArray[np.float64] = self._masked(loss - best).sum(axis=0, dtype=np.float64) / self.CURVATURE
-        return misfit
+        best = self._counted - self._counted * xp.log(xp.maximum(self._counted, 1e-30))
+        return xp.sum(self._masked(loss - best), axis=0, dtype=xp.float64) / self.CURVATURE
 
     def weights(self, predicted: Array) -> Array:
-        base = np.maximum(predicted * self.deviation, self._knee)
+        base = namespace(predicted).maximum(predicted * self.deviation, self._knee)
         return self._masked(self.deviation**2 / base / self.CURVATURE)
 
     def gradient(self, predicted: Array) -> Array:
+        xp = namespace(predicted)
         expected = predicted * self.deviation
-        base = np.maximum(expected, self._knee)
+        base = xp.maximum(expected, self._knee)
         slope = 1 - self._counted / base
-        slope += self._counted / self._knee**2 * np.minimum(expected - self._knee, 0)
+        slope += self._counted / self._knee**2 * xp.minimum(expected - self._knee, 0)
         return self._masked(self.deviation / self.CURVATURE * slope)
 
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 import time
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import Array, InEachPlace, Place, is_numpy, namespace, to_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator, SparseMatrix, squared_norm
+from tofclip.recovery.batches import PortableBatches, batches_for, write_frames
 from tofclip.recovery.loop import Progress, Result, silent
-from tofclip.recovery.method import Array, Mask, checked_readings, full_block, write_frames
+from tofclip.recovery.method import Mask, checked_readings
 from tofclip.threads import LANES, blocks, run_blocks
 
 if TYPE_CHECKING:
@@ -39,6 +41,7 @@ class LinearInverse:
 
     damping: float = 1e-2
     name = "linear"
+    portable = True
 
     def prepare(self, operator: LinearOperator, alive: NDArray[np.bool_] | None = None) -> PreparedInverse:
         """Invert the Gram matrix of the living readings.
@@ -76,8 +79,9 @@ class LinearInverse:
 
         Readings that are bad in every frame are left out; a linear map cannot leave out a reading of one frame only.
         """
+        readings = checked_readings(operator, readings, good)
         started = time.perf_counter()
-        prepared = self.prepare(operator, None if good is None else np.asarray(good.any(axis=1)))
+        prepared = self.prepare(operator, None if good is None else to_numpy(namespace(good).any(good, axis=1)))
         setup_seconds = time.perf_counter() - started
         return replace(prepared.recover(readings, progress), setup_seconds=setup_seconds)
 
@@ -100,8 +104,12 @@ class PreparedInverse:
     operator: LinearOperator
     inverse_gram: Array
 
-    def recover(self, readings: Array, progress: Progress = silent, out: Array | None = None) -> Result:
-        """Recover one picture per column of `readings`.
+    @cached_property
+    def _inverse(self) -> InEachPlace[Array]:
+        return InEachPlace(partial(Place.put, values=self.inverse_gram))
+
+    def recover(self, readings: Array, progress: Progress = silent, out: NDArray[Any] | None = None) -> Result:
+        """Recover one picture per column of `readings`, where they are.
 
         Parameters
         ----------
@@ -109,9 +117,12 @@ class PreparedInverse:
         progress : callable
             Called with the number of frames just done.
         out : (frames, rows, columns) array of the operator's type, optional
-            Where the frames are written; for shot after shot, fresh memory would cost a quarter of the time.
+            Where the frames are written; for shot after shot, fresh memory would cost a quarter of the time. NumPy's
+            only: other libraries keep memory for themselves.
         """
         readings = checked_readings(self.operator, readings, None)
+        if not is_numpy(readings):
+            return self._recovered_elsewhere(readings, progress)
         shape = (readings.shape[1], *self.operator.shape_in)
         frames = np.empty(shape, self.operator.dtype) if out is None else out
         if frames.shape != shape or frames.dtype != self.operator.dtype or not frames.flags.c_contiguous:
@@ -126,7 +137,19 @@ class PreparedInverse:
         run_blocks(project, readings.shape[1])
         return Result(frames)
 
-    def weights(self, readings: Array) -> Array:
+    def _recovered_elsewhere(self, readings: Array, progress: Progress) -> Result:
+        """Recover as many frames at once as memory allows, where the readings are."""
+        batches = PortableBatches(self.operator, readings)
+
+        def project(piece: slice) -> None:
+            weights = self._inverse.beside(readings) @ batches.block(readings, piece)
+            batches.write(self.operator.adjoint(weights), piece)
+            progress(piece.stop - piece.start)
+
+        batches.each(project)
+        return Result(batches.frames)
+
+    def weights(self, readings: NDArray[Any]) -> NDArray[Any]:
         """Return ``(A A' + mu I)^-1 f``, (blocks, readings, LANES): the adjoint of each block is `LANES` pictures.
 
         Frames beyond the last one are zero.
@@ -158,6 +181,7 @@ class Adjoint:
     """
 
     name = "adjoint"
+    portable = True
 
     def recover(
         self, operator: LinearOperator, readings: Array, good: Mask = None, progress: Progress = silent
@@ -165,16 +189,15 @@ class Adjoint:
         """Recover one picture per column of `readings`; see `Method`. Bad readings count as zero."""
         readings = checked_readings(operator, readings, good)
         if good is not None:
-            readings = readings * good
-        scale = _best_scale(operator, readings)
-        frames = np.empty((readings.shape[1], *operator.shape_in), operator.dtype)
+            readings = readings * namespace(good).astype(good, readings.dtype)
+        scale, batches = _best_scale(operator, readings), batches_for(operator, readings)
 
         def solve(piece: slice) -> None:
-            write_frames(operator.adjoint(scale * full_block(readings, piece)), frames, piece)
+            batches.write(operator.adjoint(scale * batches.block(readings, piece)), piece)
             progress(piece.stop - piece.start)
 
-        run_blocks(solve, readings.shape[1])
-        return Result(frames)
+        batches.each(solve)
+        return Result(batches.frames)
 
     def work(self, frames: int) -> int:
         """Return how many frame iterations `recover` reports at most."""
@@ -195,11 +218,11 @@ def one_blas_thread() -> AbstractContextManager[Any]:
     return limited
 
 
-def _best_scale(operator: LinearOperator, readings: Array) -> np.floating:
+def _best_scale(operator: LinearOperator, readings: Array) -> float:
     """The factor c that minimises ``|c A A'f - f|`` over the brightest block of frames."""
-    brightest = np.argsort(np.linalg.norm(readings, axis=0))[-LANES:]
-    block = np.ascontiguousarray(readings[:, brightest])
+    xp = namespace(readings)
+    brightest = xp.argsort(xp.sum(readings * readings, axis=0))[-min(LANES, readings.shape[1]) :]
+    block = xp.take(readings, brightest, axis=1)
     seen = operator(operator.adjoint(block))
-    energy = float(np.vdot(seen, seen))
-    scale: np.floating = readings.dtype.type(float(np.vdot(seen, block)) / energy if energy > 0 else 1)
-    return scale
+    energy = float(xp.sum(seen * seen, dtype=xp.float64))
+    return float(xp.sum(seen * block, dtype=xp.float64)) / energy if energy > 0 else 1.0

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import require_numpy
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator
 from tofclip.recovery.iterative import ProximalMethod
@@ -73,6 +74,7 @@ def choose_weight(method: ProximalMethod, operator: LinearOperator, readings: Ar
     seed : int
         Of the deal.
     """
+    require_numpy("the choice of a prior's weight", readings)
     held = folds(readings.size, run, seed)
     parts = np.split(held, held.shape[1], axis=1)
     column = readings[:, np.newaxis]

@@ -6,16 +6,15 @@ import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import numpy as np
-
+from tofclip.arrays import namespace, require_numpy
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, squared_norm
+from tofclip.recovery.batches import Batches, batches_for
 from tofclip.recovery.data_terms import DataTermMaker, LeastSquares
 from tofclip.recovery.fista import Fista
 from tofclip.recovery.loop import History, Progress, Result, Stopping, iterate, silent
-from tofclip.recovery.method import Array, Mask, checked_readings, full_block, write_frames
+from tofclip.recovery.method import Array, Mask, checked_readings
 from tofclip.recovery.proximal import NonnegativeSparsity, NonnegativeTotalVariation, Regulariser
-from tofclip.threads import run_blocks
 
 NORM_ITERATIONS = 15
 NORM_MARGIN = 1.02  # 15 power iterations on a nonnegative matrix are within 1 % of the largest eigenvalue
@@ -36,12 +35,18 @@ class ProximalMethod(ABC):
         Relative change of a block's objective below which it is done; 0: never.
     data_term : DataTermMaker
         What a misfit costs.
+
+    Attributes
+    ----------
+    portable : bool
+        Whether arrays of any library are taken, or NumPy's only.
     """
 
     weight: float
     iterations: int
     tolerance: float = 0.0
     data_term: DataTermMaker = LeastSquares
+    portable = False
 
     @abstractmethod
     def _regulariser(self, weight: float) -> Regulariser:
@@ -53,6 +58,8 @@ class ProximalMethod(ABC):
         """Recover one picture per column of `readings`; see `Method`."""
         from threadpoolctl import threadpool_limits
 
+        if not self.portable:
+            require_numpy(f"recovery with the prior {type(self).__name__}", readings)
         # Blocks share the cores already, and a lone picture's products are too small to share.
         with threadpool_limits(1, "blas"):
             return self._recover(operator, checked_readings(operator, readings, good), good, progress)
@@ -61,27 +68,30 @@ class ProximalMethod(ABC):
         stopping = Stopping(self.iterations, self.tolerance)
         started = time.perf_counter()
         step = 1 / (NORM_MARGIN * squared_norm(operator, NORM_ITERATIONS))
-        self._load_loops(operator, step, full_block(readings, slice(0, 0)))
+        batches = batches_for(operator, readings)
+        self._load_loops(operator, step, batches.dark())
         setup_seconds = time.perf_counter() - started
-        weight = self.weight * _largest_back_projection(operator, readings, good)
-        frames = np.empty((readings.shape[1], *operator.shape_in), operator.dtype)
+        weight = self.weight * _largest_back_projection(operator, batches, readings, good)
         histories: dict[int, History] = {}
 
         def solve(piece: slice) -> None:
-            data = self.data_term(full_block(readings, piece), None if good is None else full_block(good, piece))
+            trusted = None if good is None else batches.block(good, piece)
+            data = self.data_term(batches.block(readings, piece), trusted)
             solver = Fista(operator, data, self._regulariser(weight), step, data.readings.shape[1])
             histories[piece.start] = iterate(solver, stopping, progress, piece.stop - piece.start)
-            write_frames(solver.current, frames, piece)
+            batches.write(solver.current, piece)
 
-        run_blocks(solve, readings.shape[1])
-        return Result.of_blocks(frames, [histories[start] for start in sorted(histories)], setup_seconds)
+        batches.each(solve)
+        return Result.of_blocks(batches.frames, [histories[start] for start in sorted(histories)], setup_seconds)
 
     def _load_loops(self, operator: LinearOperator, step: float, dark: Array) -> None:
-        """Take one step on a dark block, so that compiled loops are loaded before the first thread needs them."""
-        lanes = dark.shape[1]
-        solver = Fista(operator, LeastSquares(dark), self._regulariser(1.0), step, lanes)
+        """Take one step on a dark block and write it, so that compiled loops are there before the first thread comes.
+
+        The operator's matrix is brought to where the readings are, for the same reason.
+        """
+        solver = Fista(operator, LeastSquares(dark), self._regulariser(1.0), step, dark.shape[1])
         solver.step()
-        write_frames(solver.current, np.empty((lanes, *operator.shape_in), operator.dtype), slice(0, lanes))
+        batches_for(operator, dark).write(solver.current, slice(0, dark.shape[1]))
 
     def work(self, frames: int) -> int:
         """Return how many frame iterations `recover` reports at most."""
@@ -95,6 +105,7 @@ class Sparse(ProximalMethod):
     weight: float = 2e-3
     iterations: int = 60
     name = "l1"
+    portable = True
 
     def _regulariser(self, weight: float) -> Regulariser:
         return NonnegativeSparsity(weight)
@@ -107,6 +118,7 @@ class TotalVariation(ProximalMethod):
     weight: float = 1e-3
     iterations: int = 60
     name = "tv"
+    portable = True
 
     def _regulariser(self, weight: float) -> Regulariser:
         return NonnegativeTotalVariation(weight)
@@ -126,17 +138,18 @@ class Wavelets(ProximalMethod):
         return NonnegativeWavelets(weight)
 
 
-def _largest_back_projection(operator: LinearOperator, readings: Array, good: Mask) -> float:
+def _largest_back_projection(operator: LinearOperator, batches: Batches, readings: Array, good: Mask) -> float:
     """The largest value of A'f: the weight at which the sparsest nonnegative solution becomes zero."""
     peaks: list[float] = []
 
     def look(piece: slice) -> None:
-        block = full_block(readings, piece)
+        block = batches.block(readings, piece)
         if good is not None:
-            block *= full_block(good, piece)
-        peaks.append(float(operator.adjoint(block).max()))
+            block = block * namespace(block).astype(batches.block(good, piece), block.dtype)
+        back = operator.adjoint(block)
+        peaks.append(float(namespace(back).max(back)))
 
-    run_blocks(look, readings.shape[1])
+    batches.each(look)
     peak = max(peaks)
     if peak <= 0:
         raise InputError("no view sees anything positive; was too high a background subtracted?")

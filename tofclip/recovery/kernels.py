@@ -88,6 +88,29 @@ def traces_of_pixels(tile_starts, columns, values, weights, traces, span):
 
 
 @compiled
+def highest_pixels(tile_starts, columns, values, scales, block, highest):
+    """Raise `highest` to the largest ``scales * (M @ block)`` over the rows of a sparse matrix M, lane by lane.
+
+    Parameters
+    ----------
+    tile_starts, columns, values
+        See `tofclip.operators.sparse.Tiles`.
+    scales : (M's rows,) array
+    block : (M's columns, LANES) array
+    highest : (LANES,) array
+    """
+    part = np.empty((4 * TILE, LANES), block.dtype)
+    for first in range(0, scales.size, part.shape[0]):
+        rows = min(part.shape[0], scales.size - first)
+        sparse_times_block(tile_starts[:, first : first + rows + 1], columns, values, block, part[:rows])
+        for row in range(rows):
+            scale, here = scales[first + row], part[row]
+            for lane in range(LANES):
+                value = scale * here[lane]
+                highest[lane] = value if value > highest[lane] else highest[lane]
+
+
+@compiled
 def put_back(candidate, current, rejected):
     """``candidate = current`` in the lanes where `rejected` is 1; it is 0 elsewhere. Arrays are (..., lanes)."""
     lanes = candidate.shape[2]

@@ -33,7 +33,9 @@ class NonnegativeLightFieldVariation:
         self.weight, self.grid, self.angular = checked_weight(weight), grid, angular
         self._dual: Array | None = None
 
-    def descend(self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float) -> Array:
+    def descend(
+        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
+    ) -> tuple[Array, Array]:
         from tofclip.recovery import kernels
 
         views, rows, columns, lanes = current.shape
@@ -53,7 +55,7 @@ class NonnegativeLightFieldVariation:
         total = np.zeros(lanes)
         kernels.light_field_primal(noisy, self._dual, weight, angular, result)
         kernels.light_field_variation(result, angular, total)
-        return self.weight * total
+        return previous, self.weight * total
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import Array, namespace, to_numpy
 from tofclip.errors import InputError
 
 Progress = Callable[[int], None]
@@ -45,8 +46,8 @@ class Stopping:
 class IterativeSolver(Protocol):
     """What the loop needs to know of a solver."""
 
-    objective: NDArray[np.float64]
-    refused: NDArray[np.bool_]
+    objective: Array
+    refused: Array
 
     def step(self) -> None:
         """Advance by one iteration."""
@@ -75,19 +76,24 @@ class History:
 
 
 def iterate(solver: IterativeSolver, stopping: Stopping, progress: Progress, frames: int) -> History:
-    """Run `solver` until `stopping` says that it is done."""
-    objective = [float(solver.objective.sum())]
+    """Run `solver` until `stopping` says that it is done.
+
+    A device is waited for once in an iteration if there is a tolerance, and not at all if there is none.
+    """
+    xp = namespace(solver.objective)
+    objective = [xp.sum(solver.objective)]
     converged = False
     for done in range(stopping.iterations):
         solver.step()
-        objective.append(float(solver.objective.sum()))
-        change = objective[-2] - objective[-1]
-        converged = not solver.refused.any() and change < stopping.tolerance * objective[-1]
+        objective.append(xp.sum(solver.objective))
+        if stopping.tolerance > 0:
+            little = objective[-2] - objective[-1] < stopping.tolerance * objective[-1]
+            converged = bool(little & ~xp.any(solver.refused))
         if converged:
             progress(frames * (stopping.iterations - done))
             break
         progress(frames)
-    return History(np.array(objective), converged)
+    return History(to_numpy(xp.stack(objective)), converged)
 
 
 @dataclass(frozen=True)
@@ -97,6 +103,7 @@ class Result:
     Parameters
     ----------
     frames : (frames, rows, columns) array
+        Where the readings were.
     iterations : int
         Of the block that took most; 0 for direct methods.
     objective : (iterations + 1,) array
@@ -107,14 +114,14 @@ class Result:
         Time spent on what depends on the operator only and on loading compiled loops, not on the readings.
     """
 
-    frames: NDArray[Any]
+    frames: Array
     iterations: int = 0
     objective: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     stopped_because: str = "direct method"
     setup_seconds: float = 0.0
 
     @classmethod
-    def of_blocks(cls, frames: NDArray[Any], histories: list[History], setup_seconds: float = 0.0) -> Result:
+    def of_blocks(cls, frames: Array, histories: list[History], setup_seconds: float = 0.0) -> Result:
         """Join the histories of all blocks."""
         longest = max(history.iterations for history in histories)
         total = np.zeros(longest + 1)

@@ -1,23 +1,25 @@
 """What every way to turn readings into pictures has in common.
 
-A method holds its settings and has one `recover`. All of them cut the frames into blocks that stay in cache and share
-the blocks between threads; memory beyond the result is bounded by a few blocks a thread.
+A method holds its settings and has one `recover`. It takes NumPy arrays; those that are `portable` take the arrays of
+any library that follows the array API standard as well, and answer in kind, on the same device. Memory beyond the
+result is bounded: see `tofclip.recovery.batches`.
 """
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import Array as Array
+from tofclip.arrays import as_type, namespace
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator
+from tofclip.recovery.batches import frames_at_once
 from tofclip.recovery.loop import Progress, Result, silent
-from tofclip.threads import LANES, blocks
+from tofclip.threads import blocks
 
-Array = NDArray[Any]
-Mask = NDArray[np.bool_] | None
+Mask = Array | None
 
 
 class Method(Protocol):
@@ -58,11 +60,12 @@ def relative_residual(operator: LinearOperator, frames: Array, readings: Array, 
     good : (readings, frames) bool array, optional
     """
     misfit = energy = 0.0
-    for piece in blocks(frames.shape[0]):
-        block = np.moveaxis(frames[piece], 0, -1)
-        mask = 1.0 if good is None else good[:, piece]
-        misfit += float(np.sum(((operator(block) - readings[:, piece]) * mask) ** 2, dtype=np.float64))
-        energy += float(np.sum((readings[:, piece] * mask) ** 2, dtype=np.float64))
+    xp = namespace(frames, readings)
+    for piece in blocks(frames.shape[0], frames_at_once(operator, readings)):
+        block = xp.moveaxis(frames[piece, ...], 0, -1)
+        mask = 1.0 if good is None else xp.astype(good[:, piece], readings.dtype)
+        misfit += float(xp.sum(((operator(block) - readings[:, piece]) * mask) ** 2, dtype=xp.float64))
+        energy += float(xp.sum((readings[:, piece] * mask) ** 2, dtype=xp.float64))
     if energy == 0:
         raise InputError("every good reading is zero; there is nothing to compare with")
     return float(np.sqrt(misfit / energy))
@@ -70,25 +73,11 @@ def relative_residual(operator: LinearOperator, frames: Array, readings: Array, 
 
 def checked_readings(operator: LinearOperator, readings: Array, good: Mask) -> Array:
     """Return `readings` contiguous and in the operator's type, refusing wrong shapes, NaN and infinity."""
+    xp = namespace(readings) if good is None else namespace(readings, good)
     if readings.ndim != 2 or readings.shape[:1] != operator.shape_out:
-        raise ShapeError("readings", f"({operator.shape_out[0]}, frames)", readings.shape)
+        raise ShapeError("readings", f"({operator.shape_out[0]}, frames)", tuple(readings.shape))
     if good is not None and good.shape != readings.shape:
-        raise ShapeError("the mask of good readings", readings.shape, good.shape)
-    if not np.all(np.isfinite(readings)):
+        raise ShapeError("the mask of good readings", tuple(readings.shape), tuple(good.shape))
+    if not xp.all(xp.isfinite(readings)):
         raise InputError("readings must not hold NaN or infinity; mark bad ones in `good`")
-    return np.ascontiguousarray(readings, dtype=operator.dtype)
-
-
-def full_block(values: Array, piece: slice) -> Array:
-    """Copy the columns `piece` into a block of exactly `LANES` columns, zero beyond them; a lone frame stays alone."""
-    block = np.zeros((values.shape[0], LANES if values.shape[1] > 1 else 1), values.dtype)
-    block[:, : piece.stop - piece.start] = values[:, piece]
-    return block
-
-
-def write_frames(block: Array, frames: Array, piece: slice) -> None:
-    """Put a (rows, columns, lanes) block where its frames belong."""
-    from tofclip.recovery.kernels import lanes_to_frames
-
-    target = frames[piece].reshape(piece.stop - piece.start, -1)
-    lanes_to_frames(block.reshape(-1, block.shape[-1]), target)
+    return as_type(readings, operator.dtype)

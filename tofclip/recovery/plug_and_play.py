@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import require_numpy
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, squared_norm
 from tofclip.recovery.data_terms import DataTerm
@@ -61,6 +62,7 @@ class PlugAndPlay:
         """Recover one picture per column of `readings`; see `Method`."""
         from threadpoolctl import threadpool_limits
 
+        require_numpy("recovery with a denoiser", readings)
         started = self.start.recover(operator, readings, good, progress)
         coupling = self.coupling * squared_norm(operator, NORM_ITERATIONS)
         frames = np.empty_like(started.frames)
@@ -134,7 +136,7 @@ def nearest_fit(
         product: Array = operator.adjoint(weights * operator(h)) + coupling * h
         return product
 
-    solution: Array = anchor.copy()
+    solution = anchor.copy()
     residual: Array = -operator.adjoint(misfit.gradient(predicted)[:, 0])
     direction = residual.copy()
     energy = float(np.vdot(residual, residual))

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import Array as Array
 from tofclip.errors import InputError
-
-Array = NDArray[Any]
+from tofclip.recovery.loops import loops_for
 
 
 class Regulariser(Protocol):
     """A penalty R(h) whose proximal map is known, on a block of (rows, columns, lanes) pictures."""
 
-    def descend(self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float) -> Array:
-        """Overwrite `previous` with ``prox_{step R}(z - step * gradient)``, a proximal gradient step.
+    def descend(
+        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
+    ) -> tuple[Array, Array]:
+        """Return ``prox_{step R}(z - step * gradient)``, a proximal gradient step, and R of it for each frame, float64.
 
         ``z = current + momentum * (current - previous)`` is the extrapolated point and `gradient` belongs to it.
-        `gradient` may be overwritten as well. Returns R of the result for each frame, (lanes,) float64.
+        `previous` and `gradient` may be overwritten; the result may lie in their memory.
         """
         ...
 
@@ -36,16 +37,12 @@ class NonnegativeSparsity:
     def __init__(self, weight: float) -> None:
         self.weight = checked_weight(weight)
 
-    def descend(self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float) -> Array:
-        from tofclip.recovery.kernels import nonnegative_shrinkage
-
-        number = current.dtype.type
-        total = np.empty(current.shape[-1])
-        # Every pixel is on its own: a block of volumes is one of tall pictures.
-        pixels = (array.reshape(-1, *array.shape[-2:]) for array in (current, previous))
-        slope = gradient.reshape(-1, *gradient.shape[-2:])
-        nonnegative_shrinkage(*pixels, momentum, slope, number(step), number(step * self.weight), total)
-        return self.weight * total
+    def descend(
+        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
+    ) -> tuple[Array, Array]:
+        loops = loops_for(current)
+        picture, total = loops.shrunk(current, previous, momentum, gradient, step, step * self.weight)
+        return picture, self.weight * total
 
 
 class NonnegativeTotalVariation:
@@ -68,19 +65,15 @@ class NonnegativeTotalVariation:
         self.sweeps = sweeps
         self._dual: Array | None = None
 
-    def descend(self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float) -> Array:
-        from tofclip.recovery import kernels
-
-        if self._dual is None:
-            self._dual = np.zeros((2, *current.shape), current.dtype)
-        number = current.dtype.type
-        weight = number(step * self.weight)
-        kernels.gradient_step(current, previous, momentum, gradient, number(step))
-        if weight > 0:
-            kernels.total_variation_dual_sweeps(gradient, self._dual, weight, self.sweeps, previous)
-        total = np.empty(current.shape[-1])
-        kernels.total_variation_primal(gradient, self._dual, weight, previous, total)
-        return self.weight * total
+    def descend(
+        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
+    ) -> tuple[Array, Array]:
+        loops = loops_for(current)
+        noisy = loops.descended(current, previous, momentum, gradient, step)
+        picture, total, self._dual = loops.variation_shrunk(
+            noisy, self._dual, step * self.weight, self.sweeps, previous
+        )
+        return picture, self.weight * total
 
 
 def checked_weight(weight: float) -> float:

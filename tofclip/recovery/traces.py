@@ -7,6 +7,8 @@ time, whose traces stay in cache.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,6 +43,35 @@ class InverseTraces:
             raise InputError(f"traces of single pixels need a sparse matrix, not {inverse.operator!r}")
         self.inverse = inverse
         self._tiles = Tiles.of(inverse.operator.matrix.T.tocsr()[pixels])
+
+    def brightest(self, block: Array) -> Array:
+        """Return how far the brightest pixel of each back-projected frame stands out.
+
+        Parameters
+        ----------
+        block : (readings, LANES) contiguous array
+            In units of their noise.
+
+        Returns
+        -------
+        (LANES,) array
+            The largest ``a'f / |a|`` over the columns a of A: the response of the filter that is matched to a lone
+            pixel, in units of its noise. Never below zero.
+        """
+        from tofclip.recovery.kernels import highest_pixels
+
+        highest = np.zeros(block.shape[1], block.dtype)
+        highest_pixels(*self._tiles, self._scales, block, highest)
+        return highest
+
+    @cached_property
+    def _scales(self) -> Array:
+        """``1 / |a|`` of each pixel, 0 where nothing is seen."""
+        starts, _, values = self._tiles
+        ends = np.concatenate([[0], np.cumsum(values.astype(np.float64) ** 2)])
+        energy = (ends[starts[:, 1:]] - ends[starts[:, :-1]]).sum(axis=0)
+        scales = np.divide(1, np.sqrt(energy), out=np.zeros(energy.size), where=energy > 0)
+        return scales.astype(values.dtype)
 
     def fill(self, weights: Array, piece: slice, traces: Array, frames: slice) -> None:
         """Write what the inverse makes of a shot at the pixels ``pixels[piece]``.

@@ -33,7 +33,9 @@ class NonnegativeWavelets:
         self.wavelet = wavelet
         self._shifts = np.random.default_rng(seed).integers(0, 64, (SHIFTS, 2))
 
-    def descend(self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float) -> Array:
+    def descend(
+        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
+    ) -> tuple[Array, Array]:
         from tofclip.recovery.kernels import gradient_step
 
         gradient_step(current, previous, momentum, gradient, current.dtype.type(step))
@@ -46,7 +48,7 @@ class NonnegativeWavelets:
             penalty += total
         previous /= SHIFTS
         np.maximum(previous, 0, out=previous)
-        return self.weight * penalty / SHIFTS
+        return previous, self.weight * penalty / SHIFTS
 
     def _shrunk(self, picture: Array, threshold: float) -> tuple[Array, Array]:
         """Shrink the details; return the picture and the sum of its details' sizes for each frame."""
