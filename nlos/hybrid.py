@@ -10,7 +10,7 @@ from nlos.band import VirtualPulse
 from nlos.capture import Capture
 from nlos.exposure import Exposure, exposure_support, exposures, unfolded_band
 from nlos.geometry import Grid
-from nlos.method import Progress, Support, common_support, silent
+from nlos.method import Progress, Support, common_support, numpy_support, silent
 from nlos.plane import Plane
 from nlos.propagation.plane_field import virtual_plane
 from nlos.propagation.propagate import Propagation, carried, require_propagation
@@ -19,6 +19,7 @@ from nlos.rsd.meeting import diffract
 from nlos.rsd.planar import grid_support, require_tolerance, source_of, waves_of
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
+from tofclip.arrays import is_numpy
 from tofclip.errors import InputError
 
 ZONES, STRICT_ZONES = 2.0, 4.0
@@ -39,7 +40,8 @@ class Hybrid:
     there Rayleigh-Sommerfeld diffraction carries it to all depths, as `PlanarRSD` does. The image is that of
     `Backprojection`. Several laser spots add up; confocal scans run at doubled wavenumbers.
 
-    Voxels between wall and virtual plane are reached backwards, without the waves that left the plane's rim.
+    Voxels between wall and virtual plane are reached backwards, without the waves that left the plane's rim. A capture
+    of another library's arrays is imaged in that library; see `nlos.portable`.
 
     Supplementary Note 12 of X. Feng, Y. Ma, L. Gao, "Compact light field photography towards versatile
     three-dimensional vision", Nat. Commun. 13, 3333 (2022).
@@ -77,13 +79,15 @@ class Hybrid:
         laser spots, a virtual plane in front of the wall, and memory.
         """
         general = common_support(capture, grid) and grid_support(grid) and exposure_support(capture)
+        if self.propagation == "time":
+            general = general and numpy_support("propagation in time", capture)
         if not general:
             return general
         foremost = float(capture.points[:, 2].max())
         if self.plane_z is not None and self.plane_z <= foremost:
             return Support(f"the virtual plane must lie in front of the wall, which reaches up to z = {foremost:.4g} m")
         try:
-            ways = [way for _, way in self._ways(capture, grid)]
+            ways = [way for _, way in self.ways(capture, grid)]
         except InputError as problem:
             return Support(str(problem))
         return ways[0].supports()
@@ -109,33 +113,42 @@ class Hybrid:
             `supports` says no.
         """
         complex_field = self.phasor_field(capture, grid, progress)
-        return Volume(np.abs(complex_field.values), grid, complex_field.provenance)
+        return Volume(abs(complex_field.values), grid, complex_field.provenance)
 
     def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; linear within the tolerance."""
         self.supports(capture, grid).require()
         band = unfolded_band(capture, grid, self.pulse)
         warn_of_aliasing(capture, band)
+        if not is_numpy(capture.signal):
+            from nlos.portable.prepared import PreparedField
+
+            prepared = PreparedField(self, capture, grid)
+            total = prepared.of(capture, progress)
+            return Volume(total, grid, {**capture.provenance, "imaging": prepared.settings})
         total = np.zeros(grid.shape, np.complex64)
-        for part, way in self._ways(capture, grid):
+        for part, way in self.ways(capture, grid):
             on_plane = carried(capture, part, way.plane, band, self.propagation, PASSAGE_SHARE * self.tolerance).values
             diffract(way, on_plane * np.float32(np.prod(way.plane.steps)), source_of(part, band), total, progress)
-        settings = {
+        return Volume(total, grid, {**capture.provenance, "imaging": {**self.settings, "plane_z_m": way.plane.z}})
+
+    @property
+    def settings(self) -> dict[str, str | float]:
+        """What a volume tells of how it was imaged."""
+        return {
             "method": "hybrid",
             "wavelength_m": self.wavelength,
             "cycles": self.cycles,
             "propagation": self.propagation,
             "tolerance": self.tolerance,
-            "plane_z_m": way.plane.z,
         }
-        return Volume(total, grid, {**capture.provenance, "imaging": settings})
 
     def virtual_plane(self, capture: Capture, grid: Grid) -> Plane:
         """Return the virtual plane of a capture's first laser spot."""
-        return self._ways(capture, grid)[0][1].plane
+        return self.ways(capture, grid)[0][1].plane
 
-    def _ways(self, capture: Capture, grid: Grid) -> list[tuple[Exposure, Diffraction]]:
-        """Every exposure, and its way from a virtual plane of its own to the grid."""
+    def ways(self, capture: Capture, grid: Grid) -> list[tuple[Exposure, Diffraction]]:
+        """Return every exposure, and its way from a virtual plane of its own to the grid."""
         band = unfolded_band(capture, grid, self.pulse)
         zones = STRICT_ZONES if self.tolerance < STRICT else ZONES
         ways = []

@@ -7,17 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nlos.band import Band
 from nlos.capture import Capture
 from nlos.exposure import Exposure, exposures, unfolded_band
-from nlos.geometry import Grid
+from nlos.geometry import FloatArray, Grid
+from nlos.hybrid import PASSAGE_SHARE, Hybrid
 from nlos.method import Progress, silent
 from nlos.portable.diffraction import PortableDiffraction
 from nlos.portable.library import Library
-from nlos.portable.signals import exposed_phasors
+from nlos.portable.propagation import WallToPlane
+from nlos.portable.signals import exposed_phasors, on_lattice
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.planar import PlanarRSD, source_of, waves_of
-from nlos.rsd.wall import PlanarWall
+from nlos.rsd.wall import PlanarWall, WallLattice
 from nlos.volume import Volume
 from tofclip.arrays import Array, is_numpy
 from tofclip.errors import InputError
@@ -44,7 +45,7 @@ class PreparedImaging:
 
     Parameters
     ----------
-    method : PlanarRSD
+    method : PlanarRSD or Hybrid
     capture : Capture
         One of them; geometry, time axis and place are what counts.
     grid : Grid
@@ -55,7 +56,7 @@ class PreparedImaging:
         The method does not support such a capture on the grid.
     """
 
-    def __init__(self, method: PlanarRSD, capture: Capture, grid: Grid) -> None:
+    def __init__(self, method: PlanarRSD | Hybrid, capture: Capture, grid: Grid) -> None:
         method.supports(capture, grid).require()
         self.method, self.grid = method, grid
         self._first = capture
@@ -90,17 +91,22 @@ class PreparedField:
 
     Parameters
     ----------
-    method : PlanarRSD
+    method : PlanarRSD or Hybrid
     capture : Capture
         One of them; geometry, time axis and place are what counts.
     grid : Grid
     """
 
-    def __init__(self, method: PlanarRSD, capture: Capture, grid: Grid) -> None:
+    def __init__(self, method: PlanarRSD | Hybrid, capture: Capture, grid: Grid) -> None:
         self.grid, self.library = grid, Library(capture.place)
         self.settings = method.settings
-        band = unfolded_band(capture, grid, method.pulse)
-        self._routes = [self._planar(method, capture, band, part) for part in exposures(capture)]
+        self._band = unfolded_band(capture, grid, method.pulse)
+        if isinstance(method, PlanarRSD):
+            self._routes = [self._planar(method, capture, part) for part in exposures(capture)]
+        else:
+            ways = method.ways(capture, grid)
+            self._routes = [self._by_plane(method, capture.points[part.members], part, way) for part, way in ways]
+            self.settings["plane_z_m"] = ways[-1][1].plane.z
 
     def of(self, capture: Capture, progress: Progress = silent) -> Array:
         """Return the field (z, y, x), complex64, where the capture's signal lives."""
@@ -109,19 +115,27 @@ class PreparedField:
             route.onwards.add(route.onto(capture), total, progress)
         return total
 
-    def _planar(self, method: PlanarRSD, capture: Capture, band: Band, part: Exposure) -> _Route:
+    def _planar(self, method: PlanarRSD, capture: Capture, part: Exposure) -> _Route:
         wall = PlanarWall.of(capture.points[part.members])
-        way = Diffraction(wall.plane, self.grid, waves_of(part, band, continued=False), method.tolerance)
-        onwards = PortableDiffraction(way, source_of(part, band), self.library)
-        return _Route(lambda one: _on_wall(wall, exposed_phasors(one, part, band), self.library), onwards)
+        way = Diffraction(wall.plane, self.grid, waves_of(part, self._band, continued=False), method.tolerance)
+
+        def onto(one: Capture) -> Array:
+            return _on_wall(wall.lattice, exposed_phasors(one, part, self._band), self.library)
+
+        return _Route(onto, PortableDiffraction(way, source_of(part, self._band), self.library))
+
+    def _by_plane(self, method: Hybrid, points: FloatArray, part: Exposure, way: Diffraction) -> _Route:
+        tolerance, area = PASSAGE_SHARE * method.tolerance, float(np.prod(way.plane.steps))
+        waves = waves_of(part, self._band, continued=False)
+        carrying = WallToPlane(points, way.plane, waves, tolerance, self.library)
+
+        def onto(one: Capture) -> Array:
+            return area * carrying.field(exposed_phasors(one, part, self._band))
+
+        return _Route(onto, PortableDiffraction(way, source_of(part, self._band), self.library))
 
 
-def _on_wall(wall: PlanarWall, phasors: Array, library: Library) -> Array:
-    """Put phasors (points, frequencies) into their places on the wall, (y, x, frequencies); the others stay dark."""
-    xp, shape = library.xp, wall.plane.shape
-    if not wall.lattice.complete:
-        place = np.full(shape[0] * shape[1], phasors.shape[0])
-        place[wall.lattice.row * shape[1] + wall.lattice.column] = np.arange(phasors.shape[0])
-        padded = xp.concat([phasors, library.zeros((1, phasors.shape[1]))], axis=0)
-        phasors = xp.take(padded, library.put(place), axis=0)
-    return xp.reshape(phasors, (*shape, -1))
+def _on_wall(wall: WallLattice, phasors: Array, library: Library) -> Array:
+    """Put phasors (points, frequencies) into their places on the wall, (y, x, frequencies)."""
+    xp = library.xp
+    return xp.permute_dims(on_lattice(xp.permute_dims(phasors, (1, 0)), wall, library), (1, 2, 0))

@@ -11,6 +11,7 @@ from nlos.band import Band
 from nlos.capture import Capture
 from nlos.exposure import Exposure
 from nlos.portable.library import Library
+from nlos.rsd.wall import WallLattice
 from tofclip.arrays import Array
 
 
@@ -35,6 +36,15 @@ def traces_of(capture: Capture, some: slice) -> Array:
     xp = Library.of(capture.signal).xp
     members = np.arange(len(capture.points))[some]
     return xp.permute_dims(_in_time(capture, members), (1, 0))
+
+
+def on_lattice(values: Array, wall: WallLattice, library: Library) -> Array:
+    """Put values (..., points) into their places on a lattice, (..., rows, columns); the others are 0."""
+    xp = library.xp
+    if not wall.complete:
+        padded = xp.concat([values, library.zeros((*values.shape[:-1], 1))], axis=-1)
+        values = xp.take(padded, library.put(wall.occupants), axis=-1)
+    return xp.reshape(values, (*values.shape[:-1], *wall.shape))
 
 
 def _in_time(capture: Capture, members: NDArray[Any]) -> Array:

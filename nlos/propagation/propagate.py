@@ -17,6 +17,7 @@ from nlos.propagation.passage import Passage
 from nlos.propagation.plane_field import PlaneField
 from nlos.propagation.shift_and_sum import delayed_sum
 from nlos.rsd.planar import require_tolerance, waves_of
+from tofclip.arrays import is_numpy, require_numpy
 from tofclip.errors import InputError
 
 Propagation = Literal["spectral", "time"]
@@ -79,8 +80,13 @@ def carried(
         )
     wavenumbers = part.passes * band.wavenumbers
     if propagation == "time":
+        require_numpy("propagation in time", capture.signal)
         traces = np.ascontiguousarray(capture.traces()[part.members])
         return PlaneField(delayed_sum(points, traces, plane, band, part.passes), plane, wavenumbers)
+    if not is_numpy(capture.signal):
+        from nlos.portable.propagation import carried_elsewhere
+
+        return carried_elsewhere(capture, part, plane, band, tolerance)
     phasors = part.phasors(capture, band)
     passage = Passage.of(points, plane, waves_of(part, band, continued=False), strength(phasors), tolerance)
     if passage is not None and passage.quicker:

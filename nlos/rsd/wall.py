@@ -61,6 +61,13 @@ class WallLattice:
         places = self.row * self.x.size + self.column
         return places.size == self.x.size * self.y.size and bool(np.all(np.diff(places) == 1))
 
+    @cached_property
+    def occupants(self) -> NDArray[np.intp]:
+        """Number of the wall point in every place, in C order; one too many where none stands."""
+        occupants = np.full(self.x.size * self.y.size, self.row.size)
+        occupants[self.row * self.x.size + self.column] = np.arange(self.row.size)
+        return occupants
+
 
 @dataclass(frozen=True, eq=False)
 class PlanarWall:

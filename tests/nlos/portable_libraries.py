@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tofclip.arrays import Place, place_named
+from tofclip.arrays import Place, place_named, to_numpy
 
 LIBRARIES = ("torch", "array_api_strict")
 
@@ -19,4 +19,4 @@ def place_of(library: str) -> Place:
 
 
 def relative_error(found: Any, expected: np.ndarray) -> float:
-    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+    return float(np.linalg.norm(to_numpy(found) - expected) / np.linalg.norm(expected))
