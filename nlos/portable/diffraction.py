@@ -15,8 +15,7 @@ from nlos.portable.library import CHUNK_BYTES, Library, whole_turns_off
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.illumination import Illumination
 from nlos.rsd.kernels import TAPS
-from nlos.rsd.meeting import WAVES_AT_A_TIME, Source
-from nlos.rsd.spectrum import PlaneWaves
+from nlos.rsd.meeting import Source
 from tofclip.arrays import Array
 from tofclip.threads import blocks, run_blocks
 
@@ -189,8 +188,9 @@ class PortableDiffraction:
     @cached_property
     def _share(self) -> Array:
         """1 / area of a period, or 0 where a wave is left out at a frequency, shape (waves, frequencies)."""
-        counted = first_frequencies(self.way.plane_waves)[:, np.newaxis] <= np.arange(self.way.waves.count)
-        return self.library.put(counted / np.prod(self.way.plane_waves.period))
+        waves = self.way.plane_waves
+        counted = waves.lateral[:, np.newaxis] <= waves.limits
+        return self.library.put(counted / np.prod(waves.period))
 
     @cached_property
     def _cell(self) -> Array:
@@ -222,19 +222,6 @@ class PortableDiffraction:
         node, share = self.way.transfer.interpolation(lateral)
         shares = [self.library.put(share[:, tap, np.newaxis]) for tap in range(TAPS)]
         return self.library.put(node), shares, self.library.put(turn.ravel())
-
-
-def first_frequencies(waves: PlaneWaves) -> NDArray[np.intp]:
-    """Return the lowest frequency at which the compiled loops count every plane wave.
-
-    They leave grazing waves out row by row and block by block; both ways are within the tolerance, but only the same
-    choice gives the same image.
-    """
-    nearest_in_row = np.full(2 * int(np.abs(waves.row).max()) + 1, np.inf)
-    np.minimum.at(nearest_in_row, waves.row, waves.lateral)
-    starts = np.arange(0, waves.lateral.size, WAVES_AT_A_TIME)
-    nearest_in_block = np.repeat(np.minimum.reduceat(waves.lateral, starts), WAVES_AT_A_TIME)[: waves.lateral.size]
-    return np.asarray(np.searchsorted(waves.limits, np.maximum(nearest_in_row[waves.row], nearest_in_block)))
 
 
 def _together(lights: list[Illumination]) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,8 +11,6 @@ from nlos.propagation.passage import Passage
 from nlos.rsd.blas import one_thread
 from nlos.rsd.inverse import inverse
 from tofclip.threads import run_blocks
-
-IntArray = NDArray[np.int64]
 
 
 def layered_sum(passage: Passage, phasors: NDArray[np.complex64]) -> NDArray[np.complex64]:
@@ -51,30 +47,15 @@ def layered_sum(passage: Passage, phasors: NDArray[np.complex64]) -> NDArray[np.
     return np.moveaxis(field, 0, -1)
 
 
-@dataclass(frozen=True, eq=False)
-class _Grid:
-    """Indices of all plane waves within a rectangle, column by column."""
-
-    row: IntArray
-    column: IntArray
-
-    @classmethod
-    def within(cls, reach: tuple[int, int]) -> _Grid:
-        column, row = np.meshgrid(*(np.arange(-n, n + 1) for n in reach[::-1]), indexing="ij")
-        return cls(row.ravel(), column.ravel())
-
-
 class _Bench:
     """One thread's memory, and what it does there."""
 
     def __init__(self, passage: Passage, terms: int) -> None:
         self.passage = passage
         self.analysis = LatticeAnalysis(passage.wall, passage.lattice, passage.reach[1], terms)
-        rows, columns = (2 * reach + 1 for reach in passage.reach)
-        wanted = passage.plane.shape
-        self.inverse = inverse(_Grid.within(passage.reach), passage.plane_lattice, wanted, 1)
-        cell = self.inverse.cell.reshape(columns, rows)
-        self.cells = cell[:, 0], cell[0] - cell[0, 0]
+        column, row = np.meshgrid(*(np.arange(-n, n + 1) for n in passage.reach[::-1]), indexing="ij")
+        self.inverse = inverse((row, column), passage.plane_lattice, passage.plane.shape, 1)
+        self.cells = self.inverse.cell[:, 0], self.inverse.cell[0] - self.inverse.cell[0, 0]
         self.spacing = np.array(passage.steps[::-1]) / passage.relief.transfer.node_step
 
     def carry(self, number: int, phasors: NDArray[np.complex64], field: NDArray[np.complex64]) -> None:
@@ -83,11 +64,12 @@ class _Bench:
         group, terms = passage.relief.groups[number], passage.relief.terms(number)
         values = np.ascontiguousarray(phasors[:, group].T)
         shift_y, shift_x = passage.shifts
-        spectrum = self.inverse.spectra[0].reshape(-1)
+        spectrum = self.inverse.spectra[0]
         for i, frequency in enumerate(range(group.start, group.stop)):
             reach = passage.rows_within(frequency)
             spectra = self.analysis.spectra(values[i], terms.over_points, reach.size - 1)
             spectrum[:] = 0
             parts = spectra.view(np.float32)
             join_terms(parts, terms.over_waves[i], self.spacing, reach, shift_x, shift_y, *self.cells, spectrum)
-            np.multiply(self.inverse.images(1)[0], self.inverse.carrier, out=field[frequency])
+            self.inverse.transform(slice(0, 1))
+            np.multiply(self.inverse.images[0], self.inverse.carrier, out=field[frequency])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,40 +11,46 @@ from numpy.typing import NDArray
 from nlos.rsd.kernels import transpose
 from nlos.rsd.window import VECTOR
 
+if TYPE_CHECKING:
+    import pyfftw
+
 PLANNING = threading.Lock()
 """FFTW plans one transform at a time."""
 
 PLANS = ("FFTW_ESTIMATE",)
 """Plans that are measured are no faster here, and differ from run to run, as the last bits of an image would."""
 
+CACHE_BYTES = 1 << 19
+"""Spectra that are transformed at a time: they stay in a core's second cache, and calls stay few."""
+
 PRODUCT_RATE = 3
 """How many operations of a matrix product take as long as one of a pruned Fourier transform; measured."""
 
 
-class Indices(Protocol):
-    """Plane waves, known by their indices along y and x; these reach as far below 0 as above."""
-
-    @property
-    def row(self) -> NDArray[np.int64]: ...
-
-    @property
-    def column(self) -> NDArray[np.int64]: ...
+Indices = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""Of plane waves along y and x, in arrays of one shape; these reach as far below 0 as above."""
 
 
 class Inverse(Protocol):
     """From the spectra of several terms to their images, with memory of its own; not to be shared between threads."""
 
     cell: NDArray[np.int64]
-    """Where in a flat spectrum every plane wave goes."""
+    """Where in a spectrum every plane wave goes, in the shape of its indices."""
+
+    spare: int
+    """A cell that belongs to no wave."""
 
     carrier: NDArray[np.complex64]
     """What every column of an image has still to be multiplied by."""
 
     spectra: NDArray[np.complex64]
-    """Memory for the spectra, term by term; 0 where no plane wave goes."""
+    """Room for some spectra (n, cells), to be transformed at a time; 0 where no plane wave goes."""
 
-    def images(self, terms: int) -> NDArray[np.complex64]:
-        """Transform the first `terms` of `spectra`; the result (term, y, x) is valid until the next call."""
+    images: NDArray[np.complex64]
+    """Room for the images of all terms, (terms, y, x)."""
+
+    def transform(self, terms: slice) -> None:
+        """Turn the first spectra into the images of these terms."""
         ...
 
 
@@ -53,7 +59,7 @@ def inverse(waves: Indices, lattice: tuple[float, float], wanted: tuple[int, int
 
     Parameters are those of `InverseTransform`; a period that is no whole number of voxels leaves matrix products only.
     """
-    columns, rows = (2 * int(np.max(index)) + 1 for index in (waves.column, waves.row))
+    rows, columns = (2 * int(np.max(index)) + 1 for index in waves)
     high, wide = (int(length) for length in lattice)
     if (high, wide) != lattice:
         return InverseProduct(waves, lattice, wanted, terms)
@@ -71,18 +77,23 @@ class InverseProduct:
     """
 
     def __init__(self, waves: Indices, lattice: tuple[float, float], wanted: tuple[int, int], terms: int) -> None:
-        rows, columns = (int(np.max(index)) for index in (waves.row, waves.column))
-        self.cell = (waves.column + columns) * (2 * rows + 1) + waves.row + rows
+        reach = rows, columns = tuple(int(np.max(index)) for index in waves)
+        self._shape = (2 * columns + 1, 2 * rows + 1)
+        self.spare = self._shape[0] * self._shape[1]
+        self.cell = (waves[1] + columns) * self._shape[1] + waves[0] + rows
         self.carrier = np.ones(wanted[1], np.complex64)
-        self.spectra = np.zeros((terms, 2 * columns + 1, 2 * rows + 1), np.complex64)
+        self.spectra = np.zeros((_at_a_time(self.spare, terms), self.spare + 1), np.complex64)
+        self.images = np.empty((terms, *wanted), np.complex64)
         self._along_y, self._along_x = (
             np.exp(2j * np.pi / length * np.outer(np.arange(-reach, reach + 1), np.arange(count))).astype(np.complex64)
-            for reach, length, count in zip((rows, columns), lattice, wanted, strict=True)
+            for reach, length, count in zip(reach, lattice, wanted, strict=True)
         )
 
-    def images(self, terms: int) -> NDArray[np.complex64]:
-        """Transform the first `terms` of `spectra`; the result is (term, y, x)."""
-        return np.stack([(spectrum @ self._along_y).T @ self._along_x for spectrum in self.spectra[:terms]])
+    def transform(self, terms: slice) -> None:
+        """Turn the first spectra into the images of these terms."""
+        for spectrum, image in zip(self.spectra, self.images[terms], strict=False):
+            half = spectrum[: self.spare].reshape(self._shape) @ self._along_y
+            np.matmul(half.T, self._along_x, out=image)
 
 
 class InverseTransform:
@@ -93,7 +104,8 @@ class InverseTransform:
 
     Parameters
     ----------
-    waves : Indices
+    waves : (rows, columns)
+        Indices along y and x.
     lattice : (int, int)
         Voxels in a period along y and x.
     wanted : (int, int)
@@ -103,39 +115,52 @@ class InverseTransform:
     """
 
     def __init__(self, waves: Indices, lattice: tuple[int, int], wanted: tuple[int, int], terms: int) -> None:
-        import pyfftw
+        from pyfftw import zeros_aligned
 
-        high, wide = lattice
-        reach = int(np.max(waves.column))
+        self._high, self._wide = high, wide = lattice
+        reach = int(np.max(waves[1]))
         columns = min(2 * reach + 1, wide)
         # Unfolded columns are shifted so that none is negative; `carrier` takes the shift back.
-        self._shift = reach if 2 * reach + 1 < wide else 0
-        column = (waves.column + self._shift) % wide
-        self.cell: NDArray[np.int64] = column * _padded(high) + waves.row % high
-        self.carrier = np.exp(-2j * np.pi * self._shift / wide * np.arange(wanted[1])).astype(np.complex64)
-        self._wanted = wanted
-        shapes = ((terms, columns, high), (columns, high), (wanted[0], wide), (terms, wanted[0], wide))
-        arrays = [pyfftw.zeros_aligned((*shape[:-1], _padded(shape[-1])), np.complex64) for shape in shapes]
-        self.spectra: NDArray[np.complex64] = arrays[0]
-        self._lines: NDArray[np.complex64] = arrays[1]
-        self._middle: NDArray[np.complex64] = arrays[2]
-        self._images: NDArray[np.complex64] = arrays[3]
-        self._high, self._wide = high, wide
-        with PLANNING:
-            backward = {"direction": "FFTW_BACKWARD", "axes": (1,), "flags": PLANS}
-            self._along_y = pyfftw.FFTW(self.spectra[0, :, :high], self._lines[:, :high], **backward)
-            self._along_x = pyfftw.FFTW(self._middle[:, :wide], self._images[0, :, :wide], **backward)
+        shift = reach if 2 * reach + 1 < wide else 0
+        self.spare = columns * _padded(high)
+        self.cell: NDArray[np.int64] = (waves[1] + shift) % wide * _padded(high) + waves[0] % high
+        self.carrier = np.exp(-2j * np.pi * shift / wide * np.arange(wanted[1])).astype(np.complex64)
+        some = _at_a_time(self.spare, terms)
+        self.spectra: NDArray[np.complex64] = zeros_aligned((some, self.spare + VECTOR), np.complex64)
+        self._columns = self.spectra[:, : self.spare].reshape(some, columns, _padded(high))[..., :high]
+        self._lines = zeros_aligned((some, columns, _padded(high)), np.complex64)[..., :high]
+        self._middle = zeros_aligned((some, wanted[0], _padded(wide)), np.complex64)[..., :wide]
+        self._rows = zeros_aligned((terms, wanted[0], _padded(wide)), np.complex64)[..., :wide]
+        self.images: NDArray[np.complex64] = self._rows[..., : wanted[1]]
+        self._plans: dict[int, tuple[pyfftw.FFTW, pyfftw.FFTW]] = {}
 
-    def images(self, terms: int) -> NDArray[np.complex64]:
-        """Transform the first `terms` of `spectra`; the result (term, y, x) is valid until the next call."""
-        columns, rows = len(self._lines), self._wanted[0]
-        for term in range(terms):
-            self._along_y.update_arrays(self.spectra[term, :, : self._high], self._lines[:, : self._high])
-            self._along_y.execute()
-            transpose(self._lines[:, :rows], self._middle[:, :columns])
-            self._along_x.update_arrays(self._middle[:, : self._wide], self._images[term, :, : self._wide])
-            self._along_x.execute()
-        return self._images[:terms, :, : self._wanted[1]]
+    def transform(self, terms: slice) -> None:
+        """Turn the first spectra into the images of these terms."""
+        count = terms.stop - terms.start
+        along_y, along_x = self._planned(count)
+        along_y.execute()
+        wanted, columns = self._middle.shape[1], self._lines.shape[1]
+        for line, middle in zip(self._lines[:count], self._middle, strict=False):
+            transpose(line[:, :wanted], middle[:, :columns])
+        along_x.update_arrays(self._middle[:count], self._rows[terms])
+        along_x.execute()
+
+    def _planned(self, count: int) -> tuple[pyfftw.FFTW, pyfftw.FFTW]:
+        import pyfftw
+
+        if count not in self._plans:
+            arrays = (self._columns, self._lines), (self._middle, self._rows)
+            with PLANNING:
+                y, x = (
+                    pyfftw.FFTW(a[:count], b[:count], direction="FFTW_BACKWARD", axes=(2,), flags=PLANS)
+                    for a, b in arrays
+                )
+            self._plans[count] = y, x
+        return self._plans[count]
+
+
+def _at_a_time(cells: int, terms: int) -> int:
+    return max(1, min(terms, CACHE_BYTES // (8 * cells)))
 
 
 def _padded(count: int) -> int:

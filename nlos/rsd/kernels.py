@@ -15,9 +15,21 @@ SQUARE = 16
 TAPS = 6
 """Nodes that the interpolation along the radius takes."""
 
+LANES, MIRRORED = 32, 4
+"""Plane waves treated together: neighbours in lateral wavenumber, two full vectors of 512 bits, and their mirror images
+in the axes."""
+
+GROUP = 2 * MIRRORED * LANES
+"""Real numbers of such a group at one frequency."""
+
+STEPS, NODES = 8, 4
+"""Frequencies, and nodes of the transfer function, that stay in registers."""
+
+TWO, THREE, FOUR = np.uint64(2), np.uint64(3), np.uint64(4)
+
 
 @compiled
-def sample_waves(radius, distance, first, step, delay, continued, waves):
+def sample_waves(radius, distance, first, step, delay, continued, ahead, waves):
     """Spherical waves of all frequencies at every radius about their source: ``exp(1j * (k * R + (k - k_0) * delay))``.
 
     They are divided by R; or, if `continued`, weighted as in the first Rayleigh-Sommerfeld integral; at a negative
@@ -33,7 +45,9 @@ def sample_waves(radius, distance, first, step, delay, continued, waves):
     delay : (2,) float64 array
         A path added to all, m, and the wavenumber k_0 whose phase it leaves alone.
     continued : bool
-    waves : (n, 2, frequencies) float32 array
+    ahead : int
+        Entries before the lowest frequency, left alone.
+    waves : (n, 2, ahead + frequencies) float32 array
         Real and imaginary parts, overwritten.
     """
     direction = math.copysign(1.0, distance)
@@ -46,10 +60,10 @@ def sample_waves(radius, distance, first, step, delay, continued, waves):
         if continued:
             rising = abs(distance) / (2 * math.pi * path**2)
             steady = rising / path
-        for w in range(waves.shape[2]):
+        for w in range(waves.shape[2] - ahead):
             value = wave * complex(steady, -direction * rising * (first + w * step))
-            waves[i, 0, w] = value.real
-            waves[i, 1, w] = value.imag
+            waves[i, 0, ahead + w] = value.real
+            waves[i, 1, ahead + w] = value.imag
             wave *= factor
 
 
@@ -67,56 +81,129 @@ def interpolation(place, node, share):
 
 
 @compiled
-def transferred(spectrum, nodes, node, share, begin, first, weights, products):
-    """``products = spectrum * transfer`` for the plane waves from `begin` on and the frequencies from `first` on.
+def carry(spectrum, first, nodes, begin, offset, shares, coefficients, terms):
+    """``terms[m] = sum_k coefficients[m, k] * transfer_k * spectrum_k`` for all plane waves, group by group.
 
-    The transfer function depends on a wave's lateral wavenumber alone and is interpolated between its nodes; waves of
-    one lateral wavenumber stand side by side and share it.
+    The transfer function depends on a wave's lateral wavenumber alone and is interpolated between its nodes, once for
+    waves mirrored in the axes. Everything between spectrum and terms stays in cache. Frequencies come in steps of
+    `STEPS`.
 
     Parameters
     ----------
-    spectrum : (waves, 2, frequencies) float32 array
+    spectrum : (groups, frequencies, 2, MIRRORED, LANES) float32 array
         Real and imaginary parts.
+    first : (groups,) int64 array
+        Frequency that each group starts at.
     nodes : (n, 2, frequencies) float32 array
-    node : (waves,) int64 array
-    share : (waves, taps) float32 array
-        As `interpolation` gives them.
-    begin, first : int
-    weights : (2, frequencies) float32 array
-        Room for the interpolated transfer function.
-    products : (some waves, 2, frequencies) float32 array
+        Transfer function.
+    begin : (groups,) int64 array
+        First node that each group takes.
+    offset : (groups + 1,) int64 array
+        Where its interpolation weights begin; it has a multiple of `NODES` of them.
+    shares : (some, LANES) float32 array
+        Interpolation weights.
+    coefficients : (m, frequencies) float32 array
+        An even number of terms.
+    terms : (m, groups, 2, MIRRORED, LANES) float32 array
         Overwritten.
     """
-    # Unsigned indices into flat arrays: an index that might be negative would keep the loops from becoming vector code.
-    count = np.uint64(spectrum.shape[2])
-    here = np.uint64(first)
-    flat_spectrum, flat_products, transfer = spectrum.reshape(-1), products.reshape(-1), weights.reshape(-1)
-    latest = -1.0
-    for b in range(products.shape[0]):
-        wave = begin + b
-        if b == 0 or node[wave] != node[wave - 1] or share[wave, 0] != latest:
-            latest = share[wave, 0]
-            _interpolate(nodes, node[wave], share[wave], here, transfer)
-        source, target = np.uint64(2 * wave) * count, np.uint64(2 * b) * count
-        for w in range(here, count):
-            real, imaginary = flat_spectrum[source + w], flat_spectrum[source + count + w]
-            flat_products[target + w] = real * transfer[w] - imaginary * transfer[count + w]
-        for w in range(here, count):
-            real, imaginary = flat_spectrum[source + w], flat_spectrum[source + count + w]
-            flat_products[target + count + w] = real * transfer[count + w] + imaginary * transfer[w]
+    groups, frequencies, count = spectrum.shape[0], spectrum.shape[1], coefficients.shape[0]
+    waves, weights, flat = spectrum.reshape(-1), shares.reshape(-1), terms.reshape(-1)
+    transfer, products = np.empty(2 * STEPS * LANES, np.float32), np.empty(STEPS * GROUP, np.float32)
+    sums = np.empty(count * GROUP, np.float32)
+    for group in range(groups):
+        sums[:] = 0
+        for k in range(first[group], frequencies, STEPS):
+            _interpolate(nodes, begin[group], k, weights, offset[group], offset[group + 1], transfer)
+            _multiply(waves, (group * frequencies + k) * GROUP, transfer, products)
+            _reduce(coefficients, k, products, sums)
+        for m in range(count):
+            to = (m * groups + group) * GROUP
+            flat[to : to + GROUP] = sums[m * GROUP : (m + 1) * GROUP]
+
+
+# Unsigned indices into flat arrays: an index that might be negative would keep the loops from becoming vector code.
 
 
 @compiled
-def _interpolate(nodes, node, share, first, transfer):
-    """Interpolate real and imaginary parts of all frequencies from `first` on."""
-    stride = np.uint64(2 * nodes.shape[2])
-    flat, start = nodes.reshape(-1), np.uint64(node) * stride
-    a0, a1, a2, a3, a4, a5 = share[0], share[1], share[2], share[3], share[4], share[5]
-    n1, n2 = start + stride, start + np.uint64(2) * stride
-    n3, n4, n5 = n2 + stride, n2 + np.uint64(2) * stride, n2 + np.uint64(3) * stride
-    for w in range(first, stride):
-        early = a0 * flat[start + w] + a1 * flat[n1 + w] + a2 * flat[n2 + w]
-        transfer[w] = early + a3 * flat[n3 + w] + a4 * flat[n4 + w] + a5 * flat[n5 + w]
+def _interpolate(nodes, node, k, weights, begin, end, transfer):
+    """Transfer function (`STEPS`, 2, `LANES`) of a group at some frequencies, four nodes at a time."""
+    flat, lanes, imaginary = nodes.reshape(-1), np.uint64(LANES), np.uint64(nodes.shape[2])
+    stride = np.uint64(2) * imaginary
+    transfer[:] = 0
+    for i in range(begin, end, NODES):
+        at, w0 = np.uint64((node + i - begin) * 2 * nodes.shape[2] + k), np.uint64(i * LANES)
+        w1, w2, w3 = w0 + lanes, w0 + np.uint64(2) * lanes, w0 + np.uint64(3) * lanes
+        for step in range(np.uint64(STEPS)):
+            n0, to = at + step, np.uint64(2) * lanes * step
+            n1, n2, n3 = n0 + stride, n0 + np.uint64(2) * stride, n0 + np.uint64(3) * stride
+            a0, a1, a2, a3 = flat[n0], flat[n1], flat[n2], flat[n3]
+            n0, n1, n2, n3 = n0 + imaginary, n1 + imaginary, n2 + imaginary, n3 + imaginary
+            b0, b1, b2, b3 = flat[n0], flat[n1], flat[n2], flat[n3]
+            for j in range(lanes):
+                s0, s1, s2, s3 = weights[w0 + j], weights[w1 + j], weights[w2 + j], weights[w3 + j]
+                transfer[to + j] += (a0 * s0 + a1 * s1) + (a2 * s2 + a3 * s3)
+                transfer[to + lanes + j] += (b0 * s0 + b1 * s1) + (b2 * s2 + b3 * s3)
+
+
+@compiled
+def _multiply(waves, start, transfer, products):
+    """Products of a group's waves with their transfer function at some frequencies."""
+    of, lanes, half = np.uint64(start), np.uint64(LANES), np.uint64(GROUP // 2)
+    for step in range(np.uint64(STEPS)):
+        at = np.uint64(2) * lanes * step
+        for mirrored in range(np.uint64(MIRRORED)):
+            to = np.uint64(GROUP) * step + lanes * mirrored
+            for j in range(lanes):
+                real, imaginary = waves[of + to + j], waves[of + to + half + j]
+                along, aside = transfer[at + j], transfer[at + lanes + j]
+                products[to + j] = real * along - imaginary * aside
+                products[to + half + j] = real * aside + imaginary * along
+
+
+@compiled
+def _reduce(coefficients, k, products, sums):
+    """Add `STEPS` frequencies to all terms, two terms at a time."""
+    g = np.uint64(GROUP)
+    for m in range(0, coefficients.shape[0], 2):
+        a, b, to = coefficients[m, k : k + STEPS], coefficients[m + 1, k : k + STEPS], np.uint64(m * GROUP)
+        a0, a1, a2, a3, a4, a5, a6, a7 = a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7]
+        b0, b1, b2, b3, b4, b5, b6, b7 = b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7]
+        for j in range(g):
+            p0, p1, p2, p3 = products[j], products[g + j], products[TWO * g + j], products[THREE * g + j]
+            low, high = a0 * p0 + a1 * p1 + a2 * p2 + a3 * p3, b0 * p0 + b1 * p1 + b2 * p2 + b3 * p3
+            at = FOUR * g + j
+            p4, p5, p6, p7 = products[at], products[at + g], products[at + TWO * g], products[at + THREE * g]
+            sums[to + j] += low + (a4 * p4 + a5 * p5 + a6 * p6 + a7 * p7)
+            sums[to + g + j] += high + (b4 * p4 + b5 * p5 + b6 * p6 + b7 * p7)
+
+
+@compiled
+def group_waves(full, row, column, share, count, k, spectrum):
+    """Put the first plane waves of one frequency, as many as count there, into their groups.
+
+    Parameters
+    ----------
+    full : (rows, columns) complex64 array
+        All plane waves of a rectangle, index 0 in its middle.
+    row, column : (groups, MIRRORED, LANES) int64 array
+        Indices of the waves.
+    share : (groups, MIRRORED, LANES) float32 array
+        What they are multiplied by.
+    count : int
+        Lanes of all groups that count at this frequency.
+    k : int
+    spectrum : (groups, frequencies, 2, MIRRORED, LANES) float32 array
+        Written to at frequency `k`.
+    """
+    middle_row, middle_column = full.shape[0] // 2, full.shape[1] // 2
+    for group in range(-(-count // LANES)):
+        for mirrored in range(MIRRORED):
+            for j in range(min(LANES, count - group * LANES)):
+                weight = share[group, mirrored, j]
+                wave = full[middle_row + row[group, mirrored, j], middle_column + column[group, mirrored, j]]
+                spectrum[group, k, 0, mirrored, j] = wave.real * weight
+                spectrum[group, k, 1, mirrored, j] = wave.imag * weight
 
 
 @compiled
@@ -131,17 +218,29 @@ def transpose(source, target):
 
 
 @compiled
-def scatter(terms, cell, begin, folded, spectra):
-    """Put terms (m, some waves, 2) of the plane waves from `begin` on into ``spectra[m, cell[wave]]``.
+def scatter(terms, cell, folded, spectra):
+    """Put the waves of some terms into their cells.
 
-    Waves that are `folded` into one another meet in one cell, and add up.
+    Parameters
+    ----------
+    terms : (m, groups, 2, MIRRORED, LANES) float32 array
+        Real and imaginary parts.
+    cell : (groups, MIRRORED, LANES) int64 array
+    folded : bool
+        Waves may meet in one cell, and then add up.
+    spectra : (m, cells) complex64 array
     """
+    flat, cells, half = terms.reshape(-1), cell.reshape(-1), np.uint64(GROUP // 2)
     for m in range(terms.shape[0]):
-        for b in range(terms.shape[1]):
-            term = complex(terms[m, b, 0], terms[m, b, 1])
-            if folded:
-                term += spectra[m, cell[begin + b]]
-            spectra[m, cell[begin + b]] = term
+        if folded:
+            spectra[m] = 0
+        for group in range(terms.shape[1]):
+            of, to = np.uint64((m * terms.shape[1] + group) * GROUP), np.uint64(group) * half
+            for j in range(half):
+                wave = complex(flat[of + j], flat[of + half + j])
+                if folded:
+                    wave += spectra[m, cells[to + j]]
+                spectra[m, cells[to + j]] = wave
 
 
 @compiled

@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 from nlos.method import Progress, silent
 from nlos.rsd.blas import one_thread
 from nlos.rsd.diffraction import Diffraction
+from nlos.rsd.groups import Groups, Interpolation
 from nlos.rsd.illumination import Illumination, constant, split
 from nlos.rsd.inverse import inverse
-from nlos.rsd.kernels import illuminate, scatter, transferred
+from nlos.rsd.kernels import LANES, MIRRORED, carry, illuminate, scatter
 from tofclip.threads import blocks, run_blocks
 
 FloatArray = NDArray[np.float64]
-
-WAVES_AT_A_TIME = 256
-"""Plane waves whose products with the transfer function stay in cache until they are summed over the frequencies."""
 
 PLANES_AT_A_TIME = 4
 
@@ -89,8 +87,8 @@ def diffract(
         Called with the number of voxels just done.
     """
     with one_thread():
-        spectrum = way.plane_waves.analysed(values, way.plane, (float(way.grid.y[0]), float(way.grid.x[0])))
-        spectrum /= np.float32(np.prod(way.plane_waves.period))
+        groups = Groups(way.plane_waves)
+        spectrum = groups.analysed(values, way.plane, (float(way.grid.y[0]), float(way.grid.x[0])))
         lights = [constant(1)] * way.grid.z.size
 
         def light(planes: slice) -> None:
@@ -99,11 +97,12 @@ def diffract(
 
         run_blocks(light, len(lights), size=PLANES_AT_A_TIME)
         most = max(light.coefficients.shape[1] for light in lights)
-        _ = way.transfer.prepared
+        interpolation = groups.interpolation(way.transfer)
+        _ = way.transfer.prepared, groups.first
         spare: list[_Bench] = []
 
         def work(planes: slice) -> None:
-            bench = spare.pop() if spare else _Bench(way, source, most)
+            bench = spare.pop() if spare else _Bench(way, source, groups, interpolation, most)
             for i in range(planes.start, planes.stop):
                 bench.image(spectrum, lights[i], float(way.grid.z[i]), total[i])
                 progress(total[i].size)
@@ -115,34 +114,37 @@ def diffract(
 class _Bench:
     """One thread's memory, and what it does there."""
 
-    def __init__(self, way: Diffraction, source: Source, terms: int) -> None:
-        waves, frequencies = way.plane_waves, way.waves.count
-        self.way, self.source = way, source
-        self.inverse = inverse(waves, way.lattice, way.grid.shape[1:], terms)
-        self.nodes = way.transfer.interpolation(waves.lateral)
-        self.products = np.zeros((WAVES_AT_A_TIME, 2, frequencies), np.float32)
-        self.weights = np.zeros((2, frequencies), np.float32)
-        starts = np.arange(0, waves.lateral.size, WAVES_AT_A_TIME)
-        self.firsts = np.searchsorted(waves.limits, np.minimum.reduceat(waves.lateral, starts))
-        self.folded = np.unique(self.inverse.cell).size < waves.lateral.size
+    def __init__(
+        self, way: Diffraction, source: Source, groups: Groups, interpolation: Interpolation, terms: int
+    ) -> None:
+        self.way, self.source, self.groups, self.interpolation = way, source, groups, interpolation
+        self.inverse = inverse(groups.indices, way.lattice, way.grid.shape[1:], terms)
+        self.cell = np.where(groups.distinct, self.inverse.cell, self.inverse.spare)
+        self.folded = np.unique(self.cell).size <= np.count_nonzero(groups.distinct)
+        # The compiled loop takes two terms at a time.
+        self.terms = np.empty((terms + terms % 2, len(groups.first), 2, MIRRORED, LANES), np.float32)
 
     def image(self, spectrum: NDArray[np.float32], light: Illumination, depth: float, field: NDArray[Any]) -> None:
         """Add one depth plane."""
-        delay = np.array([light.span.mean(), self.source.centre])
-        self._carry(spectrum, self.way.transfer.at(depth - self.way.plane.z, delay), light.coefficients)
-        images = self.inverse.images(light.coefficients.shape[1])
+        count = light.coefficients.shape[1]
+        self._carry(spectrum, light, depth)
+        for some in blocks(count, len(self.inverse.spectra)):
+            scatter(self.terms[some], self.cell, self.folded, self.inverse.spectra)
+            self.inverse.transform(some)
+        images = self.inverse.images[:count]
         x, y = self.way.grid.x, self.way.grid.y
         laser = np.zeros(3) if self.source.laser is None else self.source.laser
         carrier = self.inverse.carrier
         illuminate(images, light.even, x, y, depth, laser, self.source.centre, light.table, light.span, carrier, field)
 
-    def _carry(self, spectrum: NDArray[np.float32], transfer: NDArray[np.float32], sums: NDArray[np.float32]) -> None:
-        """Leave the spectra of all terms in the inverse transform's memory."""
-        spectra = self.inverse.spectra[: sums.shape[1]].reshape(sums.shape[1], -1)
-        if self.folded:
-            spectra[:] = 0
-        for some, first in zip(blocks(len(spectrum), WAVES_AT_A_TIME), self.firsts, strict=True):
-            products = self.products[: some.stop - some.start]
-            transferred(spectrum, transfer, *self.nodes, some.start, first, self.weights, products)
-            terms = sums[first:].T @ products.reshape(-1, sums.shape[0])[:, first:].T
-            scatter(terms.reshape(-1, len(products), 2), self.inverse.cell, some.start, self.folded, spectra)
+    def _carry(self, spectrum: NDArray[np.float32], light: Illumination, depth: float) -> None:
+        """Leave the plane waves of all terms in `terms`."""
+        frequencies, count = light.coefficients.shape
+        ahead, between = self.groups.ahead, self.interpolation
+        delay = np.array([light.span.mean(), self.source.centre])
+        nodes = self.way.transfer.at(depth - self.way.plane.z, delay, ahead)
+        coefficients = np.zeros((count + count % 2, ahead + frequencies), np.float32)
+        coefficients[:count, ahead:] = light.coefficients.T
+        terms = self.terms[: len(coefficients)]
+        weights = (between.begin, between.offset, between.shares)
+        carry(spectrum, self.groups.first, nodes, *weights, coefficients, terms)

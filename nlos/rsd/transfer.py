@@ -115,15 +115,15 @@ class Transfer:
         interpolation(lateral / self.node_step + TAPS // 2, node, share)
         return node, share
 
-    def at(self, distance: float, delay: FloatArray) -> NDArray[np.float32]:
+    def at(self, distance: float, delay: FloatArray, ahead: int = 0) -> NDArray[np.float32]:
         """Return the transfer function over a distance, shape (nodes, 2, frequencies), real and imaginary parts.
 
         A delay (path, k_0) turns every frequency by ``(k - k_0) * path`` besides. A negative distance undoes a
-        positive one, as far as waves travel at all.
+        positive one, as far as waves travel at all. `ahead` zeros stand before the lowest frequency.
         """
         radii, _ = self._radii
-        waves = np.empty((radii.size, 2, self.waves.count), np.float32)
-        sample_waves(radii, distance, self.waves.first, self.waves.step, delay, self.waves.continued, waves)
+        waves = np.zeros((radii.size, 2, ahead + self.waves.count), np.float32)
+        sample_waves(radii, distance, self.waves.first, self.waves.step, delay, self.waves.continued, ahead, waves)
         flat = self.prepared @ waves.reshape(radii.size, -1)
-        nodes: NDArray[np.float32] = flat.reshape(-1, 2, self.waves.count)
+        nodes: NDArray[np.float32] = flat.reshape(-1, *waves.shape[1:])
         return nodes

@@ -18,6 +18,10 @@ REACH = 0.88
 EDGE, WIDEST_EDGE = 0.25, 0.5
 """Width of the window's edge, relative to the largest distance along one axis."""
 
+SPREAD = 0.6
+"""Widening of a grazing wave's spectrum by the window's edge, per squared digit of the tolerance and edge width;
+measured on point scenes."""
+
 QUICK_FACTORS = (1, 3, 5, 15, 25)
 """Of these times a power of 2, single-precision Fourier transforms take half as long as of other lengths; measured."""
 
@@ -55,8 +59,8 @@ class Window:
         return cls(reach, min(room, reach + WIDEST_EDGE * along))
 
     def spread(self, tolerance: float) -> float:
-        """Lateral wavenumbers by which the window's edge spreads grazing waves, rad/m; measured on point scenes."""
-        return float(np.log10(tolerance) ** 2 / 2 / (self.edge - self.reach))
+        """Lateral wavenumbers by which the window's edge spreads grazing waves, rad/m."""
+        return float(SPREAD * np.log10(tolerance) ** 2 / (self.edge - self.reach))
 
 
 def farthest_apart(sources: Plane, y: FloatArray, x: FloatArray) -> Sides:
