@@ -15,8 +15,8 @@ from apps.benchmarks.peers import astra_seconds
 from tofclip.camera import Camera
 from tofclip.operators import LineProjection
 from tofclip.recovery import Adjoint, LinearInverse, Method, Sparse, TotalVariation
-from tofclip.recovery.direct import DENSE_FRAMES
-from tofclip.threads import LANES, blocks, run_blocks
+from tofclip.recovery.direct import DENSE_ROWS
+from tofclip.threads import LANES, run_blocks
 
 ITERATIONS = 30
 FRAMES = (256, 1016)
@@ -63,14 +63,17 @@ def dense_products(projection: LineProjection, data: NDArray[np.float32]) -> Non
     from threadpoolctl import threadpool_limits
 
     matrix = np.eye(SLIT_WIDTH, dtype=np.float32)
+    weights = np.empty_like(data)
 
-    def work(piece: slice) -> None:
-        weights = matrix @ data[:, piece]
-        for part in blocks(weights.shape[1]):
-            projection.adjoint(np.ascontiguousarray(weights[:, part]))
+    def multiply(piece: slice) -> None:
+        np.matmul(matrix[piece], data, out=weights[piece])
+
+    def project(piece: slice) -> None:
+        projection.adjoint(np.ascontiguousarray(weights[:, piece]))
 
     with threadpool_limits(1, "blas"):
-        run_blocks(work, data.shape[1], DENSE_FRAMES)
+        run_blocks(multiply, SLIT_WIDTH, DENSE_ROWS)
+    run_blocks(project, data.shape[1])
 
 
 def iterative(method: Method, frames: int) -> Prepared:

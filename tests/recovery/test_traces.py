@@ -10,6 +10,7 @@ from tofclip.errors import InputError
 from tofclip.operators import Identity
 from tofclip.recovery import LinearInverse, PreparedInverse
 from tofclip.recovery.traces import PATCH_COLUMNS, PATCH_ROWS, InverseTraces, patch_order
+from tofclip.threads import LANES
 
 
 def camera() -> Camera:
@@ -30,6 +31,17 @@ def test_traces_are_the_pictures_seen_pixel_by_pixel(frames):
     # the same sums in the same order: only a lone frame goes another way
     np.testing.assert_allclose(found[:, 1:-1], expected, atol=1e-5 * np.abs(expected).max())
     assert np.all(found[:, [0, -1]] == -1)
+
+
+def test_the_brightest_pixel_stands_out_as_its_matched_filter_says():
+    operator = camera().operator()
+    traces = InverseTraces(LinearInverse().prepare(operator), patch_order((21, 37)))
+    block = np.random.default_rng(2).standard_normal((170, LANES)).astype(np.float32)
+    block[:, 0] = -np.abs(block[:, 0])
+    matrix = operator.matrix.toarray()
+    expected = np.maximum((matrix.T @ block / np.linalg.norm(matrix, axis=0)[:, np.newaxis]).max(axis=0), 0)
+    assert expected[0] == 0
+    np.testing.assert_allclose(traces.brightest(block), expected, rtol=1e-5)
 
 
 def test_patches_hold_every_pixel_once_and_neighbours_together():

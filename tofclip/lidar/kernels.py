@@ -19,7 +19,7 @@ vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy", _n
 
 
 @njit(nogil=True, cache=True)
-def find_returns(traces, pixels, times, filters, pulse, limits, found, counts):
+def find_returns(traces, pixels, times, standing, filters, pulse, limits, found, counts):
     """Find the returns of each trace.
 
     Candidates are the peaks of the trace under a sharp filter, which still shows two returns where the matched filter
@@ -32,6 +32,8 @@ def find_returns(traces, pixels, times, filters, pulse, limits, found, counts):
         Number of the pixel to which each trace belongs.
     times : (bins,) float64 array
         Instant of each bin, increasing.
+    standing : (bins,) float32 array
+        For how many bins each one stands where background and noise are concerned.
     filters : tuple
         A sharp filter, (width, bins), and the matched one, (bins, width + 1), float32 arrays of unit energy, nowhere
         negative: entry w holds the weight of bin ``j + w - width // 2`` for a return at bin j, and the width is a
@@ -51,25 +53,25 @@ def find_returns(traces, pixels, times, filters, pulse, limits, found, counts):
         np.empty(times.size, np.float32),
         np.zeros(groups * GROUP, np.float32),
         np.empty(groups, np.float32),
-        np.ones(times.size, np.bool_),
+        standing.copy(),
         np.empty((found.shape[1], 4)),
-        np.empty((found.shape[1], 3)),
+        np.empty((found.shape[1], 4)),
         np.empty((times.size, 3)),
     )
     for place in range(traces.shape[0]):
         pixel = pixels[place]
-        counts[pixel] = returns_of(traces[place], times, filters, pulse, limits, memory, found[pixel])
+        counts[pixel] = returns_of(traces[place], times, standing, filters, pulse, limits, memory, found[pixel])
 
 
 @compiled
-def returns_of(trace, times, filters, pulse, limits, memory, found):
+def returns_of(trace, times, standing, filters, pulse, limits, memory, found):
     """Find the returns of one trace and return their number; `memory` is overwritten."""
     (sharp, matched, gains), (curve, scale) = filters, pulse
     score, maxima, bounds, free, peaks, estimate, profile = memory
     correlate(trace, sharp, score)
     keep_maxima(score, maxima)
     number, background, noise = strongest_peaks(
-        trace, times, matched, gains, scale, limits, maxima, bounds, free, peaks
+        trace, times, standing, matched, gains, scale, limits, maxima, bounds, free, peaks
     )
     needed, least, kept = 0.0, limits[1] * noise, 0
     for k in range(number):
@@ -80,7 +82,7 @@ def returns_of(trace, times, filters, pulse, limits, memory, found):
         j, strength = int(peaks[k, 0]), peaks[k, 1]
         if strength > least and strength * times[j] ** 2 >= needed:
             estimate[kept, 0] = top(trace, times, matched, background, j, strength)
-            estimate[kept, 1] = max(trace[j] - background, 0.0)
+            estimate[kept, 1], estimate[kept, 3] = max(trace[j] - background, 0.0), j
             kept += 1
     refine(trace, times, background, curve, scale, estimate[:kept], EVEN, ROUNDS)
     number = describe(trace, times, background, noise, curve, scale, estimate[:kept], least, profile, found)
@@ -136,7 +138,7 @@ def top(trace, times, matched, background, j, here):
 
 
 @compiled
-def strongest_peaks(trace, times, matched, gains, scale, limits, maxima, bounds, free, peaks):
+def strongest_peaks(trace, times, standing, matched, gains, scale, limits, maxima, bounds, free, peaks):
     """Fill `peaks` with the highest maxima that might count, in the order of time: bin, response, and bins they claim.
 
     Returns their number, the background and the noise. Peaks keep ``limits[0]`` from each other. They are taken from
@@ -144,10 +146,10 @@ def strongest_peaks(trace, times, matched, gains, scale, limits, maxima, bounds,
     beside the strongest return. The response is still that to peak and background together.
 
     Background and noise are those of the bins that no peak claims. Peaks claim their surroundings from the strongest
-    down, for as long as half of the bins stay free. `free` is true everywhere, and again afterwards.
+    down, for as long as half of the bins stay free. `free` is equal to `standing`, and again afterwards.
     """
-    total, square = sums(trace)
-    left, number, needed, claiming = trace.size, 0, 0.0, True
+    total, square, bins = sums(trace, standing)
+    left, number, needed, claiming = bins, 0, 0.0, True
     background, noise = level(total, square, left)
     bound_groups(maxima, 0, bounds.size, bounds)
     while number < peaks.shape[0]:
@@ -158,21 +160,22 @@ def strongest_peaks(trace, times, matched, gains, scale, limits, maxima, bounds,
         best = group * GROUP
         while maxima[best] != bounds[group]:
             best += 1
-        first, last = window(times, times[best], scale)
+        first, last = window(times, best, times[best], scale)
         strength = response(trace, matched, best)
         peaks[number, 0], peaks[number, 1], peaks[number, 2], peaks[number, 3] = best, strength, first, last
         number += 1
         forget_around(best, times, limits[0], maxima, bounds)
-        claiming = claiming and 2 * (left - (last - first)) >= trace.size
+        claiming = claiming and 2 * (left - (last - first)) >= bins
         if claiming:
             for i in range(first, last):
                 value = free[i] * float(trace[i])
-                total, square, left = total - value, square - value * value, left - free[i]
-                free[i] = False
+                total, square, left = total - value, square - value * trace[i], left - free[i]
+                free[i] = 0
             background, noise = level(total, square, left)
         needed = max(needed, HOPELESS * limits[2] * (strength - background * matched[best, -1]) * times[best] ** 2)
     for k in range(number):
-        free[int(peaks[k, 2]) : int(peaks[k, 3])] = True
+        for i in range(int(peaks[k, 2]), int(peaks[k, 3])):
+            free[i] = standing[i]
     sort_rows(peaks[:number])
     return number, background, noise
 
@@ -214,14 +217,15 @@ def forget_around(best, times, distance, maxima, bounds):
 
 
 @vectorised
-def sums(trace):
-    """Sum and sum of squares; float32 squares would drown a small noise on a high background."""
-    total = square = 0.0
+def sums(trace, standing):
+    """Sum, sum of squares and number of bins; float32 squares would drown a small noise on a high background."""
+    total = square = bins = 0.0
     for i in range(trace.size):
-        value = float(trace[i])
-        total += value
-        square += value * value
-    return total, square
+        value, share = float(trace[i]), float(standing[i])
+        total += share * value
+        square += share * value * value
+        bins += share
+    return total, square, bins
 
 
 @compiled

@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import is_numpy
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.detection import Detection
+from tofclip.lidar.portable import PortableSearch, PortableTraces
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.returns import Returns
 from tofclip.lidar.traces import FrameTraces, Traces
@@ -31,6 +33,7 @@ REFERENCE_RANGE = 1.0  # m; an intensity is what the same surface would send bac
 PIXELS_AT_ONCE = 128  # their traces fit the second-level cache
 PIXELS_PER_BLOCK = 8 * PIXELS_AT_ONCE
 SHARPENING = 2.0  # of the filter that looks for candidates; it costs a tenth of the matched filter's sensitivity
+WANDERING_BINS = 2  # by which the fit may move a return
 SHORTEST_PULSE_BINS = 2.0  # anything shorter falls between the samples
 
 
@@ -72,12 +75,12 @@ class ReturnSearch:
         self.pulse = Pulse.gaussian(max(camera.pulse_fwhm, shortest)) if pulse is None else pulse
         self.shears = np.zeros(times.size) if shears is None else shears
 
-    def returns(self, traces: Traces, provenance: Mapping[str, Any] | None = None) -> Returns:
+    def returns(self, traces: Traces | PortableTraces, provenance: Mapping[str, Any] | None = None) -> Returns:
         """Find the returns in the traces of all pixels.
 
         Parameters
         ----------
-        traces : Traces
+        traces : Traces or PortableTraces
         provenance : mapping, optional
             How they came about.
 
@@ -103,18 +106,28 @@ class ReturnSearch:
             provenance={} if provenance is None else provenance,
         )
 
-    def _candidates(self, traces: Traces) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
+    @property
+    def reach_bins(self) -> int:
+        """How many bins on either side of a return its search and its fit look at."""
+        return int(self._filters[1].shape[1]) // 2 + WANDERING_BINS
+
+    def _candidates(self, traces: Traces | PortableTraces) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
         """Pixel number, instant, counts and deviation of every candidate, in raster and time order."""
+        if isinstance(traces, PortableTraces):
+            return self._portable.candidates(traces.values)
         from tofclip.lidar.kernels import find_returns
 
-        total = traces.pixels.size
-        fixed = self.times, self._filters, self.pulse.table()
+        total, bins = traces.pixels.size, traces.bins
+        sharp, matched, gains = self._filters
+        # Beyond the bins that are searched the filters reach into what lies elsewhere on the axis.
+        filters = sharp[:, bins.numbers] * bins.searched, matched[bins.numbers], gains
+        fixed = self.times[bins.numbers], bins.standing, filters, self.pulse.table()
         found = np.empty((total, self.detection.most_returns, 3))
         counts = np.zeros(total, np.int64)
         limits = self.pulse.fwhm, float(self.detection.signal_to_noise), float(self.detection.share_of_pixel)
 
         def work(piece: slice) -> None:
-            memory = np.empty((PIXELS_AT_ONCE, self.times.size), np.float32)
+            memory = np.empty((PIXELS_AT_ONCE, bins.numbers.size), np.float32)
             for part in blocks(piece.stop - piece.start, PIXELS_AT_ONCE):
                 some = slice(piece.start + part.start, piece.start + part.stop)
                 block = memory[: some.stop - some.start]
@@ -128,11 +141,16 @@ class ReturnSearch:
 
     @cached_property
     def _filters(self) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float]]:
-        """The sharp filter that shows candidates, the matched one that judges them, and their gains: see the kernels."""
+        """The sharp filter that shows candidates, the matched one that judges them, and their gains."""
         sharp, matched = (_filter(self.times, shape) for shape in (self.pulse.compressed(SHARPENING), self.pulse))
         sums = matched.sum(axis=0)
         with_sums = np.ascontiguousarray(np.concatenate([matched, sums[np.newaxis]]).T)
         return sharp, with_sums, (float(sharp.sum(axis=0).max()), float(sums.max()))
+
+    @cached_property
+    def _portable(self) -> PortableSearch:
+        filters = _filter(self.times, self.pulse.compressed(SHARPENING)), _filter(self.times, self.pulse)
+        return PortableSearch(self.times, filters, self.pulse, self.detection)
 
 
 def depth(
@@ -146,7 +164,8 @@ def depth(
     Parameters
     ----------
     frames : Frames
-        Brightness (time, y, x) on any increasing time axis. The source is co-located: range is ``c * time / 2``.
+        Brightness (time, y, x) on any increasing time axis, searched in whatever library and on whatever device its
+        array is; the returns are NumPy's. The source is co-located: range is ``c * time / 2``.
     camera : Camera, optional
         Takes the place of the camera inside `frames`.
     detection, pulse
@@ -161,7 +180,8 @@ def depth(
     if camera.image_shape != frames.values.shape[1:]:
         raise ShapeError("frames", f"(time, y, x) with (y, x) = {camera.image_shape}", frames.values.shape)
     search = ReturnSearch(camera, frames.times, detection, pulse, frames.shears)
-    return search.returns(FrameTraces(frames), frames.provenance)
+    traces = FrameTraces(frames) if is_numpy(frames.values) else PortableTraces(frames)
+    return search.returns(traces, frames.provenance)
 
 
 def _filter(times: FloatArray, pulse: Pulse) -> NDArray[np.float32]:

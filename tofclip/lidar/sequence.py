@@ -14,8 +14,10 @@ from tofclip.camera import Camera, Measurement, Rectifier
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.cloud import PointCloud, point_cloud
 from tofclip.lidar.detection import Detection
+from tofclip.lidar.lit.rows import LitRows, Place
 from tofclip.lidar.returns import Returns
 from tofclip.lidar.search import ReturnSearch
+from tofclip.lidar.traces import Bins
 from tofclip.reconstruct.focus import AT_THE_CALIBRATED_DEPTH, Focus
 from tofclip.reconstruct.task import fitted_to_shot, prepare
 from tofclip.recovery import LinearInverse
@@ -50,7 +52,8 @@ class Ranger:
     """Makes clouds of shots of one camera by the linear inverse, which needs no iterations.
 
     Sweep, operators, inverted Gram matrices and filters are worked out once. No transient cube is made: pixels are
-    recovered a few at a time, at all instants, and their returns are sought at once (`tofclip.recovery.traces`).
+    recovered a few at a time, and their returns are sought at once (`tofclip.recovery.traces`). Rows that hold no light
+    are left out, but for a sample that tells background and noise (`tofclip.lidar.lit`).
 
     Parameters
     ----------
@@ -82,13 +85,17 @@ class Ranger:
         self.times = np.asarray(row_times, dtype=np.float64) - camera.time_zero
         self.rectifier = Rectifier(camera, self.times.size)
         nothing = Measurement(np.empty((0, 0), np.float32), np.empty((0, 0), bool))
-        self.pieces = focus.pieces(camera, self.times, nothing)
+        pieces = focus.pieces(camera, self.times, nothing)
         alive, self.pixels = ~camera.dead_columns, patch_order(camera.image_shape)
-        self.inverses = [
-            InverseTraces(method.prepare(camera.operator(piece.shear), alive), self.pixels) for piece in self.pieces
+        self.places = [
+            Place(piece.frames, InverseTraces(method.prepare(camera.operator(piece.shear), alive), self.pixels))
+            for piece in pieces
         ]
-        shears = np.repeat([piece.shear for piece in self.pieces], [piece.size for piece in self.pieces])
+        shears = np.repeat([piece.shear for piece in pieces], [piece.size for piece in pieces])
         self._search = ReturnSearch(camera, self.times, detection, shears=shears)
+        row = float(self.times[-1] - self.times[0]) / (self.times.size - 1)
+        limit, width = self._search.detection.signal_to_noise, self._search.pulse.fwhm / row
+        self._lit = LitRows(self.places, width, limit, self._search.reach_bins)
 
     @classmethod
     def for_shot(cls, shot: Streak, camera: Camera | None = None, focus: Focus = AT_THE_CALIBRATED_DEPTH) -> Ranger:
@@ -114,7 +121,7 @@ class Ranger:
         """Find the returns in one shot's rectified readings, (columns, rows)."""
         if readings.shape != (self.camera.slit_width_px, self.times.size):
             raise ShapeError("readings", (self.camera.slit_width_px, self.times.size), readings.shape)
-        return self._search.returns(_ShotTraces(self, readings))
+        return self._search.returns(_ShotTraces(self, readings, self._lit.bins(readings)))
 
     def cloud(self, readings: NDArray[np.float32]) -> PointCloud:
         """Make the cloud of one shot's rectified readings, (columns, rows)."""
@@ -124,16 +131,18 @@ class Ranger:
 class _ShotTraces:
     """Traces of a shot, recovered as they are asked for; see `tofclip.lidar.traces.Traces`."""
 
-    def __init__(self, ranger: Ranger, readings: NDArray[np.float32]) -> None:
-        self.pixels, self._pieces, self._inverses = ranger.pixels, ranger.pieces, ranger.inverses
-        self._weights = [
-            inverse.inverse.weights(readings[:, piece.frames])
-            for piece, inverse in zip(self._pieces, self._inverses, strict=True)
-        ]
+    def __init__(self, ranger: Ranger, readings: NDArray[np.float32], bins: Bins) -> None:
+        self.pixels, self.bins = ranger.pixels, bins
+        self._parts: list[tuple[InverseTraces, slice, NDArray[np.float32]]] = []
+        for place in ranger.places:
+            first, last = np.searchsorted(bins.numbers, [place.rows.start, place.rows.stop])
+            if first < last:
+                some = np.take(readings, bins.numbers[first:last], axis=1)
+                self._parts.append((place.inverse, slice(first, last), place.inverse.inverse.weights(some)))
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
-        for part, inverse, weights in zip(self._pieces, self._inverses, self._weights, strict=True):
-            inverse.fill(weights, piece, traces, part.frames)
+        for inverse, held, weights in self._parts:
+            inverse.fill(weights, piece, traces, held)
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -10,11 +11,38 @@ from numpy.typing import NDArray
 from tofclip.transient import Frames
 
 
+@dataclass(frozen=True)
+class Bins:
+    """Which bins of a time axis traces hold.
+
+    Parameters
+    ----------
+    numbers : (n,) int array
+        Increasing.
+    searched : (n,) bool array
+        Whether a return may lie there. Wherever one may, all bins that its search and its fit look at are held.
+    standing : (n,) float32 array
+        For how many bins of the axis each one stands where background and noise are concerned.
+    """
+
+    numbers: NDArray[np.int64]
+    searched: NDArray[np.bool_]
+    standing: NDArray[np.float32]
+
+    @classmethod
+    def whole(cls, bins: int) -> Bins:
+        """Return all bins of an axis, every one for itself."""
+        return cls(np.arange(bins), np.ones(bins, bool), np.ones(bins, np.float32))
+
+
 class Traces(Protocol):
     """Anything that hands out pixels' traces."""
 
     pixels: NDArray[np.int64]
     """Numbers of the pixels, counted in raster order, in the order in which their traces are cheapest to have."""
+
+    bins: Bins
+    """The bins that they hold."""
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
         """Write the traces of ``pixels[piece]`` into (n, bins) contiguous memory."""
@@ -32,6 +60,7 @@ class FrameTraces:
     def __init__(self, frames: Frames) -> None:
         self._pictures = frames.values.reshape(frames.times.size, -1).astype(np.float32, copy=False)
         self.pixels = np.arange(self._pictures.shape[1])
+        self.bins = Bins.whole(frames.times.size)
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
         """Write traces of neighbours in raster order."""

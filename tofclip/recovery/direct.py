@@ -22,7 +22,7 @@ from tofclip.threads import LANES, blocks, run_blocks
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
 
-DENSE_FRAMES = 4 * LANES  # the dense matrix is read from memory once for so many frames
+DENSE_ROWS = 336  # of the dense matrix, which are read from memory once for all frames
 NORM_ITERATIONS = 15  # the damping need not be known better than to a percent
 
 
@@ -162,13 +162,13 @@ class PreparedInverse:
         weights = np.zeros((-(-frames // LANES), self.inverse_gram.shape[0], LANES), self.operator.dtype)
 
         def solve(piece: slice) -> None:
-            solved = self.inverse_gram @ readings[:, piece]
-            for part in blocks(piece.stop - piece.start):
-                weights[(piece.start + part.start) // LANES, :, : part.stop - part.start] = solved[:, part]
+            solved = self.inverse_gram[piece] @ readings
+            for number, part in enumerate(blocks(frames)):
+                weights[number, piece, : part.stop - part.start] = solved[:, part]
 
         # The blocks already keep every core busy: BLAS threads of its own would wait for, and spin against, ours.
         with one_blas_thread():
-            run_blocks(solve, frames, DENSE_FRAMES)
+            run_blocks(solve, len(self.inverse_gram), DENSE_ROWS)
         return weights
 
 

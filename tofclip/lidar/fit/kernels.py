@@ -19,21 +19,19 @@ inlined = njit(inline="always")  # called for every bin: handing over the arrays
 
 
 @compiled
-def window(times, arrival, scale):
-    """First bin and the bin after the last one that a return at `arrival` reaches."""
-    return first_from(times, arrival + scale[2]), first_from(times, arrival + scale[3])
+def window(times, near, arrival, scale):
+    """First bin and the bin after the last one that a return at `arrival`, not far from bin `near`, reaches."""
+    return first_from(times, near, arrival + scale[2]), first_from(times, near, arrival + scale[3])
 
 
 @compiled
-def first_from(times, instant):
-    """First bin at `instant` or later: where it were if bins were even, and from there step by step."""
-    share = (instant - times[0]) / (times[-1] - times[0])
-    bin_number = int(min(max(share, 0.0), 1.0) * (times.size - 1))
-    while bin_number > 0 and times[bin_number - 1] >= instant:
-        bin_number -= 1
-    while bin_number < times.size and times[bin_number] < instant:
-        bin_number += 1
-    return bin_number
+def first_from(times, near, instant):
+    """First bin at `instant` or later, step by step from a bin near it."""
+    while near > 0 and times[near - 1] >= instant:
+        near -= 1
+    while near < times.size and times[near] < instant:
+        near += 1
+    return near
 
 
 @inlined
@@ -68,7 +66,7 @@ def refine(trace, times, background, curve, scale, estimate, variance, rounds):
     and photon counts it is Fisher scoring, which ends at the Poisson likelihood's maximum. A return that moved no more
     and that no moving one reaches is left alone.
 
-    `estimate` is (returns, 3): arrival, height, and by how many bins it moved last, which is overwritten.
+    `estimate` is (returns, 4): arrival, height, by how many bins it moved last (overwritten), a bin near it.
     """
     estimate[:, 2] = np.inf
     for _ in range(rounds):
@@ -102,7 +100,7 @@ def neighbours(estimate, k, curve, scale):
 def gauss_newton_step(trace, times, background, curve, scale, estimate, k, variance):
     """Improve return k of `estimate` in place, and enter there by how many bins it moved (at most one)."""
     arrival, height = estimate[k, 0], estimate[k, 1]
-    first, last = window(times, arrival, scale)
+    first, last = window(times, int(estimate[k, 3]), arrival, scale)
     pp = pd = dd = pr = dr = 0.0
     for i in range(first, last):
         p, d = pulse_at(times[i] - arrival, curve, scale)
@@ -121,7 +119,7 @@ def gauss_newton_step(trace, times, background, curve, scale, estimate, k, varia
     if height <= 0:
         estimate[k, 1] = 0.0
         return
-    bin_width = (times[-1] - times[0]) / (times.size - 1)
+    bin_width = (times[last - 1] - times[first]) / (last - 1 - first)
     step = -(pp * dr - pd * pr) / (determinant * height)  # model: height * p(t - arrival), whose slope is -height * d
     step = min(max(step, -bin_width), bin_width)
     estimate[k, 0], estimate[k, 1], estimate[k, 2] = arrival + step, height, abs(step) / bin_width
@@ -140,7 +138,7 @@ def describe(trace, times, background, noise, curve, scale, estimate, least, pro
         if height <= 0 or arrival < times[0] or arrival > times[-1]:
             continue
         concerned, own, _ = neighbours(estimate, k, curve, scale)
-        first, last = window(times, arrival, scale)
+        first, last = window(times, int(estimate[k, 3]), arrival, scale)
         pp = pd = dd = 0.0
         for i in range(first, last):
             p, d = pulse_at(times[i] - arrival, curve, scale)

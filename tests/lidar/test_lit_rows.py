@@ -1,0 +1,171 @@
+"""Rows with light told from rows without, and what leaving the dark ones out does to the returns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from tofclip.camera import Camera, SkewSweep
+from tofclip.lidar import Detection, depth
+from tofclip.lidar.lit.kernels import sum_boxes
+from tofclip.lidar.lit.rows import LitRows, Place
+from tofclip.lidar.sequence import Ranger
+from tofclip.lidar.traces import Bins
+from tofclip.reconstruct import DepthLocked, FixedFocus, recover
+from tofclip.recovery import LinearInverse
+from tofclip.recovery.traces import InverseTraces, patch_order
+from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate
+from tofclip.simulate.shapes import checkerboard
+from tofclip.threads import LANES
+
+CENTRES = 30.0 + 45 * np.arange(5)
+ROWS, REACH = 600, 8
+BIN = 20e-12
+SHAPE = (32, 32)
+NOISE = 3.0
+
+
+def camera() -> Camera:
+    sweep = SkewSweep(CENTRES, np.array([-2.0, 1.0, 0.0, 0.5, 3.0]), np.zeros(5))
+    angles = np.arctan([0.6, -0.7, 0.3, -0.1, 0.9])
+    optics = {"focal_length_px": 100.0, "lenslet_pitch": 2e-3, "focus_distance": 1.3}
+    return Camera(CENTRES, angles, SHAPE, 240, sweep=sweep, time_zero=-6e-9, **optics)
+
+
+@pytest.fixture(scope="module")
+def inverse() -> InverseTraces:
+    return InverseTraces(LinearInverse().prepare(camera().operator()), patch_order(SHAPE))
+
+
+@pytest.fixture(scope="module")
+def lit_rows(inverse) -> LitRows:
+    return LitRows([Place(slice(0, ROWS), inverse)], 3.0, 5.0, REACH)
+
+
+def dark(seed: int) -> np.ndarray:
+    """Noise about a level of its own in each column, as a sensor has it."""
+    random = np.random.default_rng(seed)
+    level = random.normal(0, 2 * NOISE, (240, 1))
+    return (level + random.normal(0, NOISE, (240, ROWS))).astype(np.float32)
+
+
+def with_pixel(readings: np.ndarray, pixel: tuple[int, int], row: float, strength: float) -> np.ndarray:
+    """Add a pulse of one pixel that stands out by `strength` where every reading of it is matched."""
+    picture = np.zeros(SHAPE, np.float32)
+    picture[pixel] = 1
+    seen = np.asarray(camera().operator()(picture))
+    pulse = np.exp2(-((2 * (np.arange(ROWS) - row) / 3.0) ** 2))
+    light = np.outer(seen, pulse)
+    return readings + (strength * NOISE / np.linalg.norm(light) * light).astype(np.float32)
+
+
+def test_noise_is_dark_whatever_the_level_of_each_column(lit_rows):
+    shares = []
+    for seed in range(5):
+        bins = lit_rows.bins(dark(seed))
+        shares.append(bins.searched.sum() / ROWS)
+        assert bins.numbers.size % LANES == 0
+        assert bins.standing.sum() == pytest.approx(ROWS)
+        assert np.all(np.diff(bins.numbers) > 0)
+    # 200 instants, of which the brightest of 1024 pixels exceeds 6 deviations once in 500
+    assert np.mean(shares) < 0.05
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_light_of_a_single_pixel_is_seen_wherever_it_is(lit_rows, seed):
+    random = np.random.default_rng(100 + seed)
+    pixel = int(random.integers(2, 30)), int(random.integers(2, 30))
+    row = random.uniform(20, ROWS - 20)
+    # half-way between two instants a pulse stands out by 0.74 of its strength, so by 8.9 +- 1 here, with 6 needed
+    bins = lit_rows.bins(with_pixel(dark(seed), pixel, row, 12.0))
+    where = np.searchsorted(bins.numbers, round(row))
+    assert bins.numbers[where] == round(row)
+    assert bins.searched[where]
+    around = np.arange(round(row) - REACH, round(row) + REACH + 1)
+    assert np.isin(around, bins.numbers[bins.standing == 1]).all()
+
+
+def test_a_higher_limit_looks_at_less_and_none_at_everything(inverse):
+    readings = with_pixel(dark(3), (16, 16), 300.0, 12.0)
+    places = [Place(slice(0, ROWS), inverse)]
+    assert not LitRows(places, 3.0, 15.0, REACH).bins(readings).searched.any()
+    everything = LitRows(places, 3.0, 0.0, REACH).bins(readings)
+    assert everything.searched.all()
+    np.testing.assert_array_equal(everything.numbers, np.arange(ROWS))
+
+
+def test_a_shot_that_is_nowhere_dark_is_searched_everywhere(lit_rows):
+    readings = dark(0)
+    for row in range(10, ROWS, 25):
+        readings = with_pixel(readings, (16, 16), row, 200.0)
+    bins = lit_rows.bins(readings)
+    assert bins.searched.all()
+    np.testing.assert_array_equal(bins.standing, np.ones(ROWS))
+
+
+def test_columns_and_rows_that_were_never_measured_are_not_taken_for_the_darkest(lit_rows):
+    readings = dark(1)
+    readings[:, :60] = 0
+    readings[40:90] = 0
+    bins = lit_rows.bins(with_pixel(readings, (16, 16), 300.0, 40.0))
+    assert bins.searched.sum() < 60
+    assert 300 in bins.numbers[bins.searched]
+
+
+def test_places_with_an_operator_of_their_own_have_their_own_instants(inverse):
+    cuts = [0, 7, 150, 151, 400, ROWS]
+    places = [Place(slice(first, last), inverse) for first, last in pairwise(cuts)]
+    bins = LitRows(places, 3.0, 5.0, REACH).bins(with_pixel(dark(4), (10, 20), 150.0, 20.0))
+    assert 150 in bins.numbers[bins.searched]
+    assert bins.standing.sum() == pytest.approx(ROWS)
+
+
+def test_boxes_are_sums_of_successive_rows():
+    readings = np.random.default_rng(0).random((6, 50)).astype(np.float32)
+    starts = np.random.default_rng(1).integers(0, 45, (2, LANES))
+    sums = np.full((2, 6, LANES), -1, np.float32)
+    sum_boxes(readings, starts, 5, (1, 6), sums)
+    expected = readings[:, starts[..., np.newaxis] + np.arange(5)].sum(axis=-1)
+    np.testing.assert_allclose(sums[:, 1:], np.moveaxis(expected, 0, 1)[:, 1:], rtol=1e-6)
+    assert np.all(sums[:, 0] == -1)
+
+
+SCENE = Scene(
+    tuple(
+        Plate((place * distance / 100, place * distance / 100, distance), (0.08, 0.08), checkerboard(3, 0.3, 0.9))
+        for distance, place in ((1.05, -6), (1.3, 7), (1.6, 0))
+    )
+)
+
+
+@pytest.mark.parametrize("focus", [FixedFocus(), DepthLocked()])
+def test_returns_are_those_of_all_rows(focus, monkeypatch):
+    made = simulate(SCENE, Instrument(camera(), StreakDetector(ROWS, BIN, peak_photons=2000.0)), 0).streak
+    ranger = Ranger(camera(), made.times, focus=focus)
+    readings = ranger.rectifier.measure(made.counts).readings
+    some = ranger.returns(readings)
+    monkeypatch.setattr(LitRows, "bins", lambda self, _: Bins.whole(self.rows))
+    everything = ranger.returns(readings)
+    places = [
+        {(int(y), int(x), round(float(time) / BIN)) for y, x, time in zip(one.y, one.x, one.time, strict=True)}
+        for one in (some, everything)
+    ]
+    assert len(places[1]) > 300
+    # background and noise come from a sample of the dark rows: a return at a limit may fall on its other side
+    assert len(places[0] ^ places[1]) <= 0.01 * len(places[1])
+    if len(some) == len(everything):
+        # 64 rows know the background of a pixel to an eighth of its noise, which moves no symmetric pulse
+        np.testing.assert_allclose(np.median(np.abs(some.range - everything.range)), 0, atol=1e-6)
+        np.testing.assert_allclose(some.intensity, everything.intensity, rtol=0.05)
+
+
+def test_frames_that_are_there_are_searched_everywhere():
+    made = simulate(SCENE, Instrument(camera(), StreakDetector(ROWS, BIN, peak_photons=2000.0)), 1).streak
+    ranger = Ranger(camera(), made.times, detection=replace(Detection(), signal_to_noise=0.0))
+    frames = recover(made, camera(), method="linear")
+    alone = depth(frames, detection=replace(Detection(), signal_to_noise=0.0))
+    found = ranger.returns(ranger.rectifier.measure(made.counts).readings)
+    assert abs(len(found) - len(alone)) <= 2
