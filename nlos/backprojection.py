@@ -16,6 +16,7 @@ from nlos.kernels import add_backprojection
 from nlos.method import Progress, Support, common_support, silent
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
+from tofclip.arrays import is_numpy
 from tofclip.errors import InputError
 from tofclip.threads import blocks, run_blocks
 
@@ -59,7 +60,8 @@ class Backprojection:
     the pulse to its complex (analytic) form. It is read between finely spaced samples by complex linear interpolation,
     so the carrier's phase never has to be computed per voxel and stays accurate in float32.
 
-    Costs one look-up per voxel and wall point; memory for the volume and for 32 MiB of signals.
+    Costs one look-up per voxel and wall point; memory for the volume and for 32 MiB of signals. A capture of another
+    library's arrays is imaged in that library; see `nlos.portable`.
 
     Liu et al., "Non-line-of-sight imaging using phasor-field virtual wave optics", Nature 572, 620-623 (2019).
 
@@ -118,21 +120,26 @@ class Backprojection:
             `supports` says no.
         """
         complex_field = self.phasor_field(capture, grid, progress)
-        return Volume(np.abs(complex_field.values), grid, complex_field.provenance)
+        return Volume(abs(complex_field.values), grid, complex_field.provenance)
 
     def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in the signal."""
         self.supports(capture, grid).require()
         band = Band(self.pulse, capture.axis)
         warn_of_aliasing(capture, band)
+        settings = {"method": "backprojection", "wavelength_m": self.wavelength, "cycles": self.cycles}
+        history = {**capture.provenance, "imaging": settings}
+        if not is_numpy(capture.signal):
+            from nlos.portable.backprojection import smeared_elsewhere
+
+            return Volume(smeared_elsewhere(capture, grid, band, self.weighting, progress), grid, history)
 
         def filtered(traces: NDArray[np.float32]) -> Waveforms:
             return band.waveforms(band.phasors(traces))
 
         count = max(1, TABLE_BYTES // (band.samples * np.dtype(np.complex64).itemsize))
         total = smeared(capture, grid, filtered, count, self.weighting, progress)
-        settings = {"method": "backprojection", "wavelength_m": self.wavelength, "cycles": self.cycles}
-        return Volume(total, grid, {**capture.provenance, "imaging": settings})
+        return Volume(total, grid, history)
 
 
 def smeared(

@@ -197,8 +197,8 @@ class Band:
     def waveforms(self, phasors: NDArray[Any]) -> Waveforms:
         """Return ``sum_k P_k * exp(1j * k * L)`` on an axis of path lengths L fine enough for linear interpolation."""
         # So few frequencies are summed faster by one matrix product than by a Fourier transform padded with zeros.
-        values = phasors @ self._carriers.astype(phasors.dtype)
-        return Waveforms(values, float(self._sample_paths[0]), self._sample_spacing)
+        carriers, start, spacing = self.carriers
+        return Waveforms(phasors @ carriers.astype(phasors.dtype), start, spacing)
 
     @property
     def samples(self) -> int:
@@ -218,11 +218,11 @@ class Band:
         return self.axis.start - tail + self._sample_spacing * np.arange(count, dtype=np.float64)
 
     @cached_property
-    def _carriers(self) -> NDArray[np.complex128]:
-        """``exp(1j * k * L)``, shape (frequencies, samples).
+    def carriers(self) -> tuple[NDArray[np.complex128], float, float]:
+        """``exp(1j * k * L)``, shape (frequencies, samples); path length of sample 0 and path between samples, m.
 
         They are 0 at the first and the last two samples: a path outside is clamped there, and reads silence.
         """
         carriers: NDArray[np.complex128] = np.exp(1j * np.outer(self.wavenumbers, self._sample_paths))
         carriers[:, [0, -2, -1]] = 0
-        return carriers
+        return carriers, float(self._sample_paths[0]), self._sample_spacing

@@ -14,6 +14,7 @@ from nlos.exposure import Exposure
 from nlos.plane import Plane
 from nlos.portable.library import CHUNK_BYTES, Library
 from nlos.portable.signals import exposed_phasors, on_lattice
+from nlos.propagation.kernels import NEAREST
 from nlos.propagation.passage import Passage
 from nlos.propagation.plane_field import PlaneField
 from nlos.propagation.propagate import SAMPLED_POINTS, strength
@@ -24,9 +25,6 @@ from tofclip.arrays import Array, to_numpy
 from tofclip.threads import blocks
 
 FloatArray = NDArray[np.float64]
-
-NEAREST = 1e-3
-"""Distance in m below which 1 / distance stops growing."""
 
 
 def carried_elsewhere(capture: Capture, part: Exposure, plane: Plane, band: Band, tolerance: float) -> PlaneField:

@@ -1,0 +1,134 @@
+"""Back-projection on the arrays of any library: every voxel looks up its paths in the wall points' waveforms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nlos.band import Band
+from nlos.capture import Capture
+from nlos.geometry import Grid
+from nlos.kernels import NEAREST
+from nlos.method import Progress
+from nlos.portable.library import Library
+from nlos.portable.signals import phasors, traces_of
+from tofclip.arrays import Array
+from tofclip.threads import blocks
+
+if TYPE_CHECKING:
+    from nlos.backprojection import Weighting
+
+TABLE_BYTES = 64 << 20
+"""Waveforms held at a time."""
+
+PAIRS = 1 << 21
+"""Pairs of voxel and wall point that are looked up at a time; each takes some 80 bytes."""
+
+
+def smeared_elsewhere(capture: Capture, grid: Grid, band: Band, weighting: Weighting, progress: Progress) -> Array:
+    """Return the complex sum of `nlos.Backprojection` where the capture's signal lives.
+
+    Memory: the volume, 64 MiB of waveforms, and some 160 MB for the pairs of voxel and wall point looked up at a time.
+
+    Parameters
+    ----------
+    capture : Capture
+    grid : Grid
+    band : Band
+    weighting : Weighting
+    progress : callable
+        Called with the number of look-ups just done.
+
+    Returns
+    -------
+    (z, y, x) complex64 array
+    """
+    library = Library(capture.place)
+    rows = _Rows(grid, library, weighting)
+    total = library.zeros((rows.count, grid.x.size))
+    size = min(TABLE_BYTES // (8 * band.samples), max(1, PAIRS // grid.x.size))
+    for points in blocks(len(capture.points), max(1, size)):
+        waveforms = _Waveforms.of(capture, points, band, library)
+        count = points.stop - points.start
+        for some in blocks(rows.count, max(1, PAIRS // (grid.x.size * count))):
+            total[some, :] += rows.looked_up(some, waveforms)
+            progress((some.stop - some.start) * grid.x.size * count)
+    return library.xp.reshape(total, grid.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class _Waveforms:
+    """Waveforms of some wall points, one after the other in one flat array, and where these stand.
+
+    Parameters
+    ----------
+    values : (points * samples,) complex64 array
+        The first and the last two samples of a point are 0.
+    samples : int
+    start, spacing : float
+        Path length of the first sample, and path between samples, m.
+    first : (points,) int64 array
+        Index of each point's first sample.
+    wall, lasers : (3, points) float32 array
+        m; one laser spot, or one for each point.
+    """
+
+    values: Array
+    samples: int
+    start: float
+    spacing: float
+    first: Array
+    wall: Array
+    lasers: Array
+
+    @classmethod
+    def of(cls, capture: Capture, points: slice, band: Band, library: Library) -> _Waveforms:
+        carriers, start, spacing = band.carriers
+        values = phasors(library, traces_of(capture, points), band) @ library.put(carriers)
+        first = band.samples * np.arange(values.shape[0])
+        lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[points]
+        return cls(
+            library.xp.reshape(values, (-1,)),
+            band.samples,
+            start,
+            spacing,
+            library.put(first),
+            library.put(capture.points[points].T),
+            library.put(lasers.T),
+        )
+
+
+class _Rows:
+    """The rows of voxels along x of a grid, row after row."""
+
+    def __init__(self, grid: Grid, library: Library, weighting: Weighting) -> None:
+        self.library, self.weighting = library, weighting
+        z, y = np.meshgrid(grid.z, grid.y, indexing="ij")
+        self.count = y.size
+        self.x = library.put(grid.x[:, np.newaxis])
+        self.y, self.z = (library.put(axis.reshape(-1, 1, 1)) for axis in (y, z))
+
+    def looked_up(self, some: slice, waveforms: _Waveforms) -> Array:
+        """Return what some rows (rows, x) find in the waveforms."""
+        xp, wall = self.library.xp, waveforms.wall
+        y, z = self.y[some, ...], self.z[some, ...]
+        squared = xp.clip((y - wall[1, :]) ** 2 + (z - wall[2, :]) ** 2, NEAREST**2, None) + (self.x - wall[0, :]) ** 2
+        distance, laser = xp.sqrt(squared), waveforms.lasers
+        outward = xp.sqrt((self.x - laser[0, :]) ** 2 + (y - laser[1, :]) ** 2 + (z - laser[2, :]) ** 2)
+        # Samples that the path is late by, in the order in which single precision loses least.
+        place = (outward - waveforms.start) * (1 / waveforms.spacing) + distance * (1 / waveforms.spacing)
+        place = xp.clip(place, 0.0, float(waveforms.samples - 2))
+        before = xp.astype(place, xp.int64)
+        share = place - xp.astype(before, place.dtype)
+        index = xp.reshape(before + waveforms.first, (-1,))
+        here, there = (xp.reshape(xp.take(waveforms.values, one), share.shape) for one in (index, index + 1))
+        return xp.sum((here + share * (there - here)) * self._weight(distance, z - wall[2, :]), axis=-1)
+
+    def _weight(self, distance: Array, ahead: Array) -> Array:
+        falloff, obliquity = self.weighting.falloff, self.weighting.obliquity
+        weight = 1 / distance if falloff == 1 else distance**-falloff
+        if obliquity == 0:
+            return weight
+        return weight * (self.library.xp.clip(ahead, 0.0, None) / distance) ** obliquity
