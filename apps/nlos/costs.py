@@ -35,7 +35,7 @@ def memory_of(imaging: Reconstructor, capture: Capture, grid: Grid) -> int:
         return volume + LAPLACIAN_COPIES * MAGNITUDE_BYTES * grid.size + COPIES * signals
     if isinstance(imaging, Backprojection):
         return volume + COPIES * TABLE_BYTES
-    return volume + capture.signal.nbytes + COPIES * _spectra(imaging, capture, grid)
+    return volume + MAGNITUDE_BYTES * capture.axis.bins * capture.valid.size + COPIES * _spectra(imaging, capture, grid)
 
 
 def _spectra(imaging: Reconstructor, capture: Capture, grid: Grid) -> int:

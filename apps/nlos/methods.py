@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from apps.nlos.settings import setting
+from apps.settings import setting
 from tofclip.errors import InputError
 from tofclip.units import MILLIMETRE
 

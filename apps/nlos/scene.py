@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apps.nlos.settings import setting
+from apps.settings import setting
 from tofclip.errors import InputError
 from tofclip.units import MILLIMETRE, PICOSECOND
 

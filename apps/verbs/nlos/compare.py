@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from apps.nlos.methods import METHODS, ImagingSettings
-from apps.nlos.settings import SettingsFile, setting, takes
 from apps.options import AsJson
+from apps.settings import SettingsFile, setting, takes
 
 if TYPE_CHECKING:
     from apps.nlos.measure import Measured
@@ -58,8 +58,8 @@ def compare(
     from apps.figures.nlos_compare import compare_figure
     from apps.figures.style import save as save_figure
     from apps.nlos.imaging import prepared, warnings_in_a_line
-    from apps.nlos.settings import save, told
     from apps.nlos.truth import HiddenTruth
+    from apps.settings import save, told
     from nlos.io import read_capture
 
     wanted = told(CompareSettings, settings, flags)
@@ -149,7 +149,7 @@ def _save_volumes(
 ) -> Iterator[Path]:
     """Write each method's volume, and name the files."""
     from apps.nlos.files import with_history
-    from apps.nlos.settings import plain
+    from apps.settings import plain
 
     for name, run in runs.items():
         path = folder / f"{name}.h5"

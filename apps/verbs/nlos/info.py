@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from apps.nlos.methods import METHODS, ImagingSettings
-from apps.nlos.settings import SettingsFile, takes
 from apps.options import AsJson
+from apps.settings import SettingsFile, takes
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid
@@ -37,9 +37,9 @@ def info(
     Example: tofclip nlos info capture.h5
     """
     from apps.nlos.imaging import box_of, prepared, scales_of
-    from apps.nlos.settings import told
     from apps.nlos.truth import HiddenTruth
     from apps.report import report
+    from apps.settings import told
     from nlos.io import read_capture
     from tofclip.units import MILLIMETRE
 

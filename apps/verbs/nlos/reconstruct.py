@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from apps.nlos.methods import METHODS, ImagingSettings
-from apps.nlos.settings import SettingsFile, setting, takes
 from apps.options import AsJson, Cluster
+from apps.settings import SettingsFile, setting, takes
 
 if TYPE_CHECKING:
     from apps.nlos.files import Results
@@ -81,8 +81,8 @@ def reconstruct(
     Example: tofclip nlos reconstruct capture.h5 --out volume.h5 --png volume.png
     """
     from apps.nlos.files import Results, is_folder_of_captures
-    from apps.nlos.settings import told
     from apps.report import report
+    from apps.settings import told
     from tofclip.errors import InputError
 
     wanted = told(ReconstructSettings, settings, flags)
@@ -116,7 +116,7 @@ def _reconstructed(source: Path, results: Results, wanted: ReconstructSettings) 
     """Image one capture, write its results, and return the figures."""
     from apps.nlos.files import with_history, write_volume
     from apps.nlos.imaging import prepared, warnings_in_a_line
-    from apps.nlos.settings import plain, save
+    from apps.settings import plain, save
     from nlos.io import read_capture
 
     capture = prepared(read_capture(source), wanted)
@@ -235,7 +235,7 @@ def _results_in(folder: Path, stem: str, suffixes: Sequence[str]) -> Results:
 
 def _keep_to(file: Path, wanted: ReconstructSettings) -> None:
     """Refuse to mix results of different settings in one folder."""
-    from apps.nlos.settings import plain, save, told
+    from apps.settings import plain, save, told
     from tofclip.errors import InputError
 
     if not file.exists():

@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import typer
 
 from apps.nlos.scene import SceneSettings
-from apps.nlos.settings import SettingsFile, takes
 from apps.options import AsJson
+from apps.settings import SettingsFile, takes
 
 HEADING = "tofclip nlos simulate --settings THIS --out CAPTURE"
 
@@ -32,8 +32,8 @@ def simulate(
     """
     from apps.files import RECORD_SUFFIXES, history, require_writable
     from apps.nlos.scene import simulated
-    from apps.nlos.settings import plain, save, told
     from apps.report import report
+    from apps.settings import plain, save, told
 
     chosen = told(SceneSettings, settings, flags)
     inputs = [path for path in (settings, chosen.mesh and Path(chosen.mesh)) if path]

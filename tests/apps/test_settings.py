@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from apps.nlos.scene import WALLS, SceneSettings
-from apps.nlos.settings import plain, save, setting, told
+from apps.settings import plain, save, setting, told
 from apps.verbs.nlos.compare import CompareSettings
 from apps.verbs.nlos.reconstruct import ReconstructSettings
 from tofclip.errors import FileFormatError, InputError, StorageError
