@@ -82,13 +82,18 @@ def as_type(array: Array, dtype: DTypeLike) -> Array:
     return xp.astype(array, getattr(xp, np.dtype(dtype).name), copy=False)
 
 
+def device_of(array: Array) -> Any:
+    """Return the device that `array` is on, as its library has it."""
+    from array_api_compat import device
+
+    return device(array)
+
+
 def zeros(shape: tuple[int, ...], like: Array) -> Array:
     """Return zeros of the type of `like`, where `like` is."""
     if is_numpy(like):
         return np.zeros(shape, like.dtype)
-    from array_api_compat import device
-
-    return namespace(like).zeros(shape, dtype=like.dtype, device=device(like))
+    return namespace(like).zeros(shape, dtype=like.dtype, device=device_of(like))
 
 
 def require_numpy(what: str, *arrays: Array) -> None:
@@ -129,9 +134,7 @@ class Place:
         """Return where `array` lives."""
         if is_numpy(array):
             return cls()
-        from array_api_compat import device
-
-        return cls(_library(array), device(array))
+        return cls(_library(array), device_of(array))
 
     @property
     def has_compiled_loops(self) -> bool:

@@ -111,7 +111,9 @@ class ReturnSearch:
         """How many bins on either side of a return its search and its fit look at."""
         return int(self._filters[1].shape[1]) // 2 + WANDERING_BINS
 
-    def _candidates(self, traces: Traces | PortableTraces) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
+    def _candidates(
+        self, traces: Traces | PortableTraces
+    ) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
         """Pixel number, instant, counts and deviation of every candidate, in raster and time order."""
         if isinstance(traces, PortableTraces):
             return self._portable.candidates(traces.values)

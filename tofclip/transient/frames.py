@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import Array, namespace, to_numpy
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record, Scalar
@@ -22,7 +23,8 @@ class Frames:
     Parameters
     ----------
     values : (time, y, x) array
-        Brightness in counts, float32, y pointing down.
+        Brightness in counts, float32, y pointing down. Of any library: what is done with the frames is done there, if
+        it can be, and what can be done in NumPy only says so. Files hold NumPy's.
     times : (time,) array
         Time of flight of each frame, s, strictly increasing: the camera's time zero is already taken off.
     camera : Camera
@@ -37,7 +39,7 @@ class Frames:
         Shear at which each frame was recovered, pixels per view step; 0 everywhere by default.
     """
 
-    values: NDArray[np.float32]
+    values: Array
     times: NDArray[np.float64]
     camera: Camera
     figures: Mapping[str, Scalar] = field(default_factory=dict)
@@ -49,15 +51,16 @@ class Frames:
         times = np.asarray(self.times, dtype=np.float64)
         object.__setattr__(self, "times", times)
         expected = (times.size, *self.camera.image_shape)
-        if np.shape(self.values) != expected:
-            raise ShapeError("frames", f"(time, y, x) = {expected}", np.shape(self.values))
+        if self.values.shape != expected:
+            raise ShapeError("frames", f"(time, y, x) = {expected}", tuple(self.values.shape))
         if times.size == 0 or not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
             raise InputError("frame times must be finite and increase")
         shears = np.asarray(self.shears, dtype=np.float64)
         object.__setattr__(self, "shears", shears if shears.size else np.zeros(times.size))
         if self.shears.shape != times.shape or not np.all(np.isfinite(self.shears)):
             raise ShapeError("the frames' shears", f"{times.shape}, finite", self.shears.shape)
-        if not np.all(np.isfinite(self.values)):
+        xp = namespace(self.values)
+        if not xp.all(xp.isfinite(self.values)):
             raise InputError("frames must not hold NaN or infinity")
 
     @property
@@ -72,7 +75,7 @@ class Frames:
         return Record(
             "frames",
             {
-                "values": Field(self.values, "count", ("time", "y", "x")),
+                "values": Field(to_numpy(self.values), "count", ("time", "y", "x")),
                 "times": Field(self.times, "s", ("time",)),
                 "shears": Field(self.shears, "px", ("time",)),
             },

@@ -1,0 +1,145 @@
+"""Returns in frames of other libraries: those that the compiled search finds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tofclip.arrays import Place, to_numpy
+from tofclip.camera import Camera
+from tofclip.errors import InputError, ShapeError
+from tofclip.lidar import Detection, Pulse, Returns, depth
+from tofclip.lidar.portable import search
+from tofclip.recovery import LinearInverse
+from tofclip.transient import Frames
+
+BIN = 20e-12
+FWHM = 60e-12
+START = 10e-9
+EVERYTHING = Detection(share_of_scene=0, share_of_instant=0, share_of_pixel=0)
+MANY = replace(EVERYTHING, most_returns=7, signal_to_noise=3.5)
+
+# The fits stop where the next step would be far below 5e-3 bins; rounding of float32 traces decides which of two rounds
+# is the last only for returns that overlap. Intensities and confidences follow the arrivals.
+ARRIVAL_BINS = 5e-3
+USUAL_BINS = 1e-6
+
+
+@pytest.fixture(params=["array_api_strict", "torch"])
+def place(request):
+    library = pytest.importorskip(request.param, reason="only where it is installed")
+    if request.param == "torch":
+        library.set_num_threads(1)  # waking others up takes longer than what there is to do
+    return Place(request.param)
+
+
+def scene(bins: int = 150, side: int = 14, unevenness: float = 0.0, seed: int = 0) -> Frames:
+    """Up to four returns in a pixel, some overlapping, some at the ends of the axis, on noise and a background."""
+    rng = np.random.default_rng(seed)
+    times = START + np.cumsum(BIN * (1 + unevenness * rng.uniform(-1, 1, bins)))
+    shape = (side, side)
+    values = rng.normal(rng.uniform(0, 30, shape), 2, (bins, *shape))
+    arrival = rng.uniform(times[0], times[-1], shape)
+    number = rng.integers(0, 5, shape)
+    for k in range(4):
+        height = 10 ** rng.uniform(1, 3, shape) * (number > k)
+        values += height * np.exp(-4 * np.log(2) * ((times[:, np.newaxis, np.newaxis] - arrival) / FWHM) ** 2)
+        near = np.clip(arrival + rng.uniform(0.8, 3, shape) * FWHM, times[0], times[-1])
+        arrival = np.where(rng.random(shape) < 0.3, near, rng.uniform(times[0], times[-1], shape))
+    camera = Camera(np.array([20.0]), np.array([0.1]), shape, 41, pulse_fwhm=FWHM)
+    return Frames(values.astype(np.float32), times, camera)
+
+
+def elsewhere(frames: Frames, place: Place) -> Frames:
+    return replace(frames, values=place.put(frames.values))
+
+
+def assert_alike(found: Returns, expected: Returns) -> None:
+    assert len(expected) > 0
+    for name in ("y", "x", "return_number"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    apart = np.abs(found.time - expected.time) / BIN
+    assert apart.max() < ARRIVAL_BINS
+    assert np.median(apart) < USUAL_BINS
+    np.testing.assert_allclose(found.range, expected.range, atol=ARRIVAL_BINS * BIN * 1.5e8)
+    np.testing.assert_allclose(found.intensity, expected.intensity, rtol=5e-3)
+    np.testing.assert_allclose(found.confidence, expected.confidence, rtol=2e-2)
+    assert np.median(np.abs(found.intensity / expected.intensity - 1)) < 1e-5
+    assert np.median(np.abs(found.confidence / expected.confidence - 1)) < 1e-4
+    assert {type(getattr(found, name)) for name in ("range", "intensity", "confidence")} == {np.ndarray}
+
+
+@pytest.mark.parametrize("detection", [Detection(), EVERYTHING, MANY], ids=["usual", "everything", "many"])
+@pytest.mark.parametrize("unevenness", [0.0, 0.1])
+def test_the_same_returns_as_by_the_compiled_search(place, detection, unevenness):
+    frames = scene(unevenness=unevenness)
+    expected = depth(frames, detection=detection)
+    assert expected.return_number.max() >= 3
+    assert_alike(depth(elsewhere(frames, place), detection=detection), expected)
+
+
+def test_a_measured_pulse_that_is_not_symmetric(place):
+    frames, pulse = scene(seed=1), Pulse.exponentially_modified(FWHM, 30e-12)
+    assert_alike(depth(elsewhere(frames, place), pulse=pulse), depth(frames, pulse=pulse))
+
+
+def test_pieces_make_no_difference(place, monkeypatch):
+    frames = elsewhere(scene(), place)
+    whole = depth(frames, detection=EVERYTHING)
+    monkeypatch.setattr(search, "WORKING_BYTES", 50 * 150 * 4 * search.WORKING_TRACES)
+    pieces = depth(frames, detection=EVERYTHING)
+    for name in ("y", "x", "time", "intensity", "confidence"):
+        np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), rtol=1e-6)
+
+
+def test_nothing_in_darkness_nor_in_light_that_never_changes(place):
+    frames = scene()
+    for level in (0.0, 20.0):
+        assert len(depth(elsewhere(replace(frames, values=np.full_like(frames.values, level)), place))) == 0
+
+
+def test_three_frames_are_enough_and_two_are_not(place):
+    values = np.array([0.0, 10.0, 0.0], np.float32)[:, np.newaxis, np.newaxis]
+    camera = Camera(np.array([20.0]), np.array([0.1]), (1, 1), 41, pulse_fwhm=FWHM)
+    frames = Frames(values, START + BIN * np.arange(3), camera)
+    expected, found = depth(frames, detection=EVERYTHING), depth(elsewhere(frames, place), detection=EVERYTHING)
+    np.testing.assert_allclose(found.time, expected.time)
+    two = Frames(place.put(values[:2]), frames.times[:2], camera)
+    with pytest.raises(InputError, match="at least three frames"):
+        depth(two)
+
+
+def test_from_readings_to_returns_without_leaving_the_device(place):
+    """A wall at one range in the readings of five views, recovered and ranged where the readings are."""
+    camera = Camera(
+        np.linspace(20.0, 100.0, 5), np.deg2rad([-38.0, -20.0, 2.0, 21.0, 40.0]), (16, 16), 120, pulse_fwhm=FWHM
+    )
+    times = START + BIN * np.arange(60)
+    operator = camera.operator()
+    wall = np.zeros((16, 16))
+    wall[4:12, 5:11] = 100
+    pulse = np.exp(-4 * np.log(2) * ((times - times[31] - 0.3 * BIN) / FWHM) ** 2)
+    readings = operator(wall)[:, np.newaxis] * pulse + np.random.default_rng(2).normal(0, 1, (120, 60))
+    readings = readings.astype(np.float32)
+    recovered = LinearInverse().recover(operator, place.put(readings))
+    found = depth(Frames(recovered.frames, times, camera))
+    expected = depth(Frames(LinearInverse().recover(operator, readings).frames, times, camera))
+    np.testing.assert_array_equal([found.y, found.x], [expected.y, expected.x])
+    # Recovery differs by 1e-6 of the brightest pixel.
+    np.testing.assert_allclose(found.time, expected.time, atol=1e-3 * BIN)
+    assert np.median(found.time) == pytest.approx(times[31] + 0.3 * BIN, abs=0.1 * BIN)
+
+
+def test_frames_of_other_libraries_are_checked_and_saved(place, tmp_path):
+    frames = scene(bins=10)
+    there = elsewhere(frames, place)
+    there.save(tmp_path / "frames.h5")
+    np.testing.assert_array_equal(Frames.load(tmp_path / "frames.h5").values, frames.values)
+    assert Place.of(there.values).library == place.library
+    np.testing.assert_array_equal(to_numpy(there.values), frames.values)
+    with pytest.raises(ShapeError):
+        replace(there, values=place.put(frames.values[1:]))
+    with pytest.raises(InputError, match="NaN"):
+        replace(there, values=place.put(np.full_like(frames.values, np.nan)))
