@@ -52,6 +52,11 @@ class Groups:
 
     waves: PlaneWaves
 
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Of the real and imaginary parts of all waves: (groups, 2, MIRRORED, LANES)."""
+        return len(self.first), 2, MIRRORED, LANES
+
     @cached_property
     def _quarter(self) -> tuple[IntArray, IntArray, FloatArray, int]:
         """Indices and lateral wavenumbers (groups, LANES) of waves without a negative index, and how many there are."""

@@ -33,7 +33,7 @@ class Illumination:
     table : (samples, m) float32 array
         f over `span`.
     span : (2,) float64 array
-        Smallest and largest R, m.
+        Smallest and largest R, m; `split` has it about 0.
     """
 
     coefficients: NDArray[np.float32]
@@ -47,8 +47,8 @@ def constant(frequencies: int) -> Illumination:
     return Illumination(np.ones((frequencies, 1), np.float32), 1, np.ones((2, 1), np.float32), np.zeros(2))
 
 
-def split(detuning: FloatArray, strength: FloatArray, span: FloatArray, tolerance: float) -> Illumination:
-    """Split the illumination of one plane.
+def split(detuning: FloatArray, strength: FloatArray, half: float, tolerance: float) -> Illumination:
+    """Split the illumination of distances from ``-half`` to ``half`` about a middle one.
 
     Parameters
     ----------
@@ -56,18 +56,18 @@ def split(detuning: FloatArray, strength: FloatArray, span: FloatArray, toleranc
         ``k - k_0``, rad/m.
     strength : (frequencies,) array
         How much each frequency counts.
-    span : (2,) array
-        Smallest and largest distance from the laser spot, m.
+    half : float
+        m.
     tolerance : float
         Root mean square error allowed, relative.
     """
-    half = (span[1] - span[0]) / 2
     # Even and odd functions are known by their values at the positive half of the nodes.
     angles = np.pi * (np.arange(NODES // 2) + 0.5) / NODES
     phase = np.outer(np.cos(angles), half * detuning)
     kept = [_leading(wave(phase), strength, tolerance) for wave in (np.cos, np.sin)]
     table = np.concatenate([_continuation(odd) @ values for odd, (values, _) in enumerate(kept)], axis=1)
     coefficients = np.concatenate([b for _, b in kept], axis=1)
+    span = np.array([-half, half])
     return Illumination(coefficients.astype(np.float32), kept[0][1].shape[1], table.astype(np.float32), span)
 
 

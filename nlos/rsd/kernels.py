@@ -82,11 +82,11 @@ def interpolation(place, node, share):
 
 @compiled
 def carry(spectrum, first, nodes, begin, offset, shares, coefficients, terms):
-    """``terms[m] = sum_k coefficients[m, k] * transfer_k * spectrum_k`` for all plane waves, group by group.
+    """``terms[m] = sum_k coefficients[m, k] * transfer_k * spectrum_k`` for all plane waves and some depths.
 
     The transfer function depends on a wave's lateral wavenumber alone and is interpolated between its nodes, once for
-    waves mirrored in the axes. Everything between spectrum and terms stays in cache. Frequencies come in steps of
-    `STEPS`.
+    waves mirrored in the axes. A group is carried to all depths while its spectrum is in cache, and nothing between
+    spectrum and terms leaves it. Frequencies come in steps of `STEPS`.
 
     Parameters
     ----------
@@ -94,32 +94,33 @@ def carry(spectrum, first, nodes, begin, offset, shares, coefficients, terms):
         Real and imaginary parts.
     first : (groups,) int64 array
         Frequency that each group starts at.
-    nodes : (n, 2, frequencies) float32 array
-        Transfer function.
+    nodes : (depths, n, 2, frequencies) float32 array
+        Transfer functions.
     begin : (groups,) int64 array
         First node that each group takes.
     offset : (groups + 1,) int64 array
         Where its interpolation weights begin; it has a multiple of `NODES` of them.
     shares : (some, LANES) float32 array
         Interpolation weights.
-    coefficients : (m, frequencies) float32 array
+    coefficients : (depths, m, frequencies) float32 array
         An even number of terms.
-    terms : (m, groups, 2, MIRRORED, LANES) float32 array
+    terms : (depths, m, groups, 2, MIRRORED, LANES) float32 array
         Overwritten.
     """
-    groups, frequencies, count = spectrum.shape[0], spectrum.shape[1], coefficients.shape[0]
+    groups, frequencies, count = spectrum.shape[0], spectrum.shape[1], coefficients.shape[1]
     waves, weights, flat = spectrum.reshape(-1), shares.reshape(-1), terms.reshape(-1)
     transfer, products = np.empty(2 * STEPS * LANES, np.float32), np.empty(STEPS * GROUP, np.float32)
     sums = np.empty(count * GROUP, np.float32)
     for group in range(groups):
-        sums[:] = 0
-        for k in range(first[group], frequencies, STEPS):
-            _interpolate(nodes, begin[group], k, weights, offset[group], offset[group + 1], transfer)
-            _multiply(waves, (group * frequencies + k) * GROUP, transfer, products)
-            _reduce(coefficients, k, products, sums)
-        for m in range(count):
-            to = (m * groups + group) * GROUP
-            flat[to : to + GROUP] = sums[m * GROUP : (m + 1) * GROUP]
+        for depth in range(coefficients.shape[0]):
+            sums[:] = 0
+            for k in range(first[group], frequencies, STEPS):
+                _interpolate(nodes[depth], begin[group], k, weights, offset[group], offset[group + 1], transfer)
+                _multiply(waves, (group * frequencies + k) * GROUP, transfer, products)
+                _reduce(coefficients[depth], k, products, sums)
+            for m in range(count):
+                to = ((depth * count + m) * groups + group) * GROUP
+                flat[to : to + GROUP] = sums[m * GROUP : (m + 1) * GROUP]
 
 
 # Unsigned indices into flat arrays: an index that might be negative would keep the loops from becoming vector code.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,18 @@ from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.groups import Groups, Interpolation
 from nlos.rsd.illumination import Illumination, constant, split
 from nlos.rsd.inverse import inverse
-from nlos.rsd.kernels import LANES, MIRRORED, carry, illuminate, scatter
+from nlos.rsd.kernels import carry, illuminate, scatter
 from tofclip.threads import blocks, run_blocks
 
 FloatArray = NDArray[np.float64]
+Field = NDArray[np.complex64]
+Parts = NDArray[np.float32]
 
-PLANES_AT_A_TIME = 4
+PLANES_AT_A_TIME = 2
+"""Depths that a group of plane waves is carried to while its spectrum is in cache."""
+
+LADDER, NARROWEST = 1.03, 1e-3
+"""Distances to the laser spot vary by less over a plane than the next power of the first, and than the second, m."""
 
 ILLUMINATION_SHARE = 0.25
 """Of the error allowed, what splitting the illumination may take; where little is hidden it weighs more."""
@@ -59,7 +65,20 @@ class Source:
             for axis, spot in ((way.grid.y, self.laser[1]), (way.grid.x, self.laser[0]))
         )
         span = np.sqrt(np.array(y) ** 2 + np.array(x) ** 2 + (depth - self.laser[2]) ** 2)
-        return split(self.wavenumbers - self.centre, self.strength, span, ILLUMINATION_SHARE * way.tolerance)
+        # One split serves all depths that differ by little: it takes as long as a small image.
+        half = LADDER ** np.ceil(np.log(max(np.ptp(span) / 2, NARROWEST)) / np.log(LADDER))
+        light = self._split(float(half), ILLUMINATION_SHARE * way.tolerance)
+        return replace(light, span=span.mean() + light.span)
+
+    def _split(self, half: float, tolerance: float) -> Illumination:
+        key = half, tolerance
+        if key not in self._splits:
+            self._splits[key] = split(self.wavenumbers - self.centre, self.strength, half, tolerance)
+        return self._splits[key]
+
+    @cached_property
+    def _splits(self) -> dict[tuple[float, float], Illumination]:
+        return {}
 
 
 def diffract(
@@ -103,10 +122,9 @@ def diffract(
 
         def work(planes: slice) -> None:
             bench = spare.pop() if spare else _Bench(way, source, groups, interpolation, most)
-            for i in range(planes.start, planes.stop):
-                bench.image(spectrum, lights[i], float(way.grid.z[i]), total[i])
-                progress(total[i].size)
+            bench.image(spectrum, lights[planes], planes, total)
             spare.append(bench)
+            progress(total[planes].size)
 
         run_blocks(work, len(lights), size=PLANES_AT_A_TIME)
 
@@ -121,30 +139,39 @@ class _Bench:
         self.inverse = inverse(groups.indices, way.lattice, way.grid.shape[1:], terms)
         self.cell = np.where(groups.distinct, self.inverse.cell, self.inverse.spare)
         self.folded = np.unique(self.cell).size <= np.count_nonzero(groups.distinct)
-        # The compiled loop takes two terms at a time.
-        self.terms = np.empty((terms + terms % 2, len(groups.first), 2, MIRRORED, LANES), np.float32)
+        self._room = np.empty(PLANES_AT_A_TIME * (terms + 1) * int(np.prod(groups.shape)), np.float32)
 
-    def image(self, spectrum: NDArray[np.float32], light: Illumination, depth: float, field: NDArray[Any]) -> None:
-        """Add one depth plane."""
-        count = light.coefficients.shape[1]
-        self._carry(spectrum, light, depth)
-        for some in blocks(count, len(self.inverse.spectra)):
-            scatter(self.terms[some], self.cell, self.folded, self.inverse.spectra)
-            self.inverse.transform(some)
-        images = self.inverse.images[:count]
+    def image(self, spectrum: Parts, lights: list[Illumination], planes: slice, total: Field) -> None:
+        """Add a few depth planes."""
+        depths = self.way.grid.z[planes]
+        carried = self._carried(spectrum, lights, depths)
+        for terms, light, depth, field in zip(carried, lights, depths, total[planes], strict=True):
+            count = light.coefficients.shape[1]
+            for some in blocks(count, len(self.inverse.spectra)):
+                scatter(terms[some], self.cell, self.folded, self.inverse.spectra)
+                self.inverse.transform(some)
+            self._illuminate(self.inverse.images[:count], light, depth, field)
+
+    def _carried(self, spectrum: Parts, lights: list[Illumination], depths: FloatArray) -> Parts:
+        """Return the plane waves of all terms, (depths, m, groups, 2, MIRRORED, LANES)."""
+        ahead, between = self.groups.ahead, self.interpolation
+        most = max(light.coefficients.shape[1] for light in lights)
+        # The compiled loop takes two terms at a time.
+        coefficients = np.zeros((len(lights), most + most % 2, spectrum.shape[1]), np.float32)
+        nodes = []
+        for own, light, depth in zip(coefficients, lights, depths, strict=True):
+            own[: light.coefficients.shape[1], ahead:] = light.coefficients.T
+            delay = np.array([light.span.mean(), self.source.centre])
+            nodes.append(self.way.transfer.at(depth - self.way.plane.z, delay, ahead))
+        shape = (*coefficients.shape[:2], *self.groups.shape)
+        terms = self._room[: int(np.prod(shape))].reshape(shape)
+        weights = (between.begin, between.offset, between.shares)
+        carry(spectrum, self.groups.first, np.stack(nodes), *weights, coefficients, terms)
+        return terms
+
+    def _illuminate(self, images: Field, light: Illumination, depth: float, field: Field) -> None:
+        """Let the laser's wave meet the images of one depth plane."""
         x, y = self.way.grid.x, self.way.grid.y
         laser = np.zeros(3) if self.source.laser is None else self.source.laser
         carrier = self.inverse.carrier
         illuminate(images, light.even, x, y, depth, laser, self.source.centre, light.table, light.span, carrier, field)
-
-    def _carry(self, spectrum: NDArray[np.float32], light: Illumination, depth: float) -> None:
-        """Leave the plane waves of all terms in `terms`."""
-        frequencies, count = light.coefficients.shape
-        ahead, between = self.groups.ahead, self.interpolation
-        delay = np.array([light.span.mean(), self.source.centre])
-        nodes = self.way.transfer.at(depth - self.way.plane.z, delay, ahead)
-        coefficients = np.zeros((count + count % 2, ahead + frequencies), np.float32)
-        coefficients[:count, ahead:] = light.coefficients.T
-        terms = self.terms[: len(coefficients)]
-        weights = (between.begin, between.offset, between.shares)
-        carry(spectrum, self.groups.first, nodes, *weights, coefficients, terms)

@@ -78,18 +78,18 @@ def test_carrying_is_transfer_and_sum_over_frequencies(count: int) -> None:
     between = GROUPS.interpolation(transfer)
     delay = np.array([0.3, 45.0])
     spectrum = GROUPS.analysed(field(), PLANE, ORIGIN)
-    coefficients = np.zeros((count, spectrum.shape[1]), np.float32)
-    coefficients[:, GROUPS.ahead :] = np.random.default_rng(1).normal(size=(count, WAVES.count))
-    terms = np.empty((count, *spectrum.shape[:1], *spectrum.shape[2:]), np.float32)
-    nodes = transfer.at(0.7, delay, GROUPS.ahead)
-    assert np.array_equal(nodes[..., GROUPS.ahead :], transfer.at(0.7, delay))
+    coefficients = np.zeros((2, count, spectrum.shape[1]), np.float32)
+    coefficients[..., GROUPS.ahead :] = np.random.default_rng(1).normal(size=(2, count, WAVES.count))
+    terms = np.empty((2, count, *GROUPS.shape), np.float32)
+    nodes = np.stack([transfer.at(depth, delay, GROUPS.ahead) for depth in (0.7, 0.9)])
+    assert np.array_equal(nodes[0, ..., GROUPS.ahead :], transfer.at(0.7, delay))
     carry(spectrum, GROUPS.first, nodes, between.begin, between.offset, between.shares, coefficients, terms)
     _, _, lateral = lateral_of_distinct(GROUPS)
     node, share = transfer.interpolation(lateral)
-    at_waves = np.einsum("qt,qtck->qck", share, nodes[node[:, np.newaxis] + np.arange(share.shape[1])])
-    at_waves = at_waves[:, 0] + 1j * at_waves[:, 1]
-    expected = np.einsum("mk,qk,kq->mq", coefficients, at_waves, complex_waves(spectrum))
-    found = complex_waves(np.moveaxis(terms, 0, 1))
+    at_waves = np.einsum("qt,zqtck->zqck", share, nodes[:, node[:, np.newaxis] + np.arange(share.shape[1])])
+    at_waves = at_waves[:, :, 0] + 1j * at_waves[:, :, 1]
+    expected = np.einsum("zmk,zqk,kq->zmq", coefficients, at_waves, complex_waves(spectrum))
+    found = complex_waves(np.moveaxis(terms, 2, 0))
     assert np.abs(found - expected).max() < 1e-5 * np.abs(expected).max()
 
 
