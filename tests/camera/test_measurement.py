@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
-from tofclip.camera import Camera, SkewSweep, dark_level, measure
+from tofclip.camera import Camera, ProjectiveSweep, Rectifier, SkewSweep, dark_level, measure
 from tofclip.errors import CalibrationError, InputError
 
 WIDTH, ROWS = 61, 80
@@ -81,3 +82,33 @@ def test_what_cannot_be_measured_is_refused():
         measure(streak(), np.ones((ROWS, WIDTH), bool), camera())
     with pytest.raises(InputError, match="dark level"):
         measure(np.full((ROWS, WIDTH), 7, np.float32), None, camera())
+
+
+def test_a_sweep_that_moves_light_across_columns_is_undone_bilinearly():
+    matrix = np.array([[1.01, 0.02, -0.7], [-0.03, 0.98, 1.3], [1e-4, -2e-4, 1.0]])
+    turned = camera(sweep=ProjectiveSweep(matrix), dead_columns=np.arange(WIDTH) == 20)
+    counts, late = streak(), 0.4
+    saturated = np.zeros(counts.shape, bool)
+    saturated[35, 30] = True
+    found = Rectifier(turned, ROWS).measure(counts, saturated, late=late)
+    row, column = turned.sweep.raw_position(*np.mgrid[:ROWS, :WIDTH].astype(float))
+    row += late
+    inside = (row >= 0) & (row <= ROWS - 1) & (column >= 0) & (column <= WIDTH - 1)
+    expected = np.where(inside, map_coordinates(counts - 100.0, [row, column], order=1, mode="nearest"), 0)
+    expected[:, 20] = 0
+    # positions in float32 are good to 1e-5 pixels, times steps of 500 counts
+    np.testing.assert_allclose(found.readings.T, expected, atol=0.02)
+    np.testing.assert_array_equal(found.readings, Rectifier(turned, ROWS).readings(counts, late=late))
+    touched = map_coordinates(saturated.astype(float), [row, column], order=1, mode="nearest") > 0
+    good = inside & ~touched
+    good[:, 20] = False
+    np.testing.assert_array_equal(found.good.T, good)
+    assert (inside & touched).sum() >= 3
+
+
+def test_a_single_row_or_column_is_sampled_too():
+    low = camera(sweep=SkewSweep(np.array([15.0]), np.array([0.0]), np.array([0.0])))
+    counts = np.arange(WIDTH, dtype=np.float32)[np.newaxis]
+    np.testing.assert_array_equal(measure(counts, None, low, dark=0.0).readings[:, 0], counts[0])
+    narrow = Camera([0.0], [0.0], (1, 1), 1, sweep=ProjectiveSweep(np.diag([1.0, 1.0, 1.0])))
+    np.testing.assert_array_equal(measure(counts.T, None, narrow, dark=0.0).readings[0], counts[0])

@@ -1,53 +1,90 @@
-"""The compiled resampling of streak images."""
+"""The compiled resampling of streak images.
+
+Pictures are (columns, rows) here: a view's sweep moves along the rows of the sensor, so that successive readings of one
+column lie side by side, before and after.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-TILE = 32  # columns that are written together: reading goes along rows, writing along columns
+vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def sample(signal, bad, near_bad, raw_row, raw_column, late, readings, good):
-    """Sample raw pixels bilinearly and write them transposed.
+@vectorised
+def sample_in_time(counts, dark, raw_row, late, readings):
+    """Sample every column linearly between two of its rows, and take off the dark level.
 
     Parameters
     ----------
-    signal : (rows, columns) float32 array
-    bad : (rows, columns) bool array
-    near_bad : (rows, columns) bool array
-        Whether the pixel, or the one below, beside, or below and beside it, is bad.
-    raw_row, raw_column : (rows, some columns) float32 arrays
-        Where each rectified pixel of these columns lies in the raw image.
+    counts : (columns, rows) float32 array
+    dark : float32
+    raw_row : (columns, rows) float32 array
+        Where each rectified pixel lies in the raw image.
     late : float32
         Rows to add to all raw rows.
-    readings : (some columns, rows) float32 array, overwritten
+    readings : (columns, rows) float32 array, overwritten
         0 beyond the raw image.
-    good : (some columns, rows) bool array, overwritten
-        False beyond the raw image and where a raw pixel that counts is bad.
     """
-    rows, columns = signal.shape
-    lowest, rightmost = np.uintp(max(rows - 2, 0)), np.uintp(max(columns - 2, 0))
-    one, last_row, last_column = np.uintp(1), np.uintp(rows - 1), np.uintp(columns - 1)
-    for start in range(0, raw_row.shape[1], TILE):
-        for r in range(rows):
-            for c in range(start, min(start + TILE, raw_row.shape[1])):
-                y, x = raw_row[r, c] + late, raw_column[r, c]
-                if y < 0 or y > rows - 1 or x < 0 or x > columns - 1:
-                    readings[c, r] = 0
-                    good[c, r] = False
-                    continue
-                top, left = min(np.uintp(y), lowest), min(np.uintp(x), rightmost)
-                below, beside = min(top + one, last_row), min(left + one, last_column)  # it may be one row high
-                down, right = y - np.float32(top), x - np.float32(left)
-                upper = signal[top, left] + right * (signal[top, beside] - signal[top, left])
-                lower = signal[below, left] + right * (signal[below, beside] - signal[below, left])
-                readings[c, r] = upper + down * (lower - upper)
-                good[c, r] = True
-                if near_bad[top, left]:
-                    spoilt = bad[top, left] and down < 1 and right < 1
-                    spoilt |= bad[top, beside] and down < 1 and right > 0
-                    spoilt |= bad[below, left] and down > 0 and right < 1
-                    spoilt |= bad[below, beside] and down > 0 and right > 0
-                    good[c, r] = not spoilt
+    rows, zero = counts.shape[1], np.int32(0)
+    last, lowest, below = np.float32(rows - 1), np.int32(max(rows - 2, 0)), np.int32(min(1, rows - 1))
+    for column in range(counts.shape[0]):
+        raw, position, reading = counts[column], raw_row[column], readings[column]
+        for row in range(position.size):
+            y = position[row] + late
+            top = min(max(np.int32(y), zero), lowest)
+            upper, lower = raw[top], raw[top + below]
+            value = upper + (y - np.float32(top)) * (lower - upper) - dark
+            reading[row] = value if y >= 0 and y <= last else np.float32(0)
+
+
+@vectorised
+def sample(counts, dark, raw_row, raw_column, late, readings):
+    """Sample bilinearly; see `sample_in_time`.
+
+    Parameters
+    ----------
+    counts : (raw columns, rows) float32 array
+    raw_row, raw_column, readings : (some columns, rows) float32 array
+    """
+    columns, rows = counts.shape
+    flat, zero, length = counts.reshape(counts.size), np.int32(0), np.int32(rows)
+    last_row, lowest, below = np.float32(rows - 1), np.int32(max(rows - 2, 0)), np.int32(min(1, rows - 1))
+    last_column, rightmost = np.float32(columns - 1), np.int32(max(columns - 2, 0))
+    beside = np.int32(min(1, columns - 1)) * length
+    for column in range(raw_row.shape[0]):
+        down, across, reading = raw_row[column], raw_column[column], readings[column]
+        for row in range(down.size):
+            y, x = down[row] + late, across[row]
+            top, left = min(max(np.int32(y), zero), lowest), min(max(np.int32(x), zero), rightmost)
+            right, here = x - np.float32(left), left * length + top
+            upper = flat[here] + right * (flat[here + beside] - flat[here])
+            lower = flat[here + below] + right * (flat[here + beside + below] - flat[here + below])
+            value = upper + (y - np.float32(top)) * (lower - upper) - dark
+            inside = y >= 0 and y <= last_row and x >= 0 and x <= last_column
+            reading[row] = value if inside else np.float32(0)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def trust(bad, raw_row, raw_column, late, good):
+    """Tell the readings that lie within the raw image and to which no bad pixel contributes.
+
+    Parameters
+    ----------
+    bad : (rows, raw columns) bool array
+    raw_row, raw_column, late
+        As for `sample`.
+    good : (some columns, rows) bool array, overwritten
+    """
+    rows, columns = bad.shape
+    for column in range(good.shape[0]):
+        for row in range(good.shape[1]):
+            y, x = raw_row[column, row] + late, raw_column[column, row]
+            good[column, row] = 0 <= y <= rows - 1 and 0 <= x <= columns - 1
+            if good[column, row]:
+                top, left = np.uintp(y), np.uintp(x)
+                # a pixel right on another one has nothing of the next
+                below, beside = top + np.uintp(y > np.float32(top)), left + np.uintp(x > np.float32(left))
+                if bad[top, left] or bad[top, beside] or bad[below, left] or bad[below, beside]:
+                    good[column, row] = False

@@ -15,7 +15,8 @@ FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 QUIET_SHARE = 0.05
-COLUMNS_PER_BLOCK = 256
+COLUMNS_PER_BLOCK = 168
+DARK = "nothing rises above the dark level; was there any light?"
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,10 @@ class Rectifier:
     camera : Camera
     rows : int
         Of the raw pictures.
+
+    Notes
+    -----
+    Memory: as much as a raw picture, twice if the sweep moves light across columns.
     """
 
     def __init__(self, camera: Camera, rows: int) -> None:
@@ -92,10 +97,13 @@ class Rectifier:
         row, column = np.ogrid[:rows, : camera.slit_width_px]
         position = (row.astype(np.float64), column.astype(np.float64))
         raw = position if camera.sweep is None else camera.sweep.raw_position(*position)
+        shape = (rows, camera.slit_width_px)
         # An exact row must not become one that lies beyond the picture by a rounding error of float32.
-        self._raw_row, self._raw_column = (
-            np.ascontiguousarray(np.broadcast_to(part, (rows, camera.slit_width_px)), dtype=np.float32) for part in raw
-        )
+        self._raw_row = np.ascontiguousarray(np.broadcast_to(raw[0], shape).T, dtype=np.float32)
+        raw_column = np.broadcast_to(raw[1], shape).T
+        own = np.broadcast_to(column.T.astype(np.float32), shape[::-1])
+        self._stays_in_column = bool(np.all(raw_column == own))
+        self._raw_column = own if self._stays_in_column else np.ascontiguousarray(raw_column, dtype=np.float32)
 
     def measure(
         self, counts: FloatImage, saturated: Mask | None = None, dark: float | None = None, late: float = 0.0
@@ -117,32 +125,66 @@ class Rectifier:
         CalibrationError, InputError
             As for `measure`, or another number of rows.
         """
-        from tofclip.camera.kernels import sample
-
-        require_width(counts, self.camera)
-        if counts.shape != self._raw_row.shape:
-            raise ShapeError("a streak image of this camera", self._raw_row.shape, counts.shape)
-        signal = np.ascontiguousarray(counts - np.float32(dark_level(counts) if dark is None else dark))
-        bad = np.zeros(counts.shape, bool) if saturated is None else np.ascontiguousarray(saturated)
-        near_bad = _spread_to_pixels_before(bad)
-        readings, good = np.empty(counts.shape[::-1], np.float32), np.empty(counts.shape[::-1], bool)
-
-        def work(piece: slice) -> None:
-            positions = self._raw_row[:, piece], self._raw_column[:, piece]
-            sample(signal, bad, near_bad, *positions, np.float32(late), readings[piece], good[piece])
-
-        run_blocks(work, counts.shape[1], COLUMNS_PER_BLOCK)
-        good &= ~self.camera.dead_columns[:, np.newaxis]
+        self._require_shape(counts)
+        good = self._good(np.zeros(counts.shape, bool) if saturated is None else saturated, late)
         if not good.any():
             raise InputError("no reading can be trusted: every pixel is saturated, dead or outside the sweep")
+        readings = self.readings(counts, dark, late)
         if not np.any((readings > 0) & good):
-            raise InputError("nothing rises above the dark level; was there any light?")
+            raise InputError(DARK)
         return Measurement(readings, good)
 
+    def readings(self, counts: FloatImage, dark: float | None = None, late: float = 0.0) -> FloatImage:
+        """Return the readings alone, for methods that cannot leave out single ones.
 
-def _spread_to_pixels_before(bad: Mask) -> Mask:
-    """Mark the pixels that are bad or have a bad one below, beside, or below and beside them."""
-    near = bad.copy()
-    near[:-1] |= bad[1:]
-    near[:, :-1] |= near[:, 1:]
-    return near
+        Parameters
+        ----------
+        counts, dark, late
+            As for `measure`.
+
+        Returns
+        -------
+        (columns, rows) float32 array
+            0 beyond the raw image and in dead columns.
+
+        Raises
+        ------
+        CalibrationError, InputError
+            As for `measure`, but for readings that cannot be trusted.
+        """
+        from tofclip.camera.kernels import sample, sample_in_time
+
+        self._require_shape(counts)
+        level, shift = np.float32(dark_level(counts) if dark is None else dark), np.float32(late)
+        readings = np.empty(self._raw_row.shape, np.float32)
+        turned = None if self._stays_in_column else np.ascontiguousarray(counts.T)
+
+        def work(piece: slice) -> None:
+            if turned is None:
+                raw = np.ascontiguousarray(counts[:, piece].T)
+                sample_in_time(raw, level, self._raw_row[piece], shift, readings[piece])
+            else:
+                sample(turned, level, self._raw_row[piece], self._raw_column[piece], shift, readings[piece])
+
+        run_blocks(work, len(readings), COLUMNS_PER_BLOCK)
+        readings[self.camera.dead_columns] = 0
+        if not readings.max() > 0:
+            raise InputError(DARK)
+        return readings
+
+    def _good(self, bad: Mask, late: float) -> Mask:
+        from tofclip.camera.kernels import trust
+
+        good, raw = np.empty(self._raw_row.shape, bool), np.ascontiguousarray(bad)
+
+        def work(piece: slice) -> None:
+            trust(raw, self._raw_row[piece], self._raw_column[piece], np.float32(late), good[piece])
+
+        run_blocks(work, len(good), COLUMNS_PER_BLOCK)
+        good &= ~self.camera.dead_columns[:, np.newaxis]
+        return good
+
+    def _require_shape(self, counts: FloatImage) -> None:
+        require_width(counts, self.camera)
+        if counts.shape != self._raw_row.shape[::-1]:
+            raise ShapeError("a streak image of this camera", self._raw_row.shape[::-1], counts.shape)

@@ -235,7 +235,7 @@ def averaged(shots: Sequence[Shot], ranger: Ranger, jitter: Jitter | None) -> tu
         streak = shots[place]()
         if jitter is not None:
             late[place] = jitter.late_bin(light_over_time(streak, ranger.camera))
-        return ranger.rectifier.measure(streak.counts, streak.saturated, late=float(late[place])).readings
+        return ranger.rectifier.readings(streak.counts, late=float(late[place]))
 
     total = readings(0)
     for place in range(1, len(shots)):

@@ -73,7 +73,7 @@ def stream_clouds(
     own = ranger
 
     def rectified(shot: Streak) -> NDArray[float32]:
-        return own.rectifier.measure(shot.counts, shot.saturated).readings
+        return own.rectifier.readings(shot.counts)
 
     stages = Stage("rectify", rectified), Stage("range", own.returns), Stage("place", point_cloud)
     for passage in in_stages(coming, stages, held, policy):
