@@ -33,6 +33,9 @@ Cluster = Annotated[
     ),
 ]
 
+DEVICES = ("cpu", "cuda", "auto", "torch:cpu")
+"""Some of the names that `tofclip.arrays.place_named` understands."""
+
 
 def completing(*names: str) -> Callable[[str], list[str]]:
     """Return what completes an option's value in the shell: the names that begin as it does so far."""
@@ -41,3 +44,15 @@ def completing(*names: str) -> Callable[[str], list[str]]:
         return [name for name in names if name.startswith(incomplete)]
 
     return beginning
+
+
+Device = Annotated[
+    str,
+    typer.Option(
+        "--device",
+        metavar="WHERE",
+        help="Where to compute: cpu (compiled loops), cuda or cuda:N (through CuPy or PyTorch), auto (cuda where there "
+        "is one), or torch:NAME for any device of PyTorch.",
+        autocompletion=completing(*DEVICES),
+    ),
+]

@@ -83,5 +83,5 @@ def numpy_support(what: str, capture: Capture) -> Support:
         return Support()
     return Support(
         f"{what} works on NumPy arrays only, and this capture's signal is on {Place.of(capture.signal)}: "
-        "bring it back with capture.on(Place()), or use PlanarRSD, Hybrid or Backprojection"
+        "bring it back by capture.on(Place()) or --device cpu, or use rsd, hybrid or backprojection"
     )

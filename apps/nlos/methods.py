@@ -13,6 +13,7 @@ from tofclip.units import MILLIMETRE
 if TYPE_CHECKING:
     from nlos import Capture, Grid
     from nlos.method import Reconstructor
+    from tofclip.arrays import Place
 
 PULSED = ("wavelength_mm", "cycles")
 
@@ -28,6 +29,9 @@ METHODS = {
 
 QUICKEST_FIRST = ("rsd", "hybrid", "backprojection")
 """They give the same picture; the later one takes more walls and lasers, and more time."""
+
+PORTABLE = QUICKEST_FIRST
+"""They compute wherever the signal is; the others have compiled loops only."""
 
 
 @dataclass(frozen=True)
@@ -111,3 +115,11 @@ def quickest(settings: ImagingSettings, capture: Capture, grid: Grid) -> str:
     """Name the quickest method that takes a capture; where none does, the one that takes most, which says why."""
     suits = (name for name in QUICKEST_FIRST if built(name, settings).supports(capture, grid))
     return next(suits, QUICKEST_FIRST[-1])
+
+
+def place_for(device: str, settings: ImagingSettings) -> Place:
+    """Return the place that a name asks for; ``auto`` stays with the compiled loops where a method has nothing else."""
+    from tofclip.arrays import Place, place_named
+
+    named = getattr(settings, "method", None)
+    return Place() if device == "auto" and named not in (None, *PORTABLE) else place_named(device)

@@ -134,7 +134,7 @@ def test_what_is_prepared_refuses_other_captures() -> None:
         (replace(capture, wall=capture.wall + 0.01), "the wall is not"),
         (replace(capture, laser=capture.laser + 0.01), "the laser is not"),
         (replace(capture, start=0.41), "prepared for TimeAxis"),
-        (capture.on(Place()), "prepared for signals on torch:cpu, got one on numpy"),
+        (capture.on(Place()), "prepared for signals on torch:cpu, got one on cpu"),
     ):
         with pytest.raises(InputError, match=reason):
             prepared.reconstruct(other)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from apps.nlos.methods import METHODS, ImagingSettings
-from apps.options import AsJson, Cluster
+from apps.options import AsJson, Cluster, Device
 from apps.settings import SettingsFile, setting, takes
 
 if TYPE_CHECKING:
@@ -40,6 +40,14 @@ class ReconstructSettings(ImagingSettings):
     )
 
 
+@dataclass(frozen=True)
+class _Order:
+    """What is asked for every capture: settings, and where to compute."""
+
+    settings: ReconstructSettings
+    device: str
+
+
 @takes(ReconstructSettings)
 def reconstruct(
     source: Annotated[
@@ -59,6 +67,7 @@ def reconstruct(
         typer.Option(metavar=".EXT", help="Format of the volumes in a folder; may be repeated.", show_default=".h5"),
     ] = None,
     cluster: Cluster = None,
+    device: Device = "cpu",
     as_json: AsJson = False,
     **flags: Any,
 ) -> None:
@@ -71,9 +80,10 @@ def reconstruct(
 
     The space in front of the wall is looked over with voxels of half a wavelength first, by the quickest of the first
     three; then the part that is bright is imaged with the voxels asked for. The settings that were told or found are
-    written beside the volume (.toml); given back by --settings they make the same volume. (To the last bit by
-    backprojection, filtered-backprojection, lct and fk; rsd and hybrid plan their Fourier transforms anew in every run
-    of the program, which changes values by a ten-millionth.)
+    written beside the volume (.toml); given back by --settings they make the same volume, on another --device to some
+    hundred-thousandths.
+
+    With --device rsd, hybrid and backprojection compute elsewhere, on a graphics processor; the others cannot.
 
     Of a folder every capture is imaged into the folder --out. Captures whose results are there already are skipped.
     If some fail, the others are done all the same, and the exit status is 1.
@@ -85,16 +95,17 @@ def reconstruct(
     from apps.settings import told
     from tofclip.errors import InputError
 
-    wanted = told(ReconstructSettings, settings, flags)
-    _require_sense(wanted)
+    order = _Order(told(ReconstructSettings, settings, flags), device)
+    _require_sense(order.settings)
+    _require_device(device, elsewhere=cluster is not None)
     if is_folder_of_captures(source):
-        _reconstruct_folder(source, out, wanted, suffix or [".h5"], (cluster, as_json))
+        _reconstruct_folder(source, out, order, suffix or [".h5"], (cluster, as_json))
         return
     if cluster is not None:
         raise InputError(f"{source}: --cluster is for a folder of captures")
     results = Results([out], png, out.with_suffix(SETTINGS_SUFFIX))
     results.require_writable(source, *([] if settings is None else [settings]))
-    report(_reconstructed(source, results, wanted), as_json, results.all)
+    report(_reconstructed(source, results, order), as_json, results.all)
 
 
 def _require_sense(settings: ReconstructSettings) -> None:
@@ -112,19 +123,38 @@ def _require_sense(settings: ReconstructSettings) -> None:
         built(name, settings if settings.wavelength_mm is not None else replace(settings, wavelength_mm=1.0))
 
 
-def _reconstructed(source: Path, results: Results, wanted: ReconstructSettings) -> dict[str, Any]:
+def _require_device(device: str, elsewhere: bool = False) -> None:
+    """Refuse a device that nothing is called, or that is not here, before a capture is read.
+
+    On a cluster the workers need it, not this machine.
+    """
+    from tofclip.arrays import place_named
+    from tofclip.errors import MissingDependencyError
+
+    try:
+        place_named(device)
+    except MissingDependencyError:
+        if not elsewhere:
+            raise
+
+
+def _reconstructed(source: Path, results: Results, order: _Order) -> dict[str, Any]:
     """Image one capture, write its results, and return the figures."""
     from apps.nlos.files import with_history, write_volume
     from apps.nlos.imaging import prepared, warnings_in_a_line
+    from apps.nlos.methods import place_for
     from apps.settings import plain, save
     from nlos.io import read_capture
+    from tofclip.arrays import Place
 
-    capture = prepared(read_capture(source), wanted)
+    place = place_for(order.device, order.settings)
+    capture = prepared(read_capture(source), order.settings)
     started = time.perf_counter()
     with warnings_in_a_line():
-        found, volume = _imaged(capture, wanted)
+        found, volume = _imaged(capture.on(place), order.settings)
+    volume = volume.on(Place())
     seconds = time.perf_counter() - started
-    volume = with_history(volume, source, {"verb": "nlos reconstruct", **plain(found)})
+    volume = with_history(volume, source, {"verb": "nlos reconstruct", "device": str(place), **plain(found)})
     for path in results.volumes:
         write_volume(volume, path, found.point_fraction)
     if results.picture is not None:
@@ -132,6 +162,7 @@ def _reconstructed(source: Path, results: Results, wanted: ReconstructSettings) 
     save(found, results.settings, HEADING)
     return {
         "method": found.method,
+        "device": str(place),
         "wavelength_mm": found.wavelength_mm,
         "voxel_mm": found.voxel_mm,
         "voxels": volume.grid.shape,
@@ -157,7 +188,7 @@ def _imaged(capture: Capture, wanted: ReconstructSettings) -> tuple[ReconstructS
 
 
 def _reconstruct_folder(
-    source: Path, out: Path, wanted: ReconstructSettings, suffixes: Sequence[str], how: tuple[str | None, bool]
+    source: Path, out: Path, order: _Order, suffixes: Sequence[str], how: tuple[str | None, bool]
 ) -> None:
     """Image every capture of a folder whose results are not there yet."""
     from apps.files import make_folder
@@ -171,8 +202,8 @@ def _reconstruct_folder(
     require_apart(source, out)
     sources = captures_in(source)
     make_folder(out)
-    _keep_to(out / FOLDER_SETTINGS, wanted)
-    jobs, skipped = _jobs(sources, out, wanted, suffixes)
+    _keep_to(out / FOLDER_SETTINGS, order.settings)
+    jobs, skipped = _jobs(sources, out, order, suffixes)
     imaged: list[dict[str, Any]] = []
 
     def note(report: Report) -> None:
@@ -192,9 +223,7 @@ def _reconstruct_folder(
         raise typer.Exit(SOME_FAILED)
 
 
-def _jobs(
-    sources: Sequence[Path], out: Path, wanted: ReconstructSettings, suffixes: Sequence[str]
-) -> tuple[list[Job], list[str]]:
+def _jobs(sources: Sequence[Path], out: Path, order: _Order, suffixes: Sequence[str]) -> tuple[list[Job], list[str]]:
     """Return one job for each capture without results, and the names of the others."""
     from tofclip.cluster import Job
 
@@ -205,16 +234,16 @@ def _jobs(
             skipped.append(path.name)
             continue
         results.settings.unlink(missing_ok=True)  # it says that results are whole, and these are of an older capture
-        work = partial(_imaged_of_many, path.resolve(), results, wanted)
+        work = partial(_imaged_of_many, path.resolve(), results, order)
         jobs.append(Job(path.name, results.settings, work, tuple(results.all[:-1])))
     return jobs, skipped
 
 
-def _imaged_of_many(source: Path, results: Results, wanted: ReconstructSettings) -> dict[str, Any]:
+def _imaged_of_many(source: Path, results: Results, order: _Order) -> dict[str, Any]:
     """Image one capture, here or on a worker, and tell a person which one it is."""
     if sys.stderr.isatty() and threading.current_thread() is threading.main_thread():
         print(source.name, file=sys.stderr)
-    return _reconstructed(source, results, wanted)
+    return _reconstructed(source, results, order)
 
 
 def _require_formats(suffixes: Sequence[str]) -> None:
