@@ -122,7 +122,7 @@ class ReturnSearch:
         total, bins = traces.pixels.size, traces.bins
         sharp, matched, gains = self._filters
         # Beyond the bins that are searched the filters reach into what lies elsewhere on the axis.
-        filters = sharp[:, bins.numbers] * bins.searched, matched[bins.numbers], gains
+        filters = np.take(sharp, bins.numbers, axis=1) * bins.searched, matched[bins.numbers], gains
         fixed = self.times[bins.numbers], bins.standing, filters, self.pulse.table()
         found = np.empty((total, self.detection.most_returns, 3))
         counts = np.zeros(total, np.int64)

@@ -72,9 +72,13 @@ def refine(trace, times, background, curve, scale, estimate, variance, rounds):
     for _ in range(rounds):
         largest = 0.0
         for k in range(estimate.shape[0]):
-            concerned, own, moving = neighbours(estimate, k, curve, scale)
+            crowded, moving = neighbours(estimate, k, curve, scale)
             if moving >= CONVERGED_BINS:
-                gauss_newton_step(trace, times, background, curve, scale, concerned, own, variance)
+                if crowded or variance[1] != 0:
+                    sums = weighted_sums(trace, times, background, curve, scale, estimate, k, variance)
+                else:
+                    sums = lone_sums(trace, times, background, curve, scale, estimate, k)
+                gauss_newton_step(times, sums, estimate[k])
                 largest = max(largest, estimate[k, 2])
         if largest < CONVERGED_BINS:
             break
@@ -82,7 +86,7 @@ def refine(trace, times, background, curve, scale, estimate, variance, rounds):
 
 @compiled
 def neighbours(estimate, k, curve, scale):
-    """Return k with all others if one of them reaches it, else alone; its place there; and the most one of them moved.
+    """Whether another return reaches return k, and the most that one of them moved.
 
     One reaches the other if it has light in bins that count for the other.
     """
@@ -93,12 +97,32 @@ def neighbours(estimate, k, curve, scale):
         if other != k and -after < later < before:
             crowded = True
             moving = max(moving, estimate[other, 2])
-    return (estimate, k, moving) if crowded else (estimate[k : k + 1], 0, moving)
+    return crowded, moving
 
 
 @compiled
-def gauss_newton_step(trace, times, background, curve, scale, estimate, k, variance):
-    """Improve return k of `estimate` in place, and enter there by how many bins it moved (at most one)."""
+def lone_sums(trace, times, background, curve, scale, estimate, k):
+    """Window of return k, and the normal equations of its fit by least squares where no other return reaches it.
+
+    Sums over the bins of pulse p, slope d and the rest r that they have to explain: pp, pd, dd, pr, dr.
+    """
+    arrival = estimate[k, 0]
+    first, last = window(times, int(estimate[k, 3]), arrival, scale)
+    pp = pd = dd = pr = dr = 0.0
+    for i in range(first, last):
+        p, d = pulse_at(times[i] - arrival, curve, scale)
+        rest = trace[i] - background
+        pp += p * p
+        pd += p * d
+        dd += d * d
+        pr += p * rest
+        dr += d * rest
+    return first, last, pp, pd, dd, pr, dr
+
+
+@compiled
+def weighted_sums(trace, times, background, curve, scale, estimate, k, variance):
+    """The same with bins weighed by their variance, and all other returns taken off; see `refine`."""
     arrival, height = estimate[k, 0], estimate[k, 1]
     first, last = window(times, int(estimate[k, 3]), arrival, scale)
     pp = pd = dd = pr = dr = 0.0
@@ -111,18 +135,25 @@ def gauss_newton_step(trace, times, background, curve, scale, estimate, k, varia
         dd += weight * d * d
         pr += weight * p * rest
         dr += weight * d * rest
+    return first, last, pp, pd, dd, pr, dr
+
+
+@compiled
+def gauss_newton_step(times, sums, own):
+    """Improve one return's arrival and height in place, and enter by how many bins it moved (at most one)."""
+    first, last, pp, pd, dd, pr, dr = sums
     determinant = pp * dd - pd * pd
-    estimate[k, 2] = 0.0
+    own[2] = 0.0
     if determinant <= 0:
         return
     height = (dd * pr - pd * dr) / determinant
     if height <= 0:
-        estimate[k, 1] = 0.0
+        own[1] = 0.0
         return
     bin_width = (times[last - 1] - times[first]) / (last - 1 - first)
     step = -(pp * dr - pd * pr) / (determinant * height)  # model: height * p(t - arrival), whose slope is -height * d
     step = min(max(step, -bin_width), bin_width)
-    estimate[k, 0], estimate[k, 1], estimate[k, 2] = arrival + step, height, abs(step) / bin_width
+    own[0], own[1], own[2] = own[0] + step, height, abs(step) / bin_width
 
 
 @compiled
@@ -137,12 +168,14 @@ def describe(trace, times, background, noise, curve, scale, estimate, least, pro
         arrival, height = estimate[k, 0], estimate[k, 1]
         if height <= 0 or arrival < times[0] or arrival > times[-1]:
             continue
-        concerned, own, _ = neighbours(estimate, k, curve, scale)
+        crowded, _ = neighbours(estimate, k, curve, scale)
         first, last = window(times, int(estimate[k, 3]), arrival, scale)
         pp = pd = dd = 0.0
         for i in range(first, last):
             p, d = pulse_at(times[i] - arrival, curve, scale)
-            rest = unexplained(trace, times, background, curve, scale, concerned, i, own) - height * p
+            rest = trace[i] - background - height * p
+            if crowded:
+                rest = unexplained(trace, times, background, curve, scale, estimate, i, k) - height * p
             profile[i, 0], profile[i, 1], profile[i, 2] = p, d, rest
             pp += p * p
             pd += p * d
@@ -171,14 +204,16 @@ def sum_and_deviation(profile, height, noise, pp, pd, dd):
     pp, pd, dd : float
         Sums of squared pulse, pulse times slope, and squared slope.
     """
-    across_energy = dd - pd * pd / pp
+    slant, per_pp = pd / pp, 1 / pp
+    across_energy = dd - pd * slant
+    per_across = 1 / across_energy
     total = misfit = unfitted = weighted = 0.0
     for i in range(profile.shape[0]):
         p, d, residual = profile[i, 0], profile[i, 1], profile[i, 2]
-        across = d - p * pd / pp  # the part of the slope that a change of height cannot mimic
+        across = d - p * slant  # the part of the slope that a change of height cannot mimic
         total += height * p
         misfit += residual * residual - noise * noise
-        unfitted += height * p * (1 - p * p / pp - across * across / across_energy)
+        unfitted += height * p * (1 - p * p * per_pp - across * across * per_across)
         weighted += across * across * height * p
     misfit += 2 * noise * noise  # two of the bins' worth of noise went into the fit
     variance = noise * noise * across_energy + max(misfit, 0.0) / max(unfitted, 1e-3 * total) * weighted

@@ -17,9 +17,9 @@ Mask = NDArray[np.bool_]
 
 LENGTH_IN_WIDTHS = 1.7  # a sum over so much of a Gaussian pulse stands out nearly as far as the matched filter's
 QUIET_SHARE, QUIETER_SHARE = 0.25, 0.05
-HARDLY_BRIGHTER = 1.5  # noise alone makes a tenth
+HARDLY_BRIGHTER, AS_DARK = 1.5, 1.25  # in mean square; noise alone makes a tenth
 FURTHER = 1.2  # than the limit has an instant to stand out
-SAMPLED = 64  # dark rows, which know the noise of a dark pixel to a tenth
+SAMPLED = 48  # dark rows at least, which know the noise of a dark pixel to a tenth
 WORTHWHILE = 0.75  # of all rows: what needs more of them is as well searched everywhere
 COLUMNS_PER_BLOCK = 192
 
@@ -43,8 +43,8 @@ class LitRows:
 
     Readings are summed over a pulse's length, once per pulse width, and each sum is brought to the noise of its column.
     Back-projection, which is the matched filter of a lone pixel in even noise, then says how far the brightest pixel of
-    each instant stands out. Of noise alone the brightest of 16 000 pixels stands out by 4.4, and by more than 1.2 times
-    the usual limit of 5 in one instant of a hundred: such instants are searched in vain.
+    each instant stands out. Of noise alone the brightest of 16 000 pixels stands out by 4.2, and by more than 1.2 times
+    the usual limit of 5 in one instant of three hundred: such instants are searched in vain.
 
     What is left out is what only the search could see. It judges a return by the inverse, in which a lone pixel stands
     out less than in the back-projection (in the seed paper's instrument 0.72 to 0.93 times as far), but by the pixel's
@@ -123,7 +123,7 @@ class LitRows:
         darkest, quiet = np.quantile(energy[measured], [QUIETER_SHARE, QUIET_SHARE])
         if quiet > HARDLY_BRIGHTER * darkest:
             return self._taken
-        counted = (measured & (energy <= quiet)).astype(np.float32)
+        counted = (measured & (energy <= max(quiet, AS_DARK * darkest))).astype(np.float32)
         run_blocks(
             lambda piece: standardise(sums, counted, (piece.start, piece.stop)), readings.shape[0], COLUMNS_PER_BLOCK
         )
