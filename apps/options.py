@@ -52,7 +52,7 @@ Device = Annotated[
         "--device",
         metavar="WHERE",
         help="Where to compute: cpu (compiled loops), cuda or cuda:N (through CuPy or PyTorch), auto (cuda where there "
-        "is one), or torch:NAME for any device of PyTorch.",
+        "is one), or any device of PyTorch such as torch:cpu.",
         autocompletion=completing(*DEVICES),
     ),
 ]

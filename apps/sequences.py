@@ -44,6 +44,18 @@ def run_all(
         return run(missing, cluster, note)
 
 
+def require_device(device: str, cluster: str | None) -> None:
+    """Refuse a device that is not here, unless workers elsewhere are to look for it, and a name that is none at all."""
+    from tofclip.arrays import place_named
+    from tofclip.errors import MissingDependencyError
+
+    try:
+        place_named(device)
+    except MissingDependencyError:
+        if cluster is None:
+            raise
+
+
 def finish(summary: Summary, total: int, as_json: bool, out: Path, figures: Mapping[str, Any] | None = None) -> None:
     """Print the figures of a sequence and its failures.
 

@@ -100,6 +100,33 @@ def test_what_is_set_up_in_a_place_is_set_up_once(place):
     assert asked == [place, Place()]
 
 
+def test_a_place_says_where_it_is(place):
+    assert str(Place()) == "cpu"
+    assert str(place).startswith(f"{place.library}:")
+    with place.current():
+        assert Place.of(place.put(VALUES)) == place
+
+
+def test_cupy_works_on_its_current_device():
+    """No CuPy here: something else that is entered and left, as its devices are, stands in for one."""
+    entered = []
+
+    class Device:
+        id = 1
+
+        def __enter__(self):
+            entered.append(self.id)
+
+        def __exit__(self, *_):
+            entered.append(-self.id)
+
+    place = Place("cupy", Device())
+    assert str(place) == "cupy:1"
+    with place.current():
+        assert entered == [1]
+    assert entered == [1, -1]
+
+
 def test_a_tensor_with_a_gradient():
     torch = pytest.importorskip("torch", reason="PyTorch is optional")
     np.testing.assert_array_equal(to_numpy(torch.ones(3, requires_grad=True) * 2), [2, 2, 2])

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -152,8 +153,19 @@ class Place:
         contiguous = np.require(to_numpy(values), requirements=["C", "W"])
         return namespace(library.asarray([0.0])).asarray(contiguous, device=self.device)
 
+    def current(self) -> AbstractContextManager[Any]:
+        """Return a context in which what is made is made here: CuPy works on its current device only."""
+        context: AbstractContextManager[Any] = self.device if self.library == "cupy" and self.device else nullcontext()
+        return context
+
     def __str__(self) -> str:
-        return self.library if self.device is None else f"{self.library}:{self.device}"
+        if self.library == "numpy":
+            return "cpu"
+        return self.library if self.device is None else f"{self.library}:{getattr(self.device, 'id', self.device)}"
+
+
+HERE = Place()
+"""NumPy's arrays, where the compiled loops work."""
 
 
 class InEachPlace(Generic[T]):

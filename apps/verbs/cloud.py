@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apps.options import AsJson, Cluster
+from apps.options import AsJson, Cluster, Device
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ def cloud(
     ] = None,
     suffix: Annotated[str, typer.Option(metavar=".EXT", help="Format of the clouds of a sequence.")] = ".ply",
     cluster: Cluster = None,
+    device: Device = "cpu",
     as_json: AsJson = False,
 ) -> None:
     """Find each pixel's returns and place them in space: x right, y down, z forward, in metres.
@@ -54,10 +55,12 @@ def cloud(
 
     Example: tofclip cloud 'frames/*.h5' --out clouds/ --cluster local
     """
+    from apps.sequences import require_device
     from tofclip.batch import Clouds, is_sequence
     from tofclip.errors import InputError
 
-    clouds = Clouds(drop_outliers, None if voxel_mm is None else voxel_mm * MILLIMETRE)
+    clouds = Clouds(drop_outliers, None if voxel_mm is None else voxel_mm * MILLIMETRE, device)
+    require_device(device, cluster)
     if is_sequence(frames):
         _clouds_of_sequence(clouds, frames, out, suffix, (cluster, as_json))
         return
@@ -83,7 +86,7 @@ def _clouds_of_sequence(clouds: Clouds, frames: Path, out: Path, suffix: str, ho
     jobs = clouds.jobs(files_in(frames), out, suffix)
     points: list[int] = []
     summary = run_all("placing", jobs, cluster, lambda report: points.append(report.figures or 0))
-    finish(summary, len(jobs), as_json, out, {"points": sum(points)})
+    finish(summary, len(jobs), as_json, out, {"points": sum(points), "device": clouds.device})
 
 
 def _cloud_of_one(clouds: Clouds, frames: Path, out: Path, as_json: bool) -> None:
@@ -96,16 +99,17 @@ def _cloud_of_one(clouds: Clouds, frames: Path, out: Path, as_json: bool) -> Non
     past = history({"verb": "cloud"}, frames, earlier=recovered.provenance)
     points, returns = clouds.found(replace(recovered, provenance=past), str(frames))
     save_cloud(points, returns, out)
-    _report(points, returns, as_json, out)
+    _report(points, returns, as_json, (out, clouds.device))
 
 
-def _report(points: PointCloud, returns: Returns, as_json: bool, out: Path) -> None:
+def _report(points: PointCloud, returns: Returns, as_json: bool, made: tuple[Path, str]) -> None:
     from apps.report import report
 
-    rows, columns = returns.camera.image_shape
+    (rows, columns), (out, device) = returns.camera.image_shape, made
     figures = {
         "points": len(points),
         "range_m": [points.range.min(), points.range.max()],
         "returns_per_pixel_mean": len(points) / (rows * columns),
+        "device": device,
     }
     report(figures, as_json, [out])

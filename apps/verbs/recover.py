@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apps.options import AsJson, Cluster, Picture, TimeZero, completing
+from apps.options import AsJson, Cluster, Device, Picture, TimeZero, completing
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
@@ -66,6 +66,7 @@ def recover(
         ),
     ] = None,
     cluster: Cluster = None,
+    device: Device = "cpu",
     as_json: AsJson = False,
 ) -> None:
     """Recover every transient frame of a raw streak image, or of each one of a sequence.
@@ -77,11 +78,13 @@ def recover(
 
     Example: tofclip recover shot.tif --camera camera.h5 --out frames.h5 --time-zero-ns -10.784
     """
+    from apps.sequences import require_device
     from tofclip.batch import Recovery, is_sequence
 
     zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
-    recovery = Recovery(method, iterations, None, focus, camera, zero)
+    recovery = Recovery(method, iterations, None, focus, camera, zero, device)
+    require_device(device, cluster)
     if is_sequence(streak):
         _refuse_for_sequence(cloud, preview)
         _recover_sequence(recovery, (streak, width), out, sweep or [], (cluster, as_json))
@@ -117,7 +120,7 @@ def _recover_sequence(
     found = shots_in(*shots)
     swept = variants(recovery, dict(map(_values, sweep)))
     jobs = [job for label, variant in swept.items() for job in variant.jobs(found, out / label)]
-    finish(run_all("recovering", jobs, cluster), len(jobs), as_json, out)
+    finish(run_all("recovering", jobs, cluster), len(jobs), as_json, out, {"device": recovery.device})
 
 
 def _values(text: str) -> tuple[str, list[str]]:
@@ -154,7 +157,7 @@ def _recover_single(
     save(preview_figure(task.streak, frames), preview)
     written = [out, preview]
     if cloud is not None:
-        points, _ = Clouds().found(frames, "the recovered frames")
+        points, _ = Clouds(device=recovery.device).found(frames, "the recovered frames")
         points.save(cloud)
         written.append(cloud)
     _report(frames, as_json, written)
@@ -192,6 +195,7 @@ def _report(frames: Frames, as_json: bool, written: list[Path]) -> None:
             "view_gains": frames.camera.gains,
             "time_shift_bins": time_shift_bins(frames.camera),
             "stopped_because": known["stopped_because"],
+            "device": known["device"],
         },
         as_json,
         written,

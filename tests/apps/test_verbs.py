@@ -84,6 +84,7 @@ class TestRecover:
             "view_gains",
             "time_shift_bins",
             "stopped_because",
+            "device",
         ]
         assert (found["frames"], found["image_shape"], found["method"]) == (ROWS, [32, 32], "tv")
         assert (len(found["view_gains"]), found["time_shift_bins"]) == (7, [0.0] * 7)
@@ -130,7 +131,7 @@ class TestCloud:
         self, run: Run, frames_file: Path, streak: Streak, tmp_path: Path
     ) -> None:
         found = object_of(run, "cloud", frames_file, "--out", tmp_path / "scene.ply")
-        assert list(found) == ["points", "range_m", "returns_per_pixel_mean"]
+        assert list(found) == ["points", "range_m", "returns_per_pixel_mean", "device"]
         cloud = PointCloud.load(tmp_path / "scene.ply")
         assert len(cloud) == found["points"] > 50  # the squares cover 36 + 49 pixels
         assert found["returns_per_pixel_mean"] == pytest.approx(found["points"] / 32**2)

@@ -83,6 +83,23 @@ def test_a_sweep_has_a_folder_for_each_combination(run, recorded, tmp_path):
     assert run(*words, "--sweep", "iterations")[0] == 2
 
 
+def test_workers_look_for_the_device_themselves(run, scheduler, few, tmp_path):
+    pytest.importorskip("torch", reason="PyTorch is optional")
+    (few / "shot1.h5").unlink()
+    words = ("recover", few, "--method", "linear", "--cluster", scheduler, "--json", "--out")
+    assert run(*words, tmp_path / "there", "--device", "torch:cpu")[0] == 0
+    assert run(*words, tmp_path / "here")[0] == 0
+    for name in ("shot0.h5", "shot2.h5"):
+        there, here = (Frames.load(tmp_path / folder / name) for folder in ("there", "here"))
+        assert (there.figures["device"], here.figures["device"]) == ("torch:cpu", "cpu")
+        # What is promised; sums in another order differ by some 1e-6.
+        assert np.linalg.norm(there.values - here.values) < 1e-4 * np.linalg.norm(here.values)
+    status, out, _ = run(*words, tmp_path / "nowhere", "--device", "torch:cuda:99")
+    assert status == 1
+    assert [failure["name"] for failure in json.loads(out)["failures"]] == ["shot0", "shot2"]
+    assert run(*words, tmp_path / "nowhere", "--device", "gpu")[0] == 2
+
+
 @pytest.mark.parametrize(
     "words",
     [

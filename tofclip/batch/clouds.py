@@ -7,7 +7,9 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from tofclip.arrays import place_named
 from tofclip.batch.inputs import result_paths
+from tofclip.batch.recovery import device_setting
 from tofclip.cluster import Job, claim
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud, Returns, depth, point_cloud
@@ -26,10 +28,13 @@ class Clouds:
         Leave out points far from their neighbours.
     voxel : float, optional
         One point for each cube of this side, m; all points by default.
+    device : str
+        Where returns are looked for, by a name that `tofclip.arrays.place_named` knows.
     """
 
     drop_outliers: bool = False
     voxel: float | None = None
+    device: str = "cpu"
 
     def found(self, frames: Frames, origin: str) -> tuple[PointCloud, Returns]:
         """Find each pixel's returns and place them in space.
@@ -41,7 +46,9 @@ class Clouds:
         """
         from tofclip.lidar.processing import downsampled, without_outliers
 
-        returns = depth(frames)
+        place = place_named(self.device)
+        with place.current():
+            returns = depth(replace(frames, values=place.put(frames.values)))
         if len(returns) == 0:
             raise InputError(f"{origin}: no return stands out of the background, so there is no point to write")
         cloud = replace(point_cloud(returns), provenance=frames.provenance)
@@ -51,7 +58,8 @@ class Clouds:
 
     def jobs(self, frames: Mapping[str, Path], folder: Path, suffix: str) -> list[Job]:
         """Return one job for each file of frames, which writes its cloud into `folder`; see `Recovery.jobs`."""
-        claim(folder, {"verb": "cloud", **asdict(self), "suffix": suffix})
+        settings = {"verb": "cloud", **asdict(self), "suffix": suffix, "device": device_setting(self.device)}
+        claim(folder, settings)
         paths = result_paths(frames, folder, suffix)
         return [Job(name, paths[name], partial(write_cloud, self, file, paths[name])) for name, file in frames.items()]
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from tofclip.cluster.folder import SETTINGS
 from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.io import read_streak
 from tofclip.storage import SIGNATURE
@@ -94,7 +95,7 @@ def files_in(source: str | Path) -> dict[str, Path]:
     """Return the files of a folder or a glob pattern by name, in the order of their names.
 
     A file's name is its path from the folder that they have in common, without the ending. Paths are absolute: a
-    cluster's workers run elsewhere. Hidden files are left out.
+    cluster's workers run elsewhere. Hidden files are left out, and the settings that a run leaves beside its results.
 
     Raises
     ------
@@ -105,7 +106,7 @@ def files_in(source: str | Path) -> dict[str, Path]:
     """
     folder = Path(source)
     if folder.is_dir():
-        found = list(folder.iterdir())
+        found = [path for path in folder.iterdir() if path.name != SETTINGS]
     elif glob.has_magic(str(source)):
         found = [Path(name) for name in glob.glob(str(source), recursive=True)]
     else:

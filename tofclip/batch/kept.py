@@ -9,11 +9,11 @@ import hashlib
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from threading import Lock
-from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
+from tofclip.arrays import Array, namespace, to_numpy
 from tofclip.camera import Camera
 from tofclip.operators import LinearOperator
 from tofclip.operators.projection import LineProjection
@@ -86,12 +86,12 @@ class KeptInverse:
     def recover(
         self,
         operator: LinearOperator,
-        readings: NDArray[Any],
-        good: NDArray[np.bool_] | None = None,
+        readings: Array,
+        good: Array | None = None,
         progress: Progress = silent,
     ) -> Result:
         """Recover one picture per column of `readings`; see `LinearInverse.recover`."""
-        alive = np.ones(operator.shape_out, bool) if good is None else np.asarray(good.any(axis=1))
+        alive = np.ones(operator.shape_out, bool) if good is None else to_numpy(namespace(good).any(good, axis=1))
         return _prepared(self.method, operator, alive.tobytes()).recover(readings, progress)
 
     def work(self, frames: int) -> int:

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from tofclip.arrays import HERE
 from tofclip.batch.inputs import Shot, result_paths
 from tofclip.batch.kept import KeptInverse, kept
 from tofclip.camera import Camera
@@ -36,6 +37,8 @@ class Recovery:
         By default each shot carries its own.
     time_zero : float, optional
         Reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
+    device : str
+        Where, by a name that `tofclip.arrays.place_named` knows; each worker of a cluster looks for it anew.
 
     Raises
     ------
@@ -49,6 +52,7 @@ class Recovery:
     focus: str = "fixed:0"
     camera: Path | None = None
     time_zero: float | None = None
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         self.solver()
@@ -63,7 +67,7 @@ class Recovery:
         """Check a shot against the camera, before any work is done."""
         known = None if self.camera is None else Camera.load(self.camera)
         focus = focus_named(self.focus)
-        task = prepare(streak, known, self.solver())
+        task = prepare(streak, known, self.solver(), device=self.device)
         camera = task.camera if self.time_zero is None else task.camera.replace(time_zero=self.time_zero)
         focus.require(camera)
         return replace(task, camera=camera, focus=focus)
@@ -81,7 +85,12 @@ class Recovery:
     def settings(self) -> dict[str, Any]:
         """Return what a result depends on besides the shot."""
         camera = None if self.camera is None else sha256_of(self.camera)
-        return {"verb": "recover", **asdict(self), "camera": camera}
+        return {"verb": "recover", **asdict(self), "camera": camera, "device": device_setting(self.device)}
+
+
+def device_setting(device: str) -> str | None:
+    """Return the device as a setting that results depend on; this processor is no news, as in folders of old."""
+    return None if device == str(HERE) else device
 
 
 def recover_shot(recovery: Recovery, shot: Shot, result: Path) -> None:

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tofclip.arrays import Array, namespace, zeros
 from tofclip.camera import Camera, Measurement
 from tofclip.operators import LinearOperator
 from tofclip.reconstruct.focus import Piece
 from tofclip.recovery import Method, Progress, Result, relative_residual, silent
+from tofclip.recovery.batches import frames_at_once
 from tofclip.recovery.iterative import ProximalMethod
 from tofclip.threads import blocks
-
-Array = NDArray[Any]
 
 
 def recover_pieces(
@@ -32,6 +30,7 @@ def recover_pieces(
     method : Method
     camera : Camera
     measurement : Measurement
+        Its arrays may be of any library that the method takes; the frames are where they are.
     pieces : sequence of Piece
         All frames, in order.
     progress : callable
@@ -47,7 +46,7 @@ def recover_pieces(
     peaks = np.array([_peak(camera.operator(piece.shear), _part(measurement, piece)) for piece in pieces])
     expected = np.array([piece.brightness for piece in pieces])
     scale = (np.maximum(peaks, 0) / expected).max() * expected
-    frames = np.zeros((measurement.readings.shape[1], *camera.image_shape), np.float32)
+    frames = zeros((measurement.readings.shape[1], *camera.image_shape), measurement.readings)
     results = []
     for piece, peak, bright in zip(pieces, peaks, scale, strict=True):
         if peak <= 0:
@@ -58,8 +57,8 @@ def recover_pieces(
             replace(method, weight=method.weight * bright / peak) if isinstance(method, ProximalMethod) else method
         )
         result = weighted.recover(camera.operator(piece.shear), part.readings, part.good, progress)
-        frames[piece.frames] = result.frames
-        results.append(replace(result, frames=frames[piece.frames]))
+        frames[piece.frames, ...] = result.frames
+        results.append(replace(result, frames=frames[piece.frames, ...]))
     return _joined(frames, results)
 
 
@@ -68,25 +67,30 @@ def residual_of_pieces(camera: Camera, frames: Array, measurement: Measurement, 
     misfit = energy = 0.0
     for piece in pieces:
         part = _part(measurement, piece)
-        own = float(np.sum((part.readings * part.good) ** 2, dtype=np.float64))
+        xp = namespace(part.readings)
+        own = float(xp.sum(_trusted(part) ** 2, dtype=xp.float64))
         if own > 0:
             operator = camera.operator(piece.shear)
-            misfit += own * relative_residual(operator, frames[piece.frames], part.readings, part.good) ** 2
+            misfit += own * relative_residual(operator, frames[piece.frames, ...], part.readings, part.good) ** 2
             energy += own
     return float(np.sqrt(misfit / energy))
 
 
 def _part(measurement: Measurement, piece: Piece) -> Measurement:
     columns = piece.frames
-    return Measurement(
-        np.ascontiguousarray(measurement.readings[:, columns]), np.ascontiguousarray(measurement.good[:, columns])
-    )
+    return Measurement(measurement.readings[:, columns], measurement.good[:, columns])
+
+
+def _trusted(part: Measurement) -> Array:
+    """The readings, zero where they are not good."""
+    return namespace(part.readings, part.good).where(part.good, part.readings, 0.0)
 
 
 def _peak(operator: LinearOperator, part: Measurement) -> float:
     """Largest value of F'f over the good readings."""
-    readings = part.readings * part.good
-    return max(float(operator.adjoint(readings[:, block]).max()) for block in blocks(readings.shape[1]))
+    xp, readings = namespace(part.readings), _trusted(part)
+    pieces = blocks(readings.shape[1], frames_at_once(operator, readings))
+    return max(float(xp.max(operator.adjoint(readings[:, piece]))) for piece in pieces)
 
 
 def _joined(frames: Array, results: list[Result]) -> Result:

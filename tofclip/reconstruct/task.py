@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from tofclip.arrays import HERE, Place, place_named, to_numpy
 from tofclip.calibration.registration import register, registration_work
 from tofclip.calibration.skew import estimate_skew
-from tofclip.camera import Camera, measure
+from tofclip.camera import Camera, Measurement, measure
 from tofclip.errors import InputError
 from tofclip.reconstruct.focus import AT_THE_CALIBRATED_DEPTH, Focus
 from tofclip.reconstruct.pieces import recover_pieces, residual_of_pieces
@@ -64,12 +65,15 @@ class Task:
     method : Method
     focus : Focus
         At which shear each frame is recovered.
+    place : Place
+        Where: readings are put there, and frames fetched from there. What precedes the recovery is done in NumPy.
     """
 
     streak: Streak
     camera: Camera
     method: Method
     focus: Focus = AT_THE_CALIBRATED_DEPTH
+    place: Place = HERE
 
     @property
     def work(self) -> int:
@@ -88,20 +92,25 @@ class Task:
         times = self.streak.times - camera.time_zero
         solving = time.perf_counter()
         pieces = self.focus.pieces(camera, times, measurement, progress)
-        result = recover_pieces(self.method, camera, measurement, pieces, progress)
-        solved = time.perf_counter()
+        with self.place.current():
+            there = Measurement(self.place.put(measurement.readings), self.place.put(measurement.good))
+            result = recover_pieces(self.method, camera, there, pieces, progress)
+            values = to_numpy(result.frames)
+            solved = time.perf_counter()
+            residual = residual_of_pieces(camera, result.frames, there, pieces)
         figures: dict[str, Scalar] = {
             "method": self.method.name,
             "focus": str(self.focus),
             "iterations": result.iterations,
             "stopped_because": result.stopped_because,
-            "relative_residual": residual_of_pieces(camera, result.frames, measurement, pieces),
+            "relative_residual": residual,
             "seconds": time.perf_counter() - started,
             "frames_per_second": result.frames.shape[0] / (solved - solving - result.setup_seconds),
             "setup_seconds": result.setup_seconds,
+            "device": str(self.place),
         }
         return Frames(
-            values=result.frames,
+            values=values,
             times=times,
             camera=camera,
             shears=np.repeat([piece.shear for piece in pieces], [piece.size for piece in pieces]),
@@ -117,6 +126,7 @@ def recover(
     method: str | Method = "tv",
     progress: Progress = silent,
     focus: Focus | None = None,
+    device: str = "cpu",
 ) -> Frames:
     """Recover every transient frame of a streak image.
 
@@ -135,6 +145,8 @@ def recover(
         Called with the number of frame iterations just done.
     focus : Focus, optional
         `FixedFocus` (the default, at shear 0), `DepthLocked` or `SharpestFocus` of `tofclip.reconstruct`.
+    device : str
+        ``"cpu"``, ``"cuda"``, ``"cuda:1"``, ``"auto"`` or a PyTorch device, see `tofclip.arrays.place_named`.
 
     Returns
     -------
@@ -148,13 +160,19 @@ def recover(
     CalibrationError
         The camera does not belong to the streak image.
     InputError
-        There is no camera, no light, or no such method.
+        There is no camera, no light, or no such method or name of a device.
+    MissingDependencyError
+        There is no such device.
     """
-    return prepare(streak, camera, method, focus).run(progress)
+    return prepare(streak, camera, method, focus, device).run(progress)
 
 
 def prepare(
-    streak: Streak, camera: Camera | None = None, method: str | Method = "tv", focus: Focus | None = None
+    streak: Streak,
+    camera: Camera | None = None,
+    method: str | Method = "tv",
+    focus: Focus | None = None,
+    device: str = "cpu",
 ) -> Task:
     """Check what `recover` needs before any work is done; arguments as there."""
     camera = camera or streak.camera
@@ -163,7 +181,8 @@ def prepare(
     _ = streak.times  # a missing axis is refused before minutes of work
     focus = AT_THE_CALIBRATED_DEPTH if focus is None else focus
     focus.require(camera)
-    return Task(streak, camera, method_named(method) if isinstance(method, str) else method, focus)
+    solver = method_named(method) if isinstance(method, str) else method
+    return Task(streak, camera, solver, focus, place_named(device))
 
 
 def fitted_to_shot(streak: Streak, camera: Camera, progress: Progress = silent) -> Camera:
