@@ -121,5 +121,6 @@ def place_for(device: str, settings: ImagingSettings) -> Place:
     """Return the place that a name asks for; ``auto`` stays with the compiled loops where a method has nothing else."""
     from tofclip.arrays import Place, place_named
 
-    named = getattr(settings, "method", None)
-    return Place() if device == "auto" and named not in (None, *PORTABLE) else place_named(device)
+    named, refine = (getattr(settings, name, None) for name in ("method", "refine"))
+    portable = named in (None, *PORTABLE) and refine is None
+    return Place() if device == "auto" and not portable else place_named(device)

@@ -67,6 +67,10 @@ class Refinement:
         arrays = numpy_support("iterative refinement", capture)
         return arrays and self.hybrid.supports(capture, grid) and self._depth_support(grid) and _size_support(grid)
 
+    def lookups(self, capture: Capture, grid: Grid) -> int:
+        """Number of voxels in all iterations; what `progress` counts up to."""
+        return self.prior.work(grid.size)
+
     def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Image the hidden scene.
 

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos.methods import METHODS, ImagingSettings
+from apps.nlos.methods import METHODS
+from apps.nlos.refining import RefinementSettings
 from apps.options import AsJson, Cluster, Device
 from apps.settings import SettingsFile, setting, takes
 
@@ -23,13 +24,16 @@ if TYPE_CHECKING:
     from tofclip.cluster import Job, Report
 
 SOME_FAILED = 1
+STOPPED = ("iterations", "stopped_because")
+"""What is told of an iteration."""
+
 SETTINGS_SUFFIX = ".toml"
 FOLDER_SETTINGS = ".settings.toml"
 HEADING = "tofclip nlos reconstruct CAPTURE --settings THIS --out VOLUME"
 
 
 @dataclass(frozen=True)
-class ReconstructSettings(ImagingSettings):
+class ReconstructSettings(RefinementSettings):
     """How a capture is imaged and written."""
 
     method: str | None = setting(
@@ -83,6 +87,8 @@ def reconstruct(
     written beside the volume (.toml); given back by --settings they make the same volume, on another --device to some
     hundred-thousandths.
 
+    --refine looks for the albedo that explains the capture best, at the cost of some four images per iteration.
+
     With --device rsd, hybrid and backprojection compute elsewhere, on a graphics processor; the others cannot.
 
     Of a folder every capture is imaged into the folder --out. Captures whose results are there already are skipped.
@@ -111,6 +117,7 @@ def reconstruct(
 def _require_sense(settings: ReconstructSettings) -> None:
     """Refuse settings that no capture could make sense of, before any is read."""
     from apps.nlos.methods import QUICKEST_FIRST, built, names_in, require_taken
+    from apps.nlos.refining import require_refinable
     from tofclip.errors import InputError
 
     if not 0 <= settings.point_fraction <= 1:
@@ -118,6 +125,7 @@ def _require_sense(settings: ReconstructSettings) -> None:
     names = QUICKEST_FIRST if settings.method is None else names_in(settings.method)
     if settings.method is not None and len(names) > 1:
         raise InputError(f"one method is asked for, got '{settings.method}'; nlos compare takes several")
+    require_refinable(settings, settings.method)
     require_taken(settings, names)
     for name in names:
         built(name, settings if settings.wavelength_mm is not None else replace(settings, wavelength_mm=1.0))
@@ -153,7 +161,7 @@ def _reconstructed(source: Path, results: Results, order: _Order) -> dict[str, A
     with warnings_in_a_line():
         found, volume = _imaged(capture.on(place), order.settings)
     volume = volume.on(Place())
-    seconds = time.perf_counter() - started
+    seconds, imaging = time.perf_counter() - started, volume.provenance["imaging"]
     volume = with_history(volume, source, {"verb": "nlos reconstruct", "device": str(place), **plain(found)})
     for path in results.volumes:
         write_volume(volume, path, found.point_fraction)
@@ -163,6 +171,7 @@ def _reconstructed(source: Path, results: Results, order: _Order) -> dict[str, A
     return {
         "method": found.method,
         "device": str(place),
+        **({"refine": found.refine, **{name: imaging[name] for name in STOPPED}} if found.refine else {}),
         "wavelength_mm": found.wavelength_mm,
         "voxel_mm": found.voxel_mm,
         "voxels": volume.grid.shape,
@@ -177,14 +186,20 @@ def _imaged(capture: Capture, wanted: ReconstructSettings) -> tuple[ReconstructS
     """Find what is not told, and image the capture."""
     from apps.nlos.imaging import box_of, boxed, imaged, scales_of
     from apps.nlos.methods import built, quickest, spelt_out
+    from apps.nlos.refining import REFINED, refined
     from tofclip.units import MILLIMETRE
 
     scales = scales_of(wanted, capture)
     found = replace(wanted, **scales._asdict())
-    method = found.method or quickest(found, capture, box_of(found, capture, scales.voxel_mm * MILLIMETRE)[1])
+    method = REFINED if found.refine else found.method
+    if method is None:
+        method = quickest(found, capture, box_of(found, capture, scales.voxel_mm * MILLIMETRE)[1])
     found = replace(spelt_out(found, [method]), method=method)
     found, grid = boxed(found, capture)
-    return found, imaged("imaging", built(method, found), capture, grid)
+    if not found.refine:
+        return found, imaged("imaging", built(method, found), capture, grid)
+    found, refinement = refined(found, grid)
+    return found, imaged("refining", refinement, capture, grid)
 
 
 def _reconstruct_folder(
