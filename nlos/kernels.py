@@ -9,9 +9,32 @@ from numba import njit
 
 # Only the fusing of multiply and add is let loose: exact zeros at the ends of the waveforms have to stay exact.
 compiled = njit(nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
+inlined = njit(inline="always")
 
 NEAREST = 1e-3
 """Distance in m below which the weight 1 / distance stops growing, for voxels that touch the wall."""
+
+COSINE = (1.0, -19.739208, 64.939392, -85.456657, 60.242130, -26.404669, 7.8001313, -1.4531124)
+SINE = (6.2831855, -41.341702, 81.605133, -76.703018, 42.025928, -14.899847, 3.2381375)
+"""Polynomials in the square of an angle in turns, fitted to cos(2 pi t) and sin(2 pi t) / t up to half a turn."""
+
+
+@inlined
+def cosine(turns):
+    """Cosine of an angle of -0.5 to 0.5 turns, to 1e-6."""
+    u = turns * turns
+    high = np.float32(COSINE[4]) + u * (np.float32(COSINE[5]) + u * (np.float32(COSINE[6]) + u * np.float32(COSINE[7])))
+    low = np.float32(COSINE[2]) + u * (np.float32(COSINE[3]) + u * high)
+    return np.float32(COSINE[0]) + u * (np.float32(COSINE[1]) + u * low)
+
+
+@inlined
+def sine(turns):
+    """Sine of an angle of -0.5 to 0.5 turns, to 1e-6."""
+    u = turns * turns
+    high = np.float32(SINE[4]) + u * (np.float32(SINE[5]) + u * np.float32(SINE[6]))
+    low = np.float32(SINE[2]) + u * (np.float32(SINE[3]) + u * high)
+    return turns * (np.float32(SINE[0]) + u * (np.float32(SINE[1]) + u * low))
 
 
 @compiled
@@ -135,3 +158,62 @@ def _add_samples(waveform, sample, before, after, sums):
         sums[place + 1] += before[ix] * waveform[first + 1]
         sums[place + 2] += after[ix] * waveform[first + 2]
         sums[place + 3] += after[ix] * waveform[first + 3]
+
+
+@compiled
+def illuminate(terms, odd, x, y, depth, laser, wavenumber, table, span, carrier, field):
+    """Add ``sum_m terms[m] * f_m(R) * exp(1j * wavenumber * R)``, R the distance from the laser spot, to a plane.
+
+    Parameters
+    ----------
+    terms : (m, y, x) complex64 array
+        May be larger than the plane along y and x.
+    odd : int
+        Terms from this one on are multiplied by 1j.
+    x, y : (n,) float64 array
+    depth : float
+    laser : (3,) float64 array
+    wavenumber : float
+        rad/m; carrier of the illumination.
+    table : (m, samples) float32 array
+        The functions f_m, evenly spaced over the distances from ``span[0]`` to ``span[1]``.
+    span : (2,) float64 array
+    carrier : (x,) complex64 array
+        Multiplies every column.
+    field : (y, x) complex64 array
+        Added to.
+    """
+    before, share, sums = np.empty(x.size, np.uint32), np.empty(x.size, np.float32), np.empty((2, x.size), np.float32)
+    waves = np.empty((2, x.size), np.float32)
+    per_metre = (table.shape[1] - 1) / max(span[1] - span[0], 1e-12)
+    for iy in range(y.size):
+        across = (y[iy] - laser[1]) ** 2 + (depth - laser[2]) ** 2
+        for ix in range(x.size):
+            distance = math.sqrt((x[ix] - laser[0]) ** 2 + across)
+            place = max((distance - span[0]) * per_metre, 0.0)
+            sample = min(int(place), table.shape[1] - 2)
+            before[ix], share[ix] = sample, place - sample
+            turns = distance * (wavenumber / (2 * math.pi))
+            turns -= math.floor(turns + 0.5)
+            waves[0, ix], waves[1, ix] = cosine(np.float32(turns)), sine(np.float32(turns))
+        sums[:] = 0
+        for m in range(terms.shape[0]):
+            _add_term(terms[m, iy], table[m], before, share, m >= odd, sums)
+        for ix in range(x.size):
+            wave = complex(waves[0, ix], waves[1, ix]) * carrier[ix]
+            field[iy, ix] += complex(sums[0, ix], sums[1, ix]) * wave
+
+
+@compiled
+def _add_term(term, samples, before, share, odd, sums):
+    """Add a row of one term times its function, and 1j if `odd`."""
+    real, imaginary = sums[0], sums[1]
+    for ix in range(before.size):
+        value = samples[before[ix]]
+        value += share[ix] * (samples[before[ix] + np.uint32(1)] - value)
+        if odd:
+            real[ix] -= value * term[ix].imag
+            imaginary[ix] += value * term[ix].real
+        else:
+            real[ix] += value * term[ix].real
+            imaginary[ix] += value * term[ix].imag

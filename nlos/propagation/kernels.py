@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numba import njit
 
+from nlos.kernels import cosine, sine
 from nlos.rsd.kernels import TAPS
 
 compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "reassoc", "arcp"}, error_model="numpy")
-inlined = njit(inline="always")
 
 ONE, NEXT = np.float32(1), np.uint64(1)
 
@@ -22,30 +22,6 @@ STEPS = 8
 
 NEAREST = 1e-3
 """Distance in m below which 1 / distance stops growing."""
-
-
-COSINE = (1.0, -19.739208, 64.939392, -85.456657, 60.242130, -26.404669, 7.8001313, -1.4531124)
-SINE = (6.2831855, -41.341702, 81.605133, -76.703018, 42.025928, -14.899847, 3.2381375)
-"""Polynomials in the square of an angle in turns, fitted to cos(2 pi t) and sin(2 pi t) / t up to half a turn."""
-
-
-@inlined
-def _cosine(turns):
-    """Cosine of an angle of -0.5 to 0.5 turns, to 1e-6."""
-    u = turns * turns
-    high = np.float32(COSINE[4]) + u * (np.float32(COSINE[5]) + u * (np.float32(COSINE[6]) + u * np.float32(COSINE[7])))
-    low = np.float32(COSINE[2]) + u * (np.float32(COSINE[3]) + u * high)
-    return np.float32(COSINE[0]) + u * (np.float32(COSINE[1]) + u * low)
-
-
-@inlined
-def _sine(turns):
-    """Sine of an angle of -0.5 to 0.5 turns, to 1e-6."""
-    u = turns * turns
-    high = np.float32(SINE[4]) + u * (np.float32(SINE[5]) + u * np.float32(SINE[6]))
-    low = np.float32(SINE[2]) + u * (np.float32(SINE[3]) + u * high)
-    return turns * (np.float32(SINE[0]) + u * (np.float32(SINE[1]) + u * low))
-
 
 @compiled
 def add_spherical_waves(sources, phasors, targets, first, step, sums):
@@ -83,12 +59,13 @@ def _start_waves(x, y, z, targets, first, step, wave):
         share = np.float32(1) / distance
         turns = distance * first
         turns -= math.floor(turns + np.float32(0.5))
-        cosine, sine = _cosine(turns) * share, _sine(turns) * share
+        real, imaginary = cosine(turns) * share, sine(turns) * share
         turns = distance * step
         turns -= math.floor(turns + np.float32(0.5))
-        along, aside = _cosine(turns), _sine(turns)
-        wave[j], wave[LANES + j] = cosine, sine
-        wave[2 * LANES + j], wave[3 * LANES + j] = cosine * along + sine * aside, sine * along - cosine * aside
+        along, aside = cosine(turns), sine(turns)
+        wave[j], wave[LANES + j] = real, imaginary
+        wave[2 * LANES + j] = real * along + imaginary * aside
+        wave[3 * LANES + j] = imaginary * along - real * aside
         wave[4 * LANES + j] = along + along
 
 

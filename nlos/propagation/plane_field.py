@@ -24,7 +24,7 @@ class PlaneField:
     Parameters
     ----------
     values : (y, x, frequencies) complex64 array
-        Of the library that the capture's signal is of. ``S_k(r_v) = sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|``.
+        ``S_k(r_v) = sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|``, of the library of the capture's signal.
     plane : Plane
     wavenumbers : (frequencies,) array
         Of the waves on the plane, rad/m: the band's, doubled for a confocal scan.

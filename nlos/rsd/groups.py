@@ -106,8 +106,8 @@ class Groups:
     def analysed(self, values: NDArray[np.complex64], plane: Plane, origin: tuple[float, float]) -> NDArray[np.float32]:
         """Return ``sum_p values(p) * exp(-1j * q (r_p - origin)) / area`` of every wave q, area that of a period.
 
-        Two matrix products per frequency: the plane's spacing need not fit the lattice, a coarse one repeats itself in
-        q as it should, and waves beyond their limit are hardly computed, and 0.
+        By matrix products: the plane's spacing need not fit the lattice, and a coarse one repeats itself in q as it
+        should. Waves beyond their limit are 0.
 
         Parameters
         ----------
@@ -122,31 +122,59 @@ class Groups:
             Real and imaginary parts.
         """
         waves, count = self.waves, values.shape[-1]
+        row, column, lateral, distinct = self._quarter
         share = (self.distinct / np.prod(waves.period)).astype(np.float32)
-        row, column = self.indices
-        lanes = np.searchsorted(self._quarter[2].ravel()[: self._quarter[3]], waves.limits, side="right")
-        along_y, along_x = (
-            _waves(axis - start, side, reach)
+        lanes = np.searchsorted(lateral.ravel()[:distinct], waves.limits, side="right")
+        y, x = (
+            _Analysis.of(axis, start, 2 * np.pi / side, reach)
             for axis, start, side, reach in zip((plane.y, plane.x), origin, waves.period, waves.reach, strict=True)
         )
         spectrum = np.zeros((len(row), self.ahead + count, 2, MIRRORED, LANES), np.float32)
 
         def analyse(some: slice) -> None:
-            fields = np.ascontiguousarray(np.moveaxis(values[..., some], -1, 0))
-            for k, field in zip(range(some.start, some.stop), fields, strict=True):
-                high, wide = waves.reach_within(float(waves.limits[k]))
-                half = _middle(along_y, high) @ field
-                full = half @ _middle(along_x, wide).T
-                group_waves(full, row, column, share, lanes[k], self.ahead + k, spectrum)
+            high, wide = (reach + 1 for reach in waves.reach_within(float(waves.limits[some][-1])))
+            lines = y.sums(np.ascontiguousarray(np.swapaxes(values[..., some], 1, 2)), high)
+            parts = [part for line in lines for part in x.sums(np.ascontiguousarray(np.swapaxes(line, 0, 2)), wide)]
+            at = self.ahead + some.start
+            group_waves(np.stack(parts), row, column, y.turns, x.turns, share, lanes[some], at, spectrum)
 
         run_blocks(analyse, count, size=FREQUENCIES_AT_A_TIME)
         return spectrum
 
 
-def _middle(waves: NDArray[np.complex64], reach: int) -> NDArray[np.complex64]:
-    return waves[len(waves) // 2 - reach : len(waves) // 2 + reach + 1]
+@dataclass(frozen=True, eq=False)
+class _Analysis:
+    """Waves along an axis of evenly spaced points, about its middle: real, and half as many points.
 
+    Parameters
+    ----------
+    cosines, sines : (waves, half the points) float32 array
+    turns : (waves,) complex64 array
+        Waves at the middle.
+    """
 
-def _waves(positions: FloatArray, period: float, reach: int) -> NDArray[np.complex64]:
-    indices = 2 * np.pi / period * np.arange(-reach, reach + 1)
-    return np.asarray(np.exp(-1j * np.outer(indices, positions)), np.complex64)
+    cosines: NDArray[np.float32]
+    sines: NDArray[np.float32]
+    turns: NDArray[np.complex64]
+
+    @classmethod
+    def of(cls, axis: FloatArray, origin: float, step: float, reach: int) -> _Analysis:
+        numbers = step * np.arange(reach + 1)
+        half = (axis.size + 1) // 2
+        phases = np.outer(numbers, (axis[::-1] - axis)[:half] / 2)
+        turns = np.exp(-1j * numbers * ((axis[0] + axis[-1]) / 2 - origin))
+        return cls(np.cos(phases).astype(np.float32), np.sin(phases).astype(np.float32), turns.astype(np.complex64))
+
+    def sums(self, values: NDArray[np.complex64], count: int) -> list[NDArray[np.complex64]]:
+        """Sums of complex values (points, ...) with the first cosines and with the first sines, (count, ...)."""
+        half = self.cosines.shape[1]
+        before, after = values[:half], values[::-1][:half]
+        even, odd = after + before, after - before
+        if len(values) % 2:
+            even[-1] = before[-1]
+        return [
+            (waves[:count] @ part.reshape(half, -1).view(np.float32))
+            .view(np.complex64)
+            .reshape(count, *values.shape[1:])
+            for waves, part in ((self.cosines, even), (self.sines, odd))
+        ]

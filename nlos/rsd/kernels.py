@@ -7,6 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
+from nlos.kernels import inlined
+
 compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "reassoc", "arcp"}, error_model="numpy")
 
 SQUARE = 16
@@ -25,7 +27,7 @@ GROUP = 2 * MIRRORED * LANES
 STEPS, NODES = 8, 4
 """Frequencies, and nodes of the transfer function, that stay in registers."""
 
-TWO, THREE, FOUR = np.uint64(2), np.uint64(3), np.uint64(4)
+TWO = np.uint64(2)
 
 
 @compiled
@@ -128,23 +130,21 @@ def carry(spectrum, first, nodes, begin, offset, shares, coefficients, terms):
 
 @compiled
 def _interpolate(nodes, node, k, weights, begin, end, transfer):
-    """Transfer function (`STEPS`, 2, `LANES`) of a group at some frequencies, four nodes at a time."""
+    """Transfer function (`STEPS`, 2, `LANES`) of a group at some frequencies, `NODES` at a time."""
     flat, lanes, imaginary = nodes.reshape(-1), np.uint64(LANES), np.uint64(nodes.shape[2])
-    stride = np.uint64(2) * imaginary
     transfer[:] = 0
     for i in range(begin, end, NODES):
-        at, w0 = np.uint64((node + i - begin) * 2 * nodes.shape[2] + k), np.uint64(i * LANES)
-        w1, w2, w3 = w0 + lanes, w0 + np.uint64(2) * lanes, w0 + np.uint64(3) * lanes
         for step in range(np.uint64(STEPS)):
-            n0, to = at + step, np.uint64(2) * lanes * step
-            n1, n2, n3 = n0 + stride, n0 + np.uint64(2) * stride, n0 + np.uint64(3) * stride
-            a0, a1, a2, a3 = flat[n0], flat[n1], flat[n2], flat[n3]
-            n0, n1, n2, n3 = n0 + imaginary, n1 + imaginary, n2 + imaginary, n3 + imaginary
-            b0, b1, b2, b3 = flat[n0], flat[n1], flat[n2], flat[n3]
+            at = np.uint64((node + i - begin) * 2 * nodes.shape[2] + k) + step
+            of, to = np.uint64(i * LANES), np.uint64(2) * lanes * step
             for j in range(lanes):
-                s0, s1, s2, s3 = weights[w0 + j], weights[w1 + j], weights[w2 + j], weights[w3 + j]
-                transfer[to + j] += (a0 * s0 + a1 * s1) + (a2 * s2 + a3 * s3)
-                transfer[to + lanes + j] += (b0 * s0 + b1 * s1) + (b2 * s2 + b3 * s3)
+                along = aside = np.float32(0)
+                for n in range(np.uint64(NODES)):
+                    share = weights[of + lanes * n + j]
+                    along += flat[at + TWO * imaginary * n] * share
+                    aside += flat[at + TWO * imaginary * n + imaginary] * share
+                transfer[to + j] += along
+                transfer[to + lanes + j] += aside
 
 
 @compiled
@@ -165,46 +165,63 @@ def _multiply(waves, start, transfer, products):
 @compiled
 def _reduce(coefficients, k, products, sums):
     """Add `STEPS` frequencies to all terms, two terms at a time."""
-    g = np.uint64(GROUP)
+    size = np.uint64(GROUP)
     for m in range(0, coefficients.shape[0], 2):
-        a, b, to = coefficients[m, k : k + STEPS], coefficients[m + 1, k : k + STEPS], np.uint64(m * GROUP)
-        a0, a1, a2, a3, a4, a5, a6, a7 = a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7]
-        b0, b1, b2, b3, b4, b5, b6, b7 = b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7]
-        for j in range(g):
-            p0, p1, p2, p3 = products[j], products[g + j], products[TWO * g + j], products[THREE * g + j]
-            low, high = a0 * p0 + a1 * p1 + a2 * p2 + a3 * p3, b0 * p0 + b1 * p1 + b2 * p2 + b3 * p3
-            at = FOUR * g + j
-            p4, p5, p6, p7 = products[at], products[at + g], products[at + TWO * g], products[at + THREE * g]
-            sums[to + j] += low + (a4 * p4 + a5 * p5 + a6 * p6 + a7 * p7)
-            sums[to + g + j] += high + (b4 * p4 + b5 * p5 + b6 * p6 + b7 * p7)
+        even, odd, to = coefficients[m, k : k + STEPS], coefficients[m + 1, k : k + STEPS], np.uint64(m * GROUP)
+        for j in range(size):
+            low = high = np.float32(0)
+            for step in range(np.uint64(STEPS)):
+                product = products[size * step + j]
+                low += even[step] * product
+                high += odd[step] * product
+            sums[to + j] += low
+            sums[to + size + j] += high
 
 
 @compiled
-def group_waves(full, row, column, share, count, k, spectrum):
-    """Put the first plane waves of one frequency, as many as count there, into their groups.
+def group_waves(parts, row, column, along_y, along_x, share, counts, first, spectrum):
+    """Put together the plane waves of some frequencies, as many as count there, and put them into their groups.
 
     Parameters
     ----------
-    full : (rows, columns) complex64 array
-        All plane waves of a rectangle, index 0 in its middle.
-    row, column : (groups, MIRRORED, LANES) int64 array
-        Indices of the waves.
+    parts : (4, columns, k, rows) complex64 array
+        Sums with cosine and with sine along x, first with cosine and then with sine along y.
+    row, column : (groups, LANES) int64 array
+        Indices of the waves, not negative.
+    along_y, along_x : (n,) complex64 array
+        What waves of every index are multiplied by, those of negative ones by its conjugate.
     share : (groups, MIRRORED, LANES) float32 array
-        What they are multiplied by.
-    count : int
-        Lanes of all groups that count at this frequency.
-    k : int
+        What they are multiplied by besides.
+    counts : (k,) int64 array
+        Lanes of all groups that count at each frequency.
+    first : int
+        Where the frequencies begin in `spectrum`.
     spectrum : (groups, frequencies, 2, MIRRORED, LANES) float32 array
-        Written to at frequency `k`.
+        Written to.
     """
-    middle_row, middle_column = full.shape[0] // 2, full.shape[1] // 2
-    for group in range(-(-count // LANES)):
-        for mirrored in range(MIRRORED):
-            for j in range(min(LANES, count - group * LANES)):
-                weight = share[group, mirrored, j]
-                wave = full[middle_row + row[group, mirrored, j], middle_column + column[group, mirrored, j]]
-                spectrum[group, k, 0, mirrored, j] = wave.real * weight
-                spectrum[group, k, 1, mirrored, j] = wave.imag * weight
+    for k in range(counts.size):
+        for lane in range(counts[k]):
+            group, j = lane // LANES, lane % LANES
+            r, c = row[group, j], column[group, j]
+            cosines, across, along, sines = parts[0, c, k, r], parts[1, c, k, r], parts[2, c, k, r], parts[3, c, k, r]
+            same, other = along_y[r] * along_x[c], np.conj(along_y[r]) * along_x[c]
+            sums = turned_back(along + across), turned_back(across - along)
+            for mirrored, wave in enumerate(
+                (
+                    (cosines - sines + sums[0]) * same,
+                    (cosines + sines + sums[1]) * other,
+                    (cosines + sines - sums[1]) * np.conj(other),
+                    (cosines - sines - sums[0]) * np.conj(same),
+                )
+            ):
+                spectrum[group, first + k, 0, mirrored, j] = wave.real * share[group, mirrored, j]
+                spectrum[group, first + k, 1, mirrored, j] = wave.imag * share[group, mirrored, j]
+
+
+@inlined
+def turned_back(number):
+    """Return -1j times a number."""
+    return complex(number.imag, -number.real)
 
 
 @compiled
@@ -242,50 +259,3 @@ def scatter(terms, cell, folded, spectra):
                 if folded:
                     wave += spectra[m, cells[to + j]]
                 spectra[m, cells[to + j]] = wave
-
-
-@compiled
-def illuminate(terms, odd, x, y, depth, laser, wavenumber, table, span, carrier, field):
-    """Add ``sum_m terms[m] * f_m(R) * exp(1j * wavenumber * R)``, R the distance from the laser spot, to a plane.
-
-    Parameters
-    ----------
-    terms : (m, y, x) complex64 array
-        May be larger than the plane along y and x.
-    odd : int
-        Terms from this one on are multiplied by 1j.
-    x, y : (n,) float64 array
-    depth : float
-    laser : (3,) float64 array
-    wavenumber : float
-        rad/m; carrier of the illumination.
-    table : (samples, m) float32 array
-        The functions f_m, evenly spaced over the distances from ``span[0]`` to ``span[1]``.
-    span : (2,) float64 array
-    carrier : (x,) complex64 array
-        Multiplies every column.
-    field : (y, x) complex64 array
-        Added to.
-    """
-    per_metre = (table.shape[0] - 1) / max(span[1] - span[0], 1e-12)
-    last = table.shape[0] - 2
-    for iy in range(y.size):
-        across = (y[iy] - laser[1]) ** 2 + (depth - laser[2]) ** 2
-        for ix in range(x.size):
-            distance = math.sqrt((x[ix] - laser[0]) ** 2 + across)
-            place = max((distance - span[0]) * per_metre, 0.0)
-            before = min(int(place), last)
-            share = np.float32(place - before)
-            real = imaginary = np.float32(0)
-            for m in range(terms.shape[0]):
-                value = table[before, m] + share * (table[before + 1, m] - table[before, m])
-                term = terms[m, iy, ix]
-                if m < odd:
-                    real += value * term.real
-                    imaginary += value * term.imag
-                else:
-                    real -= value * term.imag
-                    imaginary += value * term.real
-            phase = wavenumber * distance
-            wave = complex(math.cos(phase), math.sin(phase)) * carrier[ix]
-            field[iy, ix] += complex(real, imaginary) * wave

@@ -8,13 +8,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos.kernels import illuminate
 from nlos.method import Progress, silent
 from nlos.rsd.blas import one_thread
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.groups import Groups, Interpolation
 from nlos.rsd.illumination import Illumination, constant, split
 from nlos.rsd.inverse import inverse
-from nlos.rsd.kernels import carry, illuminate, scatter
+from nlos.rsd.kernels import carry, scatter
 from tofclip.threads import blocks, run_blocks
 
 FloatArray = NDArray[np.float64]
@@ -24,7 +25,7 @@ Parts = NDArray[np.float32]
 PLANES_AT_A_TIME = 2
 """Depths that a group of plane waves is carried to while its spectrum is in cache."""
 
-LADDER, NARROWEST = 1.03, 1e-3
+LADDER, NARROWEST = 1.05, 1e-3
 """Distances to the laser spot vary by less over a plane than the next power of the first, and than the second, m."""
 
 ILLUMINATION_SHARE = 0.25
@@ -173,5 +174,5 @@ class _Bench:
         """Let the laser's wave meet the images of one depth plane."""
         x, y = self.way.grid.x, self.way.grid.y
         laser = np.zeros(3) if self.source.laser is None else self.source.laser
-        carrier = self.inverse.carrier
-        illuminate(images, light.even, x, y, depth, laser, self.source.centre, light.table, light.span, carrier, field)
+        table, carrier = np.ascontiguousarray(light.table.T), self.inverse.carrier
+        illuminate(images, light.even, x, y, depth, laser, self.source.centre, table, light.span, carrier, field)
