@@ -72,6 +72,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   lidar scene        recovered frames to a list of objects and a picture
   lidar sequence     a folder or stack of shots to a sequence of clouds
   nlos reconstruct   recovered frames of a wall, or a folder of them, to what is hidden around the corner
+  nlos film          the flash passing through the hidden scene, as a film
   nlos compare       several methods on one capture, side by side, with time and memory
   nlos simulate      the capture of a known hidden scene; nlos info: what a capture can show
   nlos demo          a hidden 3D before a curved wall, imaged quickly and slowly

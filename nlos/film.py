@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -40,14 +41,14 @@ def save_film(video: TransientVideo, path: str | Path) -> None:
     target = Path(path)
     if target.suffix.lower() != ".gif":
         raise InputError(f"{target}: a film's name must end in .gif")
-    first, *others = (Image.fromarray(picture).quantize(dither=Image.Dither.NONE) for picture in _pictures(video))
+    first, *others = (Image.fromarray(picture).quantize(dither=Image.Dither.NONE) for picture in pictures(video))
     durations = [INSTANT_MS] * len(others) + [LAST_INSTANT_MS]
     with atomic_path(target) as temporary:
         first.save(temporary, format="GIF", save_all=True, append_images=others, duration=durations, loop=0)
 
 
-def _pictures(video: TransientVideo) -> list[NDArray[np.uint8]]:
-    """Every instant drawn, (rows, columns, 3)."""
+def pictures(video: TransientVideo) -> Iterator[NDArray[np.uint8]]:
+    """Draw every instant, (rows, columns, 3), red first; all of one size and scale."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -62,13 +63,11 @@ def _pictures(video: TransientVideo) -> list[NDArray[np.uint8]]:
     # The layout settles at the first drawing and then stays, so that nothing jumps.
     canvas.draw()
     figure.set_layout_engine("none")
-    pictures = []
     for picture, time in zip(front, video.times, strict=True):
         drawn.set_data(picture)
         axes.set_title(_title(time))
         canvas.draw()
-        pictures.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-    return pictures
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def _title(time: float) -> str:

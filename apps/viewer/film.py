@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from apps.mp4 import filming
 from apps.viewer.picture import Still
 from apps.viewer.render import Renderer
 from apps.viewer.session import Session
-from tofclip.errors import InputError, MissingDependencyError, StorageError
-from tofclip.storage import atomic_path
+from tofclip.errors import InputError
 
 PICTURES_PER_SECOND = 15.0
 MOST_PICTURES = 1500
 """A minute; live sources never end."""
-
-CODEC = "vp09"  # free of licences, and every browser plays it
 
 
 def frames_of(session: Session) -> list[int]:
@@ -50,36 +47,16 @@ def save_film(session: Session, renderer: Renderer, out: Path, advance: Callable
     ------
     InputError, MissingDependencyError, StorageError
     """
-    cv2 = _opencv()
     whole = session.shown(0.0)  # a transient begins at its end: with all of its points
     still, most, frames = Still(session.source.title, whole, renderer), 0, frames_of(session)
     rate = min(PICTURES_PER_SECOND, session.source.rate)
     if not frames:
         raise InputError(f"{session.source.title}: there is nothing to film")
-    with atomic_path(out) as temporary:
-        writer: Any = None
+    with filming(out, rate) as film:
         for frame in frames:
             session.jump(frame)
             shown = session.shown(0.0)
-            pixels = still.pixels(shown)
-            writer = writer or _writer(cv2, temporary, rate, pixels.shape)
-            writer.write(pixels[..., ::-1])
+            film.add(still.pixels(shown))
             most = max(most, len(shown.cloud))
             advance(1)
-        writer.release()
     return most
-
-
-def _writer(cv2: Any, path: Path, rate: float, shape: tuple[int, ...]) -> Any:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*CODEC), rate, (shape[1], shape[0]))
-    if not writer.isOpened():
-        raise StorageError(f"{path}: this machine's OpenCV writes no {CODEC} films; --png writes pictures")
-    return writer
-
-
-def _opencv() -> Any:
-    try:
-        import cv2
-    except ImportError as fault:
-        raise MissingDependencyError("films need OpenCV: pip install 'tofclip[film]'") from fault
-    return cv2

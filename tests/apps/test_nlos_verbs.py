@@ -211,12 +211,12 @@ def test_every_verb_explains_itself_with_an_example(run: Run) -> None:
         assert outcome.status == 0
         for word in ("--json", "Exit status"):
             assert word in outcome.out
-    assert set(examples()) == {"reconstruct", "compare", "simulate", "info", "demo"}
+    assert set(examples()) == {"reconstruct", "film", "compare", "simulate", "info", "demo"}
 
 
 def test_the_examples_run_one_after_the_other(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for verb in ("simulate", "info", "reconstruct", "compare"):
+    for verb in ("simulate", "info", "reconstruct", "film", "compare"):
         for example in examples()[verb]:
             outcome = run(*shlex.split(example)[1:])
             assert (outcome.status, outcome.err) == (0, ""), example

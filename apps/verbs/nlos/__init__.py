@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import typer
 
-from apps.verbs.nlos import compare, demo, info, reconstruct, simulate
+from apps.verbs.nlos import compare, demo, film, info, reconstruct, simulate
 
 app = typer.Typer()
 app.command()(reconstruct.reconstruct)
+app.command()(film.film)
 app.command()(compare.compare)
 app.command()(simulate.simulate)
 app.command()(info.info)

@@ -1,0 +1,89 @@
+"""`tofclip nlos film`: the flash passing through the hidden scene."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hidden_point import POINT, object_of
+from PIL import Image
+from small_instrument import Run
+
+from nlos import Capture, TransientVideo
+from tofclip.units import SPEED_OF_LIGHT
+
+QUICK = ["--voxel-mm", 40, "--instants", 5]
+
+
+def test_the_point_lights_up_when_the_flash_reaches_it(run: Run, curved: Path, tmp_path: Path) -> None:
+    words = ["film", curved, "--every-depth", "--voxel-mm", 20, "--instants", 41, "--out", tmp_path / "film.h5"]
+    found = object_of(run, *words)
+    video = TransientVideo.load(tmp_path / "film.h5")
+    assert video.values.shape == (41, *found["voxels"])
+    arrival = np.linalg.norm(Capture.load(curved).laser - POINT) / SPEED_OF_LIGHT
+    lit = video.times[video.values[:, *video.grid.nearest(POINT)].argmax()]
+    # A tenth of a nanosecond is the distance to the voxel's middle and half the step of time.
+    assert lit == pytest.approx(arrival, abs=0.1e-9)
+    # By default it begins before the flash arrives, and ends after it left.
+    assert found["first_ns"] < arrival / 1e-9 < found["last_ns"]
+    assert video.provenance["settings"]["verb"] == "nlos film"
+
+
+def test_films_and_numbers_of_front_views(run: Run, curved: Path, tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    for suffix in (".gif", ".mp4", ".h5"):
+        object_of(run, "film", curved, *QUICK, "--first-ns", 1, "--last-ns", 3, "--out", tmp_path / f"film{suffix}")
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.n_frames == 5
+    assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
+    video = TransientVideo.load(tmp_path / "film.h5")
+    assert video.values.ndim == 3
+    np.testing.assert_allclose(video.times, 1e-9 * np.linspace(1, 3, 5), rtol=1e-12)
+
+
+def test_its_settings_give_the_same_film(run: Run, curved: Path, tmp_path: Path) -> None:
+    object_of(run, "film", curved, *QUICK, "--out", tmp_path / "one.h5")
+    object_of(run, "film", curved, "--settings", tmp_path / "one.toml", "--out", tmp_path / "two.h5")
+    one, two = (TransientVideo.load(tmp_path / f"{name}.h5") for name in ("one", "two"))
+    np.testing.assert_array_equal(one.values, two.values)
+    np.testing.assert_array_equal(one.times, two.times)
+
+
+@pytest.mark.parametrize(
+    ("words", "out", "reason"),
+    [
+        (["--method", "backprojection"], "film.gif", "films are made by rsd or hybrid, not by backprojection"),
+        (["--method", "telepathy"], "film.gif", "unknown method 'telepathy'"),
+        (["--instants", 0], "film.gif", "at least one instant"),
+        (["--every-depth"], "film.gif", "write every depth to a .h5 file"),
+        (["--first-ns", 3, "--last-ns", 2], "film.gif", "must begin before it ends, got 3 to 2 ns"),
+        (["--sigma-mm", 3], "film.gif", "changes nothing"),
+        (["--method", "rsd"], "film.gif", "use the hybrid method"),
+        ([], "film.avi", "must end in .mp4 or .gif or .h5"),
+    ],
+)
+def test_what_cannot_be_filmed_is_refused(
+    run: Run, curved: Path, tmp_path: Path, words: list[object], out: str, reason: str
+) -> None:
+    refused = run("nlos", "film", curved, *words, "--voxel-mm", 80, "--out", tmp_path / out)
+    assert refused.status == 2
+    assert reason in refused.err.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scan_of_many_spots_has_no_flash(run: Run, confocal: Path, tmp_path: Path) -> None:
+    refused = run("nlos", "film", confocal, "--voxel-mm", 80, "--out", tmp_path / "film.gif")
+    assert refused.status == 2
+    assert "need one laser spot" in refused.err
+
+
+def test_without_opencv_there_is_no_mp4(
+    run: Run, curved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    refused = run("nlos", "film", curved, "--out", tmp_path / "film.mp4")
+    assert refused.status == 2
+    assert "tofclip[film]" in refused.err
+    assert refused.err.count("\n") == 1
