@@ -23,6 +23,7 @@ STEPS = 8
 NEAREST = 1e-3
 """Distance in m below which 1 / distance stops growing."""
 
+
 @compiled
 def add_spherical_waves(sources, phasors, targets, first, step, sums):
     """Sum ``phasors * exp(1j * k * R) / R`` over all sources, for `LANES` targets.
