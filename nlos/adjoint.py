@@ -18,6 +18,7 @@ from nlos.capture import Capture
 from nlos.geometry import FloatArray, Grid
 from nlos.method import Reconstructor, Support
 from nlos.volume import Volume
+from tofclip.arrays import require_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator
 from tofclip.recovery import Adjoint, Method
@@ -57,6 +58,7 @@ class CompressedCapture:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        require_numpy("imaging straight from compressed readings", self.readings)
         readings, wall = np.asarray(self.readings, dtype=np.float32), np.asarray(self.wall, dtype=np.float64)
         if readings.ndim != 2 or readings.shape[:1] != self.operator.shape_out:
             raise ShapeError("readings", (*self.operator.shape_out, "t"), readings.shape)
@@ -72,6 +74,7 @@ class CompressedCapture:
         """Read a capture (t, rows, columns) through an operator, as a CLIP camera does; masked wall points are dark."""
         if capture.signal.shape[1:] != operator.shape_in:
             raise ShapeError("signal", ("t", *operator.shape_in), capture.signal.shape)
+        require_numpy("reading through a CLIP camera", capture.signal)
         pictures = np.where(capture.valid, capture.signal, np.float32(0))
         readings = operator(np.ascontiguousarray(np.moveaxis(pictures, 0, -1)))
         place = (capture.wall, capture.laser, capture.bin_width, capture.start)

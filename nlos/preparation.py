@@ -1,10 +1,14 @@
-"""What is done to a capture before it is imaged: cutting the record, putting bins together, gating the wall's glare."""
+"""What is done to a capture before it is imaged: cutting the record, putting bins together, gating the wall's glare.
+
+All of it where the capture's signal lives.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from nlos.capture import Capture
+from tofclip.arrays import namespace
 from tofclip.errors import InputError
 
 
@@ -35,11 +39,12 @@ def binned(capture: Capture, factor: int) -> Capture:
     bins = capture.axis.bins // factor if factor >= 1 else 0
     if bins < 2:
         raise InputError(f"{capture.axis.bins} bins cannot be put together by {factor}; at least two must be left")
-    kept = capture.signal[: bins * factor].reshape(bins, factor, *capture.signal.shape[1:])
+    xp = namespace(capture.signal)
+    kept = xp.reshape(capture.signal[: bins * factor, ...], (bins, factor, *capture.signal.shape[1:]))
     # A bin stands for its middle.
     start = capture.start + (factor - 1) / 2 * capture.axis.spacing
     bin_width = factor * capture.bin_width
-    return Capture(kept.sum(axis=1), capture.wall, capture.laser, bin_width, start, capture.provenance)
+    return Capture(xp.sum(kept, axis=1), capture.wall, capture.laser, bin_width, start, capture.provenance)
 
 
 def without_first_bounce(capture: Capture, margin: float) -> Capture:
@@ -52,11 +57,12 @@ def without_first_bounce(capture: Capture, margin: float) -> Capture:
         raise InputError(f"the margin after the first bounce must be 0 m or more, got {margin}")
     direct = np.linalg.norm(capture.wall - capture.laser, axis=-1)
     paths = capture.axis.paths.reshape(-1, *[1] * direct.ndim)
-    signal = np.where(paths <= direct + margin, np.float32(0), capture.signal)
+    early = capture.place.put(paths <= direct + margin)
+    signal = namespace(capture.signal).where(early, 0.0, capture.signal)
     return Capture(signal, capture.wall, capture.laser, capture.bin_width, capture.start, capture.provenance)
 
 
 def _with_bins(capture: Capture, bins: slice) -> Capture:
     start = float(capture.axis.paths[bins.start])
-    signal = capture.signal[bins]
+    signal = capture.signal[bins, ...]
     return Capture(signal, capture.wall, capture.laser, capture.bin_width, start, capture.provenance)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.kernels import delayed_reading
+from tofclip.arrays import require_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Record
 from tofclip.transient import Frames
@@ -96,6 +97,7 @@ def without_device_legs(capture: Capture, source: Any, camera: Any) -> Capture:
     for name, place in (("source", source), ("camera", camera)):
         if place.shape != (3,) or not np.all(np.isfinite(place)):
             raise InputError(f"the {name} position must be three finite numbers, got {place}")
+    require_numpy("unwarping", capture.signal)
     legs = np.linalg.norm(capture.laser - source, axis=-1) + np.linalg.norm(capture.wall - camera, axis=-1)
     common = float(legs[capture.valid].min())
     late_bins = np.nan_to_num((legs - common) / capture.axis.spacing, nan=capture.axis.bins + 1.0)

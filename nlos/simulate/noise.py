@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nlos.capture import Capture
+from tofclip.arrays import require_numpy
 from tofclip.errors import InputError
 
 
@@ -24,6 +25,7 @@ def counted(capture: Capture, peak_counts: float, background: float = 0.0, seed:
     """
     if not (np.isfinite(peak_counts) and peak_counts > 0 and np.isfinite(background) and background >= 0):
         raise InputError(f"counts need a positive peak and a background of 0 or more, got {peak_counts}, {background}")
+    require_numpy("drawing photons", capture.signal)
     brightest = float(capture.signal.max())
     if brightest <= 0 or float(capture.signal.min()) < 0:
         raise InputError("photons can only be drawn from a signal that is nowhere negative and not all dark")

@@ -12,7 +12,6 @@ from small_instrument import Run
 
 from apps.verbs.nlos import reconstruct
 from nlos import Volume
-from tofclip.errors import InputError, MissingDependencyError
 
 torch = pytest.importorskip("torch")
 
@@ -80,12 +79,3 @@ def test_the_name_travels_with_a_folders_jobs(curved: Path, tmp_path: Path) -> N
     (job,) = pickle.loads(pickle.dumps(jobs))  # as a worker gets it
     assert job.work()["device"] == "torch:cpu"
     assert Volume.load(tmp_path / f"{curved.stem}.h5").provenance["settings"]["device"] == "torch:cpu"
-
-
-@WITHOUT_A_GRAPHICS_PROCESSOR
-def test_on_a_cluster_only_the_workers_need_the_device() -> None:
-    reconstruct._require_device("cuda", elsewhere=True)
-    with pytest.raises(MissingDependencyError, match="no CUDA device 0"):
-        reconstruct._require_device("cuda")
-    with pytest.raises(InputError, match="is no device"):
-        reconstruct._require_device("abacus", elsewhere=True)

@@ -2,9 +2,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from portable_libraries import LIBRARIES, place_of
 
 from nlos import Capture
+from nlos.adjoint import CompressedCapture
 from nlos.preparation import binned, cropped, without_first_bounce
+from nlos.simulate import counted
+from nlos.unwarp import without_device_legs
+from tofclip.arrays import to_numpy
 from tofclip.errors import InputError
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -45,3 +50,27 @@ def test_the_first_bounce_comes_later_far_from_the_laser() -> None:
     assert np.array_equal(gated.signal[:, 2], CAPTURE.signal[:, 2])
     with pytest.raises(InputError, match="margin"):
         without_first_bounce(CAPTURE, -1)
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_a_capture_is_prepared_where_it_lives(library: str) -> None:
+    moved = CAPTURE.on(place_of(library))
+    for prepared in (
+        lambda one: cropped(one, 0.395, 0.605),
+        lambda one: binned(one, 8),
+        lambda one: without_first_bounce(one, 0.25),
+    ):
+        found, expected = prepared(moved), prepared(CAPTURE)
+        assert found.place == moved.place
+        assert found.axis == expected.axis
+        np.testing.assert_allclose(to_numpy(found.signal), expected.signal, rtol=1e-6, atol=1e-6)
+
+
+def test_what_has_compiled_loops_refuses_other_arrays() -> None:
+    moved = CAPTURE.on(place_of("torch"))
+    with pytest.raises(InputError, match="unwarping works on NumPy arrays"):
+        without_device_legs(moved, np.zeros(3), np.zeros(3))
+    with pytest.raises(InputError, match="drawing photons works on NumPy arrays"):
+        counted(moved, 10)
+    with pytest.raises(InputError, match="compressed readings works on NumPy arrays"):
+        CompressedCapture(moved.signal, None, WALL, np.zeros(3), 1e-11)  # type: ignore[arg-type]

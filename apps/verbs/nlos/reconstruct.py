@@ -98,12 +98,13 @@ def reconstruct(
     """
     from apps.nlos.files import Results, is_folder_of_captures
     from apps.report import report
+    from apps.sequences import require_device
     from apps.settings import told
     from tofclip.errors import InputError
 
     order = _Order(told(ReconstructSettings, settings, flags), device)
     _require_sense(order.settings)
-    _require_device(device, elsewhere=cluster is not None)
+    require_device(device, cluster)
     if is_folder_of_captures(source):
         _reconstruct_folder(source, out, order, suffix or [".h5"], (cluster, as_json))
         return
@@ -129,21 +130,6 @@ def _require_sense(settings: ReconstructSettings) -> None:
     require_taken(settings, names)
     for name in names:
         built(name, settings if settings.wavelength_mm is not None else replace(settings, wavelength_mm=1.0))
-
-
-def _require_device(device: str, elsewhere: bool = False) -> None:
-    """Refuse a device that nothing is called, or that is not here, before a capture is read.
-
-    On a cluster the workers need it, not this machine.
-    """
-    from tofclip.arrays import place_named
-    from tofclip.errors import MissingDependencyError
-
-    try:
-        place_named(device)
-    except MissingDependencyError:
-        if not elsewhere:
-            raise
 
 
 def _reconstructed(source: Path, results: Results, order: _Order) -> dict[str, Any]:
