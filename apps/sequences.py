@@ -44,16 +44,24 @@ def run_all(
         return run(missing, cluster, note)
 
 
-def require_device(device: str, cluster: str | None) -> None:
-    """Refuse a device that is not here, unless workers elsewhere are to look for it, and a name that is none at all."""
+def device_told(device: str, cluster: str | None) -> str:
+    """Return which device a name stands for here; workers elsewhere look for it themselves.
+
+    Raises
+    ------
+    InputError, MissingDependencyError
+        It is no name of a device, or not here, where there is no cluster.
+    """
     from tofclip.arrays import place_named
     from tofclip.errors import MissingDependencyError
 
     try:
-        place_named(device)
+        found = str(place_named(device))
     except MissingDependencyError:
         if cluster is None:
             raise
+        return device
+    return found if cluster is None else device
 
 
 def finish(summary: Summary, total: int, as_json: bool, out: Path, figures: Mapping[str, Any] | None = None) -> None:

@@ -55,18 +55,18 @@ def cloud(
 
     Example: tofclip cloud 'frames/*.h5' --out clouds/ --cluster local
     """
-    from apps.sequences import require_device
+    from apps.sequences import device_told
     from tofclip.batch import Clouds, is_sequence
     from tofclip.errors import InputError
 
     clouds = Clouds(drop_outliers, None if voxel_mm is None else voxel_mm * MILLIMETRE, device)
-    require_device(device, cluster)
+    used = device_told(device, cluster)
     if is_sequence(frames):
-        _clouds_of_sequence(clouds, frames, out, suffix, (cluster, as_json))
+        _clouds_of_sequence(clouds, frames, out, suffix, (cluster, used, as_json))
         return
     if cluster is not None:
         raise InputError(f"{frames}: --cluster is for a sequence: a folder or a quoted pattern of frames")
-    _cloud_of_one(clouds, frames, out, as_json)
+    _cloud_of_one(clouds, frames, (out, used), as_json)
 
 
 def require_format(suffix: str, *further: str) -> None:
@@ -77,29 +77,32 @@ def require_format(suffix: str, *further: str) -> None:
         raise InputError(f"no cloud format is called '{suffix}'; use one of {', '.join((*FORMATS, *further))}")
 
 
-def _clouds_of_sequence(clouds: Clouds, frames: Path, out: Path, suffix: str, how: tuple[str | None, bool]) -> None:
+def _clouds_of_sequence(
+    clouds: Clouds, frames: Path, out: Path, suffix: str, how: tuple[str | None, str, bool]
+) -> None:
     from apps.sequences import finish, run_all
     from tofclip.batch import files_in
 
     require_format(suffix, DEPTH_PICTURE)
-    cluster, as_json = how
+    cluster, device, as_json = how
     jobs = clouds.jobs(files_in(frames), out, suffix)
     points: list[int] = []
     summary = run_all("placing", jobs, cluster, lambda report: points.append(report.figures or 0))
-    finish(summary, len(jobs), as_json, out, {"points": sum(points), "device": clouds.device})
+    finish(summary, len(jobs), as_json, out, {"points": sum(points), "device": device})
 
 
-def _cloud_of_one(clouds: Clouds, frames: Path, out: Path, as_json: bool) -> None:
+def _cloud_of_one(clouds: Clouds, frames: Path, made: tuple[Path, str], as_json: bool) -> None:
     from apps.files import history, require_writable
     from tofclip.batch.clouds import save_cloud
     from tofclip.transient import Frames
 
+    out, _ = made
     require_writable(out, *FORMATS, DEPTH_PICTURE, inputs=(frames,))
     recovered = Frames.load(frames)
     past = history({"verb": "cloud"}, frames, earlier=recovered.provenance)
     points, returns = clouds.found(replace(recovered, provenance=past), str(frames))
     save_cloud(points, returns, out)
-    _report(points, returns, as_json, (out, clouds.device))
+    _report(points, returns, as_json, made)
 
 
 def _report(points: PointCloud, returns: Returns, as_json: bool, made: tuple[Path, str]) -> None:

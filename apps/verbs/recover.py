@@ -78,16 +78,16 @@ def recover(
 
     Example: tofclip recover shot.tif --camera camera.h5 --out frames.h5 --time-zero-ns -10.784
     """
-    from apps.sequences import require_device
+    from apps.sequences import device_told
     from tofclip.batch import Recovery, is_sequence
 
     zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
     recovery = Recovery(method, iterations, None, focus, camera, zero, device)
-    require_device(device, cluster)
+    used = device_told(device, cluster)
     if is_sequence(streak):
         _refuse_for_sequence(cloud, preview)
-        _recover_sequence(recovery, (streak, width), out, sweep or [], (cluster, as_json))
+        _recover_sequence(recovery, (streak, width), out, sweep or [], (cluster, used, as_json))
         return
     _refuse_for_single(streak, cluster, sweep)
     _recover_single(recovery, (streak, width), out, (preview or out.with_suffix(".png"), cloud), as_json)
@@ -111,16 +111,16 @@ def _refuse_for_single(streak: str, cluster: str | None, sweep: list[str] | None
 
 
 def _recover_sequence(
-    recovery: Recovery, shots: tuple[str, float | None], out: Path, sweep: list[str], how: tuple[str | None, bool]
+    recovery: Recovery, shots: tuple[str, float | None], out: Path, sweep: list[str], how: tuple[str | None, str, bool]
 ) -> None:
     from apps.sequences import finish, run_all
     from tofclip.batch import shots_in, variants
 
-    cluster, as_json = how
+    cluster, device, as_json = how
     found = shots_in(*shots)
     swept = variants(recovery, dict(map(_values, sweep)))
     jobs = [job for label, variant in swept.items() for job in variant.jobs(found, out / label)]
-    finish(run_all("recovering", jobs, cluster), len(jobs), as_json, out, {"device": recovery.device})
+    finish(run_all("recovering", jobs, cluster), len(jobs), as_json, out, {"device": device})
 
 
 def _values(text: str) -> tuple[str, list[str]]:

@@ -114,3 +114,5 @@ def test_a_device_that_is_not_there_is_refused_in_one_line(
 def test_auto_is_this_processor_where_there_is_no_other(run: Run, files: Path, tmp_path: Path) -> None:
     words = ("recover", files / "streak.h5", "--out", tmp_path / "frames.h5", "--method", "adjoint")
     assert object_of(run, *words, "--device", "auto")["device"] == "cpu"
+    words = ("cloud", tmp_path / "frames.h5", "--out", tmp_path / "cloud.ply")
+    assert object_of(run, *words, "--device", "auto")["device"] == "cpu"

@@ -62,6 +62,11 @@ def test_the_guide_to_ones_own_light_field(tmp_path: Path, monkeypatch: pytest.M
     assert {"field.h5", "spoilt.png"} | set(shown_pictures(GUIDES[3])) <= there
 
 
+def test_the_page_on_graphics_processors(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    provide(files, {"shot.h5": "streak.h5"}, tmp_path)
+    assert {"frames.h5", "scene.ply"} <= walked("graphics_processor.md", tmp_path, monkeypatch)
+
+
 @pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
 def test_pictures_are_there_and_small(guide: Path) -> None:
     named = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", guide.read_text(encoding="utf-8"))
