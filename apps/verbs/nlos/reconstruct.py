@@ -98,13 +98,13 @@ def reconstruct(
     """
     from apps.nlos.files import Results, is_folder_of_captures
     from apps.report import report
-    from apps.sequences import require_device
+    from apps.sequences import device_told
     from apps.settings import told
     from tofclip.errors import InputError
 
     order = _Order(told(ReconstructSettings, settings, flags), device)
     _require_sense(order.settings)
-    require_device(device, cluster)
+    device_told(device, cluster)
     if is_folder_of_captures(source):
         _reconstruct_folder(source, out, order, suffix or [".h5"], (cluster, as_json))
         return
