@@ -60,7 +60,8 @@ def shot(side: int, frames: int) -> tuple[Camera, NDArray[np.float32]]:
     spacing = 0.8 * side
     angles = np.radians(np.linspace(-41, 41, VIEWS))
     width = round((VIEWS - 1) * spacing + 1.6 * side)
-    camera = Camera(0.8 * side + spacing * np.arange(VIEWS), angles, (side, side), width, pulse_fwhm=3 * BIN)
+    centres = 0.8 * side + spacing * np.arange(VIEWS, dtype=np.float64)
+    camera = Camera(centres, angles, (side, side), width, pulse_fwhm=3 * BIN)
     truth = np.zeros((side, side, frames), np.float32)
     late = np.arange(frames)[np.newaxis, np.newaxis, :] - random.uniform(0, frames, (8, 8, 1))
     cards = 100 * np.exp(-4 * np.log(2) * (late / 3) ** 2).astype(np.float32)
@@ -99,7 +100,7 @@ class Ranging:
     """The ranges of all returns in frames wherever they are, in m."""
 
     def __init__(self, camera: Camera, frames: int) -> None:
-        self._times = 10e-9 + BIN * np.arange(frames)
+        self._times = 10e-9 + BIN * np.arange(frames, dtype=np.float64)
         self._camera, self._search = camera, ReturnSearch(camera, self._times, Detection())
 
     def __call__(self, values: Array) -> Array:

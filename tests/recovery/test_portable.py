@@ -82,6 +82,7 @@ def test_pictures_are_those_of_the_compiled_loops(place, method, dtype):
     np.testing.assert_allclose(found.objective, expected.objective, rtol=ROUNDING[dtype])
     assert (found.iterations, found.stopped_because) == (expected.iterations, expected.stopped_because)
     assert sum(done) == method.work(5)
+    assert method.portable
 
 
 @every_method
@@ -198,6 +199,7 @@ def test_refused_frames_are_put_back(place):
     ids=["wavelets", "light field", "denoiser"],
 )
 def test_what_has_only_compiled_loops_says_so(place, method, what):
+    assert not method.portable
     with pytest.raises(InputError, match=f"{what} works on NumPy arrays, not on {place.library}'s"):
         method.recover(projection(), place.put(letters(2)[0]))
 

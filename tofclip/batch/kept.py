@@ -79,6 +79,7 @@ class KeptInverse:
 
     method: LinearInverse
     name = "linear"
+    portable = True
 
     def __repr__(self) -> str:
         return repr(self.method)

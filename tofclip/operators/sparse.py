@@ -56,11 +56,17 @@ class SparseMatrix(LinearOperator):
 
     @cached_property
     def _rows(self) -> InEachPlace[Product]:
-        return InEachPlace(lambda place: product_in(place, self.matrix))
+        return InEachPlace(self._product_in)
 
     @cached_property
     def _columns(self) -> InEachPlace[Product]:
-        return InEachPlace(lambda place: product_in(place, self.matrix.T.tocsr()))
+        return InEachPlace(self._transposed_product_in)
+
+    def _product_in(self, place: Place) -> Product:
+        return product_in(place, self.matrix)
+
+    def _transposed_product_in(self, place: Place) -> Product:
+        return product_in(place, self.matrix.T.tocsr())
 
     def _forward(self, block: Array) -> Array:
         if block.shape[-1] == 1 and is_numpy(block):

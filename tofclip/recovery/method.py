@@ -23,9 +23,17 @@ Mask = Array | None
 
 
 class Method(Protocol):
-    """Anything that recovers pictures from readings."""
+    """Anything that recovers pictures from readings.
+
+    Attributes
+    ----------
+    name : str
+    portable : bool
+        Whether arrays of any library are taken, or NumPy's only.
+    """
 
     name: str
+    portable: bool
 
     def recover(
         self, operator: LinearOperator, readings: Array, good: Mask = None, progress: Progress = silent

@@ -49,6 +49,7 @@ class PlugAndPlay:
     strength: float = 0.12
     coupling: float = 0.1
     name = "plug-and-play"
+    portable = False
 
     def __post_init__(self) -> None:
         if self.calls < 1:
