@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.kernels import delayed_reading
-from tofclip.arrays import require_numpy
+from tofclip.arrays import require_numpy, to_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Record
 from tofclip.transient import Frames
@@ -52,7 +52,7 @@ def unwarp(signal: Any, wall: Any, camera: Any, laser: Any, bin_width: float) ->
     Parameters
     ----------
     signal : (t, ...) array
-        As the camera saw it.
+        As the camera saw it; fetched from wherever it is.
     wall : (..., 3) array
         Wall points, m; the signal of a point with NaN becomes 0.
     camera, laser : (3,) array
@@ -64,7 +64,7 @@ def unwarp(signal: Any, wall: Any, camera: Any, laser: Any, bin_width: float) ->
     -------
     (t, ...) float32 array
     """
-    signal, wall = np.asarray(signal, dtype=np.float32), np.asarray(wall, dtype=np.float64)
+    signal, wall = np.asarray(to_numpy(signal), dtype=np.float32), np.asarray(wall, dtype=np.float64)
     camera, laser = np.asarray(camera, dtype=np.float64), np.asarray(laser, dtype=np.float64)
     if signal.shape[1:] != wall.shape[:-1] or wall.shape[-1:] != (3,):
         raise ShapeError("wall", (*signal.shape[1:], 3), wall.shape)
