@@ -2,8 +2,8 @@
 
 Run with ``python tests/benchmarks/portable_imaging.py [--device NAME ...] [--side N] [--repeats N] [--json]``, for
 instance ``--device cuda --side 128``; without a name PyTorch on this processor. N x N wall points over 2 m see four
-points; N^3 voxels, for back-projection an eighth of the wall points and voxels. Medians of the imaging alone, signals
-being there already; "prepared" is what the second capture of one geometry takes.
+points; N^3 voxels; for back-projection half as many along every side. Medians of the imaging alone, signals being there
+already; "prepared" is what the second capture of one geometry takes.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def cases(side: int) -> list[tuple[str, Reconstructor, Capture, Grid]]:
 def seen(shape: str, side: int, confocal: bool) -> Capture:
     """Simulate the capture of the points before a wall."""
     wall = relay_wall(shape, side, WIDTH)
-    return PointScene(POINTS).seen_from(wall, wall if confocal else SPOT, AXIS, JITTER)
+    return PointScene(np.array(POINTS)).seen_from(wall, wall if confocal else SPOT, AXIS, JITTER)
 
 
 def voxels(side: int) -> Grid:
