@@ -55,7 +55,7 @@ def find_returns(traces, pixels, times, standing, filters, pulse, limits, found,
         np.empty(groups, np.float32),
         standing.copy(),
         np.empty((found.shape[1], 4)),
-        np.empty((found.shape[1], 4)),
+        np.empty((found.shape[1], 5)),
         np.empty((times.size, 3)),
     )
     for place in range(traces.shape[0]):
@@ -82,7 +82,8 @@ def returns_of(trace, times, standing, filters, pulse, limits, memory, found):
         j, strength = int(peaks[k, 0]), peaks[k, 1]
         if strength > least and strength * times[j] ** 2 >= needed:
             estimate[kept, 0] = top(trace, times, matched, background, j, strength)
-            estimate[kept, 1], estimate[kept, 3] = max(trace[j] - background, 0.0), j
+            estimate[kept, 1] = max(trace[j] - background, 0.0)
+            estimate[kept, 2], estimate[kept, 3] = peaks[k, 2], peaks[k, 3]
             kept += 1
     refine(trace, times, background, curve, scale, estimate[:kept], EVEN, ROUNDS)
     number = describe(trace, times, background, noise, curve, scale, estimate[:kept], least, profile, found)
@@ -160,7 +161,7 @@ def strongest_peaks(trace, times, standing, matched, gains, scale, limits, maxim
         best = group * GROUP
         while maxima[best] != bounds[group]:
             best += 1
-        first, last = window(times, best, times[best], scale)
+        first, last = window(times, (best, best), times[best], scale)
         strength = response(trace, matched, best)
         peaks[number, 0], peaks[number, 1], peaks[number, 2], peaks[number, 3] = best, strength, first, last
         number += 1

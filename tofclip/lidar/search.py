@@ -33,7 +33,6 @@ REFERENCE_RANGE = 1.0  # m; an intensity is what the same surface would send bac
 PIXELS_AT_ONCE = 128  # their traces fit the second-level cache
 PIXELS_PER_BLOCK = 8 * PIXELS_AT_ONCE
 SHARPENING = 2.0  # of the filter that looks for candidates; it costs a tenth of the matched filter's sensitivity
-WANDERING_BINS = 2  # by which the fit may move a return
 SHORTEST_PULSE_BINS = 2.0  # anything shorter falls between the samples
 
 
@@ -102,14 +101,19 @@ class ReturnSearch:
             return_number=_rank_within(pixel[kept]),
             time=time[kept],
             camera=self.camera,
-            shear=np.interp(time[kept], self.times, self.shears),
+            shear=self._shear_at(time[kept]),
             provenance={} if provenance is None else provenance,
         )
+
+    def _shear_at(self, time: FloatArray) -> FloatArray:
+        if np.ptp(self.shears) == 0:  # looking up every instant takes longer than placing it in space
+            return np.full(time.size, self.shears[0])
+        return np.interp(time, self.times, self.shears)
 
     @property
     def reach_bins(self) -> int:
         """How many bins on either side of a return its search and its fit look at."""
-        return int(self._filters[1].shape[1]) // 2 + WANDERING_BINS
+        return int(self._filters[1].shape[1]) // 2 + 1  # the responses of a peak's neighbours tell where its top is
 
     def _candidates(
         self, traces: Traces | PortableTraces

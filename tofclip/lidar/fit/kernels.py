@@ -20,8 +20,8 @@ inlined = njit(inline="always")  # called for every bin: handing over the arrays
 
 @compiled
 def window(times, near, arrival, scale):
-    """First bin and the bin after the last one that a return at `arrival`, not far from bin `near`, reaches."""
-    return first_from(times, near, arrival + scale[2]), first_from(times, near, arrival + scale[3])
+    """First bin and the bin after the last one that a return at `arrival` reaches; `near` guesses them."""
+    return first_from(times, near[0], arrival + scale[2]), first_from(times, near[1], arrival + scale[3])
 
 
 @compiled
@@ -66,20 +66,18 @@ def refine(trace, times, background, curve, scale, estimate, variance, rounds):
     and photon counts it is Fisher scoring, which ends at the Poisson likelihood's maximum. A return that moved no more
     and that no moving one reaches is left alone.
 
-    `estimate` is (returns, 4): arrival, height, by how many bins it moved last (overwritten), a bin near it.
+    `estimate` is (returns, 5): arrival, height, first bin and the bin after the last one that it reaches, or what is
+    near them, and by how many bins it moved last, which is overwritten.
     """
-    estimate[:, 2] = np.inf
+    estimate[:, 4] = np.inf
     for _ in range(rounds):
         largest = 0.0
         for k in range(estimate.shape[0]):
             crowded, moving = neighbours(estimate, k, curve, scale)
             if moving >= CONVERGED_BINS:
-                if crowded or variance[1] != 0:
-                    sums = weighted_sums(trace, times, background, curve, scale, estimate, k, variance)
-                else:
-                    sums = lone_sums(trace, times, background, curve, scale, estimate, k)
+                sums = normal_equations(trace, times, background, curve, scale, estimate, k, crowded, variance)
                 gauss_newton_step(times, sums, estimate[k])
-                largest = max(largest, estimate[k, 2])
+                largest = max(largest, estimate[k, 4])
         if largest < CONVERGED_BINS:
             break
 
@@ -91,69 +89,63 @@ def neighbours(estimate, k, curve, scale):
     One reaches the other if it has light in bins that count for the other.
     """
     before, after = scale[1] / scale[0] + scale[3], (curve.shape[0] - 1 - scale[1]) / scale[0] - scale[2]
-    crowded, moving = False, estimate[k, 2]
+    crowded, moving = False, estimate[k, 4]
     for other in range(estimate.shape[0]):
         later = estimate[other, 0] - estimate[k, 0]
         if other != k and -after < later < before:
             crowded = True
-            moving = max(moving, estimate[other, 2])
+            moving = max(moving, estimate[other, 4])
     return crowded, moving
 
 
 @compiled
-def lone_sums(trace, times, background, curve, scale, estimate, k):
-    """Window of return k, and the normal equations of its fit by least squares where no other return reaches it.
+def normal_equations(trace, times, background, curve, scale, estimate, k, crowded, variance):
+    """Sums over the bins of return k, of their pulse p, its slope d and the rest r: pp, pd, dd, pr, dr; see `refine`.
 
-    Sums over the bins of pulse p, slope d and the rest r that they have to explain: pp, pd, dd, pr, dr.
+    The bins are entered in `estimate`. Only if it is `crowded` are the other returns taken off.
     """
-    arrival = estimate[k, 0]
-    first, last = window(times, int(estimate[k, 3]), arrival, scale)
+    arrival, height = estimate[k, 0], estimate[k, 1]
+    first, last = window(times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale)
+    estimate[k, 2], estimate[k, 3] = first, last
     pp = pd = dd = pr = dr = 0.0
     for i in range(first, last):
         p, d = pulse_at(times[i] - arrival, curve, scale)
         rest = trace[i] - background
-        pp += p * p
-        pd += p * d
-        dd += d * d
-        pr += p * rest
-        dr += d * rest
-    return first, last, pp, pd, dd, pr, dr
-
-
-@compiled
-def weighted_sums(trace, times, background, curve, scale, estimate, k, variance):
-    """The same with bins weighed by their variance, and all other returns taken off; see `refine`."""
-    arrival, height = estimate[k, 0], estimate[k, 1]
-    first, last = window(times, int(estimate[k, 3]), arrival, scale)
-    pp = pd = dd = pr = dr = 0.0
-    for i in range(first, last):
-        p, d = pulse_at(times[i] - arrival, curve, scale)
-        rest = unexplained(trace, times, background, curve, scale, estimate, i, k)
-        weight = 1 / (variance[0] + variance[1] * (trace[i] - rest + height * p))
-        pp += weight * p * p
-        pd += weight * p * d
-        dd += weight * d * d
-        pr += weight * p * rest
-        dr += weight * d * rest
-    return first, last, pp, pd, dd, pr, dr
+        if crowded:
+            rest = unexplained(trace, times, background, curve, scale, estimate, i, k)
+        if variance[1] != 0:
+            weight = 1 / (variance[0] + variance[1] * (trace[i] - rest + height * p))
+            pp += weight * p * p
+            pd += weight * p * d
+            dd += weight * d * d
+            pr += weight * p * rest
+            dr += weight * d * rest
+        else:
+            pp += p * p
+            pd += p * d
+            dd += d * d
+            pr += p * rest
+            dr += d * rest
+    return pp, pd, dd, pr, dr
 
 
 @compiled
 def gauss_newton_step(times, sums, own):
     """Improve one return's arrival and height in place, and enter by how many bins it moved (at most one)."""
-    first, last, pp, pd, dd, pr, dr = sums
+    pp, pd, dd, pr, dr = sums
     determinant = pp * dd - pd * pd
-    own[2] = 0.0
+    own[4] = 0.0
     if determinant <= 0:
         return
     height = (dd * pr - pd * dr) / determinant
     if height <= 0:
         own[1] = 0.0
         return
+    first, last = int(own[2]), int(own[3])
     bin_width = (times[last - 1] - times[first]) / (last - 1 - first)
     step = -(pp * dr - pd * pr) / (determinant * height)  # model: height * p(t - arrival), whose slope is -height * d
     step = min(max(step, -bin_width), bin_width)
-    own[0], own[1], own[2] = own[0] + step, height, abs(step) / bin_width
+    own[0], own[1], own[4] = own[0] + step, height, abs(step) / bin_width
 
 
 @compiled
@@ -169,7 +161,7 @@ def describe(trace, times, background, noise, curve, scale, estimate, least, pro
         if height <= 0 or arrival < times[0] or arrival > times[-1]:
             continue
         crowded, _ = neighbours(estimate, k, curve, scale)
-        first, last = window(times, int(estimate[k, 3]), arrival, scale)
+        first, last = window(times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale)
         pp = pd = dd = 0.0
         for i in range(first, last):
             p, d = pulse_at(times[i] - arrival, curve, scale)

@@ -19,7 +19,7 @@ LENGTH_IN_WIDTHS = 1.7  # a sum over so much of a Gaussian pulse stands out near
 QUIET_SHARE, QUIETER_SHARE = 0.25, 0.05
 HARDLY_BRIGHTER, AS_DARK = 1.5, 1.25  # in mean square; noise alone makes a tenth
 FURTHER = 1.2  # than the limit has an instant to stand out
-SAMPLED = 48  # dark rows at least, which know the noise of a dark pixel to a tenth
+SAMPLED = 32  # dark rows at least, which know the noise of a dark pixel to an eighth
 WORTHWHILE = 0.75  # of all rows: what needs more of them is as well searched everywhere
 COLUMNS_PER_BLOCK = 192
 
@@ -95,8 +95,8 @@ class LitRows:
         Memory: as much as the readings, divided by the rows of a pulse width.
         """
         lit = self._lit_instants(readings)
-        searched = self._near(lit, self._step)
-        kept = self._near(lit, self._step + self._reach)
+        searched = self._near(lit, self._step // 2 + 1)
+        kept = self._near(lit, self._step // 2 + 1 + self._reach)
         number = SAMPLED + -(int(kept.sum()) + SAMPLED) % LANES
         dark = np.flatnonzero(~kept)
         if self.rows - dark.size + number > WORTHWHILE * self.rows:

@@ -83,7 +83,7 @@ def take_strongest(rest, free, dither, level, table, first, scale, times, peaks,
             continue
         peaks[row, numbers[row]] = best
         numbers[row] += 1
-        begin, end = window(times, best, times[best], scale)
+        begin, end = window(times, (best, best), times[best], scale)
         rest[row, begin:end] = 0
         free[row] -= end - begin
 
@@ -102,13 +102,13 @@ def locate(histograms, peaks, numbers, curve, scale, times, found):
     found : (n, most returns, 3) float64 array
         Overwritten with arrival, photons and standard deviation of the arrival where there is a return.
     """
-    estimate = np.empty((peaks.shape[1], 4))
+    estimate = np.empty((peaks.shape[1], 5))
     for row in range(histograms.shape[0]):
         trace, number = histograms[row], numbers[row]
         background = quiet_rate(trace, times, peaks[row, :number], scale)
         for k in range(number):
             peak = peaks[row, k]
-            estimate[k, 0], estimate[k, 3] = times[peak], peak
+            estimate[k, 0], estimate[k, 2], estimate[k, 3] = times[peak], peak, peak
             estimate[k, 1] = first_height(trace, times, background, curve, scale, peak)
         refine(trace, times, background, curve, scale, estimate[:number], POISSON, ROUNDS)
         for k in range(number):
@@ -120,7 +120,7 @@ def quiet_rate(trace, times, peaks, scale):
     """Background photons of a bin, from the bins that no return reaches."""
     free = np.ones(trace.size, np.bool_)
     for peak in peaks:
-        first, last = window(times, peak, times[peak], scale)
+        first, last = window(times, (peak, peak), times[peak], scale)
         free[first:last] = False
     photons = bins = 0.0
     for i in range(trace.size):
@@ -134,7 +134,7 @@ def quiet_rate(trace, times, peaks, scale):
 def first_height(trace, times, background, curve, scale, peak):
     """Height of a return from the photons around its bin; never less than half a photon's."""
     arrival = times[peak]
-    first, last = window(times, peak, arrival, scale)
+    first, last = window(times, (peak, peak), arrival, scale)
     area = excess = 0.0
     for i in range(first, last):
         area += pulse_at(times[i] - arrival, curve, scale)[0]
@@ -146,7 +146,7 @@ def first_height(trace, times, background, curve, scale, peak):
 def summarise(trace, times, background, curve, scale, estimate, k, found):
     """Arrival, photons and the arrival's Cramer-Rao deviation at the estimate."""
     arrival, height = estimate[k, 0], estimate[k, 1]
-    first, last = window(times, int(estimate[k, 3]), arrival, scale)
+    first, last = window(times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale)
     pp = pd = dd = total = 0.0
     for i in range(first, last):
         p, d = pulse_at(times[i] - arrival, curve, scale)
