@@ -18,7 +18,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")
 GRID = Grid.box((-0.7, 0.6), (-0.5, 0.5), (0.7, 1.1), (0.13, 0.11, 0.1))
 METHOD = Hybrid(wavelength=0.4)
 AGREEMENT = 5e-5
-"""Both ways compute the same sums in single precision; measured 1e-6, and 1e-5 for many terms that nearly cancel."""
+"""Both ways compute the same sums in single precision; measured 2e-6."""
 
 
 def scene(shape: str, laser: str = "single", count: int = 12) -> Capture:
@@ -64,7 +64,9 @@ def test_the_field_on_a_plane_is_that_of_the_compiled_loops(by_transforms: None)
         expected = propagate(capture, uneven, METHOD.pulse, tolerance=tolerance)
         found = propagate(capture.on(place_of("torch")), uneven, METHOD.pulse, tolerance=tolerance)
         assert np.array_equal(found.wavenumbers, expected.wavenumbers)
-        assert relative_error(found.values, expected.values) < AGREEMENT
+        # At the stricter tolerance rounding decides which of the last terms is taken.
+        agreement = AGREEMENT if tolerance == 1e-2 else 0.2 * tolerance
+        assert relative_error(found.values, expected.values) < agreement
 
 
 def test_little_memory_means_smaller_pieces(by_transforms: None, monkeypatch: pytest.MonkeyPatch) -> None:
