@@ -1,10 +1,20 @@
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 from relay_walls import AXIS, HIDDEN, JITTER, planar_wall
 
 from nlos import Capture
+from nlos.rsd.blas import one_thread
 from nlos.simulate import PointScene
+
+
+@pytest.fixture(autouse=True)
+def _one_thread_for_products() -> Iterator[None]:
+    """Small matrices gain nothing from threads, which on a busy machine wait for each other."""
+    with one_thread():
+        yield
 
 
 @pytest.fixture
