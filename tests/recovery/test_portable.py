@@ -9,7 +9,7 @@ import pytest
 
 from tofclip.arrays import Place, to_numpy
 from tofclip.errors import InputError, ShapeError
-from tofclip.operators import Diagonal, FourierShear, LineProjection, squared_norm
+from tofclip.operators import Diagonal, FourierShear, LineProjection, Stack, squared_norm
 from tofclip.recovery import (
     Adjoint,
     Fista,
@@ -21,10 +21,13 @@ from tofclip.recovery import (
     PlugAndPlay,
     Poisson,
     Sparse,
+    Stopping,
     TotalVariation,
     Wavelets,
     batches,
+    iterate,
     relative_residual,
+    silent,
 )
 from tofclip.recovery.compiled import CompiledLoops
 from tofclip.recovery.hold_out import choose_weight
@@ -163,6 +166,17 @@ def test_no_step_waits_for_the_device(prior, monkeypatch):
         solver.step()
 
 
+def test_a_tolerance_waits_for_the_device_once_in_an_iteration(monkeypatch):
+    pytest.importorskip("array_api_strict")
+    readings = Place("array_api_strict").put(letters(3)[0])
+    solver = Fista(projection(), LeastSquares(readings), NonnegativeSparsity(0.5), 1 / squared_norm(projection()), 3)
+    kind, asked = type(readings), []
+    truth = kind.__bool__
+    monkeypatch.setattr(kind, "__bool__", lambda array: bool(asked.append(array)) or truth(array))
+    history = iterate(solver, Stopping(7, 1e-9), silent, 3)
+    assert len(asked) == history.iterations == 7
+
+
 @pytest.mark.parametrize("shape", [(7, 6, 3), (1, 9, 2), (8, 1, 1)], ids=str)
 @pytest.mark.parametrize("weight", [0.0, 0.3])
 def test_total_variation_sweep_by_sweep(place, shape, weight):
@@ -211,7 +225,10 @@ def test_the_choice_of_a_weight_says_so_too(place):
 
 def test_operators_with_compiled_loops_only_say_so(place):
     operator = projection() @ FourierShear((24, 23), 0.5, (1, 1))
-    with pytest.raises(InputError, match="Composition works on NumPy arrays"):
+    for whole in (operator, Stack([operator, projection()]).H.H):
+        with pytest.raises(InputError, match="the operator FourierShear works on NumPy arrays"):
+            whole(place.put(np.zeros((24, 23), np.float32)))
+    with pytest.raises(InputError, match="the operator FourierShear works on NumPy arrays"):
         Sparse().recover(operator, place.put(letters(2)[0]))
 
 

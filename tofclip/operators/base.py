@@ -41,9 +41,12 @@ class LinearOperator(ABC):
     ----------
     portable : bool
         Whether arrays of any library are taken, or NumPy's only.
+    parts : tuple of LinearOperator
+        Those that this one is made of, if it is.
     """
 
     portable = False
+    parts: tuple[LinearOperator, ...] = ()
 
     def __init__(self, shape_in: Shape, shape_out: Shape, dtype: DTypeLike = np.float32) -> None:
         self.shape_in = tuple(int(n) for n in shape_in)
@@ -76,7 +79,7 @@ class LinearOperator(ABC):
 
     def _as_block(self, values: Array, shape: Shape, what: str) -> tuple[Array, bool]:
         if not self.portable:
-            require_numpy(f"the operator {type(self).__name__}", values)
+            require_numpy(f"the operator {type(self._bound_to_numpy).__name__}", values)
         array = np.asarray(values) if is_numpy(values) else values
         single = array.shape == shape
         if not single and array.shape[:-1] != shape:
@@ -84,6 +87,15 @@ class LinearOperator(ABC):
         if namespace(array).isdtype(array.dtype, "complex floating"):
             raise InputError(f"{what} must be real, got {array.dtype}")
         return as_type(array[..., None] if single else array, self.dtype), single
+
+    def _made_of(self, *parts: LinearOperator) -> None:
+        """Remember the parts; what is made of several takes the arrays that all of them take."""
+        self.parts, self.portable = parts, all(part.portable for part in parts)
+
+    @property
+    def _bound_to_numpy(self) -> LinearOperator:
+        """The innermost part because of which other libraries' arrays cannot be taken."""
+        return next((part._bound_to_numpy for part in self.parts if not part.portable), self)
 
     @property
     def H(self) -> LinearOperator:  # noqa: N802 - the field's own symbol
@@ -103,7 +115,8 @@ class Adjoint(LinearOperator):
 
     def __init__(self, operator: LinearOperator) -> None:
         super().__init__(operator.shape_out, operator.shape_in, operator.dtype)
-        self.operator, self.portable = operator, operator.portable
+        self.operator = operator
+        self._made_of(operator)
 
     def _forward(self, block: Array) -> Array:
         return self.operator._adjoint(block)
@@ -127,7 +140,7 @@ class Composition(LinearOperator):
             raise InputError(f"cannot compose {outer.dtype} with {inner.dtype}; build both in one type")
         super().__init__(inner.shape_in, outer.shape_out, outer.dtype)
         self.outer, self.inner = outer, inner
-        self.portable = outer.portable and inner.portable
+        self._made_of(outer, inner)
 
     def _forward(self, block: Array) -> Array:
         return self.outer._forward(self.inner._forward(block))

@@ -28,7 +28,7 @@ class Stack(LinearOperator):
         rows = [operator.shape_out[0] for operator in operators]
         super().__init__(first.shape_in, (sum(rows), *first.shape_out[1:]), first.dtype)
         self.operators = tuple(operators)
-        self.portable = _all_portable(operators)
+        self._made_of(*operators)
 
     def _forward(self, block: Array) -> Array:
         return namespace(block).concat([operator._forward(block) for operator in self.operators])
@@ -49,7 +49,8 @@ class BlockDiagonal(LinearOperator):
     def __init__(self, operators: Sequence[LinearOperator]) -> None:
         stacked = Stack(operators)  # refuses operators that do not fit each other
         super().__init__((len(operators), *stacked.shape_in), stacked.shape_out, stacked.dtype)
-        self.operators, self.portable = stacked.operators, stacked.portable
+        self.operators = stacked.operators
+        self._made_of(*operators)
 
     def _forward(self, block: Array) -> Array:
         parts = [operator._forward(block[k, ...]) for k, operator in enumerate(self.operators)]
@@ -78,7 +79,7 @@ class Integration(LinearOperator):
                 raise InputError(f"cannot add {first.dtype} to {other.dtype}; build both in one type")
         super().__init__((len(operators), *first.shape_in), first.shape_out, first.dtype)
         self.operators = tuple(operators)
-        self.portable = _all_portable(operators)
+        self._made_of(*operators)
 
     def _forward(self, block: Array) -> Array:
         total = zeros((*self.shape_out, block.shape[-1]), block)
@@ -88,10 +89,6 @@ class Integration(LinearOperator):
 
     def _adjoint(self, block: Array) -> Array:
         return namespace(block).stack([operator._adjoint(block) for operator in self.operators])
-
-
-def _all_portable(operators: Sequence[LinearOperator]) -> bool:
-    return all(operator.portable for operator in operators)
 
 
 def _with_own_rows(operators: Sequence[LinearOperator], block: Array) -> Iterator[tuple[LinearOperator, Array]]:
