@@ -1,4 +1,4 @@
-"""Ranges of a recovered shot, and shots to clouds one after the other."""
+"""Ranges of a recovered shot, and a stream of shots to clouds."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ import numpy as np
 from apps.benchmarks.case import Case, Prepared
 from apps.benchmarks.recovery import dense_products, operator, readings
 from tofclip.lidar import depth
-from tofclip.lidar.sequence import Jitter, Ranger, averaged, light_over_time
+from tofclip.lidar.sequence import Ranger
 from tofclip.simulate import default_instrument, default_scene, simulate, true_frames
 from tofclip.simulate.instrument import Instrument
+from tofclip.streaming import stream_clouds
 from tofclip.threads import run_blocks
 
 ROWS = (254, 1016)
+STREAMED = 8
 
 
 def instrument(rows: int) -> Instrument:
@@ -35,15 +37,20 @@ def ranges(rows: int) -> Prepared:
 
 
 def streaming(rows: int) -> Prepared:
-    """A shot that was read already: time of arrival, sweep, linear inverse, returns, cloud."""
+    """Shots that were read already, one after the other: sweep, linear inverse, returns, clouds."""
     made = instrument(rows)
-    streak = simulate(default_scene(), made, 0).streak
-    ranger = Ranger(made.camera, streak.times)
-    jitter = Jitter(light_over_time(streak, made.camera))
+    streaks = [simulate(default_scene(), made, seed).streak for seed in range(3)]
+    ranger = Ranger(made.camera, streaks[0].times)
+    shots = [streaks[number % len(streaks)] for number in range(STREAMED)]
     projection, data = made.camera.operator(), readings(rows)[: made.camera.slit_width_px]
     if data.shape[0] != operator().shape_out[0]:
         raise RuntimeError("the demo's instrument has another slit than the benchmark's")
-    return Prepared(lambda: averaged([lambda: streak], ranger, jitter), lambda: dense_products(projection, data), 1)
+    return Prepared(
+        lambda: list(stream_clouds(shots, ranger)),
+        lambda: dense_products(projection, data),
+        STREAMED,
+        floor_share=1 / STREAMED,
+    )
 
 
 CASES = (
@@ -58,11 +65,11 @@ CASES = (
     ),
     Case(
         "streaming-cloud",
-        "a shot to its cloud",
+        f"a stream of {STREAMED} shots to their clouds",
         "time bins",
         ROWS,
         "shots",
-        "a dense and a sparse product alone",
+        "a dense and a sparse product of all rows alone",
         streaming,
     ),
 )

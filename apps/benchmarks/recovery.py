@@ -83,10 +83,10 @@ def iterative(method: Method, frames: int) -> Prepared:
 
 
 def linear(frames: int) -> Prepared:
-    """The linear inverse, prepared, into memory that is there."""
+    """The linear inverse, prepared."""
     projection, data = operator(), readings(frames)
-    inverse, out = LinearInverse().prepare(projection), np.empty((frames, *projection.shape_in), np.float32)
-    return Prepared(lambda: inverse.recover(data, out=out), lambda: dense_products(projection, data), frames)
+    inverse = LinearInverse().prepare(projection)
+    return Prepared(lambda: inverse.recover(data), lambda: dense_products(projection, data), frames)
 
 
 def adjoint(frames: int) -> Prepared:

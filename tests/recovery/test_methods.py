@@ -48,17 +48,6 @@ def test_a_prepared_inverse_serves_many_shots(operator):
     np.testing.assert_array_equal(prepared.recover(readings).frames, LinearInverse().recover(operator, readings).frames)
 
 
-def test_frames_can_be_written_into_memory_at_hand(operator):
-    readings = np.random.default_rng(6).random((40, 33))
-    prepared = LinearInverse().prepare(operator)
-    out = np.full((33, 12, 11), np.nan)
-    assert prepared.recover(readings, out=out).frames is out
-    np.testing.assert_array_equal(out, prepared.recover(readings).frames)
-    for unfit in (out[:-1], out.astype(np.float32), np.asfortranarray(out)):
-        with pytest.raises(ShapeError, match="out must have shape"):
-            prepared.recover(readings, out=unfit)
-
-
 def test_setting_up_is_told_apart_from_recovering(operator):
     result = LinearInverse().recover(operator, np.ones((40, 2)))
     assert result.setup_seconds > 0

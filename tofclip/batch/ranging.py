@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from threading import Lock
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,23 +87,22 @@ class Ranging:
 def write_cloud_of(plan: Path, version: str, shots: tuple[Shot, ...], result: Path) -> tuple[int, list[float]]:
     """Write the cloud of some shots; return its points and how many rows each shot was late.
 
-    Operators, inverted matrices and the frames' memory are made once in a process for each `version` (SHA-256) of the
-    plan. Memory: one shot, its readings, and the frames, which all clouds share.
+    Operators and inverted matrices are made once in a process for each `version` (SHA-256) of the plan. Memory: one
+    shot, and twice as much again for its readings and what is recovered of them.
     """
-    ranger, jitter, turn = _prepared(plan, version)
-    with turn:  # the frames' memory is used again for each shot
-        cloud, late = averaged(shots, ranger, jitter)
+    ranger, jitter = _prepared(plan, version)
+    cloud, late = averaged(shots, ranger, jitter)
     cloud.save(result)
     return len(cloud), [float(one) for one in late]
 
 
 @lru_cache(maxsize=2)
-def _prepared(plan: Path, version: str) -> tuple[Ranger, Jitter | None, Any]:
+def _prepared(plan: Path, version: str) -> tuple[Ranger, Jitter | None]:
     record = Record.load(plan, "ranging")
     camera = Camera.from_record(record.child("camera", "camera"))
     times, light = (_field(record, name, units) for name, units in (("row_times", "s"), ("light", "count")))
     ranger = Ranger(camera, times, focus=focus_named(str(record.attribute("focus"))))
-    return ranger, Jitter(light) if light.size else None, Lock()
+    return ranger, Jitter(light) if light.size else None
 
 
 def _field(record: Record, name: str, units: str) -> NDArray[np.float64]:

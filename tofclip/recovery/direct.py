@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.arrays import Array, InEachPlace, Place, is_numpy, namespace, to_numpy
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, SparseMatrix, squared_norm
 from tofclip.recovery.batches import PortableBatches, batches_for, write_frames
 from tofclip.recovery.loop import Progress, Result, silent
@@ -108,7 +108,7 @@ class PreparedInverse:
     def _inverse(self) -> InEachPlace[Array]:
         return InEachPlace(partial(Place.put, values=self.inverse_gram))
 
-    def recover(self, readings: Array, progress: Progress = silent, out: NDArray[Any] | None = None) -> Result:
+    def recover(self, readings: Array, progress: Progress = silent) -> Result:
         """Recover one picture per column of `readings`, where they are.
 
         Parameters
@@ -116,17 +116,11 @@ class PreparedInverse:
         readings : (readings, frames) array
         progress : callable
             Called with the number of frames just done.
-        out : (frames, rows, columns) array of the operator's type, optional
-            Where the frames are written; for shot after shot, fresh memory would cost a quarter of the time. NumPy's
-            only: other libraries keep memory for themselves.
         """
         readings = checked_readings(self.operator, readings, None)
         if not is_numpy(readings):
             return self._recovered_elsewhere(readings, progress)
-        shape = (readings.shape[1], *self.operator.shape_in)
-        frames = np.empty(shape, self.operator.dtype) if out is None else out
-        if frames.shape != shape or frames.dtype != self.operator.dtype or not frames.flags.c_contiguous:
-            raise ShapeError("out", f"{shape}, contiguous, {self.operator.dtype}", (*frames.shape, frames.dtype))
+        frames = np.empty((readings.shape[1], *self.operator.shape_in), self.operator.dtype)
         weights = self.weights(readings)
 
         def project(piece: slice) -> None:
