@@ -13,7 +13,7 @@ from nlos.geometry import Grid
 from nlos.kernels import NEAREST
 from nlos.method import Progress
 from nlos.portable.library import Library
-from nlos.portable.signals import phasors, traces_of
+from nlos.portable.signals import Analysis, traces_of
 from tofclip.arrays import Array
 from tofclip.threads import blocks
 
@@ -23,14 +23,15 @@ if TYPE_CHECKING:
 TABLE_BYTES = 64 << 20
 """Waveforms held at a time."""
 
-PAIRS = 1 << 21
-"""Pairs of voxel and wall point that are looked up at a time; each takes some 80 bytes."""
+PAIR_BYTES = 16
+"""A pair of voxel and wall point takes five times as much, in several arrays."""
 
 
 def smeared_elsewhere(capture: Capture, grid: Grid, band: Band, weighting: Weighting, progress: Progress) -> Array:
     """Return the complex sum of `nlos.Backprojection` where the capture's signal lives.
 
-    Memory: the volume, 64 MiB of waveforms, and some 160 MB for the pairs of voxel and wall point looked up at a time.
+    Memory: the volume, 64 MiB of waveforms, and five chunks (`Library.chunk_bytes`) for the pairs of voxel and wall
+    point that are looked up at a time.
 
     Parameters
     ----------
@@ -48,11 +49,12 @@ def smeared_elsewhere(capture: Capture, grid: Grid, band: Band, weighting: Weigh
     library = Library(capture.place)
     rows = _Rows(grid, library, weighting)
     total = library.zeros((rows.count, grid.x.size))
-    size = min(TABLE_BYTES // (8 * band.samples), max(1, PAIRS // grid.x.size))
+    analysis, pairs = Analysis(band, capture.axis.bins, library), library.chunk_bytes // PAIR_BYTES
+    size = min(TABLE_BYTES // (8 * band.samples), max(1, pairs // grid.x.size))
     for points in blocks(len(capture.points), max(1, size)):
-        waveforms = _Waveforms.of(capture, points, band, library)
+        waveforms = _Waveforms.of(capture, points, band, analysis)
         count = points.stop - points.start
-        for some in blocks(rows.count, max(1, PAIRS // (grid.x.size * count))):
+        for some in blocks(rows.count, max(1, pairs // (grid.x.size * count))):
             total[some, :] += rows.looked_up(some, waveforms)
             progress((some.stop - some.start) * grid.x.size * count)
     return library.xp.reshape(total, grid.shape)
@@ -84,9 +86,9 @@ class _Waveforms:
     lasers: Array
 
     @classmethod
-    def of(cls, capture: Capture, points: slice, band: Band, library: Library) -> _Waveforms:
-        carriers, start, spacing = band.carriers
-        values = phasors(library, traces_of(capture, points), band) @ library.put(carriers)
+    def of(cls, capture: Capture, points: slice, band: Band, analysis: Analysis) -> _Waveforms:
+        library, (carriers, start, spacing) = Library(capture.place), band.carriers
+        values = analysis.of(traces_of(capture, points)) @ library.put(carriers)
         first = band.samples * np.arange(values.shape[0])
         lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[points]
         return cls(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nlos.depths import Depths
 from nlos.method import Progress, silent
-from nlos.portable.library import CHUNK_BYTES, Library, whole_turns_off
+from nlos.portable.library import Library, whole_turns_off
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.illumination import Illumination
 from nlos.rsd.kernels import TAPS
@@ -59,8 +59,8 @@ class PortableDiffraction:
 
     Holding one is the cache: the second field of the same geometry needs no planning. Transfer functions and
     illuminations of all depths are kept up to 1 GiB (50 MB for 128 depths, 120 frequencies and 400 nodes), beyond that
-    made anew for every field. Memory besides: some 32 bytes per plane wave and frequency, at most 400 MB for the
-    depths that are treated together.
+    made anew for every field. Memory besides: four chunks (`Library.chunk_bytes`) for the depths that are treated
+    together, and at least 40 bytes per plane wave and frequency.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ class PortableDiffraction:
             yield from self._kept
             return
         waves, frequencies = self._share.shape
-        size = max(1, CHUNK_BYTES // (8 * waves * frequencies))
+        size = max(1, self.library.chunk_bytes // (8 * waves * frequencies))
         nodes = self.way.transfer.nodes.size
         keeping = 8 * self.way.grid.z.size * nodes * frequencies <= KEPT_BYTES
         made = []

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import Array, Place, namespace
 
-CHUNK_BYTES = 96 << 20
-"""The largest array that is made at a time; some four of its size are alive together."""
+CACHED_CHUNK, LARGE_CHUNK = 8 << 20, 256 << 20
+"""Bytes of the largest array that is made at a time: on a processor, with its caches, and on a graphics processor, with
+its thousands of lanes."""
 
 SINGLE = {"f": np.float32, "c": np.complex64}
 
@@ -37,6 +38,11 @@ class Library:
     def xp(self) -> Any:
         """The functions of the array API standard."""
         return namespace(self.place.put(np.zeros(1, np.float32)))
+
+    @property
+    def chunk_bytes(self) -> int:
+        """The largest array that should be made at a time; some four of its size are alive together."""
+        return CACHED_CHUNK if "cpu" in str(self.place.device).lower() else LARGE_CHUNK
 
     def put(self, values: NDArray[Any]) -> Array:
         """Bring a NumPy array here, in single precision if it holds real or complex numbers."""

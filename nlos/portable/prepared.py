@@ -15,7 +15,7 @@ from nlos.method import Progress, silent
 from nlos.portable.diffraction import PortableDiffraction
 from nlos.portable.library import Library
 from nlos.portable.propagation import WallToPlane
-from nlos.portable.signals import exposed_phasors, on_lattice
+from nlos.portable.signals import Analysis, exposed, on_lattice
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.planar import PlanarRSD, source_of, waves_of
 from nlos.rsd.wall import PlanarWall, WallLattice
@@ -101,6 +101,7 @@ class PreparedField:
         self.grid, self.library = grid, Library(capture.place)
         self.settings = method.settings
         self._band = unfolded_band(capture, grid, method.pulse)
+        self._analysis = Analysis(self._band, capture.axis.bins, self.library)
         if isinstance(method, PlanarRSD):
             self._routes = [self._planar(method, capture, part) for part in exposures(capture)]
         else:
@@ -120,7 +121,7 @@ class PreparedField:
         way = Diffraction(wall.plane, self.grid, waves_of(part, self._band, continued=False), method.tolerance)
 
         def onto(one: Capture) -> Array:
-            return _on_wall(wall.lattice, exposed_phasors(one, part, self._band), self.library)
+            return _on_wall(wall.lattice, self._analysis.of(exposed(one, part)), self.library)
 
         return _Route(onto, PortableDiffraction(way, source_of(part, self._band), self.library))
 
@@ -130,7 +131,7 @@ class PreparedField:
         carrying = WallToPlane(points, way.plane, waves, tolerance, self.library)
 
         def onto(one: Capture) -> Array:
-            return area * carrying.field(exposed_phasors(one, part, self._band))
+            return area * carrying.field(self._analysis.of(exposed(one, part)))
 
         return _Route(onto, PortableDiffraction(way, source_of(part, self._band), self.library))
 

@@ -12,8 +12,8 @@ from nlos.band import Band
 from nlos.capture import Capture
 from nlos.exposure import Exposure
 from nlos.plane import Plane
-from nlos.portable.library import CHUNK_BYTES, Library
-from nlos.portable.signals import exposed_phasors, on_lattice
+from nlos.portable.library import Library
+from nlos.portable.signals import Analysis, exposed, on_lattice
 from nlos.propagation.kernels import NEAREST
 from nlos.propagation.passage import Passage
 from nlos.propagation.plane_field import PlaneField
@@ -30,8 +30,10 @@ FloatArray = NDArray[np.float64]
 def carried_elsewhere(capture: Capture, part: Exposure, plane: Plane, band: Band, tolerance: float) -> PlaneField:
     """Carry one exposure of a capture onto a plane where its signal lives; see `nlos.propagate`."""
     waves, points = waves_of(part, band, continued=False), capture.points[part.members]
-    carrying = WallToPlane(points, plane, waves, tolerance, Library(capture.place))
-    return PlaneField(carrying.field(exposed_phasors(capture, part, band)), plane, part.passes * band.wavenumbers)
+    library = Library(capture.place)
+    phasors = Analysis(band, capture.axis.bins, library).of(exposed(capture, part))
+    field = WallToPlane(points, plane, waves, tolerance, library).field(phasors)
+    return PlaneField(field, plane, part.passes * band.wavenumbers)
 
 
 class WallToPlane:
@@ -42,7 +44,7 @@ class WallToPlane:
     come; they stay for later ones, so that a sequence of like signals is planned once.
 
     Memory beyond phasors and result: for the terms, some 8 bytes per wall point, term and six frequencies (20 MB for
-    128 x 128 points and 120 frequencies); and some 400 MB for what is treated together.
+    128 x 128 points and 120 frequencies); and four chunks (`Library.chunk_bytes`) for what is treated together.
 
     Parameters
     ----------
@@ -131,7 +133,7 @@ class _Layered:
             count = len(terms.over_points)
             over_nodes = terms.over_waves[..., :count] + 1j * terms.over_waves[..., count : 2 * count]
             over_points = put(terms.over_points)
-            for some in blocks(len(over_nodes), max(1, CHUNK_BYTES // (8 * count * rows * columns))):
+            for some in blocks(len(over_nodes), max(1, self.library.chunk_bytes // (8 * count * rows * columns))):
                 frequencies = slice(together.start + some.start, together.start + some.stop)
                 groups.append(_Group(frequencies, over_points, put(over_nodes[some])))
         return groups
@@ -210,7 +212,7 @@ class _Direct:
         padded = xp.reshape(xp.concat([phasors, missing], axis=1), (sources, coarse, fine))
         targets = self._targets.shape[1]
         field = self.library.zeros((targets, coarse * fine))
-        for some in blocks(targets, max(1, CHUNK_BYTES // (8 * sources * coarse * fine))):
+        for some in blocks(targets, max(1, self.library.chunk_bytes // (8 * sources * coarse * fine))):
             field[some, :] = xp.reshape(self._summed(some, padded), (-1, coarse * fine))
         return xp.reshape(field[:, : self.count], (*self.shape, self.count))
 

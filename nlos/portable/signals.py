@@ -15,20 +15,30 @@ from nlos.rsd.wall import WallLattice
 from tofclip.arrays import Array
 
 
-def exposed_phasors(capture: Capture, part: Exposure, band: Band) -> Array:
-    """Return the phasors (points, frequencies) of one exposure's members, complex64; see `nlos.band.Band.phasors`.
+class Analysis:
+    """The Fourier transform of signals at a band's frequencies, as a matrix that is kept where the signals live.
 
-    One matrix product; memory for the members' signals and for the phasors twice.
+    Parameters
+    ----------
+    band : Band
+    bins : int
+        Of the signals; a band may have been made for a longer record.
+    library : Library
     """
-    library, xp = Library.of(capture.signal), Library.of(capture.signal).xp
-    return phasors(library, xp.permute_dims(_in_time(capture, part.members), (1, 0)), band)
+
+    def __init__(self, band: Band, bins: int, library: Library) -> None:
+        paths = band.axis.start + band.axis.spacing * np.arange(bins)
+        waves = band.weights * np.exp(-1j * np.outer(paths, band.wavenumbers))
+        self._library, self._real, self._imaginary = library, library.put(waves.real), library.put(waves.imag)
+
+    def of(self, traces: Array) -> Array:
+        """Return the phasors (points, frequencies) of signals (points, t); see `nlos.band.Band.phasors`."""
+        return self._library.joined(traces @ self._real, traces @ self._imaginary)
 
 
-def phasors(library: Library, traces: Array, band: Band) -> Array:
-    """Return the phasors (points, frequencies) of signals (points, t)."""
-    paths = band.axis.start + band.axis.spacing * np.arange(traces.shape[1])
-    waves = band.weights * np.exp(-1j * np.outer(paths, band.wavenumbers))
-    return library.joined(traces @ library.put(waves.real), traces @ library.put(waves.imag))
+def exposed(capture: Capture, part: Exposure) -> Array:
+    """Return the signals (points, t) of one exposure's members."""
+    return Library.of(capture.signal).xp.permute_dims(_in_time(capture, part.members), (1, 0))
 
 
 def traces_of(capture: Capture, some: slice) -> Array:

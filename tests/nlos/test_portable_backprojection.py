@@ -10,6 +10,8 @@ from relay_walls import AXIS, HIDDEN, JITTER, curved_wall, lasers_for
 import nlos.portable.backprojection
 from nlos import Backprojection, Capture, Grid
 from nlos.backprojection import Weighting
+from nlos.portable.backprojection import PAIR_BYTES
+from nlos.portable.library import Library
 from nlos.simulate import PointScene
 from tofclip.arrays import to_numpy
 
@@ -66,7 +68,7 @@ def test_pieces_make_up_the_whole_and_progress_counts_them(laser: str, monkeypat
     counted: list[int] = []
     for table, pairs in ((1 << 20, 40), (1, 1 << 20), (1 << 20, 1)):
         monkeypatch.setattr(nlos.portable.backprojection, "TABLE_BYTES", table)
-        monkeypatch.setattr(nlos.portable.backprojection, "PAIRS", pairs)
+        monkeypatch.setattr(Library, "chunk_bytes", pairs * PAIR_BYTES)
         counted.clear()
         found = METHOD.phasor_field(capture, Grid(GRID.x, GRID.y, GRID.z[1:2]), counted.append).values
         assert relative_error(found, whole[1:2]) < 1e-6

@@ -7,8 +7,8 @@ import pytest
 from portable_libraries import LIBRARIES, place_of, relative_error
 from scene_shapes import shaped_capture, shaped_wall
 
-import nlos.portable.propagation
 from nlos import Capture, Grid, Hybrid, PreparedImaging, propagate
+from nlos.portable.library import Library
 from nlos.propagation.passage import Passage
 from tofclip.arrays import Place, to_numpy
 from tofclip.errors import InputError
@@ -73,7 +73,7 @@ def test_little_memory_means_smaller_pieces(by_transforms: None, monkeypatch: py
     capture = scene("wavy").on(place_of("array_api_strict"))
     plane = METHOD.virtual_plane(capture, GRID)
     whole = propagate(capture, plane, METHOD.pulse).values
-    monkeypatch.setattr(nlos.portable.propagation, "CHUNK_BYTES", 1 << 16)
+    monkeypatch.setattr(Library, "chunk_bytes", 1 << 16)
     assert relative_error(propagate(capture, plane, METHOD.pulse).values, to_numpy(whole)) < 1e-6
 
 

@@ -22,6 +22,7 @@ from nlos import (
     TransientImaging,
     Volume,
 )
+from nlos.portable.library import Library
 from nlos.simulate import PointScene
 from nlos.time_axis import TimeAxis
 from tofclip.arrays import Place
@@ -106,7 +107,7 @@ def test_few_voxels_and_a_laser_beside_the_grid(library: str) -> None:
 def test_depths_may_be_treated_one_by_one_and_planned_anew(kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
     capture = scene("single").on(place_of("array_api_strict"))
     whole = METHOD.reconstruct(capture, GRID)
-    monkeypatch.setattr(nlos.portable.diffraction, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(Library, "chunk_bytes", 1)
     monkeypatch.setattr(nlos.portable.diffraction, "KEPT_BYTES", kept)
     counted: list[int] = []
     prepared = PreparedImaging(METHOD, capture, GRID)
