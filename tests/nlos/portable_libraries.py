@@ -1,7 +1,11 @@
-"""Libraries other than NumPy that the tests of portable imaging put captures into."""
+"""Libraries other than NumPy that the tests of portable imaging put captures into.
+
+Where there is a graphics processor, ``TOFCLIP_TEST_DEVICES=cuda pytest tests/nlos -k portable`` tests it as well.
+"""
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -9,15 +13,16 @@ import pytest
 
 from tofclip.arrays import Place, place_named, to_numpy
 
-LIBRARIES = ("torch", "array_api_strict")
+LIBRARIES = ("torch", "array_api_strict", *os.environ.get("TOFCLIP_TEST_DEVICES", "").split())
 
 
 def place_of(library: str) -> Place:
-    """Return the library's processor; skip the test where the library is not installed."""
-    module = pytest.importorskip(library)
+    """Return a library's processor, or the device of that name; skip the test where the library is not installed."""
     if library == "array_api_strict":
-        return Place.of(module.asarray([0.0]))
-    module.set_num_threads(1)  # waking others up takes longer than what there is to do
+        return Place.of(pytest.importorskip(library).asarray([0.0]))
+    if library != "torch":
+        return place_named(library)
+    pytest.importorskip(library).set_num_threads(1)  # waking others up takes longer than what there is to do
     return place_named("torch:cpu")
 
 
