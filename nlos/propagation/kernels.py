@@ -12,13 +12,16 @@ from nlos.rsd.kernels import TAPS
 
 compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "reassoc", "arcp"}, error_model="numpy")
 
-ONE, NEXT = np.float32(1), np.uint64(1)
+NEXT = np.uint64(1)
 
 LANES = 64
 """Points of the plane treated together: four full vectors of 512 bits."""
 
 STEPS = 8
 """Frequencies for which a wave stays in registers."""
+
+FACTORS = 16
+"""float32 factors in a vector of 512 bits."""
 
 NEAREST = 1e-3
 """Distance in m below which 1 / distance stops growing."""
@@ -126,7 +129,7 @@ def _add_shifted(signal, now, later, total):
 
 
 @compiled
-def join_terms(spectra, over_nodes, spacing, reach, shift_x, shift_y, cell_x, cell_y, joined):
+def join_terms(spectra, over_nodes, node, share, reach, shift_x, shift_y, cell_x, cell_y, joined):
     """Add ``sum_m factor_m(q) * spectra[m]``, moved by an offset in space, to the plane waves of a flat spectrum.
 
     The factors depend on the lateral wavenumber alone and are interpolated once for a column and its mirror image.
@@ -137,8 +140,10 @@ def join_terms(spectra, over_nodes, spacing, reach, shift_x, shift_y, cell_x, ce
         Real and imaginary parts in turns; columns and rows in the order of Fourier transforms.
     over_nodes : (nodes, n) float32 array
         Factors at the nodes: the real parts of all m terms, then the imaginary parts, then anything.
-    spacing : (2,) float64 array
-        Distance of neighbouring waves along x and y, in nodes.
+    node : (columns, rows) int64 array
+        First node about every wave whose indices are not negative.
+    share : (columns, rows, taps) float32 array
+        Weights of the nodes from it on.
     reach : (some columns,) int64 array
         Largest index along y that counts in every column from 0 on.
     shift_x, shift_y : complex64 array
@@ -153,7 +158,7 @@ def join_terms(spectra, over_nodes, spacing, reach, shift_x, shift_y, cell_x, ce
     line = np.empty(2 * shift_y.size, np.float32)
     for column in range(reach.size):
         tall = reach[column]
-        _interpolate_factors(over_nodes, column * spacing[0], spacing[1], tall, 2 * spectra.shape[0], factors)
+        _interpolate_factors(over_nodes, node[column], share[column], tall, 2 * spectra.shape[0], factors)
         for x in range(-column, column + 1, max(1, 2 * column)):
             _add_terms(spectra, x % spectra.shape[1], factors, tall, line)
             along, to = shift_x[shift_x.size // 2 + x], cell_x[cell_x.size // 2 + x]
@@ -162,30 +167,28 @@ def join_terms(spectra, over_nodes, spacing, reach, shift_x, shift_y, cell_x, ce
 
 
 @compiled
-def _interpolate_factors(over_nodes, across, spacing, tall, wanted, factors):
-    """Interpolate the factors of a column from index 0 to `tall` between six nodes (Lagrange), and mirror them."""
-    count, middle = np.uint64(over_nodes.shape[1]), factors.shape[1] // 2
-    flat, sums = over_nodes.reshape(-1), np.empty(over_nodes.shape[1], np.float32)
-    for row in range(tall + 1):
-        place = math.sqrt(across * across + (row * spacing) ** 2) + TAPS // 2
-        first = int(place) - TAPS // 2 + 1
-        t0 = np.float32(place - first)
-        t1, t2, t3, t4, t5 = t0 - ONE, t0 - 2 * ONE, t0 - 3 * ONE, t0 - 4 * ONE, t0 - 5 * ONE
-        near, far, middle_two = t0 * t1, t4 * t5, t2 * t3
-        a0, a5 = t1 * middle_two * far / np.float32(-120), near * middle_two * t4 / np.float32(120)
-        a1, a4 = t0 * middle_two * far / np.float32(24), near * middle_two * t5 / np.float32(-24)
-        a2, a3 = near * t3 * far / np.float32(-12), near * t2 * far / np.float32(12)
-        n0 = np.uint64(first) * count
-        n1, n2 = n0 + count, n0 + np.uint64(2) * count
-        n3, n4, n5 = n2 + count, n2 + np.uint64(2) * count, n2 + np.uint64(3) * count
-        for m in range(count):
-            early = a0 * flat[n0 + m] + a1 * flat[n1 + m] + a2 * flat[n2 + m]
-            sums[m] = early + a3 * flat[n3 + m] + a4 * flat[n4 + m] + a5 * flat[n5 + m]
-        for m in range(wanted):
-            factors[m, middle + row] = sums[m]
-    for m in range(wanted):
-        for row in range(1, tall + 1):
-            factors[m, middle - row] = factors[m, middle + row]
+def _interpolate_factors(over_nodes, node, share, tall, wanted, factors):
+    """Interpolate the factors of a column from index 0 to `tall` between the nodes, and mirror them."""
+    count, wide, lanes = over_nodes.shape[1], factors.shape[1], np.uint64(FACTORS)
+    flat, shares, mirrored = over_nodes.reshape(-1), share.reshape(-1), factors.reshape(-1)
+    square = np.empty(FACTORS * FACTORS, np.float32)
+    for start in range(0, tall + 1, FACTORS):
+        rows = min(FACTORS, tall + 1 - start)
+        for m in range(0, wanted, FACTORS):
+            for row in range(rows):
+                of, weights = np.uint64(node[start + row] * count + m), np.uint64((start + row) * TAPS)
+                for lane in range(lanes):
+                    total = np.float32(0)
+                    for tap in range(np.uint64(TAPS)):
+                        total += shares[weights + tap] * flat[of + tap * np.uint64(count) + lane]
+                    square[np.uint64(row) * lanes + lane] = total
+            for lane in range(min(FACTORS, wanted - m)):
+                middle = (m + lane) * wide + wide // 2
+                after, before = np.uint64(middle + start), np.uint64(middle - start - rows + 1)
+                for row in range(np.uint64(rows)):
+                    mirrored[after + row] = square[row * lanes + np.uint64(lane)]
+                for row in range(np.uint64(rows)):
+                    mirrored[before + row] = square[(np.uint64(rows - 1) - row) * lanes + np.uint64(lane)]
 
 
 @compiled

@@ -34,13 +34,14 @@ def layered_sum(passage: Passage, phasors: NDArray[np.complex64]) -> NDArray[np.
     relief = passage.relief
     with one_thread():
         most = max(relief.counts)
-        _ = passage.shifts
+        _ = passage.shifts, passage.between_nodes
         spare: list[_Bench] = []
 
         def work(some: slice) -> None:
             bench = spare.pop() if spare else _Bench(passage, most)
             for number in range(some.start, some.stop):
-                bench.carry(number, phasors, field)
+                # High frequencies have most waves: with these first, threads end together.
+                bench.carry(len(relief.groups) - 1 - number, phasors, field)
             spare.append(bench)
 
         run_blocks(work, len(relief.groups), size=1)
@@ -56,7 +57,6 @@ class _Bench:
         column, row = np.meshgrid(*(np.arange(-n, n + 1) for n in passage.reach[::-1]), indexing="ij")
         self.inverse = inverse((row, column), passage.plane_lattice, passage.plane.shape, 1)
         self.cells = self.inverse.cell[:, 0], self.inverse.cell[0] - self.inverse.cell[0, 0]
-        self.spacing = np.array(passage.steps[::-1]) / passage.relief.transfer.node_step
 
     def carry(self, number: int, phasors: NDArray[np.complex64], field: NDArray[np.complex64]) -> None:
         """Carry one group of frequencies."""
@@ -70,6 +70,7 @@ class _Bench:
             spectra = self.analysis.spectra(values[i], terms.over_points, reach.size - 1)
             spectrum[:] = 0
             parts = spectra.view(np.float32)
-            join_terms(parts, terms.over_waves[i], self.spacing, reach, shift_x, shift_y, *self.cells, spectrum)
+            over_waves = terms.over_waves[i], *passage.between_nodes
+            join_terms(parts, *over_waves, reach, shift_x, shift_y, *self.cells, spectrum)
             self.inverse.transform(slice(0, 1))
             np.multiply(self.inverse.images[0], self.inverse.carrier, out=field[frequency])

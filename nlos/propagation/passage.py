@@ -156,6 +156,18 @@ class Passage:
         return rows
 
     @cached_property
+    def between_nodes(self) -> tuple[IntArray, NDArray[np.float32]]:
+        """Where waves without negative indices lie among the nodes of the transfer functions.
+
+        First node (columns, rows) and the weights (columns, rows, taps) of those from it on.
+        """
+        y, x = (spacing * np.arange(reach + 1) for spacing, reach in zip(self.steps, self.reach, strict=True))
+        lateral = np.hypot(x[:, np.newaxis], y)
+        # The corners beyond the limit are not looked at; the table ends before them.
+        node, share = self.relief.transfer.interpolation(np.minimum(lateral, self.limits[-1]).ravel())
+        return node.reshape(lateral.shape), share.reshape(*lateral.shape, -1)
+
+    @cached_property
     def shifts(self) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
         """Plane waves along y and x at the plane's first point, 0 at the wall's; divided by the lattice's period."""
         y, x = (

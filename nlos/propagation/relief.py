@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.rsd.transfer import Transfer
+from nlos.propagation.kernels import FACTORS
+from nlos.rsd.transfer import OVERSAMPLING, Transfer
 from tofclip.threads import blocks, run_blocks
 
 FloatArray = NDArray[np.float64]
@@ -24,9 +25,6 @@ FLAT = 1e-5
 
 CARRIER = 0.4
 """Wavenumber along z, relative to the band's highest, about which the waves vary least with depth."""
-
-LANES = 16
-"""float32 numbers in a vector of 512 bits."""
 
 RESOLVED = 1e-10
 """Combinations of depths that hold less than this share of the wall points are none."""
@@ -138,9 +136,10 @@ class Relief:
 
     def _energy(self, group: slice) -> tuple[FloatArray, NDArray[np.complex64]]:
         """Energies, increasing, and combinations of `_shapes` (n, n) that carry them."""
-        lateral = np.maximum(self.transfer.nodes, 0)[:, np.newaxis]
+        # The nodes are closer than energies need.
+        lateral = np.maximum(self.transfer.nodes[:: int(OVERSAMPLING)], 0)[:, np.newaxis]
         weights = np.sqrt(lateral * (lateral <= self.limits[group])) * self.strength[group]
-        weighted = self._table[..., group] * weights.astype(np.float32)
+        weighted = self._table[:, :: int(OVERSAMPLING), group] * weights.astype(np.float32)
         flat = weighted.reshape(len(weighted), -1)
         values, vectors = np.linalg.eigh(flat.conj() @ flat.T)
         return np.maximum(values, 0).astype(np.float64), vectors
@@ -172,7 +171,7 @@ class Relief:
         terms = kept.shape[1]
         over_waves = (kept.T @ table.reshape(len(table), -1)).reshape(terms, *table.shape[1:]).T
         # Padded to whole vectors.
-        parts = np.zeros((*over_waves.shape[:-1], -(-2 * terms // LANES) * LANES), np.float32)
+        parts = np.zeros((*over_waves.shape[:-1], -(-2 * terms // FACTORS) * FACTORS), np.float32)
         parts[..., :terms], parts[..., terms : 2 * terms] = over_waves.real, over_waves.imag
         return Terms(parts, kept.conj().T @ self._shapes[1])
 
