@@ -5,7 +5,18 @@ import numpy as np
 import pytest
 
 from tofclip import arrays
-from tofclip.arrays import InEachPlace, Place, as_type, is_numpy, namespace, place_named, require_numpy, to_numpy, zeros
+from tofclip.arrays import (
+    InEachPlace,
+    Place,
+    as_type,
+    is_numpy,
+    namespace,
+    number,
+    place_named,
+    require_numpy,
+    to_numpy,
+    zeros,
+)
 from tofclip.errors import InputError, MissingDependencyError
 
 VALUES = np.arange(6, dtype=np.float32).reshape(2, 3)
@@ -90,6 +101,14 @@ def test_zeros_are_like_what_they_are_for(place):
         assert Place.of(nothing) == Place.of(like)
         assert to_numpy(nothing).dtype == VALUES.dtype
         np.testing.assert_array_equal(to_numpy(nothing), [[0], [0]])
+
+
+def test_numbers_are_like_what_they_are_for(place):
+    for like in (VALUES, place.put(VALUES)):
+        there = number(1.5, like)
+        assert Place.of(there).library == Place.of(like).library
+        assert (to_numpy(there).dtype, float(there)) == (VALUES.dtype, 1.5)
+        np.testing.assert_array_equal(to_numpy(namespace(like).minimum(like, there)), np.minimum(VALUES, 1.5))
 
 
 def test_what_is_set_up_in_a_place_is_set_up_once(place):

@@ -97,6 +97,11 @@ def zeros(shape: tuple[int, ...], like: Array) -> Array:
     return namespace(like).zeros(shape, dtype=like.dtype, device=device_of(like))
 
 
+def number(value: float, like: Array) -> Array:
+    """Return a number of the type of `like`, where `like` is: for functions that not every library has for Python's."""
+    return like.dtype.type(value) if is_numpy(like) else zeros((), like) + value
+
+
 def require_numpy(what: str, *arrays: Array) -> None:
     """Refuse arrays of other libraries.
 

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from tofclip.arrays import Array, Place, namespace
+from tofclip.arrays import Array, Place, namespace, number
 from tofclip.errors import InputError, ShapeError
 from tofclip.recovery.loops import loops_for
 
@@ -92,7 +92,7 @@ class Huber(DataTerm):
         if not (np.isfinite(threshold) and threshold > 0):
             raise InputError(f"Huber's threshold must be positive, got {threshold}")
         super().__init__(readings, good)
-        self.threshold = threshold
+        self.threshold = number(threshold, readings)
 
     def value(self, predicted: Array) -> Array:
         xp = namespace(predicted)
@@ -132,15 +132,16 @@ class Poisson(DataTerm):
         self.deviation = namespace(readings).astype(beside, readings.dtype)[:, None]
         self._counted = readings * self.deviation
         self._knee = self.deviation**2 / 2
+        self._nothing = number(0.0, readings)
 
     def value(self, predicted: Array) -> Array:
         xp = namespace(predicted)
         expected = predicted * self.deviation
         base = xp.maximum(expected, self._knee)
-        short = xp.minimum(expected - self._knee, 0)
+        short = xp.minimum(expected - self._knee, self._nothing)
         loss = base - self._counted * xp.log(base)
         loss += (1 - self._counted / self._knee) * short + self._counted / self._knee**2 * short**2 / 2
-        best = self._counted - self._counted * xp.log(xp.maximum(self._counted, 1e-30))
+        best = self._counted - self._counted * xp.log(xp.maximum(self._counted, number(1e-30, self._counted)))
         return xp.sum(self._masked(loss - best), axis=0, dtype=xp.float64) / self.CURVATURE
 
     def weights(self, predicted: Array) -> Array:
@@ -152,7 +153,7 @@ class Poisson(DataTerm):
         expected = predicted * self.deviation
         base = xp.maximum(expected, self._knee)
         slope = 1 - self._counted / base
-        slope += self._counted / self._knee**2 * xp.minimum(expected - self._knee, 0)
+        slope += self._counted / self._knee**2 * xp.minimum(expected - self._knee, self._nothing)
         return self._masked(self.deviation / self.CURVATURE * slope)
 
 

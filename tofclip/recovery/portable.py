@@ -15,7 +15,7 @@ class PortableLoops:
         xp = namespace(current)
         noisy = self.descended(current, previous, momentum, gradient, step)
         noisy -= threshold
-        result = xp.clip(noisy, min=0)
+        result = xp.clip(noisy, min=0.0)
         pixels = tuple(range(result.ndim - 1))
         return result, xp.sum(result, axis=pixels, dtype=xp.float64)
 
@@ -63,7 +63,7 @@ def _primal(noisy: Array, dual: Array, weight: float) -> Array:
     divergence -= xp.roll(across, 1, axis=1)
     divergence *= weight
     divergence += noisy
-    return xp.clip(divergence, min=0)
+    return xp.clip(divergence, min=0.0)
 
 
 def _differences(picture: Array) -> Array:
@@ -78,4 +78,4 @@ def _projected(dual: Array) -> Array:
     """Return `dual` projected onto vectors of length at most 1."""
     xp = namespace(dual)
     length = xp.sqrt(xp.sum(dual * dual, axis=0))
-    return dual / xp.clip(length, min=1)
+    return dual / xp.clip(length, min=1.0)

@@ -159,5 +159,5 @@ def _sum_and_deviation(
     leverage = pulse * pulse / energy + across * across / across_energy
     unfitted = xp.sum(height * pulse * (1 - leverage), axis=0)
     weighted = xp.sum(across * across * height * pulse, axis=0)
-    dispersion = xp.clip(misfit, min=0) / xp.maximum(unfitted, 1e-3 * total)
+    dispersion = xp.clip(misfit, min=0.0) / xp.maximum(unfitted, 1e-3 * total)
     return total, xp.sqrt(noise**2 * across_energy + dispersion * weighted) / (across_energy * height)

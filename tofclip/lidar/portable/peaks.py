@@ -66,7 +66,7 @@ class Level:
     def noise(self) -> Array:
         """Standard deviation, (pixels,)."""
         xp, mean = namespace(self.total), self.total / self.left
-        return xp.sqrt(xp.clip(self.square / self.left - mean * mean, min=0))
+        return xp.sqrt(xp.clip(self.square / self.left - mean * mean, min=0.0))
 
     def without(self, values: Array, free: Array, chosen: Array) -> Level:
         """Return the level of the `chosen` pixels less those of some values that were `free`, (bins, pixels) both."""
@@ -164,7 +164,7 @@ class PeakSearch:
         """Response of the matched filter at the bins `best` to what exceeds the background; never below zero."""
         weights = looked_up(self._tables.beside(response)[1], best)
         exceeding = picked(response, best) - (level.background - level.offset) * weights
-        return namespace(response).clip(exceeding, min=0)
+        return namespace(response).clip(exceeding, min=0.0)
 
     def _judged(self, centred: Array, response: Array, level: Level, found: list[tuple[Array, Array]]) -> Peaks:
         """Keep what the matched filter confirms, now that background and noise are known; sort by time."""
@@ -181,7 +181,7 @@ class PeakSearch:
         needed = xp.max(xp.where(active, self._share * weighed, 0), axis=0)
         kept = active & (strength > self._detection.signal_to_noise * level.noise) & (weighed >= needed)
         arrival = xp.stack([self._top(response, bins[k, :], strength[k, :], level) for k in rows])
-        height = xp.clip(picked(centred, bins) - (level.background - level.offset), min=0)
+        height = xp.clip(picked(centred, bins) - (level.background - level.offset), min=0.0)
         return Peaks(arrival, xp.where(kept, height, 0), kept, level.background, level.noise)
 
     def _top(self, response: Array, best: Array, here: Array, level: Level) -> Array:
