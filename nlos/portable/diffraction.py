@@ -60,7 +60,7 @@ class PortableDiffraction:
     Holding one is the cache: the second field of the same geometry needs no planning. Transfer functions and
     illuminations of all depths are kept up to 1 GiB (50 MB for 128 depths, 120 frequencies and 400 nodes), beyond that
     made anew for every field. Memory besides: four chunks (`Library.chunk_bytes`) for the depths that are treated
-    together, and at least 40 bytes per plane wave and frequency.
+    together, and at least 60 bytes per plane wave and frequency.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ class PortableDiffraction:
         """1 / area of a period, or 0 where a wave is left out at a frequency, shape (waves, frequencies)."""
         waves = self.way.plane_waves
         counted = waves.lateral[:, np.newaxis] <= waves.limits
-        return self.library.put(counted / np.prod(waves.period))
+        return self.library.put(counted.astype(np.float32) / np.float32(np.prod(waves.period)))
 
     @cached_property
     def _cell(self) -> Array:
