@@ -27,8 +27,8 @@ REAL_TYPES = (np.dtype(np.float32), np.dtype(np.float64))
 class LinearOperator(ABC):
     """A linear map between real arrays of fixed shapes.
 
-    Subclasses write `_forward` and `_adjoint`, which get a contiguous block of the operator's own type with the batch
-    as last axis, and return one.
+    Subclasses write `_forward` and `_adjoint`, which get a block of the operator's own type with the batch as last
+    axis, and return one: of NumPy's arrays a contiguous one, and of other libraries' only what says it is `portable`.
 
     Parameters
     ----------

@@ -97,13 +97,11 @@ class PeakSearch:
     def __init__(self, times: FloatArray, filters: Filters, pulse: Pulse, detection: Detection) -> None:
         (_, scale), self._detection = pulse.table(), detection
         claimed = [np.searchsorted(times, times + reach) for reach in scale[2:]]
-        near = np.abs(times[:, np.newaxis] - times) < pulse.fwhm  # as rounding has it: bins are often just so far apart
-        distances = [np.argmax(near, axis=1), times.size - np.argmax(near[:, ::-1], axis=1)]
         self._widest = max(1, int((claimed[1] - claimed[0]).max()))
         self._bins, self._last_time = times.size, float(times[-1])
         self._gains = [float(one.sum(axis=0).max()) for one in filters]
         self._sharp, self._matched = (InEachPlace(partial(_banded_product, one)) for one in filters)
-        tables = [times, filters[1].sum(axis=0, dtype=np.float64), *claimed, *distances]
+        tables = [times, filters[1].sum(axis=0, dtype=np.float64), *claimed, *_neighbourhoods(times, pulse.fwhm)]
         self._tables = InEachPlace(lambda place: [place.put(table) for table in tables])
 
     def peaks(self, traces: Array) -> Peaks:
@@ -203,6 +201,18 @@ def _level(centred: Array, offset: Array) -> Level:
     total = xp.sum(centred, axis=0, dtype=xp.float64)
     square = xp.sum(centred * centred, axis=0, dtype=xp.float64)
     return Level(offset, total, square, 0 * total + centred.shape[0])
+
+
+def _neighbourhoods(times: FloatArray, distance: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First bin that is less than `distance` from each bin, and the one after the last.
+
+    Bins are often just so far apart; what then is less is for the rounding of their difference to say, as in the
+    compiled loops, and not for that of a sum with the distance.
+    """
+    first, last = np.searchsorted(times, times - distance), np.searchsorted(times, times + distance, side="right")
+    first += times - times[first] >= distance
+    last -= times[last - 1] - times >= distance
+    return first, last
 
 
 def _banded_product(filters: NDArray[np.float32], place: Place) -> Product:
