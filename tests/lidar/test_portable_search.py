@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from array_places import PLACES, place_called
 
 from tofclip.arrays import Place, to_numpy
 from tofclip.camera import Camera
@@ -27,12 +28,9 @@ ARRIVAL_BINS = 5e-3
 USUAL_BINS = 1e-6
 
 
-@pytest.fixture(params=["array_api_strict", "torch"])
+@pytest.fixture(params=PLACES)
 def place(request):
-    library = pytest.importorskip(request.param, reason="only where it is installed")
-    if request.param == "torch":
-        library.set_num_threads(1)  # waking others up takes longer than what there is to do
-    return Place(request.param)
+    return place_called(request.param)
 
 
 def scene(bins: int = 150, side: int = 14, unevenness: float = 0.0, seed: int = 0) -> Frames:

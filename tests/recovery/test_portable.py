@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from array_places import PLACES, place_called
 
 from tofclip.arrays import Place, to_numpy
 from tofclip.errors import InputError, ShapeError
@@ -42,12 +43,9 @@ ROUNDING = {np.float32: 1e-5, np.float64: 1e-11}
 every_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
 
 
-@pytest.fixture(params=["array_api_strict", "torch"])
+@pytest.fixture(params=PLACES)
 def place(request):
-    library = pytest.importorskip(request.param, reason="only where it is installed")
-    if request.param == "torch":
-        library.set_num_threads(1)  # waking others up takes longer than what there is to do
-    return Place(request.param)
+    return place_called(request.param)
 
 
 def projection(dtype: type = np.float32) -> LineProjection:
