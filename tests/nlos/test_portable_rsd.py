@@ -10,6 +10,7 @@ from relay_walls import AXIS, HIDDEN, JITTER, planar_wall
 
 import nlos.portable.diffraction
 from nlos import (
+    Backprojection,
     Capture,
     FilteredBackprojection,
     FKMigration,
@@ -178,3 +179,16 @@ def test_methods_of_compiled_loops_refuse_in_one_line() -> None:
         assert "\n" not in reason
     with pytest.raises(InputError, match="works on NumPy arrays"):
         capture.traces()
+
+
+@pytest.mark.parametrize("method", [METHOD, Hybrid(0.4), Backprojection(0.15)])
+def test_pytorch_differentiates_through_it(method: PlanarRSD | Hybrid | Backprojection) -> None:
+    place_of("torch")
+    import torch
+
+    capture = scene("single")
+    signal = torch.tensor(capture.signal, requires_grad=True)
+    brightness = method.phasor_field(replace(capture, signal=signal), GRID).values[2, 4, 9].real
+    brightness.backward()
+    # The field is linear in the signal: its gradient, applied to the signal, is the field. Sums in single precision.
+    assert float(torch.sum(signal.grad * signal.detach())) == pytest.approx(float(brightness.detach()), rel=1e-3)
