@@ -45,8 +45,11 @@ def test_terms_of_relief_give_the_field_of_the_compiled_loops(shape: str, laser:
 
 @pytest.mark.parametrize("library", LIBRARIES)
 @pytest.mark.parametrize("laser", ["single", "confocal"])
-def test_direct_sums_give_the_field_of_the_compiled_loops(laser: str, library: str) -> None:
+def test_direct_sums_give_the_field_of_the_compiled_loops(
+    laser: str, library: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Scattered points stand above no lattice."""
+    monkeypatch.setattr(Passage, "quicker", False)
     capture = scene("relief", laser)
     wall = capture.wall.copy()
     wall[..., :2] += np.random.default_rng(1).uniform(-0.05, 0.05, (*wall.shape[:-1], 2))
