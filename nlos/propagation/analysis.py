@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,16 @@ if TYPE_CHECKING:
 
 COLUMNS_AT_A_TIME = 8
 """Plans for Fourier transforms of so many columns more."""
+
+
+class Analysis(Protocol):
+    """Sums ``sum_p values(p) * exp(-1j * q r_p)`` of several terms, on one thread."""
+
+    def spectra(
+        self, values: NDArray[np.complex64], weights: NDArray[np.complex64], reach: int
+    ) -> NDArray[np.complex64]:
+        """Analyse ``values * weights[m]`` up to an index along x, (terms, columns, rows); see `LatticeAnalysis`."""
+        ...
 
 
 class LatticeAnalysis:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.propagation.analysis import LatticeAnalysis
 from nlos.propagation.kernels import join_terms
 from nlos.propagation.passage import Passage
 from nlos.rsd.blas import one_thread
@@ -53,7 +52,7 @@ class _Bench:
 
     def __init__(self, passage: Passage, terms: int) -> None:
         self.passage = passage
-        self.analysis = LatticeAnalysis(passage.wall, passage.lattice, passage.reach[1], terms)
+        self.analysis = passage.analysis(terms)
         column, row = np.meshgrid(*(np.arange(-n, n + 1) for n in passage.reach[::-1]), indexing="ij")
         self.inverse = inverse((row, column), passage.plane_lattice, passage.plane.shape, 1)
         self.cells = self.inverse.cell[:, 0], self.inverse.cell[0] - self.inverse.cell[0, 0]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.plane import Plane, step
+from nlos.propagation.analysis import Analysis, LatticeAnalysis
 from nlos.propagation.relief import Relief
 from nlos.rsd.transfer import Transfer, Waves
 from nlos.rsd.wall import WallLattice
@@ -78,9 +79,18 @@ class Passage:
         """Whether Fourier transforms lead to the plane faster than a direct sum, and within the tolerance."""
         relief = float(np.ptp(self._distances))
         terms = 4 + (self.waves.first + self.waves.highest) / 2 * relief / (2 * np.pi)
-        layers = PREPARATION + self.waves.count * terms * (CALL + TRANSFORM * np.prod(self.lattice))
+        layers = PREPARATION + self.waves.count * terms * self.seconds_per_term
         direct = PRODUCT * self.waves.count * len(self.points) * np.prod(self.plane.shape)
         return self.tolerance >= FINEST and bool(layers < direct)
+
+    @property
+    def seconds_per_term(self) -> float:
+        """Roughly, on one core."""
+        return CALL + TRANSFORM * float(np.prod(self.lattice))
+
+    def analysis(self, terms: int) -> Analysis:
+        """Return what analyses a field on the wall, up to so many terms at once; not to be shared between threads."""
+        return LatticeAnalysis(self.wall, self.lattice, self.reach[1], terms)
 
     @cached_property
     def _distances(self) -> FloatArray:

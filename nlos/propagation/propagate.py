@@ -15,6 +15,7 @@ from nlos.propagation.direct import direct_sum
 from nlos.propagation.layered import layered_sum
 from nlos.propagation.passage import Passage
 from nlos.propagation.plane_field import PlaneField
+from nlos.propagation.scattered import ScatteredPassage, scattered_transforms
 from nlos.propagation.shift_and_sum import delayed_sum
 from nlos.rsd.planar import require_tolerance, waves_of
 from tofclip.arrays import is_numpy, require_numpy
@@ -49,7 +50,8 @@ def propagate(
         interpolation between bins.
     tolerance : float
         Relative error of the field that is allowed for the sake of speed, 1e-4 to 0.1; "spectral" only. Walls of many
-        points on an even lattice go by Fourier transforms, others by direct sums, good to 1e-5.
+        points go by Fourier transforms, those of scattered points if finufft is installed (``tofclip[scattered]``),
+        others by direct sums, good to 1e-5.
 
     Returns
     -------
@@ -88,7 +90,10 @@ def carried(
 
         return carried_elsewhere(capture, part, plane, band, tolerance)
     phasors = part.phasors(capture, band)
-    passage = Passage.of(points, plane, waves_of(part, band, continued=False), strength(phasors), tolerance)
+    way = points, plane, waves_of(part, band, continued=False), strength(phasors), tolerance
+    passage = Passage.of(*way)
+    if passage is None and scattered_transforms():
+        passage = ScatteredPassage.of(*way)
     if passage is not None and passage.quicker:
         return PlaneField(layered_sum(passage, phasors), plane, wavenumbers)
     return PlaneField(direct_sum(points, phasors, plane, wavenumbers), plane, wavenumbers)
