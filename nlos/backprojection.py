@@ -13,7 +13,7 @@ from nlos.band import Band, VirtualPulse, Waveforms
 from nlos.capture import Capture
 from nlos.geometry import FloatArray, Grid
 from nlos.kernels import add_backprojection
-from nlos.method import Progress, Support, common_support, silent
+from nlos.method import PhasorMethod, Progress, Support, common_support, silent
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
 from tofclip.arrays import is_numpy
@@ -53,7 +53,7 @@ class Weighting:
 
 
 @dataclass(frozen=True)
-class Backprojection:
+class Backprojection(PhasorMethod):
     """Point-wise back-projection with a virtual pulse: exact for every wall, laser and grid, slow.
 
     ``I(r) = | sum_p s_p(|r_L - r| + |r - r_p|) / |r - r_p| |`` with s_p the signal of wall point r_p, filtered with
@@ -98,29 +98,6 @@ class Backprojection:
     def lookups(self, capture: Capture, grid: Grid) -> int:
         """Number of look-ups that a reconstruction costs; what `progress` counts up to."""
         return len(capture.points) * grid.size
-
-    def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
-        """Image the hidden scene.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-        progress : callable, optional
-            Called with the number of look-ups just done.
-
-        Returns
-        -------
-        Volume
-            Brightness I(r), float32.
-
-        Raises
-        ------
-        InputError
-            `supports` says no.
-        """
-        complex_field = self.phasor_field(capture, grid, progress)
-        return Volume(abs(complex_field.values), grid, complex_field.provenance)
 
     def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in the signal."""

@@ -10,7 +10,7 @@ from nlos.band import VirtualPulse
 from nlos.capture import Capture
 from nlos.exposure import Exposure, exposure_support, exposures, unfolded_band
 from nlos.geometry import Grid
-from nlos.method import Progress, Support, common_support, numpy_support, silent
+from nlos.method import PhasorMethod, Portion, Progress, Support, common_support, numpy_support, silent
 from nlos.plane import Plane
 from nlos.propagation.plane_field import virtual_plane
 from nlos.propagation.propagate import Propagation, carried, require_propagation
@@ -28,12 +28,15 @@ ZONES, STRICT_ZONES = 2.0, 4.0
 PASSAGE_SHARE = 0.6
 """Of the error allowed, what the way from the wall to the plane may take."""
 
+PASSAGE_PROGRESS = {"spectral": 0.4, "time": 0.95}
+"""Of all time, what the way from the wall to the plane takes, roughly."""
+
 STRICT = 3e-3
 """Tolerance."""
 
 
 @dataclass(frozen=True)
-class Hybrid:
+class Hybrid(PhasorMethod):
     """The hybrid frequency-time solver: curved, disconnected and scattered walls at nearly the speed of planar ones.
 
     What the wall recorded is carried onto a virtual plane, on which it is the field of the same outgoing waves; from
@@ -92,29 +95,6 @@ class Hybrid:
             return Support(str(problem))
         return ways[0].supports()
 
-    def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
-        """Image the hidden scene.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-        progress : callable, optional
-            Called with the number of voxels just done, once for every laser spot.
-
-        Returns
-        -------
-        Volume
-            Brightness I(r), float32.
-
-        Raises
-        ------
-        InputError
-            `supports` says no.
-        """
-        complex_field = self.phasor_field(capture, grid, progress)
-        return Volume(abs(complex_field.values), grid, complex_field.provenance)
-
     def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; linear within the tolerance."""
         self.supports(capture, grid).require()
@@ -127,9 +107,13 @@ class Hybrid:
             total = prepared.of(capture, progress)
             return Volume(total, grid, {**capture.provenance, "imaging": prepared.settings})
         total = np.zeros(grid.shape, np.complex64)
+        passage = int(PASSAGE_PROGRESS[self.propagation] * grid.size)
         for part, way in self.ways(capture, grid):
-            on_plane = carried(capture, part, way.plane, band, self.propagation, PASSAGE_SHARE * self.tolerance).values
-            diffract(way, on_plane * np.float32(np.prod(way.plane.steps)), source_of(part, band), total, progress)
+            onto = Portion(progress, int(np.prod(way.plane.shape)) * way.waves.count, passage)
+            onwards = Portion(progress, grid.size, grid.size - passage)
+            tolerance = PASSAGE_SHARE * self.tolerance
+            on_plane = carried(capture, part, way.plane, band, self.propagation, tolerance, onto).values
+            diffract(way, on_plane * np.float32(np.prod(way.plane.steps)), source_of(part, band), total, onwards)
         return Volume(total, grid, {**capture.provenance, "imaging": {**self.settings, "plane_z_m": way.plane.z}})
 
     @property

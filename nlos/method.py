@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -24,6 +26,31 @@ VOXEL_BYTES = 12
 
 def silent(_: int) -> None:
     """Report nothing."""
+
+
+class Portion:
+    """Progress of one step of several, reported as a portion of all work; may be called from several threads.
+
+    Parameters
+    ----------
+    progress : callable
+        Of the whole.
+    work : int
+        What the step counts up to.
+    portion : int
+        What that is of the whole.
+    """
+
+    def __init__(self, progress: Progress, work: int, portion: int) -> None:
+        self._progress, self._work, self._portion = progress, work, portion
+        self._done, self._lock = 0, threading.Lock()
+
+    def __call__(self, done: int) -> None:
+        with self._lock:
+            before = self._done * self._portion // self._work
+            self._done += done
+            share = self._done * self._portion // self._work - before
+        self._progress(share)
 
 
 @dataclass(frozen=True)
@@ -57,6 +84,37 @@ class Reconstructor(Protocol):
     def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Image the hidden scene."""
         ...
+
+
+class PhasorMethod(ABC):
+    """A method whose image is the magnitude of a complex field."""
+
+    @abstractmethod
+    def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
+        """Return the complex sum whose magnitude `reconstruct` gives, complex64."""
+
+    def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
+        """Image the hidden scene.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+        progress : callable, optional
+            Called with the number of look-ups just done, or of voxels, once for every laser spot; see the method.
+
+        Returns
+        -------
+        Volume
+            Brightness I(r), float32.
+
+        Raises
+        ------
+        InputError
+            `supports` says no.
+        """
+        field = self.phasor_field(capture, grid, progress)
+        return Volume(abs(field.values), grid, field.provenance)
 
 
 def common_support(capture: Capture, grid: Grid) -> Support:

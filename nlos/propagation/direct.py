@@ -1,10 +1,11 @@
-"""From wall to plane at the band's frequencies: every wall point's spherical wave, summed."""
+"""From points to points at the band's frequencies: every one's spherical wave, summed."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos.method import Progress, silent
 from nlos.plane import Plane
 from nlos.propagation.kernels import LANES, STEPS, add_spherical_waves
 from tofclip.threads import run_blocks
@@ -16,36 +17,54 @@ LANES_AT_A_TIME = 4
 
 
 def direct_sum(
-    points: FloatArray, phasors: NDArray[np.complex64], plane: Plane, wavenumbers: FloatArray
+    points: FloatArray,
+    phasors: NDArray[np.complex64],
+    plane: Plane,
+    wavenumbers: FloatArray,
+    progress: Progress = silent,
 ) -> NDArray[np.complex64]:
-    """Return ``sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|`` on a plane, in float32.
+    """Return ``sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|`` on a plane, (y, x, frequencies) complex64.
 
-    Good to 1e-5 for walls of any shape and order; one complex product per pair of points and frequency. Memory for the
+    See `waves_at`.
+    """
+    return waves_at(plane.points.reshape(-1, 3), points, phasors, wavenumbers, progress).reshape(*plane.shape, -1)
+
+
+def waves_at(
+    targets: FloatArray,
+    sources: FloatArray,
+    phasors: NDArray[np.complex64],
+    wavenumbers: FloatArray,
+    progress: Progress = silent,
+) -> NDArray[np.complex64]:
+    """Return ``sum_s P_k(s) * exp(1j * k * |t - s|) / |t - s|`` at every target t, in float32.
+
+    Good to 1e-5 for points of any place and order; one complex product per pair of points and frequency. Memory for the
     result and a copy of the phasors.
 
     Parameters
     ----------
-    points : (n, 3) array
+    targets, sources : (m, 3), (n, 3) array
         m.
     phasors : (n, frequencies) complex64 array
-    plane : Plane
     wavenumbers : (frequencies,) array
         Evenly spaced, rad/m.
+    progress : callable, optional
+        Called with the number of values just done.
 
     Returns
     -------
-    (y, x, frequencies) complex64 array
+    (m, frequencies) complex64 array
     """
     frequencies = wavenumbers.size
     padded = -(-frequencies // STEPS) * STEPS
-    parts = np.zeros((len(points), 2 * padded), np.float32)
+    parts = np.zeros((len(sources), 2 * padded), np.float32)
     parts[:, : 2 * frequencies] = np.ascontiguousarray(phasors, np.complex64).view(np.float32)
-    targets = plane.points.reshape(-1, 3)
+    # Distances are what counts: near the middle of both, float32 coordinates have most digits.
+    middle = (sources.mean(axis=0) + targets.mean(axis=0)) / 2
     groups = -(-len(targets) // LANES)
-    lanes = np.resize(targets, (groups * LANES, 3)).reshape(groups, LANES, 3)
-    # Distances are what counts: near the middle, float32 coordinates have most digits.
-    middle = targets.mean(axis=0)
-    sources = (points - middle).astype(np.float32)
+    lanes = np.resize((targets - middle).astype(np.float32), (groups * LANES, 3)).reshape(groups, LANES, 3)
+    emitters = (sources - middle).astype(np.float32)
     field = np.empty((groups, LANES, frequencies), np.complex64)
     step = wavenumbers[1] - wavenumbers[0] if frequencies > 1 else 0.0
     turns, turns_on = np.float32(wavenumbers[0] / (2 * np.pi)), np.float32(step / (2 * np.pi))
@@ -53,10 +72,10 @@ def direct_sum(
     def work(some: slice) -> None:
         for group in range(some.start, some.stop):
             sums = np.zeros(padded * 2 * LANES, np.float32)
-            around = np.ascontiguousarray((lanes[group] - middle).T, np.float32).ravel()
-            add_spherical_waves(sources, parts, around, turns, turns_on, sums)
+            add_spherical_waves(emitters, parts, np.ascontiguousarray(lanes[group].T).ravel(), turns, turns_on, sums)
             real, imaginary = np.moveaxis(sums.reshape(padded, 2, LANES)[:frequencies], 1, 0)
             field[group].real, field[group].imag = real.T, imaginary.T
+        progress((min(some.stop * LANES, len(targets)) - some.start * LANES) * frequencies)
 
     run_blocks(work, groups, size=LANES_AT_A_TIME)
-    return field.reshape(-1, frequencies)[: len(targets)].reshape(*plane.shape, frequencies)
+    return field.reshape(-1, frequencies)[: len(targets)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos.method import Progress, silent
 from nlos.propagation.kernels import join_terms
 from nlos.propagation.passage import Passage
 from nlos.rsd.blas import one_thread
@@ -12,7 +13,7 @@ from nlos.rsd.inverse import inverse
 from tofclip.threads import run_blocks
 
 
-def layered_sum(passage: Passage, phasors: NDArray[np.complex64]) -> NDArray[np.complex64]:
+def layered_sum(passage: Passage, phasors: NDArray[np.complex64], progress: Progress = silent) -> NDArray[np.complex64]:
     """Return ``sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|`` on a plane, within the passage's tolerance.
 
     Per frequency some two to ten Fourier transforms of the wall, weighted by functions of its depth, and one back.
@@ -23,6 +24,8 @@ def layered_sum(passage: Passage, phasors: NDArray[np.complex64]) -> NDArray[np.
     ----------
     passage : Passage
     phasors : (n, frequencies) complex64 array
+    progress : callable, optional
+        Called with the number of values just done.
 
     Returns
     -------
@@ -40,7 +43,9 @@ def layered_sum(passage: Passage, phasors: NDArray[np.complex64]) -> NDArray[np.
             bench = spare.pop() if spare else _Bench(passage, most)
             for number in range(some.start, some.stop):
                 # High frequencies have most waves: with these first, threads end together.
-                bench.carry(len(relief.groups) - 1 - number, phasors, field)
+                group = len(relief.groups) - 1 - number
+                bench.carry(group, phasors, field)
+                progress(field[relief.groups[group]].size)
             spare.append(bench)
 
         run_blocks(work, len(relief.groups), size=1)

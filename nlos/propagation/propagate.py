@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
 from nlos.exposure import Exposure, exposures
+from nlos.method import Progress, silent
 from nlos.plane import Plane
 from nlos.propagation.direct import direct_sum
 from nlos.propagation.layered import layered_sum
@@ -70,9 +71,18 @@ def propagate(
 
 
 def carried(
-    capture: Capture, part: Exposure, plane: Plane, band: Band, propagation: Propagation, tolerance: float = 1e-2
+    capture: Capture,
+    part: Exposure,
+    plane: Plane,
+    band: Band,
+    propagation: Propagation,
+    tolerance: float = 1e-2,
+    progress: Progress = silent,
 ) -> PlaneField:
-    """Carry one exposure of a capture at a band's frequencies; see `propagate`."""
+    """Carry one exposure of a capture at a band's frequencies; see `propagate`.
+
+    Progress, which another library's arrays leave out, counts points of the plane times frequencies.
+    """
     require_propagation(propagation)
     points = capture.points[part.members]
     foremost = float(points[:, 2].max())
@@ -84,7 +94,7 @@ def carried(
     if propagation == "time":
         require_numpy("propagation in time", capture.signal)
         traces = np.ascontiguousarray(capture.traces()[part.members])
-        return PlaneField(delayed_sum(points, traces, plane, band, part.passes), plane, wavenumbers)
+        return PlaneField(delayed_sum(points, traces, plane, band, part.passes, progress), plane, wavenumbers)
     if not is_numpy(capture.signal):
         from nlos.portable.propagation import carried_elsewhere
 
@@ -95,8 +105,8 @@ def carried(
     if passage is None and scattered_transforms():
         passage = ScatteredPassage.of(*way)
     if passage is not None and passage.quicker:
-        return PlaneField(layered_sum(passage, phasors), plane, wavenumbers)
-    return PlaneField(direct_sum(points, phasors, plane, wavenumbers), plane, wavenumbers)
+        return PlaneField(layered_sum(passage, phasors, progress), plane, wavenumbers)
+    return PlaneField(direct_sum(points, phasors, plane, wavenumbers, progress), plane, wavenumbers)
 
 
 def strength(phasors: NDArray[np.complex64]) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.band import Band
+from nlos.method import Progress, silent
 from nlos.plane import Plane
 from nlos.propagation.kernels import shift_and_sum
 from tofclip.threads import run_blocks
@@ -16,7 +17,12 @@ POINTS_AT_A_TIME = 64
 
 
 def delayed_sum(
-    points: FloatArray, traces: NDArray[np.float32], plane: Plane, band: Band, passes: int
+    points: FloatArray,
+    traces: NDArray[np.float32],
+    plane: Plane,
+    band: Band,
+    passes: int,
+    progress: Progress = silent,
 ) -> NDArray[np.complex64]:
     """Return the band's phasors of transients carried onto a plane bin by bin.
 
@@ -35,6 +41,8 @@ def delayed_sum(
     band : Band
     passes : int
         How often light runs between wall and plane: 2 in a confocal scan.
+    progress : callable, optional
+        Called with the number of values just done.
 
     Returns
     -------
@@ -53,6 +61,7 @@ def delayed_sum(
         sums = np.zeros((some.stop - some.start, bins), np.float32)
         shift_and_sum(traces, points, targets[some], scale, float(latest), sums)
         field[some] = sums @ analysis
+        progress(field[some].size)
 
     run_blocks(work, len(targets), size=POINTS_AT_A_TIME)
     return field.reshape(*plane.shape, -1)

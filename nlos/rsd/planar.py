@@ -11,7 +11,7 @@ from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
 from nlos.exposure import Exposure, exposure_support, exposures, unfolded_band
 from nlos.geometry import Grid
-from nlos.method import Progress, Support, common_support, silent
+from nlos.method import PhasorMethod, Progress, Support, common_support, silent
 from nlos.plane import Plane, evenly_spaced
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.meeting import Source, diffract
@@ -24,7 +24,7 @@ from tofclip.errors import InputError
 
 
 @dataclass(frozen=True)
-class PlanarRSD:
+class PlanarRSD(PhasorMethod):
     """Diffraction from a planar wall to all depths: the image of `Backprojection`, thousands of times faster.
 
     ``I(r) = | sum_k exp(1j * k * |r_L - r|) * sum_p P_k(r_p) * exp(1j * k * |r_p - r|) / |r_p - r| |``: the inner sum
@@ -76,29 +76,6 @@ class PlanarRSD:
         if grid.z[0] <= walls[0].plane.z:
             return Support(f"the grid must begin in front of the wall, which is at z = {walls[0].plane.z:.4g} m")
         return self._way(walls[0].plane, grid, band, exposures(capture)[0]).supports()
-
-    def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
-        """Image the hidden scene.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-        progress : callable, optional
-            Called with the number of voxels just done, once for every laser spot.
-
-        Returns
-        -------
-        Volume
-            Brightness I(r), float32.
-
-        Raises
-        ------
-        InputError
-            `supports` says no.
-        """
-        complex_field = self.phasor_field(capture, grid, progress)
-        return Volume(abs(complex_field.values), grid, complex_field.provenance)
 
     def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in the signal."""
