@@ -72,6 +72,13 @@ def to_numpy(array: Array) -> NDArray[Any]:
     return values
 
 
+def is_complex(array: Array) -> bool:
+    """Say whether `array` is of a complex type."""
+    if is_numpy(array):
+        return bool(array.dtype.kind == "c")
+    return bool(namespace(array).isdtype(array.dtype, "complex floating"))
+
+
 def as_type(array: Array, dtype: DTypeLike) -> Array:
     """Return `array` in a NumPy type, in the library and on the device where it is; as it is if it has that type.
 

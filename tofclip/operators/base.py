@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from tofclip.arrays import Array as Array
-from tofclip.arrays import InEachPlace, Place, as_type, is_numpy, namespace, require_numpy
+from tofclip.arrays import InEachPlace, Place, as_type, is_complex, is_numpy, namespace, require_numpy
 from tofclip.errors import InputError, ShapeError
 
 Shape = tuple[int, ...]
@@ -84,7 +84,7 @@ class LinearOperator(ABC):
         single = array.shape == shape
         if not single and array.shape[:-1] != shape:
             raise ShapeError(what, f"{shape} or {shape} and a batch axis", tuple(array.shape))
-        if namespace(array).isdtype(array.dtype, "complex floating"):
+        if is_complex(array):
             raise InputError(f"{what} must be real, got {array.dtype}")
         return as_type(array[..., None] if single else array, self.dtype), single
 

@@ -5,6 +5,7 @@ The last axis is the frames', side by side. `loops_for` is the one place where t
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Protocol
 
 from tofclip.arrays import Array, is_numpy
@@ -54,10 +55,18 @@ class Loops(Protocol):
 
 def loops_for(array: Array) -> Loops:
     """Return the loops that work on arrays like this one."""
-    if is_numpy(array):
-        from tofclip.recovery.compiled import CompiledLoops
+    return _compiled() if is_numpy(array) else _portable()
 
-        return CompiledLoops()
+
+@cache
+def _compiled() -> Loops:
+    from tofclip.recovery.compiled import CompiledLoops
+
+    return CompiledLoops()
+
+
+@cache
+def _portable() -> Loops:
     from tofclip.recovery.portable import PortableLoops
 
     return PortableLoops()
