@@ -93,7 +93,8 @@ class LatticeAnalysis:
             self._spread(values, weight)
             self._along_x.execute()
             for number, end in enumerate(ends):
-                transpose(self._lines[:, end], middle[number * columns : (number + 1) * columns, :rows])
+                turned = middle[number * columns : (number + 1) * columns, :rows]
+                transpose(self._lines[:, end].view(np.float64), turned.view(np.float64))
             plan.update_arrays(middle, spectrum)
             plan.execute()
         return spectra

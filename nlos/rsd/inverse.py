@@ -140,7 +140,8 @@ class InverseTransform:
         along_y, along_x = self._planned(count)
         along_y.execute()
         wanted, columns = self._middle.shape[1], self._lines.shape[1]
-        for line, middle in zip(self._lines[:count], self._middle, strict=False):
+        lines, middles = self._lines.view(np.float64), self._middle.view(np.float64)
+        for line, middle in zip(lines[:count], middles, strict=False):
             transpose(line[:, :wanted], middle[:, :columns])
         along_x.update_arrays(self._middle[:count], self._rows[terms])
         along_x.execute()

@@ -226,13 +226,20 @@ def turned_back(number):
 
 @compiled
 def transpose(source, target):
-    """Copy ``target[i, j] = source[j, i]``, in squares that stay in cache."""
+    """Copy ``target[i, j] = source[j, i]``, in squares that stay in cache; quickest for complex64 seen as float64."""
     rows, columns = target.shape
     for top in range(0, rows, SQUARE):
         for left in range(0, columns, SQUARE):
-            for i in range(top, min(top + SQUARE, rows)):
-                for j in range(left, min(left + SQUARE, columns)):
-                    target[i, j] = source[j, i]
+            if top + SQUARE <= rows and left + SQUARE <= columns:
+                square, turned = source[left : left + SQUARE, top : top + SQUARE], target[top:, left : left + SQUARE]
+                # A fixed number of steps becomes vector code.
+                for i in range(np.uint64(SQUARE)):
+                    for j in range(np.uint64(SQUARE)):
+                        turned[i, j] = square[j, i]
+            else:
+                for i in range(top, min(top + SQUARE, rows)):
+                    for j in range(left, min(left + SQUARE, columns)):
+                        target[i, j] = source[j, i]
 
 
 @compiled

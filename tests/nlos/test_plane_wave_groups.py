@@ -11,7 +11,7 @@ import nlos.rsd.inverse
 from nlos.plane import Plane
 from nlos.rsd.groups import Groups
 from nlos.rsd.inverse import inverse
-from nlos.rsd.kernels import LANES, MIRRORED, STEPS, carry, scatter
+from nlos.rsd.kernels import LANES, MIRRORED, STEPS, carry, scatter, transpose
 from nlos.rsd.spectrum import PlaneWaves
 from nlos.rsd.transfer import Transfer, Waves
 from nlos.rsd.window import Window
@@ -114,3 +114,12 @@ def test_images_are_sums_of_plane_waves(lattice: tuple[float, float], monkeypatc
     expected = np.einsum("mq,qy,qx->myx", complex_waves(np.moveaxis(parts, 0, 1)), *along)
     found = way.images * way.carrier
     assert np.abs(found - expected).max() < 1e-5 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("shape", [(5, 7), (16, 32), (33, 50), (100, 17)])
+def test_matrices_are_transposed_whatever_their_sides(shape: tuple[int, int]) -> None:
+    source = np.random.default_rng(0).normal(size=(shape[0], shape[1] + 3))[:, 1:-2]
+    target = np.zeros((shape[1], shape[0] + 2))
+    transpose(source, target[:, : shape[0]])
+    assert np.array_equal(target[:, : shape[0]], source.T)
+    assert not target[:, shape[0] :].any()
