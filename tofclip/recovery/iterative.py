@@ -32,7 +32,8 @@ class ProximalMethod(ABC):
     iterations : int
         At most so many for each frame.
     tolerance : float
-        Relative change of a block's objective below which it is done; 0: never.
+        Relative change of a block's objective below which it is done; 0: never. What a block is depends on the arrays
+        (`tofclip.recovery.batches`), and with it when its frames are done.
     data_term : DataTermMaker
         What a misfit costs.
 
