@@ -158,9 +158,7 @@ def strongest_peaks(trace, times, standing, matched, gains, scale, limits, maxim
         brightest = gains[1] * (bounds[group] / gains[0] - background)
         if bounds[group] <= 0 or brightest <= limits[1] * noise or brightest * times[-1] ** 2 < needed:
             break
-        best = group * GROUP
-        while maxima[best] != bounds[group]:
-            best += 1
+        best = place_in_group(maxima, group, bounds[group])
         first, last = window(times, (best, best), times[best], scale)
         strength = response(trace, matched, best)
         peaks[number, 0], peaks[number, 1], peaks[number, 2], peaks[number, 3] = best, strength, first, last
@@ -205,6 +203,15 @@ def bound_groups(maxima, first, last, bounds):
         highest_bits[group] = highest
 
 
+@vectorised
+def place_in_group(maxima, group, value):
+    """Bin of the last maximum of a group that is as high as `value`, which has to be there."""
+    place, here = 0, maxima[group * GROUP : (group + 1) * GROUP]
+    for j in range(GROUP):
+        place = max(place, j if here[j] == value else 0)
+    return group * GROUP + place
+
+
 @compiled
 def forget_around(best, times, distance, maxima, bounds):
     """Take away the maxima nearer than `distance` to a bin, and that at the bin itself."""
@@ -239,8 +246,8 @@ def level(total, square, bins):
 @compiled
 def highest_place(values):
     """Return where the first of the highest values stands."""
-    place = 0
-    for other in range(1, values.size):
-        if values[other] > values[place]:
-            place = other
+    place, highest = 0, values[0]
+    for other in range(1, values.size):  # without a branch, whose way nobody could foretell
+        higher = values[other] > highest
+        place, highest = other if higher else place, values[other] if higher else highest
     return place

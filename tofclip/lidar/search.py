@@ -141,9 +141,9 @@ class ReturnSearch:
                 find_returns(block, traces.pixels[some], *fixed, limits, found, counts)
 
         run_blocks(work, total, PIXELS_PER_BLOCK)
-        filled = np.arange(found.shape[1]) < counts[:, np.newaxis]
-        time, signal, deviation = found[filled].T
-        return np.nonzero(filled)[0], time, signal, deviation
+        filled = np.flatnonzero(np.arange(found.shape[1]) < counts[:, np.newaxis])
+        time, signal, deviation = np.take(found.reshape(-1, found.shape[2]), filled, axis=0).T
+        return filled // found.shape[1], time, signal, deviation
 
     @cached_property
     def _filters(self) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float]]:

@@ -103,11 +103,15 @@ def highest_pixels(tile_starts, columns, values, scales, block, highest):
     for first in range(0, scales.size, part.shape[0]):
         rows = min(part.shape[0], scales.size - first)
         sparse_times_block(tile_starts[:, first : first + rows + 1], columns, values, block, part[:rows])
-        for row in range(rows):
-            scale, here = scales[first + row], part[row]
+        for row in range(0, rows, 4):  # four at a time, for one look at the highest so far
+            second, third, fourth = min(row + 1, rows - 1), min(row + 2, rows - 1), min(row + 3, rows - 1)
+            a, b, c, d = part[row], part[second], part[third], part[fourth]
+            s, t, u, v = scales[first + row], scales[first + second], scales[first + third], scales[first + fourth]
             for lane in range(LANES):
-                value = scale * here[lane]
-                highest[lane] = value if value > highest[lane] else highest[lane]
+                one, two, three, four = s * a[lane], t * b[lane], u * c[lane], v * d[lane]
+                one, three = one if one > two else two, three if three > four else four
+                one = one if one > three else three
+                highest[lane] = one if one > highest[lane] else highest[lane]
 
 
 @compiled
