@@ -106,6 +106,10 @@ def test_a_shot_that_is_nowhere_dark_is_searched_everywhere(lit_rows):
     np.testing.assert_array_equal(bins.standing, np.ones(ROWS))
 
 
+def test_a_shot_without_any_reading_is_searched_everywhere(lit_rows):
+    assert lit_rows.bins(np.zeros((240, ROWS), np.float32)).searched.all()
+
+
 def test_columns_and_rows_that_were_never_measured_are_not_taken_for_the_darkest(lit_rows):
     readings = dark(1)
     readings[:, :60] = 0
