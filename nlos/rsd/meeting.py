@@ -139,7 +139,7 @@ class _Bench:
         self.way, self.source, self.groups, self.interpolation = way, source, groups, interpolation
         self.inverse = inverse(groups.indices, way.lattice, way.grid.shape[1:], terms)
         self.cell = np.where(groups.distinct, self.inverse.cell, self.inverse.spare)
-        self.folded = np.unique(self.cell).size <= np.count_nonzero(groups.distinct)
+        self.folded = bool(np.bincount(self.inverse.cell[groups.distinct]).max() > 1)
         self._room = np.empty(PLANES_AT_A_TIME * (terms + 1) * int(np.prod(groups.shape)), np.float32)
 
     def image(self, spectrum: Parts, lights: list[Illumination], planes: slice, total: Field) -> None:

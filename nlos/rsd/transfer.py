@@ -13,8 +13,9 @@ from nlos.rsd.window import Window
 
 FloatArray = NDArray[np.float64]
 
-OVERSAMPLING = 3.0
-"""Nodes along the lateral wavenumber, relative to the Nyquist rate of the window's radius."""
+OVERSAMPLING = 2.5
+"""Nodes along the lateral wavenumber, relative to the Nyquist rate of the window's radius; interpolation then errs by
+5e-5."""
 
 RADII_PER_PERIOD = 1.25
 """Samples along the radius per period of the fastest product of wave and Bessel function."""
