@@ -36,8 +36,8 @@ def find_returns(traces, pixels, times, standing, filters, pulse, limits, found,
         For how many bins each one stands where background and noise are concerned.
     filters : tuple
         A sharp filter, (width, bins), and the matched one, (bins, width + 1), float32 arrays of unit energy, nowhere
-        negative: entry w holds the weight of bin ``j + w - width // 2`` for a return at bin j, and the width is a
-        multiple of four. The last column holds the sum over the others. Then the largest such sum, of either.
+        negative: entry w holds the weight of bin ``j + w - width // 2`` for a return at bin j, and the width of the
+        sharp one is a multiple of four. The last column holds the sum over the others. Then the largest sum of either.
     pulse : tuple
         See `Pulse.table`.
     limits : (float, float, float)

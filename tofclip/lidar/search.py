@@ -148,15 +148,19 @@ class ReturnSearch:
     @cached_property
     def _filters(self) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float]]:
         """The sharp filter that shows candidates, the matched one that judges them, and their gains."""
-        sharp, matched = (_filter(self.times, shape) for shape in (self.pulse.compressed(SHARPENING), self.pulse))
+        sharp, matched = self._bare_filters
         sums = matched.sum(axis=0)
         with_sums = np.ascontiguousarray(np.concatenate([matched, sums[np.newaxis]]).T)
         return sharp, with_sums, (float(sharp.sum(axis=0).max()), float(sums.max()))
 
     @cached_property
+    def _bare_filters(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        # The compiled loop takes four weights of the sharp filter at a time.
+        return _filter(self.times, self.pulse.compressed(SHARPENING), 4), _filter(self.times, self.pulse, 2)
+
+    @cached_property
     def _portable(self) -> PortableSearch:
-        filters = _filter(self.times, self.pulse.compressed(SHARPENING)), _filter(self.times, self.pulse)
-        return PortableSearch(self.times, filters, self.pulse, self.detection)
+        return PortableSearch(self.times, self._bare_filters, self.pulse, self.detection)
 
 
 def depth(
@@ -190,15 +194,15 @@ def depth(
     return search.returns(traces, frames.provenance)
 
 
-def _filter(times: FloatArray, pulse: Pulse) -> NDArray[np.float32]:
-    """Unit-energy filter for a return at each bin, (width, bins); the time axis may be uneven.
+def _filter(times: FloatArray, pulse: Pulse, multiple: int) -> NDArray[np.float32]:
+    """Unit-energy filter for a return at each bin, (width, bins), its width a `multiple`; the time axis may be uneven.
 
     What a measured pulse has below zero is noise and left out. Where the axis cuts off most of the pulse the energy
     stays below one: little would be known of such a return.
     """
     before, after = pulse.support
     reach = int(np.ceil(max(-before, after) / np.diff(times).min()))
-    half = 2 * (reach // 2 + 1)  # the compiled loop takes four weights at a time
+    half = multiple // 2 * (reach // (multiple // 2) + 1)
     filters = np.zeros((2 * half, times.size))
     for row, shift in enumerate(range(-half, half)):
         here = np.arange(max(0, -shift), min(times.size, times.size - shift))

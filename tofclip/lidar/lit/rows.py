@@ -19,7 +19,7 @@ LENGTH_IN_WIDTHS = 1.7  # a sum over so much of a Gaussian pulse stands out near
 QUIET_SHARE, QUIETER_SHARE = 0.25, 0.05
 HARDLY_BRIGHTER, AS_DARK = 1.5, 1.25  # in mean square; noise alone makes a tenth
 FURTHER = 1.2  # than the limit has an instant to stand out
-SAMPLED = 32  # dark rows at least, which know the noise of a dark pixel to an eighth
+SAMPLED = 24  # dark rows at least, which know the noise of a dark pixel to a seventh
 WORTHWHILE = 0.75  # of all rows: what needs more of them is as well searched everywhere
 COLUMNS_PER_BLOCK = 192
 
