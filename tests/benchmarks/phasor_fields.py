@@ -37,6 +37,7 @@ CYCLES = 4.24
 LASER = np.array([0.1, 0.05, 0.02])
 POINTS = np.array([[0.3, -0.2, 1.0], [-0.5, 0.4, 0.9], [0.1, 0.6, 1.4]])
 ROWS_IN_TIME = (2, 6)
+STRICT = 1e-4  # a tolerance that only direct sums keep
 
 Row = dict[str, object]
 
@@ -155,6 +156,17 @@ def propagation_rows(repeats: int) -> list[Row]:
     return [*rows[:-1], rows[-1] | {"at_least": 200}]
 
 
+def scattered_row(repeats: int) -> Row:
+    """From 16384 scattered points onto 128 x 128, by non-uniform transforms, and directly onto every eighth row."""
+    random = np.random.default_rng(0)
+    wall = random.uniform([-1, -1, 0], [1, 1, 0.3], (128 * 128, 3))
+    capture = PointScene(POINTS).seen_from(wall, LASER, TimeAxis(512, 32e-12), 60e-12)
+    pulse, axis = PlanarRSD(8 / 128, CYCLES).pulse, np.linspace(-1, 1, 128)
+    taken = seconds(lambda: propagate(capture, Plane(axis, axis, 0.4), pulse), repeats)
+    direct = 8 * seconds(lambda: propagate(capture, Plane(axis, axis[::8], 0.4), pulse, tolerance=STRICT), repeats)
+    return {"name": "propagation 128, scattered points", "seconds": taken, "direct_times_this": direct / taken}
+
+
 def large_scene() -> tuple[Capture, Grid]:
     """A wall of 125 x 125 points and 1016 bins of 4.6 ps, relief 0.15 m, and 100^3 voxels of 6 mm."""
     x, y = np.meshgrid(np.linspace(-0.69, 0.69, 125), np.linspace(-0.65, 0.65, 125))
@@ -189,7 +201,7 @@ def main() -> None:
         print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
         return
     rows = [*planar_rows(arguments.repeats, arguments.ytal), *propagation_rows(arguments.repeats)]
-    rows.append(large_row(arguments.repeats))
+    rows += [scattered_row(arguments.repeats), large_row(arguments.repeats)]
     if arguments.json:
         print(json.dumps({"threads": thread_count(), "rows": rows}))
         return
