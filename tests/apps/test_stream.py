@@ -31,7 +31,7 @@ def test_a_streaming_camera_becomes_clouds(tmp_path: Path, capsys: pytest.Captur
     assert main([*words, "--json"]) == 0
     figures = told(capsys)
     assert figures["clouds"] == 3
-    assert set(figures["stages_s"]) == {"read", "wait", "rectify", "range", "place"}
+    assert set(figures["stages_s"]) == {"read", "wait", "rectify", "recover", "range", "place"}
     assert figures["latency_s"]["median"] > 0
     assert figures["clouds_per_second"] > 0
     saved = sorted(tmp_path.iterdir())

@@ -48,7 +48,7 @@ def test_a_stream_gives_the_clouds_of_its_shots():
         np.testing.assert_allclose(one.cloud.range, alone.range, atol=2e-5)
         np.testing.assert_allclose(one.cloud.intensity, alone.intensity, rtol=1e-3)
         assert one.latency > 0
-        assert set(one.seconds) == {"read", "wait", "rectify", "range", "place"}
+        assert set(one.seconds) == {"read", "wait", "rectify", "recover", "range", "place"}
     medians = [np.median(one.cloud.range) for one in streamed]
     np.testing.assert_allclose(np.diff(medians), -0.05, atol=2e-3)
 

@@ -17,7 +17,7 @@ from tofclip.lidar.detection import Detection
 from tofclip.lidar.lit.rows import LitRows, Place
 from tofclip.lidar.returns import Returns
 from tofclip.lidar.search import ReturnSearch
-from tofclip.lidar.traces import Bins
+from tofclip.lidar.traces import Bins, Traces
 from tofclip.reconstruct.focus import AT_THE_CALIBRATED_DEPTH, Focus
 from tofclip.reconstruct.task import fitted_to_shot, prepare
 from tofclip.recovery import LinearInverse
@@ -119,9 +119,23 @@ class Ranger:
 
     def returns(self, readings: NDArray[np.float32]) -> Returns:
         """Find the returns in one shot's rectified readings, (columns, rows)."""
+        return self.search(self.recover(readings))
+
+    def recover(self, readings: NDArray[np.float32]) -> Traces:
+        """Do what a shot needs as a whole before its pixels are recovered, a few at a time, by whoever asks for them.
+
+        Parameters
+        ----------
+        readings : (columns, rows) float32 array
+            Rectified.
+        """
         if readings.shape != (self.camera.slit_width_px, self.times.size):
             raise ShapeError("readings", (self.camera.slit_width_px, self.times.size), readings.shape)
-        return self._search.returns(_ShotTraces(self, readings, self._lit.bins(readings)))
+        return _ShotTraces(self, readings, self._lit.bins(readings))
+
+    def search(self, traces: Traces) -> Returns:
+        """Find the returns in what `recover` returned."""
+        return self._search.returns(traces)
 
     def cloud(self, readings: NDArray[np.float32]) -> PointCloud:
         """Make the cloud of one shot's rectified readings, (columns, rows)."""

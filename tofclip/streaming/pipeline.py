@@ -26,7 +26,7 @@ class StreamedCloud:
         Number of its shot in the source, from 0; what was dropped has been counted.
     seconds : mapping
         What each stage took: ``"read"`` (the source, which is no latency), ``"wait"`` (between the stages),
-        ``"rectify"``, ``"range"`` and ``"place"``.
+        ``"rectify"``, ``"recover"``, ``"range"`` and ``"place"``.
     latency : float
         Time from when the shot was there until its cloud was handed out, s.
     """
@@ -42,8 +42,8 @@ def stream_clouds(
 ) -> Generator[StreamedCloud, None, None]:
     """Yield the cloud of every shot by the linear inverse, as soon as it is made.
 
-    A shot is rectified, its returns are found, and they are placed in space, each on a thread of its own, while the
-    next ones are read.
+    A shot is rectified and recovered, its returns are found, and they are placed in space, each on a thread of its own,
+    while the next ones are read.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def stream_clouds(
 
     Notes
     -----
-    Memory: ``4 * (held + 1)`` shots, and what a `Ranger` takes.
+    Memory: ``5 * (held + 1)`` shots, and what a `Ranger` takes.
     """
     coming = iter(shots)
     if ranger is None:
@@ -75,7 +75,9 @@ def stream_clouds(
     def rectified(shot: Streak) -> NDArray[float32]:
         return own.rectifier.readings(shot.counts)
 
-    stages = Stage("rectify", rectified), Stage("range", own.returns), Stage("place", point_cloud)
+    # One stage's work on all cores has ends where some of them wait; another stage's fills these.
+    ranging = Stage("recover", own.recover), Stage("range", own.search)
+    stages = Stage("rectify", rectified), *ranging, Stage("place", point_cloud)
     for passage in in_stages(coming, stages, held, policy):
         yield StreamedCloud(passage.value, passage.number, passage.seconds, passage.latency)
 
