@@ -31,7 +31,7 @@ FloatArray = NDArray[np.float64]
 
 REFERENCE_RANGE = 1.0  # m; an intensity is what the same surface would send back from here
 PIXELS_AT_ONCE = 128  # their traces fit the second-level cache
-PIXELS_PER_BLOCK = 8 * PIXELS_AT_ONCE
+PIXELS_PER_BLOCK = 4 * PIXELS_AT_ONCE
 SHARPENING = 2.0  # of the filter that looks for candidates; it costs a tenth of the matched filter's sensitivity
 SHORTEST_PULSE_BINS = 2.0  # anything shorter falls between the samples
 
