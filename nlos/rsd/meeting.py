@@ -26,7 +26,8 @@ PLANES_AT_A_TIME = 2
 """Depths that a group of plane waves is carried to while its spectrum is in cache."""
 
 LADDER, NARROWEST = 1.05, 1e-3
-"""Distances to the laser spot vary by less over a plane than the next power of the first, and than the second, m."""
+"""Half the range of distances from the laser spot to a plane is rounded up to a power of the first, and at least the
+second, m."""
 
 ILLUMINATION_SHARE = 0.25
 """Of the error allowed, what splitting the illumination may take; where little is hidden it weighs more."""
