@@ -34,8 +34,8 @@ class PlanarRSD(PhasorMethod):
 
     Errs by less than `tolerance` at depths of a wavelength and more; nearer to the wall, waves that fade within a
     wavelength are missing. Holds the wall's spectrum, 8 bytes per plane wave and frequency (60 MB for 128 x 128
-    points and 120 frequencies), and the volume. A capture of another library's arrays is imaged in that library; see
-    `nlos.portable`.
+    points and 120 frequencies), the volume, and per thread the waves of all terms of two depths (30 MB). A capture of
+    another library's arrays is imaged in that library; see `nlos.portable`.
 
     Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight imaging systems",
     Nat. Commun. 11, 1645 (2020).
