@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.rsd.blas import one_thread
 from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
-from tofclip.threads import blocks, run_blocks
+from tofclip.threads import blocks, one_blas_thread, run_blocks
 
 ENVELOPE_HALF_WIDTHS = 3.0
 """The pulse's cycles fill its Gaussian envelope from -3 to +3 standard deviations."""
@@ -175,7 +174,7 @@ class Band:
         """
         real, bins = traces.dtype.type, traces.shape[1]
         # A library's own threads would go on waiting, busily, where ours want to work.
-        with one_thread():
+        with one_blas_thread():
             shapes, coefficients = (part.astype(real) for part in self._analysis(bins, 8 * float(np.finfo(real).eps)))
             parts = np.empty((len(traces), coefficients.shape[1]), real)
 

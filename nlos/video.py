@@ -23,7 +23,7 @@ from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
-from tofclip.threads import blocks, run_blocks
+from tofclip.threads import blocks, one_blas_thread, run_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
 INSTANTS_AT_A_TIME = 32
@@ -231,8 +231,6 @@ class TransientImaging:
 
     def _watch(self, capture: Capture, grid: Grid, instants: FloatArray, use: Use, progress: Progress) -> None:
         """Hand the field of every depth to `use`, some instants at a time; depths run side by side."""
-        from threadpoolctl import threadpool_limits
-
         self.supports(capture, grid).require()
         band = self._band(capture, grid, instants)
         warn_of_aliasing(capture, band)
@@ -248,7 +246,7 @@ class TransientImaging:
                     use(depth, some, depths.to_images(arrived @ turns[:, some]))
                 progress(grid.shape[1] * grid.shape[2])
 
-        with threadpool_limits(1, "blas"):
+        with one_blas_thread():
             run_blocks(work, grid.z.size, size=1)
 
     def _band(self, capture: Capture, grid: Grid, instants: FloatArray) -> Band:

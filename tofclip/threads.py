@@ -7,10 +7,17 @@ into blocks and runs the blocks on a few Python threads. There is no second thre
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 from tofclip.errors import InputError
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 LANES = 32
 """Frames per block: a row of a block is two full vectors of 512 bits, and a 174 x 174 picture stays in cache."""
@@ -35,6 +42,19 @@ def thread_count() -> int:
     return int(wanted)
 
 
+_calling = threading.local()
+
+
+@contextmanager
+def on_this_thread() -> Iterator[None]:
+    """Let `run_blocks` work on the calling thread alone, for whoever has other work for the other cores."""
+    _calling.alone = True
+    try:
+        yield
+    finally:
+        _calling.alone = False
+
+
 def blocks(total: int, size: int = LANES) -> Iterator[slice]:
     """Cut ``range(total)`` into slices of at most `size`."""
     for start in range(0, total, size):
@@ -47,7 +67,7 @@ def run_blocks(work: Callable[[slice], None], total: int, size: int = LANES) -> 
     An interruption (Ctrl-C) waits for the blocks under way and starts no further ones.
     """
     pieces = list(blocks(total, size))
-    threads = min(thread_count(), len(pieces))
+    threads = 1 if getattr(_calling, "alone", False) else min(thread_count(), len(pieces))
     if threads <= 1:
         for piece in pieces:
             work(piece)
@@ -58,3 +78,21 @@ def run_blocks(work: Callable[[slice], None], total: int, size: int = LANES) -> 
             pass
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def one_blas_thread() -> AbstractContextManager[Any]:
+    """Keep matrix products on the threads that call them.
+
+    Where blocks keep every core busy already, BLAS threads of its own would wait for, and spin against, ours.
+    """
+    limited: AbstractContextManager[Any] = _blas().limit(limits=1, user_api="blas")
+    return limited
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """The linear-algebra libraries that are loaded; looking for them takes as long as a small image."""
+    import scipy.linalg  # noqa: F401 - brings one of its own beside NumPy's
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()

@@ -16,7 +16,7 @@ from tofclip.camera import Camera
 from tofclip.operators import LineProjection
 from tofclip.recovery import Adjoint, LinearInverse, Method, Sparse, TotalVariation
 from tofclip.recovery.direct import DENSE_ROWS
-from tofclip.threads import LANES, run_blocks
+from tofclip.threads import LANES, one_blas_thread, run_blocks
 
 ITERATIONS = 30
 FRAMES = (256, 1016)
@@ -60,8 +60,6 @@ def adjoints(projection: LineProjection, data: NDArray[np.float32]) -> None:
 
 def dense_products(projection: LineProjection, data: NDArray[np.float32]) -> None:
     """A product with a dense matrix and one with the sparse transpose for every frame."""
-    from threadpoolctl import threadpool_limits
-
     matrix = np.eye(SLIT_WIDTH, dtype=np.float32)
     weights = np.empty_like(data)
 
@@ -71,7 +69,7 @@ def dense_products(projection: LineProjection, data: NDArray[np.float32]) -> Non
     def project(piece: slice) -> None:
         projection.adjoint(np.ascontiguousarray(weights[:, piece]))
 
-    with threadpool_limits(1, "blas"):
+    with one_blas_thread():
         run_blocks(multiply, SLIT_WIDTH, DENSE_ROWS)
     run_blocks(project, data.shape[1])
 

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from nlos.method import Progress, silent
 from nlos.propagation.kernels import join_terms
 from nlos.propagation.passage import Passage
-from nlos.rsd.blas import one_thread
 from nlos.rsd.inverse import inverse
-from tofclip.threads import run_blocks
+from tofclip.threads import one_blas_thread, run_blocks
 
 
 def layered_sum(passage: Passage, phasors: NDArray[np.complex64], progress: Progress = silent) -> NDArray[np.complex64]:
@@ -34,7 +33,7 @@ def layered_sum(passage: Passage, phasors: NDArray[np.complex64], progress: Prog
     """
     field = np.empty((phasors.shape[1], *passage.plane.shape), np.complex64)
     relief = passage.relief
-    with one_thread():
+    with one_blas_thread():
         most = max(relief.counts)
         _ = passage.shifts, passage.between_nodes
         spare: list[_Bench] = []

@@ -21,6 +21,7 @@ from nlos.refinement.spherical import spherical_sum
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.planar import source_of
 from tofclip.operators import Diagonal, LinearOperator, Stack
+from tofclip.threads import one_blas_thread
 
 Array = NDArray[Any]
 FloatArray = NDArray[np.float64]
@@ -76,10 +77,8 @@ class HiddenToWall(LinearOperator):
 
     def _each(self, work: Callable[[Array], Array], block: Array) -> Array:
         """Treat every frame alone: each is a volume, too large to gain from company."""
-        from threadpoolctl import threadpool_limits
-
         # Depths and targets share the cores already: BLAS threads of its own would fight with ours.
-        with threadpool_limits(1, "blas"):
+        with one_blas_thread():
             return np.stack([work(np.ascontiguousarray(frame)) for frame in np.moveaxis(block, -1, 0)], axis=-1)
 
 

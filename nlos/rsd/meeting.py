@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from nlos.kernels import illuminate
 from nlos.method import Progress, silent
-from nlos.rsd.blas import one_thread
 from nlos.rsd.diffraction import Diffraction
 from nlos.rsd.groups import Groups, Interpolation
 from nlos.rsd.illumination import Illumination, constant, split
 from nlos.rsd.inverse import inverse
 from nlos.rsd.kernels import carry, scatter
-from tofclip.threads import blocks, run_blocks
+from tofclip.threads import blocks, one_blas_thread, run_blocks
 
 FloatArray = NDArray[np.float64]
 Field = NDArray[np.complex64]
@@ -107,7 +106,7 @@ def diffract(
     progress : callable, optional
         Called with the number of voxels just done.
     """
-    with one_thread():
+    with one_blas_thread():
         groups = Groups(way.plane_waves)
         spectrum = groups.analysed(values, way.plane, (float(way.grid.y[0]), float(way.grid.x[0])))
         lights = [constant(1)] * way.grid.z.size

@@ -17,10 +17,10 @@ from collections.abc import Callable
 import numpy as np
 import scipy.fft
 import scipy.linalg
-from threadpoolctl import threadpool_limits
 
 from tofclip.operators import LinearOperator
 from tofclip.operators.light_field_camera import CAMERAS, LineCamera
+from tofclip.threads import one_blas_thread
 
 SHAPE = (128, 128)
 VIEWS = [(float(v), float(u)) for v in range(-4, 4) for u in range(-4, 4)]
@@ -108,7 +108,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    with threadpool_limits(1, "blas"):
+    with one_blas_thread():
         speed = table(arguments.sampling_ratio, arguments.repeats)
         making = set_up(max(3, arguments.repeats // 10))
     if arguments.json:

@@ -6,14 +6,14 @@ import pytest
 from relay_walls import AXIS, HIDDEN, JITTER, planar_wall
 
 from nlos import Capture
-from nlos.rsd.blas import one_thread
 from nlos.simulate import PointScene
+from tofclip.threads import one_blas_thread
 
 
 @pytest.fixture(autouse=True)
 def _one_thread_for_products() -> Iterator[None]:
     """Small matrices gain nothing from threads, which on a busy machine wait for each other."""
-    with one_thread():
+    with one_blas_thread():
         yield
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
-from typing import TYPE_CHECKING, Any
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +16,7 @@ from tofclip.operators import LinearOperator, SparseMatrix, squared_norm
 from tofclip.recovery.batches import PortableBatches, batches_for, write_frames
 from tofclip.recovery.loop import Progress, Result, silent
 from tofclip.recovery.method import Mask, checked_readings
-from tofclip.threads import LANES, blocks, run_blocks
-
-if TYPE_CHECKING:
-    from threadpoolctl import ThreadpoolController
+from tofclip.threads import LANES, blocks, one_blas_thread, run_blocks
 
 DENSE_ROWS = 336  # of the dense matrix, which are read from memory once for all frames
 NORM_ITERATIONS = 15  # the damping need not be known better than to a percent
@@ -196,20 +192,6 @@ class Adjoint:
     def work(self, frames: int) -> int:
         """Return how many frame iterations `recover` reports at most."""
         return frames
-
-
-@cache
-def _blas() -> ThreadpoolController:
-    """The linear-algebra libraries that are loaded; looking for them takes longer than a block."""
-    from threadpoolctl import ThreadpoolController
-
-    return ThreadpoolController()
-
-
-def one_blas_thread() -> AbstractContextManager[Any]:
-    """Keep matrix products on the threads that call them."""
-    limited: AbstractContextManager[Any] = _blas().limit(limits=1, user_api="blas")
-    return limited
 
 
 def _best_scale(operator: LinearOperator, readings: Array) -> float:

@@ -15,6 +15,7 @@ from tofclip.recovery.fista import Fista
 from tofclip.recovery.loop import History, Progress, Result, Stopping, iterate, silent
 from tofclip.recovery.method import Array, Mask, checked_readings
 from tofclip.recovery.proximal import NonnegativeSparsity, NonnegativeTotalVariation, Regulariser
+from tofclip.threads import one_blas_thread
 
 NORM_ITERATIONS = 15
 NORM_MARGIN = 1.02  # 15 power iterations on a nonnegative matrix are within 1 % of the largest eigenvalue
@@ -57,12 +58,10 @@ class ProximalMethod(ABC):
         self, operator: LinearOperator, readings: Array, good: Mask = None, progress: Progress = silent
     ) -> Result:
         """Recover one picture per column of `readings`; see `Method`."""
-        from threadpoolctl import threadpool_limits
-
         if not self.portable:
             require_numpy(f"recovery with the prior {type(self).__name__}", readings)
         # Blocks share the cores already, and a lone picture's products are too small to share.
-        with threadpool_limits(1, "blas"):
+        with one_blas_thread():
             return self._recover(operator, checked_readings(operator, readings, good), good, progress)
 
     def _recover(self, operator: LinearOperator, readings: Array, good: Mask, progress: Progress) -> Result:

@@ -16,6 +16,7 @@ from tofclip.recovery.denoisers import CollaborativeWiener, Denoiser
 from tofclip.recovery.iterative import NORM_ITERATIONS, ProximalMethod
 from tofclip.recovery.loop import Progress, Result, silent
 from tofclip.recovery.method import Array, Mask
+from tofclip.threads import one_blas_thread
 
 BRIGHTEST = 0.999  # quantile that stands for the brightest pixel: a single hot one must not set the scale
 
@@ -61,13 +62,11 @@ class PlugAndPlay:
         self, operator: LinearOperator, readings: Array, good: Mask = None, progress: Progress = silent
     ) -> Result:
         """Recover one picture per column of `readings`; see `Method`."""
-        from threadpoolctl import threadpool_limits
-
         require_numpy("recovery with a denoiser", readings)
         started = self.start.recover(operator, readings, good, progress)
         coupling = self.coupling * squared_norm(operator, NORM_ITERATIONS)
         frames = np.empty_like(started.frames)
-        with threadpool_limits(1, "blas"):  # the products of small groups of patches are too small to share
+        with one_blas_thread():  # the products of small groups of patches are too small to share
             for number, picture in enumerate(started.frames):
                 column = slice(number, number + 1)
                 kept = None if good is None else good[:, column]

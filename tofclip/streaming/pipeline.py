@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-
-from numpy import float32
-from numpy.typing import NDArray
+from time import perf_counter
+from typing import Any
 
 from tofclip.lidar.cloud import PointCloud, point_cloud
 from tofclip.lidar.sequence import Ranger
+from tofclip.recovery.direct import one_blas_thread
 from tofclip.streaming.channel import Policy
-from tofclip.streaming.stages import Stage, in_stages
+from tofclip.streaming.stages import READ, WAIT, Stage, in_stages
+from tofclip.threads import on_this_thread, thread_count
 from tofclip.transient import Streak
 
 
@@ -25,7 +27,7 @@ class StreamedCloud:
     shot : int
         Number of its shot in the source, from 0; what was dropped has been counted.
     seconds : mapping
-        What each stage took: ``"read"`` (the source, which is no latency), ``"wait"`` (between the stages),
+        What each stage took: ``"read"`` (the source, which is no latency), ``"wait"`` (until its turn came),
         ``"rectify"``, ``"recover"``, ``"range"`` and ``"place"``.
     latency : float
         Time from when the shot was there until its cloud was handed out, s.
@@ -42,8 +44,8 @@ def stream_clouds(
 ) -> Generator[StreamedCloud, None, None]:
     """Yield the cloud of every shot by the linear inverse, as soon as it is made.
 
-    A shot is rectified and recovered, its returns are found, and they are placed in space, each on a thread of its own,
-    while the next ones are read.
+    A shot is rectified and recovered, its returns are found and placed in space, all on one core, while the other cores
+    work on other shots and the next ones are read. Until the stream ends, NumPy's products keep to one thread.
 
     Parameters
     ----------
@@ -62,7 +64,7 @@ def stream_clouds(
 
     Notes
     -----
-    Memory: ``5 * (held + 1)`` shots, and what a `Ranger` takes.
+    Memory: ``3 * (held + 1)`` shots, one more for each core with what is recovered of it, and what a `Ranger` takes.
     """
     coming = iter(shots)
     if ranger is None:
@@ -72,14 +74,35 @@ def stream_clouds(
         ranger, coming = Ranger.for_shot(first), _with_first(first, coming)
     own = ranger
 
-    def rectified(shot: Streak) -> NDArray[float32]:
-        return own.rectifier.readings(shot.counts)
+    def made(shot: Streak) -> tuple[PointCloud, dict[str, float]]:
+        with on_this_thread():
+            return _cloud_of(shot, own)
 
-    # One stage's work on all cores has ends where some of them wait; another stage's fills these.
-    ranging = Stage("recover", own.recover), Stage("range", own.search)
-    stages = Stage("rectify", rectified), *ranging, Stage("place", point_cloud)
-    for passage in in_stages(coming, stages, held, policy):
-        yield StreamedCloud(passage.value, passage.number, passage.seconds, passage.latency)
+    # A core for each shot: shared out among all, a shot would be done sooner, but cores would wait for each other.
+    with one_blas_thread(), ThreadPoolExecutor(thread_count(), "stream work") as cores:
+        stages = Stage("begin", lambda shot: cores.submit(made, shot)), Stage("end", Future.result)
+        for passage in in_stages(coming, stages, held, policy):
+            cloud, seconds = passage.value
+            waited = passage.latency - sum(seconds.values())
+            told = {READ: passage.seconds[READ], WAIT: waited, **seconds}
+            yield StreamedCloud(cloud, passage.number, told, passage.latency)
+
+
+def _cloud_of(shot: Streak, ranger: Ranger) -> tuple[PointCloud, dict[str, float]]:
+    """Make the cloud of a shot; return it and what each step took, s."""
+    steps: dict[str, Callable[[Any], Any]] = {
+        "rectify": lambda streak: ranger.rectifier.readings(streak.counts),
+        "recover": ranger.recover,
+        "range": ranger.search,
+        "place": point_cloud,
+    }
+    value: Any = shot
+    seconds, last = {}, perf_counter()
+    for name, step in steps.items():
+        value = step(value)
+        now = perf_counter()
+        seconds[name], last = now - last, now
+    return value, seconds
 
 
 def _with_first(first: Streak, others: Iterator[Streak]) -> Iterator[Streak]:

@@ -15,7 +15,7 @@ from tofclip.clip_recovery import ClipRecovery
 from tofclip.metrics import nmse
 from tofclip.studies.library import Library
 from tofclip.studies.outcome import Advance, Panel, Row
-from tofclip.threads import thread_count
+from tofclip.threads import one_blas_thread, thread_count
 
 BORDER_PX = 12
 """Pixels that are not scored: views leave the picture there."""
@@ -112,11 +112,9 @@ def solve(cases: Sequence[Case], library: Library, seeds: int, advance: Advance)
 
 def in_parallel(work: Callable[[Job], Done], jobs: Sequence[Job]) -> list[Done]:
     """Run independent jobs on all cores, each on one; the first exception is raised and no further job started."""
-    from threadpoolctl import threadpool_limits
-
     pool = ThreadPoolExecutor(min(thread_count(), max(len(jobs), 1)), thread_name_prefix="tofclip")
     try:
-        with threadpool_limits(1, "blas"):
+        with one_blas_thread():
             return list(pool.map(work, jobs))
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

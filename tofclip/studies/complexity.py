@@ -15,6 +15,7 @@ from tofclip.operators import LinearOperator, Reshape, squared_norm
 from tofclip.operators.light_field_camera import CAMERAS, COMPRESSIVE_CAMERAS, LightFieldCamera
 from tofclip.operators.shear import View
 from tofclip.recovery import Fista, LeastSquares, NonnegativeTotalVariation
+from tofclip.threads import one_blas_thread
 
 WEIGHT = 1e-2  # relative to the largest A'f; what an iteration costs does not depend on it
 NORM_ITERATIONS = 10
@@ -79,12 +80,10 @@ def iteration_costs(
     -----
     Memory is about ten light fields in float32.
     """
-    from threadpoolctl import threadpool_limits
-
     views = [(v, u) for v, u in light_field.views.tolist()]
     shape = (light_field.pictures.shape[1], light_field.pictures.shape[2])
     methods = _methods(shape, views, exposures, sampling_ratio)
-    with threadpool_limits(1, "blas"):  # all methods on one core
+    with one_blas_thread():  # all methods on one core
         return [_timed(method, light_field, shear, repeats) for method in methods]
 
 

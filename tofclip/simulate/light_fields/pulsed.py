@@ -19,7 +19,7 @@ from tofclip.simulate.light_fields.array import CameraArray
 from tofclip.simulate.light_fields.bodies import Body
 from tofclip.simulate.light_fields.render import look
 from tofclip.simulate.render import FWHM_PER_SIGMA, gathered, share_rows
-from tofclip.threads import run_blocks
+from tofclip.threads import one_blas_thread, run_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
 Array = NDArray[Any]
@@ -102,8 +102,6 @@ def flash(scene: PulsedScene, array: CameraArray, clock: Clock) -> NDArray[np.fl
     A surface of reflectance 1 that faces all lamps from the distance of the array's focus has brightness 1, summed
     over time. Memory beyond the result is about 1 kB for each ray of a view and thread.
     """
-    from threadpoolctl import threadpool_limits
-
     views = array.views
     pictures = np.empty((len(views), *array.image_shape, clock.bins), np.float32)
 
@@ -111,7 +109,7 @@ def flash(scene: PulsedScene, array: CameraArray, clock: Clock) -> NDArray[np.fl
         for number in range(which.start, which.stop):
             pictures[number] = flash_view(scene, array, clock, (views[number, 0], views[number, 1]))
 
-    with threadpool_limits(1, "blas"):  # the threads are used for views
+    with one_blas_thread():  # the threads are used for views
         run_blocks(some, len(views), 1)
     return pictures
 

@@ -14,7 +14,7 @@ from tofclip.light_field import LightField
 from tofclip.operators.shear import View
 from tofclip.simulate.light_fields.array import CameraArray
 from tofclip.simulate.light_fields.bodies import Body
-from tofclip.threads import run_blocks
+from tofclip.threads import one_blas_thread, run_blocks
 
 Array = NDArray[Any]
 
@@ -60,8 +60,6 @@ class RenderedLightField:
 
 def render(scene: Scene, array: CameraArray) -> RenderedLightField:
     """Render every view of an array; memory is about 200 bytes for each ray of one view and thread."""
-    from threadpoolctl import threadpool_limits
-
     views = array.views
     pictures = np.empty((len(views), *array.image_shape), np.float32)
 
@@ -70,7 +68,7 @@ def render(scene: Scene, array: CameraArray) -> RenderedLightField:
             v, u = views[number]
             pictures[number] = render_view(scene, array, (float(v), float(u)))
 
-    with threadpool_limits(1, "blas"):  # the threads are used for views
+    with one_blas_thread():  # the threads are used for views
         run_blocks(some, len(views), 1)
     return RenderedLightField(LightField(pictures, views), shear_map(scene, array))
 
