@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from tofclip.errors import InputError
-from tofclip.threads import LANES, THREADS_VARIABLE, blocks, run_blocks, thread_count
+from tofclip.threads import LANES, THREADS_VARIABLE, blocks, on_this_thread, run_blocks, thread_count
 
 
 def test_blocks_cover_everything_once():
@@ -26,6 +26,20 @@ def test_every_block_runs_on_no_more_threads_than_allowed(monkeypatch, threads):
     run_blocks(work, 10 * LANES)
     assert sorted(seen) == list(range(0, 10 * LANES, LANES))
     assert len(names) <= int(threads)
+
+
+def test_a_thread_may_keep_its_blocks_to_itself(monkeypatch):
+    monkeypatch.setenv(THREADS_VARIABLE, "2")
+    names: set[str] = set()
+
+    def work(_: slice) -> None:
+        names.add(threading.current_thread().name)
+
+    with on_this_thread():
+        run_blocks(work, 10 * LANES)
+    assert names == {threading.current_thread().name}
+    run_blocks(work, 10 * LANES)
+    assert len(names) > 1
 
 
 @pytest.mark.parametrize("threads", ["1", "2"])

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
 from tofclip.lidar.cloud import PointCloud, point_cloud
 from tofclip.lidar.sequence import Ranger
-from tofclip.recovery.direct import one_blas_thread
 from tofclip.streaming.channel import Policy
 from tofclip.streaming.stages import READ, WAIT, Stage, in_stages
-from tofclip.threads import on_this_thread, thread_count
+from tofclip.threads import on_this_thread, one_blas_thread, thread_count
 from tofclip.transient import Streak
 
 
@@ -81,11 +81,12 @@ def stream_clouds(
     # A core for each shot: shared out among all, a shot would be done sooner, but cores would wait for each other.
     with one_blas_thread(), ThreadPoolExecutor(thread_count(), "stream work") as cores:
         stages = Stage("begin", lambda shot: cores.submit(made, shot)), Stage("end", Future.result)
-        for passage in in_stages(coming, stages, held, policy):
-            cloud, seconds = passage.value
-            waited = passage.latency - sum(seconds.values())
-            told = {READ: passage.seconds[READ], WAIT: waited, **seconds}
-            yield StreamedCloud(cloud, passage.number, told, passage.latency)
+        with closing(in_stages(coming, stages, held, policy)) as passages:
+            for passage in passages:
+                cloud, seconds = passage.value
+                waited = passage.latency - sum(seconds.values())
+                told = {READ: passage.seconds[READ], WAIT: waited, **seconds}
+                yield StreamedCloud(cloud, passage.number, told, passage.latency)
 
 
 def _cloud_of(shot: Streak, ranger: Ranger) -> tuple[PointCloud, dict[str, float]]:
