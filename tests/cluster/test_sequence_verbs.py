@@ -172,7 +172,9 @@ def test_captures_on_a_cluster_are_imaged_as_here(run, scheduler, tmp_path):
     assert (status, told["imaged"][0]["capture"], list(told["failed"])) == (1, "0.h5", ["broken.h5"]), err
     for number in range(3):
         one, other = (Volume.load(folder / f"{number}.h5") for folder in (here, there))
-        np.testing.assert_array_equal(other.values, one.values)
+        # Sums of some hundred float32 numbers, each rounded to 6e-8: processes that have done other things before may
+        # add in another order.
+        np.testing.assert_allclose(other.values, one.values, rtol=0, atol=1e-5 * one.values.max())
     assert run("nlos", "reconstruct", captures / "0.h5", "--out", tmp_path / "v.h5", "--cluster", scheduler)[0] == 2
 
 

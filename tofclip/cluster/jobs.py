@@ -8,12 +8,12 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 from tofclip.errors import TofclipError
 from tofclip.storage import one_line
+from tofclip.threads import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -123,24 +123,13 @@ def attempt(job: Job) -> Report:
     problem, figures = "", None
     try:
         if not job.result.exists():
-            with _linear_algebra().limit(limits=1, user_api="blas"):
+            with one_blas_thread():
                 figures = job.work()
     except TofclipError as fault:
         problem = one_line(fault)
     except Exception as fault:
         problem = f"unforeseen {type(fault).__name__}: {one_line(fault)}"
     return Report(job.name, problem, figures, f"{platform.node()}:{os.getpid()}", peak_memory_bytes())
-
-
-@cache
-def _linear_algebra() -> Any:
-    """What sets the number of threads; looking for the libraries takes longer than some jobs."""
-    import numpy as np
-    import scipy.linalg
-    from threadpoolctl import ThreadpoolController
-
-    _ = np, scipy.linalg  # each brings a library of its own
-    return ThreadpoolController()
 
 
 def peak_memory_bytes() -> int:
