@@ -1,11 +1,12 @@
 from __future__ import annotations
 
 import threading
+import time
 
 import pytest
 
 from tofclip.errors import InputError
-from tofclip.threads import LANES, THREADS_VARIABLE, blocks, on_this_thread, run_blocks, thread_count
+from tofclip.threads import LANES, THREADS_VARIABLE, blocks, on_this_thread, one_per_core, run_blocks, thread_count
 
 
 def test_blocks_cover_everything_once():
@@ -58,3 +59,54 @@ def test_a_nonsensical_thread_count_is_refused(monkeypatch, value):
     monkeypatch.setenv(THREADS_VARIABLE, value)
     with pytest.raises(InputError, match=THREADS_VARIABLE):
         thread_count()
+
+
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_items_have_a_core_each_and_come_back_in_order(monkeypatch, threads):
+    monkeypatch.setenv(THREADS_VARIABLE, threads)
+    busy, most, lock = [0], [0], threading.Lock()
+
+    def work(item: int) -> tuple[int, int]:
+        with lock:
+            busy[0] += 1
+            most[0] = max(most[0], busy[0])
+        names: set[str] = set()
+        run_blocks(lambda _: names.add(threading.current_thread().name), 4 * LANES)
+        time.sleep(0.01 * (item % 3))
+        with lock:
+            busy[0] -= 1
+        return item, len(names)
+
+    assert list(one_per_core(work, range(10))) == [(item, 1) for item in range(10)]
+    assert most[0] <= int(threads)
+
+
+def test_a_failed_item_ends_the_row_in_its_place_and_few_are_begun_after_it():
+    begun: list[int] = []
+
+    def work(item: int) -> int:
+        begun.append(item)
+        if item == 2:
+            raise InputError("the third")
+        return item
+
+    coming = one_per_core(work, iter(range(1000)))
+    assert [next(coming), next(coming)] == [0, 1]
+    with pytest.raises(InputError, match="the third"):
+        next(coming)
+    assert len(begun) <= 3 + thread_count()
+
+
+def test_items_are_taken_as_they_are_needed():
+    taken: list[int] = []
+
+    def items():
+        for item in range(1000):
+            taken.append(item)
+            yield item
+
+    coming = one_per_core(lambda item: item, items())
+    assert next(coming) == 0
+    assert len(taken) == thread_count() + 1
+    coming.close()
+    assert len(taken) == thread_count() + 1

@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from tofclip.errors import InputError
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
+
+T = TypeVar("T")
+Made = TypeVar("Made")
 
 LANES = 32
 """Frames per block: a row of a block is two full vectors of 512 bits, and a 174 x 174 picture stays in cache."""
@@ -53,6 +57,33 @@ def on_this_thread() -> Iterator[None]:
         yield
     finally:
         _calling.alone = False
+
+
+def one_per_core(work: Callable[[T], Made], items: Iterable[T]) -> Generator[Made, None, None]:
+    """Yield what `work` makes of each item, in order, while every core is busy with another one of them.
+
+    Items that share the cores wait for each other; items that have one each do not. `thread_count` of them are worked
+    on at a time, and as many results are kept at most. NumPy's products keep to one thread until the end. The first
+    exception is raised where its result would be.
+    """
+
+    def alone(item: T) -> Made:
+        with on_this_thread():
+            return work(item)
+
+    count = thread_count()
+    with one_blas_thread(), ThreadPoolExecutor(count, "tofclip") as cores:
+        under_way: deque[Future[Made]] = deque()
+        try:
+            for item in items:
+                under_way.append(cores.submit(alone, item))
+                if len(under_way) > count:
+                    yield under_way.popleft().result()
+            while under_way:
+                yield under_way.popleft().result()
+        finally:
+            for one in under_way:
+                one.cancel()
 
 
 def blocks(total: int, size: int = LANES) -> Iterator[slice]:

@@ -22,6 +22,7 @@ from tofclip.reconstruct.focus import AT_THE_CALIBRATED_DEPTH, Focus
 from tofclip.reconstruct.task import fitted_to_shot, prepare
 from tofclip.recovery import LinearInverse
 from tofclip.recovery.traces import InverseTraces, patch_order
+from tofclip.threads import one_per_core
 from tofclip.transient import Streak
 
 FloatArray = NDArray[np.float64]
@@ -203,7 +204,7 @@ def clouds(
     Parameters
     ----------
     shots : sequence of callables
-        Each reads its shot when it is called; one is in memory at a time.
+        Each reads its shot when it is called, on the thread that works on it.
     ranger : Ranger
     average : int
         Shots whose readings are averaged.
@@ -216,14 +217,22 @@ def clouds(
     ------
     InputError
         No shot, or fewer than one to average; a shot without any light, by its name.
+
+    Notes
+    -----
+    Every core works on a cloud of its own. Memory: a shot for each core, with what is recovered of it, and what a
+    `Ranger` takes.
     """
     if not shots or average < 1 or first < 0:
         raise InputError("a sequence needs at least one shot, and at least one to average")
     jitter = Jitter(light_over_time(shots[0](), ranger.camera)) if steady else None
-    for start in range(first * average, len(shots), average):
+
+    def step(start: int) -> Step:
         numbers = range(start, min(start + average, len(shots)))
         cloud, late = averaged([shots[number] for number in numbers], ranger, jitter)
-        yield Step(cloud, numbers, late)
+        return Step(cloud, numbers, late)
+
+    yield from one_per_core(step, range(first * average, len(shots), average))
 
 
 def averaged(shots: Sequence[Shot], ranger: Ranger, jitter: Jitter | None) -> tuple[PointCloud, FloatArray]:
