@@ -110,3 +110,13 @@ def test_items_are_taken_as_they_are_needed():
     assert len(taken) == thread_count() + 1
     coming.close()
     assert len(taken) == thread_count() + 1
+
+
+def test_work_on_this_thread_stays_there_when_a_part_of_it_asks_for_the_same(monkeypatch):
+    monkeypatch.setenv(THREADS_VARIABLE, "2")
+    names: set[str] = set()
+    with on_this_thread():
+        with on_this_thread():
+            pass
+        run_blocks(lambda _: names.add(threading.current_thread().name), 8 * LANES)
+    assert names == {threading.current_thread().name}

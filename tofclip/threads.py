@@ -52,11 +52,16 @@ _calling = threading.local()
 @contextmanager
 def on_this_thread() -> Iterator[None]:
     """Let `run_blocks` work on the calling thread alone, for whoever has other work for the other cores."""
+    before = _alone()
     _calling.alone = True
     try:
         yield
     finally:
-        _calling.alone = False
+        _calling.alone = before
+
+
+def _alone() -> bool:
+    return getattr(_calling, "alone", False)
 
 
 def one_per_core(work: Callable[[T], Made], items: Iterable[T]) -> Generator[Made, None, None]:
@@ -98,7 +103,7 @@ def run_blocks(work: Callable[[slice], None], total: int, size: int = LANES) -> 
     An interruption (Ctrl-C) waits for the blocks under way and starts no further ones.
     """
     pieces = list(blocks(total, size))
-    threads = 1 if getattr(_calling, "alone", False) else min(thread_count(), len(pieces))
+    threads = 1 if _alone() else min(thread_count(), len(pieces))
     if threads <= 1:
         for piece in pieces:
             work(piece)
