@@ -55,6 +55,7 @@ class LiveShots(ShotSource):
         self._count, self._trouble = 0, ""
         self._latency, self._lost = float("nan"), 0
         self._ranger = Ranger(camera, first.times)
+        self.rectifier = self._ranger.rectifier  # knows the sweep already
         self._lock, self._stopping = threading.Lock(), threading.Event()
         self._ended = False
         self._keep(self._ranged(self.rectified(first)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +35,12 @@ class ShotSource(Source):
     def __init__(self, title: str, camera: Camera, row_times: NDArray[np.float64]) -> None:
         super().__init__(title, SHOTS_PER_SECOND, Abilities(shears=SHEARS if camera.views > 1 else None))
         self.linear = LinearPath(camera, row_times - camera.time_zero)
-        self._rectifier = Rectifier(camera, row_times.size)
         self._views: OrderedDict[int, View] = OrderedDict()
+
+    @cached_property
+    def rectifier(self) -> Rectifier:
+        """What takes the sweep off a shot."""
+        return Rectifier(self.linear.camera, self.linear.times.size)
 
     @abc.abstractmethod
     def readings(self, number: int) -> Readings:
@@ -43,7 +48,7 @@ class ShotSource(Source):
 
     def rectified(self, streak: Streak) -> Readings:
         """Take dark level and sweep off a shot."""
-        return self._rectifier.measure(streak.counts, streak.saturated).readings
+        return self.rectifier.measure(streak.counts, streak.saturated).readings
 
     def view(self, number: int) -> View:
         if number not in self._views:
