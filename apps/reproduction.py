@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from tofclip.storage import atomic_path
 
 if TYPE_CHECKING:
-    from tofclip.studies.outcome import Outcome, Study
+    from apps.studies.outcome import Outcome, Study
 
 PAGE = "reproduction.md"
 FOLDER = "reproduction"

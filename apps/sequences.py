@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 if TYPE_CHECKING:
-    from tofclip.cluster import Job, Report, Summary
+    from tofclip.sequences.jobs import Job, Report, Summary
 
 SOME_FAILED = 1
 BYTES_PER_MIB = 1 << 20
@@ -32,7 +32,7 @@ def run_all(
         Called with each report.
     """
     from apps.progress import progress
-    from tofclip.cluster import run, unfinished
+    from tofclip.sequences.jobs import run, unfinished
 
     missing = unfinished(jobs)
     with progress(title, len(missing)) as advance:

@@ -10,8 +10,8 @@ from devices.statistics import Stats
 from devices.uri import Uri
 from tofclip.errors import InputError
 from tofclip.io import read_streak
+from tofclip.shots import Streak
 from tofclip.storage import Field, Record
-from tofclip.transient import Streak
 
 
 class PictureSource(Source):

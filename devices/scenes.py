@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.camera import Camera, SkewSweep
+from tofclip.shots import Streak
 from tofclip.simulate import (
     Instrument,
     Plate,
@@ -19,7 +20,6 @@ from tofclip.simulate import (
     simulate,
 )
 from tofclip.simulate.shapes import Pattern, cut_out, letter, plain, stripes
-from tofclip.transient import Streak
 
 SENSOR_PIXELS = 256
 LENSLETS = 7

@@ -34,8 +34,8 @@ from devices.tcspc import times_of
 from devices.uri import Uri
 from tofclip.camera import Camera
 from tofclip.errors import DeviceTimeoutError, InputError
+from tofclip.shots import Streak
 from tofclip.storage import Record, provenance
-from tofclip.transient import Streak
 
 GATHERING = ("seconds", "frames", "bins", "start_ps", "period_ps", "records", "sync", "pixels")
 BIN_WIDTH = 20e-12

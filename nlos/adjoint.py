@@ -21,7 +21,7 @@ from nlos.volume import Volume
 from tofclip.arrays import require_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator
-from tofclip.recovery import Adjoint, Method
+from tofclip.solvers import Adjoint, Method
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class CompressedCapture:
         Parameters
         ----------
         method : Method, optional
-            Of `tofclip.recovery`; defaults to the adjoint. `LinearInverse` costs as much and is sharper.
+            Of `tofclip.solvers`; defaults to the adjoint. `LinearInverse` costs as much and is sharper.
         """
         method = method or Adjoint()
         frames = method.recover(self.operator, self.readings).frames
@@ -107,7 +107,7 @@ class AdjointImaging:
     solver : Reconstructor
         Any method of this package.
     recovery : Method
-        The adjoint, or another of `tofclip.recovery`.
+        The adjoint, or another of `tofclip.solvers`.
     threshold : float
         Voxels weaker than this share of the brightest become 0; 0 keeps all.
     """

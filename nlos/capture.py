@@ -17,7 +17,7 @@ from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
 
 if TYPE_CHECKING:
-    from tofclip.transient import Frames
+    from tofclip.shots import Frames
 
 FloatArray = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from nlos.capture import Capture
 from nlos.kernels import delayed_reading
 from tofclip.arrays import require_numpy, to_numpy
 from tofclip.errors import InputError, ShapeError
+from tofclip.shots import Frames
 from tofclip.storage import Record
-from tofclip.transient import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
 ATTACHMENT = "relay_wall"

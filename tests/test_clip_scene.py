@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tofclip import Camera, Frames, Streak, read_streak, recover
-from tofclip.calibration import calibrate
-from tofclip.recovery import Sparse
+from tofclip.camera.calibration import calibrate
+from tofclip.solvers import Sparse
 
 TIME_ZERO = -10.784e-9
 PEAK_ROWS = [93, 139, 182, 331, 431, 476, 683]  # of the trial, summed energy times range squared

@@ -23,7 +23,7 @@ NAMES = {
         "recover",
     ],
     "tofclip.io": ["read_streak"],
-    "tofclip.transient": ["Frames", "Streak"],
+    "tofclip.shots": ["Frames", "Streak"],
     "nlos": [
         "Backprojection",
         "Capture",

@@ -18,10 +18,10 @@ from tofclip.arrays import Place
 from tofclip.camera import Camera
 from tofclip.lidar import Detection, depth
 from tofclip.operators import BlockDiagonal, Diagonal, Integration, LinearOperator, LineProjection, Reshape, Stack
-from tofclip.recovery import Adjoint, Huber, LinearInverse, Method, Poisson, Sparse, TotalVariation, relative_residual
-from tofclip.recovery import direct as direct_module
-from tofclip.recovery import loop as loop_module
-from tofclip.transient import Frames
+from tofclip.shots import Frames
+from tofclip.solvers import Adjoint, Huber, LinearInverse, Method, Poisson, Sparse, TotalVariation, relative_residual
+from tofclip.solvers import direct as direct_module
+from tofclip.solvers import loop as loop_module
 
 strict = pytest.importorskip("array_api_strict")
 ELSEWHERE = Place("array_api_strict", strict.Device("device1"))

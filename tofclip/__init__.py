@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from tofclip.io import read_streak
     from tofclip.lidar import PointCloud, depth, point_cloud
     from tofclip.metrics import nmse
-    from tofclip.reconstruct import recover
-    from tofclip.transient import Frames, Streak
+    from tofclip.recovery import recover
+    from tofclip.shots import Frames, Streak
 
 __all__ = [
     "Camera",
@@ -37,15 +37,15 @@ __all__ = [
 
 _HOMES = {
     "Camera": "tofclip.camera",
-    "Frames": "tofclip.transient",
+    "Frames": "tofclip.shots",
     "PointCloud": "tofclip.lidar",
-    "Streak": "tofclip.transient",
+    "Streak": "tofclip.shots",
     "TofclipError": "tofclip.errors",
     "depth": "tofclip.lidar",
     "nmse": "tofclip.metrics",
     "point_cloud": "tofclip.lidar",
     "read_streak": "tofclip.io",
-    "recover": "tofclip.reconstruct",
+    "recover": "tofclip.recovery",
 }
 
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from apps.benchmarks.case import Case, Prepared
 from apps.benchmarks.peers import lensless_seconds
-from tofclip.clip_measurement import Setup, measure
-from tofclip.clip_recovery import ClipRecovery
 from tofclip.light_field import LightField
+from tofclip.light_field.measurement import Setup, measure
+from tofclip.recovery.light_field import ClipRecovery
 
 SIDES = (64, 128)
 SHEAR = -0.3

@@ -9,10 +9,10 @@ import numpy as np
 from apps.benchmarks.case import Case, Prepared
 from apps.benchmarks.recovery import dense_products, operator, readings
 from tofclip.lidar import depth
-from tofclip.lidar.sequence import Ranger
+from tofclip.sequences.ranger import Ranger
+from tofclip.sequences.streaming import stream_clouds
 from tofclip.simulate import default_instrument, default_scene, simulate, true_frames
 from tofclip.simulate.instrument import Instrument
-from tofclip.streaming import stream_clouds
 from tofclip.threads import run_blocks
 
 ROWS = (254, 1016)

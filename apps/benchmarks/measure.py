@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 from apps.benchmarks.case import AbsentPeerError, Action, Case
-from tofclip.cluster.jobs import peak_memory_bytes
+from tofclip.sequences.jobs.jobs import peak_memory_bytes
 
 FEWEST, MOST = 3, 31
 SECONDS = 1.0

@@ -14,8 +14,8 @@ from apps.benchmarks.case import Case, Prepared
 from apps.benchmarks.peers import astra_seconds
 from tofclip.camera import Camera
 from tofclip.operators import LineProjection
-from tofclip.recovery import Adjoint, LinearInverse, Method, Sparse, TotalVariation
-from tofclip.recovery.direct import DENSE_ROWS
+from tofclip.solvers import Adjoint, LinearInverse, Method, Sparse, TotalVariation
+from tofclip.solvers.direct import DENSE_ROWS
 from tofclip.threads import LANES, one_blas_thread, run_blocks
 
 ITERATIONS = 30

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from tofclip.calibration import FocusCalibration
+    from tofclip.camera.calibration import FocusCalibration
 
 ZOOM_HALF_WIDTH_PX = 20
 MARGIN_ROWS = 25

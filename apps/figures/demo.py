@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tofclip.lidar import PointCloud, Returns
+    from tofclip.shots import Frames, Streak
     from tofclip.simulate import Truth
-    from tofclip.transient import Frames, Streak
 
 BRIGHTEST = 99.5  # percent: a glint does not darken the rest
 HISTOGRAM_BINS = 61

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from tofclip.occlusion.experiment import Experiment
-    from tofclip.occlusion.probe import Probe
+    from apps.occlusion.experiment import Experiment
+    from apps.occlusion.probe import Probe
 
 SEEN, UNSEEN = "#57c84d", "#ff5a5f"
 BEYOND = 1.15  # of the target's distance behind the occluder is drawn

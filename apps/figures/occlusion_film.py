@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from tofclip.occlusion.experiment import Experiment
+    from apps.occlusion.experiment import Experiment
 
 FRAME_MS, LAST_FRAME_MS = 120, 2500
 DARK = 0.02  # of a return's brightest instant: the film passes over fainter ones

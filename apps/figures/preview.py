@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from tofclip.transient import Frames, Streak
+    from tofclip.shots import Frames, Streak
 
 COLUMNS = 4
 MOST_MOMENTS = 3 * COLUMNS

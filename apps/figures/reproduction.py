@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from apps.figures.style import DEPTH, SMALL, draw, page
 
 if TYPE_CHECKING:
-    from tofclip.studies.outcome import Outcome
+    from apps.studies.outcome import Outcome
 
 PANEL_INCHES = 1.5
 BRIGHTEST = 99.5  # percentile drawn white: a lone bright pixel must not darken the rest

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from tofclip.lidar import PointCloud
     from tofclip.lidar.objects import SeenObject
-    from tofclip.transient import Frames
+    from tofclip.shots import Frames
 
 BRIGHTEST = 99.5  # percent: a glint does not darken the rest
 FAINTEST_SHOWN = 0.4  # of the colours: dim points stay visible

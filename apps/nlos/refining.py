@@ -61,7 +61,7 @@ def refined(settings: Refining, grid: Grid) -> tuple[Refining, Refinement]:
     """Build the refinement that settings ask for on a grid; the settings come back with what nobody told."""
     from nlos import Refinement
     from nlos.refinement.refine import variation
-    from tofclip.recovery import Sparse
+    from tofclip.solvers import Sparse
 
     weight = PRIOR_WEIGHT if settings.prior_weight is None else settings.prior_weight
     iterations = settings.iterations or ITERATIONS

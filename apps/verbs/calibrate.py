@@ -11,7 +11,7 @@ from apps.options import AsJson, Picture, TimeZero
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.calibration import FocusCalibration
+    from tofclip.camera.calibration import FocusCalibration
 
 
 def calibrate(
@@ -47,7 +47,7 @@ def calibrate(
     from apps.figures.calibration import calibration_figure
     from apps.figures.style import save
     from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
-    from tofclip.calibration import calibrate as fit
+    from tofclip.camera.calibration import calibrate as fit
     from tofclip.io import read_streak
 
     pictures = (line, line_background, dot, dot_background)

@@ -49,8 +49,8 @@ def simulate(
     """
     from apps.files import RECORD_SUFFIXES, history, require_writable
     from apps.report import report
-    from tofclip.clip_measurement import Setup, measure, spoilt
     from tofclip.io.light_fields import read_light_field
+    from tofclip.light_field.measurement import Setup, measure, spoilt
 
     require_writable(out, *RECORD_SUFFIXES, inputs=(light_field,))
     known = read_light_field(light_field)
@@ -103,8 +103,8 @@ def recover(
     """
     from apps.files import require_writable
     from apps.report import report
-    from tofclip.clip_measurement import ClipMeasurement
-    from tofclip.clip_recovery import ClipRecovery
+    from tofclip.light_field.measurement import ClipMeasurement
+    from tofclip.recovery.light_field import ClipRecovery
     from tofclip.storage import Record
 
     inputs = (measurement,) if truth is None else (measurement, truth)

@@ -12,8 +12,8 @@ from apps.options import AsJson, Cluster, Device
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
-    from tofclip.batch import Clouds
     from tofclip.lidar import PointCloud, Returns
+    from tofclip.sequences import Clouds
 
 FORMATS = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".h5")
 DEPTH_PICTURE = ".exr"
@@ -56,8 +56,8 @@ def cloud(
     Example: tofclip cloud 'frames/*.h5' --out clouds/ --cluster local
     """
     from apps.sequences import device_told
-    from tofclip.batch import Clouds, is_sequence
     from tofclip.errors import InputError
+    from tofclip.sequences import Clouds, is_sequence
 
     clouds = Clouds(drop_outliers, None if voxel_mm is None else voxel_mm * MILLIMETRE, device)
     used = device_told(device, cluster)
@@ -81,7 +81,7 @@ def _clouds_of_sequence(
     clouds: Clouds, frames: Path, out: Path, suffix: str, how: tuple[str | None, str, bool]
 ) -> None:
     from apps.sequences import finish, run_all
-    from tofclip.batch import files_in
+    from tofclip.sequences import files_in
 
     require_format(suffix, DEPTH_PICTURE)
     cluster, device, as_json = how
@@ -93,8 +93,8 @@ def _clouds_of_sequence(
 
 def _cloud_of_one(clouds: Clouds, frames: Path, made: tuple[Path, str], as_json: bool) -> None:
     from apps.files import history, require_writable
-    from tofclip.batch.clouds import save_cloud
-    from tofclip.transient import Frames
+    from tofclip.sequences.clouds import save_cloud
+    from tofclip.shots import Frames
 
     out, _ = made
     require_writable(out, *FORMATS, DEPTH_PICTURE, inputs=(frames,))

@@ -13,8 +13,8 @@ from apps.options import AsJson
 
 if TYPE_CHECKING:
     from tofclip.lidar import PointCloud, Returns
+    from tofclip.shots import Frames, Streak
     from tofclip.simulate import SimulatedShot
-    from tofclip.transient import Frames, Streak
 
 BORDER_PX = 12  # views leave the slit there: the picture's rim is scored by nobody
 
@@ -65,7 +65,7 @@ def _run(seed: int) -> DemoRun:
     from apps.files import history
     from apps.progress import progress
     from tofclip.lidar import depth, point_cloud
-    from tofclip.reconstruct import prepare
+    from tofclip.recovery import prepare
     from tofclip.simulate import default_instrument, default_scene, simulate, true_frames
 
     scene, instrument = default_scene(), default_instrument()

@@ -11,7 +11,7 @@ from apps.options import AsJson, Cluster, TimeZero
 from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.cluster import Report
+    from tofclip.sequences.jobs import Report
 
 app = typer.Typer()
 
@@ -78,10 +78,10 @@ def parallax(
     from apps.files import RECORD_SUFFIXES, require_writable
     from apps.progress import progress
     from apps.report import report
-    from tofclip.calibration.parallax import LOOK
     from tofclip.camera import Camera
+    from tofclip.camera.calibration.parallax import LOOK
     from tofclip.io import read_streak
-    from tofclip.reconstruct import parallax_from_shot, prepare
+    from tofclip.recovery import parallax_from_shot, prepare
 
     require_writable(out, *RECORD_SUFFIXES, inputs=(streak,) if camera is None else (streak, camera))
     task = prepare(read_streak(streak), None if camera is None else Camera.load(camera))
@@ -121,7 +121,7 @@ def scene(
     from tofclip.errors import InputError
     from tofclip.lidar import depth, point_cloud
     from tofclip.lidar.objects import find_objects
-    from tofclip.transient import Frames
+    from tofclip.shots import Frames
 
     require_writable(out, *PICTURE_SUFFIXES, inputs=(frames,))
     recovered = Frames.load(frames)
@@ -170,7 +170,7 @@ def sequence(
     """
     from apps.sequences import finish, run_all
     from apps.verbs.cloud import require_format
-    from tofclip.batch import Ranging, shots_in
+    from tofclip.sequences import Ranging, shots_in
 
     require_format(suffix)
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND

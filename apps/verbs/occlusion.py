@@ -12,11 +12,11 @@ from apps.options import AsJson
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
-    from tofclip.occlusion.experiment import Experiment
-    from tofclip.occlusion.probe import Probe
+    from apps.occlusion.experiment import Experiment
+    from apps.occlusion.probe import Probe
 
 SCENE_NAMES = ("v-letter", "plate", "person", "tree", "bush", "trellis", "board")
-"""Those of `tofclip.occlusion.scenes`, named here so that help appears without loading them."""
+"""Those of `apps.occlusion.scenes`, named here so that help appears without loading them."""
 
 app = typer.Typer()
 
@@ -97,11 +97,11 @@ def demo(
     from apps.figures.occlusion_film import STEPS, save_flash, save_walk
     from apps.figures.style import save
     from apps.files import make_folder
+    from apps.occlusion.experiment import USUAL_PHOTONS, Experiment, Settings
+    from apps.occlusion.scenes import occlusion_scene
     from apps.progress import progress
     from apps.report import report
     from tofclip.errors import InputError
-    from tofclip.occlusion.experiment import USUAL_PHOTONS, Experiment, Settings
-    from tofclip.occlusion.scenes import occlusion_scene
 
     started = time.perf_counter()
     if encoder not in USUAL_PHOTONS:
@@ -124,8 +124,8 @@ def demo(
 
 def _look(experiment: Experiment) -> list[Probe]:
     """Cast the rays, recover, and try small targets inside the inactive region and beyond, if it ends."""
+    from apps.occlusion.probe import FACTORS, probe
     from apps.progress import progress
-    from tofclip.occlusion.probe import FACTORS, probe
 
     scene, probes = experiment.scene, []
     factors = FACTORS if scene.region.ends else ()

@@ -11,8 +11,8 @@ from apps.options import AsJson, Cluster, Device, Picture, TimeZero, completing
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.batch import Recovery
-    from tofclip.transient import Frames, Streak
+    from tofclip.sequences import Recovery
+    from tofclip.shots import Frames, Streak
 
 
 def recover(
@@ -79,7 +79,7 @@ def recover(
     Example: tofclip recover shot.tif --camera camera.h5 --out frames.h5 --time-zero-ns -10.784
     """
     from apps.sequences import device_told
-    from tofclip.batch import Recovery, is_sequence
+    from tofclip.sequences import Recovery, is_sequence
 
     zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
@@ -114,7 +114,7 @@ def _recover_sequence(
     recovery: Recovery, shots: tuple[str, float | None], out: Path, sweep: list[str], how: tuple[str | None, str, bool]
 ) -> None:
     from apps.sequences import finish, run_all
-    from tofclip.batch import shots_in, variants
+    from tofclip.sequences import shots_in, variants
 
     cluster, device, as_json = how
     found = shots_in(*shots)
@@ -141,8 +141,8 @@ def _recover_single(
     from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
     from apps.progress import progress
     from apps.verbs.cloud import FORMATS as CLOUD_SUFFIXES
-    from tofclip.batch import Clouds
-    from tofclip.batch.recovery import with_history
+    from tofclip.sequences import Clouds
+    from tofclip.sequences.recovering import with_history
 
     preview, cloud = further
     inputs = tuple(Path(name) for name in (shot[0], recovery.camera) if name is not None and not _is_address(name))
@@ -180,7 +180,7 @@ def _shot(streak: str, bin_width: float | None) -> Streak:
 
 def _report(frames: Frames, as_json: bool, written: list[Path]) -> None:
     from apps.report import report
-    from tofclip.reconstruct import time_shift_bins
+    from tofclip.recovery import time_shift_bins
 
     known = frames.figures
     report(

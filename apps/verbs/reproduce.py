@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from apps.reproduction import Result
-    from tofclip.cluster import Summary
-    from tofclip.studies.library import Library
-    from tofclip.studies.outcome import Advance, Study
+    from apps.studies.library import Library
+    from apps.studies.outcome import Advance, Study
+    from tofclip.sequences.jobs import Summary
 
 
 def _names(incomplete: str) -> list[str]:
     """Complete the name of a study in the shell."""
-    from tofclip.studies.registry import STUDIES
+    from apps.studies.registry import STUDIES
 
     return completing("all", *(name for study in STUDIES for name in (study.name, *study.also)))(incomplete)
 
@@ -52,8 +52,8 @@ def reproduce(
     from apps.report import report
     from apps.reproduction import FOLDER, write_page
     from apps.sequences import finish
-    from tofclip.studies.library import Library
-    from tofclip.studies.registry import studies_called
+    from apps.studies.library import Library
+    from apps.studies.registry import studies_called
 
     studies = studies_called(name)
     _require_folder(data)
@@ -99,7 +99,7 @@ def _shared(studies: Sequence[Study], library: Library, seeds: int, folder: Path
     """Have the studies that are not there yet made by workers."""
     from apps.reproduction import kept_result
     from apps.sequences import run_all
-    from tofclip.cluster import Job
+    from tofclip.sequences.jobs import Job
 
     data = None if library.data is None else library.data.resolve()
     jobs = []
@@ -115,7 +115,7 @@ def _shared(studies: Sequence[Study], library: Library, seeds: int, folder: Path
 
 def make_study(name: str, data: Path | None, seeds: int, folder: Path) -> None:
     """Make a study again and write it; light fields are rendered or read once in a process."""
-    from tofclip.studies.registry import studies_called
+    from apps.studies.registry import studies_called
 
     (study,) = studies_called(name)
     _made(study, _library(data), seeds, folder, lambda _: None)
@@ -123,7 +123,7 @@ def make_study(name: str, data: Path | None, seeds: int, folder: Path) -> None:
 
 @cache
 def _library(data: Path | None) -> Library:
-    from tofclip.studies.library import Library
+    from apps.studies.library import Library
 
     return Library(data)
 
@@ -165,7 +165,7 @@ def _made(study: Study, library: Library, seeds: int, folder: Path, advance: Adv
 def _all_results(library: Library, seeds: int, folder: Path) -> list[Result]:
     """Every result that the folder holds with these settings, in the order of the paper's tables."""
     from apps.reproduction import kept_result
-    from tofclip.studies.registry import STUDIES
+    from apps.studies.registry import STUDIES
 
     found = (kept_result(folder / f"{study.name}.json", _settings(study, library, seeds)) for study in STUDIES)
     return [result for result in found if result is not None]

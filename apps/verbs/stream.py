@@ -16,9 +16,9 @@ from apps.options import AsJson, TimeZero
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.lidar.sequence import Ranger
-    from tofclip.streaming import StreamedCloud
-    from tofclip.transient import Streak
+    from tofclip.sequences.ranger import Ranger
+    from tofclip.sequences.streaming import StreamedCloud
+    from tofclip.shots import Streak
 
 MOST_REMEMBERED = 10_000  # shots over which medians are taken: a stream may run for days
 
@@ -64,7 +64,7 @@ def stream(
     from apps.report import report
     from apps.verbs.cloud import require_format
     from tofclip.errors import InputError
-    from tofclip.streaming import stream_clouds
+    from tofclip.sequences.streaming import stream_clouds
 
     require_format(suffix)
     if shots is not None and shots < 1:
@@ -89,7 +89,7 @@ def _coming(source: str, bin_width: float | None) -> Iterator[Streak]:
         from devices.transients import read_transients
 
         return read_transients(source, bin_width)
-    from tofclip.batch import shots_in
+    from tofclip.sequences import shots_in
 
     return (shot() for shot in shots_in(source, bin_width).values())
 
@@ -97,8 +97,8 @@ def _coming(source: str, bin_width: float | None) -> Iterator[Streak]:
 def _ranger(first: Streak, camera: Path | None, time_zero: float | None, focus: str) -> Ranger:
     from tofclip.camera import Camera
     from tofclip.errors import InputError
-    from tofclip.lidar.sequence import Ranger
-    from tofclip.reconstruct import SharpestFocus, focus_named
+    from tofclip.recovery import SharpestFocus, focus_named
+    from tofclip.sequences.ranger import Ranger
 
     chosen = focus_named(focus)
     if isinstance(chosen, SharpestFocus):
@@ -117,7 +117,7 @@ def _again(first: Streak, others: Iterator[Streak]) -> Iterator[Streak]:
 
 def _followed(made: Iterable[StreamedCloud], out: Path | None, suffix: str) -> Mapping[str, Any]:
     """Take the clouds as they come; return what is told at the end."""
-    from tofclip.lidar.sequence import cloud_path
+    from tofclip.sequences.ranger import cloud_path
 
     stages: dict[str, deque[float]] = {}
     latency: deque[float] = deque(maxlen=MOST_REMEMBERED)

@@ -13,9 +13,9 @@ from tofclip.camera import Camera
 from tofclip.lidar import Detection, Returns, depth, point_cloud
 from tofclip.lidar.detection import BRIGHT_QUANTILE
 from tofclip.lidar.processing import selected
-from tofclip.recovery import LinearInverse
-from tofclip.recovery.direct import PreparedInverse
-from tofclip.transient import Frames
+from tofclip.shots import Frames
+from tofclip.solvers import LinearInverse
+from tofclip.solvers.direct import PreparedInverse
 
 Readings = NDArray[np.float32]
 

@@ -13,10 +13,10 @@ from apps.viewer.shots import ShotSource
 from apps.viewer.source import View
 from tofclip.camera import Camera
 from tofclip.errors import InputError, TofclipError
-from tofclip.lidar.sequence import Ranger
+from tofclip.sequences.ranger import Ranger
+from tofclip.sequences.streaming import Stage, in_stages
+from tofclip.shots import Streak
 from tofclip.storage import one_line
-from tofclip.streaming import Stage, in_stages
-from tofclip.transient import Streak
 
 MOST_KEPT = 32
 LONGEST_STOP = 10.0
@@ -29,8 +29,8 @@ RATE_OVER = 8
 class LiveShots(ShotSource):
     """Shots that an iterator delivers, made into clouds as they come; the last 32 can be looked at again.
 
-    Reading, rectifying and ranging are stages side by side (`tofclip.streaming`). Shots that come faster than that are
-    dropped, the oldest that waits first, so that what one sees is never late.
+    Reading, rectifying and ranging are stages side by side (`tofclip.sequences.streaming`). Shots that come
+    faster than that are dropped, the oldest that waits first, so that what one sees is never late.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from apps.viewer.linear_path import SHEARS, LinearPath, Readings
 from apps.viewer.source import Abilities, Gate, Source, View, Waveform
 from apps.viewer.transient import depth_picture
 from tofclip.camera import Camera, Rectifier
-from tofclip.transient import Streak
+from tofclip.shots import Streak
 
 SHOTS_PER_SECOND = 10.0
 MOST_KEPT = 16

@@ -15,8 +15,8 @@ from tofclip.storage import SIGNATURE, Record, reading
 if TYPE_CHECKING:
     from apps.viewer.source import Source
     from tofclip.camera import Camera
-    from tofclip.transient import Streak
-    from tofclip.transient.stack import StreakStack
+    from tofclip.shots import Streak
+    from tofclip.shots.stack import StreakStack
 
 
 @dataclass(frozen=True)
@@ -70,10 +70,10 @@ def open_source(name: str, extras: Extras | None = None) -> Source:
 
 def _hdf5(path: Path, extras: Extras) -> Source:
     from apps.viewer.transient import TransientSource
-    from tofclip.transient import Frames
+    from tofclip.shots import Frames
 
     if _is_stack(path):
-        from tofclip.transient.stack import StreakStack
+        from tofclip.shots.stack import StreakStack
 
         stack = StreakStack(path)
         return _shots(path.name, [partial(_stacked, stack, number, extras) for number in range(len(stack))], extras)
@@ -132,7 +132,7 @@ def _instrument(address: str, extras: Extras) -> Source:
 def _camera_of(shot: Streak, extras: Extras) -> Camera:
     """The camera of a row of shots; a sweep that is not known is found from the first one."""
     from tofclip.camera import Camera
-    from tofclip.reconstruct import fitted_to_shot, prepare
+    from tofclip.recovery import fitted_to_shot, prepare
 
     known = prepare(shot, None if extras.camera is None else Camera.load(extras.camera), "linear").camera
     if extras.time_zero is not None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from apps.viewer.linear_path import SHEARS, LinearPath, Readings, least_intensity, view_of
 from apps.viewer.source import Abilities, Gate, Source, View, Waveform
 from tofclip.lidar import PointCloud, depth
-from tofclip.transient import Frames
+from tofclip.shots import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
 SECONDS_TO_PLAY = 12.0

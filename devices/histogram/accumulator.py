@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from tofclip.camera import Camera
 from tofclip.errors import InputError
+from tofclip.shots import Streak
 from tofclip.threads import run_blocks, thread_count
-from tofclip.transient import Streak
 
 MOST_CELLS = 1 << 26
 """Bins of all pixels together: half a gigabyte for each thread."""

@@ -25,6 +25,6 @@ def read_numpy_archive(fields: Fields) -> Capture:
 def read_lift_archive(path: str | Path) -> Capture:
     """Recover a LIFT streak image of a relay wall by the linear inverse, and take its wall out."""
     from tofclip.io import read_streak
-    from tofclip.reconstruct import recover
+    from tofclip.recovery import recover
 
     return Capture.from_frames(recover(read_streak(path), method="linear"))

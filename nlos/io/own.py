@@ -13,7 +13,7 @@ def read_own(path: str | Path) -> Capture | None:
     """Read a capture, or take one out of recovered frames; None if the HDF5 file is not one of ours."""
     import h5py
 
-    from tofclip.transient import Frames
+    from tofclip.shots import Frames
 
     try:
         with h5py.File(path, "r") as file:

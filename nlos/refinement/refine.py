@@ -15,8 +15,8 @@ from nlos.plane import step
 from nlos.refinement.model import WallModel
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
-from tofclip.recovery import Method, Sparse
-from tofclip.recovery.light_field_variation import LightFieldVariation
+from tofclip.solvers import Method, Sparse
+from tofclip.solvers.light_field_variation import LightFieldVariation
 
 VOLUMES_HELD = 12
 """float32 volumes that the solver holds at once, with the duals of total variation."""
@@ -33,7 +33,7 @@ def variation(grid: Grid, weight: float = 2e-2, iterations: int = 60) -> LightFi
     grid : Grid
         What will be imaged on; evenly spaced.
     weight, iterations
-        As of `tofclip.recovery.TotalVariation`.
+        As of `tofclip.solvers.TotalVariation`.
     """
     across = step(grid.x) if grid.x.size > 1 else 1.0
     along = step(grid.z) if grid.z.size > 1 else across
@@ -56,7 +56,7 @@ class Refinement:
     hybrid : Hybrid
         Its wavelength, cycles, tolerance and virtual plane.
     prior : Method
-        A proximal method of `tofclip.recovery`; `Sparse` is l1, `variation` total variation.
+        A proximal method of `tofclip.solvers`; `Sparse` is l1, `variation` total variation.
     """
 
     hybrid: Hybrid

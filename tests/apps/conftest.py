@@ -25,7 +25,7 @@ from small_instrument import (
 
 from apps.cli import main
 from tofclip.camera import Camera, SkewSweep
-from tofclip.transient import Streak
+from tofclip.shots import Streak
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tofclip.shots import Streak
 from tofclip.storage import Field, Record
-from tofclip.transient import Streak
 
 CENTRES_PX = np.array([30.4, 70.0, 110.7, 150.0, 190.2, 230.0, 269.6])
 ANGLES = np.deg2rad([-43.0, -26.0, -13.0, 0.5, 23.0, 37.0, 48.0])

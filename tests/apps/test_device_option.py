@@ -12,7 +12,7 @@ import pytest
 from small_instrument import Run
 
 from tofclip import Frames, PointCloud, Streak, arrays, recover
-from tofclip.reconstruct import DepthLocked, Focus, SharpestFocus
+from tofclip.recovery import DepthLocked, Focus, SharpestFocus
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ import tofclip
 from apps.cli import COMPLETION_VARIABLE, MAP
 from apps.documentation import page, verbs, write_pages
 from apps.help import folded, told
-from tofclip.studies.registry import studies_called
+from apps.studies.registry import studies_called
 
 ROOT = Path(tofclip.__file__).parents[1]
 VERBS = verbs()

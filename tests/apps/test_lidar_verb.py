@@ -10,10 +10,10 @@ import numpy as np
 from small_instrument import Run
 
 from tofclip.camera import Camera, SkewSweep
+from tofclip.shots import Frames
+from tofclip.shots.stack import save_stack
 from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate, true_frames
 from tofclip.simulate.shapes import checkerboard
-from tofclip.transient import Frames
-from tofclip.transient.stack import save_stack
 
 CENTRES = 40.0 + 60 * np.arange(5)
 CAMERA = Camera(

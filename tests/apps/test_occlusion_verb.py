@@ -14,8 +14,8 @@ from small_instrument import Run
 
 from apps.cli import main
 from apps.figures import occlusion_film
+from apps.occlusion.scenes import SCENES, occlusion_scene
 from apps.verbs.occlusion import SCENE_NAMES
-from tofclip.occlusion.scenes import SCENES, occlusion_scene
 
 
 def test_the_inactive_length_of_the_papers_experiment(run: Run, tmp_path: Path) -> None:

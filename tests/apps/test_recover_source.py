@@ -10,8 +10,8 @@ from small_instrument import Run
 
 from devices.scenes import LineLight, line_light
 from tofclip.lidar import PointCloud, depth
+from tofclip.shots import Frames
 from tofclip.simulate import score
-from tofclip.transient import Frames
 
 
 @pytest.fixture(scope="module")

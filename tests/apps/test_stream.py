@@ -13,8 +13,8 @@ from apps.cli import main
 from devices.scenes import exposed, line_light
 from devices.transients import read_transient, read_transients
 from tofclip.lidar import PointCloud
-from tofclip.transient import Streak
-from tofclip.transient.stack import save_stack
+from tofclip.shots import Streak
+from tofclip.shots.stack import save_stack
 
 
 def shots(number: int) -> list[Streak]:

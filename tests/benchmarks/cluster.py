@@ -26,8 +26,8 @@ from typing import Any
 
 from distributed import LocalCluster
 
-from tofclip.batch import Ranging, shots_in
-from tofclip.cluster import Summary, run
+from tofclip.sequences import Ranging, shots_in
+from tofclip.sequences.jobs import Summary, run
 from tofclip.simulate import default_instrument, default_scene, simulate
 
 ROWS = 254

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from tofclip.clip_measurement import Setup, measure, spoilt
-from tofclip.clip_recovery import ClipRecovery
 from tofclip.io.light_fields import read_light_field
+from tofclip.light_field.measurement import Setup, measure, spoilt
 from tofclip.metrics import nmse
+from tofclip.recovery.light_field import ClipRecovery
 
 BORDER_PX = 12
 FACTORS = 10 ** np.linspace(-1, 1, 9)

@@ -22,8 +22,8 @@ from tofclip.lidar import Detection
 from tofclip.lidar.portable import PortableTraces
 from tofclip.lidar.search import ReturnSearch
 from tofclip.lidar.traces import FrameTraces
-from tofclip.recovery import LinearInverse, Sparse, TotalVariation
-from tofclip.transient import Frames
+from tofclip.shots import Frames
+from tofclip.solvers import LinearInverse, Sparse, TotalVariation
 
 VIEWS = 7
 BIN = 20e-12

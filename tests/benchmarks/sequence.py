@@ -17,11 +17,11 @@ from dataclasses import replace
 from functools import partial
 
 from tofclip.lidar import depth, point_cloud
-from tofclip.lidar.sequence import Ranger, clouds
-from tofclip.reconstruct import recover
+from tofclip.recovery import recover
+from tofclip.sequences.ranger import Ranger, clouds
+from tofclip.shots import Streak
 from tofclip.simulate import default_instrument, default_scene, simulate
 from tofclip.threads import thread_count
-from tofclip.transient import Streak
 
 ROW = 10
 

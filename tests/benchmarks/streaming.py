@@ -17,11 +17,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from tofclip.lidar.sequence import Ranger
+from tofclip.sequences.ranger import Ranger
+from tofclip.sequences.streaming import stream_clouds
+from tofclip.shots import Streak
 from tofclip.simulate import default_instrument, default_scene, simulate
-from tofclip.streaming import stream_clouds
 from tofclip.threads import thread_count
-from tofclip.transient import Streak
 
 SHARE_OF_RATE = 0.75
 SMALL_ROWS = 96

@@ -20,7 +20,7 @@ from devices.timetag.codec import RECORD, TimeTagCodec
 from devices.transients import read_transient
 from tofclip.errors import InputError, MissingTimeAxisError
 from tofclip.lidar import depth
-from tofclip.reconstruct import recover
+from tofclip.recovery import recover
 from tofclip.simulate import score
 from tofclip.storage import Field, Record
 

@@ -17,7 +17,7 @@ import tofclip
 API = Path(tofclip.__file__).parents[1] / "docs" / "api"
 PAGES = "\n".join(page.read_text(encoding="utf-8") for page in sorted(API.glob("*.md")))
 SHOWN = re.findall(r"automodule:: (\S+)", PAGES)
-WITHOUT_PAGE = {"tofclip.studies"}  # its verb, reproduce, tells what it makes
+WITHOUT_PAGE = {"apps.studies"}  # its verb, reproduce, tells what it makes
 
 
 def public_rooms() -> list[str]:

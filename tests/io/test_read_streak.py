@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import FileFormatError, InputError, MissingTimeAxisError, StorageError, TofclipError
 from tofclip.io import read_streak
+from tofclip.shots import Frames, Streak
 from tofclip.storage import Field, Record
-from tofclip.transient import Frames, Streak
 
 
 @pytest.fixture

@@ -12,13 +12,13 @@ from tofclip.camera import Camera, SkewSweep
 from tofclip.lidar import Detection, depth
 from tofclip.lidar.lit.kernels import sum_boxes
 from tofclip.lidar.lit.rows import LitRows, Place
-from tofclip.lidar.sequence import Ranger
 from tofclip.lidar.traces import Bins
-from tofclip.reconstruct import DepthLocked, FixedFocus, recover
-from tofclip.recovery import LinearInverse
-from tofclip.recovery.traces import InverseTraces, patch_order
+from tofclip.recovery import DepthLocked, FixedFocus, recover
+from tofclip.sequences.ranger import Ranger
 from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate
 from tofclip.simulate.shapes import checkerboard
+from tofclip.solvers import LinearInverse
+from tofclip.solvers.traces import InverseTraces, patch_order
 from tofclip.threads import LANES
 
 CENTRES = 30.0 + 45 * np.arange(5)

@@ -13,8 +13,8 @@ from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Detection, Pulse, Returns, depth
 from tofclip.lidar.portable import search
-from tofclip.recovery import LinearInverse
-from tofclip.transient import Frames
+from tofclip.shots import Frames
+from tofclip.solvers import LinearInverse
 
 BIN = 20e-12
 FWHM = 60e-12

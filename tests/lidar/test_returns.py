@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Detection, Pulse, Returns, depth
-from tofclip.transient import Frames
+from tofclip.shots import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
 BIN = 20e-12

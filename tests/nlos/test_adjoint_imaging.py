@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import nlos.studies.adjoint as study_module
+import apps.studies.hidden_scene_adjoint as study_module
+from apps.studies.hidden_scene_adjoint import office, put_between_marks, study, table, tomography
 from nlos import Backprojection, Capture, Grid, PlanarRSD
 from nlos.adjoint import AdjointImaging, CompressedCapture
 from nlos.simulate import PointScene, relay_wall
-from nlos.studies.adjoint import office, put_between_marks, study, table, tomography
 from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import SparseMatrix
-from tofclip.recovery import LinearInverse
+from tofclip.solvers import LinearInverse
 
 pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")
 

@@ -82,7 +82,7 @@ def test_carrying_is_transfer_and_sum_over_frequencies(count: int) -> None:
     coefficients[..., GROUPS.ahead :] = np.random.default_rng(1).normal(size=(2, count, WAVES.count))
     terms = np.empty((2, count, *GROUPS.shape), np.float32)
     nodes = np.stack([transfer.at(depth, delay, GROUPS.ahead) for depth in (0.7, 0.9)])
-    # Two products of different widths: equal up to rounding, not to the bit, since BLAS may take another kernel for each.
+    # Two products of different widths agree to rounding, not to the bit: BLAS may take another kernel for each.
     alone = transfer.at(0.7, delay)
     assert not nodes[..., : GROUPS.ahead].any()
     assert np.abs(nodes[0, ..., GROUPS.ahead :] - alone).max() < 1e-5 * np.abs(alone).max()  # float32

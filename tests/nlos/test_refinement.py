@@ -15,7 +15,7 @@ from nlos.refinement.spherical import spherical_sum
 from nlos.simulate import HiddenScene, PointScene, Surface, counted
 from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
-from tofclip.recovery import Sparse
+from tofclip.solvers import Sparse
 
 pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")  # small walls are coarse ones
 HYBRID = Hybrid(0.2, 4.0)

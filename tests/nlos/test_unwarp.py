@@ -12,8 +12,8 @@ from nlos import Backprojection, Capture, Grid
 from nlos.unwarp import unwarp, without_device_legs
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError, ShapeError
+from tofclip.shots import Frames
 from tofclip.storage import Field, Record
-from tofclip.transient import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
 # These walls are coarser than the shortest of the pulse's waves wants; see test_sampling.py.

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from apps.occlusion.experiment import ILLUMINATIONS, Experiment, Settings
+from apps.occlusion.probe import probe
+from apps.occlusion.scenes import BEHIND, DISTANCE, SCENES, occlusion_scene, upright_bar
 from tofclip.errors import InputError, ShapeError
 from tofclip.metrics import correlation, nmse
-from tofclip.occlusion.experiment import ILLUMINATIONS, Experiment, Settings
-from tofclip.occlusion.probe import probe
 from tofclip.occlusion.readings import TimedReadings, encoded
 from tofclip.occlusion.recovery import covered, model_behind, separate
 from tofclip.occlusion.region import InactiveRegion
-from tofclip.occlusion.scenes import BEHIND, DISTANCE, SCENES, occlusion_scene, upright_bar
 from tofclip.units import SPEED_OF_LIGHT
 
 SMALL = Settings(side_px=48, sampling_ratio=1.0)

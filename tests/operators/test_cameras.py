@@ -116,7 +116,7 @@ def test_every_camera_refocuses_the_letters(name, weight, worst, shared_data):
     """Readings from the true views; bounds with a little room above what was seen. Mixed up depths give twice that."""
     from tofclip.io.light_fields import read_light_field
     from tofclip.metrics import nmse
-    from tofclip.recovery import TotalVariation
+    from tofclip.solvers import TotalVariation
 
     letters = read_light_field(shared_data / "lightfields" / "render_letters.npz")
     camera = CAMERAS[name]((128, 128), [(v, u) for v, u in letters.views.tolist()], 0.5, 0)

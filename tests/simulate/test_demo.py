@@ -9,9 +9,9 @@ import pytest
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import depth, point_cloud
+from tofclip.shots import Frames
 from tofclip.simulate import Truth, default_instrument, default_scene, score, simulate, true_frames
 from tofclip.simulate.shapes import cut_out, letter, plain
-from tofclip.transient import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
 BIN_M = SPEED_OF_LIGHT * 20e-12 / 2

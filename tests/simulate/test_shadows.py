@@ -8,10 +8,10 @@ from scipy.ndimage import binary_erosion
 
 from tofclip import depth, recover
 from tofclip.lidar import Detection
-from tofclip.reconstruct import DepthLocked
-from tofclip.recovery import TotalVariation
+from tofclip.recovery import DepthLocked
 from tofclip.simulate import default_instrument, simulate
 from tofclip.simulate.shadows import BEAM_RADIUS, WALL_DEPTH, WALL_SIDE_PX, shadow_scene
+from tofclip.solvers import TotalVariation
 from tofclip.units import SPEED_OF_LIGHT
 
 

@@ -34,8 +34,8 @@ from apps.viewer.source import Gate, Source
 from apps.viewer.sources import Extras, open_source
 from apps.viewer.volume import PROJECTION, SLICE, SURFACE
 from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError, StorageError
-from tofclip.transient import Streak
-from tofclip.transient.stack import save_stack
+from tofclip.shots import Streak
+from tofclip.shots.stack import save_stack
 
 
 @pytest.fixture(scope="module")

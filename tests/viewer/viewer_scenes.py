@@ -9,7 +9,7 @@ from apps.viewer.source import Gate, Source, View
 from nlos import Grid, Volume
 from tofclip.camera import Camera, SkewSweep
 from tofclip.lidar import PointCloud
-from tofclip.transient import Frames, Streak
+from tofclip.shots import Frames, Streak
 from tofclip.units import SPEED_OF_LIGHT
 
 CENTRES_PX = np.array([30.4, 70.0, 110.7, 150.0, 190.2, 230.0, 269.6])

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.io import hpdta
 from tofclip.io.tiff import MAX_PIXELS
+from tofclip.shots import Streak
 from tofclip.storage import atomic_path, reading
-from tofclip.transient import Streak
 
 SIGNATURE = b"IM"
 AXES = ("X", "Y")

@@ -20,7 +20,7 @@ from tofclip.camera import Camera, PolynomialSweep, ProjectiveSweep, SkewSweep, 
 from tofclip.errors import CalibrationError, FileFormatError, InputError
 from tofclip.io.archive import Archive
 from tofclip.io.relay_wall import read_relay_wall
-from tofclip.transient import Streak
+from tofclip.shots import Streak
 
 MEANT = {"resample_flag": 1, "image_inverted_flag": 0}
 """Flags of the archive and the only value whose meaning is known."""

@@ -12,8 +12,8 @@ from tofclip.io.itex import SIGNATURE as ITEX_SIGNATURE
 from tofclip.io.itex import read_itex
 from tofclip.io.lift import read_lift
 from tofclip.io.tiff import read_tiff
+from tofclip.shots import Streak
 from tofclip.storage import SIGNATURE, provenance, reading
-from tofclip.transient import Streak
 
 # A file is known by its first bytes: suffixes get lost and lie.
 READERS: dict[bytes, Callable[[str | Path], Streak]] = {

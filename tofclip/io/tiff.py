@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io import hpdta
+from tofclip.shots import Streak
 from tofclip.storage import one_line, reading
-from tofclip.transient import Streak
 
 if TYPE_CHECKING:
     import tifffile

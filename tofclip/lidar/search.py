@@ -23,8 +23,8 @@ from tofclip.lidar.portable import PortableSearch, PortableTraces
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.returns import Returns
 from tofclip.lidar.traces import FrameTraces, Traces
+from tofclip.shots import Frames
 from tofclip.threads import blocks, run_blocks
-from tofclip.transient import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float64]

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.transient import Frames
+from tofclip.shots import Frames
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,6 @@ class FrameTraces:
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
         """Write traces of neighbours in raster order."""
-        from tofclip.recovery.kernels import lanes_to_frames
+        from tofclip.solvers.kernels import lanes_to_frames
 
         lanes_to_frames(self._pictures[:, piece], traces)

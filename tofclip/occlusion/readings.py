@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.clip_measurement import ClipMeasurement, Setup
 from tofclip.errors import ShapeError
+from tofclip.light_field.measurement import ClipMeasurement, Setup
 from tofclip.operators.light_field_camera import LightFieldCamera
 from tofclip.simulate.light_fields import CameraArray, Clock
 from tofclip.units import SPEED_OF_LIGHT

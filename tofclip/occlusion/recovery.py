@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.clip_recovery import ITERATIONS, RELATIVE_CHANGE, ClipRecovery
 from tofclip.errors import InputError
 from tofclip.occlusion.readings import Rig, TimedReadings
 from tofclip.operators import Diagonal, LinearOperator, Stack
 from tofclip.operators.shear import LinearShear, View
-from tofclip.recovery import TotalVariation
+from tofclip.recovery.light_field import ITERATIONS, RELATIVE_CHANGE, ClipRecovery
+from tofclip.solvers import TotalVariation
 
 Array = NDArray[Any]
 

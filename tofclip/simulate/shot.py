@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from tofclip.camera import Camera
 from tofclip.errors import InputError
+from tofclip.shots import Streak
 from tofclip.simulate.instrument import Instrument
 from tofclip.simulate.render import streak_of_rays, view_rays
 from tofclip.simulate.scene import Scene
 from tofclip.simulate.truth import Truth
 from tofclip.storage import provenance
-from tofclip.transient import Streak
 
 
 @dataclass(frozen=True)

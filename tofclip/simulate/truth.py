@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
+from tofclip.shots import Frames
 from tofclip.simulate.instrument import Instrument
 from tofclip.simulate.render import gathered, pulse_sigma_bins, share_rows
 from tofclip.simulate.scene import NO_PLATE, Scene
-from tofclip.transient import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
 MATERIAL = 0.1  # a surface that reflects less says too little about where it is

@@ -130,7 +130,7 @@ def _measured(methods: Mapping[str, Reconstructor], capture: Capture, grid: Grid
 def _figures(runs: Mapping[str, Measured], truth: HiddenTruth | None) -> dict[str, dict[str, Any]]:
     """Figures of every method; the first is the reference."""
     from apps.nlos.measure import sharpness, truth_figures
-    from nlos.studies.adjoint import correlation
+    from apps.studies.hidden_scene_adjoint import correlation
 
     reference = next(iter(runs.values())).volume
     return {

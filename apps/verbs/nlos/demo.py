@@ -125,7 +125,7 @@ def _flattened(capture: Capture) -> Capture:
 
 def _figures(run: DemoRun) -> dict[str, Any]:
     from apps.nlos.measure import truth_figures
-    from nlos.studies.adjoint import correlation
+    from apps.studies.hidden_scene_adjoint import correlation
 
     reference = run.images["backprojection"]
     figures: dict[str, Any] = {

@@ -21,7 +21,7 @@ from apps.settings import SettingsFile, setting, takes
 if TYPE_CHECKING:
     from apps.nlos.files import Results
     from nlos import Capture, Volume
-    from tofclip.cluster import Job, Report
+    from tofclip.sequences.jobs import Job, Report
 
 SOME_FAILED = 1
 STOPPED = ("iterations", "stopped_because")
@@ -196,7 +196,7 @@ def _reconstruct_folder(
     from apps.nlos.files import captures_in, require_apart
     from apps.report import report
     from apps.sequences import run_all
-    from tofclip.cluster import run
+    from tofclip.sequences.jobs import run
 
     cluster, as_json = how
     _require_formats(suffixes)
@@ -226,7 +226,7 @@ def _reconstruct_folder(
 
 def _jobs(sources: Sequence[Path], out: Path, order: _Order, suffixes: Sequence[str]) -> tuple[list[Job], list[str]]:
     """Return one job for each capture without results, and the names of the others."""
-    from tofclip.cluster import Job
+    from tofclip.sequences.jobs import Job
 
     jobs, skipped = [], []
     for path in sources:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.lidar.traces import Bins
-from tofclip.recovery.traces import InverseTraces
+from tofclip.solvers.traces import InverseTraces
 from tofclip.threads import LANES, run_blocks
 
 FloatImage = NDArray[np.float32]

@@ -10,8 +10,8 @@ from tofclip.lidar.detection import Detection
 from tofclip.lidar.portable.fit import PulseFit
 from tofclip.lidar.portable.peaks import Filters, PeakSearch
 from tofclip.lidar.pulse import Pulse
+from tofclip.shots import Frames
 from tofclip.threads import blocks
-from tofclip.transient import Frames
 
 FloatArray = NDArray[np.float64]
 Candidates = tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]

@@ -56,7 +56,7 @@ class SpreadLineCamera(LineCamera):
     """CLIP-1D with angles dealt so that neighbouring ones look from places spread evenly over the aperture.
 
     What is out of focus is then blurred rather than torn into streaks, and which seed was drawn hardly matters
-    (`tofclip.studies.dealing_table` shows how much better it is than dealing at random).
+    (`apps.studies.dealing_table` shows how much better it is than dealing at random).
     """
 
     name: ClassVar[str] = "line-spread"

@@ -1,0 +1,109 @@
+"""What a study of the paper returns: a table of ours beside the paper's figures, and pictures in the paper's layout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apps.studies.library import Library
+
+Advance = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure of a table.
+
+    Parameters
+    ----------
+    labels : tuple of str
+        One for each of the table's columns.
+    ours : tuple of float
+        One for each seed.
+    paper : float or None
+        None: the paper has no such figure.
+    """
+
+    labels: tuple[str, ...]
+    ours: tuple[float, ...]
+    paper: float | None = None
+
+    @property
+    def mean(self) -> float:
+        """Mean over the seeds."""
+        return float(np.mean(self.ours))
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation over the seeds (of a sample; 0 for a single one)."""
+        return float(np.std(self.ours, ddof=1)) if len(self.ours) > 1 else 0.0
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A picture (rows, columns) with its title; brightness from 0, or a map of shears in colours."""
+
+    title: str
+    picture: NDArray[Any]
+    is_map: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Rows and pictures of a study.
+
+    Parameters
+    ----------
+    columns : tuple of str
+        What the rows' labels say.
+    figure : str
+        What the rows' figures are, with the unit.
+    rows : tuple of Row
+    panels : tuple of tuple of Panel
+        Pictures as they are laid out: one tuple for each line.
+    """
+
+    columns: tuple[str, ...]
+    figure: str
+    rows: tuple[Row, ...]
+    panels: tuple[tuple[Panel, ...], ...]
+
+
+@dataclass(frozen=True)
+class Study:
+    """A table or figure of the paper that can be made again.
+
+    Parameters
+    ----------
+    name : str
+        What the user types.
+    also : tuple of str
+        Other names: the figures that show the table's pictures.
+    title : str
+    note : str
+        What differs from the paper.
+    seconds : float
+        About what a seed costs on two cores.
+    seeded : bool
+        False: it has no random choices, more seeds change nothing.
+    work : callable
+        (library, seeds, advance) to the outcome; calls `advance` with shares that add up to `steps` per seed.
+    steps : int
+        Advances for each seed.
+    recording : str or None
+        What it needs of the folder of recorded data; without that it cannot be made.
+    """
+
+    name: str
+    also: tuple[str, ...]
+    title: str
+    note: str
+    seconds: float
+    steps: int
+    work: Callable[[Library, int, Advance], Outcome]
+    seeded: bool = True
+    recording: str | None = None

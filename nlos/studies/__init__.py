@@ -1,1 +1,0 @@
-"""Studies of the paper's supplement, on simulated scenes: what `docs/nlos.md` reports."""

@@ -1,0 +1,71 @@
+"""Two workers behind a scheduler, as on a cluster, and a small sequence of shots."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofclip import Streak
+from tofclip.camera import Camera, SkewSweep
+from tofclip.shots.stack import save_stack
+from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate
+from tofclip.simulate.shapes import checkerboard
+
+CENTRES = 40.0 + 60 * np.arange(5)
+SHOTS = 6
+
+
+@pytest.fixture(scope="package")
+def scheduler() -> Iterator[str]:
+    """Address of a scheduler with two workers; a job may outlive one of them and no more."""
+    dask = pytest.importorskip("dask", reason="dask.distributed is an extra")
+    distributed = pytest.importorskip("distributed", reason="dask.distributed is an extra")
+    settings = {"distributed.scheduler.allowed-failures": 1}
+    with (
+        dask.config.set(settings),
+        distributed.LocalCluster(
+            n_workers=2,
+            threads_per_worker=1,
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+            env={"TOFCLIP_THREADS": "1"},
+        ) as cluster,
+    ):
+        yield cluster.scheduler_address
+
+
+@pytest.fixture(scope="package")
+def camera() -> Camera:
+    """Five views of 32 x 32 pixels, with its sweep."""
+    sweep = SkewSweep(CENTRES, np.array([-2.0, 1.0, 0.0, 0.5, 3.0]), np.zeros(5))
+    angles = np.arctan([0.5, -0.8, 0.9, -0.4, 0.1])
+    optics = {"focal_length_px": 100.0, "lenslet_pitch": 5e-3, "focus_distance": 1.3}
+    return Camera(CENTRES, angles, (32, 32), 320, sweep=sweep, time_zero=-6e-9, pulse_fwhm=150e-12, **optics)
+
+
+@pytest.fixture(scope="package")
+def streaks(camera: Camera) -> list[Streak]:
+    """Shots of two plates that differ in their noise."""
+
+    def plate(distance: float, place_px: float) -> Plate:
+        pixel = distance / 100.0
+        return Plate((place_px * pixel, place_px * pixel, distance), (9 * pixel, 9 * pixel), checkerboard(3, 0.3, 0.9))
+
+    made = Instrument(camera, StreakDetector(128, 50e-12, peak_photons=5e4))
+    return [simulate(Scene((plate(1.1, -8), plate(1.5, 8))), made, seed).streak for seed in range(SHOTS)]
+
+
+@pytest.fixture(scope="package")
+def recorded(tmp_path_factory: pytest.TempPathFactory, camera: Camera, streaks: list[Streak]) -> Path:
+    """A folder with ``camera.h5``, ``shots.h5`` (a stack) and ``shots`` (a folder with a file for each)."""
+    folder = tmp_path_factory.mktemp("recorded")
+    camera.save(folder / "camera.h5")
+    save_stack(streaks, folder / "shots.h5")
+    (folder / "shots").mkdir()
+    for number, streak in enumerate(streaks):
+        streak.save(folder / "shots" / f"shot{number}.h5")
+    return folder

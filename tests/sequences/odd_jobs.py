@@ -1,0 +1,56 @@
+"""Jobs that a test can ask for: well-behaved, failing, deadly. Workers import this module by its name."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from tofclip.errors import InputError
+from tofclip.sequences.jobs import Job
+from tofclip.storage import atomic_path
+
+
+def square(number: int, result: Path) -> int:
+    """Write a square."""
+    with atomic_path(result) as temporary:
+        temporary.write_text(str(number**2))
+    return number**2
+
+
+def refuse(result: Path) -> None:
+    raise InputError(f"{result.name}: is not to be had\nat any price")
+
+
+def stumble() -> None:
+    raise ZeroDivisionError("a defect")
+
+
+def die(result: Path, *, every_time: bool) -> None:
+    """Kill the worker in the middle of writing; with `every_time` also the next one."""
+    once = result.with_suffix(".died")
+    if every_time or not once.exists():
+        once.touch()
+        with atomic_path(result) as temporary:
+            temporary.write_text("half a resu")
+            os.kill(os.getpid(), signal.SIGKILL)
+    square(7, result)
+
+
+def on_a_full_disk(work: Callable[[], Any]) -> Any:
+    """Do a job while no file may grow beyond a kilobyte: the system refuses to write on, as a full disk does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, hard))
+    try:
+        return work()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def squares(folder: Path, count: int) -> list[Job]:
+    paths = [folder / f"{number:03d}.txt" for number in range(count)]
+    return [Job(path.stem, path, partial(square, number, path)) for number, path in enumerate(paths)]

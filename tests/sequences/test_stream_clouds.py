@@ -1,0 +1,68 @@
+"""Shots to clouds while they come, against the same shots one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofclip.camera import Camera
+from tofclip.errors import InputError
+from tofclip.lidar import depth, point_cloud
+from tofclip.recovery import recover
+from tofclip.sequences.ranger import Ranger
+from tofclip.sequences.streaming import stream_clouds
+from tofclip.shots import Streak
+from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate
+from tofclip.simulate.shapes import plain
+
+CENTRES = 30.0 + 45 * np.arange(4)
+
+
+def shots(number: int) -> list[Streak]:
+    """Plates that come nearer from shot to shot."""
+    camera = Camera(
+        CENTRES, np.arctan([0.6, -0.7, 0.3, -0.1]), (24, 24), 200, time_zero=-6e-9, pulse_fwhm=150e-12, sweep=None
+    )
+    detector = StreakDetector(96, 50e-12, peak_photons=5e4)
+    made = []
+    for shot in range(number):
+        scene = Scene((Plate((0.0, 0.0, 1.4 - 0.05 * shot), (0.05, 0.05), plain(0.8)),))
+        made.append(simulate(scene, Instrument(still(camera), detector), shot).streak)
+    return made
+
+
+def still(camera: Camera) -> Camera:
+    from tofclip.camera import SkewSweep
+
+    return camera.replace(sweep=SkewSweep(CENTRES, np.zeros(4), np.zeros(4)))
+
+
+def test_a_stream_gives_the_clouds_of_its_shots():
+    made = shots(4)
+    streamed = list(stream_clouds(made))
+    assert [one.shot for one in streamed] == [0, 1, 2, 3]
+    for one, shot in zip(streamed, made, strict=True):
+        alone = point_cloud(depth(recover(shot, method="linear")))
+        assert len(one.cloud) == len(alone) > 100
+        # the same inverse, summed in another order: float32 keeps 1e-6 of 1.4 m
+        np.testing.assert_allclose(one.cloud.range, alone.range, atol=2e-5)
+        np.testing.assert_allclose(one.cloud.intensity, alone.intensity, rtol=1e-3)
+        assert one.latency > 0
+        assert set(one.seconds) == {"read", "wait", "rectify", "recover", "range", "place"}
+    medians = [np.median(one.cloud.range) for one in streamed]
+    np.testing.assert_allclose(np.diff(medians), -0.05, atol=2e-3)
+
+
+def test_a_ranger_of_ones_own_is_used():
+    made = shots(2)
+    ranger = Ranger(made[0].camera, made[0].times)
+    (first, second) = stream_clouds(iter(made), ranger, held=2)
+    np.testing.assert_array_equal(first.cloud.xyz, next(stream_clouds(made)).cloud.xyz)
+    assert second.shot == 1
+
+
+def test_no_shot_is_no_cloud_and_faults_come_through():
+    assert list(stream_clouds([])) == []
+    made = shots(1)
+    with pytest.raises(InputError, match="above the dark level"):
+        list(stream_clouds([made[0], Streak(np.full((96, 200), 3.0), made[0].times)], Ranger.for_shot(made[0])))

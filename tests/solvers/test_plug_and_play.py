@@ -1,0 +1,127 @@
+"""Plug-and-play recovery: its quadratic step against a dense solve, its fixed points, its gain over the start."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from tofclip.errors import InputError
+from tofclip.metrics import nmse
+from tofclip.operators import RadonProjection, squared_norm
+from tofclip.solvers import Huber, LeastSquares, PlugAndPlay, RegularisationByDenoising, TotalVariation
+from tofclip.solvers.plug_and_play import nearest_fit
+
+SHAPE = (48, 45)
+
+
+@pytest.fixture(scope="module")
+def projections() -> RadonProjection:
+    return RadonProjection(SHAPE, 48, np.arange(14) * np.pi / 14, np.zeros(14), dtype=np.float64)
+
+
+@pytest.fixture(scope="module")
+def truth() -> np.ndarray:
+    picture = np.zeros(SHAPE)
+    picture[8:40, 8:13] = picture[8:40, 24:29] = 1
+    picture[8:13, 8:40] = 0.6
+    return picture
+
+
+def unchanged(noisy: np.ndarray, pilot: np.ndarray, deviation: float) -> np.ndarray:
+    return noisy
+
+
+def readings_with_noise(operator: RadonProjection, truth: np.ndarray) -> np.ndarray:
+    clean = operator(truth)
+    return (clean + 0.04 * clean.max() * np.random.default_rng(0).standard_normal(clean.shape))[:, np.newaxis]
+
+
+def test_the_quadratic_step_is_the_dense_solution():
+    operator = RadonProjection((7, 6), 7, np.arange(5) * np.pi / 5, np.zeros(5), dtype=np.float64)
+    dense = np.stack([operator(row.reshape(7, 6)) for row in np.eye(42)], axis=1)
+    rng = np.random.default_rng(1)
+    readings, anchor = rng.random(operator.shape_out), rng.random((7, 6))
+    found = nearest_fit(operator, LeastSquares(readings[:, np.newaxis]), anchor, 0.7, iterations=60)
+    known = np.linalg.solve(dense.T @ dense + 0.7 * np.eye(42), dense.T @ readings + 0.7 * anchor.ravel())
+    np.testing.assert_allclose(found.ravel(), known, atol=1e-8)
+
+
+def test_bad_readings_hardly_pull_with_huber_s_weights():
+    operator = RadonProjection((7, 6), 7, np.arange(5) * np.pi / 5, np.zeros(5), dtype=np.float64)
+    anchor = np.random.default_rng(2).random((7, 6))
+    spoilt = operator(anchor)[:, np.newaxis]
+    spoilt[3] += 1e4
+    pulled = nearest_fit(operator, Huber(spoilt, threshold=0.01), anchor, 1.0)
+    assert np.abs(pulled - anchor).max() < 0.01  # at most threshold / coupling
+    assert np.abs(nearest_fit(operator, LeastSquares(spoilt), anchor, 1.0) - anchor).max() > 100
+
+
+def test_without_a_denoiser_the_data_are_met(projections, truth):
+    """A denoiser that changes nothing leaves the iterations of proximal points: they end at the least residual."""
+    readings = projections(truth)[:, np.newaxis]
+    start = TotalVariation(0.05, 20)
+    found = PlugAndPlay(start, unchanged, calls=40).recover(projections, readings)
+    before = np.linalg.norm(projections(start.recover(projections, readings).frames[0]) - readings[:, 0])
+    assert np.linalg.norm(projections(found.frames[0]) - readings[:, 0]) < 0.1 * before
+
+
+def test_it_improves_on_its_start(projections, truth):
+    readings = readings_with_noise(projections, truth)
+    start = TotalVariation(0.004, 200, 1e-4)  # too small a weight: the start is noisy
+    before = nmse(start.recover(projections, readings).frames[0], truth)
+    result = PlugAndPlay(start).recover(projections, readings)
+    assert nmse(result.frames[0], truth) < 0.8 * before
+    assert result.frames.min() >= 0
+    assert result.stopped_because == "8 calls of the denoiser done"
+
+
+def blurred(noisy: np.ndarray, pilot: np.ndarray, deviation: float) -> np.ndarray:
+    return gaussian_filter(noisy, 1.0)
+
+
+def test_regularisation_by_denoising_ends_at_its_equation(projections, truth):
+    """``A'(A h - f) + coupling (h - denoise(h)) = 0`` holds at the end; the iteration contracts for a blur."""
+    readings = projections(gaussian_filter(truth, 2) + 0.5)[:, np.newaxis]  # so that nothing is cut at 0
+    method = RegularisationByDenoising(TotalVariation(0.02, 20), blurred, calls=80)
+    picture = method.recover(projections, readings).frames[0]
+    coupling = method.coupling * squared_norm(projections)
+    pull = projections.adjoint(readings[:, 0] - projections(picture))
+    push = coupling * (picture - gaussian_filter(picture, 1.0))
+    assert picture.min() > 0
+    # ten steps of conjugate gradients a call leave a hundredth
+    assert np.linalg.norm(pull - push) < 0.03 * np.linalg.norm(pull)
+
+
+def test_many_frames_are_recovered_one_by_one(projections, truth):
+    readings = np.concatenate([projections(truth)[:, np.newaxis], projections(truth[::-1].copy())[:, np.newaxis]], 1)
+    method = PlugAndPlay(TotalVariation(0.02, 30), calls=2)
+    both = method.recover(projections, readings).frames
+    alone = method.recover(projections, readings[:, :1].copy()).frames
+    np.testing.assert_allclose(both[0], alone[0], atol=5e-3)  # a batch sets one weight for all its frames
+
+
+def test_a_frame_without_light_stays_dark(projections, truth):
+    readings = np.stack([projections(truth), np.zeros(projections.shape_out)], axis=1)
+    frames = PlugAndPlay(TotalVariation(0.02, 10), calls=2).recover(projections, readings).frames
+    assert frames[1].max() == 0
+
+
+def test_huber_s_term_reaches_the_denoiser_s_loop(projections, truth):
+    readings = projections(truth)[:, np.newaxis].copy()
+    bad = np.random.default_rng(3).permutation(readings.size)[: readings.size // 20]
+    clean_peak = readings.max()
+    readings[bad] = clean_peak
+    squares = PlugAndPlay(TotalVariation(0.02, 200)).recover(projections, readings).frames[0]
+    term = partial(Huber, threshold=0.02 * clean_peak)
+    robust = PlugAndPlay(TotalVariation(0.005, 200, 0.0, term)).recover(projections, readings).frames[0]
+    assert nmse(robust, truth) < 0.5 * nmse(squares, truth)
+
+
+def test_settings_without_sense_are_refused():
+    with pytest.raises(InputError, match="call"):
+        PlugAndPlay(TotalVariation(), calls=0)
+    with pytest.raises(InputError, match="positive"):
+        PlugAndPlay(TotalVariation(), strength=0)

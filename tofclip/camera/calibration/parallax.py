@@ -1,0 +1,194 @@
+"""How far the views move apart with range: lenslet pitch and focus distance.
+
+They come from shears, or slit centres, of targets at known distances; the shears from the shot itself, whose time gates
+are in focus where the views agree with one picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofclip.camera import Camera, Measurement
+from tofclip.errors import CalibrationError, InputError, ShapeError
+from tofclip.solvers import Progress, Sparse, relative_residual, silent
+
+FloatArray = NDArray[np.float64]
+
+LOOK = Sparse(weight=5e-3, iterations=30)
+"""How a gate is recovered to see whether its views agree."""
+
+
+@dataclass(frozen=True)
+class Parallax:
+    """A fitted ``s(d) = -strength * (1/d - nearness)``.
+
+    Parameters
+    ----------
+    strength : float
+        Focal length (px) times lenslet pitch (m), px m.
+    nearness : float
+        Inverse of the focus distance, 1/m; may come out slightly negative where the views are focused on infinity.
+    misfit_px : float
+        Root mean square of what the fit leaves, pixels of shear, or of a slit centre.
+    """
+
+    strength: float
+    nearness: float
+    misfit_px: float
+
+    def applied(self, camera: Camera) -> Camera:
+        """Return `camera` with this parallax.
+
+        A negative strength (views numbered against the sense in which near objects move) turns the view positions
+        round, so that near objects have negative shear. A focus beyond infinity counts as infinity.
+        """
+        return camera.replace(
+            view_positions=camera.view_positions * np.sign(self.strength),
+            lenslet_pitch=abs(self.strength) / camera.focal_length_px,
+            focus_distance=1 / self.nearness if self.nearness > 0 else np.inf,
+        )
+
+
+@dataclass(frozen=True)
+class FocusCurve:
+    """Agreement of the views, gate by gate, over shears.
+
+    Parameters
+    ----------
+    agreement : (gates, shears) array
+        Energy of the readings over that of the residual; 0 for dark gates.
+    shears : (gates,) array
+        Where each is highest, between the shears tried.
+    weight : (gates,) array
+        How surely: relative curvature at the maximum times the gate's light; 0 where the maximum lies at an end.
+    """
+
+    agreement: FloatArray
+    shears: FloatArray
+    weight: FloatArray
+
+
+def parallax_from_shears(shears: ArrayLike, distances: ArrayLike, weight: ArrayLike | None = None) -> Parallax:
+    """Fit s(d) to shears of surfaces at known distances.
+
+    Parameters
+    ----------
+    shears : (n,) array
+        Pixels per view step.
+    distances : (n,) array
+        Metres.
+    weight : (n,) array, optional
+
+    Raises
+    ------
+    CalibrationError
+        Fewer than two different distances.
+    """
+    s, d = np.asarray(shears, dtype=np.float64), np.asarray(distances, dtype=np.float64)
+    w = np.ones(s.shape) if weight is None else np.asarray(weight, dtype=np.float64)
+    if not s.shape == d.shape == w.shape or s.ndim != 1:
+        raise ShapeError("distances and weights", s.shape, d.shape)
+    if not np.all(np.isfinite(s)) or not np.all(d > 0) or np.unique(d[w > 0]).size < 2:
+        raise CalibrationError("a parallax needs finite shears at two or more positive distances")
+    root = np.sqrt(w)
+    design = np.stack([-1 / d, np.ones_like(d)], axis=1)
+    (strength, constant), *_ = np.linalg.lstsq(design * root[:, np.newaxis], s * root, rcond=None)
+    misfit = np.sqrt(np.average((design @ [strength, constant] - s) ** 2, weights=w))
+    return Parallax(float(strength), float(constant / strength), float(misfit))
+
+
+def parallax_from_centres(camera: Camera, centres_px: ArrayLike, distances: ArrayLike) -> Parallax:
+    """Fit s(d) to the views' slit centres, measured with a target at known distances.
+
+    Parameters
+    ----------
+    camera : Camera
+        Its own centres are those at the focus distance that is to be found.
+    centres_px : (views, n) array
+        0-based slit columns of the views' optical axes.
+    distances : (n,) array
+        Metres.
+    """
+    centres = np.asarray(centres_px, dtype=np.float64)
+    if centres.ndim != 2 or centres.shape[0] != camera.views:
+        raise ShapeError("slit centres", f"({camera.views}, distances)", centres.shape)
+    aside = camera.view_positions - camera.view_positions.mean()
+    moved = centres - camera.centres_px[:, np.newaxis]
+    moved -= moved.mean(axis=0)  # all views together: the target was moved sideways
+    shears = aside @ moved / np.sum(aside**2)
+    fitted = parallax_from_shears(shears, distances)
+    nearness = 1 / np.asarray(distances, dtype=np.float64) - fitted.nearness
+    left = moved + fitted.strength * aside[:, np.newaxis] * nearness
+    left -= left.mean(axis=1, keepdims=True)  # a view's own centre is not the parallax's concern
+    return Parallax(fitted.strength, fitted.nearness, float(np.sqrt(np.mean(left**2))))
+
+
+def sharpest_shears(
+    measurement: Measurement,
+    camera: Camera,
+    gates: Sequence[slice],
+    shears: ArrayLike,
+    progress: Progress = silent,
+) -> FocusCurve:
+    """Recover every gate at every shear and see where the views agree best with one picture.
+
+    Wrongly sheared views contradict each other, and no nonnegative picture of few bright pixels explains them all. In
+    the depth-of-field arrangement, where little defocuses, that tells more than the pictures' sharpness.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        Rectified readings.
+    camera : Camera
+    gates : sequence of slice
+        Frames of each gate.
+    shears : (n,) array
+        Evenly spaced, pixels per view step.
+    progress : callable
+        Called with the number of frame iterations just done.
+    """
+    tried = np.asarray(shears, dtype=np.float64)
+    if tried.ndim != 1 or tried.size < 2 or not np.all(np.isfinite(tried)):
+        raise InputError("at least two finite shears have to be tried")
+    table = np.zeros((len(gates), tried.size))
+    for column, shear in enumerate(tried):
+        operator = camera.operator(float(shear))
+        for row, gate in enumerate(gates):
+            readings = np.ascontiguousarray(measurement.readings[:, gate])
+            good = np.ascontiguousarray(measurement.good[:, gate])
+            if operator.adjoint(readings * good).max() <= 0:
+                progress(LOOK.work(readings.shape[1]))  # dark
+                continue
+            frames = LOOK.recover(operator, readings, good, progress).frames
+            table[row, column] = relative_residual(operator, frames, readings, good) ** -2
+    light = np.array([np.sum((measurement.readings * measurement.good)[:, gate].clip(0)) for gate in gates])
+    return _curve(table, tried, light)
+
+
+def sharpness(frames: NDArray[np.float32]) -> float:
+    """Mean square over squared mean of the frames, weighted by their light; 1 for even pictures, 0 without light."""
+    flat = frames.reshape(frames.shape[0], -1)
+    light = flat.sum(axis=1, dtype=np.float64)
+    square = np.einsum("tp,tp->t", flat, flat, dtype=np.float64)
+    lit = light > 0
+    if not lit.any():
+        return 0.0
+    return float(np.average(square[lit] * flat.shape[1] / light[lit] ** 2, weights=light[lit]))
+
+
+def _curve(table: FloatArray, tried: FloatArray, light: FloatArray) -> FocusCurve:
+    """Vertex of the parabola through each maximum and its neighbours."""
+    rows = np.arange(table.shape[0])
+    best = table.argmax(axis=1)
+    inner = best.clip(1, max(1, tried.size - 2))
+    left, centre, right = (table[rows, (inner + side).clip(0, tried.size - 1)] for side in (-1, 0, 1))
+    bend = 2 * centre - left - right
+    firm = (best == inner) & (bend > 0)
+    beyond = np.divide((right - left) / 2, bend, out=np.zeros_like(centre), where=firm)
+    step = tried[1] - tried[0]
+    weight = np.where(firm, light * bend / np.maximum(centre, np.finfo(np.float64).tiny), 0.0)
+    return FocusCurve(table, tried[best] + np.where(firm, beyond, 0.0) * step, weight)

@@ -1,0 +1,201 @@
+"""From a streak image and a camera to transient frames: the main path, as a paragraph."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from tofclip.arrays import HERE, Place, place_named, to_numpy
+from tofclip.camera import Camera, Measurement, measure
+from tofclip.camera.calibration.registration import register, registration_work
+from tofclip.camera.calibration.skew import estimate_skew
+from tofclip.errors import InputError
+from tofclip.recovery.focus import AT_THE_CALIBRATED_DEPTH, Focus
+from tofclip.recovery.pieces import recover_pieces, residual_of_pieces
+from tofclip.shots import Frames, Streak
+from tofclip.solvers import (
+    Adjoint,
+    LinearInverse,
+    Method,
+    Progress,
+    Sparse,
+    TotalVariation,
+    silent,
+)
+from tofclip.storage import Scalar
+
+METHODS: dict[str, Callable[..., Method]] = {
+    "tv": TotalVariation,
+    "l1": Sparse,
+    "linear": LinearInverse,
+    "adjoint": Adjoint,
+}
+
+
+def method_named(name: str, **settings: Any) -> Method:
+    """Make a recovery method by its short name, with settings of its own where given.
+
+    Parameters
+    ----------
+    name : str
+        ``"tv"``, ``"l1"``, ``"linear"`` or ``"adjoint"``.
+    **settings
+        Passed on, such as ``iterations`` and ``weight`` of the iterative methods.
+    """
+    if name not in METHODS:
+        raise InputError(f"unknown method '{name}'; choose one of {', '.join(METHODS)}")
+    try:
+        return METHODS[name](**settings)
+    except TypeError as fault:
+        raise InputError(f"method '{name}' does not take {', '.join(settings)}") from fault
+
+
+@dataclass(frozen=True)
+class Task:
+    """A recovery that is about to run, so that a progress bar can know its length.
+
+    Parameters
+    ----------
+    streak : Streak
+    camera : Camera
+    method : Method
+    focus : Focus
+        At which shear each frame is recovered.
+    place : Place
+        Where: readings are put there, and frames fetched from there. What precedes the recovery is done in NumPy.
+    """
+
+    streak: Streak
+    camera: Camera
+    method: Method
+    focus: Focus = AT_THE_CALIBRATED_DEPTH
+    place: Place = HERE
+
+    @property
+    def work(self) -> int:
+        """Frame iterations that will be reported at most."""
+        frames = self.streak.counts.shape[0]
+        own = self.method.work(frames) + self.focus.work(frames)
+        return own + (registration_work() if self.camera.sweep is None else 0)
+
+    def run(self, progress: Progress = silent) -> Frames:
+        """Recover; see `recover`."""
+        started = time.perf_counter()
+        camera = self.camera
+        if camera.sweep is None:
+            camera = fitted_to_shot(self.streak, camera, progress)
+        measurement = measure(self.streak.counts, self.streak.saturated, camera)
+        times = self.streak.times - camera.time_zero
+        solving = time.perf_counter()
+        pieces = self.focus.pieces(camera, times, measurement, progress)
+        with self.place.current():
+            there = Measurement(self.place.put(measurement.readings), self.place.put(measurement.good))
+            result = recover_pieces(self.method, camera, there, pieces, progress)
+            values = to_numpy(result.frames)
+            solved = time.perf_counter()
+            residual = residual_of_pieces(camera, result.frames, there, pieces)
+        figures: dict[str, Scalar] = {
+            "method": self.method.name,
+            "focus": str(self.focus),
+            "iterations": result.iterations,
+            "stopped_because": result.stopped_because,
+            "relative_residual": residual,
+            "seconds": time.perf_counter() - started,
+            "frames_per_second": result.frames.shape[0] / (solved - solving - result.setup_seconds),
+            "setup_seconds": result.setup_seconds,
+            "device": str(self.place),
+        }
+        return Frames(
+            values=values,
+            times=times,
+            camera=camera,
+            shears=np.repeat([piece.shear for piece in pieces], [piece.size for piece in pieces]),
+            figures=figures,
+            attachments=self.streak.attachments,
+            provenance={**self.streak.provenance, "objective": result.objective.tolist()},
+        )
+
+
+def recover(
+    streak: Streak,
+    camera: Camera | None = None,
+    method: str | Method = "tv",
+    progress: Progress = silent,
+    focus: Focus | None = None,
+    device: str = "cpu",
+) -> Frames:
+    """Recover every transient frame of a streak image.
+
+    A camera without a sweep has it estimated from the shot (`estimate_skew`), refined together with the views' gains
+    and centres (`register`); the frames carry the camera that was used.
+
+    Parameters
+    ----------
+    streak : Streak
+        With a time axis.
+    camera : Camera, optional
+        Defaults to the one that the streak image carries.
+    method : str or Method
+        ``"tv"`` (default), ``"l1"``, ``"linear"``, ``"adjoint"``, or a configured `tofclip.solvers` method.
+    progress : callable
+        Called with the number of frame iterations just done.
+    focus : Focus, optional
+        `FixedFocus` (the default, at shear 0), `DepthLocked` or `SharpestFocus` of `tofclip.recovery`.
+    device : str
+        ``"cpu"``, ``"cuda"``, ``"cuda:1"``, ``"auto"`` or a PyTorch device, see `tofclip.arrays.place_named`.
+
+    Returns
+    -------
+    Frames
+        ``(time, y, x)`` in counts, with time of flight in seconds.
+
+    Raises
+    ------
+    MissingTimeAxisError
+        The streak image does not say how long a row lasts.
+    CalibrationError
+        The camera does not belong to the streak image.
+    InputError
+        There is no camera, no light, or no such method or name of a device.
+    MissingDependencyError
+        There is no such device.
+    """
+    return prepare(streak, camera, method, focus, device).run(progress)
+
+
+def prepare(
+    streak: Streak,
+    camera: Camera | None = None,
+    method: str | Method = "tv",
+    focus: Focus | None = None,
+    device: str = "cpu",
+) -> Task:
+    """Check what `recover` needs before any work is done; arguments as there."""
+    camera = camera or streak.camera
+    if camera is None:
+        raise InputError(f"{streak.source} carries no camera: give one (--camera camera.h5, made by calibrate)")
+    _ = streak.times  # a missing axis is refused before minutes of work
+    focus = AT_THE_CALIBRATED_DEPTH if focus is None else focus
+    focus.require(camera)
+    solver = method_named(method) if isinstance(method, str) else method
+    return Task(streak, camera, solver, focus, place_named(device))
+
+
+def fitted_to_shot(streak: Streak, camera: Camera, progress: Progress = silent) -> Camera:
+    """Return `camera` with sweep, gains and centres found from the shot itself."""
+    skew = estimate_skew(streak.counts, camera)
+    coarse = replace(camera, sweep=skew.sweep)
+    return register(streak.counts, streak.saturated, coarse, progress).camera
+
+
+def time_shift_bins(camera: Camera) -> list[float]:
+    """Rows by which each view is late at the first row, relative to the reference view."""
+    if camera.sweep is None:
+        return [0.0] * camera.views
+    rows, _ = camera.sweep.raw_position(np.zeros(camera.views), camera.centres_px)
+    reference = int(np.argmin(np.abs(camera.view_positions)))
+    return [float(row) for row in rows - rows[reference]]

@@ -1,0 +1,279 @@
+"""Shot after shot to cloud after cloud, with what does not change from shot to shot worked out once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.camera import Camera, Measurement, Rectifier
+from tofclip.errors import InputError, ShapeError
+from tofclip.lidar.cloud import PointCloud, point_cloud
+from tofclip.lidar.detection import Detection
+from tofclip.lidar.lit.rows import LitRows, Place
+from tofclip.lidar.returns import Returns
+from tofclip.lidar.search import ReturnSearch
+from tofclip.lidar.traces import Bins, Traces
+from tofclip.recovery.focus import AT_THE_CALIBRATED_DEPTH, Focus
+from tofclip.recovery.plan import fitted_to_shot, prepare
+from tofclip.shots import Streak
+from tofclip.solvers import LinearInverse
+from tofclip.solvers.traces import InverseTraces, patch_order
+from tofclip.threads import one_per_core
+
+FloatArray = NDArray[np.float64]
+Shot = Callable[[], Streak]
+
+LARGEST_JITTER_BIN = 32
+
+
+@dataclass(frozen=True)
+class Step:
+    """One cloud of a sequence.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    shots : range
+        Numbers of the shots it was made from.
+    late_bin : (shots,) array
+        Rows by which each came later than the first shot of the sequence.
+    """
+
+    cloud: PointCloud
+    shots: range
+    late_bin: FloatArray
+
+
+class Ranger:
+    """Makes clouds of shots of one camera by the linear inverse, which needs no iterations.
+
+    Sweep, operators, inverted Gram matrices and filters are worked out once. No transient cube is made: pixels are
+    recovered a few at a time, and their returns are sought at once (`tofclip.solvers.traces`). Rows that hold no light
+    are left out, but for a sample that tells background and noise (`tofclip.lidar.lit`).
+
+    Parameters
+    ----------
+    camera : Camera
+        With its sweep; one that has to be found from a shot is found from the first (`fitted_to_shot`) beforehand.
+    row_times : (rows,) array
+        Instant of each row, s.
+    method : LinearInverse, optional
+    focus : Focus, optional
+        One that needs no look at the shot: `FixedFocus` or `DepthLocked`.
+    detection : Detection, optional
+
+    Notes
+    -----
+    Memory: a (columns, columns) matrix for each shear, and for a shot as much again as its readings.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        row_times: FloatArray,
+        method: LinearInverse | None = None,
+        focus: Focus = AT_THE_CALIBRATED_DEPTH,
+        detection: Detection | None = None,
+    ) -> None:
+        focus.require(camera)
+        method = LinearInverse() if method is None else method
+        self.camera = camera
+        self.times = np.asarray(row_times, dtype=np.float64) - camera.time_zero
+        self.rectifier = Rectifier(camera, self.times.size)
+        nothing = Measurement(np.empty((0, 0), np.float32), np.empty((0, 0), bool))
+        pieces = focus.pieces(camera, self.times, nothing)
+        alive, self.pixels = ~camera.dead_columns, patch_order(camera.image_shape)
+        self.places = [
+            Place(piece.frames, InverseTraces(method.prepare(camera.operator(piece.shear), alive), self.pixels))
+            for piece in pieces
+        ]
+        shears = np.repeat([piece.shear for piece in pieces], [piece.size for piece in pieces])
+        self._search = ReturnSearch(camera, self.times, detection, shears=shears)
+        row = float(self.times[-1] - self.times[0]) / (self.times.size - 1)
+        limit, width = self._search.detection.signal_to_noise, self._search.pulse.fwhm / row
+        self._lit = LitRows(self.places, width, limit, self._search.reach_bins)
+
+    @classmethod
+    def for_shot(cls, shot: Streak, camera: Camera | None = None, focus: Focus = AT_THE_CALIBRATED_DEPTH) -> Ranger:
+        """Prepare for shots like this one; a sweep that is not known is found from it.
+
+        Parameters
+        ----------
+        shot : Streak
+            With a time axis.
+        camera : Camera, optional
+            Defaults to the one that the shot carries.
+        focus : Focus
+
+        Raises
+        ------
+        MissingTimeAxisError, InputError, CalibrationError
+            As for `tofclip.recover`.
+        """
+        known = prepare(shot, camera, LinearInverse(), focus).camera
+        return cls(known if known.sweep is not None else fitted_to_shot(shot, known), shot.times, focus=focus)
+
+    def returns(self, readings: NDArray[np.float32]) -> Returns:
+        """Find the returns in one shot's rectified readings, (columns, rows)."""
+        return self.search(self.recover(readings))
+
+    def recover(self, readings: NDArray[np.float32]) -> Traces:
+        """Do what a shot needs as a whole before its pixels are recovered, a few at a time, by whoever asks for them.
+
+        Parameters
+        ----------
+        readings : (columns, rows) float32 array
+            Rectified.
+        """
+        if readings.shape != (self.camera.slit_width_px, self.times.size):
+            raise ShapeError("readings", (self.camera.slit_width_px, self.times.size), readings.shape)
+        return _ShotTraces(self, readings, self._lit.bins(readings))
+
+    def search(self, traces: Traces) -> Returns:
+        """Find the returns in what `recover` returned."""
+        return self._search.returns(traces)
+
+    def cloud(self, readings: NDArray[np.float32]) -> PointCloud:
+        """Make the cloud of one shot's rectified readings, (columns, rows)."""
+        return point_cloud(self.returns(readings))
+
+
+class _ShotTraces:
+    """Traces of a shot, recovered as they are asked for; see `tofclip.lidar.traces.Traces`."""
+
+    def __init__(self, ranger: Ranger, readings: NDArray[np.float32], bins: Bins) -> None:
+        self.pixels, self.bins = ranger.pixels, bins
+        self._parts: list[tuple[InverseTraces, slice, NDArray[np.float32]]] = []
+        for place in ranger.places:
+            first, last = np.searchsorted(bins.numbers, [place.rows.start, place.rows.stop])
+            if first < last:
+                some = np.take(readings, bins.numbers[first:last], axis=1)
+                self._parts.append((place.inverse, slice(first, last), place.inverse.inverse.weights(some)))
+
+    def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
+        for inverse, held, weights in self._parts:
+            inverse.fill(weights, piece, traces, held)
+
+
+@dataclass
+class Jitter:
+    """Finds by how many rows a shot is late, from its light over time.
+
+    Parameters
+    ----------
+    reference : (rows,) array
+        Light of the shot with which the others are compared.
+    """
+
+    reference: FloatArray
+    _spectrum: Any = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        self._spectrum = np.conj(np.fft.rfft(_edges(self.reference), 2 * self.reference.size))
+
+    def late_bin(self, light: FloatArray) -> float:
+        """Rows by which `light` comes later than the reference, below a row; at most 32 either way."""
+        agreement = np.fft.irfft(np.fft.rfft(_edges(light), 2 * light.size) * self._spectrum)
+        reach = min(LARGEST_JITTER_BIN, light.size // 2 - 1)
+        near = np.concatenate([agreement[-reach:], agreement[: reach + 1]])
+        best = int(near.argmax())
+        if best in (0, near.size - 1):
+            return float(best - reach)
+        left, centre, right = near[best - 1 : best + 2]
+        return best - reach + float((right - left) / 2 / max(2 * centre - left - right, np.finfo(np.float64).tiny))
+
+
+def light_over_time(streak: Streak, camera: Camera) -> FloatArray:
+    """Sum of each raw row over the reference view's middle, where neighbouring views' skew does not matter."""
+    reference = int(np.argmin(np.abs(camera.view_positions)))
+    half = camera.image_shape[1] // 4
+    middle = round(camera.centres_px[reference])
+    return np.asarray(streak.counts[:, max(0, middle - half) : middle + half + 1].sum(axis=1, dtype=np.float64))
+
+
+def clouds(
+    shots: Sequence[Shot], ranger: Ranger, average: int = 1, steady: bool = True, first: int = 0
+) -> Iterator[Step]:
+    """Yield one cloud for every `average` successive shots; what is left over at the end makes one more.
+
+    Parameters
+    ----------
+    shots : sequence of callables
+        Each reads its shot when it is called, on the thread that works on it.
+    ranger : Ranger
+    average : int
+        Shots whose readings are averaged.
+    steady : bool
+        Whether to find how late each shot comes against the first one, and take it off.
+    first : int
+        Number of the first cloud wanted: a sequence that was interrupted goes on there.
+
+    Raises
+    ------
+    InputError
+        No shot, or fewer than one to average; a shot without any light, by its name.
+
+    Notes
+    -----
+    Every core works on a cloud of its own. Memory: a shot for each core, with what is recovered of it, and what a
+    `Ranger` takes.
+    """
+    if not shots or average < 1 or first < 0:
+        raise InputError("a sequence needs at least one shot, and at least one to average")
+    jitter = Jitter(light_over_time(shots[0](), ranger.camera)) if steady else None
+
+    def step(start: int) -> Step:
+        numbers = range(start, min(start + average, len(shots)))
+        cloud, late = averaged([shots[number] for number in numbers], ranger, jitter)
+        return Step(cloud, numbers, late)
+
+    yield from one_per_core(step, range(first * average, len(shots), average))
+
+
+def averaged(shots: Sequence[Shot], ranger: Ranger, jitter: Jitter | None) -> tuple[PointCloud, FloatArray]:
+    """Make one cloud of successive shots.
+
+    Parameters
+    ----------
+    shots : sequence of callables
+        At least one; one is in memory at a time.
+    ranger : Ranger
+    jitter : Jitter, optional
+        None: the shots are taken as they come.
+
+    Returns
+    -------
+    PointCloud
+    (shots,) array
+        Rows by which each shot was late, as far as that was asked for.
+    """
+    late = np.zeros(len(shots))
+
+    def readings(place: int) -> NDArray[np.float32]:
+        streak = shots[place]()
+        if jitter is not None:
+            late[place] = jitter.late_bin(light_over_time(streak, ranger.camera))
+        return ranger.rectifier.readings(streak.counts, late=float(late[place]))
+
+    total = readings(0)
+    for place in range(1, len(shots)):
+        total += readings(place)
+    total /= len(shots)
+    return ranger.cloud(total), late
+
+
+def cloud_path(folder: Path, number: int, suffix: str) -> Path:
+    """Return where cloud `number` of a sequence is kept."""
+    return folder / f"cloud_{number:06d}{suffix}"
+
+
+def _edges(light: FloatArray) -> FloatArray:
+    """Changes of the root of the light: near objects outshine far ones, and a constant says nothing."""
+    rise = np.diff(np.sqrt(np.maximum(light - np.median(light), 0)), prepend=0.0)
+    length: float = float(np.linalg.norm(rise)) or 1.0
+    return rise / length

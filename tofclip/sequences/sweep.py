@@ -1,0 +1,43 @@
+"""Parameter sweeps: every combination of some settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+
+from tofclip.errors import InputError
+from tofclip.sequences.recovering import Recovery
+
+KINDS = {"method": str, "iterations": int, "weight": float, "focus": str}
+"""Settings that can be swept, and what their values are."""
+
+
+def variants(recovery: Recovery, values: Mapping[str, Sequence[str]]) -> dict[str, Recovery]:
+    """Return a recovery for every combination of values, by a name that can be a folder's.
+
+    Parameters
+    ----------
+    recovery : Recovery
+        Has the settings that are not swept.
+    values : mapping of str to sequence of str
+        Values of ``method``, ``iterations``, ``weight`` and ``focus``.
+
+    Raises
+    ------
+    InputError
+        No such setting, no such value, or a combination that does not exist, such as iterations of ``linear``.
+    """
+    unknown = [name for name in values if name not in KINDS]
+    if unknown:
+        raise InputError(f"'{unknown[0]}' cannot be swept; take {', '.join(KINDS)}")
+    found = {}
+    for chosen in product(*values.values()):
+        named = dict(zip(values, chosen, strict=True))
+        try:
+            settings = {name: KINDS[name](value) for name, value in named.items()}
+        except ValueError as fault:
+            raise InputError(f"sweep: {fault}") from fault
+        label = ",".join(f"{name}={value}" for name, value in named.items())
+        found[label] = replace(recovery, **settings)
+    return found

@@ -1,0 +1,61 @@
+"""The solvers' inner loops on NumPy arrays: what `tofclip.solvers.kernels` does, as `Loops`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.solvers import kernels
+
+Array = NDArray[Any]
+Sums = NDArray[np.float64]
+
+
+class CompiledLoops:
+    """Loops on contiguous NumPy arrays, each in one pass through memory, in place; see `Loops`."""
+
+    def shrunk(
+        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float, threshold: float
+    ) -> tuple[Array, Sums]:
+        """Overwrite and return `previous`."""
+        number, total = current.dtype.type, np.empty(current.shape[-1])
+        # Every pixel is on its own: a block of volumes is one of tall pictures.
+        now, before, slope = (_tall(array) for array in (current, previous, gradient))
+        kernels.nonnegative_shrinkage(now, before, momentum, slope, number(step), number(threshold), total)
+        return previous, total
+
+    def descended(self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float) -> Array:
+        """Overwrite and return `gradient`."""
+        now, before, slope = (_tall(array) for array in (current, previous, gradient))
+        kernels.gradient_step(now, before, momentum, slope, current.dtype.type(step))
+        return gradient
+
+    def variation_shrunk(
+        self, noisy: Array, dual: Array | None, weight: float, sweeps: int, result: Array
+    ) -> tuple[Array, Sums, Array]:
+        """Overwrite and return `result` and `dual`."""
+        if dual is None:
+            dual = np.zeros((2, *noisy.shape), noisy.dtype)
+        weight, total = noisy.dtype.type(weight), np.empty(noisy.shape[-1])
+        if weight > 0:
+            kernels.total_variation_dual_sweeps(noisy, dual, weight, sweeps, result)
+        kernels.total_variation_primal(noisy, dual, weight, result, total)
+        return result, total, dual
+
+    def squared_sums(self, values: Array) -> Sums:
+        """Multiply and add without a temporary."""
+        total: Sums = np.einsum("if,if->f", values, values, dtype=np.float64)
+        return total
+
+    def put_back(self, values: Array, before: Array, refused: NDArray[np.bool_]) -> Array:
+        """Overwrite and return `values`; most often there is nothing to do."""
+        if refused.any():
+            kernels.put_back(_tall(values), _tall(before), refused.astype(values.dtype))
+        return values
+
+
+def _tall(array: Array) -> Array:
+    """The same memory as (rows, columns, frames)."""
+    return array.reshape(-1, *array.shape[-2:])

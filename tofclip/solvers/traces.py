@@ -1,0 +1,92 @@
+"""The linear inverse pixel by pixel: a few pixels at all instants, instead of all pixels at a few instants.
+
+Whoever looks at one pixel's brightness over time, as the search for returns does, never needs the transient cube: the
+dense part of the inverse, which is small, is worked out for the whole shot, and the sparse part for a few pixels at a
+time, whose traces stay in cache.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import InputError
+from tofclip.operators import SparseMatrix
+from tofclip.operators.sparse import Tiles
+from tofclip.solvers.direct import PreparedInverse
+from tofclip.solvers.method import Array
+
+PATCH_ROWS, PATCH_COLUMNS = 8, 8  # the readings that such a patch looks at stay in the second-level cache
+
+
+def patch_order(image_shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Return the numbers of all pixels of a picture, counted in raster order, patch by patch."""
+    row, column = np.divmod(np.arange(image_shape[0] * image_shape[1]), image_shape[1])
+    return np.lexsort((column, row, column // PATCH_COLUMNS, row // PATCH_ROWS))
+
+
+class InverseTraces:
+    """A prepared inverse whose sparse part is applied to pixels in an order of their own.
+
+    Parameters
+    ----------
+    inverse : PreparedInverse
+        Of a sparse matrix in float32.
+    pixels : (n,) int array
+        Numbers of the pixels, counted in raster order; see `patch_order`.
+    """
+
+    def __init__(self, inverse: PreparedInverse, pixels: NDArray[np.int64]) -> None:
+        if not isinstance(inverse.operator, SparseMatrix):
+            raise InputError(f"traces of single pixels need a sparse matrix, not {inverse.operator!r}")
+        self.inverse = inverse
+        self._tiles = Tiles.of(inverse.operator.matrix.T.tocsr()[pixels])
+
+    def brightest(self, block: Array) -> Array:
+        """Return how far the brightest pixel of each back-projected frame stands out.
+
+        Parameters
+        ----------
+        block : (readings, LANES) contiguous array
+            In units of their noise.
+
+        Returns
+        -------
+        (LANES,) array
+            The largest ``a'f / |a|`` over the columns a of A: the response of the filter that is matched to a lone
+            pixel, in units of its noise. Never below zero.
+        """
+        from tofclip.solvers.kernels import highest_pixels
+
+        highest = np.zeros(block.shape[1], block.dtype)
+        highest_pixels(*self._tiles, self._scales, block, highest)
+        return highest
+
+    @cached_property
+    def _scales(self) -> Array:
+        """``1 / |a|`` of each pixel, 0 where nothing is seen."""
+        starts, _, values = self._tiles
+        ends = np.concatenate([[0], np.cumsum(values.astype(np.float64) ** 2)])
+        energy = (ends[starts[:, 1:]] - ends[starts[:, :-1]]).sum(axis=0)
+        scales = np.divide(1, np.sqrt(energy), out=np.zeros(energy.size), where=energy > 0)
+        return scales.astype(values.dtype)
+
+    def fill(self, weights: Array, piece: slice, traces: Array, frames: slice) -> None:
+        """Write what the inverse makes of a shot at the pixels ``pixels[piece]``.
+
+        Parameters
+        ----------
+        weights : (blocks, readings, LANES) array
+            `PreparedInverse.weights` of the shot's readings.
+        piece : slice
+        traces : (pixels of the piece, time) contiguous array, of which the columns `frames` are overwritten
+        frames : slice
+            As many as the readings had.
+        """
+        from tofclip.solvers.kernels import traces_of_pixels
+
+        starts = np.ascontiguousarray(self._tiles.starts[:, piece.start : piece.stop + 1])
+        span = frames.start, frames.stop
+        traces_of_pixels(starts, self._tiles.columns, self._tiles.values, weights, traces, span)

@@ -1,0 +1,363 @@
+"""Files of our own: HDF5 records that name their units and axes, and writing that is all or nothing.
+
+A *record* is a tree of named arrays. Each array carries its unit and the names of its axes; the root carries what
+kind of thing it is and where it came from. Every class that can be saved turns itself into a `Record` and back, so
+that the layout of the file is decided here and nowhere else. No damaged byte of a record goes unnoticed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import errno
+import hashlib
+import io
+import json
+import os
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from tofclip.errors import FileFormatError, StorageError
+from tofclip.version import __version__
+
+if TYPE_CHECKING:
+    import h5py
+
+Scalar = str | int | float | bool
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+"""The first bytes of every HDF5 file."""
+
+FORMAT_NAME = "tofclip"
+FORMAT_VERSION = 1
+# The layouts of HDF5 1.10 carry checksums; a damaged file of the older ones can hang the library.
+LIBRARY_VERSIONS = ("v110", "v110")
+CHUNK_CUBE = (64, 32, 32)
+COMPRESS_FROM_BYTES = 1 << 16
+
+
+@dataclass(frozen=True)
+class Field:
+    """An array with its unit and the names of its axes.
+
+    Parameters
+    ----------
+    values : ndarray
+    units : str
+        SI unit (``"s"``, ``"m"``, ``"rad"``), ``"px"``, ``"count"``, or ``""`` for a pure number.
+    axes : tuple of str
+        One name per dimension, e.g. ``("time", "y", "x")``.
+    """
+
+    values: NDArray[Any]
+    units: str = ""
+    axes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Record:
+    """A tree of arrays and scalars, as it lies in an HDF5 file.
+
+    Parameters
+    ----------
+    kind : str
+        What the record describes: ``"camera"``, ``"streak"``, ``"frames"``, ``"cloud"``, ``"capture"``, ``"volume"``.
+    fields : mapping of str to Field
+    attributes : mapping of str to str, int, float or bool
+    children : mapping of str to Record
+        Records that travel inside this one, such as a streak image's camera.
+    provenance : mapping
+        How it came about; any JSON-serialisable tree.
+    origin : str
+        The file it was read from, for error messages.
+    """
+
+    kind: str
+    fields: Mapping[str, Field] = field(default_factory=dict)
+    attributes: Mapping[str, Scalar] = field(default_factory=dict)
+    children: Mapping[str, Record] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    origin: str = ""
+
+    def array(self, name: str, dtype: DTypeLike, dimensions: int, units: str = "") -> NDArray[Any]:
+        """Return field `name` as a checked array.
+
+        Raises
+        ------
+        FileFormatError
+            The field is absent, or has another number of dimensions, another unit, or another type.
+        """
+        if name not in self.fields:
+            raise FileFormatError(self.origin, f"{self.kind} record has no field '{name}'")
+        found = self.fields[name]
+        if found.values.ndim != dimensions:
+            raise FileFormatError(
+                self.origin,
+                f"field '{name}' must have {dimensions} dimensions, found shape {found.values.shape}",
+            )
+        if found.units != units:
+            raise FileFormatError(self.origin, f"field '{name}' must be in '{units}', found '{found.units}'")
+        if not np.can_cast(found.values.dtype, dtype, casting="same_kind"):
+            raise FileFormatError(
+                self.origin,
+                f"field '{name}' must convert to {np.dtype(dtype)}, found {found.values.dtype}",
+            )
+        return np.ascontiguousarray(found.values, dtype=dtype)
+
+    def attribute(self, name: str, default: Scalar | None = None) -> Scalar:
+        """Return scalar attribute `name`, or `default` if it is absent and a default is given."""
+        if name in self.attributes:
+            return self.attributes[name]
+        if default is None:
+            raise FileFormatError(self.origin, f"{self.kind} record has no attribute '{name}'")
+        return default
+
+    def child(self, name: str, kind: str) -> Record:
+        """Return the record that travels inside this one under `name`, refusing another kind."""
+        found = self.children.get(name)
+        if found is None or found.kind != kind:
+            raise FileFormatError(self.origin, f"{self.kind} record carries no {kind} '{name}'")
+        return found
+
+    def save(self, path: str | Path) -> None:
+        """Write the record to `path`, whole or not at all.
+
+        Raises
+        ------
+        StorageError
+            The disk is full, the folder is missing or writing is not allowed; `path` is left as it was.
+        """
+        write_record(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path, *kinds: str) -> Record:
+        """Read a record, refusing any other kind than those named (none named: any kind)."""
+        found = read_record(path)
+        if kinds and found.kind not in kinds:
+            wanted = " or ".join(kinds)
+            raise FileFormatError(path, f"holds a {found.kind} record, expected {wanted}")
+        return found
+
+
+def write_record(record: Record, path: str | Path) -> None:
+    """Write a record to `path`, whole or not at all; see `Record.save`."""
+    import h5py
+
+    with atomic_path(path) as temporary:
+        # HDF5 crashes the process when the disk fills up under it: it writes to memory, and Python to the disk.
+        image = io.BytesIO()
+        with h5py.File(image, "w", libver=LIBRARY_VERSIONS) as file:
+            _write_attribute(file, "format", FORMAT_NAME)
+            _write_attribute(file, "format_version", FORMAT_VERSION)
+            _write_attribute(file, "provenance", json.dumps(dict(record.provenance), default=str))
+            _write_group(file, record)
+        temporary.write_bytes(image.getbuffer())
+
+
+def read_record(path: str | Path) -> Record:
+    """Read the record in `path`, of whatever kind; see `Record.load`."""
+    with _opened(path) as file:
+        found = _read_group(file, str(path))
+        return replace(found, provenance=_parse_provenance(_text(file, "provenance"), path))
+
+
+@contextlib.contextmanager
+def _opened(path: str | Path) -> Iterator[h5py.File]:
+    """Open one of our HDF5 files for reading; anything else is a clear error."""
+    import h5py
+
+    with reading(path), open(path, "rb") as raw:
+        start = raw.read(len(SIGNATURE))
+    if start != SIGNATURE:
+        raise FileFormatError(path, "is not an HDF5 file" if start else "is empty")
+    try:
+        with h5py.File(path, "r") as file:
+            if _text(file, "format") != FORMAT_NAME:
+                raise FileFormatError(path, "is an HDF5 file, but not one of tofclip's")
+            version = int(file.attrs.get("format_version", 0))
+            if version > FORMAT_VERSION:
+                raise FileFormatError(path, f"has format version {version}; this program reads {FORMAT_VERSION}")
+            yield file
+    except (OSError, KeyError, RuntimeError) as fault:
+        raise FileFormatError(path, f"is damaged or incomplete ({one_line(fault)})") from fault
+
+
+def _write_group(group: h5py.Group, record: Record) -> None:
+    _write_attribute(group, "kind", record.kind)
+    for name, value in record.attributes.items():
+        _write_attribute(group, f"value.{name}", value)
+    for name, entry in record.fields.items():
+        dataset = group.create_dataset(name, data=entry.values, **_storage_options(entry.values))
+        _write_attribute(dataset, "units", entry.units)
+        _write_attribute(dataset, "axes", ",".join(entry.axes))
+    for name, child in record.children.items():
+        _write_group(group.create_group(name), child)
+
+
+def _write_attribute(item: h5py.Group | h5py.Dataset, name: str, value: Scalar) -> None:
+    import h5py
+
+    if isinstance(value, str):
+        # Of fixed length, because strings of variable length lie in a heap without checksums.
+        length = max(1, len(value.encode()))
+        item.attrs.create(name, value.encode(), dtype=h5py.string_dtype("utf-8", length))
+    else:
+        item.attrs[name] = value
+
+
+def _storage_options(values: NDArray[Any]) -> dict[str, Any]:
+    """Checksums for every array, compression for the large ones."""
+    if values.size == 0 or values.ndim == 0:
+        return {}
+    if values.nbytes < COMPRESS_FROM_BYTES:
+        return {"chunks": values.shape, "fletcher32": True}
+    chunks: tuple[int, ...] | bool = True
+    if values.ndim == len(CHUNK_CUBE):
+        chunks = tuple(min(c, n) for c, n in zip(CHUNK_CUBE, values.shape, strict=True))
+    return {
+        "chunks": chunks,
+        "compression": "gzip",
+        "compression_opts": 4,
+        "shuffle": True,
+        "fletcher32": True,
+    }
+
+
+def _read_group(group: h5py.Group, origin: str) -> Record:
+    import h5py
+
+    fields: dict[str, Field] = {}
+    children: dict[str, Record] = {}
+    for name, item in group.items():
+        if isinstance(item, h5py.Dataset):
+            axes = _text(item, "axes")
+            fields[name] = Field(item[()], _text(item, "units"), tuple(axes.split(",")) if axes else ())
+        elif isinstance(item, h5py.Group):
+            children[name] = _read_group(item, origin)
+        else:
+            raise FileFormatError(origin, f"is damaged: '{name}' cannot be read")
+    attributes = {
+        name.removeprefix("value."): _plain(value) for name, value in group.attrs.items() if name.startswith("value.")
+    }
+    return Record(_text(group, "kind"), fields, attributes, children, origin=origin)
+
+
+def _text(item: h5py.Group | h5py.Dataset, name: str) -> str:
+    return str(_plain(item.attrs.get(name, "")))
+
+
+def _plain(value: Any) -> Scalar:
+    """Turn an HDF5 attribute into a Python scalar."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    text_or_number: Scalar = plain.decode() if isinstance(plain, bytes) else plain
+    return text_or_number
+
+
+def _parse_provenance(text: str, path: str | Path) -> dict[str, Any]:
+    try:
+        found = json.loads(text)
+    except json.JSONDecodeError as fault:
+        raise FileFormatError(path, "its provenance is not JSON") from fault
+    return found if isinstance(found, dict) else {}
+
+
+def provenance(settings: Mapping[str, Any], *inputs: str | Path) -> dict[str, Any]:
+    """Describe how a result came about: program version, time, settings, and a hash of every input file."""
+    return {
+        "software": f"tofclip {__version__}",
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "settings": dict(settings),
+        "inputs": [{"name": Path(path).name, "sha256": sha256_of(path)} for path in inputs if Path(path).is_file()],
+    }
+
+
+def sha256_of(path: str | Path) -> str:
+    """Hexadecimal SHA-256 of a file."""
+    with reading(path), open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary name beside `path` and rename it to `path` when the block ends well.
+
+    On any exception, Ctrl-C included, the temporary file is removed and `path` stays as it was. Problems of the file
+    system become `StorageError`.
+    """
+    target = Path(path)
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=target.suffix, dir=target.parent or ".")
+        os.close(handle)
+    except OSError as fault:
+        raise StorageError(f"{target}: cannot be written: {_reason(fault)}") from fault
+    temporary = Path(name)
+    try:
+        yield temporary
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, target)
+    except OSError as fault:
+        if isinstance(fault, StorageError):
+            raise
+        raise StorageError(f"{target}: cannot be written: {_reason(fault)}") from fault
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def remove_leftovers(targets: Iterable[Path]) -> None:
+    """Remove the temporary files of writers of `targets` that were killed before `atomic_path` could.
+
+    Only when nobody writes these targets any more: a writer whose temporary file is gone fails.
+    """
+    wanted: dict[Path, set[str]] = {}
+    for target in targets:
+        wanted.setdefault(target.parent, set()).add(target.name)
+    for folder, names in wanted.items():
+        with contextlib.suppress(OSError):
+            for entry in os.scandir(folder):
+                target_name = Path(entry.name).stem[1:].rpartition(".")[0]
+                if entry.name.startswith(".") and target_name in names:
+                    Path(entry.path).unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Turn the operating system's refusals to read `path` into `StorageError`."""
+    try:
+        yield
+    except FileNotFoundError as fault:
+        raise StorageError(f"{path}: no such file") from fault
+    except IsADirectoryError as fault:
+        raise StorageError(f"{path}: is a folder, a file is needed") from fault
+    except PermissionError as fault:
+        raise StorageError(f"{path}: reading is not permitted") from fault
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _reason(fault: OSError) -> str:
+    if fault.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "the disk is full; free some space or choose another folder with --out"
+    if isinstance(fault, FileNotFoundError):
+        return "the folder does not exist; create it first"
+    if isinstance(fault, NotADirectoryError):
+        return "its folder is a file"
+    if isinstance(fault, IsADirectoryError):
+        return "it is a folder; name a file"
+    if isinstance(fault, PermissionError):
+        return "writing is not permitted there"
+    return one_line(fault)
+
+
+def one_line(fault: BaseException) -> str:
+    """Return an exception's message without line breaks, or its name where it has none."""
+    return " ".join(str(fault).split()) or type(fault).__name__

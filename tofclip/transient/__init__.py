@@ -1,6 +1,0 @@
-"""The two pictures of a transient: the streak image that was measured and the frames recovered from it."""
-
-from tofclip.transient.frames import Frames
-from tofclip.transient.streak import Streak
-
-__all__ = ["Frames", "Streak"]
