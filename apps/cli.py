@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from apps.help import explain
+from apps.help import set_help_texts
 from apps.verbs import (
     bench,
     calibrate,
@@ -35,20 +35,22 @@ from apps.verbs import (
 from tofclip import __version__
 from tofclip.errors import TofclipError
 
-FAULTY_INPUT = 2
-DEFECT = 1
-INTERRUPTED = 130  # 128 + SIGINT, as shells report it
-READER_GONE = 141  # 128 + SIGPIPE
+EXIT_INPUT_ERROR = 2
+EXIT_DEFECT = 1
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
 
 DEBUG_FLAG = "--debug"
-COMPLETION_VARIABLE = "_TOFCLIP_COMPLETE"  # what shells set while they ask typer how a word may go on
+COMPLETION_VARIABLE = (
+    "_TOFCLIP_COMPLETE"  # what shells set while they ask typer how a word may go on
+)
 EPILOG = (
-    f"Exit status: 0 done; {FAULTY_INPUT} unusable input, with one line on standard error that says what to do; "
-    f"{INTERRUPTED} interrupted; {DEFECT} some of a sequence failed, or a defect of this program. "
+    f"Exit status: 0 done; {EXIT_INPUT_ERROR} unusable input, with one line on standard error that says what to do; "
+    f"{EXIT_INTERRUPTED} interrupted; {EXIT_DEFECT} some of a sequence failed, or a defect of this program. "
     f"{DEBUG_FLAG} anywhere shows where an error came from."
 )
 
-MAP = f"""\
+VERB_OVERVIEW = f"""\
 tofclip {__version__}: 3D from streak images, through occluders and around corners
 
                         four focus pictures
@@ -104,11 +106,11 @@ app.add_typer(devices.app, name="devices")
 app.command()(record.record)
 app.command()(convert.convert)
 app.command()(info.info)
-explain(app, EPILOG)
+set_help_texts(app, EPILOG)
 
 
 @app.callback(invoke_without_command=True)
-def _without_verb(
+def _show_overview(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
 ) -> None:
@@ -117,7 +119,7 @@ def _without_verb(
         print(__version__)
         raise typer.Exit
     if context.invoked_subcommand is None:
-        print(MAP)
+        print(VERB_OVERVIEW)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -131,40 +133,47 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = DEBUG_FLAG in words
     try:
-        status = app([word for word in words if word != DEBUG_FLAG], prog_name="tofclip", standalone_mode=False)
+        status = app(
+            [word for word in words if word != DEBUG_FLAG],
+            prog_name="tofclip",
+            standalone_mode=False,
+        )
         sys.stdout.flush()
     except Exception as fault:
         if debug:
             traceback.print_exc()
-        return _report(fault)
+        return _report_error(fault)
     except KeyboardInterrupt:
-        status = INTERRUPTED
+        status = EXIT_INTERRUPTED
     except SystemExit as end:  # typer's answer to a broken pipe, and the end of shell completion
         completes = end.code == 0 or COMPLETION_VARIABLE in os.environ
-        status = end.code if completes else READER_GONE
-    if status == INTERRUPTED:
+        status = end.code if completes else EXIT_BROKEN_PIPE
+    if status == EXIT_INTERRUPTED:
         print("tofclip: interrupted; no unfinished file was left behind", file=sys.stderr)
     return int(status or 0)
 
 
-def _report(fault: Exception) -> int:
+def _report_error(fault: Exception) -> int:
     """Print one line about an error and return the exit status."""
     if isinstance(fault, BrokenPipeError):
         # Python flushes once more at exit; let that go nowhere instead of failing again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return READER_GONE
+        return EXIT_BROKEN_PIPE
     if isinstance(fault, typer.TyperException):
-        print(f"tofclip: error: {_one_line(fault.format_message()).rstrip('.')} (see --help)", file=sys.stderr)
-        return FAULTY_INPUT
+        print(
+            f"tofclip: error: {_one_line(fault.format_message()).rstrip('.')} (see --help)",
+            file=sys.stderr,
+        )
+        return EXIT_INPUT_ERROR
     if isinstance(fault, TofclipError):
         print(f"tofclip: error: {_one_line(str(fault))}", file=sys.stderr)
-        return FAULTY_INPUT
+        return EXIT_INPUT_ERROR
     kind = type(fault).__name__
     print(
         f"tofclip: error: unforeseen {kind}: {_one_line(str(fault))} ({DEBUG_FLAG} shows where; please report it)",
         file=sys.stderr,
     )
-    return DEFECT
+    return EXIT_DEFECT
 
 
 def _one_line(text: str) -> str:

@@ -1,4 +1,6 @@
-"""The verbs' pages of the documentation, made from the program itself so that they cannot be out of date."""
+"""The verbs' pages of the documentation, made from the program itself so that they cannot be out of
+date.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +11,23 @@ from pathlib import Path
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
-from apps.cli import EPILOG, MAP, app
-from apps.help import PROGRAM, told
+from apps.cli import EPILOG, VERB_OVERVIEW, app
+from apps.help import PROGRAM, split_docstring
 
-COMPLETION = """\
+COMPLETION_NOTE = """\
 `tofclip --install-completion` teaches the shell that it is called from (bash, zsh or fish) to complete verbs, options
 and names of methods with the tab key; `tofclip --show-completion` only shows what it would install."""
 
 
-def verbs() -> dict[str, TyperCommand]:
+def collect_verbs() -> dict[str, TyperCommand]:
     """Return every verb that computes, by the words that call it, such as ``lidar scene``."""
-    return dict(_found(typer.main.get_command(app), ()))
+    return dict(_walk_commands(typer.main.get_command(app), ()))
 
 
-def _found(command: object, words: tuple[str, ...]) -> Iterator[tuple[str, TyperCommand]]:
+def _walk_commands(command: object, words: tuple[str, ...]) -> Iterator[tuple[str, TyperCommand]]:
     if isinstance(command, TyperGroup):
         for name, below in command.commands.items():
-            yield from _found(below, (*words, name))
+            yield from _walk_commands(below, (*words, name))
     elif isinstance(command, TyperCommand):
         yield " ".join(words), command
 
@@ -44,51 +46,63 @@ def write_pages(folder: Path) -> list[Path]:
         The verbs' pages, then the list.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    pages = {f"{name.replace(' ', '-')}.md": page(name, command) for name, command in verbs().items()}
-    pages["index.md"] = _index(list(pages))
+    pages = {
+        f"{name.replace(' ', '-')}.md": render_page(name, command)
+        for name, command in collect_verbs().items()
+    }
+    pages["index.md"] = _render_index(list(pages))
     for old in folder.glob("*.md"):
         if old.name not in pages:
             old.unlink()
     for name, text in pages.items():
         path = folder / name
-        if not path.exists() or path.read_text(encoding="utf-8") != text:  # what is the same is not built again
+        if (
+            not path.exists() or path.read_text(encoding="utf-8") != text
+        ):  # what is the same is not built again
             path.write_text(text, encoding="utf-8")
     return [folder / name for name in pages]
 
 
-def page(name: str, command: TyperCommand) -> str:
-    """Return a verb's page in Markdown: what it does, an example, its arguments and options, the exit statuses."""
+def render_page(name: str, command: TyperCommand) -> str:
+    """Return a verb's page in Markdown: what it does, an example, its arguments and options, the
+    exit statuses.
+    """
     context = typer.Context(command, info_name=f"{PROGRAM} {name}")
-    prose, examples = told(command.callback.__doc__ if command.callback else None)
+    prose, examples = split_docstring(command.callback.__doc__ if command.callback else None)
     usage = " ".join([PROGRAM, name, *command.collect_usage_pieces(context)])
-    parts = [f"# {PROGRAM} {name}", *map(_plain, prose), f"```text\n{usage}\n```"]
+    parts = [f"# {PROGRAM} {name}", *map(_escape_markdown, prose), f"```text\n{usage}\n```"]
     parts += [f"```sh\n{example}\n```" for example in examples]
-    for heading, entries in _panels(command, context).items():
-        parts += [f"## {_plain(heading)}", *entries]
-    return "\n\n".join([*parts, "## Exit status", _plain(EPILOG.removeprefix("Exit status: ")), ""])
+    for heading, entries in _collect_panels(command, context).items():
+        parts += [f"## {_escape_markdown(heading)}", *entries]
+    return "\n\n".join(
+        [*parts, "## Exit status", _escape_markdown(EPILOG.removeprefix("Exit status: ")), ""]
+    )
 
 
-def _panels(command: TyperCommand, context: typer.Context) -> dict[str, list[str]]:
+def _collect_panels(command: TyperCommand, context: typer.Context) -> dict[str, list[str]]:
     """Return what is told of arguments and options, under the headings that they have in the help."""
     panels: dict[str, list[str]] = {}
     for param in command.get_params(context):
         if isinstance(param, TyperArgument | TyperOption) and not param.hidden:
             usual = "Arguments" if isinstance(param, TyperArgument) else "Options"
-            panels.setdefault(param.rich_help_panel or usual, []).append(_entry(param, context))
+            panels.setdefault(param.rich_help_panel or usual, []).append(
+                _format_entry(param, context)
+            )
     return panels
 
 
-def _entry(param: TyperArgument | TyperOption, context: typer.Context) -> str:
+def _format_entry(param: TyperArgument | TyperOption, context: typer.Context) -> str:
     """Return one term of a definition list."""
     name, told_of_it = param.get_help_record(context) or (param.name, "")
-    return f"`{name}`\n: {_plain(told_of_it)}"
+    return f"`{name}`\n: {_escape_markdown(told_of_it)}"
 
 
-def _index(pages: list[str]) -> str:
+def _render_index(pages: list[str]) -> str:
     names = "\n".join(page.removesuffix(".md") for page in pages)
-    return f"# Verbs\n\n```text\n{MAP}\n```\n\n{COMPLETION}\n\n```{{toctree}}\n:maxdepth: 1\n\n{names}\n```\n"
+    contents = f"```{{toctree}}\n:maxdepth: 1\n\n{names}\n```\n"
+    return f"# Verbs\n\n```text\n{VERB_OVERVIEW}\n```\n\n{COMPLETION_NOTE}\n\n{contents}"
 
 
-def _plain(text: str) -> str:
+def _escape_markdown(text: str) -> str:
     """Keep Markdown from seeing anything but words."""
     return re.sub(r"([\\`*_<>$\[\]{}|])", r"\\\1", " ".join(text.split()))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tofclip.errors import InputError, StorageError
-from tofclip.storage import provenance
+from tofclip.storage import collect_provenance
 
 RECORD_SUFFIXES = (".h5", ".hdf5")
 PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
@@ -17,7 +17,8 @@ PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 def require_writable(out: Path, *suffixes: str, inputs: tuple[Path, ...] = ()) -> None:
     """Refuse an output that cannot be written, or that would overwrite an input.
 
-    Finding out after minutes of work would be too late. The writing itself is all or nothing in any case.
+    Finding out after minutes of work would be too late. The writing itself is all or nothing in any
+    case.
 
     Parameters
     ----------
@@ -41,18 +42,24 @@ def require_writable(out: Path, *suffixes: str, inputs: tuple[Path, ...] = ()) -
         raise StorageError(f"{out}: cannot be written: writing is not permitted there")
     for path in inputs:
         if out.exists() and path.exists() and out.samefile(path):
-            raise InputError(f"{out}: is an input too; choose another name, so that it is not overwritten")
+            raise InputError(
+                f"{out}: is an input too; choose another name, so that it is not overwritten"
+            )
 
 
-def history(settings: Mapping[str, Any], *inputs: Path, earlier: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def build_provenance(
+    settings: Mapping[str, Any], *inputs: Path, earlier: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
     """Describe how a result came about, with what is known about its input's own past."""
-    described = provenance({name: _plain(value) for name, value in settings.items()}, *inputs)
+    described = collect_provenance(
+        {name: _to_plain_value(value) for name, value in settings.items()}, *inputs
+    )
     if earlier:
         described["earlier"] = dict(earlier)
     return described
 
 
-def _plain(value: Any) -> Any:
+def _to_plain_value(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 

@@ -1,7 +1,8 @@
-"""The guides' commands, run as they stand: tests run them on small files, and the guides' own pictures come from it.
+"""The guides' commands, run as they stand: tests run them on small files, and the guides' own
+pictures come from it.
 
-``python -m apps.guides docs/tutorial.md FOLDER`` runs a guide where all files of FOLDER are at hand, and puts the
-pictures that the guide shows beside it.
+``python -m apps.guides docs/tutorial.md FOLDER`` runs a guide where all files of FOLDER are at
+hand, and puts the pictures that the guide shows beside it.
 """
 
 from __future__ import annotations
@@ -21,40 +22,49 @@ from apps.cli import main
 from apps.help import PROGRAM
 from tofclip.storage import atomic_path
 
-BLOCKS = re.compile(r"^```(sh|python)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-PICTURES = re.compile(r"!\[[^\]]*\]\((pictures/[^)]+)\)")
-LARGEST_WHOLE = 150_000  # bytes of a picture that is kept as it is
-COLOURS = 256  # of a larger one: a quarter of the size, off by less than 16 of 255 anywhere
+BLOCK_PATTERN = re.compile(r"^```(sh|python)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+PICTURE_PATTERN = re.compile(r"!\[[^\]]*\]\((pictures/[^)]+)\)")
+MAX_UNREDUCED_BYTES = 150_000  # bytes of a picture that is kept as it is
+PALETTE_SIZE = 256  # of a larger one: a quarter of the size, off by less than 16 of 255 anywhere
 
 
-def steps(guide: Path) -> list[tuple[str, str]]:
+def read_steps(guide: Path) -> list[tuple[str, str]]:
     """Return what a guide tells to run, in its order: ``("sh", command)`` or ``("python", code)``.
 
-    Blocks called ``console``, whose lines begin with a prompt, need an instrument, a screen or the network and are
-    left out.
+    Blocks called ``console``, whose lines begin with a prompt, need an instrument, a screen or the
+    network and are left out.
     """
     found = []
-    for language, text in BLOCKS.findall(guide.read_text(encoding="utf-8")):
+    for language, text in BLOCK_PATTERN.findall(guide.read_text(encoding="utf-8")):
         if language == "python":
             found.append((language, text))
         else:
-            found += [(language, line) for line in text.replace("\\\n", " ").splitlines() if line.strip()]
+            found += [
+                (language, line) for line in text.replace("\\\n", " ").splitlines() if line.strip()
+            ]
     return found
 
 
-def commands_for_hardware(guide: Path) -> list[str]:
+def find_hardware_commands(guide: Path) -> list[str]:
     """Return this program's commands in the blocks that are left out, without their prompt."""
-    blocks = re.findall(r"^```console\n(.*?)^```", guide.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
-    return [line.removeprefix("$ ") for block in blocks for line in block.splitlines() if f"$ {PROGRAM} " in line]
+    blocks = re.findall(
+        r"^```console\n(.*?)^```", guide.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
+    return [
+        line.removeprefix("$ ")
+        for block in blocks
+        for line in block.splitlines()
+        if f"$ {PROGRAM} " in line
+    ]
 
 
-def walk(guide: Path) -> Iterator[tuple[str, int]]:
+def run_guide(guide: Path) -> Iterator[tuple[str, int]]:
     """Run a guide's steps in the current folder; yield each with its exit status.
 
     Python blocks share their names, as if typed into one session.
     """
     names: dict[str, Any] = {}
-    for language, text in steps(guide):
+    for language, text in read_steps(guide):
         if language == "python":
             exec(compile(text, guide.name, "exec"), names)
             yield text, 0
@@ -63,9 +73,13 @@ def walk(guide: Path) -> Iterator[tuple[str, int]]:
             yield text, main(words) if program == PROGRAM else 127
 
 
-def shown_pictures(guide: Path) -> dict[str, Path]:
-    """Return the pictures of a guide's own commands: the name its command wrote, and where the guide shows it."""
-    places = [guide.parent / found for found in PICTURES.findall(guide.read_text(encoding="utf-8"))]
+def find_pictures(guide: Path) -> dict[str, Path]:
+    """Return the pictures of a guide's own commands: the name its command wrote, and where the
+    guide shows it.
+    """
+    places = [
+        guide.parent / found for found in PICTURE_PATTERN.findall(guide.read_text(encoding="utf-8"))
+    ]
     return {place.name: place for place in places if place.parent.name == guide.stem}
 
 
@@ -75,23 +89,25 @@ def make_pictures(guide: Path, inputs: Path) -> None:
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         for file in inputs.iterdir():
             os.symlink(file, file.name)
-        for step, status in walk(guide):
+        for step, status in run_guide(guide):
             if status:
                 raise SystemExit(f"{step}: exit status {status}")
-        for name, place in shown_pictures(guide).items():
-            _keep(Path(name), place)
+        for name, place in find_pictures(guide).items():
+            _store_picture(Path(name), place)
 
 
-def _keep(picture: Path, place: Path) -> None:
+def _store_picture(picture: Path, place: Path) -> None:
     from PIL import Image
 
     place.parent.mkdir(parents=True, exist_ok=True)
-    if picture.stat().st_size <= LARGEST_WHOLE:
+    if picture.stat().st_size <= MAX_UNREDUCED_BYTES:
         with atomic_path(place) as temporary:
             shutil.copyfile(picture, temporary)
         return
     with Image.open(picture) as whole, atomic_path(place) as temporary:
-        few = whole.convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few = whole.convert("RGB").quantize(
+            PALETTE_SIZE, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        )
         few.save(temporary, format="PNG", optimize=True)
 
 

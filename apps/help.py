@@ -1,6 +1,8 @@
-"""What the help of every verb says beyond its options: an example that can be pasted, and the exit statuses.
+"""What the help of every verb says beyond its options: an example that can be pasted, and the exit
+statuses.
 
-A verb's docstring ends in a paragraph that begins with ``Example:``; several such paragraphs are several examples.
+A verb's docstring ends in a paragraph that begins with ``Example:``; several such paragraphs are
+several examples.
 """
 
 from __future__ import annotations
@@ -14,42 +16,49 @@ if TYPE_CHECKING:
     import typer
 
 PROGRAM = "tofclip"
-EXAMPLE = "Example:"
-WIDTH = 72  # of an example, so that it fits the narrowest usual terminal with its indentation
+EXAMPLE_MARK = "Example:"
+MAX_EXAMPLE_WIDTH = (
+    72  # of an example, so that it fits the narrowest usual terminal with its indentation
+)
 
 
-def explain(app: typer.Typer, closing: str) -> None:
+def set_help_texts(app: typer.Typer, closing: str) -> None:
     """Give every verb its help, made from its docstring, with `closing` as the last paragraph."""
     for verb in app.registered_commands:
-        prose, examples = told(verb.callback.__doc__ if verb.callback else None)
-        shown = [f"{EXAMPLE}\n    {folded(example)}" for example in examples]
-        verb.help = _literal("\n\n".join(prose))
-        verb.epilog = _literal("\n\n".join([*shown, closing]))
+        prose, examples = split_docstring(verb.callback.__doc__ if verb.callback else None)
+        shown = [f"{EXAMPLE_MARK}\n    {wrap_command(example)}" for example in examples]
+        verb.help = _escape_markup("\n\n".join(prose))
+        verb.epilog = _escape_markup("\n\n".join([*shown, closing]))
     for group in app.registered_groups:
         if group.typer_instance is not None:
-            explain(group.typer_instance, closing)
+            set_help_texts(group.typer_instance, closing)
 
 
-def told(docstring: str | None) -> tuple[list[str], list[str]]:
+def split_docstring(docstring: str | None) -> tuple[list[str], list[str]]:
     """Split a docstring into its paragraphs of prose and its example commands.
 
-    Lines of a paragraph are joined, since a terminal is narrower than the source; one with indented lines stays.
+    Lines of a paragraph are joined, since a terminal is narrower than the source; one with indented
+    lines stays.
     """
     paragraphs = [one for one in inspect.cleandoc(docstring or "").split("\n\n") if one.strip()]
-    examples = [" ".join(one.split()[1:]) for one in paragraphs if one.startswith(EXAMPLE)]
-    return [_joined(one) for one in paragraphs if not one.startswith(EXAMPLE)], examples
+    examples = [" ".join(one.split()[1:]) for one in paragraphs if one.startswith(EXAMPLE_MARK)]
+    return [_join_lines(one) for one in paragraphs if not one.startswith(EXAMPLE_MARK)], examples
 
 
-def folded(command: str) -> str:
+def wrap_command(command: str) -> str:
     """Break a long command between its words, as a shell takes it."""
-    lines = textwrap.wrap(command, WIDTH, break_long_words=False, break_on_hyphens=False)
+    lines = textwrap.wrap(
+        command, MAX_EXAMPLE_WIDTH, break_long_words=False, break_on_hyphens=False
+    )
     return " \\\n        ".join(lines)
 
 
-def _joined(paragraph: str) -> str:
-    return paragraph if re.search(r"^[ *-]", paragraph, re.MULTILINE) else " ".join(paragraph.split())
+def _join_lines(paragraph: str) -> str:
+    return (
+        paragraph if re.search(r"^[ *-]", paragraph, re.MULTILINE) else " ".join(paragraph.split())
+    )
 
 
-def _literal(text: str) -> str:
+def _escape_markup(text: str) -> str:
     """Keep rich from taking brackets, as of extras, for its markup."""
     return re.sub(r"(?=\[[a-z#/@])", r"\\", text)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 CODEC = "vp09"  # free of licences, and every browser plays it
 
 
-def opencv() -> Any:
+def import_opencv() -> Any:
     """Import OpenCV, or say where it is to be had."""
     try:
         import cv2
@@ -26,7 +26,7 @@ def opencv() -> Any:
     return cv2
 
 
-class Film:
+class FilmWriter:
     """A film that is being written.
 
     Parameters
@@ -37,16 +37,20 @@ class Film:
     """
 
     def __init__(self, path: Path, rate: float) -> None:
-        self._path, self._rate, self._cv2 = path, rate, opencv()
+        self._path, self._rate, self._cv2 = path, rate, import_opencv()
         self._writer: Any = None
 
     def add(self, pixels: NDArray[np.uint8]) -> None:
         """Append a picture (rows, columns, 3), red first; all are of one size."""
         if self._writer is None:
             code = self._cv2.VideoWriter_fourcc(*CODEC)
-            self._writer = self._cv2.VideoWriter(str(self._path), code, self._rate, (pixels.shape[1], pixels.shape[0]))
+            self._writer = self._cv2.VideoWriter(
+                str(self._path), code, self._rate, (pixels.shape[1], pixels.shape[0])
+            )
             if not self._writer.isOpened():
-                raise StorageError(f"{self._path}: this machine's OpenCV writes no {CODEC} films; write pictures")
+                raise StorageError(
+                    f"{self._path}: this machine's OpenCV writes no {CODEC} films; write pictures"
+                )
         self._writer.write(pixels[..., ::-1])
 
     def close(self) -> None:
@@ -56,10 +60,10 @@ class Film:
 
 
 @contextmanager
-def filming(out: Path, rate: float) -> Iterator[Film]:
+def open_film(out: Path, rate: float) -> Iterator[FilmWriter]:
     """Yield a film to add pictures to; the file appears whole or not at all."""
     with atomic_path(out) as temporary:
-        film = Film(temporary, rate)
+        film = FilmWriter(temporary, rate)
         try:
             yield film
         finally:

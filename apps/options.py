@@ -8,8 +8,10 @@ from typing import Annotated
 
 import typer
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object of figures and nothing else.")]
-TimeZero = Annotated[
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object of figures and nothing else.")
+]
+TimeZeroOption = Annotated[
     float | None,
     typer.Option(
         "--time-zero-ns",
@@ -18,12 +20,17 @@ TimeZero = Annotated[
         show_default="the camera's",
     ),
 ]
-Picture = Annotated[
+PreviewOption = Annotated[
     Path | None,
-    typer.Option("--preview", metavar="PNG", help="Where the picture goes.", show_default="beside --out, .png"),
+    typer.Option(
+        "--preview",
+        metavar="PNG",
+        help="Where the picture goes.",
+        show_default="beside --out, .png",
+    ),
 ]
 
-Cluster = Annotated[
+ClusterOption = Annotated[
     str | None,
     typer.Option(
         "--cluster",
@@ -33,11 +40,11 @@ Cluster = Annotated[
     ),
 ]
 
-DEVICES = ("cpu", "cuda", "auto", "torch:cpu")
-"""Some of the names that `tofclip.arrays.place_named` understands."""
+DEVICE_NAMES = ("cpu", "cuda", "auto", "torch:cpu")
+"""Some of the names that `tofclip.arrays.parse_device` understands."""
 
 
-def completing(*names: str) -> Callable[[str], list[str]]:
+def make_completer(*names: str) -> Callable[[str], list[str]]:
     """Return what completes an option's value in the shell: the names that begin as it does so far."""
 
     def beginning(incomplete: str) -> list[str]:
@@ -46,13 +53,13 @@ def completing(*names: str) -> Callable[[str], list[str]]:
     return beginning
 
 
-Device = Annotated[
+DeviceOption = Annotated[
     str,
     typer.Option(
         "--device",
         metavar="WHERE",
         help="Where to compute: cpu (compiled loops), cuda or cuda:N (through CuPy or PyTorch), auto (cuda where there "
         "is one), or any device of PyTorch such as torch:cpu.",
-        autocompletion=completing(*DEVICES),
+        autocompletion=make_completer(*DEVICE_NAMES),
     ),
 ]

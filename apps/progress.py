@@ -11,18 +11,18 @@ from types import FrameType
 
 Advance = Callable[[int], None]
 
-_screen = threading.Lock()
+_screen_lock = threading.Lock()
 
 
 @contextlib.contextmanager
-def progress(title: str, total: int) -> Iterator[Advance]:
+def show_progress(title: str, total: int) -> Iterator[Advance]:
     """Yield a function to call with the amount of work just done, from any thread.
 
-    The bar is drawn on standard error, and only on a terminal; inside another bar, or off the main thread as on a
-    cluster's worker, there is none. After Ctrl-C the function raises in every thread that
-    calls it, so that none goes on computing for nothing.
+    The bar is drawn on standard error, and only on a terminal; inside another bar, or off the main
+    thread as on a cluster's worker, there is none. After Ctrl-C the function raises in every thread
+    that calls it, so that none goes on computing for nothing.
     """
-    with _interruption() as interrupted, _bar(title, total) as draw:
+    with _watch_interrupt() as interrupted, _open_bar(title, total) as draw:
 
         def advance(amount: int) -> None:
             if interrupted.is_set():
@@ -33,31 +33,42 @@ def progress(title: str, total: int) -> Iterator[Advance]:
 
 
 @contextlib.contextmanager
-def _bar(title: str, total: int) -> Iterator[Advance]:
+def _open_bar(title: str, total: int) -> Iterator[Advance]:
     watched = sys.stderr.isatty() and threading.current_thread() is threading.main_thread()
-    if not watched or not _screen.acquire(blocking=False):
+    if not watched or not _screen_lock.acquire(blocking=False):
         yield lambda _: None
         return
     try:
-        with _drawn_bar(title, total) as draw:
+        with _draw_bar(title, total) as draw:
             yield draw
     finally:
-        _screen.release()
+        _screen_lock.release()
 
 
 @contextlib.contextmanager
-def _drawn_bar(title: str, total: int) -> Iterator[Advance]:
+def _draw_bar(title: str, total: int) -> Iterator[Advance]:
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
-    columns = TextColumn("{task.description}"), BarColumn(None), TaskProgressColumn(), TimeRemainingColumn()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(None),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as drawn:
         task = drawn.add_task(title, total=total)
         yield lambda amount: drawn.advance(task, amount)
 
 
 @contextlib.contextmanager
-def _interruption() -> Iterator[threading.Event]:
+def _watch_interrupt() -> Iterator[threading.Event]:
     """Yield an event that Ctrl-C sets before it raises `KeyboardInterrupt` in the main thread."""
     interrupted = threading.Event()
     if threading.current_thread() is not threading.main_thread():

@@ -15,41 +15,42 @@ def report(figures: Mapping[str, Any], as_json: bool, written: Sequence[Path] = 
     Parameters
     ----------
     figures : mapping
-        Names to numbers, strings, and lists or mappings of these. NumPy's numbers and arrays are understood.
+        Names to numbers, strings, and lists or mappings of these. NumPy's numbers and arrays are
+        understood.
     as_json : bool
         One JSON object on one line (NaN becomes null) instead of a table.
     written : sequence of Path
         Files to name in the table.
     """
-    plain = plainly(figures)
+    plain = to_json_value(figures)
     if as_json:
         print(json.dumps(plain, allow_nan=False))
         return
     width = max(map(len, plain), default=0)
     for name, value in plain.items():
-        print(f"{name.replace('_', ' '):<{width}}  {_in_words(value)}")
+        print(f"{name.replace('_', ' '):<{width}}  {_format_value(value)}")
     for path in written:
         print(f"wrote {path}")
 
 
-def plainly(value: Any) -> Any:
+def to_json_value(value: Any) -> Any:
     """Turn NumPy's numbers and arrays, paths and NaN into what JSON knows."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, Mapping):
-        return {str(name): plainly(entry) for name, entry in value.items()}
+        return {str(name): to_json_value(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [plainly(entry) for entry in value]
+        return [to_json_value(entry) for entry in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
 
 
-def _in_words(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, list):
-        return ", ".join(map(_in_words, value))
+        return ", ".join(map(_format_value, value))
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_in_words(entry)}" for name, entry in value.items())
+        return ", ".join(f"{name} {_format_value(entry)}" for name, entry in value.items())
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) < 1000 else f"{value:.0f}"
     return "unknown" if value is None else str(value)

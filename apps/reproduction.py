@@ -1,4 +1,6 @@
-"""Tables of studies as Markdown and CSV, what is kept of a finished one, and the page that shows them all."""
+"""Tables of studies as Markdown and CSV, what is kept of a finished one, and the page that shows
+them all.
+"""
 
 from __future__ import annotations
 
@@ -15,20 +17,24 @@ from tofclip.storage import atomic_path
 if TYPE_CHECKING:
     from apps.studies.outcome import Outcome, Study
 
-PAGE = "reproduction.md"
-FOLDER = "reproduction"
+PAGE_NAME = "reproduction.md"
+STUDY_FOLDER = "reproduction"
 """Beside the page: what each study made."""
 
 Result = Mapping[str, Any]
-"""A finished study as it is kept: name, title, note, command, settings, columns, figure, rows, seconds."""
+"""A finished study as it is kept: name, title, note, command, settings, columns, figure, rows,
+seconds.
+"""
 
 
-def result_of(study: Study, outcome: Outcome, settings: Mapping[str, Any], command: str, seconds: float) -> Result:
+def make_result(
+    study: Study, outcome: Outcome, settings: Mapping[str, Any], command: str, seconds: float
+) -> Result:
     """Return what is kept of a finished study; plain values only."""
     rows = [asdict(row) | {"mean": row.mean, "spread": row.spread} for row in outcome.rows]
     return {
         "name": study.name,
-        "also": study.also,
+        "also": study.aliases,
         "title": study.title,
         "note": study.note,
         "settings": dict(settings),
@@ -40,7 +46,7 @@ def result_of(study: Study, outcome: Outcome, settings: Mapping[str, Any], comma
     }
 
 
-def kept_result(path: Path, settings: Mapping[str, Any]) -> Result | None:
+def load_result(path: Path, settings: Mapping[str, Any]) -> Result | None:
     """Return the result in `path` if it is whole and was made with the same settings."""
     try:
         found = json.loads(path.read_text("utf-8"))
@@ -53,12 +59,12 @@ def write_result(result: Result, folder: Path) -> list[Path]:
     """Write NAME.md, NAME.csv and at last NAME.json, which tells that the study is finished."""
     name = result["name"]
     texts = {
-        f"{name}.md": f"{section(result)}\n",
-        f"{name}.csv": _csv(result),
+        f"{name}.md": f"{render_section(result)}\n",
+        f"{name}.csv": _render_csv(result),
         f"{name}.json": json.dumps(result, indent=1, default=list),
     }
     for file, text in texts.items():
-        _write(folder / file, text)
+        _write_text(folder / file, text)
     return [folder / file for file in texts]
 
 
@@ -72,39 +78,49 @@ def write_page(results: Sequence[Result], folder: Path) -> Path:
         "weight is chosen by cross-validation with the first seed, without the truth. Most scenes of the paper are not "
         "public: its figures stand beside ours for other scenes of the same kind, which may be easier or harder.\n"
     )
-    sections = (section(result, f"{FOLDER}/") for result in results)
-    _write(folder / PAGE, "\n\n".join([head.rstrip(), *sections]) + "\n")
-    return folder / PAGE
+    sections = (render_section(result, f"{STUDY_FOLDER}/") for result in results)
+    _write_text(folder / PAGE_NAME, "\n\n".join([head.rstrip(), *sections]) + "\n")
+    return folder / PAGE_NAME
 
 
-def section(result: Result, beside: str = "") -> str:
-    """Return a study's heading, command, table and picture in Markdown; pictures lie in the folder `beside`."""
+def render_section(result: Result, beside: str = "") -> str:
+    """Return a study's heading, command, table and picture in Markdown; pictures lie in the folder
+    `beside`.
+    """
     names = ", ".join([result["name"], *result["also"]])
     header = [*result["columns"], f"ours ({result['figure']})", "spread", "paper"]
-    lines = [header, ["---"] * len(header), *map(_cells, result["rows"])]
+    lines = [header, ["---"] * len(header), *map(_format_cells, result["rows"])]
     table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
     made = f"`{result['command']}`, {result['seconds']:.0f} s"
     picture = f"![{result['title']}]({beside}{result['name']}.png)"
     return f"## {result['title']} ({names})\n\n{result['note']} Made by {made}.\n\n{table}\n\n{picture}"
 
 
-def _cells(row: Mapping[str, Any]) -> list[str]:
+def _format_cells(row: Mapping[str, Any]) -> list[str]:
     paper = "" if row["paper"] is None else f"{row['paper']:.2f}"
     spread = f"{row['spread']:.2f}" if len(row["ours"]) > 1 else ""
     return [*row["labels"], f"{row['mean']:.2f}", spread, paper]
 
 
-def _csv(result: Result) -> str:
+def _render_csv(result: Result) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     seeds = max(len(row["ours"]) for row in result["rows"])
-    writer.writerow([*result["columns"], "mean", "spread", "paper", *(f"seed {number}" for number in range(seeds))])
+    writer.writerow(
+        [
+            *result["columns"],
+            "mean",
+            "spread",
+            "paper",
+            *(f"seed {number}" for number in range(seeds)),
+        ]
+    )
     for row in result["rows"]:
         paper = "" if row["paper"] is None else row["paper"]
         writer.writerow([*row["labels"], row["mean"], row["spread"], paper, *row["ours"]])
     return text.getvalue()
 
 
-def _write(path: Path, text: str) -> None:
+def _write_text(path: Path, text: str) -> None:
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -1,4 +1,6 @@
-"""Run the jobs of a sequence under a progress bar, say what became of them, and end with 1 if some failed."""
+"""Run the jobs of a sequence under a progress bar, say what became of them, and end with 1 if some
+failed.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +14,15 @@ import typer
 if TYPE_CHECKING:
     from tofclip.sequences.jobs import Job, Report, Summary
 
-SOME_FAILED = 1
+EXIT_SOME_FAILED = 1
 BYTES_PER_MIB = 1 << 20
 
 
-def run_all(
-    title: str, jobs: Sequence[Job], cluster: str | None, watch: Callable[[Report], object] = lambda _: None
+def run_with_progress(
+    title: str,
+    jobs: Sequence[Job],
+    cluster: str | None,
+    watch: Callable[[Report], object] = lambda _: None,
 ) -> Summary:
     """Do what is not done yet, with a bar that tells the time left.
 
@@ -31,20 +36,20 @@ def run_all(
     watch : callable, optional
         Called with each report.
     """
-    from apps.progress import progress
-    from tofclip.sequences.jobs import run, unfinished
+    from apps.progress import show_progress
+    from tofclip.sequences.jobs import run_jobs, select_unfinished
 
-    missing = unfinished(jobs)
-    with progress(title, len(missing)) as advance:
+    missing = select_unfinished(jobs)
+    with show_progress(title, len(missing)) as advance:
 
         def note(report: Report) -> None:
             watch(report)
             advance(1)
 
-        return run(missing, cluster, note)
+        return run_jobs(missing, cluster, note)
 
 
-def device_told(device: str, cluster: str | None) -> str:
+def resolve_device(device: str, cluster: str | None) -> str:
     """Return which device a name stands for here; workers elsewhere look for it themselves.
 
     Raises
@@ -52,11 +57,11 @@ def device_told(device: str, cluster: str | None) -> str:
     InputError, MissingDependencyError
         It is no name of a device, or not here, where there is no cluster.
     """
-    from tofclip.arrays import place_named
+    from tofclip.arrays import parse_device
     from tofclip.errors import MissingDependencyError
 
     try:
-        found = str(place_named(device))
+        found = str(parse_device(device))
     except MissingDependencyError:
         if cluster is None:
             raise
@@ -64,7 +69,9 @@ def device_told(device: str, cluster: str | None) -> str:
     return found if cluster is None else device
 
 
-def finish(summary: Summary, total: int, as_json: bool, out: Path, figures: Mapping[str, Any] | None = None) -> None:
+def report_summary(
+    summary: Summary, total: int, as_json: bool, out: Path, figures: Mapping[str, Any] | None = None
+) -> None:
     """Print the figures of a sequence and its failures.
 
     Parameters
@@ -97,11 +104,13 @@ def finish(summary: Summary, total: int, as_json: bool, out: Path, figures: Mapp
         **(figures or {}),
     }
     if as_json:
-        failures = [{"name": failure.name, "problem": failure.problem} for failure in summary.failures]
+        failures = [
+            {"name": failure.name, "problem": failure.problem} for failure in summary.failures
+        ]
         report({**told, "failures": failures}, as_json=True)
     else:
         report(told, as_json=False, written=[out])
         for failure in summary.failures:
             print(f"failed: {failure.name}: {failure.problem}", file=sys.stderr)
     if summary.failures:
-        raise typer.Exit(SOME_FAILED)
+        raise typer.Exit(EXIT_SOME_FAILED)

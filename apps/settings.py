@@ -1,7 +1,9 @@
-"""Settings of a verb: declared once, told by a TOML file or by flags, and written beside the result.
+"""Settings of a verb: declared once, told by a TOML file or by flags, and written beside the
+result.
 
-A verb's settings are a frozen dataclass whose fields `setting` makes. The name of a field is the key in the file and,
-with dashes, the flag. Flags win over the file. A field that is None has a value that the verb has to find.
+A verb's settings are a frozen dataclass whose fields `setting_field` makes. The name of a field is
+the key in the file and, with dashes, the flag. Flags win over the file. A field that is None has a
+value that the verb has to find.
 """
 
 from __future__ import annotations
@@ -19,25 +21,33 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin,
 
 import typer
 
-from apps.options import completing
+from apps.options import make_completer
 from tofclip.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-PANEL = "Settings (keys of the TOML file, there with _ for -)"
+HELP_PANEL = "Settings (keys of the TOML file, there with _ for -)"
 
-SettingsFile = Annotated[
+SettingsOption = Annotated[
     Path | None,
-    typer.Option("--settings", metavar="TOML", help="Settings that no flag tells; written beside each result."),
+    typer.Option(
+        "--settings",
+        metavar="TOML",
+        help="Settings that no flag tells; written beside each result.",
+    ),
 ]
 
 Settings = TypeVar("Settings", bound="DataclassInstance")
 Verb = TypeVar("Verb", bound=Callable[..., None])
 
 
-def setting(
-    metavar: str | None, meaning: str, default: Any = None, shown: str | None = None, choices: Iterable[str] = ()
+def setting_field(
+    metavar: str | None,
+    meaning: str,
+    default: Any = None,
+    shown: str | None = None,
+    choices: Iterable[str] = (),
 ) -> Any:
     """Declare a setting.
 
@@ -52,24 +62,28 @@ def setting(
     choices : iterable of str
         Names that shells offer to complete.
     """
-    option = {"metavar": metavar, "help": meaning, "show_default": str(default) if shown is None else shown}
-    completed = {"autocompletion": completing(*choices)} if choices else {}
+    option = {
+        "metavar": metavar,
+        "help": meaning,
+        "show_default": str(default) if shown is None else shown,
+    }
+    completed = {"autocompletion": make_completer(*choices)} if choices else {}
     return dataclasses.field(default=default, metadata={**option, **completed})
 
 
-def takes(kind: type[DataclassInstance]) -> Callable[[Verb], Verb]:
+def add_setting_flags(kind: type[DataclassInstance]) -> Callable[[Verb], Verb]:
     """Give a verb a flag for every setting; they reach its ``**flags``, None where absent."""
 
     def with_flags(verb: Verb) -> Verb:
         known = inspect.signature(verb, eval_str=True)
         own = [one for one in known.parameters.values() if one.kind is not one.VAR_KEYWORD]
-        verb.__signature__ = known.replace(parameters=[*own, *_flags(kind)])  # type: ignore[attr-defined]
+        verb.__signature__ = known.replace(parameters=[*own, *_make_flags(kind)])  # type: ignore[attr-defined]
         return verb
 
     return with_flags
 
 
-def told(kind: type[Settings], file: Path | None, flags: Mapping[str, Any]) -> Settings:
+def load_settings(kind: type[Settings], file: Path | None, flags: Mapping[str, Any]) -> Settings:
     """Put together what a file and flags tell.
 
     Raises
@@ -79,41 +93,54 @@ def told(kind: type[Settings], file: Path | None, flags: Mapping[str, Any]) -> S
     InputError
         It holds an unknown key, or a value of another type.
     """
-    by_file = {} if file is None else _in_file(kind, file)
-    return kind(**{**by_file, **{name: value for name, value in flags.items() if value is not None}})
+    by_file = {} if file is None else _read_file(kind, file)
+    return kind(
+        **{**by_file, **{name: value for name, value in flags.items() if value is not None}}
+    )
 
 
-def plain(settings: DataclassInstance) -> dict[str, Any]:
+def settings_to_dict(settings: DataclassInstance) -> dict[str, Any]:
     """Name every setting that has a value."""
-    return {name: value for name, value in dataclasses.asdict(settings).items() if value is not None}
+    return {
+        name: value for name, value in dataclasses.asdict(settings).items() if value is not None
+    }
 
 
-def save(settings: DataclassInstance, path: Path, heading: str) -> None:
-    """Write the settings that have a value, whole or not at all; given back, they are the same to the last bit."""
+def save_settings(settings: DataclassInstance, path: Path, heading: str) -> None:
+    """Write the settings that have a value, whole or not at all; given back, they are the same to
+    the last bit.
+    """
     from tofclip.storage import atomic_path
 
-    lines = [f"# {heading}", *(f"{name} = {_as_toml(value)}" for name, value in plain(settings).items())]
+    lines = [
+        f"# {heading}",
+        *(f"{name} = {_to_toml(value)}" for name, value in settings_to_dict(settings).items()),
+    ]
     with atomic_path(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _flags(kind: type[DataclassInstance]) -> list[inspect.Parameter]:
+def _make_flags(kind: type[DataclassInstance]) -> list[inspect.Parameter]:
     """A class's own settings come before those that it inherits."""
     hints, own = get_type_hints(kind), inspect.get_annotations(kind)
     ordered = sorted(dataclasses.fields(kind), key=lambda field: field.name not in own)
     flags = []
     for field in ordered:
-        option = typer.Option(rich_help_panel=PANEL, **field.metadata)
+        option = typer.Option(rich_help_panel=HELP_PANEL, **field.metadata)
         annotated: Any = Annotated  # with a computed type, which no type checker can follow
         annotation = annotated[hints[field.name] | None, option]
-        flags.append(inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation))
+        flags.append(
+            inspect.Parameter(
+                field.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation
+            )
+        )
     return flags
 
 
-def _in_file(kind: type[DataclassInstance], file: Path) -> dict[str, Any]:
-    from tofclip.storage import reading
+def _read_file(kind: type[DataclassInstance], file: Path) -> dict[str, Any]:
+    from tofclip.storage import translate_read_errors
 
-    with reading(file), open(file, "rb") as opened:
+    with translate_read_errors(file), open(file, "rb") as opened:
         try:
             found = tomllib.load(opened)
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
@@ -124,12 +151,18 @@ def _in_file(kind: type[DataclassInstance], file: Path) -> dict[str, Any]:
             like = difflib.get_close_matches(name, hints, 1)
             hint = f"did you mean '{like[0]}'?" if like else f"known are {', '.join(hints)}"
             raise InputError(f"{file}: no setting is called '{name}'; {hint}")
-    return {name: _fitting(value, hints[name], f"{file}: {name}") for name, value in found.items()}
+    return {
+        name: _convert_value(value, hints[name], f"{file}: {name}") for name, value in found.items()
+    }
 
 
-def _fitting(value: Any, hint: Any, where: str) -> Any:
+def _convert_value(value: Any, hint: Any, where: str) -> Any:
     """Return a value of the file as the type that the field asks for."""
-    wanted = next(one for one in get_args(hint) if one is not NoneType) if NoneType in get_args(hint) else hint
+    wanted = (
+        next(one for one in get_args(hint) if one is not NoneType)
+        if NoneType in get_args(hint)
+        else hint
+    )
     if get_origin(wanted) is tuple:
         count = len(get_args(wanted))
         if isinstance(value, list) and len(value) == count and all(map(_is_number, value)):
@@ -139,7 +172,12 @@ def _fitting(value: Any, hint: Any, where: str) -> Any:
         return float(value)
     if type(value) is wanted and wanted is not float:
         return value
-    names = {float: "a finite number", int: "a whole number", str: "a text in quotes", bool: "true or false"}
+    names = {
+        float: "a finite number",
+        int: "a whole number",
+        str: "a text in quotes",
+        bool: "true or false",
+    }
     raise InputError(f"{where} must be {names[wanted]}, got {value!r}")
 
 
@@ -147,8 +185,9 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _as_toml(value: Any) -> str:
+def _to_toml(value: Any) -> str:
     if isinstance(value, tuple):
-        return f"[{', '.join(map(_as_toml, value))}]"
-    # TOML's basic strings and numbers are JSON's, but for the delete character, and for escapes of half a character.
+        return f"[{', '.join(map(_to_toml, value))}]"
+    # TOML's basic strings and numbers are JSON's, but for the delete character, and for escapes of
+    # half a character.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -5,8 +5,9 @@
     with devices.open("sim+timetag://?seed=1") as source:
         for batch in source:
             batch.records      # NumPy structured array, one row per record
-    source.stats               # acquired = delivered + unread + dropped_host + lost_device + malformed
-    streak = devices.read_transient("sim+linospad2://?seed=1")     # photons or frames to what tofclip.recover takes
+    source.stats               # acquired = delivered + unread + dropped_host + lost_device +
+    malformed streak = devices.read_transient("sim+linospad2://?seed=1")     # photons or frames to
+    what tofclip.recover takes
 
 Which address opens which instrument is written down in `devices.registry`.
 """
@@ -17,19 +18,30 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from devices.codec import Codec, Decoded
-    from devices.registry import Found, discover, open  # noqa: A004 - the name users type
+    from devices.codec import Codec, DecodeResult
+    from devices.registry import DiscoveredInstrument, discover, open  # noqa: A004 - the name users type
     from devices.source import Batch, Info, Source
     from devices.statistics import Stats
     from devices.transients import read_transient
 
-__all__ = ["Batch", "Codec", "Decoded", "Found", "Info", "Source", "Stats", "discover", "open", "read_transient"]
+__all__ = [
+    "Batch",
+    "Codec",
+    "DecodeResult",
+    "DiscoveredInstrument",
+    "Info",
+    "Source",
+    "Stats",
+    "discover",
+    "open",
+    "read_transient",
+]
 
 _HOMES = {
     "Batch": "devices.source",
     "Codec": "devices.codec",
-    "Decoded": "devices.codec",
-    "Found": "devices.registry",
+    "DecodeResult": "devices.codec",
+    "DiscoveredInstrument": "devices.registry",
     "Info": "devices.source",
     "Source": "devices.source",
     "Stats": "devices.statistics",

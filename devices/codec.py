@@ -1,8 +1,9 @@
 """What a codec is: an instrument's bytes to records and back, with no instrument in sight.
 
-A codec never reads from anywhere and keeps nothing between calls. What a decoder has to remember from one piece of the
-stream to the next (how often a counter has wrapped) is an explicit *state* that goes in and comes out; bytes of a
-record that is not complete yet stay with the caller, which asks `Codec.whole` how far the complete ones reach.
+A codec never reads from anywhere and keeps nothing between calls. What a decoder has to remember
+from one piece of the stream to the next (how often a counter has wrapped) is an explicit *state*
+that goes in and comes out; bytes of a record that is not complete yet stay with the caller, which
+asks `Codec.count_complete_bytes` how far the complete ones reach.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def as_bytes(data: bytes | bytearray | memoryview | ByteView) -> ByteView:
 
 
 @dataclass(frozen=True)
-class Decoded:
+class DecodeResult:
     """What became of a piece of the stream.
 
     Parameters
@@ -49,8 +50,9 @@ class Decoded:
 class Codec(Protocol):
     """Bytes to records and back, both vectorised.
 
-    ``decode(encode(x), start).records`` equals ``x`` for every array of valid records. A codec raises only exceptions
-    of `tofclip.errors`, whatever the bytes; it allocates no more than a stated multiple of the bytes that it was given.
+    ``decode(encode(x), start).records`` equals ``x`` for every array of valid records. A codec
+    raises only exceptions of `tofclip.errors`, whatever the bytes; it allocates no more than a
+    stated multiple of the bytes that it was given.
     """
 
     name: ClassVar[str]
@@ -68,13 +70,15 @@ class Codec(Protocol):
     def start(self) -> Any:
         """State before the first byte, and after the instrument began anew."""
 
-    def whole(self, data: ByteView) -> int:
+    def count_complete_bytes(self, data: ByteView) -> int:
         """Return how many bytes at the front of `data` form whole records."""
 
-    def count(self, data: ByteView) -> int:
-        """Return how many records, malformed ones included, are in `data`, of which `whole` is all."""
+    def count_records(self, data: ByteView) -> int:
+        """Return how many records, malformed ones included, are in `data`, of which
+        `count_complete_bytes` is all.
+        """
 
-    def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> Decoded:
+    def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
         """Decode whole records; `after_loss` says that some are missing right before them.
 
         ``len(decoded.records) + decoded.malformed == count(data)``.

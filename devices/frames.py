@@ -1,4 +1,6 @@
-"""Cameras' pictures as records, each with its number, so that they are buffered, recorded and replayed like photons."""
+"""Cameras' pictures as records, each with its number, so that they are buffered, recorded and
+replayed like photons.
+"""
 
 from __future__ import annotations
 
@@ -9,23 +11,24 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from devices.codec import ByteView, Decoded, Records, as_bytes
+from devices.codec import ByteView, DecodeResult, Records, as_bytes
 from tofclip.errors import InputError
 from tofclip.storage import Scalar
 
-MOST_FRAME_BYTES = 1 << 26
+MAX_FRAME_BYTES = 1 << 26
 """No camera here has larger pictures: 16 megapixels of 32 bits."""
 
-_NUMBER = np.dtype("<i8")
-_PIXELS = {1: "u1", 8: "u1", 16: "<u2", 32: "<u4"}
+_NUMBER_DTYPE = np.dtype("<i8")
+_PIXEL_DTYPES = {1: "u1", 8: "u1", 16: "<u2", 32: "<u4"}
 
 
 @dataclass(frozen=True)
 class FrameCodec:
-    """A picture's number (8 bytes, little-endian) and its pixels as the camera sent them, to records and back.
+    """A picture's number (8 bytes, little-endian) and its pixels as the camera sent them, to
+    records and back.
 
-    A frame is malformed if its number is not above that of the one before. Decoding allocates what the pixels take,
-    8 bits for each of those that came as single bits.
+    A frame is malformed if its number is not above that of the one before. Decoding allocates what
+    the pixels take, 8 bits for each of those that came as single bits.
 
     Parameters
     ----------
@@ -36,7 +39,8 @@ class FrameCodec:
     Raises
     ------
     InputError
-        There is no such depth, or a picture would be empty, larger than 64 MiB, or not made of whole bytes.
+        There is no such depth, or a picture would be empty, larger than 64 MiB, or not made of
+        whole bytes.
     """
 
     rows: int
@@ -48,16 +52,30 @@ class FrameCodec:
     """Number of the last frame."""
 
     def __post_init__(self) -> None:
-        if self.bits not in _PIXELS:
-            raise InputError(f"pixels have {', '.join(map(str, _PIXELS))} bits, not {self.bits}")
+        if self.bits not in _PIXEL_DTYPES:
+            raise InputError(
+                f"pixels have {', '.join(map(str, _PIXEL_DTYPES))} bits, not {self.bits}"
+            )
         total = self.rows * self.columns * self.bits
-        if self.rows < 1 or self.columns < 1 or total > 8 * MOST_FRAME_BYTES or self.columns * self.bits % 8:
-            raise InputError(f"pictures of {self.rows} x {self.columns} pixels of {self.bits} bits cannot be")
+        if (
+            self.rows < 1
+            or self.columns < 1
+            or total > 8 * MAX_FRAME_BYTES
+            or self.columns * self.bits % 8
+        ):
+            raise InputError(
+                f"pictures of {self.rows} x {self.columns} pixels of {self.bits} bits cannot be"
+            )
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:
         """`number` and `counts` (rows, columns)."""
-        return np.dtype([("number", _NUMBER), ("counts", _PIXELS[self.bits], (self.rows, self.columns))])
+        return np.dtype(
+            [
+                ("number", _NUMBER_DTYPE),
+                ("counts", _PIXEL_DTYPES[self.bits], (self.rows, self.columns)),
+            ]
+        )
 
     @property
     def settings(self) -> Mapping[str, Scalar]:
@@ -72,29 +90,31 @@ class FrameCodec:
     @property
     def frame_bytes(self) -> int:
         """Bytes of a picture and its number."""
-        return _NUMBER.itemsize + self.pixel_bytes
+        return _NUMBER_DTYPE.itemsize + self.pixel_bytes
 
-    def whole(self, data: ByteView) -> int:
+    def count_complete_bytes(self, data: ByteView) -> int:
         """Return how many bytes at the front of `data` form whole frames."""
         return len(data) - len(data) % self.frame_bytes
 
-    def count(self, data: ByteView) -> int:
+    def count_records(self, data: ByteView) -> int:
         """Return the number of frames in `data`."""
         return len(data) // self.frame_bytes
 
-    def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> Decoded:
+    def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
         """Decode whole frames; `state` is the last one's number."""
         words = as_bytes(data)
         if words.size % self.frame_bytes:
-            raise InputError(f"{words.size} bytes are not a whole number of {self.frame_bytes}-byte frames")
+            raise InputError(
+                f"{words.size} bytes are not a whole number of {self.frame_bytes}-byte frames"
+            )
         frames = np.ascontiguousarray(words).reshape(-1, self.frame_bytes)
-        numbers = frames[:, : _NUMBER.itemsize].copy().view(_NUMBER)[:, 0]
+        numbers = frames[:, : _NUMBER_DTYPE.itemsize].copy().view(_NUMBER_DTYPE)[:, 0]
         before = np.maximum.accumulate(np.concatenate([[state], numbers]))
-        good = numbers > before[:-1]
-        records = np.empty(int(good.sum()), self.dtype)
-        records["number"] = numbers[good]
-        records["counts"] = self._pixels(frames[good, _NUMBER.itemsize :])
-        return Decoded(records, len(numbers) - len(records), int(before[-1]))
+        valid = numbers > before[:-1]
+        records = np.empty(int(valid.sum()), self.dtype)
+        records["number"] = numbers[valid]
+        records["counts"] = self._unpack_pixels(frames[valid, _NUMBER_DTYPE.itemsize :])
+        return DecodeResult(records, len(numbers) - len(records), int(before[-1]))
 
     def encode(self, records: Records) -> bytes:
         """Return numbers and pixels as the camera sends them.
@@ -112,21 +132,23 @@ class FrameCodec:
             raise InputError("a single bit is 0 or 1")
         frames = np.empty((len(records), self.frame_bytes), np.uint8)
         numbers = np.ascontiguousarray(records["number"])
-        frames[:, : _NUMBER.itemsize] = numbers.view(np.uint8).reshape(-1, _NUMBER.itemsize)
-        frames[:, _NUMBER.itemsize :] = self._bytes(records["counts"])
+        frames[:, : _NUMBER_DTYPE.itemsize] = numbers.view(np.uint8).reshape(
+            -1, _NUMBER_DTYPE.itemsize
+        )
+        frames[:, _NUMBER_DTYPE.itemsize :] = self._pack_pixels(records["counts"])
         return frames.tobytes()
 
-    def numbered(self, number: int, pixels: bytes) -> bytes:
+    def pack_frame(self, number: int, pixels: bytes) -> bytes:
         """Return a frame's bytes from those of its pixels."""
-        return number.to_bytes(_NUMBER.itemsize, "little") + pixels
+        return number.to_bytes(_NUMBER_DTYPE.itemsize, "little") + pixels
 
-    def _pixels(self, data: ByteView) -> Any:
+    def _unpack_pixels(self, data: ByteView) -> Any:
         shape = (len(data), self.rows, self.columns)
         if self.bits == 1:
             return np.unpackbits(data, axis=1).reshape(shape)
-        return np.ascontiguousarray(data).view(_PIXELS[self.bits]).reshape(shape)
+        return np.ascontiguousarray(data).view(_PIXEL_DTYPES[self.bits]).reshape(shape)
 
-    def _bytes(self, counts: Any) -> Any:
+    def _pack_pixels(self, counts: Any) -> Any:
         flat = np.ascontiguousarray(counts).reshape(len(counts), self.rows * self.columns)
         if self.bits == 1:
             return np.packbits(flat, axis=1)

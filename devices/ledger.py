@@ -1,4 +1,6 @@
-"""Book-keeping of records: every change moves records from one account to another, so the accounts always balance."""
+"""Book-keeping of records: every change moves records from one account to another, so the accounts
+always balance.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +22,11 @@ class Ledger:
         """The accounts as they stand."""
         return self._stats
 
-    def arrive(self, records: int) -> None:
+    def receive(self, records: int) -> None:
         """Enter records that arrived and wait to be read."""
         self._add(acquired=records, unread=records)
 
-    def settle(self, delivered: int, malformed: int) -> None:
+    def deliver(self, delivered: int, malformed: int) -> None:
         """Move records that waited to those that were read."""
         self._add(unread=-delivered - malformed, delivered=delivered, malformed=malformed)
 
@@ -32,7 +34,7 @@ class Ledger:
         """Move records that waited to those that nobody read in time."""
         self._add(unread=-records, dropped_host=records)
 
-    def break_off(self, records: int = 1) -> None:
+    def truncate(self, records: int = 1) -> None:
         """Enter records of which only a part arrived."""
         self._add(acquired=records, malformed=records)
 
@@ -51,4 +53,6 @@ class Ledger:
     def _add(self, **changes: int) -> None:
         with self._lock:
             now = self._stats
-            self._stats = replace(now, **{name: getattr(now, name) + change for name, change in changes.items()})
+            self._stats = replace(
+                now, **{name: getattr(now, name) + change for name, change in changes.items()}
+            )

@@ -10,10 +10,10 @@ from types import TracebackType
 from typing import Self
 
 HOST = "127.0.0.1"
-PATIENCE = 0.03
+POLL_INTERVAL_S = 0.03
 """Seconds after which a waiting thread looks whether the server has closed."""
 
-LONGEST_REQUEST = 1 << 16
+MAX_REQUEST_BYTES = 1 << 16
 
 
 class Connection:
@@ -21,12 +21,14 @@ class Connection:
 
     def __init__(self, link: socket.socket, closing: threading.Event) -> None:
         self._link, self._closing = link, closing
-        self._held = b""
+        self._buffer = b""
         self._sending = threading.Lock()
-        link.settimeout(PATIENCE)
+        link.settimeout(POLL_INTERVAL_S)
 
     def send(self, data: bytes) -> None:
-        """Send all of `data`, however long the client takes, unless it goes away or the server closes."""
+        """Send all of `data`, however long the client takes, unless it goes away or the server
+        closes.
+        """
         left = memoryview(data)
         with self._sending:
             while left and not self._closing.is_set():
@@ -37,10 +39,12 @@ class Connection:
                 except OSError:
                     return
 
-    def request(self, end: bytes) -> bytes | None:
-        """Return what came up to `end`, None when the client is gone, says too much, or the server closes."""
-        while end not in self._held:
-            if self._closing.is_set() or len(self._held) > LONGEST_REQUEST:
+    def read_request(self, end: bytes) -> bytes | None:
+        """Return what came up to `end`, None when the client is gone, says too much, or the server
+        closes.
+        """
+        while end not in self._buffer:
+            if self._closing.is_set() or len(self._buffer) > MAX_REQUEST_BYTES:
                 return None
             try:
                 came = self._link.recv(4096)
@@ -50,8 +54,8 @@ class Connection:
                 return None
             if not came:
                 return None
-            self._held += came
-        request, _, self._held = self._held.partition(end)
+            self._buffer += came
+        request, _, self._buffer = self._buffer.partition(end)
         return request
 
     def close(self) -> None:
@@ -74,13 +78,15 @@ class LoopbackServer:
         self._serve = serve
         self._closing = threading.Event()
         self._listener = socket.create_server((HOST, 0))
-        self._listener.settimeout(PATIENCE)
+        self._listener.settimeout(POLL_INTERVAL_S)
         self.port: int = self._listener.getsockname()[1]
         self._connections: list[Connection] = []
-        self._threads = [threading.Thread(target=self._accept, name="emulated instrument", daemon=True)]
+        self._threads = [
+            threading.Thread(target=self._accept, name="emulated instrument", daemon=True)
+        ]
         self._threads[0].start()
 
-    def hang_up(self) -> None:
+    def close_connections(self) -> None:
         """Close all connections; clients may come again."""
         for connection in self._connections:
             connection.close()
@@ -90,7 +96,7 @@ class LoopbackServer:
         """Serve nobody any more; closing twice is fine."""
         self._closing.set()
         self._listener.close()
-        self.hang_up()
+        self.close_connections()
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join(2)
@@ -99,7 +105,10 @@ class LoopbackServer:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
 
@@ -114,7 +123,9 @@ class LoopbackServer:
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection = Connection(link, self._closing)
             self._connections.append(connection)
-            thread = threading.Thread(target=self._run, args=(connection,), name="emulated instrument", daemon=True)
+            thread = threading.Thread(
+                target=self._run, args=(connection,), name="emulated instrument", daemon=True
+            )
             self._threads.append(thread)
             thread.start()
 

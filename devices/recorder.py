@@ -9,20 +9,20 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from devices.decoded import DecodedSource
-from devices.recording.writer import RecordingWriter, head_of
+from devices.decoded_source import DecodedSource
+from devices.recording.writer import RecordingWriter, make_head
 from devices.source import Source
 from devices.statistics import Stats
 from tofclip.errors import DeviceTimeoutError, InputError, TofclipError
 
-LOOK = 0.25
+POLL_INTERVAL_S = 0.25
 """Seconds after which the recorder looks at the clock, though nothing came."""
 
-Watch = Callable[[float], None]
+ProgressCallback = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordingSummary:
     """What a recording came to.
 
     Parameters
@@ -38,14 +38,14 @@ class Recorded:
     stats: Stats
 
 
-def record(
+def record_source(
     source: Source, path: Path, seconds: float = float("inf"), provenance: Mapping[str, Any] | None = None,
-    watch: Watch | None = None,
-) -> Recorded:  # fmt: skip
+    watch: ProgressCallback | None = None,
+) -> RecordingSummary:  # fmt: skip
     """Read a source to its end, or for some time, and write everything that comes to `path`.
 
-    However this ends (an exception, Ctrl-C, a killed program), the file holds what came until then, and can be opened.
-    The source is closed. Memory: the source's.
+    However this ends (an exception, Ctrl-C, a killed program), the file holds what came until then,
+    and can be opened. The source is closed. Memory: the source's.
 
     Parameters
     ----------
@@ -68,14 +68,18 @@ def record(
         The instrument failed; what came before is in the file.
     """
     if not isinstance(source, DecodedSource):
-        raise InputError(f"{source.info.instrument}: comes from a file already, there is nothing to record")
-    head = head_of(source.codec, source.info, source.calibration, dict(provenance or {}))
+        raise InputError(
+            f"{source.info.instrument}: comes from a file already, there is nothing to record"
+        )
+    head = make_head(source.codec, source.info, source.calibration, dict(provenance or {}))
     begin = monotonic()
     with source, contextlib.closing(RecordingWriter(path, head)) as writer:
         source.tap = writer.add
         fault = "interrupted"
         try:
-            _read(source, begin + seconds, lambda: (watch or _ignore)(monotonic() - begin))
+            _drain_source(
+                source, begin + seconds, lambda: (watch or _ignore_progress)(monotonic() - begin)
+            )
             fault = ""
         except TofclipError as failure:
             fault = str(failure)
@@ -83,20 +87,20 @@ def record(
         finally:
             source.close()
             writer.finish(source.stats, fault)
-        return Recorded(monotonic() - begin, writer.bytes_flushed, source.stats)
+        return RecordingSummary(monotonic() - begin, writer.bytes_flushed, source.stats)
 
 
-def _read(source: Source, deadline: float, tell: Callable[[], None]) -> None:
+def _drain_source(source: Source, deadline: float, report: Callable[[], None]) -> None:
     """Read until the deadline or the end, then stop the source and read what is left."""
     while (left := deadline - monotonic()) > 0:
-        tell()
+        report()
         with contextlib.suppress(DeviceTimeoutError):
-            if source.read(min(left, LOOK)) is None:
+            if source.read(min(left, POLL_INTERVAL_S)) is None:
                 return
     source.stop()
     while source.read() is not None:
         pass
 
 
-def _ignore(seconds: float) -> None:
+def _ignore_progress(seconds: float) -> None:
     """Nobody watches."""

@@ -1,7 +1,7 @@
 """Which address opens what. The tables are all there is to registering an instrument.
 
-Every entry is ``"module:name"`` and is imported when it is needed, so that one instrument's libraries never keep
-another from working.
+Every entry is ``"module:name"`` and is imported when it is needed, so that one instrument's
+libraries never keep another from working.
 """
 
 from __future__ import annotations
@@ -26,25 +26,29 @@ OPENERS: dict[str, str] = {
     "sim+remoteex": "devices.remoteex.simulation:open_emulated",
     "sim+spad512": "devices.spad512.emulator:open_emulated",
     "timetag": "devices.timetag.source:open_timetag",
-    "sim+timetag": "devices.emulation.addresses:open_timetag",
+    "sim+timetag": "devices.emulation.source:open_timetag",
 }
 """Scheme of an address -> function ``(Uri) -> Source``."""
 
-FILES: dict[str, str] = {
+FILE_OPENERS: dict[str, str] = {
     ".dat": "devices.linospad2.source:open_recording",
-    ".img": "devices.pictures:open_picture",
-    ".tif": "devices.pictures:open_picture",
-    ".tiff": "devices.pictures:open_picture",
+    ".img": "devices.streak_file:open_streak_file",
+    ".tif": "devices.streak_file:open_streak_file",
+    ".tiff": "devices.streak_file:open_streak_file",
     ".phu": "devices.tcspc:open_phu",
     ".ptu": "devices.tcspc:open_ptu",
     ".sdt": "devices.tcspc:open_sdt",
     ".h5": "devices.replay:open_recording",
     ".hdf5": "devices.replay:open_recording",
 }
-"""Ending of a file's name, lower case -> function ``(Uri) -> Source``, for addresses ``file://PATH``."""
+"""Ending of a file's name, lower case -> function ``(Uri) -> Source``, for addresses
+``file://PATH``.
+"""
 
 FINDERS: tuple[str, ...] = ("devices.timetag.source:find_timetaggers",)
-"""Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail, without hardware."""
+"""Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail,
+without hardware.
+"""
 
 CODECS: dict[str, str] = {
     "frames": "devices.frames:FrameCodec",
@@ -62,7 +66,7 @@ class Opener(Protocol):
 
 
 @dataclass(frozen=True)
-class Found:
+class DiscoveredInstrument:
     """An instrument that can be opened now.
 
     Parameters
@@ -86,7 +90,8 @@ def open(uri: str) -> Source:  # noqa: A001 - the name users type: devices.open
     Parameters
     ----------
     uri : str
-        Its address: ``timetag://SERIAL``, ``sim+timetag://?seed=1``, ``file://PATH``; see `OPENERS` for all.
+        Its address: ``timetag://SERIAL``, ``sim+timetag://?seed=1``, ``file://PATH``; see `OPENERS`
+        for all.
 
     Raises
     ------
@@ -101,16 +106,16 @@ def open(uri: str) -> Source:  # noqa: A001 - the name users type: devices.open
     if parsed.scheme not in OPENERS:
         known = ", ".join(sorted([*OPENERS, "file"]))
         raise InputError(f"'{uri}': no source is called '{parsed.scheme}'; known are {known}")
-    opener: Opener = named(OPENERS[parsed.scheme])
+    opener: Opener = import_entry(OPENERS[parsed.scheme])
     return opener(parsed)
 
 
-def discover() -> list[Found]:
+def discover() -> list[DiscoveredInstrument]:
     """Look for instruments; without any hardware, or libraries for it, the list is empty."""
-    return [found for finder in FINDERS for found in named(finder)()]
+    return [found for finder in FINDERS for found in import_entry(finder)()]
 
 
-def codec_named(name: str, settings: Mapping[str, Scalar]) -> Codec:
+def build_codec(name: str, settings: Mapping[str, Scalar]) -> Codec:
     """Build the codec called `name` from the settings that it once gave.
 
     Raises
@@ -121,21 +126,21 @@ def codec_named(name: str, settings: Mapping[str, Scalar]) -> Codec:
     if name not in CODECS:
         raise InputError(f"no codec is called '{name}'; known are {', '.join(sorted(CODECS))}")
     try:
-        codec: Codec = named(CODECS[name])(**settings)
+        codec: Codec = import_entry(CODECS[name])(**settings)
     except TypeError as fault:
         raise InputError(f"codec '{name}' does not take {', '.join(settings)}") from fault
     return codec
 
 
 def _open_file(uri: Uri) -> Source:
-    ending = Path(uri.place).suffix.lower()
-    if ending not in FILES:
-        raise InputError(f"'{uri.text}': the name must end in {', '.join(sorted(FILES))}")
-    opener: Opener = named(FILES[ending])
+    ending = Path(uri.location).suffix.lower()
+    if ending not in FILE_OPENERS:
+        raise InputError(f"'{uri.text}': the name must end in {', '.join(sorted(FILE_OPENERS))}")
+    opener: Opener = import_entry(FILE_OPENERS[ending])
     return opener(uri)
 
 
-def named(entry: str) -> Any:
+def import_entry(entry: str) -> Any:
     """Import what a table's entry names."""
     module, _, name = entry.partition(":")
     return getattr(importlib.import_module(module), name)

@@ -8,19 +8,19 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import Any, NamedTuple
 
-from devices.decoded import DecodedSource
+from devices.decoded_source import DecodedSource
 from devices.ledger import Ledger
-from devices.recording.blocks import Kind
+from devices.recording.blocks import BlockKind
 from devices.recording.reader import Block, Damage, Recording
-from devices.source import PATIENCE, Batch, Info
+from devices.source import READ_TIMEOUT_S, Batch, Info
 from devices.uri import Uri
 from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError
 from tofclip.storage import Record
 
-BILLION = 1_000_000_000
+NS_PER_S = 1_000_000_000
 
 
-class _Mark(NamedTuple):
+class _Checkpoint(NamedTuple):
     """What the decoder and the accounts were when a block began."""
 
     state: Any
@@ -29,9 +29,11 @@ class _Mark(NamedTuple):
 
 
 class ReplaySource(DecodedSource):
-    """A recording played back. It never drops anything: the reader sets the pace, unless the recording does.
+    """A recording played back. It never drops anything: the reader sets the pace, unless the
+    recording does.
 
-    The accounts are those of the playback. After `seek` they are as if everything before had been read.
+    The accounts are those of the playback. After `seek` they are as if everything before had been
+    read.
 
     Memory: one piece and its records; 100 bytes for each piece of the recording.
 
@@ -52,11 +54,13 @@ class ReplaySource(DecodedSource):
         super().__init__(self._recording.codec, Ledger())
         self._info = self._recording.info
         self._is_paced = is_paced
-        self._blocks = list(self._pieces())
+        self._blocks = list(self._list_blocks())
         self._next = self._skip = 0
         self._begin: tuple[float, int] | None = None
-        self._marks = [_Mark(self.codec.start, 0, 0)]  # of every block up to the furthest that was read
-        self._go_to(0)
+        self._checkpoints = [
+            _Checkpoint(self.codec.start, 0, 0)
+        ]  # of every block up to the furthest that was read
+        self._seek_to(0)
 
     @property
     def info(self) -> Info:
@@ -70,13 +74,13 @@ class ReplaySource(DecodedSource):
     def is_seekable(self) -> bool:
         return True
 
-    def read(self, timeout: float = PATIENCE) -> Batch | None:
+    def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
         if self._next >= len(self._blocks):
             return None
         block = self._blocks[self._next]
         if self._is_paced:
-            self._wait_for(block, timeout)
-        batch = self._pass()
+            self._wait_until_due(block, timeout)
+        batch = self._decode_next()
         if not self._skip:
             return batch
         skipped, self._skip = self._skip, 0
@@ -86,60 +90,66 @@ class ReplaySource(DecodedSource):
         if record < 0:
             raise InputError(f"records are numbered from 0, got {record}")
         tap, self.tap = self.tap, None
-        self._go_to(bisect_right(self._marks, record, key=lambda mark: mark.delivered) - 1)
-        while self._next < len(self._blocks) and self._marks[self._next].delivered <= record:
-            self._pass()
+        self._seek_to(bisect_right(self._checkpoints, record, key=lambda mark: mark.delivered) - 1)
+        while self._next < len(self._blocks) and self._checkpoints[self._next].delivered <= record:
+            self._decode_next()
         self.tap = tap
-        reached = self._marks[self._next].delivered
+        reached = self._checkpoints[self._next].delivered
         if record > reached:
-            raise InputError(f"{self._recording.path} has only {reached} records, no record {record}")
+            raise InputError(
+                f"{self._recording.path} has only {reached} records, no record {record}"
+            )
         if record < reached:
-            self._go_to(self._next - 1)
-            self._skip = record - self._marks[self._next].delivered
+            self._seek_to(self._next - 1)
+            self._skip = record - self._checkpoints[self._next].delivered
 
     def close(self) -> None:
         self._next = len(self._blocks)
         self._recording.close()
 
-    def _pass(self) -> Batch:
+    def _decode_next(self) -> Batch:
         """Decode the next block and note how things are behind it."""
-        batch = self._decoded(self._recording.blocks.piece(self._blocks[self._next]))
+        batch = self._decode_piece(self._recording.blocks.read_piece(self._blocks[self._next]))
         self._next += 1
-        if self._next == len(self._marks):
-            self._marks.append(_Mark(self._state, self.stats.delivered, self.stats.malformed))
+        if self._next == len(self._checkpoints):
+            self._checkpoints.append(
+                _Checkpoint(self._state, self.stats.delivered, self.stats.malformed)
+            )
         return batch
 
-    def _go_to(self, number: int) -> None:
+    def _seek_to(self, number: int) -> None:
         """Make the next block the one with that number, as if all before it had been read."""
         self._next, self._skip = number, 0
-        self._state, delivered, malformed = self._marks[number]
+        self._state, delivered, malformed = self._checkpoints[number]
         self._ledger = Ledger()
-        self._ledger.arrive(sum(block.header.records for block in self._blocks))
-        self._ledger.settle(delivered, malformed)
+        self._ledger.receive(sum(block.header.records for block in self._blocks))
+        self._ledger.deliver(delivered, malformed)
         self._begin = None
 
-    def _pieces(self) -> Iterator[Block]:
+    def _list_blocks(self) -> Iterator[Block]:
         for entry in self._recording.blocks:
             if isinstance(entry, Damage):
                 raise FileFormatError(
                     self._recording.path,
                     f"is damaged at byte {entry.position}; tofclip devices repair makes a sound copy",
                 )
-            if entry.header.kind is Kind.PIECE:
+            if entry.header.kind is BlockKind.PIECE:
                 yield entry
 
-    def _wait_for(self, block: Block, timeout: float) -> None:
+    def _wait_until_due(self, block: Block, timeout: float) -> None:
         """Wait until a block is due."""
         now = monotonic()
         if self._begin is None:
             self._begin = now, block.header.time_ns
-        due = self._begin[0] + (block.header.time_ns - self._begin[1]) / BILLION
+        due = self._begin[0] + (block.header.time_ns - self._begin[1]) / NS_PER_S
         sleep(max(0.0, min(due - now, timeout)))
         if due - now > timeout:
-            raise DeviceTimeoutError(f"the next piece of {self._recording.path} is due in {due - now - timeout:.3g} s")
+            raise DeviceTimeoutError(
+                f"the next piece of {self._recording.path} is due in {due - now - timeout:.3g} s"
+            )
 
 
 def open_recording(uri: Uri) -> ReplaySource:
     """Open ``file://PATH?pace=fast``, or ``pace=realtime``."""
-    uri.only("pace")
-    return ReplaySource(Path(uri.place), uri.choice("pace", "fast", "realtime") == "realtime")
+    uri.reject_unknown("pace")
+    return ReplaySource(Path(uri.location), uri.choice("pace", "fast", "realtime") == "realtime")

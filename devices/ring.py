@@ -11,8 +11,8 @@ from typing import Literal
 from devices.ledger import Ledger
 from tofclip.errors import BufferOverflowError, DeviceTimeoutError
 
-Policy = Literal["block", "drop_oldest", "fail"]
-POLICIES: tuple[Policy, ...] = ("block", "drop_oldest", "fail")
+OverflowPolicy = Literal["block", "drop_oldest", "fail"]
+OVERFLOW_POLICIES: tuple[OverflowPolicy, ...] = ("block", "drop_oldest", "fail")
 
 
 class Gap(enum.IntEnum):
@@ -42,21 +42,23 @@ class Piece:
     gap: Gap = Gap.NONE
 
 
-class Ring:
-    """A queue of pieces that never holds more than `capacity` bytes (but always at least one piece).
+class RingBuffer:
+    """A queue of pieces that never holds more than `capacity` bytes (but always at least one
+    piece).
 
     Parameters
     ----------
     capacity : int
         Bytes.
     policy : {"block", "drop_oldest", "fail"}
-        What happens when it is full: the writer waits (and the instrument's own memory fills up), the oldest piece
-        goes, or reading ends with `BufferOverflowError` after what is in the queue.
+        What happens when it is full: the writer waits (and the instrument's own memory fills up),
+        the oldest piece goes, or reading ends with `BufferOverflowError` after what is in the
+        queue.
     ledger : Ledger
         Where arrivals and drops are entered.
     """
 
-    def __init__(self, capacity: int, policy: Policy, ledger: Ledger) -> None:
+    def __init__(self, capacity: int, policy: OverflowPolicy, ledger: Ledger) -> None:
         self._capacity, self._policy, self._ledger = capacity, policy, ledger
         self._pieces: deque[Piece] = deque()
         self._bytes = 0
@@ -66,19 +68,21 @@ class Ring:
         self._lost_before_next = Gap.NONE
 
     def put(self, piece: Piece) -> None:
-        """Append a piece. With policy ``"block"`` this waits until there is room or the ring has ended."""
+        """Append a piece. With policy ``"block"`` this waits until there is room or the ring has
+        ended.
+        """
         with self._changed:
-            self._ledger.arrive(piece.records)
+            self._ledger.receive(piece.records)
             if self._policy == "block":
-                self._changed.wait_for(lambda: self._fits(piece) or self._ended)
-            elif self._policy == "fail" and not self._fits(piece):
+                self._changed.wait_for(lambda: self._has_room(piece) or self._ended)
+            elif self._policy == "fail" and not self._has_room(piece):
                 self._ledger.drop(piece.records)
                 self._fault = BufferOverflowError(
                     f"records came faster than they were read and the buffer of {self._capacity} bytes is full; "
                     "read faster, or choose policy=block or policy=drop_oldest"
                 )
                 raise self._fault
-            while not self._fits(piece) and self._policy == "drop_oldest":
+            while not self._has_room(piece) and self._policy == "drop_oldest":
                 self._drop_oldest()
             self._pieces.append(replace(piece, gap=max(piece.gap, self._lost_before_next)))
             self._bytes += len(piece.data)
@@ -96,7 +100,9 @@ class Ring:
             What `fail` was given, once everything before it has been taken.
         """
         with self._changed:
-            if not self._changed.wait_for(lambda: self._pieces or self._ended or self._fault, timeout):
+            if not self._changed.wait_for(
+                lambda: self._pieces or self._ended or self._fault, timeout
+            ):
                 raise DeviceTimeoutError(
                     f"the instrument sent nothing for {timeout:g} s; is there light on the detector?"
                 )
@@ -116,12 +122,14 @@ class Ring:
             self._changed.notify_all()
 
     def end(self) -> None:
-        """End the stream; what is in it can still be taken, and a writer that waits for room waits no more."""
+        """End the stream; what is in it can still be taken, and a writer that waits for room waits
+        no more.
+        """
         with self._changed:
             self._ended = True
             self._changed.notify_all()
 
-    def _fits(self, piece: Piece) -> bool:
+    def _has_room(self, piece: Piece) -> bool:
         return not self._pieces or self._bytes + len(piece.data) <= self._capacity
 
     def _drop_oldest(self) -> None:

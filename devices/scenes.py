@@ -1,4 +1,6 @@
-"""What emulated instruments look at: scenes of `tofclip.simulate`, so that the truth behind their photons is known."""
+"""What emulated instruments look at: scenes of `tofclip.simulate_shot`, so that the truth behind
+their photons is known.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +12,26 @@ from numpy.typing import NDArray
 from tofclip.camera import Camera, SkewSweep
 from tofclip.shots import Streak
 from tofclip.simulate import (
+    GroundTruth,
     Instrument,
     Plate,
     Scene,
     StreakDetector,
-    Truth,
-    default_instrument,
-    default_scene,
-    simulate,
+    make_default_instrument,
+    make_default_scene,
+    simulate_shot,
 )
-from tofclip.simulate.shapes import Pattern, cut_out, letter, plain, stripes
+from tofclip.simulate.shapes import (
+    Pattern,
+    cut_pattern,
+    make_letter,
+    make_plain_pattern,
+    make_stripes,
+)
 
 SENSOR_PIXELS = 256
-LENSLETS = 7
-PICTURE_PX = 32
+LENSLET_COUNT = 7
+IMAGE_SIZE_PX = 32
 
 
 @dataclass(frozen=True)
@@ -45,75 +53,103 @@ class LineLight:
     photons: NDArray[np.float64]
     row_times: NDArray[np.float64]
     camera: Camera
-    truth: Truth
+    truth: GroundTruth
 
 
-def line_instrument() -> Instrument:
-    """Return seven lenslets before a line of 256 pixels, as long as LinoSPAD2; nothing sweeps, nothing is skewed."""
-    half = PICTURE_PX / 2
-    centres = np.linspace(half, SENSOR_PIXELS - half, LENSLETS)
-    still = SkewSweep(centres, np.zeros(LENSLETS), np.zeros(LENSLETS))
-    demonstration = default_instrument()
+def make_line_instrument() -> Instrument:
+    """Return seven lenslets before a line of 256 pixels, as long as LinoSPAD2; nothing sweeps,
+    nothing is skewed.
+    """
+    half = IMAGE_SIZE_PX / 2
+    centres = np.linspace(half, SENSOR_PIXELS - half, LENSLET_COUNT)
+    still = SkewSweep(centres, np.zeros(LENSLET_COUNT), np.zeros(LENSLET_COUNT))
+    demonstration = make_default_instrument()
     camera = Camera(
         centres_px=centres,
-        angles=np.radians(np.linspace(-42, 46, LENSLETS)),
-        image_shape=(PICTURE_PX, PICTURE_PX),
+        angles=np.radians(np.linspace(-42, 46, LENSLET_COUNT)),
+        image_shape=(IMAGE_SIZE_PX, IMAGE_SIZE_PX),
         slit_width_px=SENSOR_PIXELS,
         sweep=still,
         time_zero=demonstration.camera.time_zero,
         pulse_fwhm=demonstration.camera.pulse_fwhm,
-        focal_length_px=demonstration.camera.focal_length_px * PICTURE_PX / demonstration.camera.image_shape[0],
+        focal_length_px=demonstration.camera.focal_length_px
+        * IMAGE_SIZE_PX
+        / demonstration.camera.image_shape[0],
     )
     return Instrument(camera, StreakDetector())
 
 
-def line_scene() -> Scene:
-    """Return a letter and four plates between 1.7 and 3.2 m, as coarse as pictures of 32 pixels need."""
+def make_line_scene() -> Scene:
+    """Return a letter and four plates between 1.7 and 3.2 m, as coarse as pictures of 32 pixels
+    need.
+    """
     return Scene(
         (
-            _plate(cut_out(letter("U"), plain(0.8)), (-26, -22), 44, 1.75),
-            _plate(plain(0.8), (24, -24), 36, 2.1, yaw=0.15),
-            _plate(plain(0.7), (-24, 26), 34, 2.5),
-            _plate(plain(0.8), (24, 24), 40, 2.8, pitch=-0.15),
-            _plate(stripes(3, 0.3, 0.9), (0, 0), 100, 3.18),
+            _make_plate(
+                cut_pattern(make_letter("U"), make_plain_pattern(0.8)), (-26, -22), 44, 1.75
+            ),
+            _make_plate(make_plain_pattern(0.8), (24, -24), 36, 2.1, yaw=0.15),
+            _make_plate(make_plain_pattern(0.7), (-24, 26), 34, 2.5),
+            _make_plate(make_plain_pattern(0.8), (24, 24), 40, 2.8, pitch=-0.15),
+            _make_plate(make_stripes(3, 0.3, 0.9), (0, 0), 100, 3.18),
         )
     )
 
 
-def line_light() -> LineLight:
-    """Return the light of `line_scene` on the pixels of `line_instrument`."""
-    return _light(line_scene(), line_instrument())
+def simulate_line_light() -> LineLight:
+    """Return the light of `make_line_scene` on the pixels of `make_line_instrument`."""
+    return _simulate_light(make_line_scene(), make_line_instrument())
 
 
-def demonstration_light() -> LineLight:
-    """Return the demonstration's light; its camera is known as focus pictures would tell: without sweep and gains."""
-    light = _light(default_scene(), default_instrument())
-    return replace(light, camera=replace(light.camera, sweep=None, gains=np.ones(light.camera.views)))
+def simulate_demonstration_light() -> LineLight:
+    """Return the demonstration's light; its camera is known as focus pictures would tell: without
+    sweep and gains.
+    """
+    light = _simulate_light(make_default_scene(), make_default_instrument())
+    return replace(
+        light, camera=replace(light.camera, sweep=None, gains=np.ones(light.camera.views))
+    )
 
 
-def array_light() -> NDArray[np.float64]:
+def render_array_light() -> NDArray[np.float64]:
     """Return the demonstration's reference view as an array of 512 x 512 pixels sees it, 0..1."""
-    picture = np.nan_to_num(Truth.of(default_scene(), default_instrument()).reflectance)
+    picture = np.nan_to_num(
+        GroundTruth.from_scene(make_default_scene(), make_default_instrument()).reflectance
+    )
     return np.asarray(np.kron(picture, np.ones((4, 4))), np.float64)
 
 
-def exposed(light: LineLight, seed: int) -> Streak:
+def draw_exposure(light: LineLight, seed: int) -> Streak:
     """Draw one exposure, without any instrument in between."""
     counts = np.random.default_rng(seed).poisson(light.photons).astype(np.float32)
     return Streak(counts, light.row_times, camera=light.camera)
 
 
-def _light(scene: Scene, instrument: Instrument) -> LineLight:
-    shot = simulate(scene, instrument, seed=0)  # the expected signal has no noise for a seed to draw
+def _simulate_light(scene: Scene, instrument: Instrument) -> LineLight:
+    shot = simulate_shot(
+        scene, instrument, seed=0
+    )  # the expected signal has no noise for a seed to draw
     detector = instrument.detector
     return LineLight(
-        shot.signal.astype(np.float64) + detector.background_photons, detector.row_times, shot.camera, shot.truth
+        shot.signal.astype(np.float64) + detector.background_photons,
+        detector.row_times,
+        shot.camera,
+        shot.truth,
     )
 
 
-def _plate(
-    pattern: Pattern, middle: tuple[float, float], side: float, depth: float, yaw: float = 0.0, pitch: float = 0.0
+def _make_plate(
+    pattern: Pattern,
+    middle: tuple[float, float],
+    side: float,
+    depth: float,
+    yaw: float = 0.0,
+    pitch: float = 0.0,
 ) -> Plate:
-    """Square plate; `middle` (x, y) from the optical axis and `side` are in 128ths of the picture's side."""
-    unit = depth / default_instrument().camera.focal_length_px
-    return Plate((middle[0] * unit, middle[1] * unit, depth), (side * unit, side * unit), pattern, yaw, pitch)
+    """Square plate; `middle` (x, y) from the optical axis and `side` are in 128ths of the picture's
+    side.
+    """
+    unit = depth / make_default_instrument().camera.focal_length_px
+    return Plate(
+        (middle[0] * unit, middle[1] * unit, depth), (side * unit, side * unit), pattern, yaw, pitch
+    )

@@ -13,7 +13,7 @@ from devices.statistics import Stats
 from tofclip.errors import InputError
 from tofclip.storage import Record, Scalar
 
-PATIENCE = 5.0
+READ_TIMEOUT_S = 5.0
 """Seconds that an iteration waits for the next batch of a live instrument."""
 
 
@@ -28,8 +28,8 @@ class Info:
     serial : str
         Its serial number; empty where it has none.
     details : mapping of str to str, int, float or bool
-        Firmware, clock and the like; units in the names (``clock_hz``). Where a protocol is not public, ``"limits"``
-        says what that means.
+        Firmware, clock and the like; units in the names (``clock_hz``). Where a protocol is not
+        public, ``"limits"`` says what that means.
     """
 
     instrument: str
@@ -50,9 +50,11 @@ class Batch:
     records : (n,) structured array
         Of the codec's `dtype`. May be empty.
     first : int
-        Number of the first one among all records that arrived well, from 0; what `Source.seek` takes.
+        Number of the first one among all records that arrived well, from 0; what `Source.seek`
+        takes.
     after_gap : bool
-        Something is missing right before these records. Where the instrument was away, its clock has started anew.
+        Something is missing right before these records. Where the instrument was away, its clock
+        has started anew.
     """
 
     records: Records
@@ -66,8 +68,9 @@ class Batch:
 class Source(abc.ABC):
     """A stream of records: a context manager and an iterator over batches.
 
-    A subclass gives `read`, `close`, `info` and `stats`, and where they differ from the defaults the rest.
-    Opening is done by the constructor (or the function in `devices.registry`); leaving the context closes.
+    A subclass gives `read`, `close`, `info` and `stats`, and where they differ from the defaults
+    the rest. Opening is done by the constructor (or the function in `devices.registry`); leaving
+    the context closes.
     """
 
     @property
@@ -82,12 +85,16 @@ class Source(abc.ABC):
 
     @property
     def calibration(self) -> Record | None:
-        """Tables and constants that turn records into seconds and pixels, None where there are none."""
+        """Tables and constants that turn records into seconds and pixels, None where there are
+        none.
+        """
         return None
 
     @property
     def is_live(self) -> bool:
-        """Whether the records come from an instrument, real or emulated, and go by if nobody reads them."""
+        """Whether the records come from an instrument, real or emulated, and go by if nobody reads
+        them.
+        """
         return False
 
     @property
@@ -96,7 +103,7 @@ class Source(abc.ABC):
         return False
 
     @abc.abstractmethod
-    def read(self, timeout: float = PATIENCE) -> Batch | None:
+    def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
         """Return the next batch, or None at the end of the stream.
 
         Parameters
@@ -123,7 +130,8 @@ class Source(abc.ABC):
         raise InputError("a live source cannot seek; record it and open the recording")
 
     def stop(self) -> None:
-        """Let the instrument register nothing more; what arrived can still be read, up to the None at the end.
+        """Let the instrument register nothing more; what arrived can still be read, up to the None
+        at the end.
 
         Where nothing waits to be read this is the same as `close`.
         """
@@ -146,6 +154,9 @@ class Source(abc.ABC):
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()

@@ -9,7 +9,8 @@ from dataclasses import asdict, dataclass
 class Stats:
     """A snapshot of a source's accounts, in records.
 
-    Every record that the instrument acquired is in exactly one of the five that follow; see `is_balanced`.
+    Every record that the instrument acquired is in exactly one of the five that follow; see
+    `is_balanced`.
 
     Parameters
     ----------
@@ -39,14 +40,14 @@ class Stats:
     reconnects: int = 0
 
     @property
-    def accounted(self) -> int:
+    def total_records(self) -> int:
         """Records whose fate is known."""
         return self.delivered + self.unread + self.dropped_host + self.lost_device + self.malformed
 
     @property
     def is_balanced(self) -> bool:
         """Whether acquired = delivered + unread + dropped_host + lost_device + malformed."""
-        return self.acquired == self.accounted
+        return self.acquired == self.total_records
 
     def as_dict(self) -> dict[str, int]:
         """Return the accounts by name."""

@@ -14,25 +14,25 @@ from time import monotonic
 from typing import Protocol
 
 from devices.codec import Codec, as_bytes
-from devices.decoded import DecodedSource
+from devices.decoded_source import DecodedSource
 from devices.ledger import Ledger
-from devices.ring import Gap, Piece, Policy, Ring
-from devices.source import PATIENCE, Batch, Info
+from devices.ring import Gap, OverflowPolicy, Piece, RingBuffer
+from devices.source import READ_TIMEOUT_S, Batch, Info
 from tofclip.errors import DeviceError, DeviceTimeoutError
 from tofclip.storage import Record
 
-POLL = 0.1
+POLL_INTERVAL_S = 0.1
 """Seconds after which the thread looks whether it should stop, though nothing came."""
 
-LONGEST_DRAIN = 3.0
+DRAIN_TIMEOUT_S = 3.0
 """Seconds in which a stopped instrument must have handed over what it still holds."""
 
-LONGEST_STOP = 15.0
+STOP_TIMEOUT_S = 15.0
 """Seconds that `StreamSource.close` waits for the thread, which never takes so long."""
 
 
 @dataclass(frozen=True)
-class Arrival:
+class Transfer:
     """What one transfer brought.
 
     Parameters
@@ -61,8 +61,10 @@ class Feed(Protocol):
     def start(self) -> None:
         """Let the instrument send."""
 
-    def pull(self, timeout: float) -> Arrival | None:
-        """Return what came next, None at the end; `DeviceTimeoutError` if nothing came. Enters reconnections itself."""
+    def pull(self, timeout: float) -> Transfer | None:
+        """Return what came next, None at the end; `DeviceTimeoutError` if nothing came. Enters
+        reconnections itself.
+        """
 
     def stop(self) -> None:
         """Let the instrument register nothing more; what it holds can still be pulled."""
@@ -72,11 +74,11 @@ class Feed(Protocol):
 
 
 @dataclass(frozen=True)
-class Buffering:
-    """How much a stream holds for a slow reader, and what happens then; see `Ring`."""
+class BufferSettings:
+    """How much a stream holds for a slow reader, and what happens then; see `RingBuffer`."""
 
     capacity: int = 64 << 20
-    policy: Policy = "block"
+    policy: OverflowPolicy = "block"
 
 
 class StreamSource(DecodedSource):
@@ -93,15 +95,17 @@ class StreamSource(DecodedSource):
     buffering : Buffering
     """
 
-    def __init__(self, feed: Feed, codec: Codec, ledger: Ledger, buffering: Buffering | None = None) -> None:
-        buffering = buffering or Buffering()
+    def __init__(
+        self, feed: Feed, codec: Codec, ledger: Ledger, buffering: BufferSettings | None = None
+    ) -> None:
+        buffering = buffering or BufferSettings()
         super().__init__(codec, ledger)
         self._feed = feed
-        self._ring = Ring(buffering.capacity, buffering.policy, ledger)
+        self._ring = RingBuffer(buffering.capacity, buffering.policy, ledger)
         self._stopping, self._closed = threading.Event(), False
         feed.start()
         self._info, self._calibration = feed.info, feed.calibration
-        self._thread = threading.Thread(target=self._empty, name="device reader", daemon=True)
+        self._thread = threading.Thread(target=self._run_reader, name="device reader", daemon=True)
         self._thread.start()
 
     @property
@@ -116,11 +120,11 @@ class StreamSource(DecodedSource):
     def is_live(self) -> bool:
         return True
 
-    def read(self, timeout: float = PATIENCE) -> Batch | None:
+    def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
         piece = None if self._closed else self._ring.get(timeout)
         if piece is None:
             return None
-        return self._decoded(piece)
+        return self._decode_piece(piece)
 
     def stop(self) -> None:
         self._stopping.set()
@@ -129,12 +133,12 @@ class StreamSource(DecodedSource):
         self._closed = True
         self._stopping.set()
         self._ring.end()
-        self._thread.join(LONGEST_STOP)
+        self._thread.join(STOP_TIMEOUT_S)
 
-    def _empty(self) -> None:
+    def _run_reader(self) -> None:
         """Move bytes from the instrument into the ring until the end; the thread's whole life."""
         try:
-            _Reader(self._feed, self.codec, self._ledger, self._ring).run(self._stopping)
+            _FeedReader(self._feed, self.codec, self._ledger, self._ring).run(self._stopping)
         except Exception as fault:  # whoever reads gets to see it
             self._ring.fail(fault)
         try:
@@ -144,10 +148,10 @@ class StreamSource(DecodedSource):
         self._ring.end()
 
 
-class _Reader:
+class _FeedReader:
     """Cuts what a feed brings into whole records."""
 
-    def __init__(self, feed: Feed, codec: Codec, ledger: Ledger, ring: Ring) -> None:
+    def __init__(self, feed: Feed, codec: Codec, ledger: Ledger, ring: RingBuffer) -> None:
         self._feed, self._codec, self._ledger, self._ring = feed, codec, ledger, ring
         self._rest, self._gap = b"", Gap.NONE
 
@@ -156,37 +160,39 @@ class _Reader:
         try:
             while not stopping.is_set():
                 try:
-                    arrival = self._feed.pull(POLL)
+                    arrival = self._feed.pull(POLL_INTERVAL_S)
                 except DeviceTimeoutError:
                     self._ledger.time_out()
                     continue
                 if arrival is None:
                     break
-                self._take(arrival)
+                self._enqueue(arrival)
             self._drain()
         finally:
-            self._break_off()
+            self._count_truncated()
 
     def _drain(self) -> None:
         self._feed.stop()
-        deadline = monotonic() + LONGEST_DRAIN
+        deadline = monotonic() + DRAIN_TIMEOUT_S
         with contextlib.suppress(DeviceTimeoutError):
-            while monotonic() < deadline and (arrival := self._feed.pull(POLL)) is not None:
-                self._take(arrival)
+            while (
+                monotonic() < deadline and (arrival := self._feed.pull(POLL_INTERVAL_S)) is not None
+            ):
+                self._enqueue(arrival)
 
-    def _take(self, arrival: Arrival) -> None:
+    def _enqueue(self, arrival: Transfer) -> None:
         if arrival.gap is not Gap.NONE:
-            self._break_off()
+            self._count_truncated()
             self._gap = max(self._gap, arrival.gap)
         data = self._rest + arrival.data
-        end = self._codec.whole(as_bytes(data))
+        end = self._codec.count_complete_bytes(as_bytes(data))
         whole, self._rest = data[:end], data[end:]
         if whole:
-            self._ring.put(Piece(whole, self._codec.count(as_bytes(whole)), self._gap))
+            self._ring.put(Piece(whole, self._codec.count_records(as_bytes(whole)), self._gap))
             self._gap = Gap.NONE
 
-    def _break_off(self) -> None:
+    def _count_truncated(self) -> None:
         """Enter a record of which the end never came."""
         if self._rest:
-            self._ledger.break_off()
+            self._ledger.truncate()
             self._rest = b""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from devices.ring import POLICIES
-from devices.stream import Buffering
+from devices.ring import OVERFLOW_POLICIES
+from devices.stream import BufferSettings
 from devices.uri import Uri
 from tofclip.errors import InputError
 
@@ -12,16 +12,18 @@ OPTIONS = ("buffer_mib", "policy")
 _MEBIBYTE = 1 << 20
 
 
-def buffering(uri: Uri) -> Buffering:
+def parse_buffer_settings(uri: Uri) -> BufferSettings:
     """Read ``buffer_mib=64&policy=block`` (or ``drop_oldest``, ``fail``)."""
-    capacity = uri.value("buffer_mib", float, Buffering().capacity / _MEBIBYTE) * _MEBIBYTE
+    capacity = uri.value("buffer_mib", float, BufferSettings().capacity / _MEBIBYTE) * _MEBIBYTE
     if not 0 < capacity <= 1 << 36:
         raise InputError(f"'{uri.text}': buffer_mib must be within 0 and 65536")
-    policy = next(policy for policy in POLICIES if policy == uri.choice("policy", *POLICIES))
-    return Buffering(int(capacity), policy)
+    policy = next(
+        policy for policy in OVERFLOW_POLICIES if policy == uri.choice("policy", *OVERFLOW_POLICIES)
+    )
+    return BufferSettings(int(capacity), policy)
 
 
-def seconds(uri: Uri, name: str, default: float) -> float:
+def parse_seconds(uri: Uri, name: str, default: float) -> float:
     """Read a time to wait, within 0 and 600 s."""
     found = uri.value(name, float, default)
     if not 0 < found <= 600:

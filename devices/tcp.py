@@ -1,4 +1,6 @@
-"""TCP: a connection to an instrument's server, with bounded waiting, bounded lengths and our exceptions."""
+"""TCP: a connection to an instrument's server, with bounded waiting, bounded lengths and our
+exceptions.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +11,15 @@ from time import monotonic
 from types import TracebackType
 from typing import Self
 
-from tofclip.errors import DeviceDisconnectedError, DeviceError, DeviceNotFoundError, DeviceTimeoutError, ProtocolError
+from tofclip.errors import (
+    DeviceDisconnectedError,
+    DeviceError,
+    DeviceNotFoundError,
+    DeviceTimeoutError,
+    ProtocolError,
+)
 
-PIECE = 1 << 18
+RECEIVE_BYTES = 1 << 18
 """Most bytes taken from the system at once."""
 
 
@@ -35,8 +43,8 @@ class TcpLink:
 
     def __init__(self, host: str, port: int, timeout: float) -> None:
         self.name = f"{host}:{port}"
-        self._held = bytearray()
-        with self._translated():
+        self._buffer = bytearray()
+        with self._translate_errors():
             try:
                 self._socket = socket.create_connection((host, port), timeout)
             except TimeoutError:
@@ -50,23 +58,24 @@ class TcpLink:
 
     def send(self, data: bytes, timeout: float) -> None:
         """Send all of `data`."""
-        with self._translated():
+        with self._translate_errors():
             self._socket.settimeout(timeout)
             self._socket.sendall(data)
 
-    def some(self, limit: int, timeout: float) -> bytes:
+    def read_available(self, limit: int, timeout: float) -> bytes:
         """Return what came, at least 1 and at most `limit` bytes.
 
         Raises
         ------
         DeviceTimeoutError, DeviceDisconnectedError
         """
-        if not self._held:
-            self._fill(monotonic() + timeout, timeout)
-        return self._taken(min(limit, len(self._held)))
+        if not self._buffer:
+            self._fill_buffer(monotonic() + timeout, timeout)
+        return self._take_bytes(min(limit, len(self._buffer)))
 
-    def exactly(self, length: int, limit: int, timeout: float) -> bytes:
-        """Return `length` bytes, a length that came from the wire and is bounded before anything is held for it.
+    def read_exactly(self, length: int, limit: int, timeout: float) -> bytes:
+        """Return `length` bytes, a length that came from the wire and is bounded before anything is
+        held for it.
 
         Raises
         ------
@@ -76,13 +85,15 @@ class TcpLink:
             What came in time stays for the next call.
         """
         if not 0 <= length <= limit:
-            raise ProtocolError(f"{self.name} announced {length} bytes; at most {limit} are possible")
+            raise ProtocolError(
+                f"{self.name} announced {length} bytes; at most {limit} are possible"
+            )
         deadline = monotonic() + timeout
-        while len(self._held) < length:
-            self._fill(deadline, timeout)
-        return self._taken(length)
+        while len(self._buffer) < length:
+            self._fill_buffer(deadline, timeout)
+        return self._take_bytes(length)
 
-    def until(self, end: bytes, limit: int, timeout: float) -> bytes:
+    def read_until(self, end: bytes, limit: int, timeout: float) -> bytes:
         """Return everything up to `end`, which is taken off.
 
         Raises
@@ -94,13 +105,15 @@ class TcpLink:
         """
         deadline = monotonic() + timeout
         searched = 0
-        while (found := self._held.find(end, searched)) < 0:
-            if len(self._held) > limit:
-                raise ProtocolError(f"{self.name} sent {len(self._held)} bytes without the end of a message")
-            searched = max(0, len(self._held) - len(end) + 1)
-            self._fill(deadline, timeout)
-        message = self._taken(found)
-        self._taken(len(end))
+        while (found := self._buffer.find(end, searched)) < 0:
+            if len(self._buffer) > limit:
+                raise ProtocolError(
+                    f"{self.name} sent {len(self._buffer)} bytes without the end of a message"
+                )
+            searched = max(0, len(self._buffer) - len(end) + 1)
+            self._fill_buffer(deadline, timeout)
+        message = self._take_bytes(found)
+        self._take_bytes(len(end))
         return message
 
     def close(self) -> None:
@@ -111,29 +124,32 @@ class TcpLink:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        fault: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
 
-    def _taken(self, length: int) -> bytes:
-        taken = bytes(self._held[:length])
-        del self._held[:length]
+    def _take_bytes(self, length: int) -> bytes:
+        taken = bytes(self._buffer[:length])
+        del self._buffer[:length]
         return taken
 
-    def _fill(self, deadline: float, timeout: float) -> None:
+    def _fill_buffer(self, deadline: float, timeout: float) -> None:
         """Wait for more, until `deadline`."""
-        with self._translated():
+        with self._translate_errors():
             left = deadline - monotonic()
             if left <= 0:
                 raise DeviceTimeoutError(f"{self.name} sent nothing for {timeout:g} s")
             self._socket.settimeout(left)
-            came = self._socket.recv(PIECE)
+            came = self._socket.recv(RECEIVE_BYTES)
         if not came:
             raise DeviceDisconnectedError(f"{self.name} closed the connection")
-        self._held += came
+        self._buffer += came
 
     @contextlib.contextmanager
-    def _translated(self) -> Iterator[None]:
+    def _translate_errors(self) -> Iterator[None]:
         try:
             yield
         except DeviceError:
@@ -141,4 +157,6 @@ class TcpLink:
         except TimeoutError as fault:
             raise DeviceTimeoutError(f"{self.name} did not answer in time") from fault
         except OSError as fault:
-            raise DeviceDisconnectedError(f"the connection to {self.name} broke: {fault.strerror or fault}") from fault
+            raise DeviceDisconnectedError(
+                f"the connection to {self.name} broke: {fault.strerror or fault}"
+            ) from fault

@@ -1,7 +1,7 @@
 """Files of time-correlated single-photon counting: PicoQuant's PTU and PHU, Becker & Hickl's SDT.
 
-The libraries `ptufile` and `sdtfile` read them (extra ``tcspc``). What they make of a file is handed on as records:
-photons one by one (PTU in T3 mode), or whole histograms (PHU, SDT).
+The libraries `ptufile` and `sdtfile` read them (extra ``tcspc``). What they make of a file is
+handed on as records: photons one by one (PTU in T3 mode), or whole histograms (PHU, SDT).
 """
 
 from __future__ import annotations
@@ -15,28 +15,31 @@ from numpy.typing import NDArray
 
 from devices.codec import Records
 from devices.ledger import Ledger
-from devices.source import PATIENCE, Batch, Info, Source
+from devices.source import READ_TIMEOUT_S, Batch, Info, Source
 from devices.statistics import Stats
 from devices.uri import Uri
 from tofclip.errors import FileFormatError, InputError, MissingDependencyError, TofclipError
-from tofclip.storage import Record, Scalar, one_line, reading
+from tofclip.storage import Record, Scalar, format_error_line, translate_read_errors
 
-PHOTON = np.dtype([("sync", "<u8"), ("bin", "<u4"), ("channel", "<u4")])
-"""`sync`: number of the laser's pulse. `bin`: time after it, in the file's resolution. `channel`: from 0."""
+PHOTON_DTYPE = np.dtype([("sync", "<u8"), ("bin", "<u4"), ("channel", "<u4")])
+"""`sync`: number of the laser's pulse. `bin`: time after it, in the file's resolution. `channel`:
+from 0.
+"""
 
-BATCH = 1 << 16
-MOST_BYTES = 1 << 31
+BATCH_RECORDS = 1 << 16
+MAX_FILE_BYTES = 1 << 31
 """Larger files are not read: their photons would not fit into memory four times over."""
 
-MOST_BINS = 1 << 20
+MAX_BINS = 1 << 20
 
-Contents = tuple[Records, dict[str, Scalar], Info]
+FileContents = tuple[Records, dict[str, Scalar], Info]
 
 
 class TcspcFile(Source):
     """A file's records. Memory: four times the file, which the libraries read as a whole.
 
-    The calibration has ``resolution_s``, the width of a bin, ``channels``, and for photons ``laser_period_s``.
+    The calibration has ``resolution_s``, the width of a bin, ``channels``, and for photons
+    ``laser_period_s``.
 
     Parameters
     ----------
@@ -52,18 +55,24 @@ class TcspcFile(Source):
         It is damaged, or of a kind that has no times after a laser's pulse.
     """
 
-    def __init__(self, path: str | Path, reader: Callable[[Path], Contents]) -> None:
-        with reading(path):
+    def __init__(self, path: str | Path, reader: Callable[[Path], FileContents]) -> None:
+        with translate_read_errors(path):
             size = Path(path).stat().st_size
-        if size > MOST_BYTES:
-            raise FileFormatError(path, f"is larger than {MOST_BYTES} bytes; export a part of it")
+        if size > MAX_FILE_BYTES:
+            raise FileFormatError(
+                path, f"is larger than {MAX_FILE_BYTES} bytes; export a part of it"
+            )
         try:
-            with reading(path):
+            with translate_read_errors(path):
                 self._records, self._attributes, self._info = reader(Path(path))
         except TofclipError:
             raise
-        except Exception as fault:  # whatever the library stumbles over, it is the file that is damaged
-            raise FileFormatError(path, f"is a damaged or unsupported file ({one_line(fault)})") from fault
+        except (
+            Exception
+        ) as fault:  # whatever the library stumbles over, it is the file that is damaged
+            raise FileFormatError(
+                path, f"is a damaged or unsupported file ({format_error_line(fault)})"
+            ) from fault
         self._closed = False
         self.seek(0)
 
@@ -83,22 +92,24 @@ class TcspcFile(Source):
     def is_seekable(self) -> bool:
         return True
 
-    def read(self, timeout: float = PATIENCE) -> Batch | None:
+    def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
         """Return the next batch at once; `timeout` does not matter."""
         first = self._next
-        records = self._records[first : first + BATCH]
+        records = self._records[first : first + BATCH_RECORDS]
         if self._closed or len(records) == 0:
             return None
         self._next += len(records)
-        self._ledger.settle(len(records), 0)
+        self._ledger.deliver(len(records), 0)
         return Batch(records, first)
 
     def seek(self, record: int) -> None:
         if not 0 <= record <= len(self._records):
-            raise InputError(f"the file has {len(self._records)} records, there is no number {record}")
+            raise InputError(
+                f"the file has {len(self._records)} records, there is no number {record}"
+            )
         self._next, self._ledger = record, Ledger()
-        self._ledger.arrive(len(self._records))
-        self._ledger.settle(record, 0)
+        self._ledger.receive(len(self._records))
+        self._ledger.deliver(record, 0)
 
     def close(self) -> None:
         self._closed = True
@@ -106,85 +117,111 @@ class TcspcFile(Source):
 
 def open_ptu(uri: Uri) -> TcspcFile:
     """Open ``file://run.ptu``."""
-    return _opened(uri, _photons)
+    return _open_file(uri, _read_photons)
 
 
 def open_phu(uri: Uri) -> TcspcFile:
     """Open ``file://run.phu``."""
-    return _opened(uri, _picoquant_histograms)
+    return _open_file(uri, _read_picoquant_histograms)
 
 
 def open_sdt(uri: Uri) -> TcspcFile:
     """Open ``file://run.sdt``."""
-    return _opened(uri, _becker_hickl_histograms)
+    return _open_file(uri, _read_becker_hickl_histograms)
 
 
-def _opened(uri: Uri, reader: Callable[[Path], Contents]) -> TcspcFile:
-    uri.only()
-    return TcspcFile(uri.place, reader)
+def _open_file(uri: Uri, reader: Callable[[Path], FileContents]) -> TcspcFile:
+    uri.reject_unknown()
+    return TcspcFile(uri.location, reader)
 
 
-def _photons(path: Path) -> Contents:
-    ptufile = _library("ptufile")
+def _read_photons(path: Path) -> FileContents:
+    ptufile = _import_library("ptufile")
     with ptufile.PtuFile(path) as file:
         if not file.is_t3:
-            raise FileFormatError(path, "is in T2 mode, whose times are not counted from the laser; record in T3 mode")
+            raise FileFormatError(
+                path, "is in T2 mode, whose times are not counted from the laser; record in T3 mode"
+            )
         decoded = file.decode_records()
         resolution, rate = float(file.tcspc_resolution), float(file.syncrate)
         kind = str(file.record_type.name)
-    photons = decoded[(decoded["channel"] >= 0) & (decoded["dtime"] >= 0)]  # the others mark lines, frames, overflows
-    records = np.empty(len(photons), PHOTON)
-    records["sync"], records["bin"], records["channel"] = photons["time"], photons["dtime"], photons["channel"]
+    photons = decoded[
+        (decoded["channel"] >= 0) & (decoded["dtime"] >= 0)
+    ]  # the others mark lines, frames, overflows
+    records = np.empty(len(photons), PHOTON_DTYPE)
+    records["sync"], records["bin"], records["channel"] = (
+        photons["time"],
+        photons["dtime"],
+        photons["channel"],
+    )
     channels = int(records["channel"].max(initial=0)) + 1
-    attributes: dict[str, Scalar] = {"resolution_s": _positive(resolution, path), "channels": channels}
+    attributes: dict[str, Scalar] = {
+        "resolution_s": _require_positive(resolution, path),
+        "channels": channels,
+    }
     if rate > 0:
         attributes["laser_period_s"] = 1 / rate
     return records, attributes, Info(f"TCSPC file ({kind})", "", dict(attributes))
 
 
-def _picoquant_histograms(path: Path) -> Contents:
-    ptufile = _library("ptufile")
+def _read_picoquant_histograms(path: Path) -> FileContents:
+    ptufile = _import_library("ptufile")
     with ptufile.PhuFile(path) as file:
-        return _histograms(file.histograms(), float(file.tcspc_resolution), "PicoQuant histograms", path)
+        return _make_histogram_records(
+            file.histograms(), float(file.tcspc_resolution), "PicoQuant histograms", path
+        )
 
 
-def _becker_hickl_histograms(path: Path) -> Contents:
-    sdtfile = _library("sdtfile")
+def _read_becker_hickl_histograms(path: Path) -> FileContents:
+    sdtfile = _import_library("sdtfile")
     with sdtfile.SdtFile(path) as file:
-        curves = [curve for block in file.data for curve in np.asarray(block).reshape(-1, block.shape[-1])]
+        curves = [
+            curve for block in file.data for curve in np.asarray(block).reshape(-1, block.shape[-1])
+        ]
         steps = {float(times[1] - times[0]) for times in file.times if len(times) > 1}
     if len(steps) != 1:
-        raise FileFormatError(path, f"has blocks of {len(steps)} different resolutions, expected one")
-    return _histograms(curves, steps.pop(), "Becker & Hickl histograms", path)
+        raise FileFormatError(
+            path, f"has blocks of {len(steps)} different resolutions, expected one"
+        )
+    return _make_histogram_records(curves, steps.pop(), "Becker & Hickl histograms", path)
 
 
-def _histograms(curves: Any, resolution: float, instrument: str, path: Path) -> Contents:
+def _make_histogram_records(
+    curves: Any, resolution: float, instrument: str, path: Path
+) -> FileContents:
     lengths = {len(curve) for curve in curves}
-    if len(lengths) != 1 or not 0 < max(lengths) <= MOST_BINS:
-        raise FileFormatError(path, f"has histograms of {sorted(lengths) or 'no'} bins, expected one length")
+    if len(lengths) != 1 or not 0 < max(lengths) <= MAX_BINS:
+        raise FileFormatError(
+            path, f"has histograms of {sorted(lengths) or 'no'} bins, expected one length"
+        )
     counts = np.stack(list(curves))
     records = np.zeros(len(counts), [("channel", "<u4"), ("histogram", "<u4", counts.shape[1:])])
     records["channel"], records["histogram"] = np.arange(len(counts)), counts
-    attributes: dict[str, Scalar] = {"resolution_s": _positive(resolution, path), "channels": len(counts)}
+    attributes: dict[str, Scalar] = {
+        "resolution_s": _require_positive(resolution, path),
+        "channels": len(counts),
+    }
     return records, attributes, Info(instrument, "", dict(attributes))
 
 
-def _positive(resolution: float, path: Path) -> float:
+def _require_positive(resolution: float, path: Path) -> float:
     if not (np.isfinite(resolution) and resolution > 0):
         raise FileFormatError(path, f"says that its bins last {resolution} s")
     return resolution
 
 
-def _library(name: str) -> Any:
+def _import_library(name: str) -> Any:
     import importlib
 
     try:
         return importlib.import_module(name)
     except ImportError as fault:
-        raise MissingDependencyError(f"{name} is missing; install tofclip[tcspc] to read this file") from fault
+        raise MissingDependencyError(
+            f"{name} is missing; install tofclip[tcspc] to read this file"
+        ) from fault
 
 
-def times_of(photons: Records, calibration: Record) -> NDArray[np.float64]:
+def compute_photon_times(photons: Records, calibration: Record) -> NDArray[np.float64]:
     """Return when each photon came, s after the laser's pulse: the beginning of its bin."""
     times: NDArray[np.float64] = photons["bin"] * float(calibration.attribute("resolution_s"))
     return times

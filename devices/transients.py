@@ -1,15 +1,16 @@
-"""From a source's address to the streak image that recovery takes: photons histogrammed, frames added up.
+"""From a source's address to the streak image that recovery takes: photons histogrammed, frames
+added up.
 
-Besides what a source itself takes, its address may say how to gather (`GATHERING`), e.g.
+Besides what a source itself takes, its address may say how to gather (`ACCUMULATION_OPTIONS`), e.g.
 ``file://run.h5?seconds=2&bins=576``:
 
 * ``seconds``: of reading, at most; a live source that never ends needs it, 10 by default;
 * ``frames``: of a camera, to add up; 1 by default;
-* ``bins``, ``start_ps``, ``period_ps``: number of histogram bins, middle of the first one after the laser's pulse, and
-  the laser's period, where the source does not know it;
+* ``bins``, ``start_ps``, ``period_ps``: number of histogram bins, middle of the first one after the
+  laser's pulse, and the laser's period, where the source does not know it;
 * ``records``: photons of a shot, where a source is read shot after shot; 100 000 by default;
-* ``sync``, ``pixels``: channel of the laser's pulses and channels of the line's pixels of a time tagger, ``0`` and
-  ``1,2,3`` by default.
+* ``sync``, ``pixels``: channel of the laser's pulses and channels of the line's pixels of a time
+  tagger, ``0`` and ``1,2,3`` by default.
 """
 
 from __future__ import annotations
@@ -29,23 +30,32 @@ from numpy.typing import NDArray
 from devices.histogram import BinAxis, StampHistogram, TagHistogram, TimeHistogram
 from devices.linospad2.calibration import BoardCalibration
 from devices.registry import open as open_source
-from devices.source import PATIENCE, Batch, Source
-from devices.tcspc import times_of
+from devices.source import READ_TIMEOUT_S, Batch, Source
+from devices.tcspc import compute_photon_times
 from devices.uri import Uri
 from tofclip.camera import Camera
 from tofclip.errors import DeviceTimeoutError, InputError
 from tofclip.shots import Streak
-from tofclip.storage import Record, provenance
+from tofclip.storage import Record, collect_provenance
 
-GATHERING = ("seconds", "frames", "bins", "start_ps", "period_ps", "records", "sync", "pixels")
-BIN_WIDTH = 20e-12
+ACCUMULATION_OPTIONS = (
+    "seconds",
+    "frames",
+    "bins",
+    "start_ps",
+    "period_ps",
+    "records",
+    "sync",
+    "pixels",
+)
+BIN_WIDTH_S = 20e-12
 """Width of a histogram's bins where nobody gives another, s."""
 
-PICOSECOND = 1e-12
+PICOSECOND_S = 1e-12
 
 
 @dataclass(frozen=True)
-class Gathering:
+class AccumulationSettings:
     """How records become a streak image; see the module's text.
 
     Parameters
@@ -61,7 +71,7 @@ class Gathering:
     sync : int
     pixels : tuple of int
     bin_width : float or None
-        s. None: `BIN_WIDTH` for photons, and the camera's own time axis for frames.
+        s. None: `BIN_WIDTH_S` for photons, and the camera's own time axis for frames.
     records : int
     """
 
@@ -76,16 +86,18 @@ class Gathering:
     records: int = 100_000
 
     @classmethod
-    def of(cls, uri: Uri, bin_width: float | None) -> Gathering:
+    def from_uri(cls, uri: Uri, bin_width: float | None) -> AccumulationSettings:
         """Read the values of an address that say how to gather."""
         standard = cls()
-        pixels = uri.value("pixels", _whole_numbers, standard.pixels)
+        pixels = uri.value("pixels", _parse_integers, standard.pixels)
         found = cls(
             uri.value("seconds", float, standard.seconds),
             uri.value("frames", int, standard.frames),
             uri.value("bins", int, 0) if "bins" in uri.values else None,
-            uri.value("start_ps", float, 0.0) * PICOSECOND,
-            uri.value("period_ps", float, 0.0) * PICOSECOND if "period_ps" in uri.values else None,
+            uri.value("start_ps", float, 0.0) * PICOSECOND_S,
+            uri.value("period_ps", float, 0.0) * PICOSECOND_S
+            if "period_ps" in uri.values
+            else None,
             uri.value("sync", int, standard.sync),
             pixels,
             bin_width,
@@ -101,16 +113,21 @@ class Gathering:
         Raises
         ------
         InputError
-            Neither the address nor the source says how many bins there are, or how long the laser's period is.
+            Neither the address nor the source says how many bins there are, or how long the laser's
+            period is.
         """
-        width = BIN_WIDTH if self.bin_width is None else self.bin_width
+        width = BIN_WIDTH_S if self.bin_width is None else self.bin_width
         period = self.period or known_period
         if self.bins is not None:
             return BinAxis(width, self.bins, self.start, period)
         if period is None:
-            raise InputError("nobody knows the laser's period: add period_ps=... or bins=... to the address")
+            raise InputError(
+                "nobody knows the laser's period: add period_ps=... or bins=... to the address"
+            )
         if not 0 < width <= period:
-            raise InputError(f"bins must be longer than 0 and shorter than the laser's period, got {width} s")
+            raise InputError(
+                f"bins must be longer than 0 and shorter than the laser's period, got {width} s"
+            )
         return BinAxis(width, int(period / width * (1 + 1e-9)), self.start, period)
 
 
@@ -122,15 +139,16 @@ def read_transient(address: str, bin_width: float | None = None) -> Streak:
     Parameters
     ----------
     address : str
-        As `devices.open` takes it, with `GATHERING`'s values where needed.
+        As `devices.open` takes it, with `ACCUMULATION_OPTIONS`'s values where needed.
     bin_width : float, optional
-        Width of a photon histogram's bins, s, 20 ps by default; of a camera's rows instead of its own time axis.
+        Width of a photon histogram's bins, s, 20 ps by default; of a camera's rows instead of its
+        own time axis.
 
     Returns
     -------
     Streak
-        With the camera that the source knows, if it knows one; hot pixels, and pixels that reached a camera's limit,
-        are marked in ``Streak.saturated``.
+        With the camera that the source knows, if it knows one; hot pixels, and pixels that reached
+        a camera's limit, are marked in ``Streak.saturated``.
 
     Raises
     ------
@@ -140,24 +158,29 @@ def read_transient(address: str, bin_width: float | None = None) -> Streak:
         The instrument failed before there was anything to gather.
     """
     uri = Uri.parse(address)
-    gathering = Gathering.of(uri, bin_width)
-    with open_source(_own(uri)) as source:
-        streak = _gathered(_batches(source, gathering.seconds), source.calibration, gathering)
+    gathering = AccumulationSettings.from_uri(uri, bin_width)
+    with open_source(_strip_accumulation_options(uri)) as source:
+        streak = _accumulate_streak(
+            _read_batches(source, gathering.seconds), source.calibration, gathering
+        )
         known = source.calibration
-        past = {**provenance({"address": address, "bin_width_s": bin_width}), "source": source.info.as_dict()}
+        past = {
+            **collect_provenance({"address": address, "bin_width_s": bin_width}),
+            "source": source.info.as_dict(),
+        }
         source.stop()
         while source.read() is not None:
             pass
     past["stats"] = source.stats.as_dict()
-    return replace(streak, camera=_camera(known), source=address, provenance=past)
+    return replace(streak, camera=_read_camera(known), source=address, provenance=past)
 
 
 def read_transients(address: str, bin_width: float | None = None) -> Iterator[Streak]:
     """Read a source until it ends, and yield one streak image after the other.
 
-    One is made of each ``frames`` pictures of a camera or ``records`` photons, as the address says; the last one may
-    have fewer. The source is opened once, and closed with the generator. Memory: a batch of the source, and a streak
-    image.
+    One is made of each ``frames`` pictures of a camera or ``records`` photons, as the address says;
+    the last one may have fewer. The source is opened once, and closed with the generator. Memory: a
+    batch of the source, and a streak image.
 
     Parameters
     ----------
@@ -170,17 +193,19 @@ def read_transients(address: str, bin_width: float | None = None) -> Iterator[St
         As for `read_transient`.
     """
     uri = Uri.parse(address)
-    gathering = Gathering.of(uri, bin_width)
-    with open_source(_own(uri)) as source:
+    gathering = AccumulationSettings.from_uri(uri, bin_width)
+    with open_source(_strip_accumulation_options(uri)) as source:
         known = source.calibration
-        camera = _camera(known)
-        batches = _batches(source, gathering.seconds if "seconds" in uri.values else inf)
-        for number, parts in groupby(_cut(batches, gathering), itemgetter(0)):
-            streak = _gathered((part for _, part in parts), known, gathering)
+        camera = _read_camera(known)
+        batches = _read_batches(source, gathering.seconds if "seconds" in uri.values else inf)
+        for number, parts in groupby(_split_shots(batches, gathering), itemgetter(0)):
+            streak = _accumulate_streak((part for _, part in parts), known, gathering)
             yield replace(streak, camera=camera, source=f"{address} shot {number}")
 
 
-def _cut(batches: Iterator[Batch], gathering: Gathering) -> Iterator[tuple[int, Batch]]:
+def _split_shots(
+    batches: Iterator[Batch], gathering: AccumulationSettings
+) -> Iterator[tuple[int, Batch]]:
     """Cut batches where shots end, and say to which shot each part belongs."""
     done = 0
     for batch in batches:
@@ -189,38 +214,48 @@ def _cut(batches: Iterator[Batch], gathering: Gathering) -> Iterator[tuple[int, 
         start = 0
         while start < len(batch):
             end = min(len(batch), start + size - done % size)
-            yield done // size, Batch(batch.records[start:end], batch.first + start, batch.after_gap and start == 0)
+            yield (
+                done // size,
+                Batch(
+                    batch.records[start:end], batch.first + start, batch.after_gap and start == 0
+                ),
+            )
             done += end - start
             start = end
 
 
-def _gathered(batches: Iterator[Batch], calibration: Record | None, gathering: Gathering) -> Streak:
+def _accumulate_streak(
+    batches: Iterator[Batch], calibration: Record | None, gathering: AccumulationSettings
+) -> Streak:
     first = next(batches, None)
     if first is None:
         raise InputError("the source ended before it gave anything")
     names = first.records.dtype.names or ()
     if "counts" in names:
-        return _sum_of_frames(first, batches, calibration, gathering)
+        return _sum_frames(first, batches, calibration, gathering)
     if "histogram" in names:
-        return _ready_histograms([first, *batches], calibration or Record("none"), gathering)
-    histogram = _histogram(names, calibration, gathering)
+        return _stack_histograms([first, *batches], calibration or Record("none"), gathering)
+    histogram = _make_histogram(names, calibration, gathering)
     while first is not None:
         if isinstance(histogram, TagHistogram):
             histogram.add(first.records, first.after_gap)
         elif isinstance(histogram, TimeHistogram):
-            histogram.add(first.records["channel"], times_of(first.records, calibration or Record("none")))
+            histogram.add(
+                first.records["channel"],
+                compute_photon_times(first.records, calibration or Record("none")),
+            )
         else:
             histogram.add(first.records)
         first = next(batches, None)
-    return histogram.streak()
+    return histogram.to_streak()
 
 
-def _batches(source: Source, seconds: float) -> Iterator[Batch]:
+def _read_batches(source: Source, seconds: float) -> Iterator[Batch]:
     """Read until the end, or for so many seconds of a live source."""
     deadline = monotonic() + seconds
     while not source.is_live or monotonic() < deadline:
         try:
-            batch = source.read(PATIENCE)
+            batch = source.read(READ_TIMEOUT_S)
         except DeviceTimeoutError:
             if not source.stats.delivered:
                 raise
@@ -230,8 +265,8 @@ def _batches(source: Source, seconds: float) -> Iterator[Batch]:
         yield batch
 
 
-def _histogram(
-    names: tuple[str, ...], calibration: Record | None, gathering: Gathering
+def _make_histogram(
+    names: tuple[str, ...], calibration: Record | None, gathering: AccumulationSettings
 ) -> StampHistogram | TagHistogram | TimeHistogram:
     """Return an empty histogram for records of this kind."""
     known = calibration or Record("none")
@@ -243,19 +278,30 @@ def _histogram(
         return TagHistogram(gathering.axis(None), gathering.sync, gathering.pixels, tick)
     if "bin" in names:
         axis = gathering.axis(float(known.attribute("laser_period_s", 0.0)) or None)
-        return TimeHistogram(int(known.attribute("channels")), axis, float(known.attribute("resolution_s")))
+        return TimeHistogram(
+            int(known.attribute("channels")), axis, float(known.attribute("resolution_s"))
+        )
     raise InputError(f"records of {', '.join(names)} are no photons of a line of pixels")
 
 
-def _ready_histograms(batches: list[Batch], calibration: Record, gathering: Gathering) -> Streak:
+def _stack_histograms(
+    batches: list[Batch], calibration: Record, gathering: AccumulationSettings
+) -> Streak:
     """Return histograms that the instrument has made itself, a channel in each column."""
     counts = np.concatenate([batch.records["histogram"] for batch in batches]).T
-    times: NDArray[np.float64] = (np.arange(len(counts)) + 0.5) * np.float64(calibration.attribute("resolution_s"))
+    times: NDArray[np.float64] = (np.arange(len(counts)) + 0.5) * np.float64(
+        calibration.attribute("resolution_s")
+    )
     streak = Streak(counts.astype(np.float32), times)
     return streak if gathering.bin_width is None else streak.with_bin_width(gathering.bin_width)
 
 
-def _sum_of_frames(first: Batch, batches: Iterator[Batch], calibration: Record | None, gathering: Gathering) -> Streak:
+def _sum_frames(
+    first: Batch,
+    batches: Iterator[Batch],
+    calibration: Record | None,
+    gathering: AccumulationSettings,
+) -> Streak:
     """Add up a camera's frames; a pixel that reached its limit in one of them is not to be trusted."""
     kind = first.records.dtype["counts"].base
     limit = np.iinfo(kind).max if kind.kind in "ui" else np.inf
@@ -277,17 +323,17 @@ def _sum_of_frames(first: Batch, batches: Iterator[Batch], calibration: Record |
     return streak if gathering.bin_width is None else streak.with_bin_width(gathering.bin_width)
 
 
-def _camera(calibration: Record | None) -> Camera | None:
+def _read_camera(calibration: Record | None) -> Camera | None:
     known = None if calibration is None else calibration.children.get("camera")
     return None if known is None else Camera.from_record(known)
 
 
-def _own(uri: Uri) -> str:
+def _strip_accumulation_options(uri: Uri) -> str:
     """Return the address without what says how to gather."""
-    values = {name: value for name, value in uri.values.items() if name not in GATHERING}
-    place = quote(uri.place, safe="/:@[]~ ")
+    values = {name: value for name, value in uri.values.items() if name not in ACCUMULATION_OPTIONS}
+    place = quote(uri.location, safe="/:@[]~ ")
     return f"{uri.scheme}://{place}" + (f"?{urlencode(values)}" if values else "")
 
 
-def _whole_numbers(text: str) -> tuple[int, ...]:
+def _parse_integers(text: str) -> tuple[int, ...]:
     return tuple(int(word) for word in text.split(","))

@@ -1,4 +1,6 @@
-"""Addresses of sources: ``scheme://place?name=value&...``, with every value checked and none ignored."""
+"""Addresses of sources: ``scheme://place?name=value&...``, with every value checked and none
+ignored.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ class Uri:
         The address as it was given, for messages.
     scheme : str
         Lower case, e.g. ``"sim+timetag"``.
-    place : str
+    location : str
         All between ``://`` and ``?``: a serial number, ``HOST:PORT`` or a path.
     values : mapping of str to str
         The query.
@@ -30,7 +32,7 @@ class Uri:
 
     text: str
     scheme: str
-    place: str
+    location: str
     values: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -58,7 +60,7 @@ class Uri:
             raise InputError(f"'{text}': a name is given twice")
         return cls(text, scheme.lower(), unquote(place), dict(pairs))
 
-    def only(self, *names: str) -> None:
+    def reject_unknown(self, *names: str) -> None:
         """Refuse values of other names than these."""
         for name in self.values:
             if name not in names:
@@ -66,7 +68,9 @@ class Uri:
                 raise InputError(f"'{self.text}': '{name}' is unknown; {self.scheme} takes {known}")
 
     def value(self, name: str, kind: Callable[[str], T], default: T) -> T:
-        """Return value `name` turned into a `kind` (``int``, ``float``, ``str``), `default` where it is not given."""
+        """Return value `name` turned into a `kind` (``int``, ``float``, ``str``), `default` where
+        it is not given.
+        """
         if name not in self.values:
             return default
         try:
@@ -90,10 +94,14 @@ class Uri:
             There is no host, or the port is not within 1..65535.
         """
         try:
-            parts = urlsplit(f"//{self.place}")
+            parts = urlsplit(f"//{self.location}")
             host, port = parts.hostname, parts.port
         except ValueError as fault:
-            raise InputError(f"'{self.text}': a port must be a whole number within 1..65535") from fault
+            raise InputError(
+                f"'{self.text}': a port must be a whole number within 1..65535"
+            ) from fault
         if not host or port == 0:
-            raise InputError(f"'{self.text}': name a computer, as in {self.scheme}://192.168.0.2:{default_port}")
+            raise InputError(
+                f"'{self.text}': name a computer, as in {self.scheme}://192.168.0.2:{default_port}"
+            )
         return host, default_port if port is None else port

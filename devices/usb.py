@@ -24,11 +24,11 @@ from tofclip.errors import (
 if TYPE_CHECKING:
     import usb.core
 
-INTERFACE = 0
-REPLUG_POLL = 0.05
+INTERFACE_NUMBER = 0
+REPLUG_POLL_S = 0.05
 """Seconds between two looks for an instrument that was unplugged."""
 
-_GONE = (errno.ENODEV, errno.EIO, errno.ENOENT, errno.ENXIO, errno.ESHUTDOWN)
+_DISCONNECT_ERRNOS = (errno.ENODEV, errno.EIO, errno.ENOENT, errno.ENXIO, errno.ESHUTDOWN)
 
 
 class UsbIdentity(NamedTuple):
@@ -63,28 +63,36 @@ def system_backend() -> Any:
 
         backend = usb.backend.libusb1.get_backend(find_library=libusb_package.find_library)
     except (ImportError, OSError) as fault:
-        raise UsbBackendError(f"the USB library does not load ({fault}); install pyusb and libusb-package") from fault
+        raise UsbBackendError(
+            f"the USB library does not load ({fault}); install pyusb and libusb-package"
+        ) from fault
     if backend is None:
-        raise UsbBackendError("libusb does not load on this machine; install libusb-package or the system's libusb-1.0")
+        raise UsbBackendError(
+            "libusb does not load on this machine; install libusb-package or the system's libusb-1.0"
+        )
     return backend
 
 
-def find(identity: UsbIdentity, backend: Any) -> Iterator[usb.core.Device]:
+def find_devices(identity: UsbIdentity, backend: Any) -> Iterator[usb.core.Device]:
     """Yield every connected instrument of that kind."""
     import usb.core
 
-    with translated(identity):
-        yield from usb.core.find(find_all=True, backend=backend, idVendor=identity.vendor, idProduct=identity.product)
+    with translate_errors(identity):
+        yield from usb.core.find(
+            find_all=True, backend=backend, idVendor=identity.vendor, idProduct=identity.product
+        )
 
 
-def serial_of(device: usb.core.Device, identity: UsbIdentity) -> str:
-    """Return the serial number, empty where there is none; `DevicePermissionError` where it may not be read."""
-    with translated(identity):
+def read_serial(device: usb.core.Device, identity: UsbIdentity) -> str:
+    """Return the serial number, empty where there is none; `DevicePermissionError` where it may not
+    be read.
+    """
+    with translate_errors(identity):
         return str(device.serial_number or "")
 
 
 @contextlib.contextmanager
-def translated(identity: UsbIdentity) -> Iterator[None]:
+def translate_errors(identity: UsbIdentity) -> Iterator[None]:
     """Turn the exceptions of pyusb into ours."""
     import usb.core
 
@@ -93,35 +101,43 @@ def translated(identity: UsbIdentity) -> Iterator[None]:
     except usb.core.NoBackendError as fault:  # a ValueError, so it has to come first
         raise UsbBackendError("no USB library was found; install libusb-package") from fault
     except usb.core.USBError as fault:
-        raise _ours(fault, identity) from fault
+        raise _convert_error(fault, identity) from fault
     except ValueError as fault:
         if "langid" not in str(fault):
             raise
-        raise _forbidden(identity) from fault  # pyusb says so where it may not open the device
+        raise _make_permission_error(
+            identity
+        ) from fault  # pyusb says so where it may not open the device
     except NotImplementedError as fault:
-        raise DeviceError(f"USB device {identity}: this system's USB library cannot do that ({fault})") from fault
+        raise DeviceError(
+            f"USB device {identity}: this system's USB library cannot do that ({fault})"
+        ) from fault
 
 
-def _ours(fault: usb.core.USBError, identity: UsbIdentity) -> DeviceError:
+def _convert_error(fault: usb.core.USBError, identity: UsbIdentity) -> DeviceError:
     import usb.core
 
     number = fault.errno
     if isinstance(fault, usb.core.USBTimeoutError) or number == errno.ETIMEDOUT:
         return DeviceTimeoutError(f"USB device {identity} sent nothing in time")
     if number == errno.EACCES:
-        return _forbidden(identity)
-    if number in _GONE:
+        return _make_permission_error(identity)
+    if number in _DISCONNECT_ERRNOS:
         return DeviceDisconnectedError(f"USB device {identity} was unplugged")
     if number == errno.EBUSY:
-        return DeviceBusyError(f"USB device {identity} is used by another program; close that first")
+        return DeviceBusyError(
+            f"USB device {identity} is used by another program; close that first"
+        )
     if number == errno.EPIPE:
         return DeviceStalledError(f"USB device {identity} stalled; unplug it and plug it in again")
     if number == errno.EOVERFLOW:
-        return TransferOverflowError(f"USB device {identity} sent more than was asked for; the transfer is lost")
+        return TransferOverflowError(
+            f"USB device {identity} sent more than was asked for; the transfer is lost"
+        )
     return DeviceError(f"USB device {identity}: {' '.join(str(fault).split())}")
 
 
-def _forbidden(identity: UsbIdentity) -> DevicePermissionError:
+def _make_permission_error(identity: UsbIdentity) -> DevicePermissionError:
     return DevicePermissionError(
         f"USB device {identity} may not be opened by this user; put this line into "
         f"/etc/udev/rules.d/70-tofclip.rules and plug it in again: {identity.udev_rule}"
@@ -149,17 +165,20 @@ class UsbLink:
 
     def __init__(self, identity: UsbIdentity, serial: str, backend: Any) -> None:
         self.identity, self._backend = identity, backend
-        self._device, self.serial = self._found(serial)
+        self._device, self.serial = self._find_device(serial)
         self._claim()
 
     def read(self, endpoint: int, buffer: array.array[int], timeout: float) -> int:
-        """Fill `buffer` from a bulk endpoint and return how many bytes came; fewer than fit are no fault.
+        """Fill `buffer` from a bulk endpoint and return how many bytes came; fewer than fit are no
+        fault.
 
         Raises
         ------
         DeviceTimeoutError, DeviceStalledError, DeviceDisconnectedError, TransferOverflowError
         """
-        return self._halt_cleared(endpoint, lambda: int(self._device.read(endpoint, buffer, _milliseconds(timeout))))
+        return self._retry_after_halt(
+            endpoint, lambda: int(self._device.read(endpoint, buffer, _to_milliseconds(timeout)))
+        )
 
     def write(self, endpoint: int, data: bytes, timeout: float) -> None:
         """Send all of `data` to a bulk endpoint.
@@ -169,9 +188,13 @@ class UsbLink:
         DeviceTimeoutError, DeviceStalledError, DeviceDisconnectedError
             DeviceTimeoutError also where only a part was taken.
         """
-        sent = self._halt_cleared(endpoint, lambda: int(self._device.write(endpoint, data, _milliseconds(timeout))))
+        sent = self._retry_after_halt(
+            endpoint, lambda: int(self._device.write(endpoint, data, _to_milliseconds(timeout)))
+        )
         if sent != len(data):
-            raise DeviceTimeoutError(f"USB device {self.identity} took only {sent} of {len(data)} bytes in time")
+            raise DeviceTimeoutError(
+                f"USB device {self.identity} took only {sent} of {len(data)} bytes in time"
+            )
 
     def reconnect(self, patience: float) -> None:
         """Wait until the instrument with this serial number is back, and claim it.
@@ -186,10 +209,10 @@ class UsbLink:
         while monotonic() < deadline:
             # Not there yet, or there before the system has given this user the right to it.
             with contextlib.suppress(DeviceError):
-                self._device, self.serial = self._found(self.serial)
+                self._device, self.serial = self._find_device(self.serial)
                 self._claim()
                 return
-            sleep(min(REPLUG_POLL, patience / 10))
+            sleep(min(REPLUG_POLL_S, patience / 10))
         raise DeviceDisconnectedError(
             f"USB device {self.identity} {self.serial} was unplugged and did not come back within {patience:g} s"
         )
@@ -202,38 +225,48 @@ class UsbLink:
         with contextlib.suppress(usb.core.USBError):
             usb.util.dispose_resources(self._device)
 
-    def _found(self, serial: str) -> tuple[usb.core.Device, str]:
+    def _find_device(self, serial: str) -> tuple[usb.core.Device, str]:
         """Find the one instrument that is meant, and its serial number."""
-        known = [(device, serial_of(device, self.identity)) for device in find(self.identity, self._backend)]
+        known = [
+            (device, read_serial(device, self.identity))
+            for device in find_devices(self.identity, self._backend)
+        ]
         fitting = [(device, number) for device, number in known if serial in ("", number)]
         if not fitting:
             others = ", ".join(number for _, number in known) or "none"
             wanted = f" with serial number {serial}" if serial else ""
-            raise DeviceNotFoundError(f"no USB device {self.identity}{wanted} is connected (connected: {others})")
+            raise DeviceNotFoundError(
+                f"no USB device {self.identity}{wanted} is connected (connected: {others})"
+            )
         if len(fitting) > 1:
             numbers = ", ".join(number for _, number in fitting)
-            raise DeviceNotFoundError(f"several USB devices {self.identity} are connected; say which: {numbers}")
+            raise DeviceNotFoundError(
+                f"several USB devices {self.identity} are connected; say which: {numbers}"
+            )
         return fitting[0]
 
     def _claim(self) -> None:
         import usb.core
         import usb.util
 
-        with translated(self.identity):
-            with contextlib.suppress(NotImplementedError):  # only Linux and macOS have drivers to detach
-                if self._device.is_kernel_driver_active(INTERFACE):
-                    self._device.detach_kernel_driver(INTERFACE)
+        with translate_errors(self.identity):
+            with contextlib.suppress(
+                NotImplementedError
+            ):  # only Linux and macOS have drivers to detach
+                if self._device.is_kernel_driver_active(INTERFACE_NUMBER):
+                    self._device.detach_kernel_driver(INTERFACE_NUMBER)
             try:
                 self._device.get_active_configuration()
             except usb.core.USBError:
-                self._device.set_configuration()  # only where there is none, because this resets the device
-            usb.util.claim_interface(self._device, INTERFACE)
+                # only where there is none, because this resets the device
+                self._device.set_configuration()
+            usb.util.claim_interface(self._device, INTERFACE_NUMBER)
 
-    def _halt_cleared(self, endpoint: int, transfer: Callable[[], int]) -> int:
+    def _retry_after_halt(self, endpoint: int, transfer: Callable[[], int]) -> int:
         """Do a transfer; if the endpoint has stalled, clear it and try once more."""
         import usb.core
 
-        with translated(self.identity):
+        with translate_errors(self.identity):
             try:
                 return transfer()
             except usb.core.USBError as fault:
@@ -243,6 +276,6 @@ class UsbLink:
             return transfer()
 
 
-def _milliseconds(seconds: float) -> int:
+def _to_milliseconds(seconds: float) -> int:
     """Return what libusb takes: 0 would mean for ever."""
     return max(1, round(seconds * 1000))

@@ -1,4 +1,6 @@
-"""How the documentation is built: ``sphinx-build -W docs docs/_build``. Nothing is fetched from the network."""
+"""How the documentation is built: ``sphinx-build -W docs docs/_build``. Nothing is fetched from the
+network.
+"""
 
 from __future__ import annotations
 

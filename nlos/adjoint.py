@@ -1,8 +1,9 @@
-"""From compressed readings of a wall to the hidden scene, with no iteration on the way (supplement Note 13).
+"""From compressed readings of a wall to the hidden scene, with no iteration on the way (supplement
+Note 13).
 
-A CLIP camera reads the wall at every instant through an operator F with far fewer readings than wall points. For
-imaging around corners the wall is only an aperture, which bears artefacts: the adjoint F'f, in O(Nt N^2 m), is often
-enough.
+A CLIP camera reads the wall at every instant through an operator F with far fewer readings than
+wall points. For imaging around corners the wall is only an aperture, which bears artefacts: the
+adjoint F'f, in O(Nt N^2 m), is often enough.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from nlos.volume import Volume
 from tofclip.arrays import require_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator
-from tofclip.solvers import Adjoint, Method
+from tofclip.solvers import Backprojection, Method
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,7 @@ class CompressedCapture:
 
     Parameters
     ----------
-    readings : (readings, t) array
+    measurements : (readings, t) array
         Kept as float32.
     operator : LinearOperator
         F, from pictures (rows, columns) to (readings,).
@@ -49,7 +50,7 @@ class CompressedCapture:
         Readings, operator and wall disagree, or a reading is not finite.
     """
 
-    readings: NDArray[np.float32]
+    measurements: NDArray[np.float32]
     operator: LinearOperator
     wall: FloatArray
     laser: FloatArray
@@ -58,45 +59,55 @@ class CompressedCapture:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require_numpy("imaging straight from compressed readings", self.readings)
-        readings, wall = np.asarray(self.readings, dtype=np.float32), np.asarray(self.wall, dtype=np.float64)
-        if readings.ndim != 2 or readings.shape[:1] != self.operator.shape_out:
-            raise ShapeError("readings", (*self.operator.shape_out, "t"), readings.shape)
+        require_numpy("imaging straight from compressed readings", self.measurements)
+        measurements, wall = (
+            np.asarray(self.measurements, dtype=np.float32),
+            np.asarray(self.wall, dtype=np.float64),
+        )
+        if measurements.ndim != 2 or measurements.shape[:1] != self.operator.shape_out:
+            raise ShapeError("readings", (*self.operator.shape_out, "t"), measurements.shape)
         if wall.shape != (*self.operator.shape_in, 3):
             raise ShapeError("wall", (*self.operator.shape_in, 3), wall.shape)
-        if not np.all(np.isfinite(readings)):
+        if not np.all(np.isfinite(measurements)):
             raise InputError("readings must not hold NaN or infinity; set bad ones to 0")
-        object.__setattr__(self, "readings", np.ascontiguousarray(readings))
+        object.__setattr__(self, "readings", np.ascontiguousarray(measurements))
         object.__setattr__(self, "wall", wall)
 
     @classmethod
     def of(cls, capture: Capture, operator: LinearOperator) -> CompressedCapture:
-        """Read a capture (t, rows, columns) through an operator, as a CLIP camera does; masked wall points are dark."""
+        """Read a capture (t, rows, columns) through an operator, as a CLIP camera does; masked wall
+        points are dark.
+        """
         if capture.signal.shape[1:] != operator.shape_in:
             raise ShapeError("signal", ("t", *operator.shape_in), capture.signal.shape)
         require_numpy("reading through a CLIP camera", capture.signal)
         pictures = np.where(capture.valid, capture.signal, np.float32(0))
-        readings = operator(np.ascontiguousarray(np.moveaxis(pictures, 0, -1)))
+        measurements = operator(np.ascontiguousarray(np.moveaxis(pictures, 0, -1)))
         place = (capture.wall, capture.laser, capture.bin_width, capture.start)
-        return cls(readings, operator, *place, capture.provenance)
+        return cls(measurements, operator, *place, capture.provenance)
 
-    def recovered(self, method: Method | None = None) -> Capture:
+    def recover_transients(self, method: Method | None = None) -> Capture:
         """Recover the wall's transients.
 
         Parameters
         ----------
         method : Method, optional
-            Of `tofclip.solvers`; defaults to the adjoint. `LinearInverse` costs as much and is sharper.
+            Of `tofclip.solvers`; defaults to the adjoint. `LinearInverse` costs as much and is
+            sharper.
         """
-        method = method or Adjoint()
-        frames = method.recover(self.operator, self.readings).frames
-        history = {**self.provenance, "recovery": {"method": method.name, "readings": len(self.readings)}}
+        method = method or Backprojection()
+        frames = method.recover(self.operator, self.measurements).frames
+        history = {
+            **self.provenance,
+            "recovery": {"method": method.name, "readings": len(self.measurements)},
+        }
         return Capture(frames, self.wall, self.laser, self.bin_width, self.start, history)
 
 
 @dataclass(frozen=True)
 class AdjointImaging:
-    """Imaging straight from compressed readings: recover each instant, image, and cut off what is weak.
+    """Imaging straight from compressed readings: recover each instant, image, and cut off what is
+    weak.
 
     Memory for the recovered transients, besides what the solver needs.
 
@@ -113,7 +124,7 @@ class AdjointImaging:
     """
 
     solver: Reconstructor
-    recovery: Method = field(default_factory=Adjoint)
+    recovery: Method = field(default_factory=Backprojection)
     threshold: float = 0.3
 
     def __post_init__(self) -> None:
@@ -122,8 +133,10 @@ class AdjointImaging:
 
     def supports(self, capture: CompressedCapture, grid: Grid) -> Support:
         """Say whether the solver can image such a capture on `grid`, and if not, why."""
-        blank = np.zeros((capture.readings.shape[1], *capture.wall.shape[:-1]), np.float32)
-        return self.solver.supports(Capture(blank, capture.wall, capture.laser, capture.bin_width, capture.start), grid)
+        blank = np.zeros((capture.measurements.shape[1], *capture.wall.shape[:-1]), np.float32)
+        return self.solver.supports(
+            Capture(blank, capture.wall, capture.laser, capture.bin_width, capture.start), grid
+        )
 
     def reconstruct(self, capture: CompressedCapture, grid: Grid) -> Volume:
         """Image the hidden scene.
@@ -134,5 +147,5 @@ class AdjointImaging:
             `supports` says no.
         """
         self.supports(capture, grid).require()
-        volume = self.solver.reconstruct(capture.recovered(self.recovery), grid)
+        volume = self.solver.reconstruct(capture.recover_transients(self.recovery), grid)
         return volume.threshold(self.threshold)

@@ -1,4 +1,6 @@
-"""Phasor-field back-projection: every wall point's filtered signal, smeared over the voxels that it may come from."""
+"""Phasor-field back-projection: every wall point's filtered signal, smeared over the voxels that it
+may come from.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +15,17 @@ from nlos.band import Band, VirtualPulse, Waveforms
 from nlos.capture import Capture
 from nlos.geometry import FloatArray, Grid
 from nlos.kernels import add_backprojection
-from nlos.method import PhasorMethod, Progress, Support, common_support, silent
+from nlos.method import PhasorMethod, Progress, Support, check_common_support, ignore_progress
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
 from tofclip.arrays import is_numpy
 from tofclip.errors import InputError
-from tofclip.threads import blocks, run_blocks
+from tofclip.threads import run_blocks, split_blocks
 
 TABLE_BYTES = 32 << 20
 """Filtered signals held at a time."""
 
-Filter = Callable[[NDArray[np.float32]], Waveforms]
+SignalFilter = Callable[[NDArray[np.float32]], Waveforms]
 """Turns signals (points, t) into what is smeared over the voxels."""
 
 BRICK_Z, BRICK_Y, BRICK_X = 8, 8, 128
@@ -38,10 +40,11 @@ class Weighting:
     Parameters
     ----------
     falloff : float
-        1: each wall point is a source of a spherical wave, as in Liu et al. 2019; 0: all voxels alike.
+        1: each wall point is a source of a spherical wave, as in Liu et al. 2019; 0: all voxels
+        alike.
     obliquity : float
-        Power of the cosine of the angle at the wall point between the voxel and +z; 1 with falloff 1 makes it the far
-        field of the first Rayleigh-Sommerfeld integral; 0: all directions alike.
+        Power of the cosine of the angle at the wall point between the voxel and +z; 1 with falloff
+        1 makes it the far field of the first Rayleigh-Sommerfeld integral; 0: all directions alike.
     """
 
     falloff: float = 1.0
@@ -49,26 +52,31 @@ class Weighting:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.falloff) and np.isfinite(self.obliquity) and self.obliquity >= 0):
-            raise InputError(f"weights need finite powers, that of the obliquity not negative, got {self}")
+            raise InputError(
+                f"weights need finite powers, that of the obliquity not negative, got {self}"
+            )
 
 
 @dataclass(frozen=True)
 class Backprojection(PhasorMethod):
     """Point-wise back-projection with a virtual pulse: exact for every wall, laser and grid, slow.
 
-    ``I(r) = | sum_p s_p(|r_L - r| + |r - r_p|) / |r - r_p| |`` with s_p the signal of wall point r_p, filtered with
-    the pulse to its complex (analytic) form. It is read between finely spaced samples by complex linear interpolation,
-    so the carrier's phase never has to be computed per voxel and stays accurate in float32.
+    ``I(r) = | sum_p s_p(|r_L - r| + |r - r_p|) / |r - r_p| |`` with s_p the signal of wall point
+    r_p, filtered with the pulse to its complex (analytic) form. It is read between finely spaced
+    samples by complex linear interpolation, so the carrier's phase never has to be computed per
+    voxel and stays accurate in float32.
 
-    Costs one look-up per voxel and wall point; memory for the volume and for 32 MiB of signals. A capture of another
-    library's arrays is imaged in that library; see `nlos.portable`.
+    Costs one look-up per voxel and wall point; memory for the volume and for 32 MiB of signals. A
+    capture of another library's arrays is imaged in that library; see `nlos.portable`.
 
-    Liu et al., "Non-line-of-sight imaging using phasor-field virtual wave optics", Nature 572, 620-623 (2019).
+    Liu et al., "Non-line-of-sight imaging using phasor-field virtual wave optics", Nature 572,
+    620-623 (2019).
 
     Parameters
     ----------
     wavelength : float
-        Carrier wavelength of the virtual pulse, m of path. Lateral resolution is about wavelength * depth / wall size.
+        Carrier wavelength of the virtual pulse, m of path. Lateral resolution is about wavelength *
+        depth / wall size.
     cycles : float
         Length of the pulse in wavelengths; see `nlos.band.VirtualPulse`.
     weighting : Weighting
@@ -86,49 +94,65 @@ class Backprojection(PhasorMethod):
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why.
 
-        True in a condition if it can; ``.reason`` tells why not. Refused are a single wall point, a grid behind the
-        wall, a volume above 8 GiB, and time bins too coarse for the wavelength.
+        True in a condition if it can; ``.reason`` tells why not. Refused are a single wall point, a
+        grid behind the wall, a volume above 8 GiB, and time bins too coarse for the wavelength.
         """
         try:
             Band(self.pulse, capture.axis)
         except InputError as problem:
             return Support(str(problem))
-        return common_support(capture, grid)
+        return check_common_support(capture, grid)
 
     def lookups(self, capture: Capture, grid: Grid) -> int:
         """Number of look-ups that a reconstruction costs; what `progress` counts up to."""
         return len(capture.points) * grid.size
 
-    def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
-        """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in the signal."""
+    def phasor_field(
+        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
+    ) -> Volume:
+        """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in
+        the signal.
+        """
         self.supports(capture, grid).require()
         band = Band(self.pulse, capture.axis)
         warn_of_aliasing(capture, band)
-        settings = {"method": "backprojection", "wavelength_m": self.wavelength, "cycles": self.cycles}
+        settings = {
+            "method": "backprojection",
+            "wavelength_m": self.wavelength,
+            "cycles": self.cycles,
+        }
         history = {**capture.provenance, "imaging": settings}
         if not is_numpy(capture.signal):
-            from nlos.portable.backprojection import smeared_elsewhere
+            from nlos.portable.backprojection import backproject_on_device
 
-            return Volume(smeared_elsewhere(capture, grid, band, self.weighting, progress), grid, history)
+            return Volume(
+                backproject_on_device(capture, grid, band, self.weighting, progress), grid, history
+            )
 
-        def filtered(traces: NDArray[np.float32]) -> Waveforms:
-            return band.waveforms(band.phasors(traces))
+        def apply_filter(traces: NDArray[np.float32]) -> Waveforms:
+            return band.waveforms(band.compute_phasors(traces))
 
-        count = max(1, TABLE_BYTES // (band.samples * np.dtype(np.complex64).itemsize))
-        total = smeared(capture, grid, filtered, count, self.weighting, progress)
+        count = max(1, TABLE_BYTES // (band.sample_count * np.dtype(np.complex64).itemsize))
+        total = backproject_signals(capture, grid, apply_filter, count, self.weighting, progress)
         return Volume(total, grid, history)
 
 
-def smeared(
-    capture: Capture, grid: Grid, filtered: Filter, points_at_a_time: int, weighting: Weighting, progress: Progress
+def backproject_signals(
+    capture: Capture,
+    grid: Grid,
+    apply_filter: SignalFilter,
+    points_at_a_time: int,
+    weighting: Weighting,
+    progress: Progress,
 ) -> NDArray[np.complex64]:
-    """Smear every wall point's filtered signal over the voxels that it may come from, and add all up.
+    """Smear every wall point's filtered signal over the voxels that it may come from, and add all
+    up.
 
     Parameters
     ----------
     capture : Capture
     grid : Grid
-    filtered : callable
+    apply_filter : callable
         Filters the signals of some wall points.
     points_at_a_time : int
         How many are filtered at once; bounds the memory.
@@ -141,11 +165,13 @@ def smeared(
     (z, y, x) complex64 array
     """
     total = np.zeros(grid.shape, np.complex64)
-    for some in blocks(len(capture.points), points_at_a_time):
+    for some in split_blocks(len(capture.points), points_at_a_time):
         lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[some]
         wall = capture.points[some].astype(np.float32)
-        batch = _Batch(filtered(capture.traces(some)), wall, lasers.astype(np.float32), weighting)
-        _backproject(batch, grid, total, progress)
+        batch = _Batch(
+            apply_filter(capture.traces(some)), wall, lasers.astype(np.float32), weighting
+        )
+        _add_batch(batch, grid, total, progress)
     return total
 
 
@@ -158,27 +184,34 @@ class _Batch:
     lasers: NDArray[np.float32]
     weighting: Weighting
 
-    def add_to(self, field: NDArray[np.complex64], x: FloatArray, y: FloatArray, z: FloatArray) -> None:
+    def add_to(
+        self, field: NDArray[np.complex64], x: FloatArray, y: FloatArray, z: FloatArray
+    ) -> None:
         """Add what these wall points contribute to a brick of voxels."""
         values = self.waveforms.values.view(np.float32)
         start, spacing = np.float32(self.waveforms.start), np.float32(self.waveforms.spacing)
         axes = (axis.astype(np.float32) for axis in (x, y, z))
-        # A brick of its own, because a contiguous array lets one compiled version serve every piece of a volume.
+        # A brick of its own, because a contiguous array lets one compiled version serve every piece
+        # of a volume.
         brick = np.zeros(field.shape, np.complex64)
         powers = np.array([1 - self.weighting.falloff, self.weighting.obliquity], np.float32)
         add_backprojection(values, start, spacing, self.wall, self.lasers, *axes, powers, brick)
         field += brick
 
 
-def _backproject(batch: _Batch, grid: Grid, total: NDArray[np.complex64], progress: Progress) -> None:
+def _add_batch(batch: _Batch, grid: Grid, total: NDArray[np.complex64], progress: Progress) -> None:
     """Add a batch of wall points to the whole volume, brick by brick, on all threads."""
     bricks = list(
-        itertools.product(blocks(grid.z.size, BRICK_Z), blocks(grid.y.size, BRICK_Y), blocks(grid.x.size, BRICK_X))
+        itertools.product(
+            split_blocks(grid.z.size, BRICK_Z),
+            split_blocks(grid.y.size, BRICK_Y),
+            split_blocks(grid.x.size, BRICK_X),
+        )
     )
 
-    def work(turn: slice) -> None:
+    def process_block(turn: slice) -> None:
         for z, y, x in bricks[turn]:
             batch.add_to(total[z, y, x], grid.x[x], grid.y[y], grid.z[z])
             progress(len(batch.wall) * total[z, y, x].size)
 
-    run_blocks(work, len(bricks), size=1)
+    run_blocks(process_block, len(bricks), size=1)

@@ -1,6 +1,8 @@
-"""The virtual pulse of phasor-field imaging, and the few frequencies of a capture that it lets pass.
+"""The virtual pulse of phasor-field imaging, and the few frequencies of a capture that it lets
+pass.
 
-Liu et al., "Non-line-of-sight imaging using phasor-field virtual wave optics", Nature 572, 620-623 (2019).
+Liu et al., "Non-line-of-sight imaging using phasor-field virtual wave optics", Nature 572, 620-623
+(2019).
 """
 
 from __future__ import annotations
@@ -14,42 +16,46 @@ from numpy.typing import NDArray
 
 from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
-from tofclip.threads import blocks, one_blas_thread, run_blocks
+from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 
-ENVELOPE_HALF_WIDTHS = 3.0
+ENVELOPE_SIGMAS = 3.0
 """The pulse's cycles fill its Gaussian envelope from -3 to +3 standard deviations."""
 
-BAND_EDGE = 0.01
-"""Frequencies at which the pulse's spectrum is weaker than this, relative to its peak, are left out."""
+BAND_EDGE_LEVEL = 0.01
+"""Frequencies at which the pulse's spectrum is weaker than this, relative to its peak, are left
+out.
+"""
 
-TAIL_WIDTHS = 4.0
+TAIL_SIGMAS = 4.0
 """Room for the pulse before and after the record, in standard deviations of its envelope."""
 
 BLOCK_BINS = 64
 """Bins that are reduced to the few shapes of waves in the band before the Fourier transform."""
 
-POINTS_AT_A_TIME = 1024
+POINTS_PER_BLOCK = 1024
 """Wall points that a thread filters at once."""
 
 SAMPLES_PER_WAVELENGTH = 64
-"""Samples of a filtered signal per carrier wavelength: linear interpolation then errs by 1e-3 rms for 3 cycles."""
+"""Samples of a filtered signal per carrier wavelength: linear interpolation then errs by 1e-3 rms
+for 3 cycles.
+"""
 
 
 @dataclass(frozen=True)
 class VirtualPulse:
     """A carrier of a given wavelength under a Gaussian envelope.
 
-    The envelope over path length L is ``exp(-L^2 / (2 * sigma^2))`` with ``6 * sigma = cycles * wavelength``: 99.7 % of
-    it lie within the cycles.
+    The envelope over path length L is ``exp(-L^2 / (2 * sigma^2))`` with ``6 * sigma = cycles *
+    wavelength``: 99.7 % of it lie within the cycles.
 
     Parameters
     ----------
     wavelength : float
-        Carrier wavelength in path length, m. About twice the size of the finest detail that is resolved; at least
-        twice the spacing of the wall points.
+        Carrier wavelength in path length, m. About twice the size of the finest detail that is
+        resolved; at least twice the spacing of the wall points.
     cycles : float
-        Length of the pulse in wavelengths. With fewer than 3 the spectrum reaches down to frequency 0, where it has to
-        be cut, and the pulse rings.
+        Length of the pulse in wavelengths. With fewer than 3 the spectrum reaches down to frequency
+        0, where it has to be cut, and the pulse rings.
     """
 
     wavelength: float
@@ -59,7 +65,9 @@ class VirtualPulse:
         for name in ("wavelength", "cycles"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
-                raise InputError(f"{name} of the virtual pulse must be a positive number, got {value}")
+                raise InputError(
+                    f"{name} of the virtual pulse must be a positive number, got {value}"
+                )
 
     @property
     def wavenumber(self) -> float:
@@ -69,7 +77,7 @@ class VirtualPulse:
     @property
     def sigma(self) -> float:
         """Standard deviation of the envelope, m of path."""
-        return self.cycles * self.wavelength / (2 * ENVELOPE_HALF_WIDTHS)
+        return self.cycles * self.wavelength / (2 * ENVELOPE_SIGMAS)
 
     def spectrum(self, wavenumbers: Any) -> NDArray[np.float64]:
         """Strength of the pulse at wavenumbers in rad/m, 1 at the carrier."""
@@ -100,8 +108,8 @@ class Waveforms:
 class Band:
     """The frequencies at which a virtual pulse sees a capture.
 
-    They are harmonics of a period that holds the whole record and the pulse before and after it, so that no signal
-    wraps around.
+    They are harmonics of a period that holds the whole record and the pulse before and after it, so
+    that no signal wraps around.
 
     Parameters
     ----------
@@ -112,7 +120,8 @@ class Band:
     Raises
     ------
     InputError
-        The pulse is too short for the time bins: no frequency is left, or its carrier itself is lost.
+        The pulse is too short for the time bins: no frequency is left, or its carrier itself is
+        lost.
     """
 
     pulse: VirtualPulse
@@ -129,7 +138,7 @@ class Band:
     @cached_property
     def tail_bins(self) -> int:
         """Bins of silence before and after the record, which the pulse spreads into."""
-        return int(np.ceil(TAIL_WIDTHS * self.pulse.sigma / self.axis.spacing)) + 1
+        return int(np.ceil(TAIL_SIGMAS * self.pulse.sigma / self.axis.spacing)) + 1
 
     @cached_property
     def period_bins(self) -> int:
@@ -140,28 +149,33 @@ class Band:
 
     @cached_property
     def harmonics(self) -> NDArray[np.int64]:
-        """Indices of the band's frequencies in the transform, without 0 and without the Nyquist frequency."""
+        """Indices of the band's frequencies in the transform, without 0 and without the Nyquist
+        frequency.
+        """
         indices = np.arange(1, (self.period_bins + 1) // 2)
-        return indices[self.pulse.spectrum(indices * self._fundamental) >= BAND_EDGE]
+        return indices[
+            self.pulse.spectrum(indices * self._fundamental_wavenumber) >= BAND_EDGE_LEVEL
+        ]
 
     @property
-    def _fundamental(self) -> float:
+    def _fundamental_wavenumber(self) -> float:
         return 2 * np.pi / (self.period_bins * self.axis.spacing)
 
     @property
     def wavenumbers(self) -> NDArray[np.float64]:
         """The band's wavenumbers k, rad/m, evenly spaced, shape (frequencies,)."""
-        return self._fundamental * self.harmonics.astype(np.float64)
+        return self._fundamental_wavenumber * self.harmonics.astype(np.float64)
 
     @property
     def weights(self) -> NDArray[np.float64]:
         """The pulse's weights G_k, shape (frequencies,).
 
-        Scaled so that a signal ``cos(k * L)`` of the carrier gives phasors that add up to ``exp(1j * k * L)``.
+        Scaled so that a signal ``cos(k * L)`` of the carrier gives phasors that add up to ``exp(1j
+        * k * L)``.
         """
         return self.pulse.spectrum(self.wavenumbers) * (2 / self.period_bins)
 
-    def phasors(self, traces: NDArray[Any]) -> NDArray[Any]:
+    def compute_phasors(self, traces: NDArray[Any]) -> NDArray[Any]:
         """Return ``P_k = G_k * sum_i H_i * exp(-1j * k * L_i)`` of every signal.
 
         Parameters
@@ -174,29 +188,41 @@ class Band:
         """
         real, bins = traces.dtype.type, traces.shape[1]
         # A library's own threads would go on waiting, busily, where ours want to work.
-        with one_blas_thread():
-            shapes, coefficients = (part.astype(real) for part in self._analysis(bins, 8 * float(np.finfo(real).eps)))
+        with limit_blas_threads():
+            shapes, coefficients = (
+                part.astype(real)
+                for part in self._build_fourier_matrices(bins, 8 * float(np.finfo(real).eps))
+            )
             parts = np.empty((len(traces), coefficients.shape[1]), real)
 
-            def filtered(some: slice) -> None:
+            def filter_block(some: slice) -> None:
                 in_time = traces[some].T
                 short = np.empty((len(coefficients), in_time.shape[1]), real)
-                for block, own in zip(blocks(bins, BLOCK_BINS), np.split(short, -(-bins // BLOCK_BINS)), strict=True):
+                for block, own in zip(
+                    split_blocks(bins, BLOCK_BINS),
+                    np.split(short, -(-bins // BLOCK_BINS)),
+                    strict=True,
+                ):
                     np.matmul(shapes[: block.stop - block.start].T, in_time[block], out=own)
                 np.matmul(short.T, coefficients, out=parts[some])
 
-            run_blocks(filtered, len(traces), POINTS_AT_A_TIME)
+            run_blocks(filter_block, len(traces), POINTS_PER_BLOCK)
         return parts.view(np.result_type(real, np.complex64))
 
-    def _analysis(self, bins: int, precision: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _build_fourier_matrices(
+        self, bins: int, precision: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Matrices of two steps of a Fourier transform at the band's frequencies.
 
-        Within a block of bins a narrow band's waves are made up of few shapes (bins, n), whatever their phases; the
-        second matrix (blocks * n, 2 * frequencies) has what `phasors` are made of, real and imaginary parts in turns.
+        Within a block of bins a narrow band's waves are made up of few shapes (bins, n), whatever
+        their phases; the second matrix (blocks * n, 2 * frequencies) has what `compute_phasors` are
+        made of, real and imaginary parts in turns.
         """
         phases = np.outer(self.axis.spacing * np.arange(BLOCK_BINS), self.wavenumbers)
         waves = np.exp(-1j * phases)
-        shapes, strengths, _ = np.linalg.svd(np.concatenate([waves.real, waves.imag], axis=1), full_matrices=False)
+        shapes, strengths, _ = np.linalg.svd(
+            np.concatenate([waves.real, waves.imag], axis=1), full_matrices=False
+        )
         shapes = shapes[:, strengths > precision * strengths[0]]
         starts = self.axis.start + self.axis.spacing * np.arange(0, bins, BLOCK_BINS)
         turns = self.weights * np.exp(-1j * np.outer(starts, self.wavenumbers))
@@ -204,19 +230,24 @@ class Band:
         return shapes, coefficients.reshape(-1, self.wavenumbers.size).view(np.float64)
 
     def waveforms(self, phasors: NDArray[Any]) -> Waveforms:
-        """Return ``sum_k P_k * exp(1j * k * L)`` on an axis of path lengths L fine enough for linear interpolation."""
-        # So few frequencies are summed faster by one matrix product than by a Fourier transform padded with zeros.
+        """Return ``sum_k P_k * exp(1j * k * L)`` on an axis of path lengths L fine enough for
+        linear interpolation.
+        """
+        # So few frequencies are summed faster by one matrix product than by a Fourier transform
+        # padded with zeros.
         carriers, start, spacing = self.carriers
         return Waveforms(phasors @ carriers.astype(phasors.dtype), start, spacing)
 
     @property
-    def samples(self) -> int:
+    def sample_count(self) -> int:
         """Length of the waveforms."""
         return self._sample_paths.size
 
     @cached_property
     def _sample_spacing(self) -> float:
-        factor = max(1, int(np.ceil(SAMPLES_PER_WAVELENGTH * self.axis.spacing / self.pulse.wavelength)))
+        factor = max(
+            1, int(np.ceil(SAMPLES_PER_WAVELENGTH * self.axis.spacing / self.pulse.wavelength))
+        )
         return self.axis.spacing / factor
 
     @cached_property
@@ -228,10 +259,14 @@ class Band:
 
     @cached_property
     def carriers(self) -> tuple[NDArray[np.complex128], float, float]:
-        """``exp(1j * k * L)``, shape (frequencies, samples); path length of sample 0 and path between samples, m.
+        """``exp(1j * k * L)``, shape (frequencies, samples); path length of sample 0 and path
+        between samples, m.
 
-        They are 0 at the first and the last two samples: a path outside is clamped there, and reads silence.
+        They are 0 at the first and the last two samples: a path outside is clamped there, and reads
+        silence.
         """
-        carriers: NDArray[np.complex128] = np.exp(1j * np.outer(self.wavenumbers, self._sample_paths))
+        carriers: NDArray[np.complex128] = np.exp(
+            1j * np.outer(self.wavenumbers, self._sample_paths)
+        )
         carriers[:, [0, -2, -1]] = 0
         return carriers, float(self._sample_paths[0]), self._sample_spacing

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.time_axis import TimeAxis
-from tofclip.arrays import Array, Place, is_numpy, namespace, require_numpy, to_numpy
+from tofclip.arrays import Array, ComputeDevice, is_numpy, namespace, require_numpy, to_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
 
@@ -21,33 +21,36 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-BIN_WIDTHS = (1e-15, 1e-7)
+BIN_WIDTH_LIMITS_S = (1e-15, 1e-7)
 """Shortest and longest credible time bin, s: from 0.3 um to 30 m of path."""
 
-WIDEST_WALL = 1e3
+MAX_WALL_EXTENT_M = 1e3
 """m; a wider one was not measured in metres."""
 
 
-MEASURED_POINTS = 1000
+MAX_SPACING_POINTS = 1000
 """Wall points whose nearest neighbours tell the sampling of the wall."""
 
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """What a detector saw at points of a relay wall while the laser lit one spot, or a spot for each point.
+    """What a detector saw at points of a relay wall while the laser lit one spot, or a spot for
+    each point.
 
-    A confocal scan has ``laser`` equal to ``wall``; a paired scan has another spot for every point; a grid of lasers
-    that were all combined with all points becomes paired by `exhaustive`.
+    A confocal scan has ``laser`` equal to ``wall``; a paired scan has another spot for every point;
+    a grid of lasers that were all combined with all points becomes paired by `exhaustive`.
 
     Parameters
     ----------
     signal : (t, ...) array
-        Brightness per time bin and wall point, kept as float32. May be negative (background taken off). An array of
-        another library stays where it is, and is imaged there by the methods that can; the geometry is NumPy's.
+        Brightness per time bin and wall point, kept as float32. May be negative (background taken
+        off). An array of another library stays where it is, and is imaged there by the methods that
+        can; the geometry is NumPy's.
     wall : (..., 3) array
         Wall points, m. Points with a NaN coordinate are left out, whatever their signal holds.
     laser : (3,) or (..., 3) array
-        The laser spot on the wall, m; or one spot per wall point, equal to the wall for a confocal scan.
+        The laser spot on the wall, m; or one spot per wall point, equal to the wall for a confocal
+        scan.
     bin_width : float
         Duration of a time bin, s.
     start : float
@@ -58,8 +61,9 @@ class Capture:
     Raises
     ------
     ShapeError, InputError
-        Shapes disagree, a used signal is not finite, no wall point is left, the time axis is unusable, lengths or
-        durations are not in metres or seconds, or the laser spot lies far behind the wall.
+        Shapes disagree, a used signal is not finite, no wall point is left, the time axis is
+        unusable, lengths or durations are not in metres or seconds, or the laser spot lies far
+        behind the wall.
     """
 
     signal: Array
@@ -70,9 +74,9 @@ class Capture:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "signal", _signal(self.signal))
-        object.__setattr__(self, "wall", _real(self.wall, np.float64, "wall"))
-        object.__setattr__(self, "laser", _real(self.laser, np.float64, "laser"))
+        object.__setattr__(self, "signal", _to_float_signal(self.signal))
+        object.__setattr__(self, "wall", _to_real_array(self.wall, np.float64, "wall"))
+        object.__setattr__(self, "laser", _to_real_array(self.laser, np.float64, "laser"))
         object.__setattr__(self, "bin_width", float(self.bin_width))
         object.__setattr__(self, "start", float(self.start))
         self._validate()
@@ -91,20 +95,22 @@ class Capture:
         self._validate_units()
         if not np.any(self.valid):
             raise InputError("every wall point is NaN: nothing is left to image with")
-        bad = _not_finite(self.signal, self.valid)
+        bad = _count_non_finite(self.signal, self.valid)
         if bad:
             raise InputError(
                 f"{bad} samples of the signal are NaN or infinite; set them to 0, or their wall points to NaN"
             )
 
     def _validate_units(self) -> None:
-        if not BIN_WIDTHS[0] <= self.bin_width <= BIN_WIDTHS[1]:
-            raise InputError(f"a bin width of {self.bin_width:g} s is not credible; give seconds (16 ps are 16e-12)")
+        if not BIN_WIDTH_LIMITS_S[0] <= self.bin_width <= BIN_WIDTH_LIMITS_S[1]:
+            raise InputError(
+                f"a bin width of {self.bin_width:g} s is not credible; give seconds (16 ps are 16e-12)"
+            )
         if not np.any(self.valid):
             return
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         extent = float((high - low).max())
-        if extent > WIDEST_WALL:
+        if extent > MAX_WALL_EXTENT_M:
             raise InputError(f"a wall of {extent:g} m is not credible; give its points in metres")
         behind = float(low[2] - self.lasers[:, 2].min())
         if len(self.points) > 1 and behind > extent / 2:
@@ -135,7 +141,10 @@ class Capture:
         bin_width, start, provenance
             As of `Capture`.
         """
-        wall, laser = _real(wall, np.float64, "wall"), _real(laser, np.float64, "laser")
+        wall, laser = (
+            _to_real_array(wall, np.float64, "wall"),
+            _to_real_array(laser, np.float64, "laser"),
+        )
         shape = (*laser.shape[:-1], *wall.shape[:-1], 3)
         every_laser = laser.reshape(*laser.shape[:-1], *[1] * (wall.ndim - 1), laser.shape[-1])
         if wall.shape[-1:] != (3,) or laser.shape[-1:] != (3,):
@@ -144,13 +153,15 @@ class Capture:
         return cls(signal, *pairs, bin_width, start, provenance or {})
 
     @property
-    def place(self) -> Place:
+    def device(self) -> ComputeDevice:
         """Where the signal lives: library and device."""
-        return Place.of(self.signal)
+        return ComputeDevice.of(self.signal)
 
-    def on(self, place: Place) -> Capture:
-        """Return the capture with its signal brought to a place, such as ``tofclip.arrays.place_named("cuda")``."""
-        return replace(self, signal=place.put(self.signal))
+    def on(self, device: ComputeDevice) -> Capture:
+        """Return the capture with its signal brought to a place, such as
+        ``tofclip.arrays.parse_device("cuda")``.
+        """
+        return replace(self, signal=device.put(self.signal))
 
     @property
     def axis(self) -> TimeAxis:
@@ -160,7 +171,9 @@ class Capture:
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
         """Wall points whose position, and whose own laser spot, is known; shape (...)."""
-        return np.asarray(np.isfinite(self.wall).all(axis=-1) & np.isfinite(self.laser).all(axis=-1))
+        return np.asarray(
+            np.isfinite(self.wall).all(axis=-1) & np.isfinite(self.laser).all(axis=-1)
+        )
 
     @cached_property
     def points(self) -> FloatArray:
@@ -169,25 +182,33 @@ class Capture:
 
     @cached_property
     def lasers(self) -> FloatArray:
-        """Laser spots, m: shape (1, 3) if it stands still, else (points, 3) in the order of `points`."""
+        """Laser spots, m: shape (1, 3) if it stands still, else (points, 3) in the order of
+        `points`.
+        """
         return self.laser[np.newaxis] if self.laser.shape == (3,) else self.laser[self.valid]
 
     @cached_property
     def spacing(self) -> float:
-        """Typical distance of neighbouring wall points, m: the median to the nearest other; infinite for a lone one."""
+        """Typical distance of neighbouring wall points, m: the median to the nearest other;
+        infinite for a lone one.
+        """
         from scipy.spatial import cKDTree
 
         # An exhaustive capture names every wall point once per laser.
         places = np.unique(self.points, axis=0)
         if len(places) == 1:
             return float("inf")
-        return float(np.median(cKDTree(places).query(places[:: len(places) // MEASURED_POINTS + 1], 2)[0][:, 1]))
+        return float(
+            np.median(
+                cKDTree(places).query(places[:: len(places) // MAX_SPACING_POINTS + 1], 2)[0][:, 1]
+            )
+        )
 
     def traces(self, selection: slice = slice(None)) -> NDArray[np.float32]:
         """Signals of some valid wall points, in the order of `points`, shape (points, t).
 
-        All signals of a complete wall are not copied: then time is the slow axis in memory. Refuses signals of other
-        libraries.
+        All signals of a complete wall are not copied: then time is the slow axis in memory. Refuses
+        signals of other libraries.
         """
         require_numpy("this treatment of a capture's signal", self.signal)
         in_time: NDArray[np.float32] = self.signal.reshape(self.signal.shape[0], -1)
@@ -197,27 +218,33 @@ class Capture:
 
     @classmethod
     def from_frames(cls, frames: Frames) -> Capture:
-        """Take the wall's part out of recovered frames and remove each wall point's way to the camera.
+        """Take the wall's part out of recovered frames and remove each wall point's way to the
+        camera.
 
-        The frames must carry a record ``"relay_wall"``: fields ``wall`` (rows, columns, 3), ``camera`` (3,) and
-        ``laser`` (3,) in m; attributes ``row_offset`` and ``column_offset``, the pixel that saw the first wall point,
-        and ``receive_delay_bins``, the number of bins that the record began after light of path 0.
+        The frames must carry a record ``"relay_wall"``: fields ``wall`` (rows, columns, 3),
+        ``camera`` (3,) and ``laser`` (3,) in m; attributes ``row_offset`` and ``column_offset``,
+        the pixel that saw the first wall point, and ``receive_delay_bins``, the number of bins that
+        the record began after light of path 0.
 
         Coordinates stay as they are in the record.
 
         Raises
         ------
         InputError
-            The frames carry no relay wall, the wall does not fit into the picture, or the frames are not evenly
-            spaced in time.
+            The frames carry no relay wall, the wall does not fit into the picture, or the frames
+            are not evenly spaced in time.
         """
-        from nlos.unwarp import captured_wall
+        from nlos.unwarp import extract_wall_capture
 
-        return captured_wall(frames)
+        return extract_wall_capture(frames)
 
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
-        names = ("row", "column") if self.wall.ndim == 3 else tuple(f"wall_{i}" for i in range(self.wall.ndim - 1))
+        names = (
+            ("row", "column")
+            if self.wall.ndim == 3
+            else tuple(f"wall_{i}" for i in range(self.wall.ndim - 1))
+        )
         fields = {
             "signal": Field(to_numpy(self.signal), "count", ("time", *names)),
             "wall": Field(self.wall, "m", (*names, "xyz")),
@@ -249,25 +276,25 @@ class Capture:
         return cls.from_record(Record.load(path, "capture"))
 
 
-def _signal(values: Any) -> Array:
+def _to_float_signal(values: Any) -> Array:
     if is_numpy(values):
-        return _real(values, np.float32, "signal")
+        return _to_real_array(values, np.float32, "signal")
     xp = namespace(values)
     if not xp.isdtype(values.dtype, ("real floating", "integral", "bool")):
         raise InputError(f"signal must hold real numbers, got {values.dtype}")
     return xp.astype(values, xp.float32, copy=False)
 
 
-def _not_finite(signal: Array, valid: NDArray[np.bool_]) -> int:
+def _count_non_finite(signal: Array, valid: NDArray[np.bool_]) -> int:
     """Count the samples (t, ...) that are NaN or infinite at valid wall points."""
     if is_numpy(signal):
         return int(np.count_nonzero(~np.isfinite(signal[:, valid])))
     xp = namespace(signal)
-    bad = ~xp.isfinite(signal) & Place.of(signal).put(valid)
+    bad = ~xp.isfinite(signal) & ComputeDevice.of(signal).put(valid)
     return int(xp.sum(xp.astype(bad, xp.int64)))
 
 
-def _real(values: Any, dtype: type, name: str) -> NDArray[Any]:
+def _to_real_array(values: Any, dtype: type, name: str) -> NDArray[Any]:
     array = np.asarray(values)
     if array.dtype.kind not in "fiub":
         raise InputError(f"{name} must hold real numbers, got {array.dtype}")

@@ -1,4 +1,6 @@
-"""The definition of the phasor-field image, summed term by term in float64: slow, and what other methods answer to."""
+"""The definition of the phasor-field image, summed term by term in float64: slow, and what other
+methods answer to.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +10,16 @@ from numpy.typing import NDArray
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
 from nlos.geometry import Grid
-from nlos.method import common_support
+from nlos.method import check_common_support
 from nlos.volume import Volume
 
-TERMS_AT_A_TIME = 1 << 20
+TERMS_PER_BLOCK = 1 << 20
 """Distances held at a time, 8 MB of each kind, whatever the sizes of wall and volume."""
 
 
-def exact_phasor_field(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Volume:
-    """Sum ``P_k(r_p) * exp(1j * k * (|r_L - r| + |r - r_p|)) / |r - r_p|`` over the band and the wall.
+def compute_exact_phasor_field(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Volume:
+    """Sum ``P_k(r_p) * exp(1j * k * (|r_L - r| + |r - r_p|)) / |r - r_p|`` over the band and the
+    wall.
 
     Costs one complex exponential per voxel, wall point and frequency, plus one each.
 
@@ -37,12 +40,12 @@ def exact_phasor_field(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Vol
         An empty band, a single wall point, a grid behind the wall, or one that is too large.
     """
     band = Band(pulse, capture.axis)
-    common_support(capture, grid).require()
-    phasors = band.phasors(capture.traces().astype(np.float64))
+    check_common_support(capture, grid).require()
+    phasors = band.compute_phasors(capture.traces().astype(np.float64))
     z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
     voxels = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
     field = np.empty(len(voxels), np.complex128)
-    count = max(1, TERMS_AT_A_TIME // len(capture.points))
+    count = max(1, TERMS_PER_BLOCK // len(capture.points))
     for first in range(0, len(voxels), count):
         some = slice(first, first + count)
         field[some] = _sum_over_wall(capture, voxels[some], band.wavenumbers, phasors)
@@ -55,14 +58,16 @@ def _sum_over_wall(
     wavenumbers: NDArray[np.float64],
     phasors: NDArray[np.complex128],
 ) -> NDArray[np.complex128]:
-    last_leg = _distances(voxels, capture.points)
-    path = last_leg + _distances(voxels, capture.lasers)
+    last_leg = _compute_distances(voxels, capture.points)
+    path = last_leg + _compute_distances(voxels, capture.lasers)
     field = np.zeros(len(voxels), np.complex128)
     for k, at_k in zip(wavenumbers, phasors.T, strict=True):
         field += (np.exp(1j * k * path) / last_leg) @ at_k
     return field
 
 
-def _distances(voxels: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _compute_distances(
+    voxels: NDArray[np.float64], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
     distances: NDArray[np.float64] = np.linalg.norm(voxels[:, np.newaxis] - points, axis=-1)
     return distances

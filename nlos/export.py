@@ -1,4 +1,6 @@
-"""Volumes in the formats that other programs read: VTK images, points, meshes, EXR pictures and NumPy archives."""
+"""Volumes in the formats that other programs read: VTK images, points, meshes, EXR pictures and
+NumPy archives.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.plane import evenly_spaced, step
+from nlos.plane import axis_step, is_evenly_spaced
 from tofclip.arrays import to_numpy
 from tofclip.errors import InputError
 from tofclip.storage import atomic_path
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
     from nlos.geometry import FloatArray
     from nlos.volume import Volume
 
-FLAT_VOXEL = 1e-3
+FLAT_VOXEL_M = 1e-3
 """m; thickness told of a volume that is a single voxel deep."""
 
 
@@ -60,8 +62,9 @@ class Mesh:
             file.write(rows.tobytes())
 
 
-def surface_of(volume: Volume, fraction: float) -> Mesh:
-    """Draw the surface on which the magnitude is `fraction` (0..1) of the largest, by marching cubes.
+def extract_surface(volume: Volume, fraction: float) -> Mesh:
+    """Draw the surface on which the magnitude is `fraction` (0..1) of the largest, by marching
+    cubes.
 
     Raises
     ------
@@ -72,7 +75,9 @@ def surface_of(volume: Volume, fraction: float) -> Mesh:
 
     magnitude = volume.magnitude
     if not 0 < fraction < 1:
-        raise InputError(f"a surface lies at a fraction between 0 and 1 of the brightest, got {fraction}")
+        raise InputError(
+            f"a surface lies at a fraction between 0 and 1 of the brightest, got {fraction}"
+        )
     if min(magnitude.shape) < 2 or not magnitude.any():
         raise InputError("a surface needs at least 2 voxels along every axis, and light")
     grid = pyvista.RectilinearGrid(volume.grid.x, volume.grid.y, volume.grid.z)
@@ -82,15 +87,21 @@ def surface_of(volume: Volume, fraction: float) -> Mesh:
     return Mesh(np.asarray(found.points, np.float32), faces)
 
 
-def points_of(volume: Volume, fraction: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Positions (n, 3) in m, and magnitudes (n,), of the voxels with at least `fraction` (0..1) of the brightest."""
+def extract_points(
+    volume: Volume, fraction: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Positions (n, 3) in m, and magnitudes (n,), of the voxels with at least `fraction` (0..1) of
+    the brightest.
+    """
     z, y, x = np.nonzero(volume.threshold(fraction).magnitude)
-    xyz = np.stack([volume.grid.x[x], volume.grid.y[y], volume.grid.z[z]], axis=-1).astype(np.float32)
+    xyz = np.stack([volume.grid.x[x], volume.grid.y[y], volume.grid.z[z]], axis=-1).astype(
+        np.float32
+    )
     return xyz, volume.magnitude[z, y, x].astype(np.float32)
 
 
-def export(volume: Volume, path: str | Path, fraction: float) -> None:
-    """Do what `Volume.export` describes."""
+def export_volume(volume: Volume, path: str | Path, fraction: float) -> None:
+    """Do what `Volume.export_volume` describes."""
     suffix = Path(path).suffix.lower()
     if suffix in POINT_SUFFIXES:
         _write_points(volume, path, fraction)
@@ -104,17 +115,19 @@ def export(volume: Volume, path: str | Path, fraction: float) -> None:
 
 def _write_points(volume: Volume, path: str | Path, fraction: float) -> None:
     from tofclip.lidar.column import Column
-    from tofclip.lidar.export import write
+    from tofclip.lidar.export import write_table
 
-    xyz, brightness = points_of(volume, fraction)
+    xyz, brightness = extract_points(volume, fraction)
     columns = [Column(name, "m", np.ascontiguousarray(xyz[:, i])) for i, name in enumerate("xyz")]
-    write(path, [*columns, Column("brightness", "", brightness)])
+    write_table(path, [*columns, Column("brightness", "", brightness)])
 
 
 def _write_vti(volume: Volume, path: Path) -> None:
-    """Write XML image data (VTK file formats, "XML formats, ImageData"), with the numbers appended in binary."""
+    """Write XML image data (VTK file formats, "XML formats, ImageData"), with the numbers appended
+    in binary.
+    """
     origin = " ".join(f"{axis[0]:.9g}" for axis in (volume.grid.x, volume.grid.y, volume.grid.z))
-    spacing = " ".join(f"{_spacing(axis, name):.9g}" for axis, name in _axes(volume))
+    spacing = " ".join(f"{_find_spacing(axis, name):.9g}" for axis, name in _list_axes(volume))
     extent = " ".join(f"0 {n - 1}" for n in reversed(volume.grid.shape))
     head = (
         '<?xml version="1.0"?>\n'
@@ -154,17 +167,23 @@ def _write_exr(volume: Volume, path: Path) -> None:
     OpenEXR.File(header, channels).write(str(path))
 
 
-def _axes(volume: Volume) -> list[tuple[FloatArray, str]]:
+def _list_axes(volume: Volume) -> list[tuple[FloatArray, str]]:
     return [(volume.grid.x, "x"), (volume.grid.y, "y"), (volume.grid.z, "z")]
 
 
-def _spacing(axis: FloatArray, name: str) -> float:
+def _find_spacing(axis: FloatArray, name: str) -> float:
     if axis.size == 1:
-        return FLAT_VOXEL
-    if not evenly_spaced(axis):
-        raise InputError(f"a VTK image needs evenly spaced voxels along {name}; write .npz or .h5 instead")
-    return step(axis)
+        return FLAT_VOXEL_M
+    if not is_evenly_spaced(axis):
+        raise InputError(
+            f"a VTK image needs evenly spaced voxels along {name}; write .npz or .h5 instead"
+        )
+    return axis_step(axis)
 
 
-WRITERS: Mapping[str, Callable[[Volume, Path], None]] = {".vti": _write_vti, ".npz": _write_npz, ".exr": _write_exr}
+WRITERS: Mapping[str, Callable[[Volume, Path], None]] = {
+    ".vti": _write_vti,
+    ".npz": _write_npz,
+    ".exr": _write_exr,
+}
 POINT_SUFFIXES = (".ply", ".pcd", ".csv")

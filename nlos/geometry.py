@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-DEEPEST_WALL_WIDTHS = 2.0
+MAX_DEPTH_WALL_WIDTHS = 2.0
 """Deeper than this a wall is too narrow an aperture to resolve much."""
 
 
@@ -28,7 +28,8 @@ class Grid:
     Parameters
     ----------
     x, y, z : (n,) array
-        Coordinates in m, strictly increasing; x to the right, y down, z from the wall into the hidden scene.
+        Coordinates in m, strictly increasing; x to the right, y down, z from the wall into the
+        hidden scene.
 
     Raises
     ------
@@ -42,10 +43,16 @@ class Grid:
 
     def __post_init__(self) -> None:
         for name in ("x", "y", "z"):
-            object.__setattr__(self, name, _axis(getattr(self, name), name))
+            object.__setattr__(self, name, _validate_axis(getattr(self, name), name))
 
     @classmethod
-    def box(cls, x: Sequence[float], y: Sequence[float], z: Sequence[float], voxel: float | Sequence[float]) -> Grid:
+    def box(
+        cls,
+        x: Sequence[float],
+        y: Sequence[float],
+        z: Sequence[float],
+        voxel: float | Sequence[float],
+    ) -> Grid:
         """Fill a box with voxels.
 
         Parameters
@@ -53,17 +60,22 @@ class Grid:
         x, y, z : (float, float)
             First and last voxel centre along each axis, m.
         voxel : float or (float, float, float)
-            Distance of neighbouring centres, m, for all axes or for x, y and z. It is met exactly: where a side is no
-            multiple of it, the voxels are centred in the box and the outer ones lie inside.
+            Distance of neighbouring centres, m, for all axes or for x, y and z. It is met exactly:
+            where a side is no multiple of it, the voxels are centred in the box and the outer ones
+            lie inside.
         """
         sizes = np.broadcast_to(np.asarray(voxel, dtype=np.float64), (3,))
         if not np.all(np.isfinite(sizes) & (sizes > 0)):
             raise InputError(f"the voxel size must be a positive number of metres, got {voxel}")
         sides = {"x": x, "y": y, "z": z}
-        return cls(*(_filled(name, sides[name], size) for name, size in zip("xyz", sizes, strict=True)))
+        return cls(
+            *(_fill_axis(name, sides[name], size) for name, size in zip("xyz", sizes, strict=True))
+        )
 
     @classmethod
-    def in_front_of(cls, capture: Capture, voxel: float, near: float | None = None, far: float | None = None) -> Grid:
+    def in_front_of(
+        cls, capture: Capture, voxel: float, near: float | None = None, far: float | None = None
+    ) -> Grid:
         """Fill the space in front of a capture's wall, as wide and as high as the wall.
 
         Parameters
@@ -72,8 +84,9 @@ class Grid:
         voxel : float
             Distance of neighbouring voxel centres, m.
         near, far : float, optional
-            First and last z, m. They default to one voxel in front of the middle of the wall's relief, and to the
-            depth that light reaches and returns from within the record, at most two wall widths.
+            First and last z, m. They default to one voxel in front of the middle of the wall's
+            relief, and to the depth that light reaches and returns from within the record, at most
+            two wall widths.
         """
         low, high = capture.points.min(axis=0), capture.points.max(axis=0)
         width = float(max(high[0] - low[0], high[1] - low[1]))
@@ -81,7 +94,7 @@ class Grid:
         if near is None:
             near = middle + voxel
         if far is None:
-            far = middle + min(float(capture.axis.paths[-1]) / 2, DEEPEST_WALL_WIDTHS * width)
+            far = middle + min(float(capture.axis.paths[-1]) / 2, MAX_DEPTH_WALL_WIDTHS * width)
         if far < near:
             raise InputError(
                 f"no room for a hidden scene: z would run from {near:.3g} to {far:.3g} m; does the record "
@@ -91,7 +104,8 @@ class Grid:
 
     @classmethod
     def around(cls, volume: Volume, voxel: float, fraction: float = 0.15) -> Grid:
-        """Fill the smallest box that holds everything bright in a coarse volume, with one of its voxels to spare.
+        """Fill the smallest box that holds everything bright in a coarse volume, with one of its
+        voxels to spare.
 
         Imaging coarsely first and then here finely costs a small part of imaging everything finely.
 
@@ -106,9 +120,11 @@ class Grid:
         """
         indices = np.nonzero(volume.threshold(fraction).magnitude)
         if indices[0].size == 0:
-            raise InputError("the volume is dark everywhere: there is nothing to look at more closely")
+            raise InputError(
+                "the volume is dark everywhere: there is nothing to look at more closely"
+            )
         axes = (volume.grid.z, volume.grid.y, volume.grid.x)
-        z, y, x = (_widened(axis, bright) for axis, bright in zip(axes, indices, strict=True))
+        z, y, x = (_widen_range(axis, bright) for axis, bright in zip(axes, indices, strict=True))
         return cls.box(x, y, z, voxel)
 
     @property
@@ -121,13 +137,16 @@ class Grid:
         """Number of voxels."""
         return self.z.size * self.y.size * self.x.size
 
-    def nearest(self, point: Sequence[float]) -> tuple[int, int, int]:
+    def find_nearest(self, point: Sequence[float]) -> tuple[int, int, int]:
         """Index (z, y, x) of the voxel nearest to a point (x, y, z) in m."""
-        x, y, z = (int(np.argmin(np.abs(a - p))) for a, p in zip((self.x, self.y, self.z), point, strict=True))
+        x, y, z = (
+            int(np.argmin(np.abs(a - p)))
+            for a, p in zip((self.x, self.y, self.z), point, strict=True)
+        )
         return z, y, x
 
 
-def _axis(values: Any, name: str) -> FloatArray:
+def _validate_axis(values: Any, name: str) -> FloatArray:
     axis = np.array(values, dtype=np.float64)
     if axis.ndim != 1 or axis.size == 0:
         raise ShapeError(f"grid axis {name}", "(n,) with n >= 1", axis.shape)
@@ -137,15 +156,21 @@ def _axis(values: Any, name: str) -> FloatArray:
     return axis
 
 
-def _widened(axis: FloatArray, indices: NDArray[np.intp]) -> tuple[float, float]:
-    """Range of the axis that holds the indexed entries and, where there is one, the next on either side."""
-    return float(axis[max(indices.min() - 1, 0)]), float(axis[min(indices.max() + 1, axis.size - 1)])
+def _widen_range(axis: FloatArray, indices: NDArray[np.intp]) -> tuple[float, float]:
+    """Range of the axis that holds the indexed entries and, where there is one, the next on either
+    side.
+    """
+    return float(axis[max(indices.min() - 1, 0)]), float(
+        axis[min(indices.max() + 1, axis.size - 1)]
+    )
 
 
-def _filled(name: str, side: Sequence[float], voxel: float) -> FloatArray:
+def _fill_axis(name: str, side: Sequence[float], voxel: float) -> FloatArray:
     first, last = (float(end) for end in side)
     if not (np.isfinite(first) and np.isfinite(last) and first <= last):
-        raise InputError(f"side {name} of the box must run from a smaller to a larger number, got {first}, {last}")
+        raise InputError(
+            f"side {name} of the box must run from a smaller to a larger number, got {first}, {last}"
+        )
     # A side that is a whole number of voxels up to rounding keeps its outer voxel.
     steps = int(np.floor((last - first) / voxel + 1e-6))
     return (first + last) / 2 + voxel * (np.arange(steps + 1, dtype=np.float64) - steps / 2)

@@ -8,46 +8,64 @@ import numpy as np
 
 from nlos.band import VirtualPulse
 from nlos.capture import Capture
-from nlos.exposure import Exposure, exposure_support, exposures, unfolded_band
 from nlos.geometry import Grid
-from nlos.method import PhasorMethod, Portion, Progress, Support, common_support, numpy_support, silent
+from nlos.illumination_groups import (
+    IlluminationGroup,
+    check_illumination_support,
+    choose_unaliased_band,
+    group_by_illumination,
+)
+from nlos.method import (
+    PhasorMethod,
+    Progress,
+    SubProgress,
+    Support,
+    check_common_support,
+    check_numpy_support,
+    ignore_progress,
+)
 from nlos.plane import Plane
-from nlos.propagation.plane_field import virtual_plane
-from nlos.propagation.propagate import Propagation, carried, require_propagation
-from nlos.rsd.diffraction import Diffraction
-from nlos.rsd.meeting import diffract
-from nlos.rsd.planar import grid_support, require_tolerance, source_of, waves_of
+from nlos.propagation.plane_field import choose_virtual_plane
+from nlos.propagation.propagate import Propagation, propagate_group, require_propagation
+from nlos.rsd.diffraction import DiffractionPlan
+from nlos.rsd.image_planes import diffract_to_grid
+from nlos.rsd.planar import build_source, build_waves, check_grid_support, require_tolerance
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
 from tofclip.arrays import is_numpy
 from tofclip.errors import InputError
 
-ZONES, STRICT_ZONES = 2.0, 4.0
-"""Room on the virtual plane beside the straight ways, in Fresnel zones; the second below `STRICT`."""
+FRESNEL_ZONES, STRICT_FRESNEL_ZONES = 2.0, 4.0
+"""Room on the virtual plane beside the straight ways, in Fresnel zones; the second below
+`STRICT_TOLERANCE`.
+"""
 
-PASSAGE_SHARE = 0.6
+WALL_TO_PLANE_ERROR_FRACTION = 0.6
 """Of the error allowed, what the way from the wall to the plane may take."""
 
-PASSAGE_PROGRESS = {"spectral": 0.4, "time": 0.95}
+WALL_TO_PLANE_TIME_FRACTIONS = {"spectral": 0.4, "time": 0.95}
 """Of all time, what the way from the wall to the plane takes, roughly."""
 
-STRICT = 3e-3
+STRICT_TOLERANCE = 3e-3
 """Tolerance."""
 
 
 @dataclass(frozen=True)
 class Hybrid(PhasorMethod):
-    """The hybrid frequency-time solver: curved, disconnected and scattered walls at nearly the speed of planar ones.
+    """The hybrid frequency-time solver: curved, disconnected and scattered walls at nearly the
+    speed of planar ones.
 
-    What the wall recorded is carried onto a virtual plane, on which it is the field of the same outgoing waves; from
-    there Rayleigh-Sommerfeld diffraction carries it to all depths, as `PlanarRSD` does. The image is that of
-    `Backprojection`. Several laser spots add up; confocal scans run at doubled wavenumbers.
+    What the wall recorded is carried onto a virtual plane, on which it is the field of the same
+    outgoing waves; from there Rayleigh-Sommerfeld diffraction carries it to all depths, as
+    `PlanarRSD` does. The image is that of `Backprojection`. Several laser spots add up; confocal
+    scans run at doubled wavenumbers.
 
-    Voxels between wall and virtual plane are reached backwards, without the waves that left the plane's rim. A capture
-    of another library's arrays is imaged in that library; see `nlos.portable`.
+    Voxels between wall and virtual plane are reached backwards, without the waves that left the
+    plane's rim. A capture of another library's arrays is imaged in that library; see
+    `nlos.portable`.
 
-    Supplementary Note 12 of X. Feng, Y. Ma, L. Gao, "Compact light field photography towards versatile
-    three-dimensional vision", Nat. Commun. 13, 3333 (2022).
+    Supplementary Note 12 of X. Feng, Y. Ma, L. Gao, "Compact light field photography towards
+    versatile three-dimensional vision", Nat. Commun. 13, 3333 (2022).
 
     Parameters
     ----------
@@ -56,11 +74,13 @@ class Hybrid(PhasorMethod):
     cycles : float
         Length of the pulse in wavelengths; see `nlos.band.VirtualPulse`.
     propagation : {"spectral", "time"}
-        From wall to plane; see `nlos.propagate`. "time" is the paper's, slow and as coarse as the time bins.
+        From wall to plane; see `nlos.propagate`. "time" is the paper's, slow and as coarse as the
+        time bins.
     tolerance : float
         Relative error of the image that is allowed for the sake of speed, 1e-4 to 0.1.
     plane_z : float, optional
-        Where the virtual plane stands, m. Defaults to 5 to 10 cm in front of the foremost wall point.
+        Where the virtual plane stands, m. Defaults to 5 to 10 cm in front of the foremost wall
+        point.
     """
 
     wavelength: float
@@ -78,27 +98,37 @@ class Hybrid(PhasorMethod):
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why.
 
-        True in a condition if it can; ``.reason`` tells why not. Needed are voxels evenly spaced along x and y, few
-        laser spots, a virtual plane in front of the wall, and memory.
+        True in a condition if it can; ``.reason`` tells why not. Needed are voxels evenly spaced
+        along x and y, few laser spots, a virtual plane in front of the wall, and memory.
         """
-        general = common_support(capture, grid) and grid_support(grid) and exposure_support(capture)
+        general = (
+            check_common_support(capture, grid)
+            and check_grid_support(grid)
+            and check_illumination_support(capture)
+        )
         if self.propagation == "time":
-            general = general and numpy_support("propagation in time", capture)
+            general = general and check_numpy_support("propagation in time", capture)
         if not general:
             return general
         foremost = float(capture.points[:, 2].max())
         if self.plane_z is not None and self.plane_z <= foremost:
-            return Support(f"the virtual plane must lie in front of the wall, which reaches up to z = {foremost:.4g} m")
+            return Support(
+                f"the virtual plane must lie in front of the wall, which reaches up to z = {foremost:.4g} m"
+            )
         try:
-            ways = [way for _, way in self.ways(capture, grid)]
+            plans = [plan for _, plan in self.plans(capture, grid)]
         except InputError as problem:
             return Support(str(problem))
-        return ways[0].supports()
+        return plans[0].supports()
 
-    def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
-        """Return the complex sum whose magnitude `reconstruct` gives, complex64; linear within the tolerance."""
+    def phasor_field(
+        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
+    ) -> Volume:
+        """Return the complex sum whose magnitude `reconstruct` gives, complex64; linear within the
+        tolerance.
+        """
         self.supports(capture, grid).require()
-        band = unfolded_band(capture, grid, self.pulse)
+        band = choose_unaliased_band(capture, grid, self.pulse)
         warn_of_aliasing(capture, band)
         if not is_numpy(capture.signal):
             from nlos.portable.prepared import PreparedField
@@ -107,14 +137,28 @@ class Hybrid(PhasorMethod):
             total = prepared.of(capture, progress)
             return Volume(total, grid, {**capture.provenance, "imaging": prepared.settings})
         total = np.zeros(grid.shape, np.complex64)
-        passage = int(PASSAGE_PROGRESS[self.propagation] * grid.size)
-        for part, way in self.ways(capture, grid):
-            onto = Portion(progress, int(np.prod(way.plane.shape)) * way.waves.count, passage)
-            onwards = Portion(progress, grid.size, grid.size - passage)
-            tolerance = PASSAGE_SHARE * self.tolerance
-            on_plane = carried(capture, part, way.plane, band, self.propagation, tolerance, onto).values
-            diffract(way, on_plane * np.float32(np.prod(way.plane.steps)), source_of(part, band), total, onwards)
-        return Volume(total, grid, {**capture.provenance, "imaging": {**self.settings, "plane_z_m": way.plane.z}})
+        wall_to_plane_work = int(WALL_TO_PLANE_TIME_FRACTIONS[self.propagation] * grid.size)
+        for group, plan in self.plans(capture, grid):
+            wall_progress = SubProgress(
+                progress, int(np.prod(plan.plane.shape)) * plan.waves.count, wall_to_plane_work
+            )
+            depth_progress = SubProgress(progress, grid.size, grid.size - wall_to_plane_work)
+            tolerance = WALL_TO_PLANE_ERROR_FRACTION * self.tolerance
+            on_plane = propagate_group(
+                capture, group, plan.plane, band, self.propagation, tolerance, wall_progress
+            ).values
+            diffract_to_grid(
+                plan,
+                on_plane * np.float32(np.prod(plan.plane.steps)),
+                build_source(group, band),
+                total,
+                depth_progress,
+            )
+        return Volume(
+            total,
+            grid,
+            {**capture.provenance, "imaging": {**self.settings, "plane_z_m": plan.plane.z}},
+        )
 
     @property
     def settings(self) -> dict[str, str | float]:
@@ -129,16 +173,18 @@ class Hybrid(PhasorMethod):
 
     def virtual_plane(self, capture: Capture, grid: Grid) -> Plane:
         """Return the virtual plane of a capture's first laser spot."""
-        return self.ways(capture, grid)[0][1].plane
+        return self.plans(capture, grid)[0][1].plane
 
-    def ways(self, capture: Capture, grid: Grid) -> list[tuple[Exposure, Diffraction]]:
+    def plans(
+        self, capture: Capture, grid: Grid
+    ) -> list[tuple[IlluminationGroup, DiffractionPlan]]:
         """Return every exposure, and its way from a virtual plane of its own to the grid."""
-        band = unfolded_band(capture, grid, self.pulse)
-        zones = STRICT_ZONES if self.tolerance < STRICT else ZONES
-        ways = []
-        for part in exposures(capture):
-            waves = waves_of(part, band, continued=True)
-            points = capture.points[part.members]
-            plane = virtual_plane(points, grid, waves, zones, self.plane_z)
-            ways.append((part, Diffraction(plane, grid, waves, self.tolerance)))
-        return ways
+        band = choose_unaliased_band(capture, grid, self.pulse)
+        zones = STRICT_FRESNEL_ZONES if self.tolerance < STRICT_TOLERANCE else FRESNEL_ZONES
+        plans = []
+        for group in group_by_illumination(capture):
+            waves = build_waves(group, band, continued=True)
+            points = capture.points[group.indices]
+            plane = choose_virtual_plane(points, grid, waves, zones, self.plane_z)
+            plans.append((group, DiffractionPlan(plane, grid, waves, self.tolerance)))
+        return plans

@@ -7,57 +7,81 @@ import math
 import numpy as np
 from numba import njit
 
-# Only the fusing of multiply and add is let loose: exact zeros at the ends of the waveforms have to stay exact.
+# Only the fusing of multiply and add is let loose: exact zeros at the ends of the waveforms have to
+# stay exact.
 compiled = njit(nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
 inlined = njit(inline="always")
 
-NEAREST = 1e-3
+MIN_DISTANCE_M = 1e-3
 """Distance in m below which the weight 1 / distance stops growing, for voxels that touch the wall."""
 
-COSINE = (1.0, -19.739208, 64.939392, -85.456657, 60.242130, -26.404669, 7.8001313, -1.4531124)
-SINE = (6.2831855, -41.341702, 81.605133, -76.703018, 42.025928, -14.899847, 3.2381375)
-"""Polynomials in the square of an angle in turns, fitted to cos(2 pi t) and sin(2 pi t) / t up to half a turn."""
+COSINE_COEFFICIENTS = (
+    1.0,
+    -19.739208,
+    64.939392,
+    -85.456657,
+    60.242130,
+    -26.404669,
+    7.8001313,
+    -1.4531124,
+)
+SINE_COEFFICIENTS = (6.2831855, -41.341702, 81.605133, -76.703018, 42.025928, -14.899847, 3.2381375)
+"""Polynomials in the square of an angle in turns, fitted to cos(2 pi t) and sin(2 pi t) / t up to
+half a turn.
+"""
 
 
 @inlined
-def cosine(turns):
+def cosine_of_turns(turns):
     """Cosine of an angle of -0.5 to 0.5 turns, to 1e-6."""
     u = turns * turns
-    high = np.float32(COSINE[4]) + u * (np.float32(COSINE[5]) + u * (np.float32(COSINE[6]) + u * np.float32(COSINE[7])))
-    low = np.float32(COSINE[2]) + u * (np.float32(COSINE[3]) + u * high)
-    return np.float32(COSINE[0]) + u * (np.float32(COSINE[1]) + u * low)
+    high = np.float32(COSINE_COEFFICIENTS[4]) + u * (
+        np.float32(COSINE_COEFFICIENTS[5])
+        + u * (np.float32(COSINE_COEFFICIENTS[6]) + u * np.float32(COSINE_COEFFICIENTS[7]))
+    )
+    low = np.float32(COSINE_COEFFICIENTS[2]) + u * (np.float32(COSINE_COEFFICIENTS[3]) + u * high)
+    return np.float32(COSINE_COEFFICIENTS[0]) + u * (np.float32(COSINE_COEFFICIENTS[1]) + u * low)
 
 
 @inlined
-def sine(turns):
+def sine_of_turns(turns):
     """Sine of an angle of -0.5 to 0.5 turns, to 1e-6."""
     u = turns * turns
-    high = np.float32(SINE[4]) + u * (np.float32(SINE[5]) + u * np.float32(SINE[6]))
-    low = np.float32(SINE[2]) + u * (np.float32(SINE[3]) + u * high)
-    return turns * (np.float32(SINE[0]) + u * (np.float32(SINE[1]) + u * low))
+    high = np.float32(SINE_COEFFICIENTS[4]) + u * (
+        np.float32(SINE_COEFFICIENTS[5]) + u * np.float32(SINE_COEFFICIENTS[6])
+    )
+    low = np.float32(SINE_COEFFICIENTS[2]) + u * (np.float32(SINE_COEFFICIENTS[3]) + u * high)
+    return turns * (
+        np.float32(SINE_COEFFICIENTS[0]) + u * (np.float32(SINE_COEFFICIENTS[1]) + u * low)
+    )
 
 
 @compiled
-def delayed_reading(signal, late_bins):
-    """Read column p of `signal` (t, points) `late_bins[p]` bins later, linearly interpolated, 0 outside the record."""
+def shift_signals(signal, delay_bins):
+    """Read column p of `signal` (t, points) `late_bins[p]` bins later, linearly interpolated, 0
+    outside the record.
+    """
     bins, points = signal.shape
     result = np.zeros_like(signal)
     for i in range(bins):
         for p in range(points):
-            position = i + late_bins[p]
+            position = i + delay_bins[p]
             if 0 <= position <= bins - 1:
                 before = min(int(position), bins - 2)
-                share = np.float32(position - before)
-                result[i, p] = signal[before, p] + share * (signal[before + 1, p] - signal[before, p])
+                weight = np.float32(position - before)
+                result[i, p] = signal[before, p] + weight * (
+                    signal[before + 1, p] - signal[before, p]
+                )
     return result
 
 
 @compiled
 def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, powers, field):
-    """Add every wall point's waveform, read at each voxel's path and divided by the last leg, to `field`.
+    """Add every wall point's waveform, read at each voxel's path and divided by the last leg, to
+    `field`.
 
-    Meant for a brick of voxels so small that their paths to a wall point span a short piece of its waveform, which
-    then stays in the first cache level while the voxels' sums stay in the second.
+    Meant for a brick of voxels so small that their paths to a wall point span a short piece of its
+    waveform, which then stays in the first cache level while the voxels' sums stay in the second.
 
     Parameters
     ----------
@@ -78,46 +102,66 @@ def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, powers,
     # Of every voxel: real and imaginary part of the sample before its path, then of the one after.
     sums = np.zeros((z.size, y.size, 4 * x.size), np.float32)
     outward = np.empty((z.size, y.size, x.size), np.float32)
-    sample, before, after = np.empty(x.size, np.int32), np.empty(x.size, np.float32), np.empty(x.size, np.float32)
+    sample, before, after = (
+        np.empty(x.size, np.int32),
+        np.empty(x.size, np.float32),
+        np.empty(x.size, np.float32),
+    )
     weighted = powers[0] != 0 or powers[1] != 0
     for p in range(wall.shape[0]):
-        if p == 0 or (p < lasers.shape[0] and _differ(lasers[p], lasers[p - 1])):
-            _outward_samples(lasers[p], start, per_metre, x, y, z, outward)
+        if p == 0 or (p < lasers.shape[0] and _points_differ(lasers[p], lasers[p - 1])):
+            _compute_outward_samples(lasers[p], start, per_metre, x, y, z, outward)
         for iz in range(z.size):
             for iy in range(y.size):
                 across = (y[iy] - wall[p, 1]) ** 2 + (z[iz] - wall[p, 2]) ** 2
                 last = np.float32(waveforms.shape[1] // 2 - 2)
-                _find_samples(x, wall[p, 0], across, outward[iz, iy], per_metre, last, sample, before, after)
+                _find_samples(
+                    x, wall[p, 0], across, outward[iz, iy], per_metre, last, sample, before, after
+                )
                 if weighted:
-                    _weigh(x, wall[p, 0], across, max(z[iz] - wall[p, 2], np.float32(0)), powers, before, after)
+                    _apply_weights(
+                        x,
+                        wall[p, 0],
+                        across,
+                        max(z[iz] - wall[p, 2], np.float32(0)),
+                        powers,
+                        before,
+                        after,
+                    )
                 _add_samples(waveforms[p], sample, before, after, sums[iz, iy])
     for iz in range(z.size):
         for iy in range(y.size):
             row = sums[iz, iy].reshape(-1, 2, 2)
             for ix in range(x.size):
-                field[iz, iy, ix] += complex(row[ix, 0, 0] + row[ix, 1, 0], row[ix, 0, 1] + row[ix, 1, 1])
+                field[iz, iy, ix] += complex(
+                    row[ix, 0, 0] + row[ix, 1, 0], row[ix, 0, 1] + row[ix, 1, 1]
+                )
 
 
 @compiled
-def _differ(one, other):
+def _points_differ(one, other):
     """Whether two points do; in an exhaustive capture many in a row are the same."""
     return one[0] != other[0] or one[1] != other[1] or one[2] != other[2]
 
 
 @compiled
-def _outward_samples(laser, start, per_metre, x, y, z, outward):
+def _compute_outward_samples(laser, start, per_metre, x, y, z, outward):
     """Distance from the laser spot to every voxel, less `start`, in samples."""
     for iz in range(z.size):
         for iy in range(y.size):
             across = (y[iy] - laser[1]) ** 2 + (z[iz] - laser[2]) ** 2
             for ix in range(x.size):
-                outward[iz, iy, ix] = (math.sqrt((x[ix] - laser[0]) ** 2 + across) - start) * per_metre
+                outward[iz, iy, ix] = (
+                    math.sqrt((x[ix] - laser[0]) ** 2 + across) - start
+                ) * per_metre
 
 
 @compiled
 def _find_samples(x, wall_x, across, outward, per_metre, last, sample, before, after):
-    """Where a row of voxels reads a waveform: index of the sample before, and the weights of it and of the next."""
-    across = max(across, np.float32(NEAREST * NEAREST))
+    """Where a row of voxels reads a waveform: index of the sample before, and the weights of it and
+    of the next.
+    """
+    across = max(across, np.float32(MIN_DISTANCE_M * MIN_DISTANCE_M))
     for ix in range(x.size):
         distance = math.sqrt((x[ix] - wall_x) ** 2 + across)
         position = min(max(outward[ix] + distance * per_metre, np.float32(0)), last)
@@ -129,7 +173,7 @@ def _find_samples(x, wall_x, across, outward, per_metre, last, sample, before, a
 
 
 @compiled
-def _power(base, exponent):
+def _raise_to_power(base, exponent):
     """Power of a number, quick for the exponents that occur most."""
     if exponent == 0:
         return np.float32(1)
@@ -139,19 +183,23 @@ def _power(base, exponent):
 
 
 @compiled
-def _weigh(x, wall_x, across, ahead, powers, before, after):
-    """Multiply the weights of a row of voxels by powers of their distance and of the cosine of their direction."""
-    across = max(across, np.float32(NEAREST * NEAREST))
+def _apply_weights(x, wall_x, across, ahead, powers, before, after):
+    """Multiply the weights of a row of voxels by powers of their distance and of the cosine of
+    their direction.
+    """
+    across = max(across, np.float32(MIN_DISTANCE_M * MIN_DISTANCE_M))
     for ix in range(x.size):
         distance = math.sqrt((x[ix] - wall_x) ** 2 + across)
-        factor = _power(distance, powers[0]) * _power(ahead / distance, powers[1])
+        factor = _raise_to_power(distance, powers[0]) * _raise_to_power(ahead / distance, powers[1])
         before[ix] *= factor
         after[ix] *= factor
 
 
 @compiled
 def _add_samples(waveform, sample, before, after, sums):
-    """Add two neighbouring complex samples per voxel: four adjacent numbers, one vector load, one multiply-add."""
+    """Add two neighbouring complex samples per voxel: four adjacent numbers, one vector load, one
+    multiply-add.
+    """
     for ix in range(sample.size):
         first, place = np.uint32(sample[ix]), 4 * ix
         sums[place] += before[ix] * waveform[first]
@@ -161,8 +209,9 @@ def _add_samples(waveform, sample, before, after, sums):
 
 
 @compiled
-def illuminate(terms, odd, x, y, depth, laser, wavenumber, table, span, carrier, field):
-    """Add ``sum_m terms[m] * f_m(R) * exp(1j * wavenumber * R)``, R the distance from the laser spot, to a plane.
+def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, span, carrier, field):
+    """Add ``sum_m terms[m] * f_m(R) * exp(1j * wavenumber * R)``, R the distance from the laser
+    spot, to a plane.
 
     Parameters
     ----------
@@ -183,7 +232,11 @@ def illuminate(terms, odd, x, y, depth, laser, wavenumber, table, span, carrier,
     field : (y, x) complex64 array
         Added to.
     """
-    before, share, sums = np.empty(x.size, np.uint32), np.empty(x.size, np.float32), np.empty((2, x.size), np.float32)
+    before, weight, sums = (
+        np.empty(x.size, np.uint32),
+        np.empty(x.size, np.float32),
+        np.empty((2, x.size), np.float32),
+    )
     waves = np.empty((2, x.size), np.float32)
     per_metre = (table.shape[1] - 1) / max(span[1] - span[0], 1e-12)
     for iy in range(y.size):
@@ -192,25 +245,28 @@ def illuminate(terms, odd, x, y, depth, laser, wavenumber, table, span, carrier,
             distance = math.sqrt((x[ix] - laser[0]) ** 2 + across)
             place = max((distance - span[0]) * per_metre, 0.0)
             sample = min(int(place), table.shape[1] - 2)
-            before[ix], share[ix] = sample, place - sample
+            before[ix], weight[ix] = sample, place - sample
             turns = distance * (wavenumber / (2 * math.pi))
             turns -= math.floor(turns + 0.5)
-            waves[0, ix], waves[1, ix] = cosine(np.float32(turns)), sine(np.float32(turns))
+            waves[0, ix], waves[1, ix] = (
+                cosine_of_turns(np.float32(turns)),
+                sine_of_turns(np.float32(turns)),
+            )
         sums[:] = 0
         for m in range(terms.shape[0]):
-            _add_term(terms[m, iy], table[m], before, share, m >= odd, sums)
+            _add_term(terms[m, iy], table[m], before, weight, m >= odd, sums)
         for ix in range(x.size):
             wave = complex(waves[0, ix], waves[1, ix]) * carrier[ix]
             field[iy, ix] += complex(sums[0, ix], sums[1, ix]) * wave
 
 
 @compiled
-def _add_term(term, samples, before, share, odd, sums):
+def _add_term(term, samples, before, weight, odd, sums):
     """Add a row of one term times its function, and 1j if `odd`."""
     real, imaginary = sums[0], sums[1]
     for ix in range(before.size):
         value = samples[before[ix]]
-        value += share[ix] * (samples[before[ix] + np.uint32(1)] - value)
+        value += weight[ix] * (samples[before[ix] + np.uint32(1)] - value)
         if odd:
             real[ix] -= value * term[ix].imag
             imaginary[ix] += value * term[ix].real

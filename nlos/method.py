@@ -11,11 +11,13 @@ from typing import Protocol
 from nlos.capture import Capture
 from nlos.geometry import Grid
 from nlos.volume import Volume
-from tofclip.arrays import Place, is_numpy
+from tofclip.arrays import ComputeDevice, is_numpy
 from tofclip.errors import InputError
 
 Progress = Callable[[int], None]
-"""Called with the number of look-ups or voxels just done, from several threads; may raise to interrupt."""
+"""Called with the number of look-ups or voxels just done, from several threads; may raise to
+interrupt.
+"""
 
 MEMORY_LIMIT_BYTES = 8 << 30
 """Larger volumes are refused before anything is allocated."""
@@ -24,12 +26,13 @@ VOXEL_BYTES = 12
 """A complex64 sum and its float32 magnitude."""
 
 
-def silent(_: int) -> None:
+def ignore_progress(_: int) -> None:
     """Report nothing."""
 
 
-class Portion:
-    """Progress of one step of several, reported as a portion of all work; may be called from several threads.
+class SubProgress:
+    """Progress of one step of several, reported as a portion of all work; may be called from
+    several threads.
 
     Parameters
     ----------
@@ -49,8 +52,8 @@ class Portion:
         with self._lock:
             before = self._done * self._portion // self._work
             self._done += done
-            share = self._done * self._portion // self._work - before
-        self._progress(share)
+            increment = self._done * self._portion // self._work - before
+        self._progress(increment)
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,9 @@ class Reconstructor(Protocol):
         """Say whether the method can image `capture` on `grid`, and if not, why."""
         ...
 
-    def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
+    def reconstruct(
+        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
+    ) -> Volume:
         """Image the hidden scene."""
         ...
 
@@ -90,10 +95,14 @@ class PhasorMethod(ABC):
     """A method whose image is the magnitude of a complex field."""
 
     @abstractmethod
-    def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
+    def phasor_field(
+        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
+    ) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64."""
 
-    def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
+    def reconstruct(
+        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
+    ) -> Volume:
         """Image the hidden scene.
 
         Parameters
@@ -101,7 +110,8 @@ class PhasorMethod(ABC):
         capture : Capture
         grid : Grid
         progress : callable, optional
-            Called with the number of look-ups just done, or of voxels, once for every laser spot; see the method.
+            Called with the number of look-ups just done, or of voxels, once for every laser spot;
+            see the method.
 
         Returns
         -------
@@ -117,8 +127,10 @@ class PhasorMethod(ABC):
         return Volume(abs(field.values), grid, field.provenance)
 
 
-def common_support(capture: Capture, grid: Grid) -> Support:
-    """Check what no method can do without: several wall points, a grid that is not behind them, and memory."""
+def check_common_support(capture: Capture, grid: Grid) -> Support:
+    """Check what no method can do without: several wall points, a grid that is not behind them, and
+    memory.
+    """
     if len(capture.points) == 1:
         return Support("one wall point cannot locate anything: a capture needs several")
     hindmost = float(capture.points[:, 2].min())
@@ -135,11 +147,11 @@ def common_support(capture: Capture, grid: Grid) -> Support:
     return Support()
 
 
-def numpy_support(what: str, capture: Capture) -> Support:
+def check_numpy_support(what: str, capture: Capture) -> Support:
     """Check that a method of compiled loops, `what` in the message, gets a NumPy array."""
     if is_numpy(capture.signal):
         return Support()
     return Support(
-        f"{what} works on NumPy arrays only, and this capture's signal is on {Place.of(capture.signal)}: "
+        f"{what} works on NumPy arrays only, and this capture's signal is on {ComputeDevice.of(capture.signal)}: "
         "bring it back by capture.on(Place()) or --device cpu, or use rsd, hybrid or backprojection"
     )

@@ -17,23 +17,27 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-FORMATS = (".png", ".pdf", ".svg")
+PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 DEPTH_THRESHOLD = 0.4
-"""The depth map shows columns whose brightest voxel has at least this share of the volume's brightest."""
+"""The depth map shows columns whose brightest voxel has at least this share of the volume's
+brightest.
+"""
 
-COLOURS = "inferno"
-DEPTH_COLOURS = "viridis"
+COLOUR_MAP = "inferno"
+DEPTH_COLOUR_MAP = "viridis"
 WIDTH_INCHES = 13.0
 DOTS_PER_INCH = 110
-SLIMMEST, WIDEST = 0.3, 2.0
+MIN_PANEL_RATIO, MAX_PANEL_RATIO = 0.3, 2.0
 """Bounds of a panel's side relative to the scene's width, so that flat and deep boxes stay legible."""
 
 
 def save_picture(volume: Volume, path: str | Path) -> None:
-    """Draw front, side and top view (brightest voxel along the line of sight) and a depth map into a file.
+    """Draw front, side and top view (brightest voxel along the line of sight) and a depth map into
+    a file.
 
-    The front view looks along +z from the wall into the scene, x to the right and y down. Beside it, the side view
-    shares y and has the wall at its left edge; below it, the top view shares x and has the wall at its upper edge.
+    The front view looks along +z from the wall into the scene, x to the right and y down. Beside
+    it, the side view shares y and has the wall at its left edge; below it, the top view shares x
+    and has the wall at its upper edge.
 
     Parameters
     ----------
@@ -42,8 +46,8 @@ def save_picture(volume: Volume, path: str | Path) -> None:
         Ends in .png, .pdf or .svg.
     """
     target = Path(path)
-    if target.suffix.lower() not in FORMATS:
-        raise InputError(f"{target}: a picture's name must end in {', '.join(FORMATS)}")
+    if target.suffix.lower() not in PICTURE_SUFFIXES:
+        raise InputError(f"{target}: a picture's name must end in {', '.join(PICTURE_SUFFIXES)}")
     figure = _draw_figure(volume)
     with atomic_path(target) as temporary:
         figure.savefig(temporary, format=target.suffix[1:].lower())
@@ -54,7 +58,7 @@ def _draw_figure(volume: Volume) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    width, height, depth = _panel_sides(volume)
+    width, height, depth = _compute_panel_sides(volume)
     columns, rows = [width, depth, width], [height, depth]
     size = (WIDTH_INCHES, WIDTH_INCHES * sum(rows) / sum(columns) + 0.5)
     figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
@@ -64,15 +68,17 @@ def _draw_figure(volume: Volume) -> Figure:
     figure.colorbar(drawn, ax=top, label="relative brightness", location="bottom", shrink=0.8)
     depth_map = figure.add_subplot(panels[0, 2])
     drawn = _draw_depth(volume, depth_map)
-    figure.colorbar(drawn, ax=depth_map, label="z (m)", location="bottom", shrink=0.8, ticks=MaxNLocator(4))
+    figure.colorbar(
+        drawn, ax=depth_map, label="z (m)", location="bottom", shrink=0.8, ticks=MaxNLocator(4)
+    )
     return figure
 
 
-def _panel_sides(volume: Volume) -> NDArray[np.float64]:
+def _compute_panel_sides(volume: Volume) -> NDArray[np.float64]:
     """Width, height and depth of the panels, relative to the width."""
-    edges = [_edges(axis) for axis in (volume.grid.x, volume.grid.y, volume.grid.z)]
+    edges = [_find_edges(axis) for axis in (volume.grid.x, volume.grid.y, volume.grid.z)]
     lengths = np.array([last - first for first, last in edges])
-    return np.asarray(np.clip(lengths / lengths[0], SLIMMEST, WIDEST))
+    return np.asarray(np.clip(lengths / lengths[0], MIN_PANEL_RATIO, MAX_PANEL_RATIO))
 
 
 def _draw_views(volume: Volume, front: Axes, side: Axes, top: Axes) -> AxesImage:
@@ -82,9 +88,9 @@ def _draw_views(volume: Volume, front: Axes, side: Axes, top: Axes) -> AxesImage
     front.set_title("front: from the wall, along +z")
     side.set_title("side: wall at the left")
     top.set_title("top: wall at the upper edge")
-    _draw(side, magnitude.max(axis=2).T, (z, y), ("z (m)", "y (m), down"))
-    _draw(top, magnitude.max(axis=1), (x, z), ("x (m)", "z (m)"))
-    return _draw(front, magnitude.max(axis=0), (x, y), ("x (m)", "y (m), down"))
+    _draw_picture(side, magnitude.max(axis=2).T, (z, y), ("z (m)", "y (m), down"))
+    _draw_picture(top, magnitude.max(axis=1), (x, z), ("x (m)", "z (m)"))
+    return _draw_picture(front, magnitude.max(axis=0), (x, y), ("x (m)", "y (m), down"))
 
 
 def _draw_depth(volume: Volume, axes: Axes) -> AxesImage:
@@ -92,32 +98,42 @@ def _draw_depth(volume: Volume, axes: Axes) -> AxesImage:
     weak = projection.brightness < DEPTH_THRESHOLD * projection.brightness.max()
     depth = np.where(weak, np.nan, projection.depth)
     axes.set_title(f"depth (above {DEPTH_THRESHOLD:.0%} brightness)")
-    drawn = _draw(axes, depth, (volume.grid.x, volume.grid.y), ("x (m)", "y (m), down"), None)
-    drawn.set_cmap(DEPTH_COLOURS)
+    drawn = _draw_picture(
+        axes, depth, (volume.grid.x, volume.grid.y), ("x (m)", "y (m), down"), None
+    )
+    drawn.set_cmap(DEPTH_COLOUR_MAP)
     return drawn
 
 
-def _draw(
+def _draw_picture(
     axes: Axes,
     picture: NDArray[Any],
     coordinates: tuple[NDArray[np.float64], NDArray[np.float64]],
     labels: tuple[str, str],
     brightest: float | None = 1.0,
 ) -> AxesImage:
-    """Draw a picture (rows, columns) with the first coordinate to the right and the second downwards."""
-    lowest, edges = None if brightest is None else 0.0, extent(*coordinates)
-    drawn = axes.imshow(picture, COLOURS, vmin=lowest, vmax=brightest, extent=edges, interpolation="nearest")
+    """Draw a picture (rows, columns) with the first coordinate to the right and the second
+    downwards.
+    """
+    lowest, edges = None if brightest is None else 0.0, compute_extent(*coordinates)
+    drawn = axes.imshow(
+        picture, COLOUR_MAP, vmin=lowest, vmax=brightest, extent=edges, interpolation="nearest"
+    )
     axes.set_xlabel(labels[0])
     axes.set_ylabel(labels[1])
     return drawn
 
 
-def extent(right: NDArray[np.float64], down: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Left, right, lower and upper edge of a picture with axes to the right and downwards, m, as matplotlib has it."""
-    return (*_edges(right), *_edges(down)[::-1])
+def compute_extent(
+    right: NDArray[np.float64], down: NDArray[np.float64]
+) -> tuple[float, float, float, float]:
+    """Left, right, lower and upper edge of a picture with axes to the right and downwards, m, as
+    matplotlib has it.
+    """
+    return (*_find_edges(right), *_find_edges(down)[::-1])
 
 
-def _edges(axis: NDArray[np.float64]) -> tuple[float, float]:
+def _find_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
     """Outer edges of the first and the last voxel, m; a single voxel gets 1 mm."""
     half = (axis[-1] - axis[0]) / (2 * (axis.size - 1)) if axis.size > 1 else 0.5e-3
     return float(axis[0] - half), float(axis[-1] + half)

@@ -11,8 +11,10 @@ from tofclip.errors import InputError, ShapeError
 
 FloatArray = NDArray[np.float64]
 
-EVENNESS = 1e-3
-"""Points may be off an even spacing by this fraction of it; at half a wavelength that is a phase of 3 mrad."""
+EVENNESS_TOLERANCE = 1e-3
+"""Points may be off an even spacing by this fraction of it; at half a wavelength that is a phase of
+3 mrad.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +43,10 @@ class Plane:
             axis = np.array(getattr(self, name), dtype=np.float64)
             if axis.ndim != 1 or axis.size < 2:
                 raise ShapeError(f"axis {name} of a plane", "(n,) with n >= 2", axis.shape)
-            if not evenly_spaced(axis):
-                raise InputError(f"axis {name} of a plane must be finite, increasing and evenly spaced")
+            if not is_evenly_spaced(axis):
+                raise InputError(
+                    f"axis {name} of a plane must be finite, increasing and evenly spaced"
+                )
             object.__setattr__(self, name, axis)
         object.__setattr__(self, "z", float(self.z))
         if not np.isfinite(self.z):
@@ -56,7 +60,7 @@ class Plane:
     @property
     def steps(self) -> tuple[float, float]:
         """Distance of neighbouring points along y and x, m."""
-        return step(self.y), step(self.x)
+        return axis_step(self.y), axis_step(self.x)
 
     @property
     def points(self) -> FloatArray:
@@ -65,17 +69,17 @@ class Plane:
         return np.stack([x, y, np.full_like(x, self.z)], axis=-1)
 
 
-def step(axis: FloatArray) -> float:
+def axis_step(axis: FloatArray) -> float:
     """Distance of neighbouring entries of an evenly spaced axis."""
     return float(axis[-1] - axis[0]) / (axis.size - 1)
 
 
-def evenly_spaced(axis: FloatArray) -> bool:
+def is_evenly_spaced(axis: FloatArray) -> bool:
     """Whether an axis increases in equal steps; a single entry does."""
     if not np.all(np.isfinite(axis)):
         return False
     if axis.size < 2:
         return True
-    spacing = step(axis)
+    spacing = axis_step(axis)
     even = axis[0] + spacing * np.arange(axis.size)
-    return bool(spacing > 0 and np.max(np.abs(axis - even)) <= EVENNESS * spacing)
+    return bool(spacing > 0 and np.max(np.abs(axis - even)) <= EVENNESS_TOLERANCE * spacing)

@@ -1,4 +1,5 @@
-"""What is done to a capture before it is imaged: cutting the record, putting bins together, gating the wall's glare.
+"""What is done to a capture before it is imaged: cutting the record, putting bins together, gating
+the wall's glare.
 
 All of it where the capture's signal lives.
 """
@@ -12,8 +13,8 @@ from tofclip.arrays import namespace
 from tofclip.errors import InputError
 
 
-def cropped(capture: Capture, nearest: float, farthest: float) -> Capture:
-    """Keep the bins that hold paths from `nearest` to `farthest`, m.
+def crop_capture(capture: Capture, nearest: float, farthest: float) -> Capture:
+    """Keep the bins that hold paths from `find_nearest` to `farthest`, m.
 
     Raises
     ------
@@ -27,42 +28,52 @@ def cropped(capture: Capture, nearest: float, farthest: float) -> Capture:
             f"fewer than two bins hold paths from {nearest:.4g} to {farthest:.4g} m; the record runs from "
             f"{paths[0]:.4g} to {paths[-1]:.4g} m"
         )
-    return _with_bins(capture, slice(int(kept[0]), int(kept[-1]) + 1))
+    return _select_bins(capture, slice(int(kept[0]), int(kept[-1]) + 1))
 
 
-def binned(capture: Capture, factor: int) -> Capture:
+def rebin_capture(capture: Capture, factor: int) -> Capture:
     """Add up every `factor` neighbouring bins; bins left over at the end are dropped.
 
-    Counts stay counts. Bins much finer than the wall's sampling carry noise and cost time: path per bin of about the
-    distance of neighbouring wall points loses nothing.
+    Counts stay counts. Bins much finer than the wall's sampling carry noise and cost time: path per
+    bin of about the distance of neighbouring wall points loses nothing.
     """
     bins = capture.axis.bins // factor if factor >= 1 else 0
     if bins < 2:
-        raise InputError(f"{capture.axis.bins} bins cannot be put together by {factor}; at least two must be left")
+        raise InputError(
+            f"{capture.axis.bins} bins cannot be put together by {factor}; at least two must be left"
+        )
     xp = namespace(capture.signal)
-    kept = xp.reshape(capture.signal[: bins * factor, ...], (bins, factor, *capture.signal.shape[1:]))
+    kept = xp.reshape(
+        capture.signal[: bins * factor, ...], (bins, factor, *capture.signal.shape[1:])
+    )
     # A bin stands for its middle.
     start = capture.start + (factor - 1) / 2 * capture.axis.spacing
     bin_width = factor * capture.bin_width
-    return Capture(xp.sum(kept, axis=1), capture.wall, capture.laser, bin_width, start, capture.provenance)
+    return Capture(
+        xp.sum(kept, axis=1), capture.wall, capture.laser, bin_width, start, capture.provenance
+    )
 
 
-def without_first_bounce(capture: Capture, margin: float) -> Capture:
+def remove_first_bounce(capture: Capture, margin: float) -> Capture:
     """Set to 0 what arrives straight from the laser spot, by way of no hidden thing.
 
-    That light reaches wall point r_p after the path ``|r_L - r_p|``; everything up to `margin` (m) later goes with it:
-    the instrument's response and what the wall sends on.
+    That light reaches wall point r_p after the path ``|r_L - r_p|``; everything up to `margin` (m)
+    later goes with it: the instrument's response and what the wall sends on.
     """
     if not (np.isfinite(margin) and margin >= 0):
         raise InputError(f"the margin after the first bounce must be 0 m or more, got {margin}")
     direct = np.linalg.norm(capture.wall - capture.laser, axis=-1)
     paths = capture.axis.paths.reshape(-1, *[1] * direct.ndim)
-    early = capture.place.put(paths <= direct + margin)
+    early = capture.device.put(paths <= direct + margin)
     signal = namespace(capture.signal).where(early, 0.0, capture.signal)
-    return Capture(signal, capture.wall, capture.laser, capture.bin_width, capture.start, capture.provenance)
+    return Capture(
+        signal, capture.wall, capture.laser, capture.bin_width, capture.start, capture.provenance
+    )
 
 
-def _with_bins(capture: Capture, bins: slice) -> Capture:
+def _select_bins(capture: Capture, bins: slice) -> Capture:
     start = float(capture.axis.paths[bins.start])
     signal = capture.signal[bins, ...]
-    return Capture(signal, capture.wall, capture.laser, capture.bin_width, start, capture.provenance)
+    return Capture(
+        signal, capture.wall, capture.laser, capture.bin_width, start, capture.provenance
+    )

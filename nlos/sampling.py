@@ -20,7 +20,8 @@ class AliasingWarning(UserWarning):
 def warn_of_aliasing(capture: Capture, band: Band) -> None:
     """Warn if neighbouring wall points lie more than half the band's shortest wavelength apart.
 
-    In a confocal scan the path grows on both legs from point to point, so that a quarter is the limit.
+    In a confocal scan the path grows on both legs from point to point, so that a quarter is the
+    limit.
     """
     shortest = 2 * np.pi / float(band.wavenumbers[-1])
     confocal = len(capture.lasers) > 1 and np.array_equal(capture.lasers, capture.points)
@@ -32,11 +33,11 @@ def warn_of_aliasing(capture: Capture, band: Band) -> None:
             f"the virtual pulse: false images may appear; use points at most {finest:.3g} m apart, or a wavelength "
             f"{capture.spacing / finest:.2g} times longer",
             AliasingWarning,
-            stacklevel=_levels_to_caller(),
+            stacklevel=_count_levels_to_caller(),
         )
 
 
-def _levels_to_caller() -> int:
+def _count_levels_to_caller() -> int:
     """How far up the first line stands that is not this package's: what the user wrote."""
     level = 1
     frame = inspect.currentframe()

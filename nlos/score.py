@@ -10,7 +10,7 @@ import numpy as np
 from nlos.volume import Volume
 from tofclip.errors import InputError, ShapeError
 
-RADIUS = 0.04
+SCORE_RADIUS_M = 0.04
 """m; the usual measure for waves of some 12 cm."""
 
 
@@ -21,18 +21,20 @@ class PointScore:
     Parameters
     ----------
     energy : float
-        Share of the energy of the intensity ``|u|^2``, u the volume's values: of the sum of ``|u|^4``. That of ``|u|``
-        itself would mostly tell how far the sidelobes of the virtual pulse reach: for a wavelength of 0.125 m and a
-        wall of 2 m it is 0.2 to 0.3 where the energy of the intensity is 0.5 to 0.7.
+        Share of the energy of the intensity ``|u|^2``, u the volume's values: of the sum of
+        ``|u|^4``. That of ``|u|`` itself would mostly tell how far the sidelobes of the virtual
+        pulse reach: for a wavelength of 0.125 m and a wall of 2 m it is 0.2 to 0.3 where the energy
+        of the intensity is 0.5 to 0.7.
     contrast : float
-        Mean magnitude of the voxels near a point, over that of all others. It grows with the empty space imaged.
+        Mean magnitude of the voxels near a point, over that of all others. It grows with the empty
+        space imaged.
     """
 
     energy: float
     contrast: float
 
 
-def point_score(volume: Volume, points: Any, radius: float = RADIUS) -> PointScore:
+def score_points(volume: Volume, points: Any, radius: float = SCORE_RADIUS_M) -> PointScore:
     """Compare the voxels within `radius` (m) of hidden points (n, 3), m, with all others.
 
     Unlike peak over mean it is not fooled by a bright spot in the wrong place.
@@ -54,6 +56,11 @@ def point_score(volume: Volume, points: Any, radius: float = RADIUS) -> PointSco
         raise InputError(f"some voxels must lie within {radius} m of a hidden point, and some not")
     magnitude = volume.magnitude.astype(np.float64)
     if not magnitude[~near].any():
-        raise InputError("the volume is dark away from the hidden points: their contrast has no measure")
+        raise InputError(
+            "the volume is dark away from the hidden points: their contrast has no measure"
+        )
     energy = magnitude**4
-    return PointScore(float(energy[near].sum() / energy.sum()), float(magnitude[near].mean() / magnitude[~near].mean()))
+    return PointScore(
+        float(energy[near].sum() / energy.sum()),
+        float(magnitude[near].mean() / magnitude[~near].mean()),
+    )

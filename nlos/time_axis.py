@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tofclip.errors import InputError
 from tofclip.units import SPEED_OF_LIGHT
 
-MINIMUM_BINS = 2
+MIN_BINS = 2
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,16 @@ class TimeAxis:
     start: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.bins < MINIMUM_BINS:
-            raise InputError(f"a transient needs at least {MINIMUM_BINS} time bins, got {self.bins}")
+        if self.bins < MIN_BINS:
+            raise InputError(f"a transient needs at least {MIN_BINS} time bins, got {self.bins}")
         if not (np.isfinite(self.bin_width) and self.bin_width > 0):
-            raise InputError(f"bin width must be a positive number of seconds, got {self.bin_width}")
+            raise InputError(
+                f"bin width must be a positive number of seconds, got {self.bin_width}"
+            )
         if not np.isfinite(self.start):
-            raise InputError(f"the path length of bin 0 must be a finite number of metres, got {self.start}")
+            raise InputError(
+                f"the path length of bin 0 must be a finite number of metres, got {self.start}"
+            )
 
     @property
     def spacing(self) -> float:

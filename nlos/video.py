@@ -12,29 +12,31 @@ from numpy.typing import ArrayLike, NDArray
 
 from nlos.band import Band
 from nlos.capture import Capture
-from nlos.depths import Depths
-from nlos.exposure import band_without_echo, exposures, leg
+from nlos.depths import DepthPropagator
 from nlos.geometry import FloatArray, Grid
 from nlos.hybrid import Hybrid
-from nlos.method import MEMORY_LIMIT_BYTES, Progress, Support, numpy_support, silent
-from nlos.outgoing import outgoing_field, outgoing_way
+from nlos.illumination_groups import choose_band_for_paths, find_leg_bounds, group_by_illumination
+from nlos.method import MEMORY_LIMIT_BYTES, Progress, Support, check_numpy_support, ignore_progress
+from nlos.outgoing_field import compute_outgoing_field, plan_outgoing_diffraction
 from nlos.rsd.planar import PlanarRSD
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
-from tofclip.threads import blocks, one_blas_thread, run_blocks
+from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
-INSTANTS_AT_A_TIME = 32
+INSTANTS_PER_BLOCK = 32
 """Instants of one depth in memory at once."""
 
 SAMPLES_PER_SIGMA = 2
-"""Instants of a time gate per standard deviation of the pulse's envelope: its sum is then exact to single precision."""
+"""Instants of a time gate per standard deviation of the pulse's envelope: its sum is then exact to
+single precision.
+"""
 
 NO_DELAY = np.zeros(2)
 
-Use = Callable[[int, slice, NDArray[np.complex64]], None]
+FieldCallback = Callable[[int, slice, NDArray[np.complex64]], None]
 """Takes the index of a depth, some instants, and the field (instants, y, x) there."""
 
 
@@ -66,13 +68,21 @@ class TransientVideo:
     def __post_init__(self) -> None:
         scene = self.grid.shape
         if self.values.shape not in ((self.times.size, *scene), (self.times.size, *scene[1:])):
-            raise ShapeError("a transient video", f"(t, [z,] y, x) of {self.times.size} x {scene}", self.values.shape)
+            raise ShapeError(
+                "a transient video",
+                f"(t, [z,] y, x) of {self.times.size} x {scene}",
+                self.values.shape,
+            )
 
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
         axes = {name: Field(getattr(self.grid, name), "m", (name,)) for name in ("z", "y", "x")}
         names = ("time", "z", "y", "x") if self.values.ndim == 4 else ("time", "y", "x")
-        fields = {"values": Field(self.values, "", names), "time": Field(self.times, "s", ("time",)), **axes}
+        fields = {
+            "values": Field(self.values, "", names),
+            "time": Field(self.times, "s", ("time",)),
+            **axes,
+        }
         return Record("transient video", fields, provenance=self.provenance)
 
     @classmethod
@@ -81,7 +91,9 @@ class TransientVideo:
         dimensions = record.fields["values"].values.ndim if "values" in record.fields else 4
         x, y, z = (record.array(name, np.float64, 1, "m") for name in "xyz")
         values = record.array("values", np.float32, dimensions)
-        return cls(values, record.array("time", np.float64, 1, "s"), Grid(x, y, z), record.provenance)
+        return cls(
+            values, record.array("time", np.float64, 1, "s"), Grid(x, y, z), record.provenance
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the video to an HDF5 file, whole or not at all."""
@@ -103,16 +115,16 @@ class TransientVideo:
 class TransientImaging:
     """Pictures of the hidden scene at given instants, and through a time gate.
 
-    ``u(r, t) = | sum_k exp(1j * k * c * t) * sum_p P_k(r_p) * exp(1j * k * |r_p - r|) / |r_p - r| |``, t the time since
-    the flash left its spot on the wall: a hidden thing lights up when the flash reaches it, at ``|r_L - r| / c``, and
-    the image of `method` is what every voxel shows at just that time. Light that met several hidden things shows
-    later at the last of them.
+    ``u(r, t) = | sum_k exp(1j * k * c * t) * sum_p P_k(r_p) * exp(1j * k * |r_p - r|) / |r_p - r|
+    |``, t the time since the flash left its spot on the wall: a hidden thing lights up when the
+    flash reaches it, at ``|r_L - r| / c``, and the image of `method` is what every voxel shows at
+    just that time. Light that met several hidden things shows later at the last of them.
 
-    Needs one laser spot. Memory beyond the result: some 40 bytes per plane wave and frequency and thread, and 32
-    instants of one depth.
+    Needs one laser spot. Memory beyond the result: some 40 bytes per plane wave and frequency and
+    thread, and 32 instants of one depth.
 
-    Liu et al., "Non-line-of-sight imaging using phasor-field virtual wave optics", Nature 572, 620-623 (2019),
-    transient camera; Liu, Bauer, Velten, Nat. Commun. 11, 1645 (2020).
+    Liu et al., "Non-line-of-sight imaging using phasor-field virtual wave optics", Nature 572,
+    620-623 (2019), transient camera; Liu, Bauer, Velten, Nat. Commun. 11, 1645 (2020).
 
     Parameters
     ----------
@@ -122,18 +134,22 @@ class TransientImaging:
     method: PlanarRSD | Hybrid
 
     def supports(self, capture: Capture, grid: Grid) -> Support:
-        """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with ``.reason``."""
-        arrays = numpy_support("imaging in time", capture)
+        """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with
+        ``.reason``.
+        """
+        arrays = check_numpy_support("imaging in time", capture)
         if not arrays:
             return arrays
-        spots = exposures(capture)
+        spots = group_by_illumination(capture)
         if len(spots) > 1 or spots[0].laser is None:
             return Support(
                 "pictures in time need one laser spot, whose flash passes through the scene; a scan of spots has none"
             )
         return self.method.supports(capture, grid)
 
-    def video(self, capture: Capture, grid: Grid, times: ArrayLike, progress: Progress = silent) -> TransientVideo:
+    def video(
+        self, capture: Capture, grid: Grid, times: ArrayLike, progress: Progress = ignore_progress
+    ) -> TransientVideo:
         """Image the whole scene at every instant.
 
         Parameters
@@ -155,7 +171,7 @@ class TransientImaging:
         InputError
             `supports` says no, or the video is larger than 8 GiB.
         """
-        instants = _instants(times)
+        instants = _validate_times(times)
         if 4 * instants.size * grid.size > MEMORY_LIMIT_BYTES:
             raise InputError(
                 f"{instants.size} instants of {grid.size} voxels need {instants.size * grid.size / 2**28:.1f} GiB, "
@@ -163,37 +179,45 @@ class TransientImaging:
             )
         values = np.empty((instants.size, *grid.shape), np.float32)
 
-        def keep(depth: int, some: slice, seen: NDArray[np.complex64]) -> None:
+        def accumulate(depth: int, some: slice, seen: NDArray[np.complex64]) -> None:
             values[some, depth] = np.abs(seen)
 
-        self._watch(capture, grid, instants, keep, progress)
-        return TransientVideo(values, instants, grid, self._history(capture))
+        self._stream_fields(capture, grid, instants, accumulate, progress)
+        return TransientVideo(values, instants, grid, self._build_provenance(capture))
 
     def front_views(
-        self, capture: Capture, grid: Grid, times: ArrayLike, progress: Progress = silent
+        self, capture: Capture, grid: Grid, times: ArrayLike, progress: Progress = ignore_progress
     ) -> TransientVideo:
-        """Image the scene at every instant and keep the brightest of every line of sight in z, (t, y, x).
+        """Image the scene at every instant and keep the brightest of every line of sight in z, (t,
+        y, x).
 
         Memory for no more than that; parameters and errors as of `video`.
         """
         from threading import Lock
 
-        instants, joining = _instants(times), Lock()
+        instants, joining = _validate_times(times), Lock()
         values = np.zeros((instants.size, *grid.shape[1:]), np.float32)
 
-        def keep(_: int, some: slice, seen: NDArray[np.complex64]) -> None:
+        def accumulate(_: int, some: slice, seen: NDArray[np.complex64]) -> None:
             brightness = np.abs(seen)
             with joining:
                 np.maximum(values[some], brightness, out=values[some])
 
-        self._watch(capture, grid, instants, keep, progress)
-        return TransientVideo(values, instants, grid, self._history(capture))
+        self._stream_fields(capture, grid, instants, accumulate, progress)
+        return TransientVideo(values, instants, grid, self._build_provenance(capture))
 
-    def gated(self, capture: Capture, grid: Grid, opens: float, closes: float, progress: Progress = silent) -> Volume:
+    def image_gate(
+        self,
+        capture: Capture,
+        grid: Grid,
+        opens: float,
+        closes: float,
+        progress: Progress = ignore_progress,
+    ) -> Volume:
         """Image what lights up while a gate is open.
 
-        A lone point whose flash passes within the gate is as bright as in the image of the method; one that lights up
-        at another time is dark.
+        A lone point whose flash passes within the gate is as bright as in the image of the method;
+        one that lights up at another time is dark.
 
         Parameters
         ----------
@@ -219,43 +243,54 @@ class TransientImaging:
         width, sigma = SPEED_OF_LIGHT * (closes - opens), self.method.pulse.sigma
         count = int(np.ceil(SAMPLES_PER_SIGMA * width / sigma))
         instants = opens + (closes - opens) * (np.arange(count) + 0.5) / count
-        share = width / count / (np.sqrt(np.pi) * sigma)
+        weight = width / count / (np.sqrt(np.pi) * sigma)
         energy = np.zeros(grid.shape, np.float32)
 
-        def keep(depth: int, _: slice, seen: NDArray[np.complex64]) -> None:
-            energy[depth] += np.float32(share) * np.sum(seen.real**2 + seen.imag**2, axis=0)
+        def accumulate(depth: int, _: slice, seen: NDArray[np.complex64]) -> None:
+            energy[depth] += np.float32(weight) * np.sum(seen.real**2 + seen.imag**2, axis=0)
 
-        self._watch(capture, grid, instants, keep, progress)
+        self._stream_fields(capture, grid, instants, accumulate, progress)
         gate = {"gate_opens_s": opens, "gate_closes_s": closes}
-        return Volume(np.sqrt(energy), grid, self._history(capture, **gate))
+        return Volume(np.sqrt(energy), grid, self._build_provenance(capture, **gate))
 
-    def _watch(self, capture: Capture, grid: Grid, instants: FloatArray, use: Use, progress: Progress) -> None:
+    def _stream_fields(
+        self,
+        capture: Capture,
+        grid: Grid,
+        instants: FloatArray,
+        use: FieldCallback,
+        progress: Progress,
+    ) -> None:
         """Hand the field of every depth to `use`, some instants at a time; depths run side by side."""
         self.supports(capture, grid).require()
-        band = self._band(capture, grid, instants)
+        band = self._choose_band(capture, grid, instants)
         warn_of_aliasing(capture, band)
-        way = outgoing_way(self.method, capture, grid, band)
-        depths = Depths(way)
-        spectrum = depths.to_waves(outgoing_field(self.method, capture, way, band))
-        turns = np.exp(1j * SPEED_OF_LIGHT * np.outer(band.wavenumbers, instants)).astype(np.complex64)
+        plan = plan_outgoing_diffraction(self.method, capture, grid, band)
+        depths = DepthPropagator(plan)
+        spectrum = depths.to_waves(compute_outgoing_field(self.method, capture, plan, band))
+        turns = np.exp(1j * SPEED_OF_LIGHT * np.outer(band.wavenumbers, instants)).astype(
+            np.complex64
+        )
 
-        def work(planes: slice) -> None:
+        def process_block(planes: slice) -> None:
             for depth in range(planes.start, planes.stop):
                 arrived = spectrum * depths.transfer(float(grid.z[depth]), NO_DELAY)
-                for some in blocks(instants.size, INSTANTS_AT_A_TIME):
+                for some in split_blocks(instants.size, INSTANTS_PER_BLOCK):
                     use(depth, some, depths.to_images(arrived @ turns[:, some]))
                 progress(grid.shape[1] * grid.shape[2])
 
-        with one_blas_thread():
-            run_blocks(work, grid.z.size, size=1)
+        with limit_blas_threads():
+            run_blocks(process_block, grid.z.size, size=1)
 
-    def _band(self, capture: Capture, grid: Grid, instants: FloatArray) -> Band:
+    def _choose_band(self, capture: Capture, grid: Grid, instants: FloatArray) -> Band:
         """A band in which no voxel sees an echo of the record at any of the instants."""
-        nearest, farthest = leg(capture.points, grid)
+        nearest, farthest = find_leg_bounds(capture.points, grid)
         earliest, latest = SPEED_OF_LIGHT * instants.min(), SPEED_OF_LIGHT * instants.max()
-        return band_without_echo(capture.axis, self.method.pulse, earliest + nearest, latest + farthest)
+        return choose_band_for_paths(
+            capture.axis, self.method.pulse, earliest + nearest, latest + farthest
+        )
 
-    def _history(self, capture: Capture, **more: float) -> Mapping[str, Any]:
+    def _build_provenance(self, capture: Capture, **more: float) -> Mapping[str, Any]:
         settings = {
             "method": f"transient imaging by {type(self.method).__name__}",
             "wavelength_m": self.method.wavelength,
@@ -266,7 +301,7 @@ class TransientImaging:
         return {**capture.provenance, "imaging": settings}
 
 
-def _instants(times: ArrayLike) -> FloatArray:
+def _validate_times(times: ArrayLike) -> FloatArray:
     instants = np.asarray(times, dtype=np.float64)
     if instants.ndim != 1 or instants.size == 0:
         raise ShapeError("the instants of a video", "(t,) with t >= 1", instants.shape)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.geometry import Grid
-from tofclip.arrays import Array, Place, is_numpy, namespace, to_numpy
+from tofclip.arrays import Array, ComputeDevice, is_numpy, namespace, to_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
 
@@ -40,19 +40,21 @@ class Projection:
 class Volume:
     """Brightness, or complex phasor field, on a grid of voxels.
 
-    Pictures of it look along +z, from the relay wall into the hidden scene, x to the right and y down.
+    Pictures of it look along +z, from the relay wall into the hidden scene, x to the right and y
+    down.
 
-    What is left and what is right follows from the capture's coordinates alone. If +z leaves the wall on the room's
-    side (and x, y, z are right-handed, y down), the picture is what someone standing at the wall sees. If the
-    coordinates are those of a camera facing the wall (x right and y down in its picture, z into the wall, as in the
-    LIFT captures), the volume is the scene's mirror image behind the wall, and the picture is what that camera would
-    see if the wall were a mirror: the camera's left stays left, and writing that faces the wall appears reversed.
+    What is left and what is right follows from the capture's coordinates alone. If +z leaves the
+    wall on the room's side (and x, y, z are right-handed, y down), the picture is what someone
+    standing at the wall sees. If the coordinates are those of a camera facing the wall (x right and
+    y down in its picture, z into the wall, as in the LIFT captures), the volume is the scene's
+    mirror image behind the wall, and the picture is what that camera would see if the wall were a
+    mirror: the camera's left stays left, and writing that faces the wall appears reversed.
 
     Parameters
     ----------
     values : (z, y, x) array
-        Real or complex; float32 or complex64 unless given in double precision. An array of another library stays where
-        it is; what looks at the volume or writes it fetches a copy.
+        Real or complex; float32 or complex64 unless given in double precision. An array of another
+        library stays where it is; what looks at the volume or writes it fetches a copy.
     grid : Grid
     provenance : mapping
         How it came about.
@@ -79,51 +81,64 @@ class Volume:
         object.__setattr__(self, "values", values)
 
     @property
-    def place(self) -> Place:
+    def device(self) -> ComputeDevice:
         """Where the values live: library and device."""
-        return Place.of(self.values)
+        return ComputeDevice.of(self.values)
 
-    def on(self, place: Place) -> Volume:
-        """Return the volume with its values brought to a place; ``Place()`` is NumPy."""
-        return replace(self, values=place.put(self.values))
+    def on(self, device: ComputeDevice) -> Volume:
+        """Return the volume with its values brought to a place; ``ComputeDevice()`` is NumPy."""
+        return replace(self, values=device.put(self.values))
 
     @property
     def magnitude(self) -> NDArray[Any]:
-        """Brightness, real and not negative, shape (z, y, x); a NumPy array wherever the values live."""
+        """Brightness, real and not negative, shape (z, y, x); a NumPy array wherever the values
+        live.
+        """
         return to_numpy(abs(self.values))
 
-    def brightest(self) -> tuple[float, float, float]:
+    def find_brightest(self) -> tuple[float, float, float]:
         """Position (x, y, z) of the brightest voxel, m."""
         z, y, x = np.unravel_index(int(np.argmax(self.magnitude)), self.grid.shape)
         return float(self.grid.x[x]), float(self.grid.y[y]), float(self.grid.z[z])
 
     def maximum_projection(self) -> Projection:
-        """Project along z: the largest brightness of every column (y, x), and the depth where it stands."""
+        """Project along z: the largest brightness of every column (y, x), and the depth where it
+        stands.
+        """
         magnitude = self.magnitude
         return Projection(magnitude.max(axis=0), self.grid.z[magnitude.argmax(axis=0)])
 
     def threshold(self, fraction: float) -> Volume:
-        """Return the volume with every voxel set to 0 that is weaker than `fraction` (0..1) of the brightest."""
+        """Return the volume with every voxel set to 0 that is weaker than `fraction` (0..1) of the
+        brightest.
+        """
         if not 0 <= fraction <= 1:
             raise InputError(f"a threshold is a fraction between 0 and 1, got {fraction}")
         xp, magnitude = namespace(self.values), abs(self.values)
-        kept = xp.where(magnitude >= fraction * xp.max(magnitude), self.values, xp.zeros_like(self.values))
+        kept = xp.where(
+            magnitude >= fraction * xp.max(magnitude), self.values, xp.zeros_like(self.values)
+        )
         return Volume(kept, self.grid, self.provenance)
 
     def surface(self, fraction: float = 0.3) -> Mesh:
-        """Draw the surface on which the magnitude is `fraction` (0..1) of the largest; save it with ``.save``."""
-        from nlos.export import surface_of
+        """Draw the surface on which the magnitude is `fraction` (0..1) of the largest; save it with
+        ``.save``.
+        """
+        from nlos.export import extract_surface
 
-        return surface_of(self, fraction)
+        return extract_surface(self, fraction)
 
     def points(self, fraction: float = 0.3) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Positions (n, 3) in m, and magnitudes (n,), of voxels with at least `fraction` (0..1) of the brightest."""
-        from nlos.export import points_of
+        """Positions (n, 3) in m, and magnitudes (n,), of voxels with at least `fraction` (0..1) of
+        the brightest.
+        """
+        from nlos.export import extract_points
 
-        return points_of(self, fraction)
+        return extract_points(self, fraction)
 
     def export(self, path: str | Path, fraction: float = 0.3) -> None:
-        """Write the magnitude for other programs, in the format that the suffix names, whole or not at all.
+        """Write the magnitude for other programs, in the format that the suffix names, whole or not
+        at all.
 
         Parameters
         ----------
@@ -140,12 +155,14 @@ class Volume:
         InputError
             Another suffix, or voxels that the format cannot hold.
         """
-        from nlos.export import export
+        from nlos.export import export_volume
 
-        export(self, path, fraction)
+        export_volume(self, path, fraction)
 
     def save_picture(self, path: str | Path) -> None:
-        """Draw front view, depth map, top and side view with axes in metres; PNG, PDF or SVG by the file's name."""
+        """Draw front view, depth map, top and side view with axes in metres; PNG, PDF or SVG by the
+        file's name.
+        """
         from nlos.picture import save_picture
 
         save_picture(self, path)
@@ -153,12 +170,20 @@ class Volume:
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
         axes = {name: Field(getattr(self.grid, name), "m", (name,)) for name in AXES}
-        return Record("volume", {"values": Field(to_numpy(self.values), "", AXES), **axes}, provenance=self.provenance)
+        return Record(
+            "volume",
+            {"values": Field(to_numpy(self.values), "", AXES), **axes},
+            provenance=self.provenance,
+        )
 
     @classmethod
     def from_record(cls, record: Record) -> Volume:
         """Rebuild a volume from what was stored."""
-        stored = record.fields["values"].values.dtype if "values" in record.fields else np.dtype(np.float32)
+        stored = (
+            record.fields["values"].values.dtype
+            if "values" in record.fields
+            else np.dtype(np.float32)
+        )
         values = record.array("values", stored if stored.kind in "fc" else np.float32, 3)
         x, y, z = (record.array(name, np.float64, 1, "m") for name in "xyz")
         return cls(values, Grid(x, y, z), record.provenance)

@@ -1,6 +1,7 @@
 """Places beside NumPy that tests put arrays into.
 
-Where there is a graphics processor, ``TOFCLIP_TEST_DEVICES=cuda pytest -k "portable or contracts"`` tries it as well.
+Where there is a graphics processor, ``TOFCLIP_TEST_DEVICES=cuda pytest -k "portable or contracts"``
+tries it as well.
 """
 
 from __future__ import annotations
@@ -9,19 +10,23 @@ import os
 
 import pytest
 
-from tofclip.arrays import Place, place_named
+from tofclip.arrays import ComputeDevice, parse_device
 
-PLACES = ("array_api_strict", "torch", *os.environ.get("TOFCLIP_TEST_DEVICES", "").split())
+DEVICE_NAMES = ("array_api_strict", "torch", *os.environ.get("TOFCLIP_TEST_DEVICES", "").split())
 
 
-def place_called(name: str) -> Place:
-    """Return a library's processor, or the device of that name; skip the test where the library is not installed."""
+def find_device(name: str) -> ComputeDevice:
+    """Return a library's processor, or the device of that name; skip the test where the library is
+    not installed.
+    """
     if name == "numpy":
-        return Place()
+        return ComputeDevice()
     if name == "array_api_strict":
-        return Place.of(pytest.importorskip(name, reason="only where it is installed").asarray([0.0]))
+        return ComputeDevice.of(
+            pytest.importorskip(name, reason="only where it is installed").asarray([0.0])
+        )
     if name != "torch":
-        return place_named(name)
+        return parse_device(name)
     library = pytest.importorskip(name, reason="PyTorch is optional")
     library.set_num_threads(1)  # waking others up takes longer than what there is to do
-    return place_named("torch:cpu")
+    return parse_device("torch:cpu")

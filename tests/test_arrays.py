@@ -6,30 +6,30 @@ import pytest
 
 from tofclip import arrays
 from tofclip.arrays import (
-    InEachPlace,
-    Place,
+    ComputeDevice,
+    PerDevice,
     as_type,
     is_numpy,
     namespace,
-    number,
-    place_named,
+    parse_device,
     require_numpy,
+    scalar_like,
     to_numpy,
     zeros,
 )
 from tofclip.errors import InputError, MissingDependencyError
 
 VALUES = np.arange(6, dtype=np.float32).reshape(2, 3)
-STRICT = Place("array_api_strict", array_api_strict.Device("CPU_DEVICE"))
+STRICT = ComputeDevice("array_api_strict", array_api_strict.Device("CPU_DEVICE"))
 
 
 def torch_cpu():
     pytest.importorskip("torch", reason="PyTorch is optional")
-    return place_named("torch:cpu")
+    return parse_device("torch:cpu")
 
 
 @pytest.fixture(params=[lambda: STRICT, torch_cpu], ids=["array-api-strict", "torch"])
-def place(request):
+def device(request):
     return request.param()
 
 
@@ -37,54 +37,54 @@ def test_lists_and_numbers_are_numpys():
     assert all(is_numpy(values) for values in (VALUES, VALUES[0, 0], [1.0, 2.0], 3))
 
 
-def test_there_and_back(place):
-    there = place.put(VALUES)
+def test_there_and_back(device):
+    there = device.put(VALUES)
     assert not is_numpy(there)
-    assert Place.of(there) == place
-    assert not place.has_compiled_loops
+    assert ComputeDevice.of(there) == device
+    assert not device.has_compiled_loops
     back = to_numpy(there)
     assert back.dtype == VALUES.dtype
     np.testing.assert_array_equal(back, VALUES)
 
 
 @pytest.mark.parametrize("values", [VALUES[::-1], VALUES.T, np.broadcast_to(VALUES[0], (4, 3))])
-def test_values_that_lie_oddly_in_memory(place, values):
-    np.testing.assert_array_equal(to_numpy(place.put(values)), values)
+def test_values_that_lie_oddly_in_memory(device, values):
+    np.testing.assert_array_equal(to_numpy(device.put(values)), values)
 
 
-def test_what_is_there_already_is_not_copied(place):
-    there = place.put(VALUES)
-    assert place.put(there) is there
+def test_what_is_there_already_is_not_copied(device):
+    there = device.put(VALUES)
+    assert device.put(there) is there
 
 
-def test_the_functions_of_the_standard(place):
-    there = place.put(VALUES)
+def test_the_functions_of_the_standard(device):
+    there = device.put(VALUES)
     np.testing.assert_allclose(to_numpy(namespace(there).sum(there, axis=0)), VALUES.sum(axis=0))
 
 
-def test_numpy_is_the_place_of_numpys_arrays(place):
-    assert Place.of(VALUES) == Place() == place_named("cpu")
-    assert Place().put(VALUES) is VALUES
-    np.testing.assert_array_equal(Place().put(place.put(VALUES)), VALUES)
-    assert Place().has_compiled_loops
+def test_numpy_is_the_place_of_numpys_arrays(device):
+    assert ComputeDevice.of(VALUES) == ComputeDevice() == parse_device("cpu")
+    assert ComputeDevice().put(VALUES) is VALUES
+    np.testing.assert_array_equal(ComputeDevice().put(device.put(VALUES)), VALUES)
+    assert ComputeDevice().has_compiled_loops
 
 
-def test_libraries_do_not_mix(place):
+def test_libraries_do_not_mix(device):
     with pytest.raises(InputError, match=r"numpy.* do not work together"):
-        namespace(place.put(VALUES), VALUES)
+        namespace(device.put(VALUES), VALUES)
 
 
-def test_compiled_loops_refuse_what_is_not_numpys(place):
+def test_compiled_loops_refuse_what_is_not_numpys(device):
     require_numpy("the search", VALUES, [1.0])
     with pytest.raises(InputError, match="the search works on NumPy arrays, not on"):
-        require_numpy("the search", VALUES, place.put(VALUES))
+        require_numpy("the search", VALUES, device.put(VALUES))
 
 
-def test_types_are_changed_where_the_array_is(place):
-    there = place.put(VALUES)
+def test_types_are_changed_where_the_array_is(device):
+    there = device.put(VALUES)
     assert as_type(there, np.float32) is there
     double = as_type(there, np.float64)
-    assert Place.of(double) == place
+    assert ComputeDevice.of(double) == device
     assert to_numpy(double).dtype == np.float64
     np.testing.assert_array_equal(to_numpy(double), VALUES)
 
@@ -95,35 +95,37 @@ def test_numpys_are_made_contiguous_with_their_type():
     np.testing.assert_array_equal(changed, VALUES.T)
 
 
-def test_zeros_are_like_what_they_are_for(place):
-    for like in (VALUES, place.put(VALUES)):
+def test_zeros_are_like_what_they_are_for(device):
+    for like in (VALUES, device.put(VALUES)):
         nothing = zeros((2, 1), like)
-        assert Place.of(nothing) == Place.of(like)
+        assert ComputeDevice.of(nothing) == ComputeDevice.of(like)
         assert to_numpy(nothing).dtype == VALUES.dtype
         np.testing.assert_array_equal(to_numpy(nothing), [[0], [0]])
 
 
-def test_numbers_are_like_what_they_are_for(place):
-    for like in (VALUES, place.put(VALUES)):
-        there = number(1.5, like)
-        assert Place.of(there).library == Place.of(like).library
+def test_numbers_are_like_what_they_are_for(device):
+    for like in (VALUES, device.put(VALUES)):
+        there = scalar_like(1.5, like)
+        assert ComputeDevice.of(there).library == ComputeDevice.of(like).library
         assert (to_numpy(there).dtype, float(there)) == (VALUES.dtype, 1.5)
-        np.testing.assert_array_equal(to_numpy(namespace(like).minimum(like, there)), np.minimum(VALUES, 1.5))
+        np.testing.assert_array_equal(
+            to_numpy(namespace(like).minimum(like, there)), np.minimum(VALUES, 1.5)
+        )
 
 
-def test_what_is_set_up_in_a_place_is_set_up_once(place):
+def test_what_is_set_up_in_a_place_is_set_up_once(device):
     asked = []
-    copies = InEachPlace(lambda where: asked.append(where) or where.put(VALUES))
-    for array in (place.put(VALUES), VALUES, place.put(VALUES[0])):
-        assert Place.of(copies.beside(array)) == Place.of(array)
-    assert asked == [place, Place()]
+    copies = PerDevice(lambda where: asked.append(where) or where.put(VALUES))
+    for array in (device.put(VALUES), VALUES, device.put(VALUES[0])):
+        assert ComputeDevice.of(copies.get(array)) == ComputeDevice.of(array)
+    assert asked == [device, ComputeDevice()]
 
 
-def test_a_place_says_where_it_is(place):
-    assert str(Place()) == "cpu"
-    assert str(place).startswith(f"{place.library}:")
-    with place.current():
-        assert Place.of(place.put(VALUES)) == place
+def test_a_place_says_where_it_is(device):
+    assert str(ComputeDevice()) == "cpu"
+    assert str(device).startswith(f"{device.library}:")
+    with device.activate():
+        assert ComputeDevice.of(device.put(VALUES)) == device
 
 
 def test_cupy_works_on_its_current_device():
@@ -139,9 +141,9 @@ def test_cupy_works_on_its_current_device():
         def __exit__(self, *_):
             entered.append(-self.id)
 
-    place = Place("cupy", Device())
-    assert str(place) == "cupy:1"
-    with place.current():
+    device = ComputeDevice("cupy", Device())
+    assert str(device) == "cupy:1"
+    with device.activate():
         assert entered == [1]
     assert entered == [1, -1]
 
@@ -158,20 +160,20 @@ def no_graphics(monkeypatch):
 
 @pytest.mark.usefixtures("no_graphics")
 def test_without_a_graphics_processor():
-    assert place_named("auto") == Place()
+    assert parse_device("auto") == ComputeDevice()
     for name in ("cuda", "cuda:1"):
         with pytest.raises(MissingDependencyError, match="use --device cpu"):
-            place_named(name)
+            parse_device(name)
 
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:one", "torch", "", "numpy:cpu"])
 def test_names_that_are_no_device(name):
     with pytest.raises(InputError, match="is no device"):
-        place_named(name)
+        parse_device(name)
 
 
 def test_a_device_that_pytorch_does_not_have():
     pytest.importorskip("torch", reason="PyTorch is optional")
     for name in ("cuda:99", "nonsense"):
         with pytest.raises(MissingDependencyError, match="use --device cpu"):
-            place_named(f"torch:{name}")
+            parse_device(f"torch:{name}")

@@ -1,4 +1,6 @@
-"""The real instrument's shot, from its files to frames: figures that an independent trial found, and the letters."""
+"""The real instrument's shot, from its files to frames: figures that an independent trial found,
+and the letters.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,7 @@ import numpy as np
 import pytest
 
 from tofclip import Camera, Frames, Streak, read_streak, recover
-from tofclip.camera.calibration import calibrate
+from tofclip.camera.calibration import calibrate_views
 from tofclip.solvers import Sparse
 
 TIME_ZERO = -10.784e-9
@@ -26,7 +28,7 @@ def streak(shared_data) -> Streak:
 def camera(shared_data, streak) -> Camera:
     names = ("LinePattern", "LinePattern_bkg", "DotPattern", "DotPattern_bkg")
     pictures = [read_streak(shared_data / "clip" / f"{name}.tif").counts for name in names]
-    return calibrate(*pictures).camera(time_zero=TIME_ZERO)
+    return calibrate_views(*pictures).camera(time_zero=TIME_ZERO)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +64,9 @@ def test_ranges_use_the_file_s_own_time_axis(frames):
 
 @pytest.mark.parametrize(("row", "strokes"), [(93, 2), (182, 2)], ids=["U", "N"])
 def test_a_letter_s_strokes_are_apart(frames, row, strokes):
-    """U and N have two upright strokes: their middle rows show two maxima with a clear gap between them."""
+    """U and N have two upright strokes: their middle rows show two maxima with a clear gap between
+    them.
+    """
     from scipy.ndimage import gaussian_filter1d
     from scipy.signal import find_peaks
 

@@ -33,7 +33,11 @@ TREE = {
 
 
 def test_the_tree() -> None:
-    defined = {name for name, item in vars(errors).items() if inspect.isclass(item) and issubclass(item, Exception)}
+    defined = {
+        name
+        for name, item in vars(errors).items()
+        if inspect.isclass(item) and issubclass(item, Exception)
+    }
     assert defined == set(errors.__all__) == set(TREE)
     assert {name: getattr(errors, name).__bases__ for name in TREE} == TREE
 
@@ -44,7 +48,10 @@ def test_the_docstring_draws_every_class(name: str) -> None:
 
 
 def test_messages_say_what_and_where() -> None:
-    assert str(errors.ShapeError("frames", (2, 3), (3, 2))) == "frames must have shape (2, 3), got (3, 2)"
+    assert (
+        str(errors.ShapeError("frames", (2, 3), (3, 2)))
+        == "frames must have shape (2, 3), got (3, 2)"
+    )
     fault = errors.FileFormatError("shot.tif", "is empty")
     assert str(fault) == "shot.tif: is empty"
     assert fault.path == Path("shot.tif")

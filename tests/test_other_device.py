@@ -1,7 +1,8 @@
-"""Nothing hides on the processor: a device of array-api-strict that mixes with no other, and gives NumPy nothing.
+"""Nothing hides on the processor: a device of array-api-strict that mixes with no other, and gives
+NumPy nothing.
 
-So would a graphics processor: whatever stays behind on the processor, or is fetched in passing, ends in an error. What
-is fetched on purpose is counted.
+So would a graphics processor: whatever stays behind on the processor, or is fetched in passing,
+ends in an error. What is fetched on purpose is counted.
 """
 
 from __future__ import annotations
@@ -14,17 +15,34 @@ import numpy as np
 import pytest
 
 from tofclip import lidar
-from tofclip.arrays import Place
+from tofclip.arrays import ComputeDevice
 from tofclip.camera import Camera
 from tofclip.lidar import Detection, depth
-from tofclip.operators import BlockDiagonal, Diagonal, Integration, LinearOperator, LineProjection, Reshape, Stack
+from tofclip.operators import (
+    BlockDiagonal,
+    Diagonal,
+    Integration,
+    LinearOperator,
+    LineProjection,
+    Reshape,
+    Stack,
+)
 from tofclip.shots import Frames
-from tofclip.solvers import Adjoint, Huber, LinearInverse, Method, Poisson, Sparse, TotalVariation, relative_residual
+from tofclip.solvers import (
+    Backprojection,
+    Huber,
+    LinearInverse,
+    Method,
+    Poisson,
+    Sparse,
+    TotalVariation,
+    relative_residual,
+)
 from tofclip.solvers import direct as direct_module
-from tofclip.solvers import loop as loop_module
+from tofclip.solvers import iteration as loop_module
 
 strict = pytest.importorskip("array_api_strict")
-ELSEWHERE = Place("array_api_strict", strict.Device("device1"))
+OTHER_DEVICE = ComputeDevice("array_api_strict", strict.Device("device1"))
 HERE = strict.Device("CPU_DEVICE")
 
 ANGLES = np.deg2rad([-38.0, -20.0, 2.0, 21.0, 40.0])
@@ -60,12 +78,14 @@ def measured(frames: int) -> tuple[np.ndarray, np.ndarray]:
     random = np.random.default_rng(5)
     picture = np.zeros((16, 15, 1))
     picture[4:11, 5:10] = 100
-    readings = projection()(picture * random.uniform(0.5, 1, frames)) + random.normal(0, 2, (120, frames))
-    return np.maximum(readings, 0).astype(np.float32), random.random((120, frames)) > 0.03
+    measurements = projection()(picture * random.uniform(0.5, 1, frames)) + random.normal(
+        0, 2, (120, frames)
+    )
+    return np.maximum(measurements, 0).astype(np.float32), random.random((120, frames)) > 0.03
 
 
 def test_the_device_is_as_strict_as_it_is_meant_to_be() -> None:
-    there = ELSEWHERE.put(np.ones(3, np.float32))
+    there = OTHER_DEVICE.put(np.ones(3, np.float32))
     with pytest.raises(ValueError, match="different devices"):
         _ = there + strict.ones(3, dtype=strict.float32)
     with pytest.raises(RuntimeError, match="convert array on the 'array_api_strict"):
@@ -89,7 +109,7 @@ def test_operators(operator: LinearOperator, fetched: list[int]) -> None:
     random = np.random.default_rng(1)
     for apply, shape in ((operator, operator.shape_in), (operator.adjoint, operator.shape_out)):
         operand = random.random((*shape, 3), np.float32)
-        there = apply(ELSEWHERE.put(operand))
+        there = apply(OTHER_DEVICE.put(operand))
         np.testing.assert_allclose(brought_here(there), apply(operand), rtol=1e-4)
     assert fetched == []
 
@@ -102,19 +122,21 @@ def test_operators(operator: LinearOperator, fetched: list[int]) -> None:
         (Sparse(iterations=20, data_term=partial(Huber, threshold=5.0)), 1),
         (TotalVariation(iterations=20, data_term=partial(Poisson, deviation=np.full(120, 1.0))), 1),
         (LinearInverse(), 1),
-        (Adjoint(), 0),
+        (Backprojection(), 0),
     ],
 )
 def test_recovery(method: Method, fetches: int, fetched: list[int]) -> None:
-    """The objective's history is fetched at the end, and which readings are dead before the inverse is prepared."""
-    readings, good = measured(4)
-    expected = method.recover(projection(), readings, good).frames
-    there = ELSEWHERE.put(readings), ELSEWHERE.put(good)
+    """The objective's history is fetched at the end, and which readings are dead before the inverse
+    is prepared.
+    """
+    measurements, valid = measured(4)
+    expected = method.recover(projection(), measurements, valid).frames
+    there = OTHER_DEVICE.put(measurements), OTHER_DEVICE.put(valid)
     frames = method.recover(projection(), *there).frames
     assert len(fetched) == fetches
     assert max(fetched, default=0) <= 120
     assert np.linalg.norm(brought_here(frames) - expected) < 1e-4 * np.linalg.norm(expected)
-    residual = relative_residual(projection(), expected, readings, good)
+    residual = relative_residual(projection(), expected, measurements, valid)
     assert relative_residual(projection(), frames, *there) == pytest.approx(residual, rel=1e-4)
 
 
@@ -124,11 +146,15 @@ def test_the_search_for_returns(fetched: list[int]) -> None:
     arrival = random.uniform(times[5], times[-5], (2, 12, 9))
     pulses = np.exp(-4 * np.log(2) * ((times[:, None, None, None] - arrival) / 60e-12) ** 2)
     values = (300 * pulses).sum(axis=1) + random.normal(5, 2, (90, 12, 9))
-    frames = Frames(values.astype(np.float32), times, Camera(CENTRES, ANGLES, (12, 9), 120, pulse_fwhm=60e-12))
-    detection = Detection(share_of_scene=0, share_of_instant=0)
+    frames = Frames(
+        values.astype(np.float32), times, Camera(CENTRES, ANGLES, (12, 9), 120, pulse_fwhm=60e-12)
+    )
+    detection = Detection(min_scene_fraction=0, min_time_bin_fraction=0)
     expected = depth(frames, detection=detection)
     assert len(expected) > 108
-    found = depth(replace(frames, values=ELSEWHERE.put(frames.values)), detection=detection)
+    found = depth(replace(frames, values=OTHER_DEVICE.put(frames.values)), detection=detection)
     np.testing.assert_array_equal([found.y, found.x], [expected.y, expected.x])
     np.testing.assert_allclose(found.time, expected.time, atol=5e-3 * 20e-12)
-    assert sum(fetched) < 5 * 4 * 108  # a few numbers for each of at most four returns in a pixel; 90 bins each stay
+    assert (
+        sum(fetched) < 5 * 4 * 108
+    )  # a few numbers for each of at most four returns in a pixel; 90 bins each stay

@@ -16,14 +16,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tofclip.errors import FileFormatError, StorageError
-from tofclip.storage import Field, Record, atomic_path, provenance
+from tofclip.storage import Field, Record, atomic_path, collect_provenance
 
 names = st.from_regex(r"[a-z][a-z_]{0,8}", fullmatch=True)
 words = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=20)
 scalars = st.one_of(words, st.booleans(), st.integers(-(2**62), 2**62), st.floats(allow_nan=False))
 dtypes = st.sampled_from(["float32", "float64", "int64", "uint8", "bool", "complex64"])
-arrays = dtypes.flatmap(lambda d: hnp.arrays(d, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5)))
-fields = st.builds(Field, arrays, st.sampled_from(["", "s", "m", "px"]), st.lists(names, max_size=3).map(tuple))
+arrays = dtypes.flatmap(
+    lambda d: hnp.arrays(d, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5))
+)
+fields = st.builds(
+    Field, arrays, st.sampled_from(["", "s", "m", "px"]), st.lists(names, max_size=3).map(tuple)
+)
 attributes = st.dictionaries(words, scalars, max_size=4)
 leaves = st.builds(Record, words, st.dictionaries(names, fields, max_size=3), attributes)
 # Fields and children share one group of the file, hence the upper-case names of the children.
@@ -33,14 +37,18 @@ records = st.builds(
     st.dictionaries(names, fields, max_size=3),
     attributes,
     st.dictionaries(names.map(str.upper), leaves, max_size=2),
-    st.dictionaries(words, st.recursive(scalars, lambda s: st.lists(s, max_size=3), max_leaves=5), max_size=3),
+    st.dictionaries(
+        words, st.recursive(scalars, lambda s: st.lists(s, max_size=3), max_leaves=5), max_size=3
+    ),
 )
 
 
 @pytest.fixture
 def record() -> Record:
     counts = np.random.default_rng(1).random((40, 30))
-    return Record("streak", {"counts": Field(counts, "count", ("time", "column"))}, {"gain": 2.5, "name": "a"})
+    return Record(
+        "streak", {"counts": Field(counts, "count", ("time", "column"))}, {"gain": 2.5, "name": "a"}
+    )
 
 
 def assert_same(got: Record, expected: Record) -> None:
@@ -49,13 +57,19 @@ def assert_same(got: Record, expected: Record) -> None:
     for name, entry in expected.fields.items():
         stored = got.fields[name]
         np.testing.assert_array_equal(stored.values, entry.values)
-        assert (stored.values.dtype, stored.units, stored.axes) == (entry.values.dtype, entry.units, entry.axes)
+        assert (stored.values.dtype, stored.units, stored.axes) == (
+            entry.values.dtype,
+            entry.units,
+            entry.axes,
+        )
     assert got.children.keys() == expected.children.keys()
     for name, child in expected.children.items():
         assert_same(got.children[name], child)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(expected=records)
 def test_a_record_survives_its_file(expected: Record, tmp_path: Path) -> None:
     expected.save(tmp_path / "record.h5")
@@ -82,7 +96,9 @@ def test_text_longer_than_an_hdf5_attribute_survives(tmp_path: Path) -> None:
 
 
 def test_no_damaged_byte_goes_unnoticed(record: Record, tmp_path: Path) -> None:
-    """HDF5 reads some damaged files for ever and others as if nothing were wrong; checksums prevent both."""
+    """HDF5 reads some damaged files for ever and others as if nothing were wrong; checksums prevent
+    both.
+    """
     path = tmp_path / "a.h5"
     record.save(path)
     whole = path.read_bytes()
@@ -176,7 +192,9 @@ def test_attributes_and_children_are_checked(record: Record) -> None:
 
 
 @pytest.mark.parametrize("fault", [ValueError, KeyboardInterrupt, OSError, StorageError])
-def test_an_interrupted_write_leaves_the_old_file(fault: type[BaseException], tmp_path: Path) -> None:
+def test_an_interrupted_write_leaves_the_old_file(
+    fault: type[BaseException], tmp_path: Path
+) -> None:
     target = tmp_path / "scene.ply"
     target.write_text("old")
 
@@ -225,12 +243,16 @@ def test_unwritable_places_are_named(record: Record, tmp_path: Path) -> None:
     assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
 
 
-def test_forbidden_places_are_named(record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forbidden_places_are_named(
+    record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr("tempfile.mkstemp", refuse)
-    with pytest.raises(StorageError, match=r"a\.h5: cannot be written: writing is not permitted there"):
+    with pytest.raises(
+        StorageError, match=r"a\.h5: cannot be written: writing is not permitted there"
+    ):
         record.save(tmp_path / "a.h5")
     monkeypatch.setattr("builtins.open", refuse)
     with pytest.raises(StorageError, match=r"a\.h5: reading is not permitted"):
@@ -254,11 +276,17 @@ except StorageError as fault:
 
 @pytest.mark.skipif(os.name != "posix", reason="needs a limit on the size of files")
 def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path) -> None:
-    """A limit on file size stands for the full disk: the write fails half way. HDF5 itself would crash."""
+    """A limit on file size stands for the full disk: the write fails half way. HDF5 itself would
+    crash.
+    """
     target = tmp_path / "frames.h5"
     target.write_text("old")
     child = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, str(target)], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", FULL_DISK, str(target)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert (child.returncode, child.stderr) == (0, "")
     assert child.stdout.startswith(f"{target}: cannot be written: the disk is full")
@@ -268,7 +296,7 @@ def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path) -> None:
 
 def test_provenance_names_the_inputs(tmp_path: Path) -> None:
     (tmp_path / "in.tif").write_bytes(b"pixels")
-    found = provenance({"iterations": 3}, tmp_path / "in.tif", tmp_path / "absent")
+    found = collect_provenance({"iterations": 3}, tmp_path / "in.tif", tmp_path / "absent")
     assert found["settings"] == {"iterations": 3}
     assert found["inputs"] == [{"name": "in.tif", "sha256": hashlib.sha256(b"pixels").hexdigest()}]
     assert found["software"].startswith("tofclip ")

@@ -6,12 +6,22 @@ import time
 import pytest
 
 from tofclip.errors import InputError
-from tofclip.threads import LANES, THREADS_VARIABLE, blocks, on_this_thread, one_per_core, run_blocks, thread_count
+from tofclip.threads import (
+    LANES,
+    THREADS_VARIABLE,
+    limit_to_calling_thread,
+    map_per_core,
+    run_blocks,
+    split_blocks,
+    thread_count,
+)
 
 
 def test_blocks_cover_everything_once():
-    pieces = list(blocks(2 * LANES + 5))
-    assert [i for piece in pieces for i in range(piece.start, piece.stop)] == list(range(2 * LANES + 5))
+    pieces = list(split_blocks(2 * LANES + 5))
+    assert [i for piece in pieces for i in range(piece.start, piece.stop)] == list(
+        range(2 * LANES + 5)
+    )
     assert all(piece.stop - piece.start <= LANES for piece in pieces)
 
 
@@ -36,7 +46,7 @@ def test_a_thread_may_keep_its_blocks_to_itself(monkeypatch):
     def work(_: slice) -> None:
         names.add(threading.current_thread().name)
 
-    with on_this_thread():
+    with limit_to_calling_thread():
         run_blocks(work, 10 * LANES)
     assert names == {threading.current_thread().name}
     run_blocks(work, 10 * LANES)
@@ -77,7 +87,7 @@ def test_items_have_a_core_each_and_come_back_in_order(monkeypatch, threads):
             busy[0] -= 1
         return item, len(names)
 
-    assert list(one_per_core(work, range(10))) == [(item, 1) for item in range(10)]
+    assert list(map_per_core(work, range(10))) == [(item, 1) for item in range(10)]
     assert most[0] <= int(threads)
 
 
@@ -90,7 +100,7 @@ def test_a_failed_item_ends_the_row_in_its_place_and_few_are_begun_after_it():
             raise InputError("the third")
         return item
 
-    coming = one_per_core(work, iter(range(1000)))
+    coming = map_per_core(work, iter(range(1000)))
     assert [next(coming), next(coming)] == [0, 1]
     with pytest.raises(InputError, match="the third"):
         next(coming)
@@ -105,7 +115,7 @@ def test_items_are_taken_as_they_are_needed():
             taken.append(item)
             yield item
 
-    coming = one_per_core(lambda item: item, items())
+    coming = map_per_core(lambda item: item, items())
     assert next(coming) == 0
     assert len(taken) == thread_count() + 1
     coming.close()
@@ -115,8 +125,8 @@ def test_items_are_taken_as_they_are_needed():
 def test_work_on_this_thread_stays_there_when_a_part_of_it_asks_for_the_same(monkeypatch):
     monkeypatch.setenv(THREADS_VARIABLE, "2")
     names: set[str] = set()
-    with on_this_thread():
-        with on_this_thread():
+    with limit_to_calling_thread():
+        with limit_to_calling_thread():
             pass
         run_blocks(lambda _: names.add(threading.current_thread().name), 8 * LANES)
     assert names == {threading.current_thread().name}

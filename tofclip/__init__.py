@@ -1,8 +1,8 @@
 """ToF-CLIP: compact light-field photography with time of flight.
 
-Conventions, used everywhere: SI units in public signatures (pixels or bins only where a name ends in ``_px`` or
-``_bin``); float32 arrays unless float64 is asked for; transient cubes are ``(time, y, x)`` with y pointing down;
-shear s in pixels per view step, negative for near objects.
+Conventions, used everywhere: SI units in public signatures (pixels or bins only where a name ends
+in ``_px`` or ``_bin``); float32 arrays unless float64 is asked for; transient cubes are ``(time, y,
+x)`` with y pointing down; shear s in pixels per view step, negative for near objects.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
-"""Arrays of other libraries and on other devices: what they are, where they live, and how values get there and back.
+"""Arrays of other libraries and on other devices: what they are, where they live, and how values
+get there and back.
 
-The compiled loops of this package work on NumPy arrays. Whatever is written with the functions of the array API
-standard (https://data-apis.org/array-api) works on the arrays of any library that follows it: CuPy and PyTorch on a
-graphics processor, PyTorch and array-api-strict on this one. What accepts such arrays answers in the library and on
-the device of the one that came in; what has only compiled loops refuses them (`require_numpy`).
+The compiled loops of this package work on NumPy arrays. Whatever is written with the functions of
+the array API standard (https://data-apis.org/array-api) works on the arrays of any library that
+follows it: CuPy and PyTorch on a graphics processor, PyTorch and array-api-strict on this one. What
+accepts such arrays answers in the library and on the device of the one that came in; what has only
+compiled loops refuses them (`require_numpy`).
 """
 
 from __future__ import annotations
@@ -31,7 +33,9 @@ _NAMESPACES: dict[type, Any] = {}
 
 
 def is_numpy(array: Array) -> bool:
-    """Say whether `array` is NumPy's, or something that NumPy makes an array of, such as a list of numbers."""
+    """Say whether `array` is NumPy's, or something that NumPy makes an array of, such as a list of
+    numbers.
+    """
     return isinstance(array, np.ndarray | np.generic) or not hasattr(array, "__dlpack__")
 
 
@@ -47,26 +51,34 @@ def namespace(*arrays: Array) -> Any:
     if len(kinds) == 1:  # asked in every step of a solver: a dictionary answers ten times as fast
         (kind,) = kinds
         if kind not in _NAMESPACES:
-            _NAMESPACES[kind] = _namespace(arrays)
+            _NAMESPACES[kind] = _resolve_namespace(arrays)
         return _NAMESPACES[kind]
-    return _namespace(arrays)
+    return _resolve_namespace(arrays)
 
 
-def _namespace(arrays: tuple[Array, ...]) -> Any:
+def _resolve_namespace(arrays: tuple[Array, ...]) -> Any:
     from array_api_compat import array_namespace
 
     try:
         return array_namespace(*arrays)
     except TypeError as problem:
-        kinds = " and ".join(sorted({_library(array) for array in arrays}))
-        raise InputError(f"arrays of {kinds} do not work together; put all into one library") from problem
+        kinds = " and ".join(sorted({_library_name(array) for array in arrays}))
+        raise InputError(
+            f"arrays of {kinds} do not work together; put all into one library"
+        ) from problem
 
 
 def to_numpy(array: Array) -> NDArray[Any]:
-    """Return the values as a NumPy array, fetched from wherever they are; a NumPy array comes back as it is."""
-    if hasattr(array, "detach"):  # PyTorch: what was computed from a tensor with a gradient carries that along
+    """Return the values as a NumPy array, fetched from wherever they are; a NumPy array comes back
+    as it is.
+    """
+    if hasattr(
+        array, "detach"
+    ):  # PyTorch: what was computed from a tensor with a gradient carries that along
         array = array.detach().cpu()
-    elif hasattr(array, "get") and not is_numpy(array):  # CuPy copies nothing from the device unless told to
+    elif hasattr(array, "get") and not is_numpy(
+        array
+    ):  # CuPy copies nothing from the device unless told to
         array = array.get()
     values: NDArray[Any] = np.asarray(array)
     return values
@@ -80,7 +92,8 @@ def is_complex(array: Array) -> bool:
 
 
 def as_type(array: Array, dtype: DTypeLike) -> Array:
-    """Return `array` in a NumPy type, in the library and on the device where it is; as it is if it has that type.
+    """Return `array` in a NumPy type, in the library and on the device where it is; as it is if it
+    has that type.
 
     NumPy's come back contiguous, as compiled loops need them.
     """
@@ -90,7 +103,7 @@ def as_type(array: Array, dtype: DTypeLike) -> Array:
     return xp.astype(array, getattr(xp, np.dtype(dtype).name), copy=False)
 
 
-def device_of(array: Array) -> Any:
+def native_device(array: Array) -> Any:
     """Return the device that `array` is on, as its library has it."""
     from array_api_compat import device
 
@@ -101,11 +114,13 @@ def zeros(shape: tuple[int, ...], like: Array) -> Array:
     """Return zeros of the type of `like`, where `like` is."""
     if is_numpy(like):
         return np.zeros(shape, like.dtype)
-    return namespace(like).zeros(shape, dtype=like.dtype, device=device_of(like))
+    return namespace(like).zeros(shape, dtype=like.dtype, device=native_device(like))
 
 
-def number(value: float, like: Array) -> Array:
-    """Return a number of the type of `like`, where `like` is: for functions that not every library has for Python's."""
+def scalar_like(value: float, like: Array) -> Array:
+    """Return a number of the type of `like`, where `like` is: for functions that not every library
+    has for Python's.
+    """
     return like.dtype.type(value) if is_numpy(like) else zeros((), like) + value
 
 
@@ -124,17 +139,20 @@ def require_numpy(what: str, *arrays: Array) -> None:
     """
     for array in arrays:
         if not is_numpy(array):
-            raise InputError(f"{what} works on NumPy arrays, not on {_library(array)}'s; use tofclip.arrays.to_numpy")
+            raise InputError(
+                f"{what} works on NumPy arrays, not on {_library_name(array)}'s; use tofclip.arrays.to_numpy"
+            )
 
 
 @dataclass(frozen=True)
-class Place:
+class ComputeDevice:
     """Where arrays live: a library and one of its devices.
 
     Parameters
     ----------
     library : str
-        ``numpy``, ``cupy``, ``torch`` or another that follows the standard, by the name it is imported by.
+        ``numpy``, ``cupy``, ``torch`` or another that follows the standard, by the name it is
+        imported by.
     device : object, optional
         As the library has it; by default its own choice.
     """
@@ -143,11 +161,11 @@ class Place:
     device: Any = None
 
     @classmethod
-    def of(cls, array: Array) -> Place:
+    def of(cls, array: Array) -> ComputeDevice:
         """Return where `array` lives."""
         if is_numpy(array):
             return cls()
-        return cls(_library(array), device_of(array))
+        return cls(_library_name(array), native_device(array))
 
     @property
     def has_compiled_loops(self) -> bool:
@@ -158,59 +176,68 @@ class Place:
         """Return `values`, of any library, as an array that lives here, with the type they have."""
         if self.library == "numpy":
             return to_numpy(values)
-        if not is_numpy(values) and Place.of(values) == self:
+        if not is_numpy(values) and ComputeDevice.of(values) == self:
             return values
         library = importlib.import_module(self.library)
         # PyTorch warns of memory that it may not write to, and refuses steps backwards.
         contiguous = np.require(to_numpy(values), requirements=["C", "W"])
         return namespace(library.asarray([0.0])).asarray(contiguous, device=self.device)
 
-    def current(self) -> AbstractContextManager[Any]:
-        """Return a context in which what is made is made here: CuPy works on its current device only."""
-        context: AbstractContextManager[Any] = self.device if self.library == "cupy" and self.device else nullcontext()
+    def activate(self) -> AbstractContextManager[Any]:
+        """Return a context in which what is made is made here: CuPy works on its current device
+        only.
+        """
+        context: AbstractContextManager[Any] = (
+            self.device if self.library == "cupy" and self.device else nullcontext()
+        )
         return context
 
     def __str__(self) -> str:
         if self.library == "numpy":
             return "cpu"
-        return self.library if self.device is None else f"{self.library}:{getattr(self.device, 'id', self.device)}"
+        return (
+            self.library
+            if self.device is None
+            else f"{self.library}:{getattr(self.device, 'id', self.device)}"
+        )
 
 
-HERE = Place()
+CPU = ComputeDevice()
 """NumPy's arrays, where the compiled loops work."""
 
 
-class InEachPlace(Generic[T]):
+class PerDevice(Generic[T]):
     """What is set up once in each place where it is needed, such as the copy of an array.
 
     Parameters
     ----------
     make : callable
-        Sets it up in the `Place` that it is given.
+        Sets it up in the `ComputeDevice` that it is given.
     """
 
-    def __init__(self, make: Callable[[Place], T]) -> None:
+    def __init__(self, make: Callable[[ComputeDevice], T]) -> None:
         self._make = make
         self._made: dict[str, T] = {}
 
-    def beside(self, array: Array) -> T:
+    def get(self, array: Array) -> T:
         """Return what belongs where `array` lives."""
-        place = Place.of(array)
-        name = str(place)  # not every library's devices can be looked up in a dictionary
+        device = ComputeDevice.of(array)
+        name = str(device)  # not every library's devices can be looked up in a dictionary
         if name not in self._made:
-            self._made[name] = self._make(place)
+            self._made[name] = self._make(device)
         return self._made[name]
 
 
-def place_named(name: str) -> Place:
+def parse_device(name: str) -> ComputeDevice:
     """Return the place that a user asks for.
 
     Parameters
     ----------
     name : str
-        ``cpu`` for NumPy and the compiled loops; ``cuda`` or ``cuda:1`` for a graphics processor, through CuPy or else
-        PyTorch; ``auto`` for a graphics processor where there is one, and ``cpu`` where there is none; or a library
-        with its own name of a device, such as ``torch:cpu`` or ``torch:xpu``.
+        ``cpu`` for NumPy and the compiled loops; ``cuda`` or ``cuda:1`` for a graphics processor,
+        through CuPy or else PyTorch; ``auto`` for a graphics processor where there is one, and
+        ``cpu`` where there is none; or a library with its own name of a device, such as
+        ``torch:cpu`` or ``torch:xpu``.
 
     Raises
     ------
@@ -220,50 +247,56 @@ def place_named(name: str) -> Place:
         The library is not installed, or finds no such device.
     """
     if name == "cpu":
-        return Place()
+        return ComputeDevice()
     if name == "auto":
-        return next((place for library in GRAPHICS_LIBRARIES if (place := _graphics(library, 0))), Place())
+        return next(
+            (device for library in GRAPHICS_LIBRARIES if (device := _find_gpu(library, 0))),
+            ComputeDevice(),
+        )
     kind, _, which = name.partition(":")
     if kind == "cuda" and (which.isdecimal() or name == "cuda"):
         number = int(which or 0)
         for library in GRAPHICS_LIBRARIES:
-            if place := _graphics(library, number):
-                return place
+            if device := _find_gpu(library, number):
+                return device
         raise MissingDependencyError(
             f"no CUDA device {number} was found through CuPy or PyTorch; install tofclip[cuda], or use --device cpu"
         )
     if kind == "torch" and which:
-        return _torch_device(which)
+        return _find_torch_device(which)
     raise InputError(f"'{name}' is no device; use cpu, cuda, cuda:1, auto or torch:DEVICE")
 
 
-def _library(array: Array) -> str:
+def _library_name(array: Array) -> str:
     return type(array).__module__.partition(".")[0]
 
 
-def _graphics(library: str, number: int) -> Place | None:
-    """CUDA device `number` through `library`, or None where that cannot be had."""
+def _find_gpu(library: str, number: int) -> ComputeDevice | None:
+    """CUDA device `scalar_like` through `library`, or None where that cannot be had."""
     try:
         module = importlib.import_module(library)
         if library == "torch":
             found = module.cuda.is_available() and number < module.cuda.device_count()
-            return Place(library, module.device("cuda", number)) if found else None
+            return ComputeDevice(library, module.device("cuda", number)) if found else None
         found = number < module.cuda.runtime.getDeviceCount()
-        return Place(library, module.cuda.Device(number)) if found else None
+        return ComputeDevice(library, module.cuda.Device(number)) if found else None
     except Exception:
         return None
 
 
-def _torch_device(name: str) -> Place:
+def _find_torch_device(name: str) -> ComputeDevice:
     try:
         import torch
     except ImportError as problem:
-        raise MissingDependencyError("PyTorch is not installed; pip install torch, or use --device cpu") from problem
+        raise MissingDependencyError(
+            "PyTorch is not installed; pip install torch, or use --device cpu"
+        ) from problem
     try:
-        # Sums are taken in double precision, which some devices do not have. The array knows its device's number.
+        # Sums are taken in double precision, which some devices do not have. The array knows its
+        # device's number.
         device = torch.zeros(1, dtype=torch.float64, device=name).device
     except (RuntimeError, AssertionError, NotImplementedError, TypeError) as problem:
         raise MissingDependencyError(
             f"PyTorch finds no device '{name}' with float64 here; use --device cpu"
         ) from problem
-    return Place("torch", device)
+    return ComputeDevice("torch", device)

@@ -8,22 +8,27 @@
     |   +-- CalibrationError                   a camera disagrees with its data or with itself
     |   +-- MissingTimeAxisError               a streak image does not say how long a row lasts
     +-- FileFormatError         (ValueError)   a file is damaged, incomplete or of another format
-    +-- StorageError            (OSError)      a file could not be read or written: disk full, no permission
+    +-- StorageError            (OSError)      a file could not be read or written: disk full, no
+      permission
     +-- MissingDependencyError  (ImportError)  an optional library is not usable on this machine
-    +-- DeviceError             (OSError)      an instrument, or the way to it, does not do what it should
+    +-- DeviceError             (OSError)      an instrument, or the way to it, does not do what it
+      should
         +-- UsbBackendError                    there is no libusb on this machine
         +-- DeviceNotFoundError                no such instrument is connected
         +-- DevicePermissionError              this user may not talk to it
         +-- DeviceBusyError                    another program talks to it
         +-- DeviceTimeoutError  (TimeoutError) it sent nothing in time
-        +-- DeviceStalledError                 an endpoint stalled, and stalled again after it was cleared
-        +-- DeviceDisconnectedError            it was unplugged, or the connection broke, and did not come back
-        +-- TransferOverflowError              it sent more than was asked for, and the transfer is lost
+        +-- DeviceStalledError                 an endpoint stalled, and stalled again after it was
+          cleared
+        +-- DeviceDisconnectedError            it was unplugged, or the connection broke, and did
+          not come back
+        +-- TransferOverflowError              it sent more than was asked for, and the transfer is
+          lost
         +-- BufferOverflowError                the records came faster than they were read
         +-- ProtocolError                      it said what its protocol does not allow
 
-A message is one line that says what was wrong and what to do about it. The command line prints it and exits with
-status 2.
+A message is one line that says what was wrong and what to do about it. The command line prints it
+and exits with status 2.
 """
 
 from __future__ import annotations

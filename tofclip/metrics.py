@@ -11,8 +11,8 @@ from tofclip.errors import InputError, ShapeError
 def nmse(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
     """Normalised mean square error, relative to the variance of the truth.
 
-    ``sum (h - g)^2 / sum (g - mean(g))^2``. Fitting the "data error" columns of the paper's Supplementary Table 5 to
-    its stated corruption selects this form over the energy-normalised one.
+    ``sum (h - g)^2 / sum (g - mean(g))^2``. Fitting the "data error" columns of the paper's
+    Supplementary Table 5 to its stated corruption selects this form over the energy-normalised one.
 
     Parameters
     ----------
@@ -30,24 +30,29 @@ def nmse(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
     ShapeError, InputError
         The shapes differ, the border leaves nothing, or the truth is constant.
     """
-    h, g = _inner_pair(estimate, truth, border_px)
+    h, g = _crop_borders(estimate, truth, border_px)
     spread = float(np.sum((g - g.mean()) ** 2))
     if spread == 0:
-        raise InputError("the truth is constant: its variance cannot normalise an error; use nmse_energy")
+        raise InputError(
+            "the truth is constant: its variance cannot normalise an error; use nmse_energy"
+        )
     return float(np.sum((h - g) ** 2)) / spread
 
 
 def nmse_energy(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
-    """Squared error relative to the energy of the truth: ``sum (h - g)^2 / sum g^2``; arguments as in `nmse`."""
-    h, g = _inner_pair(estimate, truth, border_px)
+    """Squared error relative to the energy of the truth: ``sum (h - g)^2 / sum g^2``; arguments as
+    in `nmse`.
+    """
+    h, g = _crop_borders(estimate, truth, border_px)
     energy = float(np.sum(g**2))
     if energy == 0:
         raise InputError("the truth is zero everywhere: its energy cannot normalise an error")
     return float(np.sum((h - g) ** 2)) / energy
 
 
-def correlation(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
-    """Pearson's correlation of two pictures, whatever their scales; 0 where the estimate is one even tone.
+def correlation_coefficient(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
+    """Pearson's correlation of two pictures, whatever their scales; 0 where the estimate is one
+    even tone.
 
     Arguments as in `nmse`.
 
@@ -56,7 +61,7 @@ def correlation(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> fl
     ShapeError, InputError
         The shapes differ, the border leaves nothing, or the truth is constant.
     """
-    h, g = _inner_pair(estimate, truth, border_px)
+    h, g = _crop_borders(estimate, truth, border_px)
     h, g = h - h.mean(), g - g.mean()
     if not g.any():
         raise InputError("the truth is constant: nothing can correlate with it")
@@ -64,7 +69,7 @@ def correlation(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> fl
     return float(np.sum(h * g)) / spread if spread > 0 else 0.0
 
 
-def _inner_pair(
+def _crop_borders(
     estimate: ArrayLike, truth: ArrayLike, border_px: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     h, g = np.asarray(estimate, dtype=np.float64), np.asarray(truth, dtype=np.float64)

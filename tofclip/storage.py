@@ -1,8 +1,10 @@
-"""Files of our own: HDF5 records that name their units and axes, and writing that is all or nothing.
+"""Files of our own: HDF5 records that name their units and axes, and writing that is all or
+nothing.
 
-A *record* is a tree of named arrays. Each array carries its unit and the names of its axes; the root carries what
-kind of thing it is and where it came from. Every class that can be saved turns itself into a `Record` and back, so
-that the layout of the file is decided here and nowhere else. No damaged byte of a record goes unnoticed.
+A *record* is a tree of named arrays. Each array carries its unit and the names of its axes; the
+root carries what kind of thing it is and where it came from. Every class that can be saved turns
+itself into a `Record` and back, so that the layout of the file is decided here and nowhere else. No
+damaged byte of a record goes unnoticed.
 """
 
 from __future__ import annotations
@@ -31,15 +33,15 @@ if TYPE_CHECKING:
 
 Scalar = str | int | float | bool
 
-SIGNATURE = b"\x89HDF\r\n\x1a\n"
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """The first bytes of every HDF5 file."""
 
 FORMAT_NAME = "tofclip"
 FORMAT_VERSION = 1
 # The layouts of HDF5 1.10 carry checksums; a damaged file of the older ones can hang the library.
 LIBRARY_VERSIONS = ("v110", "v110")
-CHUNK_CUBE = (64, 32, 32)
-COMPRESS_FROM_BYTES = 1 << 16
+CUBE_CHUNK_SHAPE = (64, 32, 32)
+MIN_COMPRESSED_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,8 @@ class Record:
     Parameters
     ----------
     kind : str
-        What the record describes: ``"camera"``, ``"streak"``, ``"frames"``, ``"cloud"``, ``"capture"``, ``"volume"``.
+        What the record describes: ``"camera"``, ``"streak"``, ``"frames"``, ``"cloud"``,
+        ``"capture"``, ``"volume"``.
     fields : mapping of str to Field
     attributes : mapping of str to str, int, float or bool
     children : mapping of str to Record
@@ -102,7 +105,9 @@ class Record:
                 f"field '{name}' must have {dimensions} dimensions, found shape {found.values.shape}",
             )
         if found.units != units:
-            raise FileFormatError(self.origin, f"field '{name}' must be in '{units}', found '{found.units}'")
+            raise FileFormatError(
+                self.origin, f"field '{name}' must be in '{units}', found '{found.units}'"
+            )
         if not np.can_cast(found.values.dtype, dtype, casting="same_kind"):
             raise FileFormatError(
                 self.origin,
@@ -131,7 +136,8 @@ class Record:
         Raises
         ------
         StorageError
-            The disk is full, the folder is missing or writing is not allowed; `path` is left as it was.
+            The disk is full, the folder is missing or writing is not allowed; `path` is left as it
+            was.
         """
         write_record(self, path)
 
@@ -150,7 +156,8 @@ def write_record(record: Record, path: str | Path) -> None:
     import h5py
 
     with atomic_path(path) as temporary:
-        # HDF5 crashes the process when the disk fills up under it: it writes to memory, and Python to the disk.
+        # HDF5 crashes the process when the disk fills up under it: it writes to memory, and Python
+        # to the disk.
         image = io.BytesIO()
         with h5py.File(image, "w", libver=LIBRARY_VERSIONS) as file:
             _write_attribute(file, "format", FORMAT_NAME)
@@ -162,30 +169,34 @@ def write_record(record: Record, path: str | Path) -> None:
 
 def read_record(path: str | Path) -> Record:
     """Read the record in `path`, of whatever kind; see `Record.load`."""
-    with _opened(path) as file:
+    with _open_file(path) as file:
         found = _read_group(file, str(path))
-        return replace(found, provenance=_parse_provenance(_text(file, "provenance"), path))
+        return replace(found, provenance=_parse_provenance(_read_text(file, "provenance"), path))
 
 
 @contextlib.contextmanager
-def _opened(path: str | Path) -> Iterator[h5py.File]:
+def _open_file(path: str | Path) -> Iterator[h5py.File]:
     """Open one of our HDF5 files for reading; anything else is a clear error."""
     import h5py
 
-    with reading(path), open(path, "rb") as raw:
-        start = raw.read(len(SIGNATURE))
-    if start != SIGNATURE:
+    with translate_read_errors(path), open(path, "rb") as raw:
+        start = raw.read(len(HDF5_SIGNATURE))
+    if start != HDF5_SIGNATURE:
         raise FileFormatError(path, "is not an HDF5 file" if start else "is empty")
     try:
         with h5py.File(path, "r") as file:
-            if _text(file, "format") != FORMAT_NAME:
+            if _read_text(file, "format") != FORMAT_NAME:
                 raise FileFormatError(path, "is an HDF5 file, but not one of tofclip's")
             version = int(file.attrs.get("format_version", 0))
             if version > FORMAT_VERSION:
-                raise FileFormatError(path, f"has format version {version}; this program reads {FORMAT_VERSION}")
+                raise FileFormatError(
+                    path, f"has format version {version}; this program reads {FORMAT_VERSION}"
+                )
             yield file
     except (OSError, KeyError, RuntimeError) as fault:
-        raise FileFormatError(path, f"is damaged or incomplete ({one_line(fault)})") from fault
+        raise FileFormatError(
+            path, f"is damaged or incomplete ({format_error_line(fault)})"
+        ) from fault
 
 
 def _write_group(group: h5py.Group, record: Record) -> None:
@@ -215,11 +226,11 @@ def _storage_options(values: NDArray[Any]) -> dict[str, Any]:
     """Checksums for every array, compression for the large ones."""
     if values.size == 0 or values.ndim == 0:
         return {}
-    if values.nbytes < COMPRESS_FROM_BYTES:
+    if values.nbytes < MIN_COMPRESSED_BYTES:
         return {"chunks": values.shape, "fletcher32": True}
     chunks: tuple[int, ...] | bool = True
-    if values.ndim == len(CHUNK_CUBE):
-        chunks = tuple(min(c, n) for c, n in zip(CHUNK_CUBE, values.shape, strict=True))
+    if values.ndim == len(CUBE_CHUNK_SHAPE):
+        chunks = tuple(min(c, n) for c, n in zip(CUBE_CHUNK_SHAPE, values.shape, strict=True))
     return {
         "chunks": chunks,
         "compression": "gzip",
@@ -236,23 +247,27 @@ def _read_group(group: h5py.Group, origin: str) -> Record:
     children: dict[str, Record] = {}
     for name, item in group.items():
         if isinstance(item, h5py.Dataset):
-            axes = _text(item, "axes")
-            fields[name] = Field(item[()], _text(item, "units"), tuple(axes.split(",")) if axes else ())
+            axes = _read_text(item, "axes")
+            fields[name] = Field(
+                item[()], _read_text(item, "units"), tuple(axes.split(",")) if axes else ()
+            )
         elif isinstance(item, h5py.Group):
             children[name] = _read_group(item, origin)
         else:
             raise FileFormatError(origin, f"is damaged: '{name}' cannot be read")
     attributes = {
-        name.removeprefix("value."): _plain(value) for name, value in group.attrs.items() if name.startswith("value.")
+        name.removeprefix("value."): _to_scalar(value)
+        for name, value in group.attrs.items()
+        if name.startswith("value.")
     }
-    return Record(_text(group, "kind"), fields, attributes, children, origin=origin)
+    return Record(_read_text(group, "kind"), fields, attributes, children, origin=origin)
 
 
-def _text(item: h5py.Group | h5py.Dataset, name: str) -> str:
-    return str(_plain(item.attrs.get(name, "")))
+def _read_text(item: h5py.Group | h5py.Dataset, name: str) -> str:
+    return str(_to_scalar(item.attrs.get(name, "")))
 
 
-def _plain(value: Any) -> Scalar:
+def _to_scalar(value: Any) -> Scalar:
     """Turn an HDF5 attribute into a Python scalar."""
     plain = value.item() if isinstance(value, np.generic) else value
     text_or_number: Scalar = plain.decode() if isinstance(plain, bytes) else plain
@@ -267,19 +282,25 @@ def _parse_provenance(text: str, path: str | Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def provenance(settings: Mapping[str, Any], *inputs: str | Path) -> dict[str, Any]:
-    """Describe how a result came about: program version, time, settings, and a hash of every input file."""
+def collect_provenance(settings: Mapping[str, Any], *inputs: str | Path) -> dict[str, Any]:
+    """Describe how a result came about: program version, time, settings, and a hash of every input
+    file.
+    """
     return {
         "software": f"tofclip {__version__}",
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "settings": dict(settings),
-        "inputs": [{"name": Path(path).name, "sha256": sha256_of(path)} for path in inputs if Path(path).is_file()],
+        "inputs": [
+            {"name": Path(path).name, "sha256": compute_sha256(path)}
+            for path in inputs
+            if Path(path).is_file()
+        ],
     }
 
 
-def sha256_of(path: str | Path) -> str:
+def compute_sha256(path: str | Path) -> str:
     """Hexadecimal SHA-256 of a file."""
-    with reading(path), open(path, "rb") as file:
+    with translate_read_errors(path), open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -287,30 +308,33 @@ def sha256_of(path: str | Path) -> str:
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name beside `path` and rename it to `path` when the block ends well.
 
-    On any exception, Ctrl-C included, the temporary file is removed and `path` stays as it was. Problems of the file
-    system become `StorageError`.
+    On any exception, Ctrl-C included, the temporary file is removed and `path` stays as it was.
+    Problems of the file system become `StorageError`.
     """
     target = Path(path)
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=target.suffix, dir=target.parent or ".")
+        handle, name = tempfile.mkstemp(
+            prefix=f".{target.name}.", suffix=target.suffix, dir=target.parent or "."
+        )
         os.close(handle)
     except OSError as fault:
-        raise StorageError(f"{target}: cannot be written: {_reason(fault)}") from fault
+        raise StorageError(f"{target}: cannot be written: {_explain_os_error(fault)}") from fault
     temporary = Path(name)
     try:
         yield temporary
-        os.chmod(temporary, 0o666 & ~_umask())
+        os.chmod(temporary, 0o666 & ~_get_umask())
         os.replace(temporary, target)
     except OSError as fault:
         if isinstance(fault, StorageError):
             raise
-        raise StorageError(f"{target}: cannot be written: {_reason(fault)}") from fault
+        raise StorageError(f"{target}: cannot be written: {_explain_os_error(fault)}") from fault
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def remove_leftovers(targets: Iterable[Path]) -> None:
-    """Remove the temporary files of writers of `targets` that were killed before `atomic_path` could.
+def remove_temporary_files(targets: Iterable[Path]) -> None:
+    """Remove the temporary files of writers of `targets` that were killed before `atomic_path`
+    could.
 
     Only when nobody writes these targets any more: a writer whose temporary file is gone fails.
     """
@@ -326,7 +350,7 @@ def remove_leftovers(targets: Iterable[Path]) -> None:
 
 
 @contextlib.contextmanager
-def reading(path: str | Path) -> Iterator[None]:
+def translate_read_errors(path: str | Path) -> Iterator[None]:
     """Turn the operating system's refusals to read `path` into `StorageError`."""
     try:
         yield
@@ -338,13 +362,13 @@ def reading(path: str | Path) -> Iterator[None]:
         raise StorageError(f"{path}: reading is not permitted") from fault
 
 
-def _umask() -> int:
+def _get_umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
 
 
-def _reason(fault: OSError) -> str:
+def _explain_os_error(fault: OSError) -> str:
     if fault.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return "the disk is full; free some space or choose another folder with --out"
     if isinstance(fault, FileNotFoundError):
@@ -355,9 +379,9 @@ def _reason(fault: OSError) -> str:
         return "it is a folder; name a file"
     if isinstance(fault, PermissionError):
         return "writing is not permitted there"
-    return one_line(fault)
+    return format_error_line(fault)
 
 
-def one_line(fault: BaseException) -> str:
+def format_error_line(fault: BaseException) -> str:
     """Return an exception's message without line breaks, or its name where it has none."""
     return " ".join(str(fault).split()) or type(fault).__name__

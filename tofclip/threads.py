@@ -1,7 +1,8 @@
 """Blocks and threads: how a batch of pictures is cut up and shared between the processor's cores.
 
-The compiled kernels of this package are serial and release the interpreter lock; whoever has many frames cuts them
-into blocks and runs the blocks on a few Python threads. There is no second thread pool (OpenMP, numba's) to fight with.
+The compiled kernels of this package are serial and release the interpreter lock; whoever has many
+frames cuts them into blocks and runs the blocks on a few Python threads. There is no second thread
+pool (OpenMP, numba's) to fight with.
 """
 
 from __future__ import annotations
@@ -24,13 +25,16 @@ T = TypeVar("T")
 Made = TypeVar("Made")
 
 LANES = 32
-"""Frames per block: a row of a block is two full vectors of 512 bits, and a 174 x 174 picture stays in cache."""
+"""Frames per block: a row of a block is two full vectors of 512 bits, and a 174 x 174 picture stays
+in cache.
+"""
 
 THREADS_VARIABLE = "TOFCLIP_THREADS"
 
 
 def thread_count() -> int:
-    """Threads to use: the environment's ``TOFCLIP_THREADS``, else one for each core this process may run on.
+    """Threads to use: the environment's ``TOFCLIP_THREADS``, else one for each core this process
+    may run on.
 
     Raises
     ------
@@ -46,38 +50,41 @@ def thread_count() -> int:
     return int(wanted)
 
 
-_calling = threading.local()
+_thread_state = threading.local()
 
 
 @contextmanager
-def on_this_thread() -> Iterator[None]:
-    """Let `run_blocks` work on the calling thread alone, for whoever has other work for the other cores."""
-    before = _alone()
-    _calling.alone = True
+def limit_to_calling_thread() -> Iterator[None]:
+    """Let `run_blocks` work on the calling thread alone, for whoever has other work for the other
+    cores.
+    """
+    before = _is_limited()
+    _thread_state.alone = True
     try:
         yield
     finally:
-        _calling.alone = before
+        _thread_state.alone = before
 
 
-def _alone() -> bool:
-    return getattr(_calling, "alone", False)
+def _is_limited() -> bool:
+    return getattr(_thread_state, "alone", False)
 
 
-def one_per_core(work: Callable[[T], Made], items: Iterable[T]) -> Generator[Made, None, None]:
-    """Yield what `work` makes of each item, in order, while every core is busy with another one of them.
+def map_per_core(work: Callable[[T], Made], items: Iterable[T]) -> Generator[Made, None, None]:
+    """Yield what `work` makes of each item, in order, while every core is busy with another one of
+    them.
 
-    Items that share the cores wait for each other; items that have one each do not. `thread_count` of them are worked
-    on at a time, and as many results are kept at most. NumPy's products keep to one thread until the end. The first
-    exception is raised where its result would be.
+    Items that share the cores wait for each other; items that have one each do not. `thread_count`
+    of them are worked on at a time, and as many results are kept at most. NumPy's products keep to
+    one thread until the end. The first exception is raised where its result would be.
     """
 
     def alone(item: T) -> Made:
-        with on_this_thread():
+        with limit_to_calling_thread():
             return work(item)
 
     count = thread_count()
-    with one_blas_thread(), ThreadPoolExecutor(count, "tofclip") as cores:
+    with limit_blas_threads(), ThreadPoolExecutor(count, "tofclip") as cores:
         under_way: deque[Future[Made]] = deque()
         try:
             for item in items:
@@ -91,19 +98,20 @@ def one_per_core(work: Callable[[T], Made], items: Iterable[T]) -> Generator[Mad
                 one.cancel()
 
 
-def blocks(total: int, size: int = LANES) -> Iterator[slice]:
+def split_blocks(total: int, size: int = LANES) -> Iterator[slice]:
     """Cut ``range(total)`` into slices of at most `size`."""
     for start in range(0, total, size):
         yield slice(start, min(start + size, total))
 
 
 def run_blocks(work: Callable[[slice], None], total: int, size: int = LANES) -> None:
-    """Call `work` on every block of ``range(total)``, on `thread_count` threads; the first exception is raised.
+    """Call `work` on every block of ``range(total)``, on `thread_count` threads; the first
+    exception is raised.
 
     An interruption (Ctrl-C) waits for the blocks under way and starts no further ones.
     """
-    pieces = list(blocks(total, size))
-    threads = 1 if _alone() else min(thread_count(), len(pieces))
+    pieces = list(split_blocks(total, size))
+    threads = 1 if _is_limited() else min(thread_count(), len(pieces))
     if threads <= 1:
         for piece in pieces:
             work(piece)
@@ -116,18 +124,21 @@ def run_blocks(work: Callable[[slice], None], total: int, size: int = LANES) -> 
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def one_blas_thread() -> AbstractContextManager[Any]:
+def limit_blas_threads() -> AbstractContextManager[Any]:
     """Keep matrix products on the threads that call them.
 
-    Where blocks keep every core busy already, BLAS threads of its own would wait for, and spin against, ours.
+    Where blocks keep every core busy already, BLAS threads of its own would wait for, and spin
+    against, ours.
     """
-    limited: AbstractContextManager[Any] = _blas().limit(limits=1, user_api="blas")
+    limited: AbstractContextManager[Any] = _blas_controller().limit(limits=1, user_api="blas")
     return limited
 
 
 @cache
-def _blas() -> ThreadpoolController:
-    """The linear-algebra libraries that are loaded; looking for them takes as long as a small image."""
+def _blas_controller() -> ThreadpoolController:
+    """The linear-algebra libraries that are loaded; looking for them takes as long as a small
+    image.
+    """
     import scipy.linalg  # noqa: F401 - brings one of its own beside NumPy's
     from threadpoolctl import ThreadpoolController
 

@@ -1,6 +1,8 @@
-"""Physical constants and the few unit factors used where a name says so (``_ps``, ``_mm``, ``_deg``).
+"""Physical constants and the few unit factors used where a name says so (``_ps``, ``_mm``,
+``_deg``).
 
-Public signatures are in SI units; these factors belong to file formats, command-line flags and axis labels.
+Public signatures are in SI units; these factors belong to file formats, command-line flags and axis
+labels.
 """
 
 from __future__ import annotations

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import sys
 
-from apps.benchmarks.measure import measure
-from apps.benchmarks.registry import cases_called
+from apps.benchmarks.measure import measure_case
+from apps.benchmarks.registry import find_cases
 
 
 def main() -> None:
     """Measure what the command line names."""
     name, size = sys.argv[1:]
-    print(json.dumps(measure(cases_called(name)[0], int(size))))
+    print(json.dumps(measure_case(find_cases(name)[0], int(size))))
 
 
 if __name__ == "__main__":

@@ -7,15 +7,17 @@ from dataclasses import dataclass, field
 
 Action = Callable[[], object]
 Peer = Callable[[], float]
-"""Does the same with another program, and returns the seconds of its work alone; raises `AbsentPeerError`."""
+"""Does the same with another program, and returns the seconds of its work alone; raises
+`PeerUnavailableError`.
+"""
 
 
-class AbsentPeerError(Exception):
+class PeerUnavailableError(Exception):
     """The other program cannot be had here, and why."""
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreparedCase:
     """A case at one size, ready to run.
 
     Parameters
@@ -28,7 +30,7 @@ class Prepared:
         How much one action does, in the case's unit.
     peers : mapping of str to callable
         The same by other programs, by their names.
-    floor_share : float
+    floor_fraction : float
         Part of the floor that `floor` does, where all of it would take too long.
     """
 
@@ -36,7 +38,7 @@ class Prepared:
     floor: Action
     amount: float
     peers: Mapping[str, Peer] = field(default_factory=dict)
-    floor_share: float = 1.0
+    floor_fraction: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Case:
     sizes : tuple of int
         Rising. Growth is from each to the next; threads and floor are told of the last.
     unit : str
-        What `Prepared.amount` counts.
+        What `PreparedCase.amount` counts.
     floor : str
         What it is held against, in words.
     prepare : callable
@@ -67,7 +69,7 @@ class Case:
     sizes: tuple[int, ...]
     unit: str
     floor: str
-    prepare: Callable[[int], Prepared]
+    prepare: Callable[[int], PreparedCase]
 
     @property
     def group(self) -> str:

@@ -1,4 +1,6 @@
-"""Recovery of one picture of a light field from few readings, against the bare products of its model."""
+"""Recovery of one picture of a light field from few readings, against the bare products of its
+model.
+"""
 
 from __future__ import annotations
 
@@ -6,29 +8,33 @@ from functools import partial
 
 import numpy as np
 
-from apps.benchmarks.case import Case, Prepared
-from apps.benchmarks.peers import lensless_seconds
+from apps.benchmarks.case import Case, PreparedCase
+from apps.benchmarks.peers import time_lensless
 from tofclip.light_field import LightField
-from tofclip.light_field.measurement import Setup, measure
+from tofclip.light_field.measurement import CameraSetup, measure
 from tofclip.recovery.light_field import ClipRecovery
 
-SIDES = (64, 128)
+SIDES_PX = (64, 128)
 SHEAR = -0.3
-WEIGHT = 2e-3
-VIEWS = np.array([(v, u) for v in range(-4, 4) for u in range(-4, 4)], dtype=np.float64)
+PRIOR_WEIGHT = 2e-3
+VIEW_POSITIONS = np.array([(v, u) for v in range(-4, 4) for u in range(-4, 4)], dtype=np.float64)
 
 
-def light_field(side: int) -> LightField:
+def make_light_field(side: int) -> LightField:
     """Even patches of random brightness, the same in all 8 x 8 views."""
     patches = np.random.default_rng(0).random((8, 8)).astype(np.float32)
     picture = np.kron(patches, np.ones((side // 8, side // 8), np.float32))
-    return LightField(np.broadcast_to(picture, (len(VIEWS), side, side)).copy(), VIEWS)
+    return LightField(
+        np.broadcast_to(picture, (len(VIEW_POSITIONS), side, side)).copy(), VIEW_POSITIONS
+    )
 
 
-def recovery(encoder: str, side: int) -> Prepared:
-    """One picture by total variation at a given weight; the floor takes as many products as the recovery needed."""
-    measurement = measure(light_field(side), Setup(encoder, 0.5, 0))
-    method = ClipRecovery(weight=WEIGHT)
+def prepare_recovery(encoder: str, side: int) -> PreparedCase:
+    """One picture by total variation at a given weight; the floor takes as many products as the
+    recovery needed.
+    """
+    measurement = measure(make_light_field(side), CameraSetup(encoder, 0.5, 0))
+    method = ClipRecovery(weight=PRIOR_WEIGHT)
     needed = method.recover(measurement, SHEAR).iterations
     camera = measurement.camera()
     model = camera.weighting() @ camera.model(SHEAR)
@@ -38,38 +44,38 @@ def recovery(encoder: str, side: int) -> Prepared:
         for _ in range(needed):
             model.adjoint(model(picture))
 
-    peers = {"LenslessPiCam": partial(lensless_seconds, side, needed)} if encoder == "diffuser" else {}
-    return Prepared(lambda: method.recover(measurement, SHEAR), products, 1, peers)
+    peers = {"LenslessPiCam": partial(time_lensless, side, needed)} if encoder == "diffuser" else {}
+    return PreparedCase(lambda: method.recover(measurement, SHEAR), products, 1, peers)
 
 
-FLOOR = "the products of its iterations alone"
+FLOOR_TEXT = "the products of its iterations alone"
 
 CASES = (
     Case(
         "clip-1d",
         "CLIP-1D, half as many readings as pixels",
         "pixels a side",
-        SIDES,
+        SIDES_PX,
         "pictures",
-        FLOOR,
-        partial(recovery, "line"),
+        FLOOR_TEXT,
+        partial(prepare_recovery, "line"),
     ),
     Case(
         "clip-0d",
         "CLIP-0D, half as many readings as pixels",
         "pixels a side",
-        SIDES,
+        SIDES_PX,
         "pictures",
-        FLOOR,
-        partial(recovery, "single-pixel"),
+        FLOOR_TEXT,
+        partial(prepare_recovery, "single-pixel"),
     ),
     Case(
         "clip-2d",
         "CLIP-2D (diffuser), half as many readings as pixels; the peer takes as many iterations of one view",
         "pixels a side",
-        SIDES,
+        SIDES_PX,
         "pictures",
-        FLOOR,
-        partial(recovery, "diffuser"),
+        FLOOR_TEXT,
+        partial(prepare_recovery, "diffuser"),
     ),
 )

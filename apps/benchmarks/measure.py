@@ -6,64 +6,70 @@ import statistics
 import time
 from typing import Any
 
-from apps.benchmarks.case import AbsentPeerError, Action, Case
-from tofclip.sequences.jobs.jobs import peak_memory_bytes
+from apps.benchmarks.case import Action, Case, PeerUnavailableError
+from tofclip.sequences.jobs.jobs import measure_peak_memory_bytes
 
-FEWEST, MOST = 3, 31
-SECONDS = 1.0
-"""Repeats go on for so long, or until there are `MOST`."""
+MIN_REPEATS, MAX_REPEATS = 3, 31
+REPEAT_TIME_S = 1.0
+"""Repeats go on for so long, or until there are `MAX_REPEATS`."""
 
-SLOW_SECONDS = 2.0
+SLOW_TIME_S = 2.0
 """What takes longer is measured once."""
 
-FLOOR_SECONDS = 0.3
+FLOOR_TIME_S = 0.3
 BYTES_PER_MIB = 1 << 20
 
 
-def measure(case: Case, size: int) -> dict[str, Any]:
+def measure_case(case: Case, size: int) -> dict[str, Any]:
     """Return the figures of a case at one size.
 
     Returns
     -------
     dict
-        ``seconds`` (median, least and greatest of the repeats after one that warms up), ``per_second``, ``peak_mib`` of
-        the process with its libraries and inputs, ``own_mib`` of that only while the action ran, ``floor_seconds``,
-        ``times_floor``, and ``peers``: seconds, or why there are none.
+        ``seconds`` (median, least and greatest of the repeats after one that warms up),
+        ``per_second``, ``peak_mib`` of the process with its libraries and inputs, ``own_mib`` of
+        that only while the action ran, ``floor_seconds``, ``times_floor``, and ``peers``: seconds,
+        or why there are none.
     """
     ready = case.prepare(size)
-    before = peak_memory_bytes()
+    before = measure_peak_memory_bytes()
     ready.action()
-    peak = peak_memory_bytes()
-    seconds = repeated(ready.action, SECONDS)
+    peak = measure_peak_memory_bytes()
+    seconds = time_repeats(ready.action, REPEAT_TIME_S)
     ready.floor()
-    floor = statistics.median(repeated(ready.floor, FLOOR_SECONDS)) / ready.floor_share
+    floor = statistics.median(time_repeats(ready.floor, FLOOR_TIME_S)) / ready.floor_fraction
     median = statistics.median(seconds)
     return {
-        "seconds": {"median": median, "least": min(seconds), "greatest": max(seconds), "repeats": len(seconds)},
+        "seconds": {
+            "median": median,
+            "least": min(seconds),
+            "greatest": max(seconds),
+            "repeats": len(seconds),
+        },
         "per_second": ready.amount / median,
         "peak_mib": peak / BYTES_PER_MIB,
         "own_mib": (peak - before) / BYTES_PER_MIB,
         "floor_seconds": floor,
         "times_floor": median / floor,
-        "peers": {name: _told(peer) for name, peer in ready.peers.items()},
+        "peers": {name: _time_peer(peer) for name, peer in ready.peers.items()},
     }
 
 
-def repeated(action: Action, seconds: float) -> list[float]:
+def time_repeats(action: Action, seconds: float) -> list[float]:
     """Time an action again and again."""
     found: list[float] = []
-    while len(found) < MOST:
+    while len(found) < MAX_REPEATS:
         began = time.perf_counter()
         action()
         found.append(time.perf_counter() - began)
-        enough = len(found) >= FEWEST or found[0] > SLOW_SECONDS
+        enough = len(found) >= MIN_REPEATS or found[0] > SLOW_TIME_S
         if enough and sum(found) >= seconds:
             break
     return found
 
 
-def _told(peer: Any) -> dict[str, Any]:
+def _time_peer(peer: Any) -> dict[str, Any]:
     try:
         return {"seconds": peer()}
-    except AbsentPeerError as absence:
+    except PeerUnavailableError as absence:
         return {"absent": str(absence)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-HEAD = """\
+PAGE_HEADER = """\
 # Benchmarks
 
 Made by `{command}`; do not edit. Every figure comes from one run on one machine:
@@ -18,7 +18,7 @@ added. *Floor* is what the work cannot do without, measured beside it on the sam
 of the size with which the time grows between the first and the last size.
 """
 
-TITLES = {
+GROUP_TITLES = {
     "recovery": "Recovery of shots (7 views, 1344 slit pixels, 174 x 174 pixels)",
     "clip": "Light fields from few readings (8 x 8 views)",
     "depth": "Ranges (the demo's instrument)",
@@ -29,20 +29,24 @@ TITLES = {
     "backprojection": "Around the corner: back-projection",
     "decode": "Instruments",
 }
-COLUMNS = ("", "size", "threads", "time", "rate", "memory", "floor", "x floor", "growth")
+TABLE_COLUMNS = ("", "size", "threads", "time", "rate", "memory", "floor", "x floor", "growth")
 
 
-def page(figures: Mapping[str, Any], command: str) -> str:
+def render_page(figures: Mapping[str, Any], command: str) -> str:
     """Return the page of the figures that a run of `command` gave."""
-    parts = [HEAD.format(command=command, machine=_machine(figures["machine"])).rstrip()]
-    for group, title in TITLES.items():
-        entries = [entry for entry in figures["entries"] if entry["name"].partition("-")[0] == group]
+    parts = [
+        PAGE_HEADER.format(command=command, machine=_format_machine(figures["machine"])).rstrip()
+    ]
+    for group, title in GROUP_TITLES.items():
+        entries = [
+            entry for entry in figures["entries"] if entry["name"].partition("-")[0] == group
+        ]
         if entries:
-            parts.append(_section(title, entries))
+            parts.append(_format_section(title, entries))
     return "\n\n".join(parts) + "\n"
 
 
-def _machine(known: Mapping[str, Any]) -> str:
+def _format_machine(known: Mapping[str, Any]) -> str:
     libraries = ", ".join(f"{name} {version}" for name, version in known["libraries"].items())
     return "\n".join(
         [
@@ -54,37 +58,42 @@ def _machine(known: Mapping[str, Any]) -> str:
     )
 
 
-def _section(title: str, entries: Iterable[Mapping[str, Any]]) -> str:
-    lines, notes = [_row(COLUMNS), _row(["---"] * len(COLUMNS))], []
+def _format_section(title: str, entries: Iterable[Mapping[str, Any]]) -> str:
+    lines, notes = [_format_row(TABLE_COLUMNS), _format_row(["---"] * len(TABLE_COLUMNS))], []
     for entry in entries:
-        lines.extend(_row(_cells(entry, run)) for run in entry["runs"])
-        notes.append(f"* {entry['title']}: sizes are {entry['size']}, the floor is {entry['floor']}.{_peers(entry)}")
+        lines.extend(_format_row(_format_cells(entry, run)) for run in entry["runs"])
+        notes.append(
+            f"* {entry['title']}: sizes are {entry['size']}, the floor is {entry['floor']}.{_format_peers(entry)}"
+        )
     return "\n".join([f"## {title}", "", *lines, "", *notes])
 
 
-def _row(cells: Iterable[str]) -> str:
+def _format_row(cells: Iterable[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _cells(entry: Mapping[str, Any], run: Mapping[str, Any]) -> list[str]:
+def _format_cells(entry: Mapping[str, Any], run: Mapping[str, Any]) -> list[str]:
     first = [entry["title"], str(run["size"]), str(run["threads"])]
     if "problem" in run:
         return [*first, run["problem"], "", "", "", "", ""]
     time = run["seconds"]
-    spread = f"{_seconds(time['median'])} ({_seconds(time['least'])} to {_seconds(time['greatest'])})"
+    median, least, greatest = (
+        _format_seconds(time[name]) for name in ("median", "least", "greatest")
+    )
+    spread = f"{median} ({least} to {greatest})"
     last = run is entry["runs"][-1]
     return [
         *first,
         spread,
-        f"{_digits(run['per_second'])} {entry['unit']}/s",
+        f"{_format_digits(run['per_second'])} {entry['unit']}/s",
         f"{run['peak_mib']:.0f} MiB, own {run['own_mib']:.0f}",
-        _seconds(run["floor_seconds"]),
+        _format_seconds(run["floor_seconds"]),
         f"{run['times_floor']:.2f}",
         f"{entry['growth']:.1f}" if last and entry["growth"] is not None else "",
     ]
 
 
-def _peers(entry: Mapping[str, Any]) -> str:
+def _format_peers(entry: Mapping[str, Any]) -> str:
     """Sentences about other programs, of the runs in which they were asked for."""
     told: dict[str, list[str]] = {}
     absent: dict[str, str] = {}
@@ -92,22 +101,30 @@ def _peers(entry: Mapping[str, Any]) -> str:
         for name, found in run.get("peers", {}).items():
             if "seconds" in found:
                 ratio = found["seconds"] / run["seconds"]["median"]
-                size = f"{run['size']}, {run['threads']} threads" if run["threads"] > 1 else f"{run['size']}, 1 thread"
-                told.setdefault(name, []).append(f"{_seconds(found['seconds'])} at {size} ({ratio:.1f} times ours)")
+                size = (
+                    f"{run['size']}, {run['threads']} threads"
+                    if run["threads"] > 1
+                    else f"{run['size']}, 1 thread"
+                )
+                told.setdefault(name, []).append(
+                    f"{_format_seconds(found['seconds'])} at {size} ({ratio:.1f} times ours)"
+                )
             else:
                 absent[name] = found["absent"]
     sentences = [f" {name}: {'; '.join(found)}." for name, found in told.items()]
-    sentences += [f" Not compared: {reason}." for name, reason in absent.items() if name not in told]
+    sentences += [
+        f" Not compared: {reason}." for name, reason in absent.items() if name not in told
+    ]
     return "".join(sentences)
 
 
-def _seconds(value: float) -> str:
+def _format_seconds(value: float) -> str:
     for unit, scale in (("s", 1.0), ("ms", 1e-3)):
         if value >= scale:
-            return f"{_digits(value / scale)} {unit}"
-    return f"{_digits(value / 1e-6)} us"
+            return f"{_format_digits(value / scale)} {unit}"
+    return f"{_format_digits(value / 1e-6)} us"
 
 
-def _digits(value: float) -> str:
+def _format_digits(value: float) -> str:
     """Three digits that count, without powers of ten."""
     return f"{value:.3g}" if value < 1000 else f"{value:.0f}"

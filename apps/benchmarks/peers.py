@@ -1,4 +1,6 @@
-"""Other programs that do the same. They run in a Python of their own, named by `--peers`, where they are installed."""
+"""Other programs that do the same. They run in a Python of their own, named by `--peers`, where
+they are installed.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.benchmarks.case import AbsentPeerError
+from apps.benchmarks.case import PeerUnavailableError
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid
 
 PEERS_VARIABLE = "TOFCLIP_PEERS"
-LONGEST_SECONDS = 60
+PEER_TIMEOUT_S = 60
 
-YTAL = """
+YTAL_SCRIPT = """
 import sys, time
 import numpy as np
 from tal.io.capture_data import NLOSCaptureData
@@ -40,7 +42,7 @@ pf.solve(data, float(stored["wavelength"]), float(stored["cycles"]), CameraSyste
 print("seconds", time.perf_counter() - start)
 """
 
-ASTRA = """
+ASTRA_SCRIPT = """
 import sys, time
 import astra, numpy as np
 stored = np.load(sys.argv[1])
@@ -54,7 +56,7 @@ astra.create_sino(picture, projector)
 print("seconds", time.perf_counter() - start)
 """
 
-LENSLESS = """
+LENSLESS_SCRIPT = """
 import sys, time
 import numpy as np
 from lensless import FISTA
@@ -69,36 +71,42 @@ print("seconds", time.perf_counter() - start)
 """
 
 
-def lensless_seconds(side: int, iterations: int) -> float:
-    """Seconds of as many iterations of LenslessPiCam's FISTA on a picture of that size and one view."""
+def time_lensless(side: int, iterations: int) -> float:
+    """Seconds of as many iterations of LenslessPiCam's FISTA on a picture of that size and one
+    view.
+    """
     random = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "readings.npz"
         spread, readings = (random.random((side, side), np.float32) for _ in range(2))
         np.savez(path, spread=spread, readings=readings, iterations=iterations)
-        return seconds_told(LENSLESS, "LenslessPiCam", str(path))
+        return run_peer(LENSLESS_SCRIPT, "LenslessPiCam", str(path))
 
 
-def astra_seconds(picture: NDArray[np.float32], angles: NDArray[np.float64]) -> float:
+def time_astra(picture: NDArray[np.float32], angles: NDArray[np.float64]) -> float:
     """Seconds of ASTRA's parallel projections of a picture, linear interpolation, processor."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "picture.npz"
         np.savez(path, picture=picture, angles=angles)
-        return seconds_told(ASTRA, "ASTRA", str(path))
+        return run_peer(ASTRA_SCRIPT, "ASTRA", str(path))
 
 
-def ytal_seconds(capture: Capture, grid: Grid, wavelength: float, cycles: float) -> float:
+def time_ytal(capture: Capture, grid: Grid, wavelength: float, cycles: float) -> float:
     """Seconds of y-tal's phasor fields on the same arrays, its solve call alone."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "capture.npz"
-        arrays: dict[str, Any] = {"signal": capture.signal, "wall": capture.wall, "laser": capture.laser}
+        arrays: dict[str, Any] = {
+            "signal": capture.signal,
+            "wall": capture.wall,
+            "laser": capture.laser,
+        }
         arrays |= {"x": grid.x, "y": grid.y, "z": grid.z}
         arrays |= {"spacing": capture.axis.spacing, "wavelength": wavelength, "cycles": cycles}
         np.savez(path, **arrays)
-        return seconds_told(YTAL, "y-tal", str(path))
+        return run_peer(YTAL_SCRIPT, "y-tal", str(path))
 
 
-def seconds_told(script: str, name: str, *words: str) -> float:
+def run_peer(script: str, name: str, *words: str) -> float:
     """Run a script in the peers' Python and return the seconds that its last lines tell.
 
     Raises
@@ -108,15 +116,17 @@ def seconds_told(script: str, name: str, *words: str) -> float:
     """
     python = os.environ.get(PEERS_VARIABLE)
     if not python:
-        raise AbsentPeerError(f"{name}: --peers names no Python that has it")
+        raise PeerUnavailableError(f"{name}: --peers names no Python that has it")
     clean = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     command = [python, "-c", script, *words]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=clean, timeout=LONGEST_SECONDS)
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, env=clean, timeout=PEER_TIMEOUT_S
+        )
     except subprocess.TimeoutExpired as fault:
-        raise AbsentPeerError(f"{name}: takes more than {LONGEST_SECONDS} s") from fault
+        raise PeerUnavailableError(f"{name}: takes more than {PEER_TIMEOUT_S} s") from fault
     told = [line.split() for line in done.stdout.splitlines() if line.startswith("seconds ")]
     if done.returncode or not told:
         problem = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
-        raise AbsentPeerError(f"{name}: {problem}")
+        raise PeerUnavailableError(f"{name}: {problem}")
     return float(told[-1][1])

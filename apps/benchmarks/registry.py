@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from apps.benchmarks import clip, corner, instruments, lidar, recovery
+from apps.benchmarks import clip, instruments, lidar, recovery
+from apps.benchmarks import nlos as corner
 from apps.benchmarks.case import Case
 from tofclip.errors import InputError
 
-CASES: tuple[Case, ...] = (*recovery.CASES, *clip.CASES, *lidar.CASES, *corner.CASES, *instruments.CASES)
+CASES: tuple[Case, ...] = (
+    *recovery.CASES,
+    *clip.CASES,
+    *lidar.CASES,
+    *corner.CASES,
+    *instruments.CASES,
+)
 
 
-def cases_called(name: str) -> tuple[Case, ...]:
+def find_cases(name: str) -> tuple[Case, ...]:
     """Return the case of a name, those of a group, or every one for ``all``.
 
     Raises
@@ -20,5 +27,7 @@ def cases_called(name: str) -> tuple[Case, ...]:
     found = tuple(case for case in CASES if name in ("all", case.name, case.group))
     if not found:
         groups = ", ".join(dict.fromkeys(case.group for case in CASES))
-        raise InputError(f"unknown benchmark '{name}'; take all, a group ({groups}) or one of a group, as recovery-l1")
+        raise InputError(
+            f"unknown benchmark '{name}'; take all, a group ({groups}) or one of a group, as recovery-l1"
+        )
     return found

@@ -12,28 +12,30 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from apps.benchmarks.case import Case
-from apps.benchmarks.machine import machine
+from apps.benchmarks.machine import describe_machine
 from apps.benchmarks.peers import PEERS_VARIABLE
 from tofclip.threads import THREADS_VARIABLE, thread_count
 
-LONGEST_SECONDS = 120
-ALL_SECONDS = 580
+CASE_TIMEOUT_S = 120
+TOTAL_TIMEOUT_S = 580
 """What has not begun by then is left out, so that a run takes less than ten minutes on any machine."""
 
 
-class Clock:
-    """Counts down `ALL_SECONDS`."""
+class TimeBudget:
+    """Counts down `TOTAL_TIMEOUT_S`."""
 
     def __init__(self) -> None:
-        self._end = time.monotonic() + ALL_SECONDS
+        self._end = time.monotonic() + TOTAL_TIMEOUT_S
 
     @property
-    def left(self) -> float:
+    def remaining_s(self) -> float:
         """Seconds that are left, not negative."""
         return max(0.0, self._end - time.monotonic())
 
 
-def run_cases(cases: Sequence[Case], peers: str | None, advance: Callable[[int], None]) -> dict[str, Any]:
+def run_cases(
+    cases: Sequence[Case], peers: str | None, advance: Callable[[int], None]
+) -> dict[str, Any]:
     """Measure cases one after the other.
 
     Parameters
@@ -42,34 +44,43 @@ def run_cases(cases: Sequence[Case], peers: str | None, advance: Callable[[int],
     peers : str, optional
         Python in which other programs are installed.
     advance : callable
-        Called with 1 after each process; there are `processes` of them.
+        Called with 1 after each process; there are `count_processes` of them.
 
     Returns
     -------
     dict
-        ``machine`` and ``entries``, one for each case.
+        ``describe_machine`` and ``entries``, one for each case.
     """
-    clock = Clock()
-    return {"machine": machine(), "entries": [_entry(case, peers, clock, advance) for case in cases]}
+    clock = TimeBudget()
+    return {
+        "machine": describe_machine(),
+        "entries": [_run_case(case, peers, clock, advance) for case in cases],
+    }
 
 
-def processes(cases: Sequence[Case]) -> int:
+def count_processes(cases: Sequence[Case]) -> int:
     """Return how many processes `run_cases` starts."""
-    return sum(len(case.sizes) + len(threads()) - 1 for case in cases)
+    return sum(len(case.sizes) + len(list_thread_counts()) - 1 for case in cases)
 
 
-def threads() -> list[int]:
-    """Return the numbers of threads that are compared: 1 and all, which is 2 on the smallest machines."""
+def list_thread_counts() -> list[int]:
+    """Return the numbers of threads that are compared: 1 and all, which is 2 on the smallest
+    machines.
+    """
     return sorted({1, thread_count()})
 
 
-def _entry(case: Case, peers: str | None, clock: Clock, advance: Callable[[int], None]) -> dict[str, Any]:
-    *fewer, most = threads()
+def _run_case(
+    case: Case, peers: str | None, clock: TimeBudget, advance: Callable[[int], None]
+) -> dict[str, Any]:
+    *fewer, most = list_thread_counts()
     runs = []
     for size in case.sizes:
         for count in [*fewer, most] if size == case.sizes[-1] else [most]:
             wanted = peers if count == most else None  # a peer is asked once for each size
-            runs.append({"size": size, "threads": count, **_measured(case, (size, count), wanted, clock)})
+            runs.append(
+                {"size": size, "threads": count, **_run_process(case, (size, count), wanted, clock)}
+            )
             advance(1)
     return {
         "name": case.name,
@@ -78,29 +89,39 @@ def _entry(case: Case, peers: str | None, clock: Clock, advance: Callable[[int],
         "unit": case.unit,
         "floor": case.floor,
         "runs": runs,
-        "growth": _growth(runs, most),
+        "growth": _fit_growth(runs, most),
     }
 
 
-def _measured(case: Case, extent: tuple[int, int], peers: str | None, clock: Clock) -> dict[str, Any]:
-    """Figures of a fresh process for a size and a number of threads, or ``problem``: why there are none."""
+def _run_process(
+    case: Case, extent: tuple[int, int], peers: str | None, clock: TimeBudget
+) -> dict[str, Any]:
+    """Figures of a fresh process for a size and a number of threads, or ``problem``: why there are
+    none.
+    """
     size, count = extent
-    longest = min(LONGEST_SECONDS, clock.left)
+    longest = min(CASE_TIMEOUT_S, clock.remaining_s)
     if longest == 0:
-        return {"problem": f"left out: the others took {ALL_SECONDS} s"}
+        return {"problem": f"left out: the others took {TOTAL_TIMEOUT_S} s"}
     environment = {**os.environ, THREADS_VARIABLE: str(count), PEERS_VARIABLE: peers or ""}
     command = [sys.executable, "-m", "apps.benchmarks", case.name, str(size)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=longest)
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, env=environment, timeout=longest
+        )
     except subprocess.TimeoutExpired:
         return {"problem": f"took more than {longest:.0f} s"}
     if done.returncode:
-        return {"problem": (done.stderr.strip().splitlines() or [f"ended with status {done.returncode}"])[-1]}
+        return {
+            "problem": (
+                done.stderr.strip().splitlines() or [f"ended with status {done.returncode}"]
+            )[-1]
+        }
     figures: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return figures
 
 
-def _growth(runs: Sequence[dict[str, Any]], count: int) -> float | None:
+def _fit_growth(runs: Sequence[dict[str, Any]], count: int) -> float | None:
     """Power of the size with which the time grows, between the least and the greatest size."""
     known = [run for run in runs if run["threads"] == count and "seconds" in run]
     if len(known) < 2:

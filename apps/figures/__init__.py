@@ -1,1 +1,3 @@
-"""The pictures that verbs draw, as matplotlib figures. Import what you draw with: matplotlib is slow to load."""
+"""The pictures that verbs draw, as matplotlib figures. Import what you draw with: matplotlib is
+slow to load.
+"""

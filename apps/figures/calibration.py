@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.figures.style import LINE, SMALL, draw, label, page
+from apps.figures.style import LINE_COLOUR, SMALL_FONT_PT, draw_image, label_axes, make_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,33 +17,33 @@ if TYPE_CHECKING:
 
 ZOOM_HALF_WIDTH_PX = 20
 MARGIN_ROWS = 25
-BRIGHTEST = 99.8  # percent: a glint does not darken the rest
+WHITE_PERCENTILE = 99.8  # percent: a glint does not darken the rest
 
 
-def calibration_figure(found: FocusCalibration) -> Figure:
+def make_calibration_figure(found: FocusCalibration) -> Figure:
     """Draw both pictures whole with the fits, and a zoom into every view's slit centre."""
     views = found.centres_px.size
-    figure = page(12, 8.5)
+    figure = make_figure(12, 8.5)
     parts: Any = figure.subfigures(2, 1, height_ratios=(1.5, 1))
     whole, zooms = parts
     upper, lower = whole.subplots(2, 1, sharex=True)
-    _draw_whole(upper, found, found.signal, "slit open: the lines and their fitted angles")
-    _draw_whole(lower, found, found.dots, "slit closed: where the lines cross the slit")
+    _draw_picture(upper, found, found.signal, "slit open: the lines and their fitted angles")
+    _draw_picture(lower, found, found.dots, "slit closed: where the lines cross the slit")
     panels = zooms.subplots(2, views, squeeze=False)
     for view in range(views):
         _draw_line_zoom(panels[0, view], found, view)
         _draw_dot_profile(panels[1, view], found, view)
-    panels[0, 0].set_ylabel("row (px)", fontsize=SMALL)
-    panels[1, 0].set_ylabel("counts", fontsize=SMALL)
+    panels[0, 0].set_ylabel("row (px)", fontsize=SMALL_FONT_PT)
+    panels[1, 0].set_ylabel("counts", fontsize=SMALL_FONT_PT)
     return figure
 
 
-def _draw_whole(axes: Axes, found: FocusCalibration, picture: NDArray[Any], title: str) -> None:
+def _draw_picture(axes: Axes, found: FocusCalibration, picture: NDArray[Any], title: str) -> None:
     first = max(0, int(found.line_rows_px.min()) - MARGIN_ROWS)
     last = min(picture.shape[0], int(found.line_rows_px.max()) + MARGIN_ROWS + 1)
     shown = np.sqrt(np.maximum(picture[first:last], 0))
     extent = (-0.5, picture.shape[1] - 0.5, last - 0.5, first - 0.5)
-    draw(axes, shown, extent, aspect="auto", vmax=np.percentile(shown, BRIGHTEST))
+    draw_image(axes, shown, extent, aspect="auto", vmax=np.percentile(shown, WHITE_PERCENTILE))
     for view, angle in enumerate(np.rad2deg(found.angles)):
         _draw_line(axes, found, view)
         row = found.dot_rows_px[view]
@@ -54,44 +54,60 @@ def _draw_whole(axes: Axes, found: FocusCalibration, picture: NDArray[Any], titl
             color="white",
             ha="center",
             va="top",
-            fontsize=SMALL,
+            fontsize=SMALL_FONT_PT,
         )
-    label(axes, title, "slit column (px)", "row (px)")
+    label_axes(axes, title, "slit column (px)", "row (px)")
 
 
 def _draw_line(axes: Axes, found: FocusCalibration, view: int) -> None:
     rows = found.line_rows_px[view]
-    columns = found.line_columns_px[view] + (rows - found.dot_rows_px[view]) * np.tan(found.angles[view])
-    axes.plot(columns, rows, color=LINE, linewidth=0.8)
+    columns = found.line_columns_px[view] + (rows - found.dot_rows_px[view]) * np.tan(
+        found.angles[view]
+    )
+    axes.plot(columns, rows, color=LINE_COLOUR, linewidth=0.8)
 
 
 def _draw_line_zoom(axes: Axes, found: FocusCalibration, view: int) -> None:
     """The line around the slit, with its fit and the centre found in the dot picture."""
     column, row = round(found.centres_px[view]), round(found.dot_rows_px[view])
-    window, extent = _window(found.signal, row, column)
-    draw(axes, window, extent, aspect="equal")
+    window, extent = _cut_window(found.signal, row, column)
+    draw_image(axes, window, extent, aspect="equal")
     _draw_line(axes, found, view)
-    axes.plot(found.centres_px[view], found.dot_rows_px[view], "+", color="white", markersize=12, markeredgewidth=1)
+    axes.plot(
+        found.centres_px[view],
+        found.dot_rows_px[view],
+        "+",
+        color="white",
+        markersize=12,
+        markeredgewidth=1,
+    )
     axes.set_xlim(extent[:2])
     axes.set_ylim(extent[2:])
-    label(axes, f"view {view}", "", "")
+    label_axes(axes, f"view {view}", "", "")
 
 
 def _draw_dot_profile(axes: Axes, found: FocusCalibration, view: int) -> None:
     """The dot's profile along the slit, with the fitted centre and its uncertainty."""
     centre, error = found.centres_px[view], found.centre_uncertainty_px[view]
-    window, extent = _window(found.dots, round(found.dot_rows_px[view]), round(centre))
+    window, extent = _cut_window(found.dots, round(found.dot_rows_px[view]), round(centre))
     columns = np.arange(window.shape[1]) + extent[0] + 0.5
     axes.plot(columns, window.sum(axis=0), color="#444444", linewidth=1, drawstyle="steps-mid")
-    axes.axvspan(centre - error, centre + error, color=LINE, alpha=0.4, linewidth=0)
-    axes.axvline(centre, color=LINE, linewidth=1)
-    label(axes, f"{centre:.2f} \N{PLUS-MINUS SIGN} {error:.2f} px", "column (px)", "")
+    axes.axvspan(centre - error, centre + error, color=LINE_COLOUR, alpha=0.4, linewidth=0)
+    axes.axvline(centre, color=LINE_COLOUR, linewidth=1)
+    label_axes(axes, f"{centre:.2f} \N{PLUS-MINUS SIGN} {error:.2f} px", "column (px)", "")
     axes.ticklabel_format(axis="y", style="sci", scilimits=(0, 3))
-    axes.yaxis.get_offset_text().set_fontsize(SMALL)
+    axes.yaxis.get_offset_text().set_fontsize(SMALL_FONT_PT)
 
 
-def _window(picture: NDArray[Any], row: int, column: int) -> tuple[NDArray[Any], tuple[float, float, float, float]]:
+def _cut_window(
+    picture: NDArray[Any], row: int, column: int
+) -> tuple[NDArray[Any], tuple[float, float, float, float]]:
     """Cut out the surroundings of a pixel, and say where their outer edges lie."""
     top, left = max(0, row - ZOOM_HALF_WIDTH_PX), max(0, column - ZOOM_HALF_WIDTH_PX)
     window = picture[top : row + ZOOM_HALF_WIDTH_PX + 1, left : column + ZOOM_HALF_WIDTH_PX + 1]
-    return window, (left - 0.5, left + window.shape[1] - 0.5, top + window.shape[0] - 0.5, top - 0.5)
+    return window, (
+        left - 0.5,
+        left + window.shape[1] - 0.5,
+        top + window.shape[0] - 0.5,
+        top - 0.5,
+    )

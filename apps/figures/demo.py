@@ -1,4 +1,6 @@
-"""The demonstration in one picture: what was measured, what came out of it, and how far that is from the truth."""
+"""The demonstration in one picture: what was measured, what came out of it, and how far that is
+from the truth.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apps.figures.style import BRIGHTNESS, DEPTH, NOTHING, colour_bar, draw, label, outer_edges, page
+from apps.figures.style import (
+    BRIGHTNESS_COLOURMAP,
+    DEPTH_COLOURMAP,
+    EMPTY_COLOUR,
+    add_colour_bar,
+    draw_image,
+    label_axes,
+    make_figure,
+    outer_edges,
+)
 from tofclip.units import MILLIMETRE, NANOSECOND, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
@@ -15,63 +26,81 @@ if TYPE_CHECKING:
 
     from tofclip.lidar import PointCloud, Returns
     from tofclip.shots import Frames, Streak
-    from tofclip.simulate import Truth
+    from tofclip.simulate import GroundTruth
 
-BRIGHTEST = 99.5  # percent: a glint does not darken the rest
+WHITE_PERCENTILE = 99.5  # percent: a glint does not darken the rest
 HISTOGRAM_BINS = 61
 
 
-def demo_figure(streak: Streak, frames: Frames, returns: Returns, cloud: PointCloud, truth: Truth) -> Figure:
-    """Draw streak image, brightness and range as seen by the camera; top and side view in metres; range errors."""
-    figure = page(12, 7.6)
+def make_demo_figure(
+    streak: Streak, frames: Frames, returns: Returns, cloud: PointCloud, truth: GroundTruth
+) -> Figure:
+    """Draw streak image, brightness and range as seen by the camera; top and side view in metres;
+    range errors.
+    """
+    figure = make_figure(12, 7.6)
     panels = figure.subplots(2, 3)
     _draw_streak(panels[0, 0], streak)
     _draw_brightness(panels[0, 1], frames)
     _draw_range(panels[0, 2], returns)
-    limits = _normalised(cloud.intensity)
-    _scatter(panels[1, 0], cloud.xyz[:, 0], cloud.xyz[:, 2], limits)
-    label(panels[1, 0], "top view of the cloud", "x (m)", "z, away from the camera (m)")
-    _scatter(panels[1, 1], cloud.xyz[:, 2], cloud.xyz[:, 1], limits)
+    limits = _normalise_brightness(cloud.intensity)
+    _scatter_points(panels[1, 0], cloud.xyz[:, 0], cloud.xyz[:, 2], limits)
+    label_axes(panels[1, 0], "top view of the cloud", "x (m)", "z, away from the camera (m)")
+    _scatter_points(panels[1, 1], cloud.xyz[:, 2], cloud.xyz[:, 1], limits)
     panels[1, 1].invert_yaxis()
-    label(panels[1, 1], "side view of the cloud", "z, away from the camera (m)", "y, down (m)")
+    label_axes(panels[1, 1], "side view of the cloud", "z, away from the camera (m)", "y, down (m)")
     _draw_errors(panels[1, 2], returns, truth)
     return figure
 
 
-def _normalised(values: Any) -> Any:
+def _normalise_brightness(values: Any) -> Any:
     """Scale intensities to 0..1 with some light left for the dim ones."""
-    top = np.percentile(values, BRIGHTEST) if values.size else 1.0
+    top = np.percentile(values, WHITE_PERCENTILE) if values.size else 1.0
     return np.sqrt(np.clip(values / top, 0, 1))
 
 
 def _draw_streak(axes: Axes, streak: Streak) -> None:
     first, last = outer_edges(streak.times / NANOSECOND)
     extent = (-0.5, streak.counts.shape[1] - 0.5, last, first)
-    drawn = draw(axes, streak.counts, extent, aspect="auto", vmin=0, vmax=np.percentile(streak.counts, BRIGHTEST))
-    label(axes, "streak image: one shot, seven views", "slit column (px)", "time axis (ns)")
-    colour_bar(axes, drawn, "photons")
+    drawn = draw_image(
+        axes,
+        streak.counts,
+        extent,
+        aspect="auto",
+        vmin=0,
+        vmax=np.percentile(streak.counts, WHITE_PERCENTILE),
+    )
+    label_axes(axes, "streak image: one shot, seven views", "slit column (px)", "time axis (ns)")
+    add_colour_bar(axes, drawn, "photons")
 
 
 def _draw_brightness(axes: Axes, frames: Frames) -> None:
     ranges = np.maximum(frames.times, 0) * SPEED_OF_LIGHT / 2
     picture = np.tensordot((ranges**2).astype(np.float32), frames.values, axes=1)
-    drawn = draw(axes, picture, vmin=0, vmax=np.percentile(picture, BRIGHTEST))
-    label(axes, "recovered brightness \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}", "x (px)", "y (px), down")
-    colour_bar(axes, drawn, "photons at 1 m")
+    drawn = draw_image(axes, picture, vmin=0, vmax=np.percentile(picture, WHITE_PERCENTILE))
+    label_axes(
+        axes,
+        "recovered brightness \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}",
+        "x (px)",
+        "y (px), down",
+    )
+    add_colour_bar(axes, drawn, "photons at 1 m")
 
 
 def _draw_range(axes: Axes, returns: Returns) -> None:
-    drawn = draw(axes, returns.image("range"), cmap=DEPTH)
-    label(axes, "range of the strongest return", "x (px)", "y (px), down")
-    colour_bar(axes, drawn, "range (m)")
+    drawn = draw_image(axes, returns.image("range"), cmap=DEPTH_COLOURMAP)
+    label_axes(axes, "range of the strongest return", "x (px)", "y (px), down")
+    add_colour_bar(axes, drawn, "range (m)")
 
 
-def _scatter(axes: Axes, right: Any, up: Any, brightness: Any) -> None:
-    axes.set_facecolor(NOTHING)
-    axes.scatter(right, up, c=brightness, cmap=BRIGHTNESS, vmin=0, vmax=1, s=1.2, linewidths=0)
+def _scatter_points(axes: Axes, right: Any, up: Any, brightness: Any) -> None:
+    axes.set_facecolor(EMPTY_COLOUR)
+    axes.scatter(
+        right, up, c=brightness, cmap=BRIGHTNESS_COLOURMAP, vmin=0, vmax=1, s=1.2, linewidths=0
+    )
 
 
-def _draw_errors(axes: Axes, returns: Returns, truth: Truth) -> None:
+def _draw_errors(axes: Axes, returns: Returns, truth: GroundTruth) -> None:
     error = (returns.image("range") - truth.range)[truth.target] / MILLIMETRE
     error = error[np.isfinite(error)]
     bin_mm = SPEED_OF_LIGHT * truth.bin_width / 2 / MILLIMETRE
@@ -80,7 +109,7 @@ def _draw_errors(axes: Axes, returns: Returns, truth: Truth) -> None:
     for edge in (-bin_mm, bin_mm):
         axes.axvline(edge, color="black", linewidth=0.8, linestyle=":")
     median = float(np.median(np.abs(error)))
-    label(
+    label_axes(
         axes,
         f"range error: median {median:.2f} mm, one bin = {bin_mm:.2f} mm",
         "range error (mm), larger ones at the ends",

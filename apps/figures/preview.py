@@ -1,4 +1,6 @@
-"""A shot and its recovered frames at a glance: streak image, brightness, distance, and the strongest frames."""
+"""A shot and its recovered frames at a glance: streak image, brightness, distance, and the
+strongest frames.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.figures.style import DEPTH, SMALL, colour_bar, draw, label, outer_edges, page
+from apps.figures.style import (
+    DEPTH_COLOURMAP,
+    SMALL_FONT_PT,
+    add_colour_bar,
+    draw_image,
+    label_axes,
+    make_figure,
+    outer_edges,
+)
 from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
@@ -19,16 +29,16 @@ if TYPE_CHECKING:
 
     from tofclip.shots import Frames, Streak
 
-COLUMNS = 4
-MOST_MOMENTS = 3 * COLUMNS
-OVERVIEW_INCHES, LINE_INCHES = 4.2, 2.45
-CLOSEST_PEAKS_BIN = 12
-FAINTEST_PEAK = 0.01  # of the highest
-CROP_SHARE = 0.35  # of a frame's brightest pixel: what is dimmer is mostly artefacts
+PANEL_COLUMNS = 4
+MAX_MOMENTS = 3 * PANEL_COLUMNS
+OVERVIEW_INCHES, ROW_INCHES = 4.2, 2.45
+MIN_PEAK_DISTANCE_BINS = 12
+MIN_PEAK_PROMINENCE = 0.01  # of the highest
+CROP_THRESHOLD = 0.35  # of a frame's brightest pixel: what is dimmer is mostly artefacts
 CROP_MARGIN_PX = 8
-BRIGHTEST = 99.5  # percent: a glint does not darken the rest
-LIT = 0.2  # pixels that are lighter decide about the scale of distances
-BRIGHT_AREA = 95.0  # percent: colours need light to be told apart
+WHITE_PERCENTILE = 99.5  # percent: a glint does not darken the rest
+LIT_THRESHOLD = 0.2  # pixels that are lighter decide about the scale of distances
+BRIGHT_AREA_PERCENTILE = 95.0  # percent: colours need light to be told apart
 GAMMA = 0.6  # far objects stay visible beside near ones
 
 
@@ -41,81 +51,98 @@ class Moment:
     last: int
 
 
-def preview_figure(streak: Streak, frames: Frames) -> Figure:
+def make_preview_figure(streak: Streak, frames: Frames) -> Figure:
     """Draw a recovery.
 
-    Where time tells the range, brightness is multiplied by range squared, so that near and far surfaces of one kind
-    look alike.
+    Where time tells the range, brightness is multiplied by range squared, so that near and far
+    surfaces of one kind look alike.
     """
-    moments = telling_moments(frames)
-    lines = math.ceil(len(moments) / COLUMNS)
-    figure = page(12, OVERVIEW_INCHES + LINE_INCHES * lines)
-    parts: Any = figure.subfigures(2, 1, height_ratios=(OVERVIEW_INCHES, LINE_INCHES * lines))
+    moments = choose_moments(frames)
+    lines = math.ceil(len(moments) / PANEL_COLUMNS)
+    figure = make_figure(12, OVERVIEW_INCHES + ROW_INCHES * lines)
+    parts: Any = figure.subfigures(2, 1, height_ratios=(OVERVIEW_INCHES, ROW_INCHES * lines))
     overview, strip = parts
     left, middle, right = overview.subplots(1, 3)
-    brightness = frames.values * _compensation(frames)[:, np.newaxis, np.newaxis]
+    brightness = frames.values * _compute_compensation(frames)[:, np.newaxis, np.newaxis]
     _draw_streak(left, streak)
-    draw(middle, _toned(brightness.sum(axis=0)))
-    label(middle, "summed brightness" + _compensated(frames), "x (px)", "y (px), down")
+    draw_image(middle, _tone_map(brightness.sum(axis=0)))
+    label_axes(middle, "summed brightness" + _format_compensation(frames), "x (px)", "y (px), down")
     _draw_distance(right, brightness, frames)
-    _draw_moments(strip.subplots(lines, COLUMNS, sharex=True, sharey=True).ravel(), brightness, moments, frames)
+    _draw_moments(
+        strip.subplots(lines, PANEL_COLUMNS, sharex=True, sharey=True).ravel(),
+        brightness,
+        moments,
+        frames,
+    )
     return figure
 
 
-def telling_moments(frames: Frames) -> list[Moment]:
+def choose_moments(frames: Frames) -> list[Moment]:
     """Choose what to show: where most light comes back, in order of time.
 
-    Objects at separate ranges make separate peaks of the summed brightness times range squared; each is taken from half
-    its height to half its height. Light that comes without a pause is cut into even shares instead.
+    Objects at separate ranges make separate peaks of the summed brightness times range squared;
+    each is taken from half its height to half its height. Light that comes without a pause is cut
+    into even shares instead.
     """
-    energy = frames.values.sum(axis=(1, 2), dtype=np.float64) * _compensation(frames)
-    if energy.size <= MOST_MOMENTS:
+    energy = frames.values.sum(axis=(1, 2), dtype=np.float64) * _compute_compensation(frames)
+    if energy.size <= MAX_MOMENTS:
         return [Moment(frame, frame, frame) for frame in range(energy.size)]
-    peaks = _peaks(energy)
+    peaks = _find_peak_moments(energy)
     separate = all(earlier.last < later.first for earlier, later in pairwise(peaks))
-    return peaks if separate and len(peaks) >= COLUMNS else _even_shares(energy)
+    return peaks if separate and len(peaks) >= PANEL_COLUMNS else _split_evenly(energy)
 
 
-def _peaks(energy: NDArray[np.float64]) -> list[Moment]:
+def _find_peak_moments(energy: NDArray[np.float64]) -> list[Moment]:
     from scipy.ndimage import gaussian_filter1d
     from scipy.signal import find_peaks
 
-    smooth = np.pad(gaussian_filter1d(energy, 1.5), 1)  # padded: the first and the last frame can be peaks
+    smooth = np.pad(
+        gaussian_filter1d(energy, 1.5), 1
+    )  # padded: the first and the last frame can be peaks
     peaks, found = find_peaks(
-        smooth, distance=CLOSEST_PEAKS_BIN, prominence=FAINTEST_PEAK * smooth.max(), width=0, rel_height=0.5
+        smooth,
+        distance=MIN_PEAK_DISTANCE_BINS,
+        prominence=MIN_PEAK_PROMINENCE * smooth.max(),
+        width=0,
+        rel_height=0.5,
     )
-    chosen = np.sort(np.argsort(found["prominences"])[::-1][:MOST_MOMENTS])
+    chosen = np.sort(np.argsort(found["prominences"])[::-1][:MAX_MOMENTS])
     edges = np.rint([found["left_ips"], found["right_ips"]]).astype(int).clip(1, energy.size) - 1
     return [Moment(int(peaks[i]) - 1, int(edges[0, i]), int(edges[1, i])) for i in chosen]
 
 
-def _even_shares(energy: NDArray[np.float64]) -> list[Moment]:
+def _split_evenly(energy: NDArray[np.float64]) -> list[Moment]:
     share = np.cumsum(energy) / (energy.sum() or 1.0)
-    cuts = np.searchsorted(share, np.linspace(0.01, 0.99, MOST_MOMENTS + 1)).clip(0, energy.size - 1)
-    return [Moment((first + last) // 2, first, max(first, last - 1)) for first, last in pairwise(cuts.tolist())]
+    cuts = np.searchsorted(share, np.linspace(0.01, 0.99, MAX_MOMENTS + 1)).clip(0, energy.size - 1)
+    return [
+        Moment((first + last) // 2, first, max(first, last - 1))
+        for first, last in pairwise(cuts.tolist())
+    ]
 
 
-def _ranges(frames: Frames) -> NDArray[np.float64]:
+def _compute_ranges(frames: Frames) -> NDArray[np.float64]:
     return frames.times * SPEED_OF_LIGHT / 2
 
 
-def _tells_range(frames: Frames) -> bool:
-    """Whether time is range: not without a time zero, and not for a relay wall, whose light took three bounces."""
+def _has_known_range(frames: Frames) -> bool:
+    """Whether time is range: not without a time zero, and not for a relay wall, whose light took
+    three bounces.
+    """
     return frames.camera.time_zero != 0 and "relay_wall" not in frames.attachments
 
 
-def _compensation(frames: Frames) -> NDArray[np.float32]:
+def _compute_compensation(frames: Frames) -> NDArray[np.float32]:
     """Factor of each frame that undoes the fall-off with range; 1 where it does not apply."""
-    if _tells_range(frames):
-        return np.maximum(_ranges(frames), 0).astype(np.float32) ** 2
+    if _has_known_range(frames):
+        return np.maximum(_compute_ranges(frames), 0).astype(np.float32) ** 2
     return np.ones(frames.times.size, np.float32)
 
 
-def _compensated(frames: Frames) -> str:
-    return " \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}" if _tells_range(frames) else ""
+def _format_compensation(frames: Frames) -> str:
+    return " \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}" if _has_known_range(frames) else ""
 
 
-def _toned(picture: NDArray[Any], brightest: float = BRIGHTEST) -> NDArray[Any]:
+def _tone_map(picture: NDArray[Any], brightest: float = WHITE_PERCENTILE) -> NDArray[Any]:
     """Scale a picture to 0..1 for the eye, with the percentile `brightest` at 1."""
     top = np.percentile(picture, brightest) or picture.max() or 1.0
     toned: NDArray[Any] = np.clip(picture / top, 0, 1) ** GAMMA
@@ -123,12 +150,17 @@ def _toned(picture: NDArray[Any], brightest: float = BRIGHTEST) -> NDArray[Any]:
 
 
 def _draw_streak(axes: Axes, streak: Streak) -> None:
-    from tofclip.camera import dark_level
+    from tofclip.camera import estimate_dark_level
 
     first, last = outer_edges(streak.times / NANOSECOND)
     extent = (-0.5, streak.counts.shape[1] - 0.5, last, first)
-    draw(axes, _toned(np.maximum(streak.counts - dark_level(streak.counts), 0)), extent, aspect="auto")
-    label(axes, "streak image as measured", "slit column (px)", "time axis (ns)")
+    draw_image(
+        axes,
+        _tone_map(np.maximum(streak.counts - estimate_dark_level(streak.counts), 0)),
+        extent,
+        aspect="auto",
+    )
+    label_axes(axes, "streak image as measured", "slit column (px)", "time axis (ns)")
 
 
 def _draw_distance(axes: Axes, brightness: NDArray[Any], frames: Frames) -> None:
@@ -137,40 +169,50 @@ def _draw_distance(axes: Axes, brightness: NDArray[Any], frames: Frames) -> None
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    light = _toned(brightness.max(axis=0), BRIGHT_AREA)
+    light = _tone_map(brightness.max(axis=0), BRIGHT_AREA_PERCENTILE)
     scale, meaning = (frames.times / NANOSECOND, "time (ns)")
-    if _tells_range(frames):
-        scale, meaning = _ranges(frames), "range (m)"
+    if _has_known_range(frames):
+        scale, meaning = _compute_ranges(frames), "range (m)"
     distance = scale[brightness.argmax(axis=0)]
-    lit = distance[light > LIT] if np.any(light > LIT) else distance
-    mapped = ScalarMappable(Normalize(*np.percentile(lit, (1, 99))), colormaps[DEPTH])
-    draw(axes, mapped.to_rgba(distance)[..., :3] * light[..., np.newaxis])
-    label(axes, "when each pixel was brightest", "x (px)", "y (px), down")
-    colour_bar(axes, mapped, meaning)
+    lit = distance[light > LIT_THRESHOLD] if np.any(light > LIT_THRESHOLD) else distance
+    mapped = ScalarMappable(Normalize(*np.percentile(lit, (1, 99))), colormaps[DEPTH_COLOURMAP])
+    draw_image(axes, mapped.to_rgba(distance)[..., :3] * light[..., np.newaxis])
+    label_axes(axes, "when each pixel was brightest", "x (px)", "y (px), down")
+    add_colour_bar(axes, mapped, meaning)
 
 
-def _draw_moments(panels: Any, brightness: NDArray[Any], moments: list[Moment], frames: Frames) -> None:
+def _draw_moments(
+    panels: Any, brightness: NDArray[Any], moments: list[Moment], frames: Frames
+) -> None:
     """One averaged picture for each moment, scaled to its own brightness."""
     pictures = [brightness[moment.first : moment.last + 1].mean(axis=0) for moment in moments]
-    rows, columns = _lit_part(pictures)
+    rows, columns = _crop_to_bright(pictures)
     extent = (columns.start - 0.5, columns.stop - 0.5, rows.stop - 0.5, rows.start - 0.5)
     for axes, moment, picture in zip(panels, moments, pictures, strict=False):
-        draw(axes, picture[rows, columns], extent, vmin=0)
+        draw_image(axes, picture[rows, columns], extent, vmin=0)
         where = f"{frames.times[moment.frame] / NANOSECOND:.2f} ns"
-        if _tells_range(frames):
-            where = f"{_ranges(frames)[moment.frame]:.2f} m"
-        which = f"frame {moment.frame}" if moment.first == moment.last else f"frames {moment.first} to {moment.last}"
-        label(axes, f"{where}  ({which})", "", "")
+        if _has_known_range(frames):
+            where = f"{_compute_ranges(frames)[moment.frame]:.2f} m"
+        which = (
+            f"frame {moment.frame}"
+            if moment.first == moment.last
+            else f"frames {moment.first} to {moment.last}"
+        )
+        label_axes(axes, f"{where}  ({which})", "", "")
     for axes in panels[len(moments) :]:
         axes.set_axis_off()
-    panels[0].figure.suptitle("frames, each scaled to its own brightness; x and y in px", fontsize=SMALL + 2)
+    panels[0].figure.suptitle(
+        "frames, each scaled to its own brightness; x and y in px", fontsize=SMALL_FONT_PT + 2
+    )
 
 
-def _lit_part(pictures: list[NDArray[Any]]) -> tuple[slice, slice]:
+def _crop_to_bright(pictures: list[NDArray[Any]]) -> tuple[slice, slice]:
     """Rows and columns that hold everything bright in any picture, with a margin."""
-    bright = np.any([picture >= CROP_SHARE * picture.max() for picture in pictures], axis=0)
+    bright = np.any([picture >= CROP_THRESHOLD * picture.max() for picture in pictures], axis=0)
     sides = []
     for lit in (bright.any(axis=1), bright.any(axis=0)):
         first, last = np.flatnonzero(lit)[[0, -1]].tolist()
-        sides.append(slice(max(0, first - CROP_MARGIN_PX), min(lit.size, last + CROP_MARGIN_PX + 1)))
+        sides.append(
+            slice(max(0, first - CROP_MARGIN_PX), min(lit.size, last + CROP_MARGIN_PX + 1))
+        )
     return sides[0], sides[1]

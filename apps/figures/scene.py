@@ -1,4 +1,6 @@
-"""A scene after a flash: the picture summed over time, the cloud from two sides, and pictures at single ranges."""
+"""A scene after a flash: the picture summed over time, the cloud from two sides, and pictures at
+single ranges.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apps.figures.style import BRIGHTNESS, DEPTH, NOTHING, SMALL, draw, label, page
+from apps.figures.style import (
+    BRIGHTNESS_COLOURMAP,
+    DEPTH_COLOURMAP,
+    EMPTY_COLOUR,
+    SMALL_FONT_PT,
+    draw_image,
+    label_axes,
+    make_figure,
+)
 from tofclip.units import SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
@@ -15,16 +25,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tofclip.lidar import PointCloud
-    from tofclip.lidar.objects import SeenObject
+    from tofclip.lidar.objects import DetectedObject
     from tofclip.shots import Frames
 
-BRIGHTEST = 99.5  # percent: a glint does not darken the rest
-FAINTEST_SHOWN = 0.4  # of the colours: dim points stay visible
-RANGES_SHOWN = 4
-HALF_GATE_BIN = 4
+WHITE_PERCENTILE = 99.5  # percent: a glint does not darken the rest
+MIN_BRIGHTNESS = 0.4  # of the colours: dim points stay visible
+MAX_RANGE_PANELS = 4
+HALF_GATE_BINS = 4
 
 
-def scene_figure(frames: Frames, cloud: PointCloud, objects: Sequence[SeenObject]) -> Figure:
+def make_scene_figure(
+    frames: Frames, cloud: PointCloud, objects: Sequence[DetectedObject]
+) -> Figure:
     """Draw a scene in the manner of the paper's Supplementary Figure 21.
 
     Parameters
@@ -35,49 +47,65 @@ def scene_figure(frames: Frames, cloud: PointCloud, objects: Sequence[SeenObject
     objects : sequence of SeenObject
         Numbered in the top view; the four with most points are shown at their ranges.
     """
-    figure = page(13, 7.5)
+    figure = make_figure(13, 7.5)
     axes = figure.subplots(2, 4)
     for panel in axes[0, 1:3]:
         panel.remove()
     distance = np.maximum(frames.times, 0) * SPEED_OF_LIGHT / 2
     brightness = frames.values * (distance**2).astype(np.float32)[:, np.newaxis, np.newaxis]
-    draw(axes[0, 0], _toned(brightness.sum(axis=0)))
-    label(axes[0, 0], "summed over time, times range squared", "x (px)", "y (px), down")
-    _draw_space(figure, cloud)
-    _draw_top(axes[0, 3], cloud, objects)
-    shown = sorted(sorted(objects, key=lambda one: -one.points.size)[:RANGES_SHOWN], key=lambda one: one.range)
+    draw_image(axes[0, 0], _tone_map(brightness.sum(axis=0)))
+    label_axes(axes[0, 0], "summed over time, times range squared", "x (px)", "y (px), down")
+    _draw_cloud(figure, cloud)
+    _draw_top_view(axes[0, 3], cloud, objects)
+    shown = sorted(
+        sorted(objects, key=lambda one: -one.points.size)[:MAX_RANGE_PANELS],
+        key=lambda one: one.range,
+    )
     for panel in axes[1, len(shown) :]:
         panel.set_axis_off()
     for panel, one in zip(axes[1], shown, strict=False):
         row = int(np.abs(distance - one.range).argmin())
-        gate = slice(max(0, row - HALF_GATE_BIN), row + HALF_GATE_BIN + 1)
-        draw(panel, _toned(brightness[gate].sum(axis=0)))
-        label(panel, f"{one.range:.2f} m, shear {frames.shears[row]:.2f} px", "x (px)", "y (px), down")
+        gate = slice(max(0, row - HALF_GATE_BINS), row + HALF_GATE_BINS + 1)
+        draw_image(panel, _tone_map(brightness[gate].sum(axis=0)))
+        label_axes(
+            panel, f"{one.range:.2f} m, shear {frames.shears[row]:.2f} px", "x (px)", "y (px), down"
+        )
     return figure
 
 
-def _toned(picture: Any) -> Any:
-    top = np.percentile(picture, BRIGHTEST) or 1.0
+def _tone_map(picture: Any) -> Any:
+    top = np.percentile(picture, WHITE_PERCENTILE) or 1.0
     return np.clip(picture / top, 0, 1)
 
 
-def _draw_space(figure: Figure, cloud: PointCloud) -> None:
+def _draw_cloud(figure: Figure, cloud: PointCloud) -> None:
     """The cloud from above and aside; the camera looks along the axis that goes back."""
     space: Any = figure.add_subplot(2, 4, (2, 3), projection="3d")
     x, y, z = cloud.xyz.T
-    space.scatter(x, z, -y, c=cloud.range, cmap=DEPTH, s=1.5, linewidths=0)
-    space.set_xlabel("x (m)", fontsize=SMALL)
-    space.set_ylabel("z (m)", fontsize=SMALL)
-    space.set_zlabel("up (m)", fontsize=SMALL)
+    space.scatter(x, z, -y, c=cloud.range, cmap=DEPTH_COLOURMAP, s=1.5, linewidths=0)
+    space.set_xlabel("x (m)", fontsize=SMALL_FONT_PT)
+    space.set_ylabel("z (m)", fontsize=SMALL_FONT_PT)
+    space.set_zlabel("up (m)", fontsize=SMALL_FONT_PT)
     space.view_init(elev=22, azim=-70)
-    space.tick_params(labelsize=SMALL)
-    space.set_title("point cloud", fontsize=SMALL + 2)
+    space.tick_params(labelsize=SMALL_FONT_PT)
+    space.set_title("point cloud", fontsize=SMALL_FONT_PT + 2)
 
 
-def _draw_top(axes: Any, cloud: PointCloud, objects: Sequence[SeenObject]) -> None:
-    axes.set_facecolor(NOTHING)
-    light = FAINTEST_SHOWN + (1 - FAINTEST_SHOWN) * _toned(cloud.intensity)
-    axes.scatter(cloud.xyz[:, 0], cloud.xyz[:, 2], c=light, cmap=BRIGHTNESS, vmin=0, vmax=1, s=1.5, linewidths=0)
+def _draw_top_view(axes: Any, cloud: PointCloud, objects: Sequence[DetectedObject]) -> None:
+    axes.set_facecolor(EMPTY_COLOUR)
+    light = MIN_BRIGHTNESS + (1 - MIN_BRIGHTNESS) * _tone_map(cloud.intensity)
+    axes.scatter(
+        cloud.xyz[:, 0],
+        cloud.xyz[:, 2],
+        c=light,
+        cmap=BRIGHTNESS_COLOURMAP,
+        vmin=0,
+        vmax=1,
+        s=1.5,
+        linewidths=0,
+    )
     for number, one in enumerate(objects, 1):
-        axes.annotate(str(number), (one.centre[0], one.centre[2]), color="white", fontsize=SMALL)
-    label(axes, "top view", "x (m)", "z, away from the camera (m)")
+        axes.annotate(
+            str(number), (one.centre[0], one.centre[2]), color="white", fontsize=SMALL_FONT_PT
+        )
+    label_axes(axes, "top view", "x (m)", "z, away from the camera (m)")

@@ -1,4 +1,6 @@
-"""What all pictures have in common: sizes, colours, labelled axes, and writing that is all or nothing."""
+"""What all pictures have in common: sizes, colours, labelled axes, and writing that is all or
+nothing.
+"""
 
 from __future__ import annotations
 
@@ -15,27 +17,32 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
-BRIGHTNESS = "inferno"
-DEPTH = "viridis"
-NOTHING = "#20242c"  # where a picture has no value
-LINE = "#3dd6c8"  # drawn over a brightness map
-SMALL = 8
+BRIGHTNESS_COLOURMAP = "inferno"
+DEPTH_COLOURMAP = "viridis"
+EMPTY_COLOUR = "#20242c"  # where a picture has no value
+LINE_COLOUR = "#3dd6c8"  # drawn over a brightness map
+SMALL_FONT_PT = 8
 DOTS_PER_INCH = 100
 
 
-def page(width: float, height: float) -> Figure:
-    """Make an empty figure, in inches. It draws with Agg: no display is needed and pyplot is left alone."""
+def make_figure(width: float, height: float) -> Figure:
+    """Make an empty figure, in inches. It draws with Agg: no display is needed and pyplot is left
+    alone.
+    """
     return Figure(figsize=(width, height), dpi=DOTS_PER_INCH, layout="constrained")
 
 
-def save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure in the format that the name's ending says, whole or not at all."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary)
 
 
-def draw(
-    axes: Axes, picture: NDArray[Any], extent: tuple[float, float, float, float] | None = None, **look: Any
+def draw_image(
+    axes: Axes,
+    picture: NDArray[Any],
+    extent: tuple[float, float, float, float] | None = None,
+    **look: Any,
 ) -> AxesImage:
     """Draw a picture without smoothing over its pixels.
 
@@ -48,26 +55,30 @@ def draw(
     **look
         Further settings of ``imshow``.
     """
-    axes.set_facecolor(NOTHING)
-    return axes.imshow(picture, extent=extent, **{"cmap": BRIGHTNESS, "interpolation": "nearest", **look})
+    axes.set_facecolor(EMPTY_COLOUR)
+    return axes.imshow(
+        picture, extent=extent, **{"cmap": BRIGHTNESS_COLOURMAP, "interpolation": "nearest", **look}
+    )
 
 
-def label(axes: Axes, title: str, x: str, y: str) -> None:
+def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
     """Say what a picture shows and what its axes are."""
-    axes.set_title(title, fontsize=SMALL + 2)
-    axes.set_xlabel(x, fontsize=SMALL)
-    axes.set_ylabel(y, fontsize=SMALL)
-    axes.tick_params(labelsize=SMALL)
+    axes.set_title(title, fontsize=SMALL_FONT_PT + 2)
+    axes.set_xlabel(x, fontsize=SMALL_FONT_PT)
+    axes.set_ylabel(y, fontsize=SMALL_FONT_PT)
+    axes.tick_params(labelsize=SMALL_FONT_PT)
 
 
-def colour_bar(axes: Axes, mapped: Any, meaning: str) -> None:
+def add_colour_bar(axes: Axes, mapped: Any, meaning: str) -> None:
     """Put a labelled colour scale beside a picture."""
     bar = axes.figure.colorbar(mapped, ax=axes, shrink=0.9)
-    bar.set_label(meaning, fontsize=SMALL)
-    bar.ax.tick_params(labelsize=SMALL)
+    bar.set_label(meaning, fontsize=SMALL_FONT_PT)
+    bar.ax.tick_params(labelsize=SMALL_FONT_PT)
 
 
 def outer_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
-    """Outer edges of the first and the last pixel of an evenly spaced axis; a single pixel is as wide as its unit."""
+    """Outer edges of the first and the last pixel of an evenly spaced axis; a single pixel is as
+    wide as its unit.
+    """
     half = (axis[-1] - axis[0]) / (2 * (axis.size - 1)) if axis.size > 1 else 0.5
     return float(axis[0] - half), float(axis[-1] + half)

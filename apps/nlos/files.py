@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, history, require_writable
+from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, build_provenance, require_writable
 from nlos.export import POINT_SUFFIXES, WRITERS
 from tofclip.errors import InputError, StorageError
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 CAPTURE_SUFFIXES = (".h5", ".hdf5", ".npz", ".mat")
 VOLUME_SUFFIXES = (*RECORD_SUFFIXES, *WRITERS, *POINT_SUFFIXES)
-GEOMETRY = "geometry.toml"
+GEOMETRY_FILE = "geometry.toml"
 """Makes a folder of renderings one capture; see `nlos.io`."""
 
 
 @dataclass(frozen=True)
-class Results:
+class ResultFiles:
     """Names of what is written of one capture.
 
     Parameters
@@ -38,7 +38,7 @@ class Results:
     settings: Path
 
     @property
-    def all(self) -> list[Path]:
+    def paths(self) -> list[Path]:
         """Every file, in the order of writing."""
         return [*self.volumes, *([] if self.picture is None else [self.picture]), self.settings]
 
@@ -50,19 +50,19 @@ class Results:
             require_writable(self.picture, *PICTURE_SUFFIXES, inputs=inputs)
         require_writable(self.settings, inputs=inputs)
 
-    def up_to_date(self, source: Path) -> bool:
+    def is_up_to_date(self, source: Path) -> bool:
         """Whether all are there and younger than the capture that they came from."""
-        if not all(path.is_file() for path in self.all):
+        if not all(path.is_file() for path in self.paths):
             return False
         return self.settings.stat().st_mtime >= source.stat().st_mtime
 
 
-def is_folder_of_captures(source: Path) -> bool:
+def is_capture_folder(source: Path) -> bool:
     """Whether a path names a folder, and one that is not itself a capture."""
-    return source.is_dir() and not (source / GEOMETRY).is_file()
+    return source.is_dir() and not (source / GEOMETRY_FILE).is_file()
 
 
-def captures_in(folder: Path) -> list[Path]:
+def list_captures(folder: Path) -> list[Path]:
     """List the captures of a folder: files that may hold one, and folders of renderings.
 
     Raises
@@ -73,15 +73,20 @@ def captures_in(folder: Path) -> list[Path]:
     found = sorted(
         path
         for path in folder.iterdir()
-        if not path.name.startswith(".") and (path.suffix.lower() in CAPTURE_SUFFIXES or (path / GEOMETRY).is_file())
+        if not path.name.startswith(".")
+        and (path.suffix.lower() in CAPTURE_SUFFIXES or (path / GEOMETRY_FILE).is_file())
     )
     if not found:
-        raise InputError(f"{folder}: no capture is in there ({', '.join(CAPTURE_SUFFIXES)}, or folders of renderings)")
+        raise InputError(
+            f"{folder}: no capture is in there ({', '.join(CAPTURE_SUFFIXES)}, or folders of renderings)"
+        )
     names: dict[str, Path] = {}
     for path in found:
         other = names.setdefault(path.stem, path)
         if other is not path:
-            raise InputError(f"{folder}: {other.name} and {path.name} would have results of one name; rename one")
+            raise InputError(
+                f"{folder}: {other.name} and {path.name} would have results of one name; rename one"
+            )
     return found
 
 
@@ -93,14 +98,16 @@ def write_volume(volume: Volume, path: Path, fraction: float) -> None:
         volume.export(path, fraction)
 
 
-def with_history(volume: Volume, source: Path, settings: dict[str, object]) -> Volume:
+def add_provenance(volume: Volume, source: Path, settings: dict[str, object]) -> Volume:
     """Tell in a volume's provenance which file it was made of, and how."""
-    return replace(volume, provenance=history(settings, source, earlier=volume.provenance))
+    return replace(volume, provenance=build_provenance(settings, source, earlier=volume.provenance))
 
 
-def require_apart(source: Path, out: Path) -> None:
+def require_separate_folder(source: Path, out: Path) -> None:
     """Refuse to write results of a folder into that folder, where they would be taken for captures."""
     if out.exists() and not out.is_dir():
         raise StorageError(f"{out}: is a file; a folder of captures needs a folder for its results")
     if out.resolve() == source.resolve():
-        raise InputError(f"{out}: is the folder of the captures; choose another one for the results")
+        raise InputError(
+            f"{out}: is the folder of the captures; choose another one for the results"
+        )

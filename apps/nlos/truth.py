@@ -1,4 +1,6 @@
-"""The hidden scene that a simulated capture shows: it travels inside the capture's file, for others to compare with."""
+"""The hidden scene that a simulated capture shows: it travels inside the capture's file, for others
+to compare with.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import InputError
-from tofclip.storage import SIGNATURE, Field, Record
+from tofclip.storage import HDF5_SIGNATURE, Field, Record
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid
 
-KIND = "hidden_scene"
+RECORD_KIND = "hidden_scene"
 FloatArray = NDArray[np.float64]
 
 
@@ -34,34 +36,39 @@ class HiddenTruth:
     positions: FloatArray
     spacing: float
 
-    def record_with(self, capture: Capture) -> Record:
+    def attach_to_record(self, capture: Capture) -> Record:
         """Put the truth into the record of its capture."""
         own = {"positions": Field(self.positions, "m", ("point", "xyz"))}
-        return replace(capture.to_record(), children={KIND: Record(KIND, own, {"spacing_m": self.spacing})})
+        return replace(
+            capture.to_record(),
+            children={RECORD_KIND: Record(RECORD_KIND, own, {"spacing_m": self.spacing})},
+        )
 
     @classmethod
-    def inside(cls, path: Path) -> HiddenTruth | None:
+    def load(cls, path: Path) -> HiddenTruth | None:
         """Read the truth that a capture's file carries; None where there is none."""
         if not path.is_file():
             return None
         with open(path, "rb") as file:
-            if file.read(len(SIGNATURE)) != SIGNATURE:
+            if file.read(len(HDF5_SIGNATURE)) != HDF5_SIGNATURE:
                 return None
-        return cls._of(path)
+        return cls._read(path)
 
     @classmethod
-    def _of(cls, path: Path) -> HiddenTruth | None:
+    def _read(cls, path: Path) -> HiddenTruth | None:
         from tofclip.errors import FileFormatError
 
         try:
-            found = Record.load(path).children.get(KIND)
+            found = Record.load(path).children.get(RECORD_KIND)
         except FileFormatError:  # another laboratory's HDF5
             return None
         if found is None:
             return None
-        return cls(found.array("positions", np.float64, 2, "m"), float(found.attribute("spacing_m")))
+        return cls(
+            found.array("positions", np.float64, 2, "m"), float(found.attribute("spacing_m"))
+        )
 
-    def near(self, grid: Grid, reach: float) -> NDArray[np.bool_]:
+    def mask_near(self, grid: Grid, reach: float) -> NDArray[np.bool_]:
         """Voxels (z, y, x) whose centres lie within `reach` m of something hidden."""
         from scipy.spatial import cKDTree
 

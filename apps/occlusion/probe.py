@@ -1,7 +1,8 @@
-"""Small targets on the axis at set distances behind an occluder, to see where its inactive region ends.
+"""Small targets on the axis at set distances behind an occluder, to see where its inactive region
+ends.
 
-A target is so small that inside, at 0.8 of the region's length, all of it lies in the umbra, and beyond, at 1.2 and
-more, the outermost views see all of it. The camera looks closely at it.
+A target is so small that inside, at 0.8 of the region's length, all of it lies in the umbra, and
+beyond, at 1.2 and more, the outermost views see all of it. The camera looks closely at it.
 """
 
 from __future__ import annotations
@@ -12,40 +13,48 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.light_field.measurement import Setup
-from tofclip.metrics import correlation
-from tofclip.occlusion.readings import Rig, counted, encoded
-from tofclip.occlusion.recovery import WEIGHT
+from tofclip.light_field.measurement import CameraSetup
+from tofclip.metrics import correlation_coefficient
+from tofclip.occlusion.measurements import Rig, add_poisson_noise, measure_views
+from tofclip.occlusion.recovery import TV_WEIGHT
 from tofclip.occlusion.region import InactiveRegion
-from tofclip.recovery.light_field import ITERATIONS, RELATIVE_CHANGE
-from tofclip.simulate.light_fields import Body, CameraArray, Clock, Lambertian, PulsedScene, Rectangle, flash
-from tofclip.simulate.shapes import cut_out, letter, plain
+from tofclip.recovery.light_field import MAX_ITERATIONS, OBJECTIVE_TOLERANCE
+from tofclip.simulate.light_fields import (
+    Body,
+    CameraArray,
+    Lambertian,
+    PulsedScene,
+    Rectangle,
+    TimeAxis,
+    render_flash,
+)
+from tofclip.simulate.shapes import cut_pattern, make_letter, make_plain_pattern
 from tofclip.solvers import TotalVariation
 
 Array = NDArray[Any]
 
-FACTORS = (0.8, 1.2, 2.0)
+DISTANCE_FACTORS = (0.8, 1.2, 2.0)
 """Distances behind the occluder, in lengths of the inactive region."""
 
-TARGET_WIDTH = 0.15
+TARGET_WIDTH_FRACTION = 0.15
 """Of the occluder's; the umbra is 0.2 of it wide at 0.8 of its length."""
 
-RECOVERED = 0.8
+MIN_CORRELATION = 0.8
 """Correlation with the unoccluded truth from which on a target counts as recovered."""
 
-VIEWS = 7
+VIEW_COUNT = 7
 PICTURE_PX = 48
 TARGET_PX = 20
-PULSE = 10e-12  # the nearest target of all trials answers 25 ps after its occluder
-LONGEST_GATE = 80e-12
-PHOTONS = 2000.0  # of the brightest reading, were there no occluder
-BACKGROUND = 20.0  # photons of every reading that come at any time
-SIGNIFICANT = 5.0  # standard deviations of the background
-DIMMED = 0.5  # a view with less light than this share of the brightest view's is blocked
+PULSE_FWHM_S = 10e-12  # the nearest target of all trials answers 25 ps after its occluder
+MAX_GATE_S = 80e-12
+PEAK_PHOTONS = 2000.0  # of the brightest reading, were there no occluder
+BACKGROUND_PHOTONS = 20.0  # photons of every reading that come at any time
+SIGNIFICANCE_SIGMAS = 5.0  # standard deviations of the background
+MIN_VIEW_FRACTION = 0.5  # a view with less light than this share of the brightest view's is blocked
 
 
 @dataclass(frozen=True)
-class Probe:
+class ProbeResult:
     """One target and what became of it.
 
     Parameters
@@ -74,12 +83,14 @@ class Probe:
         return self.factor > 1
 
     @property
-    def recovered(self) -> bool:
+    def is_recovered(self) -> bool:
         """Whether it was."""
-        return self.correlation >= RECOVERED
+        return self.correlation >= MIN_CORRELATION
 
 
-def probe(occluder: tuple[Body, ...], region: InactiveRegion, factor: float, seed: int = 0) -> Probe:
+def probe_target(
+    occluder: tuple[Body, ...], region: InactiveRegion, factor: float, seed: int = 0
+) -> ProbeResult:
     """Put a target behind an occluder and try to recover it.
 
     Parameters
@@ -93,44 +104,66 @@ def probe(occluder: tuple[Body, ...], region: InactiveRegion, factor: float, see
         Of the line angles and the photons.
     """
     distance = region.distance + factor * region.length
-    width = TARGET_WIDTH * region.width
-    rig = _rig(region, distance, width, seed)
-    target = Body(Rectangle(width, width), Lambertian(cut_out(letter("L"), plain(0.9))), np.array([0.0, 0.0, distance]))
-    gate = _gate(rig, region.distance, distance)
-    hidden, free = (
-        flash(PulsedScene(bodies, rig.lamps), rig.array, gate) for bodies in ((target, *occluder), (target,))
+    width = TARGET_WIDTH_FRACTION * region.width
+    rig = _make_rig(region, distance, width, seed)
+    target = Body(
+        Rectangle(width, width),
+        Lambertian(cut_pattern(make_letter("L"), make_plain_pattern(0.9))),
+        np.array([0.0, 0.0, distance]),
     )
-    picture, views = _recovered(rig, encoded(hidden, rig, gate).values, encoded(free, rig, gate).values.max(), seed)
-    truth = free[VIEWS // 2, :, :, 0]
-    return Probe(distance, factor, correlation(picture, truth), views, picture, truth)
+    gate = _make_gate(rig, region.distance, distance)
+    hidden, free = (
+        render_flash(PulsedScene(bodies, rig.lamps), rig.array, gate)
+        for bodies in ((target, *occluder), (target,))
+    )
+    picture, views = _recover_target(
+        rig,
+        measure_views(hidden, rig, gate).values,
+        measure_views(free, rig, gate).values.max(),
+        seed,
+    )
+    truth = free[VIEW_COUNT // 2, :, :, 0]
+    return ProbeResult(
+        distance, factor, correlation_coefficient(picture, truth), views, picture, truth
+    )
 
 
-def _rig(region: InactiveRegion, distance: float, width: float, seed: int) -> Rig:
+def _make_rig(region: InactiveRegion, distance: float, width: float, seed: int) -> Rig:
     """A row of views as long as the baseline, aimed at the target, a lamp beside each."""
-    step = region.baseline / (VIEWS - 1)
+    step = region.baseline / (VIEW_COUNT - 1)
     shape = (PICTURE_PX, PICTURE_PX)
-    array = CameraArray(shape, VIEWS, distance * TARGET_PX / width, step, focus=distance, view_rows=1)
-    return Rig(array, np.stack([array.place((v, u)) for v, u in array.views]), Setup("line", 1.0, seed))
+    array = CameraArray(
+        shape, VIEW_COUNT, distance * TARGET_PX / width, step, focus=distance, view_rows=1
+    )
+    return Rig(
+        array,
+        np.stack([array.position((v, u)) for v, u in array.views]),
+        CameraSetup("line", 1.0, seed),
+    )
 
 
-def _gate(rig: Rig, occluder: float, target: float) -> Clock:
+def _make_gate(rig: Rig, occluder: float, target: float) -> TimeAxis:
     """One bin about the target's return that opens halfway from the occluder's."""
-    near, far = rig.flight_time(np.array([occluder, target]))
-    return Clock(float(far), float(min(far - near, LONGEST_GATE)), 1, PULSE)
+    near, far = rig.compute_flight_time(np.array([occluder, target]))
+    return TimeAxis(float(far), float(min(far - near, MAX_GATE_S)), 1, PULSE_FWHM_S)
 
 
-def _recovered(rig: Rig, light: Array, brightest: float, seed: int) -> tuple[Array, int]:
-    """Recover from noisy readings, blocked views left out; nothing where no view got significant light."""
-    camera, per_unit = rig.camera, PHOTONS / brightest
-    dark = BACKGROUND / per_unit
-    readings = counted(light + dark, per_unit, np.random.default_rng([seed, 3])) - np.float32(dark)
+def _recover_target(rig: Rig, light: Array, brightest: float, seed: int) -> tuple[Array, int]:
+    """Recover from noisy readings, blocked views left out; nothing where no view got significant
+    light.
+    """
+    camera, per_unit = rig.camera, PEAK_PHOTONS / brightest
+    dark = BACKGROUND_PHOTONS / per_unit
+    measurements = add_poisson_noise(
+        light + dark, per_unit, np.random.default_rng([seed, 3])
+    ) - np.float32(dark)
     sizes = [encoder.shape_out[0] for encoder in camera.encoders]
-    parts = np.split(readings[:, 0], np.cumsum(sizes)[:-1])
+    parts = np.split(measurements[:, 0], np.cumsum(sizes)[:-1])
     lights = np.array([part.mean() for part in parts])
-    doubt = np.sqrt(BACKGROUND / np.array(sizes)) / per_unit
-    seeing = (lights > SIGNIFICANT * doubt) & (lights > DIMMED * lights.max())
+    doubt = np.sqrt(BACKGROUND_PHOTONS / np.array(sizes)) / per_unit
+    seeing = (lights > SIGNIFICANCE_SIGMAS * doubt) & (lights > MIN_VIEW_FRACTION * lights.max())
     if not seeing.any():
         return np.zeros(rig.array.image_shape, np.float32), 0
-    good = np.repeat(seeing, sizes)[:, np.newaxis]
-    method = TotalVariation(WEIGHT, ITERATIONS, RELATIVE_CHANGE)
-    return method.recover(camera.model(0.0), readings, good).frames[0], int(seeing.sum())
+    valid = np.repeat(seeing, sizes)[:, np.newaxis]
+    method = TotalVariation(TV_WEIGHT, MAX_ITERATIONS, OBJECTIVE_TOLERANCE)
+    return method.recover(camera.model(0.0), measurements, valid).frames[0], int(seeing.sum())

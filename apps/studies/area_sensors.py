@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
-from apps.studies.cases import Case, solve
+from apps.studies.cases import Case, solve_cases
 from apps.studies.library import Library
 from apps.studies.outcome import Advance, Outcome, Panel, Study
 
 SPARSITIES = (1, 2, 4, 8, 16)
-NOISE = 0.025
+NOISE_FRACTION = 0.025
 SCENES = ("blocks", "printed-words", "printed-letters")
 CASES = [
-    Case((scene, str(sparsity)), f"{scene}:flat", "diffuser", 1 / sparsity**2, 0.0, white_noise=NOISE)
+    Case(
+        (scene, str(sparsity)),
+        f"{scene}:flat",
+        "diffuser",
+        1 / sparsity**2,
+        0.0,
+        white_noise=NOISE_FRACTION,
+    )
     for scene in SCENES
     for sparsity in SPARSITIES
 ]
 
 
-def area_sensors(library: Library, seeds: int, advance: Advance) -> Outcome:
+def run_area_sensors(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Recover scenes of three complexities from every n-th sensor pixel on either axis."""
-    solved = solve(CASES, library, seeds, advance)
+    solved = solve_cases(CASES, library, seeds, advance)
     panels = []
     for first in range(0, len(solved), len(SPARSITIES)):
         line = solved[first : first + len(SPARSITIES)]
@@ -35,5 +42,5 @@ STUDY = Study(
     "The paper shows pictures only, of flat scenes; these are posters of our own scenes.",
     20,
     len(CASES),
-    area_sensors,
+    run_area_sensors,
 )

@@ -1,4 +1,6 @@
-"""Cases of CLIP: measure the true views of a light field, recover the picture at one depth, score it."""
+"""Cases of CLIP: measure the true views of a light field, recover the picture at one depth, score
+it.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +14,28 @@ from numpy.typing import NDArray
 
 from apps.studies.library import Library
 from apps.studies.outcome import Advance, Panel, Row
-from tofclip.light_field.measurement import ClipMeasurement, Setup, measure, spoilt
+from tofclip.light_field.measurement import (
+    CameraSetup,
+    ClipMeasurement,
+    corrupt_measurement,
+    measure,
+)
 from tofclip.metrics import nmse
 from tofclip.recovery.light_field import ClipRecovery
-from tofclip.threads import one_blas_thread, thread_count
+from tofclip.threads import limit_blas_threads, thread_count
 
 BORDER_PX = 12
 """Pixels that are not scored: views leave the picture there."""
 
-NAMES = {"line": "CLIP-1D", "line-spread": "CLIP-1D, even", "single-pixel": "CLIP-0D", "diffuser": "CLIP-2D"}
+CAMERA_NAMES = {
+    "line": "CLIP-1D",
+    "line-spread": "CLIP-1D, even",
+    "single-pixel": "CLIP-0D",
+    "diffuser": "CLIP-2D",
+}
 
 Job = TypeVar("Job")
-Done = TypeVar("Done")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -61,7 +73,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Solved:
+class SolvedCase:
     """A case with what came out.
 
     Parameters
@@ -90,40 +102,47 @@ class Solved:
         return Panel(f"{title}\n{np.mean(self.percent):.1f} %", self.picture)
 
 
-def solve(cases: Sequence[Case], library: Library, seeds: int, advance: Advance) -> list[Solved]:
+def solve_cases(
+    cases: Sequence[Case], library: Library, seeds: int, advance: Advance
+) -> list[SolvedCase]:
     """Solve every case for every seed, cases on all cores; advances once for each case and seed.
 
     The prior's weight is chosen by cross-validation with the first seed, and kept for the others.
     """
-    truths = {(case.scene, case.shear): library.light_field(case.scene).refocus(case.shear) for case in cases}
+    truths = {
+        (case.scene, case.shear): library.light_field(case.scene).refocus(case.shear)
+        for case in cases
+    }
 
-    def solved(case: Case) -> Solved:
+    def solve_case(case: Case) -> SolvedCase:
         truth = truths[case.scene, case.shear]
         recovery, found = ClipRecovery(data_term=case.data_term), []
         for seed in range(seeds):
-            found.append(recovery.recover(measured(case, library, seed), case.shear))
+            found.append(recovery.recover(measure_case(case, library, seed), case.shear))
             recovery = replace(recovery, weight=found[0].weight)
             advance(1)
         percent = tuple(100 * nmse(recovered.picture, truth, BORDER_PX) for recovered in found)
-        return Solved(case, percent, found[0].picture, truth, found[0].weight)
+        return SolvedCase(case, percent, found[0].picture, truth, found[0].weight)
 
-    return in_parallel(solved, cases)
+    return run_in_parallel(solve_case, cases)
 
 
-def in_parallel(work: Callable[[Job], Done], jobs: Sequence[Job]) -> list[Done]:
-    """Run independent jobs on all cores, each on one; the first exception is raised and no further job started."""
+def run_in_parallel(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
+    """Run independent jobs on all cores, each on one; the first exception is raised and no further
+    job started.
+    """
     pool = ThreadPoolExecutor(min(thread_count(), max(len(jobs), 1)), thread_name_prefix="tofclip")
     try:
-        with one_blas_thread():
+        with limit_blas_threads():
             return list(pool.map(work, jobs))
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def measured(case: Case, library: Library, seed: int) -> ClipMeasurement:
+def measure_case(case: Case, library: Library, seed: int) -> ClipMeasurement:
     """Measure the true views as a case asks for."""
-    setup = Setup(case.encoder, case.sampling_ratio, seed)
+    setup = CameraSetup(case.encoder, case.sampling_ratio, seed)
     clean = measure(library.light_field(case.scene), setup)
-    noise = np.random.default_rng([seed, 2]).standard_normal(clean.readings.size, np.float32)
-    noisy = clean.readings + np.float32(case.white_noise) * clean.readings.std() * noise
-    return spoilt(replace(clean, readings=noisy), case.photons, case.bad_fraction)
+    noise = np.random.default_rng([seed, 2]).standard_normal(clean.measurements.size, np.float32)
+    noisy = clean.measurements + np.float32(case.white_noise) * clean.measurements.std() * noise
+    return corrupt_measurement(replace(clean, measurements=noisy), case.photons, case.bad_fraction)

@@ -1,4 +1,6 @@
-"""Coded lines for 1D sensors (supplement Note 4): why one slice is not enough, and what rotating the lines gains."""
+"""Coded lines for 1D sensors (supplement Note 4): why one slice is not enough, and what rotating
+the lines gains.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import InputError
-from tofclip.operators.coded_lines import SliceConvolution, coded_line
+from tofclip.operators.coded_lines import SliceConvolution, make_coded_line
 from tofclip.solvers import TotalVariation
 
-STEEPEST = np.pi / 4
-WEIGHTS = (1e-3, 3e-4, 1e-4)
+MAX_ANGLE_RAD = np.pi / 4
+TV_WEIGHTS = (1e-3, 3e-4, 1e-4)
 """Regularisations tried for each recovery, relative to the largest A'f."""
 ITERATIONS, RELATIVE_CHANGE = 800, 1e-5
 
@@ -41,7 +43,7 @@ class RotationSweep:
         return self.rotated_db - self.upright_db
 
 
-def coded_line_sensors(
+def make_coded_line_sensors(
     image_shape: tuple[int, int], lines: int, width_px: int, steepest: float, seed: int
 ) -> SliceConvolution:
     """Build 1D sensors behind coded lines, each with a code of its own.
@@ -60,29 +62,36 @@ def coded_line_sensors(
     Returns
     -------
     SliceConvolution
-        Its sensors are long enough for lines of 45 degrees from all of the picture, whatever `steepest` is.
+        Its sensors are long enough for lines of 45 degrees from all of the picture, whatever
+        `steepest` is.
     """
     random = np.random.default_rng(seed)
-    spreads = [coded_line(image_shape, width_px, angle, random) for angle in np.linspace(-steepest, steepest, lines)]
+    spreads = [
+        make_coded_line(image_shape, width_px, angle, random)
+        for angle in np.linspace(-steepest, steepest, lines)
+    ]
     return SliceConvolution(image_shape, np.stack(spreads), image_shape[0] + image_shape[1])
 
 
-def column_ranks(sensors: SliceConvolution) -> NDArray[np.int64]:
+def compute_column_ranks(sensors: SliceConvolution) -> NDArray[np.int64]:
     """Rank of G_k at every frequency k along the sensor (Eq. 14 to 16).
 
-    A column of the picture's spectrum has as many unknowns as the picture has rows, and only rank(G_k) equations: one
-    for a lone slice, whatever its PSF; at most M for M of them.
+    A column of the picture's spectrum has as many unknowns as the picture has rows, and only
+    rank(G_k) equations: one for a lone slice, whatever its PSF; at most M for M of them.
 
     Returns
     -------
     (frequencies,) array
     """
-    ranks: NDArray[np.int64] = np.linalg.matrix_rank(sensors.spectra.astype(np.complex128), rtol=1e-5)
+    ranks: NDArray[np.int64] = np.linalg.matrix_rank(
+        sensors.spectra.astype(np.complex128), rtol=1e-5
+    )
     return ranks
 
 
-def recovered(picture: NDArray[Any], sensors: SliceConvolution) -> NDArray[Any]:
-    """Measure a picture and recover it with total variation, at the one of `WEIGHTS` that comes closest to it.
+def recover_picture(picture: NDArray[Any], sensors: SliceConvolution) -> NDArray[Any]:
+    """Measure a picture and recover it with total variation, at the one of `TV_WEIGHTS` that comes
+    closest to it.
 
     Parameters
     ----------
@@ -93,19 +102,20 @@ def recovered(picture: NDArray[Any], sensors: SliceConvolution) -> NDArray[Any]:
     -------
     (rows, columns) float32 array
     """
-    readings = sensors(picture)[:, np.newaxis]
-    methods = [TotalVariation(weight, ITERATIONS, RELATIVE_CHANGE) for weight in WEIGHTS]
-    tried = [method.recover(sensors, readings).frames[0] for method in methods]
-    return max(tried, key=lambda estimate: psnr_db(estimate, picture))
+    measurements = sensors(picture)[:, np.newaxis]
+    methods = [TotalVariation(weight, ITERATIONS, RELATIVE_CHANGE) for weight in TV_WEIGHTS]
+    tried = [method.recover(sensors, measurements).frames[0] for method in methods]
+    return max(tried, key=lambda estimate: compute_psnr_db(estimate, picture))
 
 
-def rotation_sweep(
+def sweep_rotation(
     picture: NDArray[Any],
     widths_px: Sequence[int] = (1, 2, 4, 8, 32, 128),
     lines: int = 10,
     seeds: Sequence[int] = range(5),
 ) -> RotationSweep:
-    """Recover a picture from upright and from rotated coded lines of several widths (supplement Fig. 5h, i).
+    """Recover a picture from upright and from rotated coded lines of several widths (supplement
+    Fig. 5h, i).
 
     Parameters
     ----------
@@ -121,17 +131,22 @@ def rotation_sweep(
     found = [
         [
             [
-                psnr_db(recovered(picture, coded_line_sensors(shape, lines, width, angle, seed)), picture)
+                compute_psnr_db(
+                    recover_picture(
+                        picture, make_coded_line_sensors(shape, lines, width, angle, seed)
+                    ),
+                    picture,
+                )
                 for seed in seeds
             ]
             for width in widths_px
         ]
-        for angle in (0.0, STEEPEST)
+        for angle in (0.0, MAX_ANGLE_RAD)
     ]
     return RotationSweep(np.array(widths_px), np.array(found[0]), np.array(found[1]))
 
 
-def psnr_db(estimate: NDArray[Any], truth: NDArray[Any]) -> float:
+def compute_psnr_db(estimate: NDArray[Any], truth: NDArray[Any]) -> float:
     """Peak signal-to-noise ratio in dB, relative to the brightest pixel of the truth."""
     error = float(np.mean((estimate.astype(np.float64) - truth) ** 2))
     if error == 0:

@@ -1,4 +1,6 @@
-"""What one iteration costs: CLIP and compressive light-field photography on the same scene (supplement Table 1)."""
+"""What one iteration costs: CLIP and compressive light-field photography on the same scene
+(supplement Table 1).
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.light_field import LightField
-from tofclip.operators import LinearOperator, Reshape, squared_norm
+from tofclip.operators import LinearOperator, Reshape, estimate_squared_norm
 from tofclip.operators.light_field_camera import CAMERAS, COMPRESSIVE_CAMERAS, LightFieldCamera
 from tofclip.operators.shear import View
 from tofclip.solvers import Fista, LeastSquares, NonnegativeTotalVariation
-from tofclip.threads import one_blas_thread
+from tofclip.threads import limit_blas_threads
 
-WEIGHT = 1e-2  # relative to the largest A'f; what an iteration costs does not depend on it
+TV_WEIGHT = 1e-2  # relative to the largest A'f; what an iteration costs does not depend on it
 NORM_ITERATIONS = 10
 
 
@@ -30,10 +32,10 @@ class IterationCost:
     method : str
     recovers : str
         ``"light field"`` or ``"refocused picture"``.
-    readings, unknowns : int
+    measurements, unknowns : int
     complexity : str
-        Of one iteration as the paper has it: N pixels on a side, n_a views on a side, m readings, r exposures, k
-        operations of the prior for each unknown.
+        Of one iteration as the paper has it: N pixels on a side, n_a views on a side, m readings, r
+        exposures, k operations of the prior for each unknown.
     seconds : float
         Of one whole iteration: model, prior and bookkeeping; the median of the repeats.
     model_seconds : float
@@ -42,7 +44,7 @@ class IterationCost:
 
     method: str
     recovers: str
-    readings: int
+    measurements: int
     unknowns: int
     complexity: str
     seconds: float
@@ -59,10 +61,15 @@ class _Method:
     complexity: str
 
 
-def iteration_costs(
-    light_field: LightField, shear: float, exposures: int = 8, sampling_ratio: float = 0.5, repeats: int = 5
+def measure_iteration_costs(
+    light_field: LightField,
+    shear: float,
+    exposures: int = 8,
+    sampling_ratio: float = 0.5,
+    repeats: int = 5,
 ) -> list[IterationCost]:
-    """Time one iteration of every method of Table 1: FISTA with total variation for all of them alike.
+    """Time one iteration of every method of Table 1: FISTA with total variation for all of them
+    alike.
 
     Parameters
     ----------
@@ -82,22 +89,32 @@ def iteration_costs(
     """
     views = [(v, u) for v, u in light_field.views.tolist()]
     shape = (light_field.pictures.shape[1], light_field.pictures.shape[2])
-    methods = _methods(shape, views, exposures, sampling_ratio)
-    with one_blas_thread():  # all methods on one core
-        return [_timed(method, light_field, shear, repeats) for method in methods]
+    methods = _list_methods(shape, views, exposures, sampling_ratio)
+    with limit_blas_threads():  # all methods on one core
+        return [_time_method(method, light_field, shear, repeats) for method in methods]
 
 
-def _methods(shape: tuple[int, int], views: list[View], exposures: int, sampling_ratio: float) -> list[_Method]:
-    line, pixel = (CAMERAS[name](shape, views, sampling_ratio, 0) for name in ("line", "single-pixel"))
+def _list_methods(
+    shape: tuple[int, int], views: list[View], exposures: int, sampling_ratio: float
+) -> list[_Method]:
+    line, pixel = (
+        CAMERAS[name](shape, views, sampling_ratio, 0) for name in ("line", "single-pixel")
+    )
     masks = {
-        name: kind(shape, views, 1 if name == "marwah" else exposures, 0) for name, kind in COMPRESSIVE_CAMERAS.items()
+        name: kind(shape, views, 1 if name == "marwah" else exposures, 0)
+        for name, kind in COMPRESSIVE_CAMERAS.items()
     }
     whole, picture = "light field", "refocused picture"
     return [
         _Method("Ashok", masks["ashok"], whole, "(2r + k) n_a^2 N^2"),
         _Method("Babacan", masks["babacan"], whole, "(2r + k) n_a^2 N^2"),
         _Method("Marwah", masks["marwah"], whole, "(2 + k) n_a^2 N^2"),
-        _Method("Cai, Antipa", CAMERAS["diffuser"](shape, views, 1.0, 0), whole, "(4 log N + k n_a^2) N^2"),
+        _Method(
+            "Cai, Antipa",
+            CAMERAS["diffuser"](shape, views, 1.0, 0),
+            whole,
+            "(4 log N + k n_a^2) N^2",
+        ),
         _Method("CLIP-1D", line, whole, "(2m + k n_a^2) N^2"),
         _Method("CLIP-0D", pixel, whole, "(2m + k n_a^2) N^2"),
         _Method("CLIP-1D", line, picture, "(2m + 2n_a^2 + k) N^2"),
@@ -105,38 +122,44 @@ def _methods(shape: tuple[int, int], views: list[View], exposures: int, sampling
     ]
 
 
-def _timed(method: _Method, light_field: LightField, shear: float, repeats: int) -> IterationCost:
+def _time_method(
+    method: _Method, light_field: LightField, shear: float, repeats: int
+) -> IterationCost:
     camera = method.camera
-    pictures = light_field.pictures[list(camera.used)]
-    readings = camera.light_field_model()(pictures)
-    model = camera.model(shear) if method.recovers == "refocused picture" else _tall_model(camera)
-    solver = _solver(model, readings)
+    pictures = light_field.pictures[list(camera.used_views)]
+    measurements = camera.light_field_model()(pictures)
+    model = (
+        camera.model(shear) if method.recovers == "refocused picture" else _build_tall_model(camera)
+    )
+    solver = _build_solver(model, measurements)
     return IterationCost(
         method.name,
         method.recovers,
-        readings.size,
+        measurements.size,
         int(np.prod(model.shape_in)),
         method.complexity,
-        _median_seconds(solver.step, repeats),
-        _median_seconds(lambda: model.adjoint(model(solver.current)), repeats),
+        _measure_median_seconds(solver.step, repeats),
+        _measure_median_seconds(lambda: model.adjoint(model(solver.current)), repeats),
     )
 
 
-def _tall_model(camera: LightFieldCamera) -> LinearOperator:
-    """The light field's model for its views one below the other, as the solvers' priors take one picture."""
+def _build_tall_model(camera: LightFieldCamera) -> LinearOperator:
+    """The light field's model for its views one below the other, as the solvers' priors take one
+    picture.
+    """
     model = camera.light_field_model()
     views, rows, columns = model.shape_in
     return model @ Reshape((views * rows, columns), model.shape_in)
 
 
-def _solver(model: LinearOperator, readings: NDArray[Any]) -> Fista:
-    block = readings[:, np.newaxis]
-    weight = WEIGHT * float(model.adjoint(block).max())
-    step = 1 / (1.02 * squared_norm(model, NORM_ITERATIONS))
+def _build_solver(model: LinearOperator, measurements: NDArray[Any]) -> Fista:
+    block = measurements[:, np.newaxis]
+    weight = TV_WEIGHT * float(model.adjoint(block).max())
+    step = 1 / (1.02 * estimate_squared_norm(model, NORM_ITERATIONS))
     return Fista(model, LeastSquares(block), NonnegativeTotalVariation(weight), step, 1)
 
 
-def _median_seconds(action: Callable[[], object], repeats: int) -> float:
+def _measure_median_seconds(action: Callable[[], object], repeats: int) -> float:
     seconds = []
     for number in range(repeats + 1):
         started = perf_counter()

@@ -1,4 +1,6 @@
-"""A real lensless camera: the hand of the DiffuserCam recordings, from a dense and from sparse sensors (Note 3)."""
+"""A real lensless camera: the hand of the DiffuserCam recordings, from a dense and from sparse
+sensors (Note 3).
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from tofclip.operators.light_field_camera import MeasuredCamera
 from tofclip.operators.point_spreads import MeasuredPointSpreads
 from tofclip.solvers import TotalVariation, relative_residual
 
-WEIGHT = 1e-4  # relative to the largest A'f; ten times less lowers the residual by a tenth
+TV_WEIGHT = 1e-4  # relative to the largest A'f; ten times less lowers the residual by a tenth
 ITERATIONS = 200
 
 
@@ -29,7 +31,7 @@ class DiffuserRecording:
     ----------
     point_spread : (rows, columns) array
         Background taken off.
-    readings : (rows, columns) array
+    measurements : (rows, columns) array
         Background taken off; any scale.
 
     Raises
@@ -39,12 +41,14 @@ class DiffuserRecording:
     """
 
     point_spread: NDArray[np.float64]
-    readings: NDArray[np.float64]
+    measurements: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        if self.point_spread.ndim != 2 or self.readings.shape != self.point_spread.shape:
-            raise ShapeError("the readings", f"{self.point_spread.shape} like the PSF", self.readings.shape)
-        if not (np.all(np.isfinite(self.readings)) and self.readings.max() > 0):
+        if self.point_spread.ndim != 2 or self.measurements.shape != self.point_spread.shape:
+            raise ShapeError(
+                "the readings", f"{self.point_spread.shape} like the PSF", self.measurements.shape
+            )
+        if not (np.all(np.isfinite(self.measurements)) and self.measurements.max() > 0):
             raise InputError("the readings must be finite and show something; check the background")
 
 
@@ -72,22 +76,29 @@ class DiffuserRecovery:
 
 
 def read_diffuser_recording(path: str | Path) -> DiffuserRecording:
-    """Read an ``.npz`` with `psf` and `raw`, both (rows, columns) in counts, and one number `background`.
+    """Read an ``.npz`` with `psf` and `raw`, both (rows, columns) in counts, and one number
+    `background`.
 
     Raises
     ------
     StorageError, FileFormatError, InputError
-        The file cannot be read, an entry is absent or of another shape, or nothing is above the background.
+        The file cannot be read, an entry is absent or of another shape, or nothing is above the
+        background.
     """
     archive = Archive(path)
-    background = float(archive.finite("background"))
-    spread, readings = (np.clip(archive.finite(name, None, None) - background, 0, None) for name in ("psf", "raw"))
-    return DiffuserRecording(spread, readings)
+    background = float(archive.finite_array("background"))
+    spread, measurements = (
+        np.clip(archive.finite_array(name, None, None) - background, 0, None)
+        for name in ("psf", "raw")
+    )
+    return DiffuserRecording(spread, measurements)
 
 
-def diffuser_model(recording: DiffuserRecording, pitch_px: int) -> LinearOperator:
-    """Return the map from the scene, twice as high and wide as the sensor, to every n-th pixel's readings."""
-    rows, columns = recording.readings.shape
+def build_diffuser_model(recording: DiffuserRecording, pitch_px: int) -> LinearOperator:
+    """Return the map from the scene, twice as high and wide as the sensor, to every n-th pixel's
+    readings.
+    """
+    rows, columns = recording.measurements.shape
     measured = MeasuredPointSpreads(recording.point_spread[np.newaxis], [0.0])
     sensor = PitchedSensor((rows, columns), (pitch_px, pitch_px))
     return MeasuredCamera((2 * rows, 2 * columns), measured, sensor).model(0.0)
@@ -106,11 +117,11 @@ def recover_diffuser_scene(
     iterations : int
         About 16 ms each for a sensor of 300 x 400 pixels on one core.
     """
-    model = diffuser_model(recording, pitch_px)
-    every_nth = recording.readings[::pitch_px, ::pitch_px]
-    readings = (every_nth / recording.readings.max()).astype(np.float32).reshape(-1, 1)
+    model = build_diffuser_model(recording, pitch_px)
+    every_nth = recording.measurements[::pitch_px, ::pitch_px]
+    measurements = (every_nth / recording.measurements.max()).astype(np.float32).reshape(-1, 1)
     started = perf_counter()
-    result = TotalVariation(WEIGHT, iterations).recover(model, readings)
+    result = TotalVariation(TV_WEIGHT, iterations).recover(model, measurements)
     seconds = perf_counter() - started
-    residual = relative_residual(model, result.frames, readings)
+    residual = relative_residual(model, result.frames, measurements)
     return DiffuserRecovery(result.frames[0], pitch_px, residual, result.iterations, seconds)

@@ -1,15 +1,17 @@
-"""The generalised flip test: what stands in a scene is moved, mirrored and turned (Table 2, Supp. Figs 6, 7)."""
+"""The generalised flip test: what stands in a scene is moved, mirrored and turned (Table 2, Supp.
+Figs 6, 7).
+"""
 
 from __future__ import annotations
 
-from apps.studies.cases import NAMES, Case, solve
+from apps.studies.cases import CAMERA_NAMES, Case, solve_cases
 from apps.studies.library import Library
 from apps.studies.outcome import Advance, Outcome, Panel, Study
 from tofclip.simulate.light_fields.scenes import EDITS
 
 SAMPLING_RATIO = 0.5
 SCENES = {"still-life": (-0.8, -0.1, 0.5), "blocks": (-0.6, 0.0, 0.8)}
-PAPER = {  # NMSE in per cent: original, shift, flip, rotate
+PAPER_NMSE_PERCENT = {  # NMSE in per cent: original, shift, flip, rotate
     ("line", "still-life", -0.8): (7.28, 8.75, 8.13, 7.26),
     ("line", "still-life", -0.1): (9.53, 7.10, 7.14, 7.59),
     ("line", "still-life", 0.5): (7.22, 7.96, 7.17, 6.38),
@@ -24,22 +26,34 @@ PAPER = {  # NMSE in per cent: original, shift, flip, rotate
     ("single-pixel", "blocks", 0.8): (5.22, 4.86, 4.59, 5.08),
 }
 CASES = [
-    Case((NAMES[encoder], scene, f"{shear:g}", edit), f"{scene}:{edit}", encoder, SAMPLING_RATIO, shear, percent)
-    for (encoder, scene, shear), figures in PAPER.items()
+    Case(
+        (CAMERA_NAMES[encoder], scene, f"{shear:g}", edit),
+        f"{scene}:{edit}",
+        encoder,
+        SAMPLING_RATIO,
+        shear,
+        percent,
+    )
+    for (encoder, scene, shear), figures in PAPER_NMSE_PERCENT.items()
     for edit, percent in zip(EDITS, figures, strict=True)
 ]
 
 
-def flip_test(library: Library, seeds: int, advance: Advance) -> Outcome:
+def run_flip_test(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Recover every edit of both scenes at three depths with both cameras."""
-    solved = solve(CASES, library, seeds, advance)
+    solved = solve_cases(CASES, library, seeds, advance)
     panels = []
     for first in range(0, len(solved), len(EDITS)):
         for start in ("truth", "recovered"):
             line = solved[first : first + len(EDITS)]
             camera, scene, shear, _ = line[0].case.labels
-            if start == "truth" and camera == NAMES["line"]:
-                panels.append(tuple(Panel(f"{scene}, {one.case.labels[3]}, s = {shear}", one.truth) for one in line))
+            if start == "truth" and camera == CAMERA_NAMES["line"]:
+                panels.append(
+                    tuple(
+                        Panel(f"{scene}, {one.case.labels[3]}, s = {shear}", one.truth)
+                        for one in line
+                    )
+                )
             if start == "recovered":
                 panels.append(tuple(one.panel(f"{camera}, s = {shear}") for one in line))
     rows = tuple(one.row() for one in solved)
@@ -53,5 +67,5 @@ STUDY = Study(
     "The paper's scenes are not public: its scene 1 and 2 stand beside our own 'still-life' and 'blocks'.",
     40,
     len(CASES),
-    flip_test,
+    run_flip_test,
 )

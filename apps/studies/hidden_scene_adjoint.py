@@ -1,7 +1,8 @@
-"""The adjoint's images of an office at three exposures and two sampling ratios (supplement Note 13, Fig. 20 d-f).
+"""The adjoint's images of an office at three exposures and two sampling ratios (supplement Note 13,
+Fig. 20 d-f).
 
-``python -m apps.studies.hidden_scene_adjoint`` prints the table; ``--write docs/nlos.md`` puts it there, between the
-marks.
+``python -m apps.studies.hidden_scene_adjoint`` prints the table; ``--write docs/nlos.md`` puts it
+there, between the marks.
 """
 
 from __future__ import annotations
@@ -18,27 +19,27 @@ from nlos.capture import Capture
 from nlos.geometry import Grid
 from nlos.method import Reconstructor
 from nlos.rsd.planar import PlanarRSD
-from nlos.simulate import HiddenScene, Lambert, Surface, counted, relay_wall
+from nlos.simulate import HiddenScene, Lambert, Surface, add_poisson_noise, build_relay_wall
 from nlos.time_axis import TimeAxis
 from nlos.volume import Volume
 from tofclip.errors import InputError
 from tofclip.operators import RadonProjection
-from tofclip.solvers import Adjoint, LinearInverse
+from tofclip.solvers import Backprojection, LinearInverse
 
 EXPOSURES = {"20 ms": 19.0, "5 ms": 15.0, "1 ms": 6.0}
 """Largest count in the data set at each exposure, as Note 13 gives them."""
 
 SAMPLING_RATIOS = (0.1, 0.05)
-WAVELENGTH, CYCLES = 0.12, 5.0
+WAVELENGTH_M, CYCLES = 0.12, 5.0
 THRESHOLD = 0.15
-PEAK_SHARE = 0.1
+PEAK_FRACTION = 0.1
 """Readings expected to be weaker than this share of the brightest one are never the largest."""
-BISECTIONS = 12
-MARK = "<!-- adjoint study -->"
+BISECTION_STEPS = 12
+DOCUMENT_MARK = "<!-- adjoint study -->"
 
 
 @dataclass(frozen=True)
-class Row:
+class StudyRow:
     """What one exposure and sampling ratio give.
 
     Parameters
@@ -47,8 +48,9 @@ class Row:
     largest_count : float
     sampling_ratio : float
     adjoint, cut, linear : float
-        Correlation of the front view with that of all wall points at the same exposure: for recovery by the adjoint,
-        the same with both volumes cut off at the threshold, and for recovery by the linear inverse.
+        Correlation of the front view with that of all wall points at the same exposure: for
+        recovery by the adjoint, the same with both volumes cut off at the threshold, and for
+        recovery by the linear inverse.
     full : float
         Correlation of that reference itself with the noiseless one.
     """
@@ -62,57 +64,75 @@ class Row:
     full: float
 
 
-def office(spacing: float = 0.06) -> HiddenScene:
+def build_office(spacing: float = 0.06) -> HiddenScene:
     """Build a shelf with boards, a chair, a box and two letters, 1 to 2.1 m from the wall."""
-    boards = [Surface.rectangle([-0.55, y, 1.45], (0.5, 0.07), spacing, Lambert(0.8)) for y in (-0.6, -0.2, 0.2, 0.6)]
-    posts = [Surface.rectangle([x, 0.0, 1.45], (0.06, 1.27), spacing, Lambert(0.8)) for x in (-0.83, -0.27)]
+    boards = [
+        Surface.rectangle([-0.55, y, 1.45], (0.5, 0.07), spacing, Lambert(0.8))
+        for y in (-0.6, -0.2, 0.2, 0.6)
+    ]
+    posts = [
+        Surface.rectangle([x, 0.0, 1.45], (0.06, 1.27), spacing, Lambert(0.8))
+        for x in (-0.83, -0.27)
+    ]
     seat = Surface.rectangle([0.45, 0.25, 1.1], (0.45, 0.09), spacing, Lambert(0.3))
-    legs = [Surface.rectangle([x, 0.5, 1.1], (0.06, 0.4), spacing, Lambert(0.3)) for x in (0.27, 0.63)]
+    legs = [
+        Surface.rectangle([x, 0.5, 1.1], (0.06, 0.4), spacing, Lambert(0.3)) for x in (0.27, 0.63)
+    ]
     back = Surface.rectangle([0.63, -0.05, 1.12], (0.07, 0.5), spacing, Lambert(0.3))
     sign = Surface.letters("44", [0.35, -0.6, 1.9], 0.55, spacing, Lambert(1.0))
     return HiddenScene([*boards, *posts, seat, *legs, back, sign])
 
 
-def office_capture(points: int = 96) -> Capture:
+def simulate_office(points: int = 96) -> Capture:
     """Simulate the office without noise: one laser spot, a planar wall of 2 m, bins of 32 ps."""
-    wall = relay_wall("planar", points)
-    return office().seen_from(wall, [0.0, 0.0, 0.0], TimeAxis(512, 32e-12, 0.0), 35e-12)
+    wall = build_relay_wall("planar", points)
+    return build_office().simulate_capture(
+        wall, [0.0, 0.0, 0.0], TimeAxis(512, 32e-12, 0.0), 35e-12
+    )
 
 
-def office_grid() -> Grid:
+def build_office_grid() -> Grid:
     """Voxels of 2.5 cm around the office."""
     return Grid.box((-1.0, 1.0), (-1.0, 1.0), (0.9, 2.1), 0.025)
 
 
-def tomography(points: int, sampling_ratio: float) -> RadonProjection:
+def build_tomography(points: int, sampling_ratio: float) -> RadonProjection:
     """Line projections of a picture at ``sampling_ratio * points`` angles, evenly over half a turn."""
     angles = round(sampling_ratio * points)
     if angles < 1:
-        raise InputError(f"a sampling ratio of {sampling_ratio} leaves no projection of {points} x {points} points")
-    return RadonProjection((points, points), points, np.pi * np.arange(angles) / angles, np.zeros(angles))
+        raise InputError(
+            f"a sampling ratio of {sampling_ratio} leaves no projection of {points} x {points} points"
+        )
+    return RadonProjection(
+        (points, points), points, np.pi * np.arange(angles) / angles, np.zeros(angles)
+    )
 
 
-def expected_peak(capture: Capture, largest_count: float, seed: int) -> float:
-    """Expected counts in the brightest bin for which chance makes `largest_count` the largest count of all.
+def find_expected_peak(capture: Capture, largest_count: float, seed: int) -> float:
+    """Expected counts in the brightest bin for which chance makes `largest_count` the largest count
+    of all.
 
-    With millions of readings the largest count lies far above the largest expected one: 6 where that is about 1.
+    With millions of readings the largest count lies far above the largest expected one: 6 where
+    that is about 1.
     """
-    relative = capture.signal[capture.signal > PEAK_SHARE * capture.signal.max()] / capture.signal.max()
+    relative = (
+        capture.signal[capture.signal > PEAK_FRACTION * capture.signal.max()] / capture.signal.max()
+    )
     low, high = 0.0, largest_count
-    for _ in range(BISECTIONS):
+    for _ in range(BISECTION_STEPS):
         middle = (low + high) / 2
         reached = np.random.default_rng(seed).poisson(relative * middle).max() >= largest_count
         low, high = (low, middle) if reached else (middle, high)
     return high
 
 
-def correlation(one: Volume, other: Volume) -> float:
+def correlate_views(one: Volume, other: Volume) -> float:
     """Pearson correlation of two volumes' front views."""
     first, second = (volume.maximum_projection().brightness.ravel() for volume in (one, other))
     return float(np.corrcoef(first, second)[0, 1])
 
 
-def study(capture: Capture, grid: Grid, solver: Reconstructor, seed: int = 0) -> list[Row]:
+def run_study(capture: Capture, grid: Grid, solver: Reconstructor, seed: int = 0) -> list[StudyRow]:
     """Image a noiseless capture at every exposure and sampling ratio.
 
     Parameters
@@ -127,21 +147,30 @@ def study(capture: Capture, grid: Grid, solver: Reconstructor, seed: int = 0) ->
     clean = solver.reconstruct(capture, grid)
     rows = []
     for exposure, largest_count in EXPOSURES.items():
-        seen = counted(capture, expected_peak(capture, largest_count, seed), seed=seed)
+        seen = add_poisson_noise(
+            capture, find_expected_peak(capture, largest_count, seed), seed=seed
+        )
         full = solver.reconstruct(seen, grid)
         for ratio in SAMPLING_RATIOS:
-            compressed = CompressedCapture.of(seen, tomography(capture.signal.shape[1], ratio))
+            compressed = CompressedCapture.of(
+                seen, build_tomography(capture.signal.shape[1], ratio)
+            )
             adjoint, linear = (
                 AdjointImaging(solver, method, 0.0).reconstruct(compressed, grid)
-                for method in (Adjoint(), LinearInverse())
+                for method in (Backprojection(), LinearInverse())
             )
-            cut = correlation(adjoint.threshold(THRESHOLD), full.threshold(THRESHOLD))
-            agreements = (correlation(adjoint, full), cut, correlation(linear, full), correlation(full, clean))
-            rows.append(Row(exposure, largest_count, ratio, *agreements))
+            cut = correlate_views(adjoint.threshold(THRESHOLD), full.threshold(THRESHOLD))
+            agreements = (
+                correlate_views(adjoint, full),
+                cut,
+                correlate_views(linear, full),
+                correlate_views(full, clean),
+            )
+            rows.append(StudyRow(exposure, largest_count, ratio, *agreements))
     return rows
 
 
-def table(rows: Sequence[Row]) -> str:
+def format_table(rows: Sequence[StudyRow]) -> str:
     """Set the rows in Markdown."""
     lines = [
         f"| exposure | largest count | SR | adjoint | adjoint, cut at {THRESHOLD} | linear inverse | all points |",
@@ -155,7 +184,7 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def put_between_marks(text: str, document: Path) -> None:
+def replace_between_marks(text: str, document: Path) -> None:
     """Replace what stands between the two marks of a document.
 
     Raises
@@ -163,25 +192,31 @@ def put_between_marks(text: str, document: Path) -> None:
     InputError
         The document does not hold the mark twice.
     """
-    from tofclip.storage import atomic_path, reading
+    from tofclip.storage import atomic_path, translate_read_errors
 
-    with reading(document):
-        parts = document.read_text().split(MARK)
+    with translate_read_errors(document):
+        parts = document.read_text().split(DOCUMENT_MARK)
     if len(parts) != 3:
-        raise InputError(f"{document} must hold the mark {MARK} twice")
+        raise InputError(f"{document} must hold the mark {DOCUMENT_MARK} twice")
     with atomic_path(document) as temporary:
-        temporary.write_text(f"{parts[0]}{MARK}\n{text}{MARK}{parts[2]}")
+        temporary.write_text(f"{parts[0]}{DOCUMENT_MARK}\n{text}{DOCUMENT_MARK}{parts[2]}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the study from the command line."""
-    parser = argparse.ArgumentParser(description="Images of an office by the adjoint, over exposures and SR.")
-    parser.add_argument("--write", type=Path, metavar="MARKDOWN", help="put the table between this document's marks")
+    parser = argparse.ArgumentParser(
+        description="Images of an office by the adjoint, over exposures and SR."
+    )
+    parser.add_argument(
+        "--write", type=Path, metavar="MARKDOWN", help="put the table between this document's marks"
+    )
     document = parser.parse_args(arguments).write
-    result = table(study(office_capture(), office_grid(), PlanarRSD(WAVELENGTH, CYCLES)))
+    result = format_table(
+        run_study(simulate_office(), build_office_grid(), PlanarRSD(WAVELENGTH_M, CYCLES))
+    )
     print(result)
     if document is not None:
-        put_between_marks(result, document)
+        replace_between_marks(result, document)
 
 
 if __name__ == "__main__":

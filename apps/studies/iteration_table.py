@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
-from apps.studies.complexity import iteration_costs
+from apps.studies.complexity import measure_iteration_costs
 from apps.studies.library import Library
 from apps.studies.outcome import Advance, Outcome, Panel, Row, Study
 
 SCENE, SHEAR = "letters", -0.4
 
 
-def iteration_table(library: Library, seeds: int, advance: Advance) -> Outcome:
+def run_iteration_table(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Time every method; the repeats stand in for seeds."""
-    costs = iteration_costs(library.light_field(SCENE), SHEAR, repeats=2 * seeds)
+    costs = measure_iteration_costs(library.light_field(SCENE), SHEAR, repeats=2 * seeds)
     advance(1)
     rows = tuple(
         Row(
-            (cost.method, cost.recovers, str(cost.readings), str(cost.unknowns), cost.complexity), (1e3 * cost.seconds,)
+            (
+                cost.method,
+                cost.recovers,
+                str(cost.measurements),
+                str(cost.unknowns),
+                cost.complexity,
+            ),
+            (1e3 * cost.seconds,),
         )
         for cost in costs
     )
@@ -35,6 +42,6 @@ STUDY = Study(
     "The paper gives the operations; seconds are measured here, on one core, and depend on the machine.",
     5,
     1,
-    iteration_table,
+    run_iteration_table,
     seeded=False,
 )

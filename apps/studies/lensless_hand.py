@@ -1,4 +1,6 @@
-"""A recorded hand behind a real diffuser, from the whole sensor and from fewer of its pixels (Supp. Fig. 4d-f)."""
+"""A recorded hand behind a real diffuser, from the whole sensor and from fewer of its pixels (Supp.
+Fig. 4d-f).
+"""
 
 from __future__ import annotations
 
@@ -11,17 +13,19 @@ from apps.studies.outcome import Advance, Outcome, Panel, Row, Study
 
 RECORDING = "diffusercam/psf_hand_300x400.npz"
 PITCHES_PX = (1, 2, 3)
-SHOWN = 0.05  # of the brightest: where the picture is cut off
+DISPLAY_THRESHOLD = 0.05  # of the brightest: where the picture is cut off
 
 
-def lensless_hand(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover the scene from every pixel, every second and every third on either axis; nothing here is random."""
+def run_lensless_hand(library: Library, seeds: int, advance: Advance) -> Outcome:
+    """Recover the scene from every pixel, every second and every third on either axis; nothing here
+    is random.
+    """
     recording = read_diffuser_recording(library.recording(RECORDING))
     recoveries = []
     for pitch in PITCHES_PX:
         recoveries.append(recover_diffuser_scene(recording, pitch))
         advance(1)
-    window = _lit(recoveries[0].scene)
+    window = _find_bright_part(recoveries[0].scene)
     rows = tuple(Row((str(one.pitch_px),), (100 * one.relative_residual,)) for one in recoveries)
     shown = [
         Panel(f"every {pitch}. pixel\n{100 * one.relative_residual:.2f} %", one.scene[window])
@@ -30,9 +34,9 @@ def lensless_hand(library: Library, seeds: int, advance: Advance) -> Outcome:
     return Outcome(("every n-th pixel",), "relative residual, %", rows, (tuple(shown),))
 
 
-def _lit(scene: NDArray[np.float32]) -> tuple[slice, slice]:
+def _find_bright_part(scene: NDArray[np.float32]) -> tuple[slice, slice]:
     """Return the part of a scene that holds what is bright."""
-    rows, columns = np.nonzero(scene > SHOWN * scene.max())
+    rows, columns = np.nonzero(scene > DISPLAY_THRESHOLD * scene.max())
     return slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
 
 
@@ -44,7 +48,7 @@ STUDY = Study(
     "Nobody knows the true scene, so the figure is what the picture leaves unexplained of the readings.",
     10,
     len(PITCHES_PX),
-    lensless_hand,
+    run_lensless_hand,
     seeded=False,
     recording=RECORDING,
 )

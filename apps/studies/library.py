@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from tofclip.errors import InputError
 from tofclip.io.light_fields import read_light_field
 from tofclip.light_field import LightField
-from tofclip.simulate.light_fields import CameraArray, known_scene, render, render_view
-from tofclip.simulate.light_fields.scenes import EDITS, edited, without_occluder
+from tofclip.simulate.light_fields import CameraArray, make_scene, render_light_field, render_view
+from tofclip.simulate.light_fields.scenes import EDITS, edit_scene, remove_occluder
 
 
 class Library:
@@ -28,7 +28,7 @@ class Library:
 
     def __init__(self, data: Path | None = None, array: CameraArray | None = None) -> None:
         self.data, self.array = data, array or CameraArray()
-        self._known: dict[str, LightField] = {}
+        self._cache: dict[str, LightField] = {}
 
     def light_field(self, name: str) -> LightField:
         """Return the light field of a scene.
@@ -36,17 +36,17 @@ class Library:
         Parameters
         ----------
         name : str
-            A name of `tofclip.simulate.light_fields.SCENES`, ``NAME:EDIT`` with an edit of the flip test,
-            ``NAME:4x4`` for its middle sixteen views, ``NAME:flat`` for its reference view as a poster at s = 0, or
-            ``data:NAME`` for a recorded one.
+            A name of `tofclip.simulate.light_fields.SCENES`, ``NAME:EDIT`` with an edit of the flip
+            test, ``NAME:4x4`` for its middle sixteen views, ``NAME:flat`` for its reference view as
+            a poster at s = 0, or ``data:NAME`` for a recorded one.
         """
-        if name not in self._known:
-            self._known[name] = self._made(name)
-        return self._known[name]
+        if name not in self._cache:
+            self._cache[name] = self._make_light_field(name)
+        return self._cache[name]
 
-    def unoccluded(self, name: str) -> NDArray[Any]:
+    def render_unoccluded(self, name: str) -> NDArray[Any]:
         """Return what the reference view sees of an occlusion scene when its occluder is gone."""
-        return render_view(without_occluder(known_scene(name, self.array)), self.array, (0.0, 0.0))
+        return render_view(remove_occluder(make_scene(name, self.array)), self.array, (0.0, 0.0))
 
     def has_recording(self, name: str) -> bool:
         """Tell whether the folder of recorded data holds a file."""
@@ -64,7 +64,7 @@ class Library:
             raise InputError(f"{name} is recorded data; name the folder that holds it by --data")
         return self.data / name
 
-    def _made(self, name: str) -> LightField:
+    def _make_light_field(self, name: str) -> LightField:
         scene, _, variant = name.partition(":")
         if scene == "data":
             return read_light_field(self.recording(f"lightfields/{variant}.npz"))
@@ -72,9 +72,11 @@ class Library:
             whole = self.light_field(scene)
             middle = np.all((whole.views >= -2) & (whole.views < 2), axis=1)
             return LightField(whole.pictures[middle], whole.views[middle])
-        known = known_scene(scene, self.array)
+        known = make_scene(scene, self.array)
         if variant == "flat":
             views = self.array.views
             poster = render_view(known, self.array, (0.0, 0.0))
             return LightField(np.broadcast_to(poster, (len(views), *poster.shape)), views)
-        return render(edited(known, variant) if variant in EDITS else known, self.array).light_field
+        return render_light_field(
+            edit_scene(known, variant) if variant in EDITS else known, self.array
+        ).light_field

@@ -1,8 +1,8 @@
 """Light fields from one coded exposure with a learnt dictionary.
 
-The method of K. Marwah et al., ACM Trans. Graph. 32, 46 (2013), to compare CLIP with (supplement Note 5 and 8): patches
-of a light field are sparse in a dictionary that was learnt from others, and a patch of the exposure is enough to find
-which atoms they are made of.
+The method of K. Marwah et al., ACM Trans. Graph. 32, 46 (2013), to compare CLIP with (supplement
+Note 5 and 8): patches of a light field are sparse in a dictionary that was learnt from others, and
+a patch of the exposure is enough to find which atoms they are made of.
 """
 
 from __future__ import annotations
@@ -17,15 +17,17 @@ from numpy.typing import NDArray
 
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
 from tofclip.light_field import LightField
-from tofclip.threads import blocks
+from tofclip.threads import split_blocks
 
 Array = NDArray[Any]
 
-PATCHES_AT_ONCE = 64
+PATCHES_PER_BATCH = 64
 TRAINING_PATCHES = 2000
-COMPONENTS = 256
-"""Principal components that patches are learnt in: light fields have few, and learning is as much faster."""
-SPARSITY = 0.2  # of unit patches
+MAX_COMPONENTS = 256
+"""Principal components that patches are learnt in: light fields have few, and learning is as much
+faster.
+"""
+SPARSITY_WEIGHT = 0.2  # of unit patches
 EPOCHS = 2
 POWER_ITERATIONS = 15
 
@@ -51,7 +53,8 @@ class LightFieldDictionary:
 def learn_dictionary(
     light_fields: Sequence[LightField], patch_px: int = 8, atoms: int = 256, seed: int = 0
 ) -> LightFieldDictionary:
-    """Learn atoms from patches of light fields with the same views (scikit-learn's online dictionary learning).
+    """Learn atoms from patches of light fields with the same views (scikit-learn's online
+    dictionary learning).
 
     Parameters
     ----------
@@ -76,12 +79,17 @@ def learn_dictionary(
         raise MissingDependencyError(
             "learning a dictionary needs scikit-learn: pip install 'tofclip[learning]'"
         ) from fault
-    patches = _training_patches(light_fields, patch_px, np.random.default_rng(seed))
+    patches = _draw_training_patches(light_fields, patch_px, np.random.default_rng(seed))
     flat = patches.reshape(len(patches), -1)
-    kept = min(COMPONENTS, *flat.shape)
+    kept = min(MAX_COMPONENTS, *flat.shape)
     components = PCA(kept, svd_solver="randomized", random_state=seed).fit(flat).components_
     learner = MiniBatchDictionaryLearning(
-        atoms - 1, alpha=SPARSITY, max_iter=EPOCHS, batch_size=64, fit_algorithm="cd", random_state=seed
+        atoms - 1,
+        alpha=SPARSITY_WEIGHT,
+        max_iter=EPOCHS,
+        batch_size=64,
+        fit_algorithm="cd",
+        random_state=seed,
     )
     with warnings.catch_warnings():
         # Shares that are not exact in one step are mended by the next batches.
@@ -93,11 +101,17 @@ def learn_dictionary(
 
 
 def recover_with_dictionary(
-    exposure: Array, codes: Array, dictionary: LightFieldDictionary, weight: float = 1e-2, iterations: int = 100
+    exposure: Array,
+    codes: Array,
+    dictionary: LightFieldDictionary,
+    weight: float = 1e-2,
+    iterations: int = 100,
 ) -> Array:
-    """Recover a light field from one coded exposure, patch by patch, overlapping by half; their mean is taken.
+    """Recover a light field from one coded exposure, patch by patch, overlapping by half; their
+    mean is taken.
 
-    For each patch ``1/2 |y - sum_k C_k (D a)_k|^2 + w |a|_1`` is minimised by FISTA; the constant atom is free.
+    For each patch ``1/2 |y - sum_k C_k (D a)_k|^2 + w |a|_1`` is minimised by FISTA; the constant
+    atom is free.
 
     Parameters
     ----------
@@ -117,21 +131,27 @@ def recover_with_dictionary(
     -----
     Memory beyond the result is that of 64 patches' coded dictionaries, 4 MB with the default sizes.
     """
-    if codes.ndim != 3 or exposure.shape != codes.shape[1:] or dictionary.atoms.shape[1] != len(codes):
+    if (
+        codes.ndim != 3
+        or exposure.shape != codes.shape[1:]
+        or dictionary.atoms.shape[1] != len(codes)
+    ):
         expected = (dictionary.atoms.shape[1], *exposure.shape)
         raise ShapeError("mask codes for this dictionary and exposure", expected, codes.shape)
     size = dictionary.patch_px
     if min(exposure.shape) < size:
         raise ShapeError("the exposure", f"at least ({size}, {size}) px, a patch", exposure.shape)
     total, count = np.zeros(codes.shape, np.float32), np.zeros(exposure.shape, np.float32)
-    corners = list(_corners((exposure.shape[0], exposure.shape[1]), size, max(size // 2, 1)))
-    for some in blocks(len(corners), PATCHES_AT_ONCE):
+    corners = list(
+        _iterate_corners((exposure.shape[0], exposure.shape[1]), size, max(size // 2, 1))
+    )
+    for some in split_blocks(len(corners), PATCHES_PER_BATCH):
         windows = [(slice(y, y + size), slice(x, x + size)) for y, x in corners[some]]
-        readings = np.stack([exposure[window].ravel() for window in windows]).astype(np.float32)
+        measurements = np.stack([exposure[window].ravel() for window in windows]).astype(np.float32)
         masks = np.stack([codes[(slice(None), *window)] for window in windows]).astype(np.float32)
         coded = masks.transpose(2, 3, 0, 1) @ dictionary.atoms.transpose(2, 3, 1, 0)
         by_patch = np.ascontiguousarray(coded.reshape(size * size, len(windows), -1).swapaxes(0, 1))
-        shares = _sparse_shares(by_patch, readings, weight, iterations)
+        shares = _compute_sparse_weights(by_patch, measurements, weight, iterations)
         patches = np.tensordot(shares, dictionary.atoms, axes=1)
         for window, patch in zip(windows, patches, strict=True):
             total[(slice(None), *window)] += patch
@@ -139,17 +159,21 @@ def recover_with_dictionary(
     return total / count
 
 
-def _sparse_shares(coded: Array, readings: Array, weight: float, iterations: int) -> Array:
+def _compute_sparse_weights(
+    coded: Array, measurements: Array, weight: float, iterations: int
+) -> Array:
     """Shares of the atoms, (patches, atoms), for coded dictionaries (patches, pixels, atoms)."""
     transposed = coded.swapaxes(1, 2)
-    correlation = (transposed @ readings[..., np.newaxis])[..., 0]
-    step = 1 / (1.05 * _largest_eigenvalues(coded))[:, np.newaxis]
-    threshold = step * weight * np.abs(correlation).max(axis=1, keepdims=True) * np.ones_like(correlation)
+    correlation = (transposed @ measurements[..., np.newaxis])[..., 0]
+    step = 1 / (1.05 * _compute_largest_eigenvalues(coded))[:, np.newaxis]
+    threshold = (
+        step * weight * np.abs(correlation).max(axis=1, keepdims=True) * np.ones_like(correlation)
+    )
     threshold[:, 0] = 0  # brightness
     shares = ahead = np.zeros_like(correlation)
     age = 1.0
     for _ in range(iterations):
-        residual = coded @ ahead[..., np.newaxis] - readings[..., np.newaxis]
+        residual = coded @ ahead[..., np.newaxis] - measurements[..., np.newaxis]
         moved = ahead - step * (transposed @ residual)[..., 0]
         following = np.sign(moved) * np.maximum(np.abs(moved) - threshold, 0)
         older, age = age, (1 + np.sqrt(1 + 4 * age**2)) / 2
@@ -158,7 +182,7 @@ def _sparse_shares(coded: Array, readings: Array, weight: float, iterations: int
     return shares
 
 
-def _largest_eigenvalues(coded: Array) -> Array:
+def _compute_largest_eigenvalues(coded: Array) -> Array:
     """Of each coded dictionary's Gram matrix, by power iteration."""
     vector = np.ones((coded.shape[0], coded.shape[2], 1), np.float32)
     length = np.ones(coded.shape[0], np.float32)
@@ -170,8 +194,12 @@ def _largest_eigenvalues(coded: Array) -> Array:
     return safe
 
 
-def _training_patches(light_fields: Sequence[LightField], patch_px: int, random: np.random.Generator) -> Array:
-    """Patches at random places, those with most contrast, their mean taken off and their norm made 1."""
+def _draw_training_patches(
+    light_fields: Sequence[LightField], patch_px: int, random: np.random.Generator
+) -> Array:
+    """Patches at random places, those with most contrast, their mean taken off and their norm made
+    1.
+    """
     if not light_fields:
         raise InputError("at least one light field is needed to learn from")
     views = len(light_fields[0].pictures)
@@ -180,22 +208,33 @@ def _training_patches(light_fields: Sequence[LightField], patch_px: int, random:
         _, rows, columns = light_field.pictures.shape
         if len(light_field.pictures) != views or min(rows, columns) < patch_px:
             expected = f"({views}, at least {patch_px}, at least {patch_px})"
-            raise ShapeError("every light field to learn from", expected, light_field.pictures.shape)
-        corners = list(_corners((rows, columns), patch_px, 1))
+            raise ShapeError(
+                "every light field to learn from", expected, light_field.pictures.shape
+            )
+        corners = list(_iterate_corners((rows, columns), patch_px, 1))
         chosen = random.permutation(len(corners))[: 4 * TRAINING_PATCHES // len(light_fields)]
-        found += [light_field.pictures[:, y : y + patch_px, x : x + patch_px] for y, x in (corners[n] for n in chosen)]
+        found += [
+            light_field.pictures[:, y : y + patch_px, x : x + patch_px]
+            for y, x in (corners[n] for n in chosen)
+        ]
     spread = np.array([patch.std() for patch in found])
     kept = np.argsort(spread)[::-1][:TRAINING_PATCHES]
     kept = kept[spread[kept] > 0]
     if kept.size == 0:
-        raise InputError("the light fields are flat everywhere; there is nothing to learn from them")
+        raise InputError(
+            "the light fields are flat everywhere; there is nothing to learn from them"
+        )
     patches = np.stack([found[number] for number in kept])
     patches -= patches.mean(axis=(1, 2, 3), keepdims=True)
-    unit: Array = patches / spread[kept, np.newaxis, np.newaxis, np.newaxis] / np.sqrt(patches[0].size)
+    unit: Array = (
+        patches / spread[kept, np.newaxis, np.newaxis, np.newaxis] / np.sqrt(patches[0].size)
+    )
     return unit
 
 
-def _corners(shape: tuple[int, int], size: int, stride: int) -> Iterator[tuple[int, int]]:
+def _iterate_corners(shape: tuple[int, int], size: int, stride: int) -> Iterator[tuple[int, int]]:
     """Upper left corners of patches that cover everything, the last ones flush with the border."""
-    rows, columns = (sorted({*range(0, length - size + 1, stride), length - size}) for length in shape)
+    rows, columns = (
+        sorted({*range(0, length - size + 1, stride), length - size}) for length in shape
+    )
     return ((row, column) for row in rows for column in columns)

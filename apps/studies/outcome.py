@@ -1,4 +1,6 @@
-"""What a study of the paper returns: a table of ours beside the paper's figures, and pictures in the paper's layout."""
+"""What a study of the paper returns: a table of ours beside the paper's figures, and pictures in
+the paper's layout.
+"""
 
 from __future__ import annotations
 
@@ -81,7 +83,7 @@ class Study:
     ----------
     name : str
         What the user types.
-    also : tuple of str
+    aliases : tuple of str
         Other names: the figures that show the table's pictures.
     title : str
     note : str
@@ -91,7 +93,8 @@ class Study:
     seeded : bool
         False: it has no random choices, more seeds change nothing.
     work : callable
-        (library, seeds, advance) to the outcome; calls `advance` with shares that add up to `steps` per seed.
+        (library, seeds, advance) to the outcome; calls `advance` with shares that add up to `steps`
+        per seed.
     steps : int
         Advances for each seed.
     recording : str or None
@@ -99,7 +102,7 @@ class Study:
     """
 
     name: str
-    also: tuple[str, ...]
+    aliases: tuple[str, ...]
     title: str
     note: str
     seconds: float

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from apps.studies import angle_assignment as dealing_table
 from apps.studies import (
     area_sensors,
-    dealing_table,
     flash_occlusion,
     flip_test,
     inactive_region,
@@ -14,10 +14,10 @@ from apps.studies import (
     line_rotation,
     occlusion,
     representation,
-    shiny_bodies,
-    spoilt_readings,
-    whole_light_fields,
 )
+from apps.studies import corrupted_measurements as spoilt_readings
+from apps.studies import glossy_plate as shiny_bodies
+from apps.studies import light_field_recovery as whole_light_fields
 from apps.studies.outcome import Study
 from tofclip.errors import InputError
 
@@ -39,7 +39,7 @@ STUDIES: tuple[Study, ...] = (
 )
 
 
-def studies_called(name: str) -> tuple[Study, ...]:
+def find_studies(name: str) -> tuple[Study, ...]:
     """Return the study of a name, of a figure that shows its pictures, or every one for ``all``.
 
     Raises
@@ -47,8 +47,8 @@ def studies_called(name: str) -> tuple[Study, ...]:
     InputError
         Nothing has that name.
     """
-    found = tuple(study for study in STUDIES if name in ("all", study.name, *study.also))
+    found = tuple(study for study in STUDIES if name in ("all", study.name, *study.aliases))
     if not found:
-        known = ", ".join(word for study in STUDIES for word in (study.name, *study.also))
+        known = ", ".join(word for study in STUDIES for word in (study.name, *study.aliases))
         raise InputError(f"unknown study '{name}'; take all or one of {known}")
     return found

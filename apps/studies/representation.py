@@ -1,4 +1,6 @@
-"""Light fields as CLIP keeps them: refocus, depth, all in focus over the sampling ratio (Tables 8 to 10)."""
+"""Light fields as CLIP keeps them: refocus, depth, all in focus over the sampling ratio (Tables 8
+to 10).
+"""
 
 from __future__ import annotations
 
@@ -7,18 +9,26 @@ from functools import partial
 
 import numpy as np
 
-from apps.studies.cases import NAMES, Case, Solved, in_parallel, measured, solve
+from apps.studies.cases import (
+    CAMERA_NAMES,
+    Case,
+    SolvedCase,
+    measure_case,
+    run_in_parallel,
+    solve_cases,
+)
 from apps.studies.library import Library
 from apps.studies.outcome import Advance, Outcome, Panel, Study
-from tofclip.light_field import FocalStack, depth_from_focus, focal_stack
+from tofclip.light_field import FocalStack, estimate_depth_from_focus, make_focal_stack
 from tofclip.recovery.light_field import ClipRecovery
 
-STACK = np.arange(-1.3, 0.61, 0.3)
+STACK_SHEARS = np.arange(-1.3, 0.61, 0.3)
 
 
 @dataclass(frozen=True)
-class Table:
-    """A scene and the paper's figures: NMSE in per cent by camera and shear over the sampling ratios.
+class RepresentationTable:
+    """A scene and the paper's figures: NMSE in per cent by camera and shear over the sampling
+    ratios.
 
     Parameters
     ----------
@@ -34,49 +44,78 @@ class Table:
     def cases(self) -> list[Case]:
         """All of its cases."""
         return [
-            Case((NAMES[encoder], f"{shear:g}", f"{ratio:g}"), self.scene, encoder, ratio, shear, percent)
+            Case(
+                (CAMERA_NAMES[encoder], f"{shear:g}", f"{ratio:g}"),
+                self.scene,
+                encoder,
+                ratio,
+                shear,
+                percent,
+            )
             for (encoder, shear), figures in self.figures.items()
             for ratio, percent in zip((2, 1, 0.5, 0.25), figures, strict=True)
         ]
 
-    def outcome(self, library: Library, seeds: int, advance: Advance) -> Outcome:
-        """Recover at every depth and sampling ratio with both cameras; depth maps for the first seed."""
-        solved = solve(self.cases, library, seeds, advance)
-        panels = [self._true_line(library, solved)]
+    def evaluate(self, library: Library, seeds: int, advance: Advance) -> Outcome:
+        """Recover at every depth and sampling ratio with both cameras; depth maps for the first
+        seed.
+        """
+        solved = solve_cases(self.cases, library, seeds, advance)
+        panels = [self._make_truth_panels(library, solved)]
         for encoder in dict.fromkeys(encoder for encoder, _ in self.figures):
             for ratio in (2, 1, 0.5, 0.25):
-                line = [one for one in solved if (one.case.encoder, one.case.sampling_ratio) == (encoder, ratio)]
-                panels.append(_line(library, line))
+                line = [
+                    one
+                    for one in solved
+                    if (one.case.encoder, one.case.sampling_ratio) == (encoder, ratio)
+                ]
+                panels.append(_make_panels(library, line))
         rows = tuple(one.row() for one in solved)
         return Outcome(("camera", "s", "SR"), "NMSE, %", rows, tuple(panels))
 
-    def _true_line(self, library: Library, solved: list[Solved]) -> tuple[Panel, ...]:
+    def _make_truth_panels(self, library: Library, solved: list[SolvedCase]) -> tuple[Panel, ...]:
         truths = {one.case.shear: one.truth for one in solved}
-        stack = focal_stack(library.light_field(self.scene), STACK)
-        refocused = tuple(Panel(f"true views\ns = {shear:g}", truth) for shear, truth in truths.items())
-        return (*refocused, *_depth_panels(stack))
+        stack = make_focal_stack(library.light_field(self.scene), STACK_SHEARS)
+        refocused = tuple(
+            Panel(f"true views\ns = {shear:g}", truth) for shear, truth in truths.items()
+        )
+        return (*refocused, *_make_depth_panels(stack))
 
 
-def _line(library: Library, line: list[Solved]) -> tuple[Panel, ...]:
-    """The pictures of one camera and sampling ratio, with depth and all in focus from a stack of recoveries."""
+def _make_panels(library: Library, line: list[SolvedCase]) -> tuple[Panel, ...]:
+    """The pictures of one camera and sampling ratio, with depth and all in focus from a stack of
+    recoveries.
+    """
     case, recovery = line[0].case, ClipRecovery(weight=line[0].weight)
-    measurement = measured(case, library, 0)
-    shears = [float(shear) for shear in STACK]
-    pictures = in_parallel(lambda shear: recovery.recover(measurement, shear).picture, shears)
-    refocused = tuple(one.panel(f"{NAMES[case.encoder]} SR = {case.sampling_ratio:g}") for one in line)
-    return (*refocused, *_depth_panels(FocalStack(np.stack(pictures), STACK)))
+    measurement = measure_case(case, library, 0)
+    shears = [float(shear) for shear in STACK_SHEARS]
+    pictures = run_in_parallel(lambda shear: recovery.recover(measurement, shear).picture, shears)
+    refocused = tuple(
+        one.panel(f"{CAMERA_NAMES[case.encoder]} SR = {case.sampling_ratio:g}") for one in line
+    )
+    return (*refocused, *_make_depth_panels(FocalStack(np.stack(pictures), STACK_SHEARS)))
 
 
-def _depth_panels(stack: FocalStack) -> tuple[Panel, Panel]:
-    depths = depth_from_focus(stack)
-    return Panel("s from focus", stack.shears[depths], is_map=True), Panel("all in focus", stack.sharpest(depths))
+def _make_depth_panels(stack: FocalStack) -> tuple[Panel, Panel]:
+    depths = estimate_depth_from_focus(stack)
+    return Panel("s from focus", stack.shears[depths], is_map=True), Panel(
+        "all in focus", stack.all_in_focus(depths)
+    )
 
 
-def _study(name: str, figure: str, title: str, table: Table, note: str) -> Study:
-    return Study(name, (figure,), title, note, 35, len(table.cases), partial(Table.outcome, table))
+def _make_study(name: str, figure: str, title: str, table: RepresentationTable, note: str) -> Study:
+    return Study(
+        name,
+        (figure,),
+        title,
+        note,
+        35,
+        len(table.cases),
+        partial(RepresentationTable.evaluate, table),
+    )
 
 
-LETTERS = Table(
+LETTERS_TABLE = RepresentationTable(
     "letters",
     {
         ("line", -1.0): (1.75, 2.79, 5.32, None),
@@ -87,7 +126,7 @@ LETTERS = Table(
         ("single-pixel", -0.1): (1.64, 2.84, 4.48, 7.50),
     },
 )
-SLANTED = Table(
+SLANTED_TEXT_TABLE = RepresentationTable(
     "slanted-text",
     {
         ("line", -1.0): (0.97, 4.5, 9.97, None),
@@ -98,7 +137,7 @@ SLANTED = Table(
         ("single-pixel", 0.3): (3.29, 5.88, 7.62, 15.77),
     },
 )
-BOLT = Table(
+BOLT_TABLE = RepresentationTable(
     "bolt-and-letters",
     {
         ("line", -1.0): (0.97, 2.46, 4.77, None),
@@ -109,16 +148,24 @@ BOLT = Table(
         ("single-pixel", 0.2): (0.85, 1.22, 2.11, 2.94),
     },
 )
-OWN_SCENE = "The paper's recordings are not public; a rendered scene of the same kind stands for them."
+OWN_SCENE_NOTE = (
+    "The paper's recordings are not public; a rendered scene of the same kind stands for them."
+)
 
 STUDIES = (
-    _study("table8", "fig16", "CLIP of the letters: refocus, depth, all in focus", LETTERS, OWN_SCENE),
-    _study("table9", "fig17", "CLIP of a slanted text", SLANTED, OWN_SCENE),
-    _study(
+    _make_study(
+        "table8",
+        "fig16",
+        "CLIP of the letters: refocus, depth, all in focus",
+        LETTERS_TABLE,
+        OWN_SCENE_NOTE,
+    ),
+    _make_study("table9", "fig17", "CLIP of a slanted text", SLANTED_TEXT_TABLE, OWN_SCENE_NOTE),
+    _make_study(
         "table10",
         "fig18",
         "CLIP of shiny metal and letters",
-        BOLT,
-        f"{OWN_SCENE} Ball and block are glossy: uniform angular intensity does not hold there.",
+        BOLT_TABLE,
+        f"{OWN_SCENE_NOTE} Ball and block are glossy: uniform angular intensity does not hold there.",
     ),
 )

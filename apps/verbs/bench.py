@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.options import AsJson
+from apps.options import JsonOption
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -23,7 +23,8 @@ def bench(
         ),
     ] = "all",
     page: Annotated[
-        Path | None, typer.Option(metavar="MD", help="A page of the figures to write.", show_default="none")
+        Path | None,
+        typer.Option(metavar="MD", help="A page of the figures to write.", show_default="none"),
     ] = None,
     peers: Annotated[
         Path | None,
@@ -33,9 +34,10 @@ def bench(
             show_default="none",
         ),
     ] = None,
-    as_json: AsJson = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Measure time and memory, each against what the work cannot do without; all of it takes less than ten minutes.
+    """Measure time and memory, each against what the work cannot do without; all of it takes less
+    than ten minutes.
 
     Other programs slow it down: close them. TOFCLIP_THREADS bounds the number of threads.
 
@@ -43,18 +45,18 @@ def bench(
 
     Example: tofclip bench --page benchmarks.md --json
     """
-    from apps.benchmarks.page import page as made_page
-    from apps.benchmarks.registry import cases_called
-    from apps.benchmarks.run import processes, run_cases
+    from apps.benchmarks.page import render_page as made_page
+    from apps.benchmarks.registry import find_cases
+    from apps.benchmarks.run import count_processes, run_cases
     from apps.files import require_writable
-    from apps.progress import progress
+    from apps.progress import show_progress
     from apps.report import report
     from tofclip.storage import atomic_path
 
-    cases = cases_called(name)
+    cases = find_cases(name)
     if page is not None:
         require_writable(page, ".md")
-    with progress("measuring", processes(cases)) as advance:
+    with show_progress("measuring", count_processes(cases)) as advance:
         figures = run_cases(cases, None if peers is None else str(peers), advance)
     if page is not None:
         command = "tofclip bench" if name == "all" else f"tofclip bench {name}"
@@ -63,10 +65,10 @@ def bench(
     if as_json:
         report(figures, as_json=True)
     else:
-        report(_told(figures), as_json=False, written=[] if page is None else [page])
+        report(_format_summary(figures), as_json=False, written=[] if page is None else [page])
 
 
-def _told(figures: Mapping[str, Any]) -> dict[str, str]:
+def _format_summary(figures: Mapping[str, Any]) -> dict[str, str]:
     """One line for each case, of its greatest size on all threads."""
     found = {}
     for entry in figures["entries"]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.options import AsJson, Picture, TimeZero
+from apps.options import JsonOption, PreviewOption, TimeZeroOption
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
@@ -15,12 +15,20 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    line: Annotated[Path, typer.Option(metavar="TIF", help="Point source, slit open: a line for each lenslet.")],
-    line_background: Annotated[Path, typer.Option(metavar="TIF", help="The same without the source.")],
-    dot: Annotated[Path, typer.Option(metavar="TIF", help="Point source, slit closed: a dot for each lenslet.")],
-    dot_background: Annotated[Path, typer.Option(metavar="TIF", help="The same without the source.")],
+    line: Annotated[
+        Path, typer.Option(metavar="TIF", help="Point source, slit open: a line for each lenslet.")
+    ],
+    line_background: Annotated[
+        Path, typer.Option(metavar="TIF", help="The same without the source.")
+    ],
+    dot: Annotated[
+        Path, typer.Option(metavar="TIF", help="Point source, slit closed: a dot for each lenslet.")
+    ],
+    dot_background: Annotated[
+        Path, typer.Option(metavar="TIF", help="The same without the source.")
+    ],
     out: Annotated[Path, typer.Option(metavar="H5", help="The camera file to write.")],
-    time_zero_ns: TimeZero = None,
+    time_zero_ns: TimeZeroOption = None,
     focal_length_px: Annotated[
         float | None,
         typer.Option(
@@ -33,21 +41,24 @@ def calibrate(
     pulse_ps: Annotated[
         float | None,
         typer.Option(
-            metavar="PS", help="Full width at half maximum of the response to a short pulse.", show_default="60"
+            metavar="PS",
+            help="Full width at half maximum of the response to a short pulse.",
+            show_default="60",
         ),
     ] = None,
-    preview: Picture = None,
-    as_json: AsJson = False,
+    preview: PreviewOption = None,
+    as_json: JsonOption = False,
 ) -> None:
-    """Find every view's slit centre and line angle, with uncertainties and a picture of the fits over the data.
+    """Find every view's slit centre and line angle, with uncertainties and a picture of the fits
+    over the data.
 
     Example: tofclip calibrate --line line.tif --line-background line_background.tif --dot dot.tif
     --dot-background dot_background.tif --out camera.h5
     """
-    from apps.figures.calibration import calibration_figure
-    from apps.figures.style import save
+    from apps.figures.calibration import make_calibration_figure
+    from apps.figures.style import save_figure
     from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
-    from tofclip.camera.calibration import calibrate as fit
+    from tofclip.camera.calibration import calibrate_views as fit
     from tofclip.io import read_streak
 
     pictures = (line, line_background, dot, dot_background)
@@ -63,11 +74,11 @@ def calibrate(
     }
     camera = found.camera(**{name: value for name, value in known.items() if value is not None})
     camera.save(out)
-    save(calibration_figure(found), preview)
-    _report(found, as_json, [out, preview])
+    save_figure(make_calibration_figure(found), preview)
+    _report_calibration(found, as_json, [out, preview])
 
 
-def _report(found: FocusCalibration, as_json: bool, written: list[Path]) -> None:
+def _report_calibration(found: FocusCalibration, as_json: bool, written: list[Path]) -> None:
     import numpy as np
 
     from apps.report import report
@@ -84,5 +95,7 @@ def _report(found: FocusCalibration, as_json: bool, written: list[Path]) -> None
     angle_uncertainty = np.rad2deg(found.angle_uncertainty)
     rows = zip(*figures.values(), angle_uncertainty, strict=True)
     for view, (angle, centre, centre_error, angle_error) in enumerate(rows):
-        print(f"{view:4d}   {centre:8.2f} +- {centre_error:4.2f}   {angle:7.2f} +- {angle_error:4.2f}")
+        print(
+            f"{view:4d}   {centre:8.2f} +- {centre_error:4.2f}   {angle:7.2f} +- {angle_error:4.2f}"
+        )
     report({}, as_json, written)

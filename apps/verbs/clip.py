@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.options import AsJson, completing
+from apps.options import JsonOption, make_completer
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,57 +22,87 @@ app = typer.Typer(help="Light fields from few nonlocal readings.", no_args_is_he
 @app.command()
 def simulate(
     light_field: Annotated[
-        Path, typer.Argument(metavar="LIGHTFIELD", help="NPZ, HDF5, EXR with a part per view, or a folder.")
+        Path,
+        typer.Argument(
+            metavar="LIGHTFIELD", help="NPZ, HDF5, EXR with a part per view, or a folder."
+        ),
     ],
     encoder: Annotated[
         str,
         typer.Option(
             metavar="NAME",
             help="line, line-spread, single-pixel, coded-line, coded-aperture, cubic-phase or diffuser.",
-            autocompletion=completing(
-                "line", "line-spread", "single-pixel", "coded-line", "coded-aperture", "cubic-phase", "diffuser"
+            autocompletion=make_completer(
+                "line",
+                "line-spread",
+                "single-pixel",
+                "coded-line",
+                "coded-aperture",
+                "cubic-phase",
+                "diffuser",
             ),
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="H5", help="The readings to write.")],
-    sampling_ratio: Annotated[float, typer.Option(metavar="SR", help="Readings over pixels of one picture.")] = 0.5,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of angles, codes, photons and bad readings.")] = 0,
-    bad_fraction: Annotated[float, typer.Option(metavar="SHARE", help="Readings set to 0 or to the largest.")] = 0.0,
+    sampling_ratio: Annotated[
+        float, typer.Option(metavar="SR", help="Readings over pixels of one picture.")
+    ] = 0.5,
+    seed: Annotated[
+        int, typer.Option(metavar="N", min=0, help="Of angles, codes, photons and bad readings.")
+    ] = 0,
+    bad_fraction: Annotated[
+        float, typer.Option(metavar="SHARE", help="Readings set to 0 or to the largest.")
+    ] = 0.0,
     photons: Annotated[
-        float | None, typer.Option(metavar="N", help="Photons of the largest reading.", show_default="no noise")
+        float | None,
+        typer.Option(metavar="N", help="Photons of the largest reading.", show_default="no noise"),
     ] = None,
-    as_json: AsJson = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Measure the true views of a light field with a camera of few readings.
 
-    Example: tofclip clip simulate light_field.npz --encoder line --sampling-ratio 0.5 --out readings.h5
+    Example: tofclip clip simulate light_field.npz --encoder line --sampling-ratio 0.5 --out
+    readings.h5
     """
-    from apps.files import RECORD_SUFFIXES, history, require_writable
+    from apps.files import RECORD_SUFFIXES, build_provenance, require_writable
     from apps.report import report
     from tofclip.io.light_fields import read_light_field
-    from tofclip.light_field.measurement import Setup, measure, spoilt
+    from tofclip.light_field.measurement import CameraSetup, corrupt_measurement, measure
 
     require_writable(out, *RECORD_SUFFIXES, inputs=(light_field,))
     known = read_light_field(light_field)
-    setup = Setup(encoder, sampling_ratio, seed)
-    measurement = spoilt(measure(known, setup), photons, bad_fraction)
-    settings = {"verb": "clip simulate", **asdict(setup), "bad_fraction": bad_fraction, "photons": photons or 0.0}
-    measurement.to_record(history(settings, light_field)).save(out)
-    figures = {"readings": measurement.readings.size, "image_shape": measurement.image_shape, **asdict(setup)}
+    setup = CameraSetup(encoder, sampling_ratio, seed)
+    measurement = corrupt_measurement(measure(known, setup), photons, bad_fraction)
+    settings = {
+        "verb": "clip simulate",
+        **asdict(setup),
+        "bad_fraction": bad_fraction,
+        "photons": photons or 0.0,
+    }
+    measurement.to_record(build_provenance(settings, light_field)).save(out)
+    figures = {
+        "readings": measurement.measurements.size,
+        "image_shape": measurement.image_shape,
+        **asdict(setup),
+    }
     report(figures, as_json, [out])
 
 
 @app.command()
 def recover(
-    measurement: Annotated[Path, typer.Argument(metavar="H5", help="Readings made by clip simulate.")],
-    shear: Annotated[float, typer.Option(metavar="S", help="Depth to focus on, pixels per view step.")],
+    measurement: Annotated[
+        Path, typer.Argument(metavar="H5", help="Readings made by clip simulate.")
+    ],
+    shear: Annotated[
+        float, typer.Option(metavar="S", help="Depth to focus on, pixels per view step.")
+    ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The picture: .h5, .png or .exr.")],
     prior: Annotated[
         str,
         typer.Option(
             metavar="NAME",
             help="tv, wavelet or l1; or a denoiser: collaborative, bm3d or nlm.",
-            autocompletion=completing("tv", "wavelet", "l1", "collaborative", "bm3d", "nlm"),
+            autocompletion=make_completer("tv", "wavelet", "l1", "collaborative", "bm3d", "nlm"),
         ),
     ] = "tv",
     preset: Annotated[
@@ -80,22 +110,25 @@ def recover(
         typer.Option(
             metavar="NAME",
             help="fast, or quality: a denoiser finishes.",
-            autocompletion=completing("fast", "quality"),
+            autocompletion=make_completer("fast", "quality"),
         ),
     ] = "fast",
     weight: Annotated[
-        str, typer.Option(metavar="auto|VALUE", help="Of the prior, relative; auto: cross-validation.")
+        str,
+        typer.Option(metavar="auto|VALUE", help="Of the prior, relative; auto: cross-validation."),
     ] = "auto",
     data_term: Annotated[
         str,
         typer.Option(
             metavar="NAME",
             help="squares; huber for bad readings; poisson for few photons.",
-            autocompletion=completing("squares", "huber", "poisson"),
+            autocompletion=make_completer("squares", "huber", "poisson"),
         ),
     ] = "squares",
-    truth: Annotated[Path | None, typer.Option(metavar="LIGHTFIELD", help="Light field to score against.")] = None,
-    as_json: AsJson = False,
+    truth: Annotated[
+        Path | None, typer.Option(metavar="LIGHTFIELD", help="Light field to score against.")
+    ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Recover the picture refocused at one depth.
 
@@ -109,17 +142,29 @@ def recover(
 
     inputs = (measurement,) if truth is None else (measurement, truth)
     require_writable(out, ".h5", ".png", ".exr", inputs=inputs)
-    settings = ClipRecovery(prior, preset, _weight(weight), data_term)
-    readings = ClipMeasurement.from_record(Record.load(measurement, "clip_measurement"))
-    recovered = settings.recover(readings, shear)
-    figures: dict[str, Any] = {} if truth is None else _score(recovered.picture, truth, shear)
-    figures |= {field.name: getattr(recovered, field.name) for field in fields(recovered) if field.name != "picture"}
-    past = {"verb": "clip recover", "shear": shear, "prior": prior, "preset": preset, "data_term": data_term}
-    _write(recovered.picture, out, measurement, past | {"weight": recovered.weight})
+    settings = ClipRecovery(prior, preset, _parse_weight(weight), data_term)
+    measurements = ClipMeasurement.from_record(Record.load(measurement, "clip_measurement"))
+    recovered = settings.recover(measurements, shear)
+    figures: dict[str, Any] = (
+        {} if truth is None else _score_picture(recovered.picture, truth, shear)
+    )
+    figures |= {
+        field.name: getattr(recovered, field.name)
+        for field in fields(recovered)
+        if field.name != "picture"
+    }
+    past = {
+        "verb": "clip recover",
+        "shear": shear,
+        "prior": prior,
+        "preset": preset,
+        "data_term": data_term,
+    }
+    _write_picture(recovered.picture, out, measurement, past | {"weight": recovered.weight})
     report(figures, as_json, [out])
 
 
-def _weight(text: str) -> float | None:
+def _parse_weight(text: str) -> float | None:
     """Return the weight that was asked for, None for `auto`."""
     from tofclip.errors import InputError
 
@@ -131,7 +176,7 @@ def _weight(text: str) -> float | None:
         raise InputError(f"--weight takes 'auto' or a number, not '{text}'") from None
 
 
-def _score(picture: NDArray[Any], truth: Path, shear: float) -> dict[str, float]:
+def _score_picture(picture: NDArray[Any], truth: Path, shear: float) -> dict[str, float]:
     """Compare with the true views' shift-and-add."""
     from tofclip.io.light_fields import read_light_field
     from tofclip.metrics import nmse, nmse_energy
@@ -144,14 +189,18 @@ def _score(picture: NDArray[Any], truth: Path, shear: float) -> dict[str, float]
     }
 
 
-def _write(picture: NDArray[Any], out: Path, measurement: Path, settings: dict[str, Any]) -> None:
-    """Write the picture; a PNG is scaled to the picture's own brightest pixel, the others keep the values."""
-    from apps.files import history
+def _write_picture(
+    picture: NDArray[Any], out: Path, measurement: Path, settings: dict[str, Any]
+) -> None:
+    """Write the picture; a PNG is scaled to the picture's own brightest pixel, the others keep the
+    values.
+    """
+    from apps.files import build_provenance
     from tofclip.storage import Field, Record, atomic_path
 
     if out.suffix.lower() == ".h5":
         fields_kept = {"picture": Field(picture, "", ("y", "x"))}
-        past = history(settings, measurement)
+        past = build_provenance(settings, measurement)
         Record("picture", fields_kept, {"shear": settings["shear"]}, provenance=past).save(out)
         return
     with atomic_path(out) as temporary:

@@ -8,22 +8,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apps.options import AsJson, Cluster, Device
+from apps.options import ClusterOption, DeviceOption, JsonOption
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from tofclip.lidar import PointCloud, Returns
-    from tofclip.sequences import Clouds
+    from tofclip.sequences import CloudSettings
 
-FORMATS = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".h5")
-DEPTH_PICTURE = ".exr"
+CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".h5")
+DEPTH_SUFFIX = ".exr"
 
 
 def cloud(
     frames: Annotated[
         Path,
         typer.Argument(
-            metavar="FRAMES", help="Recovered frames (HDF5). A sequence: a folder or a quoted pattern of them."
+            metavar="FRAMES",
+            help="Recovered frames (HDF5). A sequence: a folder or a quoted pattern of them.",
         ),
     ],
     out: Annotated[
@@ -39,73 +40,89 @@ def cloud(
     ] = False,
     voxel_mm: Annotated[
         float | None,
-        typer.Option(metavar="MM", help="One point for each cube of this side.", show_default="all points"),
+        typer.Option(
+            metavar="MM", help="One point for each cube of this side.", show_default="all points"
+        ),
     ] = None,
-    suffix: Annotated[str, typer.Option(metavar=".EXT", help="Format of the clouds of a sequence.")] = ".ply",
-    cluster: Cluster = None,
-    device: Device = "cpu",
-    as_json: AsJson = False,
+    suffix: Annotated[
+        str, typer.Option(metavar=".EXT", help="Format of the clouds of a sequence.")
+    ] = ".ply",
+    cluster: ClusterOption = None,
+    device: DeviceOption = "cpu",
+    as_json: JsonOption = False,
 ) -> None:
     """Find each pixel's returns and place them in space: x right, y down, z forward, in metres.
 
-    Of a sequence, clouds that are in the folder already are kept; frames of which none can be made are listed at the
-    end, and the exit status is 1.
+    Of a sequence, clouds that are in the folder already are kept; frames of which none can be made
+    are listed at the end, and the exit status is 1.
 
     Example: tofclip cloud frames.h5 --out scene.ply
 
     Example: tofclip cloud 'frames/*.h5' --out clouds/ --cluster local
     """
-    from apps.sequences import device_told
+    from apps.sequences import resolve_device
     from tofclip.errors import InputError
-    from tofclip.sequences import Clouds, is_sequence
+    from tofclip.sequences import CloudSettings, is_sequence
 
-    clouds = Clouds(drop_outliers, None if voxel_mm is None else voxel_mm * MILLIMETRE, device)
-    used = device_told(device, cluster)
+    clouds = CloudSettings(
+        drop_outliers, None if voxel_mm is None else voxel_mm * MILLIMETRE, device
+    )
+    used = resolve_device(device, cluster)
     if is_sequence(frames):
-        _clouds_of_sequence(clouds, frames, out, suffix, (cluster, used, as_json))
+        _convert_sequence(clouds, frames, out, suffix, (cluster, used, as_json))
         return
     if cluster is not None:
-        raise InputError(f"{frames}: --cluster is for a sequence: a folder or a quoted pattern of frames")
-    _cloud_of_one(clouds, frames, (out, used), as_json)
+        raise InputError(
+            f"{frames}: --cluster is for a sequence: a folder or a quoted pattern of frames"
+        )
+    _convert_single(clouds, frames, (out, used), as_json)
 
 
 def require_format(suffix: str, *further: str) -> None:
     """Refuse an ending that names no format of clouds."""
     from tofclip.errors import InputError
 
-    if suffix not in (*FORMATS, *further):
-        raise InputError(f"no cloud format is called '{suffix}'; use one of {', '.join((*FORMATS, *further))}")
+    if suffix not in (*CLOUD_SUFFIXES, *further):
+        raise InputError(
+            f"no cloud format is called '{suffix}'; use one of {', '.join((*CLOUD_SUFFIXES, *further))}"
+        )
 
 
-def _clouds_of_sequence(
-    clouds: Clouds, frames: Path, out: Path, suffix: str, how: tuple[str | None, str, bool]
+def _convert_sequence(
+    clouds: CloudSettings, frames: Path, out: Path, suffix: str, how: tuple[str | None, str, bool]
 ) -> None:
-    from apps.sequences import finish, run_all
-    from tofclip.sequences import files_in
+    from apps.sequences import report_summary, run_with_progress
+    from tofclip.sequences import list_files
 
-    require_format(suffix, DEPTH_PICTURE)
+    require_format(suffix, DEPTH_SUFFIX)
     cluster, device, as_json = how
-    jobs = clouds.jobs(files_in(frames), out, suffix)
+    jobs = clouds.jobs(list_files(frames), out, suffix)
     points: list[int] = []
-    summary = run_all("placing", jobs, cluster, lambda report: points.append(report.figures or 0))
-    finish(summary, len(jobs), as_json, out, {"points": sum(points), "device": device})
+    summary = run_with_progress(
+        "placing", jobs, cluster, lambda report: points.append(report.figures or 0)
+    )
+    report_summary(summary, len(jobs), as_json, out, {"points": sum(points), "device": device})
 
 
-def _cloud_of_one(clouds: Clouds, frames: Path, made: tuple[Path, str], as_json: bool) -> None:
-    from apps.files import history, require_writable
+def _convert_single(
+    clouds: CloudSettings, frames: Path, made: tuple[Path, str], as_json: bool
+) -> None:
+    from apps.files import build_provenance, require_writable
     from tofclip.sequences.clouds import save_cloud
     from tofclip.shots import Frames
 
     out, _ = made
-    require_writable(out, *FORMATS, DEPTH_PICTURE, inputs=(frames,))
+    require_writable(out, *CLOUD_SUFFIXES, DEPTH_SUFFIX, inputs=(frames,))
     recovered = Frames.load(frames)
-    past = history({"verb": "cloud"}, frames, earlier=recovered.provenance)
-    points, returns = clouds.found(replace(recovered, provenance=past), str(frames))
+    past = build_provenance({"verb": "cloud"}, frames, earlier=recovered.provenance)
+    points, returns = clouds.make_cloud(replace(recovered, provenance=past), str(frames))
     save_cloud(points, returns, out)
-    _report(points, returns, as_json, made)
+    _report_cloud(points, returns, as_json, made)
 
 
-def _report(points: PointCloud, returns: Returns, as_json: bool, made: tuple[Path, str]) -> None:
+def _report_cloud(
+    points: PointCloud, returns: Returns, as_json: bool, made: tuple[Path, str]
+) -> None:
     from apps.report import report
 
     (rows, columns), (out, device) = returns.camera.image_shape, made

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from apps.options import AsJson
+from apps.options import JsonOption
 from tofclip.units import PICOSECOND
 
 
@@ -18,9 +18,10 @@ def convert(
         float | None,
         typer.Option(metavar="PS", help="Duration of a row in ps, where the file does not say it."),
     ] = None,
-    as_json: AsJson = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Turn a streak image into this program's HDF5, with its time axis, camera, text and relay wall inside.
+    """Turn a streak image into this program's HDF5, with its time axis, camera, text and relay wall
+    inside.
 
     Example: tofclip convert wall.npz --out wall.h5
     """

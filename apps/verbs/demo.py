@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.options import AsJson
+from apps.options import JsonOption
 
 if TYPE_CHECKING:
     from tofclip.lidar import PointCloud, Returns
@@ -20,32 +20,40 @@ BORDER_PX = 12  # views leave the slit there: the picture's rim is scored by nob
 
 
 def demo(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results; made if missing.")] = Path(
-        "demo-output"
-    ),
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder for the results; made if missing.")
+    ] = Path("demo-output"),
     seed: Annotated[int, typer.Option(min=0, metavar="N", help="Of the photon noise.")] = 0,
-    as_json: AsJson = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Simulate a scene of letters and plates, recover it from one streak image, and compare with the truth.
+    """Simulate a scene of letters and plates, recover it from one streak image, and compare with
+    the truth.
 
-    Skew, gains and slit centres are found from the shot itself. Writes streak.h5, frames.h5, cloud.ply and preview.png.
+    Skew, gains and slit centres are found from the shot itself. Writes streak.h5, frames.h5,
+    cloud.ply and preview.png.
 
     Example: tofclip demo --out demo-output
     """
-    from apps.figures.demo import demo_figure
-    from apps.figures.style import save
+    from apps.figures.demo import make_demo_figure
+    from apps.figures.style import save_figure
     from apps.files import make_folder
     from apps.report import report
 
     started = time.perf_counter()
     make_folder(out)
-    run = _run(seed)
+    run = _run_demo(seed)
     written = [out / name for name in ("streak.h5", "frames.h5", "cloud.ply", "preview.png")]
     run.streak.save(written[0])
     run.frames.save(written[1])
     run.cloud.save(written[2])
-    save(demo_figure(run.streak, run.frames, run.returns, run.cloud, run.shot.truth), written[3])
-    report({"seed": seed, **_figures(run), "seconds": time.perf_counter() - started}, as_json, written)
+    save_figure(
+        make_demo_figure(run.streak, run.frames, run.returns, run.cloud, run.shot.truth), written[3]
+    )
+    report(
+        {"seed": seed, **_collect_metrics(run), "seconds": time.perf_counter() - started},
+        as_json,
+        written,
+    )
 
 
 @dataclass(frozen=True)
@@ -60,35 +68,44 @@ class DemoRun:
     cloud: PointCloud
 
 
-def _run(seed: int) -> DemoRun:
+def _run_demo(seed: int) -> DemoRun:
     """The whole way, from a scene to a point cloud."""
-    from apps.files import history
-    from apps.progress import progress
+    from apps.files import build_provenance
+    from apps.progress import show_progress
     from tofclip.lidar import depth, point_cloud
-    from tofclip.recovery import prepare
-    from tofclip.simulate import default_instrument, default_scene, simulate, true_frames
+    from tofclip.recovery import prepare_recovery
+    from tofclip.simulate import (
+        make_default_instrument,
+        make_default_scene,
+        render_true_frames,
+        simulate_shot,
+    )
 
-    scene, instrument = default_scene(), default_instrument()
-    shot = simulate(scene, instrument, seed)
-    # What a calibration from focus pictures cannot know: sweep and gains have to be found from the shot.
+    scene, instrument = make_default_scene(), make_default_instrument()
+    shot = simulate_shot(scene, instrument, seed)
+    # What a calibration from focus pictures cannot know: sweep and gains have to be found from the
+    # shot.
     nominal = replace(shot.camera, sweep=None, gains=1.0 + 0 * shot.camera.gains)
     streak = replace(shot.streak, camera=nominal)
-    task = prepare(streak)
-    with progress("recovering", task.work) as advance:
+    task = prepare_recovery(streak)
+    with show_progress("recovering", task.work) as advance:
         frames = task.run(advance)
-    frames = replace(frames, provenance=history({"verb": "demo", "seed": seed}, earlier=frames.provenance))
+    frames = replace(
+        frames,
+        provenance=build_provenance({"verb": "demo", "seed": seed}, earlier=frames.provenance),
+    )
     returns = depth(frames)
-    truth = true_frames(scene, instrument, shot.exposure)
+    truth = render_true_frames(scene, instrument, shot.exposure)
     return DemoRun(shot, truth, streak, frames, returns, point_cloud(returns))
 
 
-def _figures(run: DemoRun) -> dict[str, Any]:
+def _collect_metrics(run: DemoRun) -> dict[str, Any]:
     from tofclip.metrics import nmse
-    from tofclip.simulate import score
+    from tofclip.simulate import score_returns
 
     picture, truth = run.frames.values.sum(axis=0), run.truth.values.sum(axis=0)
     return {
-        **score(run.returns, run.shot.truth),
+        **score_returns(run.returns, run.shot.truth),
         "image_nmse": nmse(picture, truth),
         "image_nmse_inner": nmse(picture, truth, BORDER_PX),
         "relative_residual": run.frames.figures["relative_residual"],

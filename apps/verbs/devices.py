@@ -7,20 +7,25 @@ from typing import Annotated, Any
 
 import typer
 
-from apps.options import AsJson
+from apps.options import JsonOption
 
-DAMAGED = 2
+EXIT_DAMAGED = 2
 
-app = typer.Typer(help="Streak cameras, SPAD sensors, time taggers and their recordings.", no_args_is_help=True)
+app = typer.Typer(
+    help="Streak cameras, SPAD sensors, time taggers and their recordings.", no_args_is_help=True
+)
 
-Address = Annotated[
-    str, typer.Argument(metavar="URI", help="Such as timetag://SERIAL, file://run.h5 or 'sim+timetag://?seed=1'.")
+AddressArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="URI", help="Such as timetag://SERIAL, file://run.h5 or 'sim+timetag://?seed=1'."
+    ),
 ]
-Recording = Annotated[Path, typer.Argument(metavar="H5", help="Made by tofclip record.")]
+RecordingArgument = Annotated[Path, typer.Argument(metavar="H5", help="Made by tofclip record.")]
 
 
 @app.command("list")
-def list_(as_json: AsJson = False) -> None:
+def list_(as_json: JsonOption = False) -> None:
     """Show the instruments that are connected, and the kinds of addresses there are.
 
     Example: tofclip devices list
@@ -33,7 +38,9 @@ def list_(as_json: AsJson = False) -> None:
     found = [asdict(one) for one in discover()]
     kinds = sorted({*registry.OPENERS, "file"})
     if as_json:
-        report({"devices": found, "kinds": kinds, "file_types": sorted(registry.FILES)}, as_json)
+        report(
+            {"devices": found, "kinds": kinds, "file_types": sorted(registry.FILE_OPENERS)}, as_json
+        )
         return
     for one in found:
         print(f"{one['uri']:<24}{one['instrument']}{': ' if one['note'] else ''}{one['note']}")
@@ -42,7 +49,7 @@ def list_(as_json: AsJson = False) -> None:
 
 
 @app.command()
-def info(uri: Address, as_json: AsJson = False) -> None:
+def info(uri: AddressArgument, as_json: JsonOption = False) -> None:
     """Say what is known about an instrument or a recording.
 
     Example: tofclip devices info 'sim+linospad2://?seed=1'
@@ -66,9 +73,9 @@ def info(uri: Address, as_json: AsJson = False) -> None:
 
 @app.command("test")
 def try_(
-    uri: Address,
+    uri: AddressArgument,
     seconds: Annotated[float, typer.Option(metavar="S", help="How long to read.")] = 5.0,
-    as_json: AsJson = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Read and decode for a while, and say how fast and how well that went.
 
@@ -76,17 +83,18 @@ def try_(
     """
     import devices
     from apps.report import report
-    from apps.verbs.record import ticking
-    from devices.trial import try_out
+    from apps.verbs.record import show_time_progress
+    from devices.throughput import measure_throughput
 
-    with ticking("reading", seconds) as watch:
-        trial = try_out(devices.open(uri), seconds, watch)
+    with show_time_progress("reading", seconds) as watch:
+        trial = measure_throughput(devices.open(uri), seconds, watch)
     report(trial.figures, as_json)
 
 
 @app.command()
-def verify(file: Recording, as_json: AsJson = False) -> None:
-    """Read a recording from end to end and compare it with its checksums and accounts; exit status 2 if it is damaged.
+def verify(file: RecordingArgument, as_json: JsonOption = False) -> None:
+    """Read a recording from end to end and compare it with its checksums and accounts; exit status
+    2 if it is damaged.
 
     A recording of a program that was killed is not complete, but as good as any up to its end.
 
@@ -98,17 +106,21 @@ def verify(file: Recording, as_json: AsJson = False) -> None:
     found = verified(file)
     report(found.as_dict(), as_json)
     if not found.is_sound:
-        typer.echo(f"tofclip: error: {file}: is damaged; tofclip devices repair makes a sound copy", err=True)
-        raise typer.Exit(DAMAGED)
+        typer.echo(
+            f"tofclip: error: {file}: is damaged; tofclip devices repair makes a sound copy",
+            err=True,
+        )
+        raise typer.Exit(EXIT_DAMAGED)
 
 
 @app.command()
 def repair(
-    file: Recording,
+    file: RecordingArgument,
     out: Annotated[Path, typer.Option(metavar="H5", help="The sound copy to write.")],
-    as_json: AsJson = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Copy all that is sound of a damaged or unfinished recording, and mark where something is missing.
+    """Copy all that is sound of a damaged or unfinished recording, and mark where something is
+    missing.
 
     Example: tofclip devices repair run.h5 --out sound.h5
     """

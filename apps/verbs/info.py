@@ -8,45 +8,51 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.options import AsJson
+from apps.options import JsonOption
 
 if TYPE_CHECKING:
     from tofclip.storage import Field, Record
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-FEW = 9  # numbers that are shown one by one
+MAX_LISTED_VALUES = 9  # numbers that are shown one by one
 TABLE_SUFFIXES = (".ply", ".pcd", ".csv", ".npz")
 
 
 def info(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Any file of ours, or a streak image of others.")],
-    as_json: AsJson = False,
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Any file of ours, or a streak image of others.")
+    ],
+    as_json: JsonOption = False,
 ) -> None:
     """Say what kind of thing a file holds: shapes, axes, units, text, and how it came about.
 
     Example: tofclip info frames.h5
     """
-    from apps.report import plainly, report
+    from apps.report import report, to_json_value
 
-    found = plainly({"file": file, **_described(_record_in(file))})
+    found = to_json_value({"file": file, **_describe_record(_read_record(file))})
     if as_json:
         report(found, as_json)
     else:
-        print("\n".join(_outline(found)))
+        print("\n".join(_format_tree(found)))
 
 
-def _record_in(file: Path) -> Record:
-    """Read our own records as they are, streak images and point clouds of other formats through their readers."""
-    from devices.recording.reader import head_if_recording
+def _read_record(file: Path) -> Record:
+    """Read our own records as they are, streak images and point clouds of other formats through
+    their readers.
+    """
+    from devices.recording.reader import read_head_if_recording
     from tofclip.errors import FileFormatError
     from tofclip.io import read_streak
     from tofclip.lidar import PointCloud
-    from tofclip.storage import Record, reading
+    from tofclip.storage import Record, translate_read_errors
 
-    with reading(file), open(file, "rb") as opened:
+    with translate_read_errors(file), open(file, "rb") as opened:
         start = opened.read(len(HDF5_SIGNATURE))
     if start == HDF5_SIGNATURE:
-        return head_if_recording(file) or Record.load(file)  # recordings do not fit into memory
+        return read_head_if_recording(file) or Record.load(
+            file
+        )  # recordings do not fit into memory
     if file.suffix.lower() not in TABLE_SUFFIXES:
         return read_streak(file).to_record()
     try:
@@ -57,60 +63,67 @@ def _record_in(file: Path) -> Record:
     return read_streak(file).to_record()  # an archive that is no point cloud may be a LIFT shot
 
 
-def _described(record: Record) -> dict[str, Any]:
+def _describe_record(record: Record) -> dict[str, Any]:
     found: dict[str, Any] = {"kind": record.kind}
     if record.attributes:
         found["attributes"] = record.attributes
     if record.fields:
-        found["fields"] = {name: _field(entry) for name, entry in record.fields.items()}
+        found["fields"] = {name: _describe_field(entry) for name, entry in record.fields.items()}
     if record.children:
-        found["children"] = {name: _described(child) for name, child in record.children.items()}
+        found["children"] = {
+            name: _describe_record(child) for name, child in record.children.items()
+        }
     if record.provenance:
         found["provenance"] = record.provenance
     return found
 
 
-def _field(entry: Field) -> dict[str, Any]:
+def _describe_field(entry: Field) -> dict[str, Any]:
     import numpy as np
 
     values = entry.values
-    known = {"shape": values.shape, "type": str(values.dtype), "units": entry.units, "axes": entry.axes}
+    known = {
+        "shape": values.shape,
+        "type": str(values.dtype),
+        "units": entry.units,
+        "axes": entry.axes,
+    }
     if values.dtype.kind not in "uif":
         return known
-    if values.size <= FEW:
+    if values.size <= MAX_LISTED_VALUES:
         return {**known, "values": values}
     finite = values[np.isfinite(values)]
     return {**known, "range": [finite.min(), finite.max()] if finite.size else [None, None]}
 
 
-def _outline(found: Mapping[str, Any], depth: int = 0) -> Iterator[str]:
+def _format_tree(found: Mapping[str, Any], depth: int = 0) -> Iterator[str]:
     """Indent a tree; what has no branches of its own stays on one line."""
     for name, value in found.items():
         lead = f"{'  ' * depth}{name}:"
         if isinstance(value, Mapping) and "shape" in value:
-            yield f"{lead} {_field_in_words(value)}"
+            yield f"{lead} {_format_field(value)}"
         elif isinstance(value, Mapping):
             yield lead
-            yield from _outline(value, depth + 1)
+            yield from _format_tree(value, depth + 1)
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
             yield lead
             for number, entry in enumerate(value, start=1):
-                yield from _outline({f"{number}": entry}, depth + 1)
+                yield from _format_tree({f"{number}": entry}, depth + 1)
         else:
             yield f"{lead} {value}"
 
 
-def _field_in_words(known: Mapping[str, Any]) -> str:
+def _format_field(known: Mapping[str, Any]) -> str:
     shape = " x ".join(map(str, known["shape"])) or "single value"
     axes = f" ({', '.join(known['axes'])})" if known["axes"] else ""
     if "values" in known:
-        return f"{shape}{axes} {known['type']}, {_in_brief(known['values'])} {known['units']}".rstrip()
+        return f"{shape}{axes} {known['type']}, {_format_values(known['values'])} {known['units']}".rstrip()
     least, most = known.get("range", (None, None))
     spread = "" if least is None else f", {least:.6g} .. {most:.6g}"
     return f"{shape}{axes} {known['type']}{spread} {known['units']}".rstrip()
 
 
-def _in_brief(values: Any) -> str:
+def _format_values(values: Any) -> str:
     if isinstance(values, list) and any(value is not None for value in values):
-        return f"[{', '.join(map(_in_brief, values))}]"
+        return f"[{', '.join(map(_format_values, values))}]"
     return f"{values:.6g}" if isinstance(values, int | float) else "unknown"

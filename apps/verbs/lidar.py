@@ -1,4 +1,6 @@
-"""`tofclip lidar`: how well ranges can be known, how views move with range, a scene's objects, clouds of many shots."""
+"""`tofclip lidar`: how well ranges can be known, how views move with range, a scene's objects,
+clouds of many shots.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apps.options import AsJson, Cluster, TimeZero
+from apps.options import ClusterOption, JsonOption, TimeZeroOption
 from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
@@ -17,33 +19,52 @@ app = typer.Typer()
 
 
 @app.callback(invoke_without_command=True)
-def _without_verb(context: typer.Context) -> None:
-    """How well a range can be known, and how the views' parallax grows with it; many shots in a row."""
+def _show_help(context: typer.Context) -> None:
+    """How well a range can be known, and how the views' parallax grows with it; many shots in a
+    row.
+    """
     if context.invoked_subcommand is None:
         print(context.get_help())
 
 
 @app.command()
 def accuracy(
-    photons: Annotated[float, typer.Option(metavar="N", help="Expected photons of a return.")] = 100.0,
-    background: Annotated[float, typer.Option(metavar="N", help="Expected background photons in a bin.")] = 0.1,
-    pulse_ps: Annotated[float, typer.Option(metavar="PS", help="Full width at half maximum of the pulse.")] = 60.0,
+    photons: Annotated[
+        float, typer.Option(metavar="N", help="Expected photons of a return.")
+    ] = 100.0,
+    background: Annotated[
+        float, typer.Option(metavar="N", help="Expected background photons in a bin.")
+    ] = 0.1,
+    pulse_ps: Annotated[
+        float, typer.Option(metavar="PS", help="Full width at half maximum of the pulse.")
+    ] = 60.0,
     decay_ps: Annotated[
         float | None,
-        typer.Option(metavar="PS", help="Time constant of the pulse's tail.", show_default="a Gaussian, no tail"),
+        typer.Option(
+            metavar="PS",
+            help="Time constant of the pulse's tail.",
+            show_default="a Gaussian, no tail",
+        ),
     ] = None,
     bin_width_ps: Annotated[float, typer.Option(metavar="PS", help="Duration of a bin.")] = 20.0,
     bins: Annotated[int, typer.Option(metavar="N", help="Bins of a histogram.")] = 256,
     false_alarm_rate: Annotated[
-        float, typer.Option(metavar="SHARE", help="Histograms without a return in which one may be announced.")
+        float,
+        typer.Option(
+            metavar="SHARE", help="Histograms without a return in which one may be announced."
+        ),
     ] = 0.01,
-    trials: Annotated[int, typer.Option(metavar="N", help="Histograms with a return, and as many without.")] = 2000,
+    trials: Annotated[
+        int, typer.Option(metavar="N", help="Histograms with a return, and as many without.")
+    ] = 2000,
     seed: Annotated[int, typer.Option(metavar="N", help="Of the photons' chance.")] = 0,
-    as_json: AsJson = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Locate returns in simulated photon histograms and compare the error with the Cramer-Rao bound.
+    """Locate returns in simulated photon histograms and compare the error with the Cramer-Rao
+    bound.
 
-    Example: tofclip lidar accuracy --photons 100 --background 0.1 --pulse-ps 60 --bin-width-ps 20 --trials 200
+    Example: tofclip lidar accuracy --photons 100 --background 0.1 --pulse-ps 60 --bin-width-ps 20
+    --trials 200
     """
     from dataclasses import asdict
 
@@ -52,43 +73,63 @@ def accuracy(
     from tofclip.lidar.photons import PhotonDetector, measure_accuracy
 
     width = pulse_ps * PICOSECOND
-    pulse = Pulse.gaussian(width) if decay_ps is None else Pulse.exponentially_modified(width, decay_ps * PICOSECOND)
+    pulse = (
+        Pulse.gaussian(width)
+        if decay_ps is None
+        else Pulse.exponentially_modified(width, decay_ps * PICOSECOND)
+    )
     detector = PhotonDetector(pulse, bin_width_ps * PICOSECOND, bins, false_alarm_rate)
     report(asdict(measure_accuracy(detector, photons, background, trials, seed)), as_json)
 
 
 @app.command()
 def parallax(
-    streak: Annotated[Path, typer.Argument(metavar="STREAK", help="A shot of a scene at several ranges.")],
-    out: Annotated[Path, typer.Option(metavar="H5", help="The camera to write, for recover --focus depth-locked.")],
+    streak: Annotated[
+        Path, typer.Argument(metavar="STREAK", help="A shot of a scene at several ranges.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(metavar="H5", help="The camera to write, for recover --focus depth-locked."),
+    ],
     camera: Annotated[
-        Path | None, typer.Option(metavar="H5", help="Made by calibrate.", show_default="the one inside STREAK")
+        Path | None,
+        typer.Option(metavar="H5", help="Made by calibrate.", show_default="the one inside STREAK"),
     ] = None,
-    time_zero_ns: TimeZero = None,
+    time_zero_ns: TimeZeroOption = None,
     gates: Annotated[int, typer.Option(metavar="N", help="Time gates, of equal brightness.")] = 8,
     shears: Annotated[
-        tuple[float, float, int], typer.Option(metavar="S0 S1 N", help="Shears tried, pixels per view step.")
+        tuple[float, float, int],
+        typer.Option(metavar="S0 S1 N", help="Shears tried, pixels per view step."),
     ] = (-3.0, 3.0, 13),
-    as_json: AsJson = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Find lenslet pitch and focus distance from a shot: at which shear the views agree, gate by gate.
+    """Find lenslet pitch and focus distance from a shot: at which shear the views agree, gate by
+    gate.
 
     Example: tofclip lidar parallax shot.tif --camera camera.h5 --out camera_locked.h5
     """
     from apps.files import RECORD_SUFFIXES, require_writable
-    from apps.progress import progress
+    from apps.progress import show_progress
     from apps.report import report
     from tofclip.camera import Camera
-    from tofclip.camera.calibration.parallax import LOOK
+    from tofclip.camera.calibration.parallax import GATE_METHOD
     from tofclip.io import read_streak
-    from tofclip.recovery import parallax_from_shot, prepare
+    from tofclip.recovery import fit_parallax_to_shot, prepare_recovery
 
-    require_writable(out, *RECORD_SUFFIXES, inputs=(streak,) if camera is None else (streak, camera))
-    task = prepare(read_streak(streak), None if camera is None else Camera.load(camera))
-    known = task.camera if time_zero_ns is None else task.camera.replace(time_zero=time_zero_ns * NANOSECOND)
+    require_writable(
+        out, *RECORD_SUFFIXES, inputs=(streak,) if camera is None else (streak, camera)
+    )
+    task = prepare_recovery(read_streak(streak), None if camera is None else Camera.load(camera))
+    known = (
+        task.camera
+        if time_zero_ns is None
+        else task.camera.replace(time_zero=time_zero_ns * NANOSECOND)
+    )
     rows = task.streak.counts.shape[0]
-    with progress("focusing", task.work - task.method.work(rows) + shears[2] * LOOK.work(rows)) as advance:
-        found = parallax_from_shot(task.streak, known, gates, shears, advance)
+    with show_progress(
+        "focusing", task.work - task.method.work(rows) + shears[2] * GATE_METHOD.work(rows)
+    ) as advance:
+        found = fit_parallax_to_shot(task.streak, known, gates, shears, advance)
     found.camera.save(out)
     figures = {
         "strength_px_m": found.parallax.strength,
@@ -106,16 +147,20 @@ def parallax(
 def scene(
     frames: Annotated[Path, typer.Argument(metavar="FRAMES", help="Recovered frames (HDF5).")],
     out: Annotated[Path, typer.Option(metavar="PNG", help="The picture to write.")],
-    reach_mm: Annotated[float, typer.Option(metavar="MM", help="Points this close belong together.")] = 40.0,
-    fewest_points: Annotated[int, typer.Option(metavar="N", help="Smaller groups are no objects.")] = 40,
-    as_json: AsJson = False,
+    reach_mm: Annotated[
+        float, typer.Option(metavar="MM", help="Points this close belong together.")
+    ] = 40.0,
+    fewest_points: Annotated[
+        int, typer.Option(metavar="N", help="Smaller groups are no objects.")
+    ] = 40,
+    as_json: JsonOption = False,
 ) -> None:
     """List the objects of a scene with range, size and confidence, and draw it from three sides.
 
     Example: tofclip lidar scene frames.h5 --out scene.png
     """
-    from apps.figures.scene import scene_figure
-    from apps.figures.style import save
+    from apps.figures.scene import make_scene_figure
+    from apps.figures.style import save_figure
     from apps.files import PICTURE_SUFFIXES, require_writable
     from apps.report import report
     from tofclip.errors import InputError
@@ -129,9 +174,12 @@ def scene(
     objects = find_objects(cloud, reach_mm * MILLIMETRE, fewest_points)
     if not objects:
         raise InputError(f"{frames}: no {fewest_points} points lie together within {reach_mm:g} mm")
-    save(scene_figure(recovered, cloud, objects), out)
+    save_figure(make_scene_figure(recovered, cloud, objects), out)
     named = ("range", "width", "height", "confidence", "scatter")
-    rows = [{f"{name}_m": getattr(one, name) for name in named} | {"points": one.points.size} for one in objects]
+    rows = [
+        {f"{name}_m": getattr(one, name) for name in named} | {"points": one.points.size}
+        for one in objects
+    ]
     if as_json:
         report({"points": len(cloud), "objects": rows}, as_json=True)
         return
@@ -142,40 +190,59 @@ def scene(
 def sequence(
     shots: Annotated[
         Path,
-        typer.Argument(metavar="SHOTS", help="A folder or quoted pattern of streak images, or an HDF5 stack of them."),
+        typer.Argument(
+            metavar="SHOTS",
+            help="A folder or quoted pattern of streak images, or an HDF5 stack of them.",
+        ),
     ],
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the clouds go; those already there are kept.")],
+    out: Annotated[
+        Path,
+        typer.Option(metavar="FOLDER", help="Where the clouds go; those already there are kept."),
+    ],
     camera: Annotated[
-        Path | None, typer.Option(metavar="H5", help="Made by calibrate.", show_default="the one inside the first shot")
+        Path | None,
+        typer.Option(
+            metavar="H5", help="Made by calibrate.", show_default="the one inside the first shot"
+        ),
     ] = None,
     bin_width_ps: Annotated[
-        float | None, typer.Option(metavar="PS", help="Duration of a row in ps; overrides the files' own time axis.")
+        float | None,
+        typer.Option(
+            metavar="PS", help="Duration of a row in ps; overrides the files' own time axis."
+        ),
     ] = None,
-    time_zero_ns: TimeZero = None,
+    time_zero_ns: TimeZeroOption = None,
     average: Annotated[int, typer.Option(metavar="N", help="Shots averaged for each cloud.")] = 1,
-    focus: Annotated[str, typer.Option(metavar="SHEAR", help="depth-locked or fixed:S.")] = "fixed:0",
+    focus: Annotated[
+        str, typer.Option(metavar="SHEAR", help="depth-locked or fixed:S.")
+    ] = "fixed:0",
     suffix: Annotated[str, typer.Option(metavar=".EXT", help="Format of the clouds.")] = ".ply",
     keep_jitter: Annotated[
-        bool, typer.Option("--keep-jitter", help="Do not find how late each shot comes against the first.")
+        bool,
+        typer.Option(
+            "--keep-jitter", help="Do not find how late each shot comes against the first."
+        ),
     ] = False,
-    cluster: Cluster = None,
-    as_json: AsJson = False,
+    cluster: ClusterOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Make a cloud of each shot by the linear inverse, one shot in memory at a time.
 
-    Started again after an interruption, it makes the clouds that are missing in the folder. Shots of which none can be
-    made are listed at the end, and the exit status is 1.
+    Started again after an interruption, it makes the clouds that are missing in the folder. Shots
+    of which none can be made are listed at the end, and the exit status is 1.
 
     Example: tofclip lidar sequence shots/ --camera camera.h5 --out clouds/
     """
-    from apps.sequences import finish, run_all
+    from apps.sequences import report_summary, run_with_progress
     from apps.verbs.cloud import require_format
-    from tofclip.sequences import Ranging, shots_in
+    from tofclip.sequences import RangingSettings, list_shots
 
     require_format(suffix)
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
     zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
-    jobs = Ranging(camera, zero, focus, average, not keep_jitter).jobs(shots_in(shots, width), out, suffix)
+    jobs = RangingSettings(camera, zero, focus, average, not keep_jitter).jobs(
+        list_shots(shots, width), out, suffix
+    )
     points: list[int] = []
     late: list[float] = []
 
@@ -184,7 +251,7 @@ def sequence(
             points.append(report.figures[0])
             late.extend(report.figures[1])
 
-    summary = run_all("ranging", jobs, cluster, watch)
+    summary = run_with_progress("ranging", jobs, cluster, watch)
     jitter = (sum(one**2 for one in late) / len(late)) ** 0.5 if late else 0.0
     figures = {
         "shots": len(late),
@@ -192,4 +259,4 @@ def sequence(
         "points": sum(points),
         "jitter_rms_bins": jitter,
     }
-    finish(summary, len(jobs), as_json, out, figures)
+    report_summary(summary, len(jobs), as_json, out, figures)

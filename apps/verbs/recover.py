@@ -7,11 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apps.options import AsJson, Cluster, Device, Picture, TimeZero, completing
+from apps.options import (
+    ClusterOption,
+    DeviceOption,
+    JsonOption,
+    PreviewOption,
+    TimeZeroOption,
+    make_completer,
+)
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.sequences import Recovery
+    from tofclip.sequences import RecoverySettings
     from tofclip.shots import Frames, Streak
 
 
@@ -24,25 +31,33 @@ def recover(
             "A sequence: a folder, a quoted pattern, or an HDF5 stack.",
         ),
     ],
-    out: Annotated[Path, typer.Option(metavar="H5", help="The frames to write; of a sequence: their folder.")],
+    out: Annotated[
+        Path, typer.Option(metavar="H5", help="The frames to write; of a sequence: their folder.")
+    ],
     camera: Annotated[
-        Path | None, typer.Option(metavar="H5", help="Made by calibrate.", show_default="the one inside STREAK")
+        Path | None,
+        typer.Option(metavar="H5", help="Made by calibrate.", show_default="the one inside STREAK"),
     ] = None,
     bin_width_ps: Annotated[
         float | None,
-        typer.Option(metavar="PS", help="Duration of a row in ps; overrides the file's own time axis."),
+        typer.Option(
+            metavar="PS", help="Duration of a row in ps; overrides the file's own time axis."
+        ),
     ] = None,
-    time_zero_ns: TimeZero = None,
+    time_zero_ns: TimeZeroOption = None,
     method: Annotated[
         str,
         typer.Option(
             metavar="NAME",
             help="tv, l1, linear or adjoint.",
-            autocompletion=completing("tv", "l1", "linear", "adjoint"),
+            autocompletion=make_completer("tv", "l1", "linear", "adjoint"),
         ),
     ] = "tv",
     iterations: Annotated[
-        int | None, typer.Option(metavar="N", help="At most so many, for tv and l1.", show_default="the method's")
+        int | None,
+        typer.Option(
+            metavar="N", help="At most so many, for tv and l1.", show_default="the method's"
+        ),
     ] = None,
     focus: Annotated[
         str,
@@ -53,9 +68,10 @@ def recover(
         ),
     ] = "fixed:0",
     cloud: Annotated[
-        Path | None, typer.Option(metavar="PLY", help="A point cloud to write as well.", show_default="none")
+        Path | None,
+        typer.Option(metavar="PLY", help="A point cloud to write as well.", show_default="none"),
     ] = None,
-    preview: Picture = None,
+    preview: PreviewOption = None,
     sweep: Annotated[
         list[str] | None,
         typer.Option(
@@ -65,35 +81,37 @@ def recover(
             show_default="none",
         ),
     ] = None,
-    cluster: Cluster = None,
-    device: Device = "cpu",
-    as_json: AsJson = False,
+    cluster: ClusterOption = None,
+    device: DeviceOption = "cpu",
+    as_json: JsonOption = False,
 ) -> None:
     """Recover every transient frame of a raw streak image, or of each one of a sequence.
 
     Where the camera's sweep is not known, skew, gains and centres are found from the shot itself.
 
-    Of a sequence, what is in the folder already is kept: started again, a run goes on where it stopped. Shots that
-    cannot be recovered are listed at the end, and the exit status is 1.
+    Of a sequence, what is in the folder already is kept: started again, a run goes on where it
+    stopped. Shots that cannot be recovered are listed at the end, and the exit status is 1.
 
     Example: tofclip recover shot.tif --camera camera.h5 --out frames.h5 --time-zero-ns -10.784
     """
-    from apps.sequences import device_told
-    from tofclip.sequences import Recovery, is_sequence
+    from apps.sequences import resolve_device
+    from tofclip.sequences import RecoverySettings, is_sequence
 
     zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
-    recovery = Recovery(method, iterations, None, focus, camera, zero, device)
-    used = device_told(device, cluster)
+    recovery = RecoverySettings(method, iterations, None, focus, camera, zero, device)
+    used = resolve_device(device, cluster)
     if is_sequence(streak):
-        _refuse_for_sequence(cloud, preview)
+        _check_sequence_options(cloud, preview)
         _recover_sequence(recovery, (streak, width), out, sweep or [], (cluster, used, as_json))
         return
-    _refuse_for_single(streak, cluster, sweep)
-    _recover_single(recovery, (streak, width), out, (preview or out.with_suffix(".png"), cloud), as_json)
+    _check_single_options(streak, cluster, sweep)
+    _recover_single(
+        recovery, (streak, width), out, (preview or out.with_suffix(".png"), cloud), as_json
+    )
 
 
-def _refuse_for_sequence(cloud: Path | None, preview: Path | None) -> None:
+def _check_sequence_options(cloud: Path | None, preview: Path | None) -> None:
     from tofclip.errors import InputError
 
     if cloud is not None:
@@ -102,72 +120,84 @@ def _refuse_for_sequence(cloud: Path | None, preview: Path | None) -> None:
         raise InputError("--preview is for one shot")
 
 
-def _refuse_for_single(streak: str, cluster: str | None, sweep: list[str] | None) -> None:
+def _check_single_options(streak: str, cluster: str | None, sweep: list[str] | None) -> None:
     from tofclip.errors import InputError
 
     if cluster is not None or sweep:
         option = "--sweep" if cluster is None else "--cluster"
-        raise InputError(f"{streak}: {option} is for a sequence: a folder, a quoted pattern or an HDF5 stack of shots")
+        raise InputError(
+            f"{streak}: {option} is for a sequence: a folder, a quoted pattern or an HDF5 stack of shots"
+        )
 
 
 def _recover_sequence(
-    recovery: Recovery, shots: tuple[str, float | None], out: Path, sweep: list[str], how: tuple[str | None, str, bool]
+    recovery: RecoverySettings,
+    shots: tuple[str, float | None],
+    out: Path,
+    sweep: list[str],
+    how: tuple[str | None, str, bool],
 ) -> None:
-    from apps.sequences import finish, run_all
-    from tofclip.sequences import shots_in, variants
+    from apps.sequences import report_summary, run_with_progress
+    from tofclip.sequences import expand_sweep, list_shots
 
     cluster, device, as_json = how
-    found = shots_in(*shots)
-    swept = variants(recovery, dict(map(_values, sweep)))
+    found = list_shots(*shots)
+    swept = expand_sweep(recovery, dict(map(_parse_sweep, sweep)))
     jobs = [job for label, variant in swept.items() for job in variant.jobs(found, out / label)]
-    finish(run_all("recovering", jobs, cluster), len(jobs), as_json, out, {"device": device})
+    report_summary(
+        run_with_progress("recovering", jobs, cluster), len(jobs), as_json, out, {"device": device}
+    )
 
 
-def _values(text: str) -> tuple[str, list[str]]:
+def _parse_sweep(text: str) -> tuple[str, list[str]]:
     name, _, values = text.partition("=")
     return name, values.split(",")
 
 
 def _recover_single(
-    recovery: Recovery,
+    recovery: RecoverySettings,
     shot: tuple[str, float | None],
     out: Path,
     further: tuple[Path, Path | None],
     as_json: bool,
 ) -> None:
     """Recover one shot, with a picture of it and, where asked for, a cloud."""
-    from apps.figures.preview import preview_figure
-    from apps.figures.style import save
+    from apps.figures.preview import make_preview_figure
+    from apps.figures.style import save_figure
     from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
-    from apps.progress import progress
-    from apps.verbs.cloud import FORMATS as CLOUD_SUFFIXES
-    from tofclip.sequences import Clouds
-    from tofclip.sequences.recovering import with_history
+    from apps.progress import show_progress
+    from apps.verbs.cloud import CLOUD_SUFFIXES as CLOUD_SUFFIXES
+    from tofclip.sequences import CloudSettings
+    from tofclip.sequences.recovering import add_provenance
 
     preview, cloud = further
-    inputs = tuple(Path(name) for name in (shot[0], recovery.camera) if name is not None and not _is_address(name))
+    inputs = tuple(
+        Path(name)
+        for name in (shot[0], recovery.camera)
+        if name is not None and not _is_address(name)
+    )
     require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
     require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
     if cloud is not None:
         require_writable(cloud, *CLOUD_SUFFIXES, inputs=inputs)
-    task = recovery.task(_shot(*shot))
-    with progress("recovering", task.work) as advance:
-        frames = with_history(task.run(advance), task, *inputs)
+    task = recovery.prepare_task(_read_shot(*shot))
+    with show_progress("recovering", task.work) as advance:
+        frames = add_provenance(task.run(advance), task, *inputs)
     frames.save(out)
-    save(preview_figure(task.streak, frames), preview)
+    save_figure(make_preview_figure(task.streak, frames), preview)
     written = [out, preview]
     if cloud is not None:
-        points, _ = Clouds(device=recovery.device).found(frames, "the recovered frames")
+        points, _ = CloudSettings(device=recovery.device).make_cloud(frames, "the recovered frames")
         points.save(cloud)
         written.append(cloud)
-    _report(frames, as_json, written)
+    _report_frames(frames, as_json, written)
 
 
 def _is_address(name: str | Path) -> bool:
     return "://" in str(name)
 
 
-def _shot(streak: str, bin_width: float | None) -> Streak:
+def _read_shot(streak: str, bin_width: float | None) -> Streak:
     """Read a file, or a source until it ends."""
     if _is_address(streak):
         from devices.transients import read_transient
@@ -178,9 +208,9 @@ def _shot(streak: str, bin_width: float | None) -> Streak:
     return read_streak(streak, bin_width)
 
 
-def _report(frames: Frames, as_json: bool, written: list[Path]) -> None:
+def _report_frames(frames: Frames, as_json: bool, written: list[Path]) -> None:
     from apps.report import report
-    from tofclip.recovery import time_shift_bins
+    from tofclip.recovery import compute_view_delays_bins
 
     known = frames.figures
     report(
@@ -193,7 +223,7 @@ def _report(frames: Frames, as_json: bool, written: list[Path]) -> None:
             "seconds": known["seconds"],
             "frames_per_second": known["frames_per_second"],
             "view_gains": frames.camera.gains,
-            "time_shift_bins": time_shift_bins(frames.camera),
+            "time_shift_bins": compute_view_delays_bins(frames.camera),
             "stopped_because": known["stopped_because"],
             "device": known["device"],
         },

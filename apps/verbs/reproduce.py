@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.options import AsJson, Cluster, completing
+from apps.options import ClusterOption, JsonOption, make_completer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,55 +21,76 @@ if TYPE_CHECKING:
     from tofclip.sequences.jobs import Summary
 
 
-def _names(incomplete: str) -> list[str]:
+def _complete_study(incomplete: str) -> list[str]:
     """Complete the name of a study in the shell."""
     from apps.studies.registry import STUDIES
 
-    return completing("all", *(name for study in STUDIES for name in (study.name, *study.also)))(incomplete)
+    return make_completer(
+        "all", *(name for study in STUDIES for name in (study.name, *study.aliases))
+    )(incomplete)
 
 
 def reproduce(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="table2, fig12, ...; all for every one.", autocompletion=_names)
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="table2, fig12, ...; all for every one.",
+            autocompletion=_complete_study,
+        ),
     ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for tables and pictures; made if missing.")],
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder for tables and pictures; made if missing.")
+    ],
     data: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Recorded data: DIR/lightfields/*.npz are studied as well.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Recorded data: DIR/lightfields/*.npz are studied as well."
+        ),
     ] = None,
-    seeds: Annotated[int, typer.Option(metavar="N", min=1, help="Repeats with other angles, codes and noise.")] = 3,
-    cluster: Cluster = None,
-    as_json: AsJson = False,
+    seeds: Annotated[
+        int, typer.Option(metavar="N", min=1, help="Repeats with other angles, codes and noise.")
+    ] = 3,
+    cluster: ClusterOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Make tables and figures of the paper again, its figures beside ours.
 
-    Writes DIR/reproduction.md, which shows everything, and NAME.md, NAME.csv, NAME.png and NAME.json of each study in
-    DIR/reproduction. A study that is there already, made with the same settings, is not made again. On a cluster each
-    study is a task; its seeds stay together, since the weight chosen with the first one holds for all.
+    Writes DIR/reproduction.md, which shows everything, and NAME.md, NAME.csv, NAME.png and
+    NAME.json of each study in DIR/reproduction. A study that is there already, made with the same
+    settings, is not made again. On a cluster each study is a task; its seeds stay together, since
+    the weight chosen with the first one holds for all.
 
     Example: tofclip reproduce table2 --out reproduction --seeds 3
     """
     from apps.files import make_folder
     from apps.report import report
-    from apps.reproduction import FOLDER, write_page
-    from apps.sequences import finish
+    from apps.reproduction import STUDY_FOLDER, write_page
+    from apps.sequences import report_summary
     from apps.studies.library import Library
-    from apps.studies.registry import studies_called
+    from apps.studies.registry import find_studies
 
-    studies = studies_called(name)
+    studies = find_studies(name)
     _require_folder(data)
-    folder = out / FOLDER
+    folder = out / STUDY_FOLDER
     make_folder(folder)
     library = Library(data)
     possible = [study for study in studies if _is_possible(study, library) or len(studies) == 1]
-    summary = None if cluster is None else _shared(possible, library, seeds, folder, cluster)
+    summary = (
+        None if cluster is None else _run_on_cluster(possible, library, seeds, folder, cluster)
+    )
     failed = set() if summary is None else {failure.name for failure in summary.failures}
-    results = [_result(study, library, seeds, folder) for study in possible if study.name not in failed]
-    page = write_page(_all_results(library, seeds, folder), out)
-    figures = {result["name"]: _summary(result) for result in results}
+    results = [
+        _load_or_make_result(study, library, seeds, folder)
+        for study in possible
+        if study.name not in failed
+    ]
+    page = write_page(_load_all_results(library, seeds, folder), out)
+    figures = {result["name"]: _summarise_result(result) for result in results}
     if summary is None:
         report({"seeds": seeds, **figures}, as_json, [page])
         return
-    finish(summary, len(possible), as_json, page, {"seeds": seeds, **figures})
+    report_summary(summary, len(possible), as_json, page, {"seeds": seeds, **figures})
 
 
 def _require_folder(data: Path | None) -> None:
@@ -83,11 +104,14 @@ def _is_possible(study: Study, library: Library) -> bool:
     """Tell whether the recording that a study needs is there; say what is left out."""
     if study.recording is None or library.has_recording(study.recording):
         return True
-    print(f"{study.name}: left out, it needs {study.recording} of the recorded data (--data)", file=sys.stderr)
+    print(
+        f"{study.name}: left out, it needs {study.recording} of the recorded data (--data)",
+        file=sys.stderr,
+    )
     return False
 
 
-def _settings(study: Study, library: Library, seeds: int) -> dict[str, Any]:
+def _describe_settings(study: Study, library: Library, seeds: int) -> dict[str, Any]:
     """What a result depends on, as it comes back from JSON."""
     from tofclip import __version__
 
@@ -95,83 +119,94 @@ def _settings(study: Study, library: Library, seeds: int) -> dict[str, Any]:
     return {"name": study.name, "seeds": seeds, "data": recorded, "version": __version__}
 
 
-def _shared(studies: Sequence[Study], library: Library, seeds: int, folder: Path, cluster: str) -> Summary:
+def _run_on_cluster(
+    studies: Sequence[Study], library: Library, seeds: int, folder: Path, cluster: str
+) -> Summary:
     """Have the studies that are not there yet made by workers."""
-    from apps.reproduction import kept_result
-    from apps.sequences import run_all
+    from apps.reproduction import load_result
+    from apps.sequences import run_with_progress
     from tofclip.sequences.jobs import Job
 
     data = None if library.data is None else library.data.resolve()
     jobs = []
     for study in studies:
         path = folder.resolve() / f"{study.name}.json"
-        if kept_result(path, _settings(study, library, seeds)) is None:
+        if load_result(path, _describe_settings(study, library, seeds)) is None:
             path.unlink(missing_ok=True)  # of other settings, or damaged
             work = partial(make_study, study.name, data, seeds, path.parent)
             beside = tuple(path.with_suffix(suffix) for suffix in (".md", ".csv", ".png"))
             jobs.append(Job(study.name, path, work, beside))
-    return run_all("reproducing", jobs, cluster)
+    return run_with_progress("reproducing", jobs, cluster)
 
 
 def make_study(name: str, data: Path | None, seeds: int, folder: Path) -> None:
     """Make a study again and write it; light fields are rendered or read once in a process."""
-    from apps.studies.registry import studies_called
+    from apps.studies.registry import find_studies
 
-    (study,) = studies_called(name)
-    _made(study, _library(data), seeds, folder, lambda _: None)
+    (study,) = find_studies(name)
+    _run_study(study, _load_library(data), seeds, folder, lambda _: None)
 
 
 @cache
-def _library(data: Path | None) -> Library:
+def _load_library(data: Path | None) -> Library:
     from apps.studies.library import Library
 
     return Library(data)
 
 
-def _result(study: Study, library: Library, seeds: int, folder: Path) -> Result:
+def _load_or_make_result(study: Study, library: Library, seeds: int, folder: Path) -> Result:
     """Return a study's result, made now unless the folder has it."""
-    from apps.progress import progress
-    from apps.reproduction import kept_result
+    from apps.progress import show_progress
+    from apps.reproduction import load_result
 
-    kept = kept_result(folder / f"{study.name}.json", _settings(study, library, seeds))
+    kept = load_result(folder / f"{study.name}.json", _describe_settings(study, library, seeds))
     if kept is not None:
         print(f"{study.name}: kept from an earlier run", file=sys.stderr)
         return kept
     repeats = seeds if study.seeded else 1
     print(f"{study.name}: {study.title}, about {study.seconds * repeats:.0f} s", file=sys.stderr)
-    with progress(study.name, study.steps * repeats) as advance:
-        result = _made(study, library, seeds, folder, advance)
+    with show_progress(study.name, study.steps * repeats) as advance:
+        result = _run_study(study, library, seeds, folder, advance)
     print(f"{study.name}: {result['seconds']:.0f} s", file=sys.stderr)
     return result
 
 
-def _made(study: Study, library: Library, seeds: int, folder: Path, advance: Advance) -> Result:
-    """Make a study, and write its picture, its tables, and at last the file that tells that it is finished."""
-    from apps.figures.reproduction import reproduction_figure
-    from apps.figures.style import save
-    from apps.reproduction import result_of, write_result
+def _run_study(
+    study: Study, library: Library, seeds: int, folder: Path, advance: Advance
+) -> Result:
+    """Make a study, and write its picture, its tables, and at last the file that tells that it is
+    finished.
+    """
+    from apps.figures.reproduction import make_reproduction_figure
+    from apps.figures.style import save_figure
+    from apps.reproduction import make_result, write_result
 
     started = time.perf_counter()
     outcome = study.work(library, seeds if study.seeded else 1, advance)
     seconds = time.perf_counter() - started
     recorded = "" if library.data is None else f" --data {library.data.name}"
     command = f"tofclip reproduce {study.name} --out {folder.parent.name or '.'}{recorded} --seeds {seeds}"
-    save(reproduction_figure(study.title, outcome), folder / f"{study.name}.png")
-    result = result_of(study, outcome, _settings(study, library, seeds), command, seconds)
+    save_figure(make_reproduction_figure(study.title, outcome), folder / f"{study.name}.png")
+    result = make_result(
+        study, outcome, _describe_settings(study, library, seeds), command, seconds
+    )
     write_result(result, folder)
     return result
 
 
-def _all_results(library: Library, seeds: int, folder: Path) -> list[Result]:
+def _load_all_results(library: Library, seeds: int, folder: Path) -> list[Result]:
     """Every result that the folder holds with these settings, in the order of the paper's tables."""
-    from apps.reproduction import kept_result
+    from apps.reproduction import load_result
     from apps.studies.registry import STUDIES
 
-    found = (kept_result(folder / f"{study.name}.json", _settings(study, library, seeds)) for study in STUDIES)
+    found = (
+        load_result(folder / f"{study.name}.json", _describe_settings(study, library, seeds))
+        for study in STUDIES
+    )
     return [result for result in found if result is not None]
 
 
-def _summary(result: Result) -> dict[str, Any]:
+def _summarise_result(result: Result) -> dict[str, Any]:
     """Mean of ours and of the paper's over the rows where it has figures, and the time."""
     known = [row for row in result["rows"] if row["paper"] is not None]
     figures = {"rows": len(result["rows"]), "seconds": result["seconds"]}

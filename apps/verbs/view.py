@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.options import AsJson, TimeZero
+from apps.options import JsonOption, TimeZeroOption
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
@@ -28,41 +28,56 @@ def view(
     ],
     camera: Annotated[
         Path | None,
-        typer.Option(metavar="H5", help="For raw shots; made by calibrate.", show_default="the one inside SOURCE"),
+        typer.Option(
+            metavar="H5",
+            help="For raw shots; made by calibrate.",
+            show_default="the one inside SOURCE",
+        ),
     ] = None,
     bin_width_ps: Annotated[
         float | None, typer.Option(metavar="PS", help="For raw shots: duration of a row in ps.")
     ] = None,
-    time_zero_ns: TimeZero = None,
+    time_zero_ns: TimeZeroOption = None,
     port: Annotated[
-        int | None, typer.Option(min=1, max=65535, metavar="N", help="Of the page.", show_default="a free one")
+        int | None,
+        typer.Option(min=1, max=65535, metavar="N", help="Of the page.", show_default="a free one"),
     ] = None,
     host: Annotated[
-        str, typer.Option(metavar="ADDRESS", help="Where the page is served; beyond loopback a token guards it.")
+        str,
+        typer.Option(
+            metavar="ADDRESS", help="Where the page is served; beyond loopback a token guards it."
+        ),
     ] = "127.0.0.1",
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the page's address; open nothing.")] = False,
-    desktop: Annotated[bool, typer.Option("--desktop", help="Open a window instead of a page.")] = False,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Print the page's address; open nothing.")
+    ] = False,
+    desktop: Annotated[
+        bool, typer.Option("--desktop", help="Open a window instead of a page.")
+    ] = False,
     png: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="Write a picture, without a screen.", show_default="none")
+        Path | None,
+        typer.Option(metavar="PNG", help="Write a picture, without a screen.", show_default="none"),
     ] = None,
     mp4: Annotated[
-        Path | None, typer.Option(metavar="MP4", help="Write a film, without a screen.", show_default="none")
+        Path | None,
+        typer.Option(metavar="MP4", help="Write a film, without a screen.", show_default="none"),
     ] = None,
-    as_json: AsJson = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Look at a source: on a page of the browser, in a window, as a picture or as a film.
 
     The page is served to this computer only. Through ssh: ssh -L 8080:localhost:8080 HOST, then
-    tofclip view SOURCE --port 8080 --no-browser there, and http://localhost:8080 here. On the page, ? shows the keys.
+    tofclip view SOURCE --port 8080 --no-browser there, and http://localhost:8080 here. On the page,
+    ? shows the keys.
 
     Example: tofclip view frames.h5 --png scene.png
     """
     from apps.viewer.session import Session
-    from apps.viewer.sources import Extras, open_source
+    from apps.viewer.source_factory import ShotOptions, open_source
 
     _check_outputs(desktop, png, mp4, source, camera)
     started = time.perf_counter()
-    known = Extras(
+    known = ShotOptions(
         camera,
         None if bin_width_ps is None else bin_width_ps * PICOSECOND,
         None if time_zero_ns is None else time_zero_ns * NANOSECOND,
@@ -76,10 +91,12 @@ def view(
         elif desktop:
             _open_window(session)
         else:
-            _serve(session, host, port, no_browser, as_json)
+            _serve_page(session, host, port, no_browser, as_json)
 
 
-def _check_outputs(desktop: bool, png: Path | None, mp4: Path | None, *inputs: str | Path | None) -> None:
+def _check_outputs(
+    desktop: bool, png: Path | None, mp4: Path | None, *inputs: str | Path | None
+) -> None:
     from apps.files import require_writable
     from tofclip.errors import InputError
 
@@ -93,27 +110,29 @@ def _check_outputs(desktop: bool, png: Path | None, mp4: Path | None, *inputs: s
 
 def _draw_picture(session: Session, out: Path, started: float, as_json: bool) -> None:
     from apps.report import report
-    from apps.viewer.picture import save_picture
-    from apps.viewer.render import best_renderer
+    from apps.viewer.render import choose_renderer
+    from apps.viewer.scene_figure import save_picture
 
-    shown, renderer = session.shown(0.0), best_renderer()
+    shown, renderer = session.frame_at(0.0), choose_renderer()
     save_picture(session.source.title, shown, renderer, out)
-    report(_figures(len(shown.cloud), renderer.name, started), as_json, [out])
+    report(_collect_metrics(len(shown.cloud), renderer.name, started), as_json, [out])
 
 
 def _draw_film(session: Session, out: Path, started: float, as_json: bool) -> None:
-    from apps.progress import progress
+    from apps.progress import show_progress
     from apps.report import report
-    from apps.viewer.film import frames_of, save_film
-    from apps.viewer.render import best_renderer
+    from apps.viewer.film import choose_frames, save_film
+    from apps.viewer.render import choose_renderer
 
-    renderer, pictures = best_renderer(), len(frames_of(session))
-    with progress("filming", pictures) as advance:
+    renderer, pictures = choose_renderer(), len(choose_frames(session))
+    with show_progress("filming", pictures) as advance:
         points = save_film(session, renderer, out, advance)
-    report(_figures(points, renderer.name, started) | {"pictures": pictures}, as_json, [out])
+    report(
+        _collect_metrics(points, renderer.name, started) | {"pictures": pictures}, as_json, [out]
+    )
 
 
-def _figures(points: int, backend: str, started: float) -> dict[str, Any]:
+def _collect_metrics(points: int, backend: str, started: float) -> dict[str, Any]:
     return {"points": points, "backend": backend, "seconds": time.perf_counter() - started}
 
 
@@ -123,12 +142,14 @@ def _open_window(session: Session) -> None:
     open_window(session)
 
 
-def _serve(session: Session, host: str, port: int | None, no_browser: bool, as_json: bool) -> None:
+def _serve_page(
+    session: Session, host: str, port: int | None, no_browser: bool, as_json: bool
+) -> None:
     from apps.report import report
-    from apps.viewer.door import Door
+    from apps.viewer.access_control import AccessControl
     from apps.viewer.page import Page
 
-    with contextlib.closing(Page(session, Door.at(host), port)) as page:
+    with contextlib.closing(Page(session, AccessControl.for_host(host), port)) as page:
         report({"address": page.address}, as_json)
         sys.stdout.flush()  # whoever reads the address waits for it
         if not no_browser:

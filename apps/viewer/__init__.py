@@ -1,4 +1,5 @@
-"""The viewer: clouds, transients and hidden volumes on a page of the browser, in a window, or as a picture.
+"""The viewer: clouds, transients and hidden volumes on a page of the browser, in a window, or as a
+picture.
 
 ::
 

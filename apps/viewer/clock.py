@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 
 from tofclip.errors import InputError
 
-SLOWEST, FASTEST = 1 / 16, 16.0
+MIN_SPEED, MAX_SPEED = 1 / 16, 16.0
 
 
 @dataclass
-class Clock:
-    """Counts frames while it runs; whoever asks brings the time along, in seconds of any steady clock.
+class PlaybackClock:
+    """Counts frames while it runs; whoever asks brings the time along, in seconds of any steady
+    clock.
 
     Parameters
     ----------
@@ -30,7 +31,7 @@ class Clock:
     loop: bool = True
     position: float = 0.0
     playing: bool = field(default=False, init=False)
-    _asked: float | None = field(default=None, init=False, repr=False)
+    _last_tick_s: float | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not self.rate > 0:
@@ -45,7 +46,7 @@ class Clock:
         """Run; from the oldest frame on where the last one is reached."""
         if self.frame >= count - 1:
             self.position = float(oldest)
-        self.playing, self._asked = True, None
+        self.playing, self._last_tick_s = True, None
 
     def pause(self) -> None:
         """Stand still."""
@@ -54,7 +55,7 @@ class Clock:
     def jump(self, frame: int, oldest: int, count: int) -> None:
         """Go to a frame, or to the nearest that exists."""
         self.position = float(min(max(frame, oldest), max(count - 1, oldest)))
-        self._asked = None
+        self._last_tick_s = None
 
     def step(self, frames: int, oldest: int, count: int) -> None:
         """Stand still so many frames further on, or back."""
@@ -63,12 +64,12 @@ class Clock:
 
     def set_speed(self, speed: float) -> None:
         """Run faster or slower from now on, within bounds."""
-        self.speed = min(max(speed, SLOWEST), FASTEST)
+        self.speed = min(max(speed, MIN_SPEED), MAX_SPEED)
 
     def tick(self, now: float, oldest: int, count: int) -> int:
         """Let time pass and return the frame that is due."""
-        passed = 0.0 if self._asked is None else max(0.0, now - self._asked)
-        self._asked = now
+        passed = 0.0 if self._last_tick_s is None else max(0.0, now - self._last_tick_s)
+        self._last_tick_s = now
         if self.playing and count > oldest:
             self._advance(passed * self.rate * self.speed, oldest, count)
         if self.frame < oldest:  # forgotten meanwhile

@@ -15,12 +15,12 @@ from tofclip.errors import FileFormatError, InputError
 from tofclip.lidar import PointCloud
 from tofclip.units import SPEED_OF_LIGHT
 
-SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz")
-CLOUDS_PER_SECOND = 10.0
-MOST_KEPT = 32
+CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz")
+CLOUD_RATE_HZ = 10.0
+MAX_CACHED_CLOUDS = 32
 
 
-class CloudFiles(Source):
+class CloudSource(Source):
     """Clouds in files, shown one after the other.
 
     Parameters
@@ -35,9 +35,9 @@ class CloudFiles(Source):
     """
 
     def __init__(self, title: str, paths: Sequence[Path]) -> None:
-        super().__init__(title, CLOUDS_PER_SECOND)
+        super().__init__(title, CLOUD_RATE_HZ)
         self._paths = list(paths)
-        self._kept: OrderedDict[int, View] = OrderedDict()
+        self._cache: OrderedDict[int, View] = OrderedDict()
         if not self._paths:
             raise InputError(f"{title}: there is no cloud to show")
 
@@ -45,38 +45,43 @@ class CloudFiles(Source):
         return len(self._paths)
 
     def view(self, number: int) -> View:
-        if number not in self._kept:
-            self._kept[number] = View(read_cloud(self._paths[number]))
-            if len(self._kept) > MOST_KEPT:
-                self._kept.popitem(last=False)
-        return self._kept[number]
+        if number not in self._cache:
+            self._cache[number] = View(read_cloud(self._paths[number]))
+            if len(self._cache) > MAX_CACHED_CLOUDS:
+                self._cache.popitem(last=False)
+        return self._cache[number]
 
 
-def clouds_in(folder: Path) -> list[Path]:
+def find_clouds(folder: Path) -> list[Path]:
     """Return the files of a folder that are clouds by their names, in order."""
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.name[0] != ".")
+    return sorted(
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in CLOUD_SUFFIXES and path.name[0] != "."
+    )
 
 
 def read_cloud(path: Path) -> PointCloud:
-    """Read a cloud of this program, or another's table of points with at least x, y and z in metres.
+    """Read a cloud of this program, or another's table of points with at least x, y and z in
+    metres.
 
     Raises
     ------
     InputError, StorageError, FileFormatError
         The file cannot be read, or holds no positions.
     """
-    from tofclip.lidar.export import read
+    from tofclip.lidar.export import read_table
 
     if path.suffix.lower() == ".h5":
         return PointCloud.load(path)
-    table = read(path)
+    table = read_table(path)
     if missing := [axis for axis in "xyz" if axis not in table]:
         raise FileFormatError(path, f"has no column '{missing[0]}', so it is no cloud of points")
     xyz = np.stack([table[axis] for axis in "xyz"], axis=-1)
-    return cloud_of(xyz[np.all(np.isfinite(xyz), axis=1)] if len(table) == 3 else xyz, table)
+    return make_cloud(xyz[np.all(np.isfinite(xyz), axis=1)] if len(table) == 3 else xyz, table)
 
 
-def cloud_of(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) -> PointCloud:
+def make_cloud(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) -> PointCloud:
     """Make a cloud of positions; what is not known follows from them, or is 0.
 
     Parameters

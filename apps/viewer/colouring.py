@@ -14,19 +14,21 @@ from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
 from tofclip.units import NANOSECOND
 
-STEPS = 256
+PALETTE_SIZE = 256
 """Colours of a palette, and entries of a scale."""
 
-OUTERMOST = (1.0, 99.0)
-"""Percentiles between which colours are spread where nobody sets limits: a glint does not darken the rest."""
+LIMIT_PERCENTILES = (1.0, 99.0)
+"""Percentiles between which colours are spread where nobody sets limits: a glint does not darken
+the rest.
+"""
 
-BRIGHT = 85.0
+FULL_LIGHT_PERCENTILE = 85.0
 """Percentile of the intensity from which points are drawn in full light."""
 
-DARKEST = 0.15
+MIN_SHADE = 0.15
 GAMMA = 0.8
 
-MOST_RANKED = 100_000
+MAX_RANKED_POINTS = 100_000
 """Points from which an equalised scale is made; more would cost time and change nothing to be seen."""
 
 PALETTES = ("viridis", "cividis", "inferno", "magma", "plasma", "turbo", "grey")
@@ -40,13 +42,13 @@ class Quantity:
     Parameters
     ----------
     unit : str
-        Of what `of` returns.
-    of : callable
+        Of what `extract` returns.
+    extract : callable
         Takes a cloud, returns (n,) numbers.
     """
 
     unit: str
-    of: Callable[[PointCloud], NDArray[Any]]
+    extract: Callable[[PointCloud], NDArray[Any]]
 
 
 QUANTITIES: Mapping[str, Quantity] = {
@@ -71,11 +73,13 @@ class Colouring:
     palette : str
         One of `PALETTES`.
     limits : (float, float), optional
-        Values of the first and the last colour, in the quantity's unit; `OUTERMOST` percentiles by default.
+        Values of the first and the last colour, in the quantity's unit; `LIMIT_PERCENTILES`
+        percentiles by default.
     equalised : bool
         Whether every colour is given to equally many points, instead of to an equal span of values.
     shaded : bool
-        Whether dim points are drawn darker, so that what is written on a surface can be read in colours of range.
+        Whether dim points are drawn darker, so that what is written on a surface can be read in
+        colours of range.
 
     Raises
     ------
@@ -91,11 +95,19 @@ class Colouring:
 
     def __post_init__(self) -> None:
         if self.quantity not in QUANTITIES:
-            raise InputError(f"no colour for '{self.quantity}'; choose one of {', '.join(QUANTITIES)}")
+            raise InputError(
+                f"no colour for '{self.quantity}'; choose one of {', '.join(QUANTITIES)}"
+            )
         if self.palette not in PALETTES:
-            raise InputError(f"no palette is called '{self.palette}'; choose one of {', '.join(PALETTES)}")
-        if self.limits is not None and not (np.all(np.isfinite(self.limits)) and self.limits[0] < self.limits[1]):
-            raise InputError(f"the limits of the colours must rise, got {self.limits[0]} and {self.limits[1]}")
+            raise InputError(
+                f"no palette is called '{self.palette}'; choose one of {', '.join(PALETTES)}"
+            )
+        if self.limits is not None and not (
+            np.all(np.isfinite(self.limits)) and self.limits[0] < self.limits[1]
+        ):
+            raise InputError(
+                f"the limits of the colours must rise, got {self.limits[0]} and {self.limits[1]}"
+            )
 
 
 @dataclass(frozen=True)
@@ -124,16 +136,20 @@ class Scale:
     def colours(self, values: NDArray[Any]) -> NDArray[np.uint8]:
         """Return red, green and blue, (n, 3); values beyond the limits get the outermost colours."""
         low, high = self.limits
-        if np.allclose(np.diff(self.values), (high - low) / (STEPS - 1), rtol=1e-6, atol=0):
-            even = (np.clip(values, low, high) - np.float32(low)) * np.float32((STEPS - 1) / (high - low))
+        if np.allclose(np.diff(self.values), (high - low) / (PALETTE_SIZE - 1), rtol=1e-6, atol=0):
+            even = (np.clip(values, low, high) - np.float32(low)) * np.float32(
+                (PALETTE_SIZE - 1) / (high - low)
+            )
             number = np.rint(even).astype(np.intp)
         else:
-            number = np.clip(np.searchsorted(self.values, values, side="right") - 1, 0, STEPS - 1)
-        colours: NDArray[np.uint8] = palette(self.palette)[number]
+            number = np.clip(
+                np.searchsorted(self.values, values, side="right") - 1, 0, PALETTE_SIZE - 1
+            )
+        colours: NDArray[np.uint8] = load_palette(self.palette)[number]
         return colours
 
 
-def scale_for(cloud: PointCloud, colouring: Colouring) -> Scale:
+def make_scale(cloud: PointCloud, colouring: Colouring) -> Scale:
     """Return the scale of a cloud's colours.
 
     Parameters
@@ -142,18 +158,18 @@ def scale_for(cloud: PointCloud, colouring: Colouring) -> Scale:
     colouring : Colouring
     """
     quantity = QUANTITIES[colouring.quantity]
-    values = quantity.of(cloud)
-    low, high = colouring.limits or _outermost(values)
-    scale = np.linspace(low, high, STEPS)
+    values = quantity.extract(cloud)
+    low, high = colouring.limits or _find_limits(values)
+    scale = np.linspace(low, high, PALETTE_SIZE)
     inside = values[(values >= low) & (values <= high)]
     if colouring.equalised and inside.size:
-        thinned = inside[:: max(1, inside.size // MOST_RANKED)].astype(np.float64)
-        scale = np.quantile(thinned, np.linspace(0, 1, STEPS))
+        thinned = inside[:: max(1, inside.size // MAX_RANKED_POINTS)].astype(np.float64)
+        scale = np.quantile(thinned, np.linspace(0, 1, PALETTE_SIZE))
         scale[0], scale[-1] = low, high
     return Scale(colouring.quantity, quantity.unit, colouring.palette, scale)
 
 
-def colours_of(cloud: PointCloud, scale: Scale, brightest: float = 0.0) -> NDArray[np.uint8]:
+def colour_points(cloud: PointCloud, scale: Scale, brightest: float = 0.0) -> NDArray[np.uint8]:
     """Return each point's red, green and blue, (n, 3).
 
     Parameters
@@ -163,35 +179,35 @@ def colours_of(cloud: PointCloud, scale: Scale, brightest: float = 0.0) -> NDArr
     brightest : float
         Intensity that is drawn in full light, less of it darker; 0 for no shading.
     """
-    colours = scale.colours(QUANTITIES[scale.quantity].of(cloud))
+    colours = scale.colours(QUANTITIES[scale.quantity].extract(cloud))
     if brightest <= 0 or scale.quantity == "intensity":
         return colours
     light = np.clip(cloud.intensity / np.float32(brightest), 0, 1) ** np.float32(GAMMA)
-    shade = DARKEST + (1 - DARKEST) * light
+    shade = MIN_SHADE + (1 - MIN_SHADE) * light
     return np.asarray(colours * shade[:, np.newaxis], np.uint8)
 
 
-def full_light(cloud: PointCloud) -> float:
+def find_full_light(cloud: PointCloud) -> float:
     """Return the intensity that is drawn in full light; 0 where all points are alike."""
     if len(cloud) == 0 or np.ptp(cloud.intensity) == 0:
         return 0.0
-    return float(np.percentile(cloud.intensity, BRIGHT))
+    return float(np.percentile(cloud.intensity, FULL_LIGHT_PERCENTILE))
 
 
 @functools.cache
-def palette(name: str) -> NDArray[np.uint8]:
+def load_palette(name: str) -> NDArray[np.uint8]:
     """Return the colours of a palette, (256, 3)."""
     from matplotlib import colormaps
 
-    table = colormaps["gray" if name == "grey" else name](np.linspace(0, 1, STEPS))
+    table = colormaps["gray" if name == "grey" else name](np.linspace(0, 1, PALETTE_SIZE))
     return np.ascontiguousarray(np.rint(255 * table[:, :3]), dtype=np.uint8)
 
 
-def _outermost(values: NDArray[Any]) -> tuple[float, float]:
+def _find_limits(values: NDArray[Any]) -> tuple[float, float]:
     """Limits of colours that show nearly all values, never equal."""
     if values.size == 0:
         return 0.0, 1.0
-    low, high = (float(value) for value in np.percentile(values, OUTERMOST))
+    low, high = (float(value) for value in np.percentile(values, LIMIT_PERCENTILES))
     if high - low > 1e-6 * max(abs(low), abs(high)):
         return low, high
     return low - 0.5, low + 0.5

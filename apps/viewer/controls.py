@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from apps.viewer.clock import FASTEST, SLOWEST
-from apps.viewer.looks import Looks
-from apps.viewer.session import GATES, Session, Shown
-from apps.viewer.words import Status
+from apps.viewer.appearance_panel import AppearancePanel
+from apps.viewer.clock import MAX_SPEED, MIN_SPEED
+from apps.viewer.page_text import Status
+from apps.viewer.session import GATE_MODES, DisplayedFrame, Session
 
 if TYPE_CHECKING:
     import viser
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 Post = Callable[[Callable[[], None]], None]
 
 SPEEDS = ("1/16", "1/8", "1/4", "1/2", "1", "2", "4", "8", "16")
-STEPS = {"|<": -(10**9), "-10": -10, "-1": -1, "+1": 1, "+10": 10, ">|": 10**9}
-WIDEST_GATE = 200
+FRAME_STEPS = {"|<": -(10**9), "-10": -10, "-1": -1, "+1": 1, "+10": 10, ">|": 10**9}
+MAX_HALF_GATE_FRAMES = 200
 
 
 class Controls:
-    """Playback, time gate, refocus and ways of showing; how points look is in `Looks`.
+    """Playback, time gate, refocus and ways of showing; how points look is in `AppearancePanel`.
 
     Parameters
     ----------
@@ -34,24 +34,26 @@ class Controls:
     first : Shown
     """
 
-    def __init__(self, server: viser.ViserServer, session: Session, post: Post, first: Shown) -> None:
+    def __init__(
+        self, server: viser.ViserServer, session: Session, post: Post, first: DisplayedFrame
+    ) -> None:
         self._gui, self._session, self._post = server.gui, session, post
         self._status = self._gui.add_html("")
-        self._playback()
-        if session.source.abilities.times is not None:
-            self._time_gate()
-        if session.source.abilities.shears is not None:
-            self._refocus(*session.source.abilities.shears)
-        if session.source.ways.names:
-            self._ways()
-        self._looks = Looks(server, session, post, first)
+        self._add_playback()
+        if session.source.capabilities.times is not None:
+            self._add_time_gate()
+        if session.source.capabilities.shears is not None:
+            self._add_refocus(*session.source.capabilities.shears)
+        if session.source.display_modes.names:
+            self._add_display_modes()
+        self._appearance_panel = AppearancePanel(server, session, post, first)
 
     @property
     def point_size(self) -> float:
         """Side of a point, m."""
-        return self._looks.point_size
+        return self._appearance_panel.point_size
 
-    def show(self, shown: Shown, status: Status) -> None:
+    def show(self, shown: DisplayedFrame, status: Status) -> None:
         """Bring words and controls up to date with what is shown."""
         if self._status.content != status.html:
             self._status.content = status.html
@@ -59,44 +61,62 @@ class Controls:
         if self._frame.max != last:
             self._frame.max = last
         self._frame.value = shown.frame
-        self._looks.show(shown)
+        self._appearance_panel.show(shown)
 
-    def _playback(self) -> None:
+    def _add_playback(self) -> None:
         session, gui = self._session, self._gui
         last = max(1, len(session.source) - 1)
         self._frame: Any = gui.add_slider("frame", 0, last, 1, min(session.clock.frame, last))
-        self._on(self._frame, session.jump)
+        self._bind(self._frame, session.jump)
         live = ("play", "pause", "live") if session.source.is_live else ("play", "pause")
-        self._on(gui.add_button_group("playback", live), self._run)
-        self._on(gui.add_button_group("step", tuple(STEPS)), lambda word: session.step(STEPS[word]))
-        self._on(gui.add_dropdown("speed", SPEEDS, initial_value="1"), self._set_speed)
-        self._on(gui.add_checkbox("loop", session.clock.loop), self._set_loop)
+        self._bind(gui.add_button_group("playback", live), self._run_playback)
+        self._bind(
+            gui.add_button_group("step", tuple(FRAME_STEPS)),
+            lambda word: session.step(FRAME_STEPS[word]),
+        )
+        self._bind(gui.add_dropdown("speed", SPEEDS, initial_value="1"), self._set_speed)
+        self._bind(gui.add_checkbox("loop", session.clock.loop), self._set_loop)
 
-    def _time_gate(self) -> None:
+    def _add_time_gate(self) -> None:
         gui = self._gui
         hint = "which points of the transient are shown: those whose light has come back by the current frame, ..."
-        self._on(gui.add_dropdown("time gate", GATES, initial_value=self._session.gate, hint=hint), self._set_gate)
+        self._bind(
+            gui.add_dropdown("time gate", GATE_MODES, initial_value=self._session.gate, hint=hint),
+            self._set_gate,
+        )
         hint = "frames before and after the current one, for 'around the frame'"
-        half = gui.add_slider("half gate", 1, WIDEST_GATE, 1, self._session.half_gate, hint=hint)
-        self._on(half, self._set_half_gate)
+        half = gui.add_slider(
+            "half gate", 1, MAX_HALF_GATE_FRAMES, 1, self._session.half_gate, hint=hint
+        )
+        self._bind(half, self._set_half_gate)
 
-    def _refocus(self, least: float, most: float) -> None:
+    def _add_refocus(self, least: float, most: float) -> None:
         hint = "recovers the gate once more by the linear inverse, at this shear in pixels per view step; 0: as it was"
         slider = self._gui.add_slider("refocus", least, most, 0.1, 0.0, hint=hint)
-        self._on(slider, self._set_shear)
+        self._bind(slider, self._set_shear)
 
-    def _ways(self) -> None:
-        ways, gui = self._session.source.ways, self._gui
-        self._on(gui.add_dropdown("show as", ways.names, initial_value=ways.chosen), self._set_way)
+    def _add_display_modes(self) -> None:
+        display_modes, gui = self._session.source.display_modes, self._gui
+        self._bind(
+            gui.add_dropdown("show as", display_modes.names, initial_value=display_modes.current),
+            self._set_display_mode,
+        )
         hint = "share of the brightest voxel below which nothing is shown"
-        self._on(gui.add_slider("threshold", 0.02, 0.98, 0.01, ways.threshold, hint=hint), self._set_threshold)
+        self._bind(
+            gui.add_slider("threshold", 0.02, 0.98, 0.01, display_modes.threshold, hint=hint),
+            self._set_threshold,
+        )
 
-    def _run(self, word: str) -> None:
-        {"play": self._session.play, "pause": self._session.pause, "live": self._session.follow}[word]()
+    def _run_playback(self, word: str) -> None:
+        {"play": self._session.play, "pause": self._session.pause, "live": self._session.follow}[
+            word
+        ]()
 
     def _set_speed(self, word: str) -> None:
         over, _, under = word.partition("/")
-        self._session.clock.set_speed(float(np.clip(float(over) / float(under or 1), SLOWEST, FASTEST)))
+        self._session.clock.set_speed(
+            float(np.clip(float(over) / float(under or 1), MIN_SPEED, MAX_SPEED))
+        )
 
     def _set_loop(self, loop: bool) -> None:
         self._session.clock.loop = loop
@@ -110,17 +130,17 @@ class Controls:
     def _set_shear(self, shear: float) -> None:
         self._session.shear = None if shear == 0 else shear
 
-    def _set_way(self, way: str) -> None:
-        self._session.source.ways.chosen = way
+    def _set_display_mode(self, way: str) -> None:
+        self._session.source.display_modes.current = way
 
     def _set_threshold(self, threshold: float) -> None:
-        self._session.source.ways.threshold = threshold
+        self._session.source.display_modes.threshold = threshold
 
-    def _on(self, handle: Any, act: Callable[[Any], None]) -> None:
-        on_user(handle, self._post, act)
+    def _bind(self, handle: Any, act: Callable[[Any], None]) -> None:
+        bind_user_input(handle, self._post, act)
 
 
-def on_user(handle: Any, post: Post, act: Callable[[Any], None]) -> None:
+def bind_user_input(handle: Any, post: Post, act: Callable[[Any], None]) -> None:
     """Have `act` called with a control's new value when a user, not this program, has changed it."""
 
     def changed(event: Any) -> None:

@@ -11,7 +11,7 @@ from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
 
 Limits = tuple[float, float]
-EVERYTHING: Limits = (-np.inf, np.inf)
+NO_LIMITS: Limits = (-np.inf, np.inf)
 
 
 @dataclass(frozen=True)
@@ -35,19 +35,19 @@ class Filters:
         A lower limit above its upper one.
     """
 
-    range: Limits = EVERYTHING
-    intensity: Limits = EVERYTHING
-    time: Limits = EVERYTHING
-    x: Limits = EVERYTHING
-    y: Limits = EVERYTHING
-    z: Limits = EVERYTHING
+    range: Limits = NO_LIMITS
+    intensity: Limits = NO_LIMITS
+    time: Limits = NO_LIMITS
+    x: Limits = NO_LIMITS
+    y: Limits = NO_LIMITS
+    z: Limits = NO_LIMITS
 
     def __post_init__(self) -> None:
         for name, (low, high) in vars(self).items():
             if not low <= high:
                 raise InputError(f"the limits of {name} must rise, got {low:g} and {high:g}")
 
-    def kept(self, cloud: PointCloud) -> NDArray[np.bool_]:
+    def select(self, cloud: PointCloud) -> NDArray[np.bool_]:
         """Return for each point whether it is shown, (n,)."""
         kept = np.ones(len(cloud), bool)
         columns = {"range": cloud.range, "intensity": cloud.intensity, "time": cloud.time}

@@ -8,36 +8,38 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import closing
 
-from apps.viewer.linear_path import Readings, view_of
+from apps.viewer.linear_recovery import Readings, make_view
 from apps.viewer.shots import ShotSource
 from apps.viewer.source import View
 from tofclip.camera import Camera
 from tofclip.errors import InputError, TofclipError
-from tofclip.sequences.ranger import Ranger
-from tofclip.sequences.streaming import Stage, in_stages
+from tofclip.sequences.ranger import RangingPipeline
+from tofclip.sequences.streaming import Stage, run_stages
 from tofclip.shots import Streak
-from tofclip.storage import one_line
+from tofclip.storage import format_error_line
 
-MOST_KEPT = 32
-LONGEST_STOP = 10.0
+MAX_CACHED_SHOTS = 32
+STOP_TIMEOUT_S = 10.0
 """s for the shot under way and for letting go of the instrument."""
 
-RATE_OVER = 8
+RATE_WINDOW_SHOTS = 8
 """Arrivals over which the data rate is averaged."""
 
 
-class LiveShots(ShotSource):
-    """Shots that an iterator delivers, made into clouds as they come; the last 32 can be looked at again.
+class LiveShotSource(ShotSource):
+    """Shots that an iterator delivers, made into clouds as they come; the last 32 can be looked at
+    again.
 
-    Reading, rectifying and ranging are stages side by side (`tofclip.sequences.streaming`). Shots that come
-    faster than that are dropped, the oldest that waits first, so that what one sees is never late.
+    Reading, rectifying and ranging are stages side by side (`tofclip.sequences.streaming`). Shots
+    that come faster than that are dropped, the oldest that waits first, so that what one sees is
+    never late.
 
     Parameters
     ----------
     title : str
     shots : iterator of Streak
-        Its end, or a fault of an instrument, ends the source; what came can still be looked at. A generator lets go of
-        its instrument when it is dropped then.
+        Its end, or a fault of an instrument, ends the source; what came can still be looked at. A
+        generator lets go of its instrument when it is dropped then.
     camera : Camera
         With its sweep.
     first : Streak
@@ -50,16 +52,18 @@ class LiveShots(ShotSource):
 
     def __init__(self, title: str, shots: Iterator[Streak], camera: Camera, first: Streak) -> None:
         super().__init__(title, camera, first.times)
-        self._kept: deque[tuple[Readings, View]] = deque(maxlen=MOST_KEPT)
-        self._arrivals: deque[float] = deque(maxlen=RATE_OVER + 1)
-        self._count, self._trouble = 0, ""
+        self._cache: deque[tuple[Readings, View]] = deque(maxlen=MAX_CACHED_SHOTS)
+        self._arrivals: deque[float] = deque(maxlen=RATE_WINDOW_SHOTS + 1)
+        self._count, self._failure_text = 0, ""
         self._latency, self._lost = float("nan"), 0
-        self._ranger = Ranger(camera, first.times)
-        self.rectifier = self._ranger.rectifier  # knows the sweep already
+        self._pipeline = RangingPipeline(camera, first.times)
+        self.rectifier = self._pipeline.rectifier  # knows the sweep already
         self._lock, self._stopping = threading.Lock(), threading.Event()
         self._ended = False
-        self._keep(self._ranged(self.rectified(first)))
-        self._thread = threading.Thread(target=self._run, args=(shots,), name="live shots", daemon=True)
+        self._append_entry(self._locate_returns(self.rectify(first)))
+        self._thread = threading.Thread(
+            target=self._run, args=(shots,), name="live shots", daemon=True
+        )
         self._thread.start()
 
     def __len__(self) -> int:
@@ -67,7 +71,7 @@ class LiveShots(ShotSource):
 
     @property
     def oldest(self) -> int:
-        return self._count - len(self._kept)
+        return self._count - len(self._cache)
 
     @property
     def is_live(self) -> bool:
@@ -89,50 +93,50 @@ class LiveShots(ShotSource):
         return self._lost
 
     @property
-    def trouble(self) -> str:
-        return self._trouble
+    def failure_text(self) -> str:
+        return self._failure_text
 
     def view(self, number: int) -> View:
-        return self._entry(number)[1]
+        return self._find_entry(number)[1]
 
-    def readings(self, number: int) -> Readings:
-        return self._entry(number)[0]
+    def measurements(self, number: int) -> Readings:
+        return self._find_entry(number)[0]
 
     def close(self) -> None:
         self._stopping.set()
-        self._thread.join(LONGEST_STOP)
+        self._thread.join(STOP_TIMEOUT_S)
 
-    def _entry(self, number: int) -> tuple[Readings, View]:
+    def _find_entry(self, number: int) -> tuple[Readings, View]:
         """Return what is kept of a shot, or of the nearest that is."""
         with self._lock:
-            place = number - (self._count - len(self._kept))
-            return self._kept[min(max(place, 0), len(self._kept) - 1)]
+            place = number - (self._count - len(self._cache))
+            return self._cache[min(max(place, 0), len(self._cache) - 1)]
 
     def _run(self, shots: Iterator[Streak]) -> None:
-        stages = Stage("rectify", self.rectified), Stage("range", self._ranged)
+        stages = Stage("rectify", self.rectify), Stage("range", self._locate_returns)
         try:
-            with closing(in_stages(shots, stages, policy="drop_oldest")) as made:
+            with closing(run_stages(shots, stages, policy="drop_oldest")) as made:
                 for kept, passage in enumerate(made):
                     if self._stopping.is_set():
                         break
                     self._latency, self._lost = passage.latency, passage.number - kept
-                    self._keep(passage.value)
+                    self._append_entry(passage.value)
         except TofclipError as fault:
-            self._trouble = one_line(fault)
+            self._failure_text = format_error_line(fault)
         finally:
             self._ended = True
 
-    def _ranged(self, readings: Readings) -> tuple[Readings, View]:
-        return readings, view_of(self._ranger.returns(readings))
+    def _locate_returns(self, measurements: Readings) -> tuple[Readings, View]:
+        return measurements, make_view(self._pipeline.find_returns(measurements))
 
-    def _keep(self, entry: tuple[Readings, View]) -> None:
+    def _append_entry(self, entry: tuple[Readings, View]) -> None:
         with self._lock:
-            self._kept.append(entry)
+            self._cache.append(entry)
             self._count += 1
             self._arrivals.append(time.monotonic())
 
 
-def first_and_rest(shots: Iterator[Streak], title: str) -> tuple[Streak, Iterator[Streak]]:
+def take_first(shots: Iterator[Streak], title: str) -> tuple[Streak, Iterator[Streak]]:
     """Wait for the first shot."""
     for first in shots:
         return first, shots

@@ -10,42 +10,49 @@ from typing import Any
 
 import numpy as np
 
+from apps.viewer.access_control import AccessControl
 from apps.viewer.controls import Controls
-from apps.viewer.door import Door
-from apps.viewer.keeping import Keeping
-from apps.viewer.marks import NO_SHADOWS, Marks
-from apps.viewer.panes import panes
-from apps.viewer.rates import Pace, Rate
-from apps.viewer.server import address_of, echoes, start_server, stop_server
-from apps.viewer.session import Session, Shown
-from apps.viewer.viewpoint import Viewpoint, in_front_of
-from apps.viewer.words import Status, page_title
+from apps.viewer.export_panel import ExportPanel
+from apps.viewer.page_text import Status, format_page_title
+from apps.viewer.rates import FramePacer, RateCounter
+from apps.viewer.selection_panel import NO_SHADOWS, SelectionPanel
+from apps.viewer.server import get_address, make_echo_request, start_server, stop_server
+from apps.viewer.session import DisplayedFrame, Session
+from apps.viewer.side_pictures import render_pictures
+from apps.viewer.viewpoint import Viewpoint, place_viewpoint
 from tofclip.errors import TofclipError
 
-TICK = 1 / 60
+TICK_S = 1 / 60
 """s between two looks at the clock."""
 
-STATUS_EVERY, PANES_EVERY = 0.25, 0.5
-"""s; words, controls and flat pictures need not follow every frame: they cost the browser more than the points do."""
+STATUS_PERIOD_S, PICTURES_PERIOD_S = 0.25, 0.5
+"""s; words, controls and flat pictures need not follow every frame: they cost the browser more than
+the points do.
+"""
 
-ASPECT = 0.9
+SCENE_ASPECT = 0.9
 """Width over height of the scene between two panels, on a usual screen."""
 
-PANEL_PX, PICTURES_PX = 345, 260
-AMBIENT = 2.0
+PANEL_PX, PICTURES_PANEL_PX = 345, 260
+AMBIENT_INTENSITY = 2.0
 """Light from everywhere, so that no side of a surface is black."""
 
-LOOK: dict[str, Any] = {"point_shape": "square", "point_shading": "flat", "precision": "float32"}
+POINT_STYLE: dict[str, Any] = {
+    "point_shape": "square",
+    "point_shading": "flat",
+    "precision": "float32",
+}
 SURFACE_COLOUR = (216, 210, 196)
 
 
 class Page:
-    """Serves a session. One thread, in `run`, owns the session; whatever the browsers ask for waits in a queue.
+    """Serves a session. One thread, in `run`, owns the session; whatever the browsers ask for waits
+    in a queue.
 
     Parameters
     ----------
     session : Session
-    door : Door
+    access_control : Door
     port : int, optional
 
     Raises
@@ -54,24 +61,28 @@ class Page:
         As `start_server`.
     """
 
-    def __init__(self, session: Session, door: Door, port: int | None = None) -> None:
+    def __init__(
+        self, session: Session, access_control: AccessControl, port: int | None = None
+    ) -> None:
         self.session = session
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stopping, self._woken = threading.Event(), threading.Event()
-        first = session.shown(time.monotonic())
-        self.viewpoint = in_front_of(first.cloud.xyz, ASPECT)
-        self.server = start_server(door, port)
-        self.address = address_of(self.server, door)
-        self._pace, self._frames = Pace(), Rate()
-        self._echo = echoes(self.server, lambda: self.post(lambda: self._pace.answered(time.monotonic())))
-        self._prepare()
+        first = session.frame_at(time.monotonic())
+        self.viewpoint = place_viewpoint(first.cloud.xyz, SCENE_ASPECT)
+        self.server = start_server(access_control, port)
+        self.address = get_address(self.server, access_control)
+        self._pace, self._frames = FramePacer(), RateCounter()
+        self._request_echo = make_echo_request(
+            self.server, lambda: self.post(lambda: self._pace.record_answer(time.monotonic()))
+        )
+        self._set_up_scene()
         self.controls = Controls(self.server, session, self.post, first)
-        self._marks = Marks(self.server, session, self.post)
-        self._keeping = Keeping(self.server, session, self.post, self.viewpoint)
+        self._selection_panel = SelectionPanel(self.server, session, self.post)
+        self._export_panel = ExportPanel(self.server, session, self.post, self.viewpoint)
         self._pictures: dict[str, Any] = {}
-        self._drawn: Shown | None = None
-        self._status_at = self._panes_at = 0.0
-        self._paned: Shown | None = None
+        self._drawn: DisplayedFrame | None = None
+        self._status_at = self._pictures_at = 0.0
+        self._pictured: DisplayedFrame | None = None
 
     def post(self, command: Callable[[], None]) -> None:
         """Have a command carried out by the thread that owns the session."""
@@ -83,7 +94,7 @@ class Page:
         while not self._stopping.is_set():
             self._woken.clear()
             self.update(time.monotonic())
-            self._woken.wait(TICK)
+            self._woken.wait(TICK_S)
 
     def close(self) -> None:
         """Stop serving."""
@@ -96,73 +107,81 @@ class Page:
         try:
             while not self._commands.empty():
                 self._commands.get_nowait()()
-            shown = self.session.shown(now) if self._pace.may_send(now) else self._drawn
+            shown = self.session.frame_at(now) if self._pace.can_send(now) else self._drawn
             if shown is not None and shown is not self._drawn:
                 self._draw(shown, now)
-            self._tell(now)
+            self._update_status(now)
         except TofclipError as fault:
-            self._complain(fault)
+            self._notify_error(fault)
 
-    def _prepare(self) -> None:
+    def _set_up_scene(self) -> None:
         server = self.server
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        server.gui.set_panel_label(page_title(self.session.source.title))
+        server.gui.set_panel_label(format_page_title(self.session.source.title))
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_PX)
         server.scene.set_up_direction("-y")
-        # Shadows and reflections say nothing here, and take a software renderer ten seconds to prepare for.
+        # Shadows and reflections say nothing here, and take a software renderer ten seconds to
+        # prepare for.
         server.scene.configure_default_lights(enabled=True, cast_shadow=False)
         server.scene.configure_environment_map(hdri=None)
-        server.scene.add_light_ambient("/light", intensity=AMBIENT)
-        look_from(server.initial_camera, self.viewpoint)
+        server.scene.add_light_ambient("/light", intensity=AMBIENT_INTENSITY)
+        move_camera(server.initial_camera, self.viewpoint)
         server.scene.add_frame("/camera", axes_length=0.1, axes_radius=0.003)
-        # The page makes a new material for every frame's points, and forgets the compiled shader with the last old one.
-        # Two points that stay keep it: compiling it again for every frame would take twenty times as long as drawing.
+        # The page makes a new material for every frame's points, and forgets the compiled shader
+        # with the last old one. Two points that stay keep it: compiling it again for every frame
+        # would take twenty times as long as drawing.
         staying = np.zeros((2, 3), np.float32)
-        server.scene.add_point_cloud("/camera/staying", staying, staying, point_size=1e-4, **LOOK)
-        server.on_client_connect(lambda _: self.post(self._greet))
+        server.scene.add_point_cloud(
+            "/camera/staying", staying, staying, point_size=1e-4, **POINT_STYLE
+        )
+        server.on_client_connect(lambda _: self.post(self._reset_pace))
 
-    def _greet(self) -> None:
+    def _reset_pace(self) -> None:
         """A page that has just opened is not waited for: it has a history to catch up with."""
-        self._pace = Pace(self._pace.drawn)
-        self._panes_at, self._paned = 0.0, None
+        self._pace = FramePacer(self._pace.display_rate)
+        self._pictures_at, self._pictured = 0.0, None
 
-    def _draw(self, shown: Shown, now: float) -> None:
+    def _draw(self, shown: DisplayedFrame, now: float) -> None:
         server = self.server
         with server.atomic():
             self._draw_scene(shown)
-            self._echo()
+            self._request_echo()
         server.flush()
         self._drawn = shown
         self._frames.add(now)
-        self._pace.sent(now, len(server.get_clients()))
+        self._pace.record_sent(now, len(server.get_clients()))
 
-    def _draw_scene(self, shown: Shown) -> None:
+    def _draw_scene(self, shown: DisplayedFrame) -> None:
         scene = self.server.scene
         if shown.surface is not None:
             faces, vertices = shown.surface.faces, shown.surface.vertices
-            scene.add_mesh_simple("/surface", vertices, faces, color=SURFACE_COLOUR, side="double", **NO_SHADOWS)
+            scene.add_mesh_simple(
+                "/surface", vertices, faces, color=SURFACE_COLOUR, side="double", **NO_SHADOWS
+            )
         elif self._drawn is not None and self._drawn.surface is not None:
             scene.remove_by_name("/surface")
         size, points = self.controls.point_size, shown.cloud.xyz
         if shown.surface is not None:
             points = points[:0]
-        colours: Any = shown.colours if len(points) else (0, 0, 0)  # the page complains about no colours at all
-        scene.add_point_cloud("/points", points, colours, point_size=size, **LOOK)
+        colours: Any = (
+            shown.colours if len(points) else (0, 0, 0)
+        )  # the page complains about no colours at all
+        scene.add_point_cloud("/points", points, colours, point_size=size, **POINT_STYLE)
 
-    def _tell(self, now: float) -> None:
+    def _update_status(self, now: float) -> None:
         """Bring words and flat pictures up to date, now and then."""
         shown = self._drawn
         if shown is None:
             return
-        if now - self._status_at > STATUS_EVERY:
+        if now - self._status_at > STATUS_PERIOD_S:
             self._status_at = now
             self.controls.show(shown, self._status(shown, now))
-        if now - self._panes_at > PANES_EVERY and shown is not self._paned:
-            self._panes_at, self._paned = now, shown
-            self._show_panes(shown)
+        if now - self._pictures_at > PICTURES_PERIOD_S and shown is not self._pictured:
+            self._pictures_at, self._pictured = now, shown
+            self._show_pictures(shown)
 
-    def _status(self, shown: Shown, now: float) -> Status:
+    def _status(self, shown: DisplayedFrame, now: float) -> Status:
         source = self.session.source
         return Status(
             self.session.label,
@@ -171,31 +190,35 @@ class Page:
             len(shown.cloud),
             source.data_rate,
             self._frames.per_second(now),
-            self._pace.drawn.per_second(now),
+            self._pace.display_rate.per_second(now),
             self._pace.latency,
             source.latency,
             source.lost,
-            source.trouble,
+            source.failure_text,
         )
 
-    def _show_panes(self, shown: Shown) -> None:
-        images = panes(self.session.pictures(shown), shown.scale)
+    def _show_pictures(self, shown: DisplayedFrame) -> None:
+        images = render_pictures(self.session.pictures(shown), shown.scale)
         if not self._pictures:
             panel = self.server.gui.add_panel()
             with panel.add_tab("pictures"):
-                self._pictures = {name: self.server.gui.add_image(one, label=name) for name, one in images.items()}
+                self._pictures = {
+                    name: self.server.gui.add_image(one, label=name) for name, one in images.items()
+                }
             panel.dock_left()
-            panel.set_width(PICTURES_PX)
+            panel.set_width(PICTURES_PANEL_PX)
             return
         for name, image in images.items():
             self._pictures[name].image = image
 
-    def _complain(self, fault: TofclipError) -> None:
+    def _notify_error(self, fault: TofclipError) -> None:
         for client in self.server.get_clients().values():
-            client.add_notification("that cannot be", str(fault), auto_close_seconds=6.0, color="red")
+            client.add_notification(
+                "that cannot be", str(fault), auto_close_seconds=6.0, color="red"
+            )
 
 
-def look_from(camera: Any, viewpoint: Viewpoint) -> None:
+def move_camera(camera: Any, viewpoint: Viewpoint) -> None:
     """Move a camera of the page, or the one that pages start with, to a viewpoint."""
     camera.position, camera.look_at = viewpoint.eye, viewpoint.target
     camera.fov = max(viewpoint.field_of_view, float(np.deg2rad(5.0)))

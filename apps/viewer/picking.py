@@ -11,10 +11,10 @@ from apps.viewer.source import Waveform
 from tofclip.lidar import PointCloud
 from tofclip.units import NANOSECOND
 
-WIDEST_MISS = 0.012
+MAX_MISS_RAD = 0.012
 """rad; a click that misses every point by more, 10 pixels on a usual screen, means none of them."""
 
-CLOSE_MISS = 0.004
+CLOSE_MISS_RAD = 0.004
 """rad; of all points missed by less, the nearest one is in front."""
 
 
@@ -49,7 +49,7 @@ class Pick:
     waveform: Waveform | None = None
 
     @property
-    def in_words(self) -> str:
+    def description(self) -> str:
         """One line for each thing that is known."""
         x, y, z = self.position
         lines = [
@@ -63,11 +63,13 @@ class Pick:
         return "\n".join(lines)
 
 
-def point_on_ray(xyz: NDArray[np.float32], origin: ArrayLike, direction: ArrayLike) -> int | None:
+def find_point_on_ray(
+    xyz: NDArray[np.float32], origin: ArrayLike, direction: ArrayLike
+) -> int | None:
     """Return the number of the point that a ray from the eye hits, None where it hits none.
 
-    Of the points that the ray misses closely the one nearest to the eye is meant; with none so close, the one missed
-    by the smallest angle.
+    Of the points that the ray misses closely the one nearest to the eye is meant; with none so
+    close, the one missed by the smallest angle.
 
     Parameters
     ----------
@@ -83,16 +85,19 @@ def point_on_ray(xyz: NDArray[np.float32], origin: ArrayLike, direction: ArrayLi
     with np.errstate(divide="ignore", invalid="ignore"):
         miss = np.sqrt(np.maximum(square - depth**2, 0)) / depth
     miss[~(depth > 0)] = np.inf  # behind the eye
-    close = np.flatnonzero(miss < CLOSE_MISS)
+    close = np.flatnonzero(miss < CLOSE_MISS_RAD)
     if close.size:
         return int(close[np.argmin(depth[close])])
-    if miss.size == 0 or miss.min() > WIDEST_MISS:
+    if miss.size == 0 or miss.min() > MAX_MISS_RAD:
         return None
     return int(np.argmin(miss))
 
 
-def picked(
-    cloud: PointCloud, number: int, pixel: tuple[int, int] | None = None, waveform: Waveform | None = None
+def make_pick(
+    cloud: PointCloud,
+    number: int,
+    pixel: tuple[int, int] | None = None,
+    waveform: Waveform | None = None,
 ) -> Pick:
     """Return what is known about point `number` of a cloud."""
     x, y, z = (float(value) for value in cloud.xyz[number])
@@ -108,6 +113,6 @@ def picked(
     )
 
 
-def distance(first: Pick, second: Pick) -> float:
+def measure_distance(first: Pick, second: Pick) -> float:
     """Distance of two points, m."""
     return float(np.linalg.norm(np.subtract(first.position, second.position)))

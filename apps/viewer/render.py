@@ -1,4 +1,6 @@
-"""Two ways to draw points into an array: by the graphics library where it works, by NumPy everywhere."""
+"""Two ways to draw points into an array: by the graphics library where it works, by NumPy
+everywhere.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +11,17 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.viewer.raster import BACKGROUND, rastered
+from apps.viewer.raster import BACKGROUND, rasterise_points
 from apps.viewer.viewpoint import DOWN, Viewpoint
 
 if TYPE_CHECKING:
-    from apps.viewer.session import Shown
+    from apps.viewer.session import DisplayedFrame
 
 Image = NDArray[np.uint8]
-LONGEST_PROBE = 60.0
+PROBE_TIMEOUT_S = 60.0
 """Seconds; loading the library takes three on a slow machine."""
 
-PROBE = """
+PROBE_SCRIPT = """
 import pyvista
 plotter = pyvista.Plotter(off_screen=True, window_size=(64, 64))
 plotter.add_mesh(pyvista.Sphere())
@@ -32,8 +34,12 @@ class Renderer(Protocol):
 
     name: str
 
-    def draw(self, shown: Shown, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int) -> Image:
-        """Return a picture of `shape` rows and columns, (rows, columns, 3); points are `point_px` wide."""
+    def draw(
+        self, shown: DisplayedFrame, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int
+    ) -> Image:
+        """Return a picture of `shape` rows and columns, (rows, columns, 3); points are `point_px`
+        wide.
+        """
         ...
 
 
@@ -45,7 +51,9 @@ class PyvistaRenderer:
     def __init__(self) -> None:
         self._plotter: Any = None
 
-    def draw(self, shown: Shown, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int) -> Image:
+    def draw(
+        self, shown: DisplayedFrame, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int
+    ) -> Image:
         import pyvista
 
         if self._plotter is None:
@@ -65,18 +73,25 @@ class RasterRenderer:
 
     name = "matplotlib"
 
-    def draw(self, shown: Shown, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int) -> Image:
-        return rastered(shown.cloud.xyz, shown.colours, viewpoint, shape, point_px)
+    def draw(
+        self, shown: DisplayedFrame, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int
+    ) -> Image:
+        return rasterise_points(shown.cloud.xyz, shown.colours, viewpoint, shape, point_px)
 
 
-def add_to_plotter(plotter: Any, shown: Shown, point_px: int) -> None:
+def add_to_plotter(plotter: Any, shown: DisplayedFrame, point_px: int) -> None:
     """Put points, or the surface, into a pyvista plotter."""
     import pyvista
 
     plotter.remove_actor("shown", render=False)
     if shown.surface is not None:
         faces = np.column_stack([np.full(len(shown.surface.faces), 3), shown.surface.faces]).ravel()
-        plotter.add_mesh(pyvista.PolyData(shown.surface.vertices, faces), color="#d8d2c4", name="shown", specular=0.3)
+        plotter.add_mesh(
+            pyvista.PolyData(shown.surface.vertices, faces),
+            color="#d8d2c4",
+            name="shown",
+            specular=0.3,
+        )
     elif len(shown.cloud):
         points = pyvista.PolyData(shown.cloud.xyz)
         points["colour"] = shown.colours
@@ -84,18 +99,18 @@ def add_to_plotter(plotter: Any, shown: Shown, point_px: int) -> None:
         plotter.add_mesh(points, scalars="colour", **look)
 
 
-def best_renderer() -> Renderer:
+def choose_renderer() -> Renderer:
     """Return the graphics library's where it works."""
-    return PyvistaRenderer() if graphics_work() else RasterRenderer()
+    return PyvistaRenderer() if has_working_graphics() else RasterRenderer()
 
 
-def graphics_work(probe: str = PROBE) -> bool:
+def has_working_graphics(probe: str = PROBE_SCRIPT) -> bool:
     """Whether VTK can draw here. Where it cannot it ends its process, so another one tries."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", probe],
             capture_output=True,
-            timeout=LONGEST_PROBE,
+            timeout=PROBE_TIMEOUT_S,
             check=False,
             stdin=subprocess.DEVNULL,
         )

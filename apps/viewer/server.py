@@ -11,24 +11,24 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from apps.viewer.door import LARGEST_PICTURE, Door, refused_message
+from apps.viewer.access_control import MAX_SCREENSHOT_BYTES, AccessControl, check_message
 from tofclip.errors import InputError, MissingDependencyError
 
 if TYPE_CHECKING:
     import viser
 
 FIRST_PORT = 8080
-ECHO, ECHOES = "tofclip-drawn", 4
+ECHO_PREFIX, ECHO_COUNT = "tofclip-drawn", 4
 POLICY_VIOLATION = 1008  # RFC 6455, 7.4.1
-_STARTING = threading.Lock()
+_START_LOCK = threading.Lock()
 
 
-def start_server(door: Door, port: int | None = None) -> viser.ViserServer:
-    """Start a server that lets in whom `door` lets in.
+def start_server(access_control: AccessControl, port: int | None = None) -> viser.ViserServer:
+    """Start a server that lets in whom `access_control` lets in.
 
     Parameters
     ----------
-    door : Door
+    access_control : Door
     port : int, optional
         By default the first free one from 8080 on.
 
@@ -42,11 +42,15 @@ def start_server(door: Door, port: int | None = None) -> viser.ViserServer:
     try:
         import viser
     except ImportError as fault:
-        raise MissingDependencyError(f"the page needs viser, which does not load: {fault}") from fault
-    _require_free(door.host, port or 0)
+        raise MissingDependencyError(
+            f"the page needs viser, which does not load: {fault}"
+        ) from fault
+    _require_free_port(access_control.host, port or 0)
     # viser greets on standard output, which belongs to whoever asked for JSON.
-    with _STARTING, _guarded(door), contextlib.redirect_stdout(io.StringIO()):
-        return viser.ViserServer(host=door.host, port=FIRST_PORT if port is None else port, verbose=False)
+    with _START_LOCK, _guard_server(access_control), contextlib.redirect_stdout(io.StringIO()):
+        return viser.ViserServer(
+            host=access_control.host, port=FIRST_PORT if port is None else port, verbose=False
+        )
 
 
 def stop_server(server: viser.ViserServer) -> None:
@@ -55,10 +59,10 @@ def stop_server(server: viser.ViserServer) -> None:
         server.stop()
 
 
-def address_of(server: viser.ViserServer, door: Door) -> str:
+def get_address(server: viser.ViserServer, access_control: AccessControl) -> str:
     """Return the address to open in a browser."""
-    host = f"[{door.host}]" if ":" in door.host else door.host
-    query = f"?token={door.token}" if door.token else ""
+    host = f"[{access_control.host}]" if ":" in access_control.host else access_control.host
+    query = f"?token={access_control.token}" if access_control.token else ""
     return f"http://{host}:{server.get_port()}/{query}"
 
 
@@ -69,7 +73,9 @@ def run_in_page(server: viser.ViserServer, script: str) -> None:
     server._websock_server.queue_message(_messages.RunJavascriptMessage(source=script))
 
 
-def echoes(server: viser.ViserServer, answered: Callable[[], None]) -> Callable[[], None]:
+def make_echo_request(
+    server: viser.ViserServer, answered: Callable[[], None]
+) -> Callable[[], None]:
     """Return a function that asks every page to answer once all that was sent so far is drawn.
 
     Parameters
@@ -81,22 +87,25 @@ def echoes(server: viser.ViserServer, answered: Callable[[], None]) -> Callable[
     from viser import _messages
 
     def heard(_: int, message: Any) -> None:
-        if message.request_uuid.startswith(ECHO):
+        if message.request_uuid.startswith(ECHO_PREFIX):
             answered()
 
     server._websock_server.register_handler(_messages.LocalStorageGetItemResponseMessage, heard)
-    # Among all messages to the page that are kept in order, this is the one that is answered and changes nothing.
-    # A question replaces an earlier one of its name that has not left yet: frames on their way need different ones.
-    names = itertools.cycle(f"{ECHO}-{number}" for number in range(ECHOES))
+    # Among all messages to the page that are kept in order, this is the one that is answered and
+    # changes nothing. A question replaces an earlier one of its name that has not left yet: frames
+    # on their way need different ones.
+    names = itertools.cycle(f"{ECHO_PREFIX}-{number}" for number in range(ECHO_COUNT))
 
     def ask() -> None:
         name = next(names)
-        server._websock_server.queue_message(_messages.LocalStorageGetItemRequestMessage(name, name))
+        server._websock_server.queue_message(
+            _messages.LocalStorageGetItemRequestMessage(name, name)
+        )
 
     return ask
 
 
-def _require_free(host: str, port: int) -> None:
+def _require_free_port(host: str, port: int) -> None:
     """Refuse a port that is taken: viser would silently take the next one."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -108,16 +117,23 @@ def _require_free(host: str, port: int) -> None:
 
 
 @contextlib.contextmanager
-def _guarded(door: Door) -> Iterator[None]:
-    """Let a server that starts within the block ask `door`; viser itself has no setting for that."""
+def _guard_server(access_control: AccessControl) -> Iterator[None]:
+    """Let a server that starts within the block ask `access_control`; viser itself has no setting
+    for that.
+    """
     import websockets.asyncio.server as web
 
     original = web.serve
 
     def serve(handler: Any, host: str, port: int, **settings: Any) -> Any:
         page = settings.pop("process_request")
-        settings |= {"max_size": LARGEST_PICTURE, "create_connection": _guarded_connection()}
-        return original(handler, host, port, process_request=_asking(door, page), **settings)
+        settings |= {
+            "max_size": MAX_SCREENSHOT_BYTES,
+            "create_connection": _make_guarded_connection(),
+        }
+        return original(
+            handler, host, port, process_request=_guard_requests(access_control, page), **settings
+        )
 
     web.serve = serve  # type: ignore[assignment, misc]
     try:
@@ -126,17 +142,23 @@ def _guarded(door: Door) -> Iterator[None]:
         web.serve = original  # type: ignore[misc]
 
 
-def _asking(door: Door, page: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+def _guard_requests(
+    access_control: AccessControl, page: Callable[[Any, Any], Any]
+) -> Callable[[Any, Any], Any]:
     """Put the door before what answers requests."""
 
     def answer(connection: Any, request: Any) -> Any:
         headers = {name.lower(): value for name, value in request.headers.raw_items()}
-        refusal = door.refusal(request.path, headers)
+        refusal = access_control.check_request(request.path, headers)
         if refusal:
-            status = http.HTTPStatus.NOT_FOUND if refusal == "no such page" else http.HTTPStatus.FORBIDDEN
+            status = (
+                http.HTTPStatus.NOT_FOUND
+                if refusal == "no such page"
+                else http.HTTPStatus.FORBIDDEN
+            )
             return connection.respond(status, refusal + "\n")
         response = page(connection, request)
-        cookie = door.cookie(request.path)
+        cookie = access_control.make_cookie(request.path)
         if response is not None:
             response.headers["Referrer-Policy"] = "no-referrer"  # the address holds the token
             response.headers["X-Frame-Options"] = "DENY"
@@ -147,7 +169,7 @@ def _asking(door: Door, page: Callable[[Any, Any], Any]) -> Callable[[Any, Any],
     return answer
 
 
-def _guarded_connection() -> type:
+def _make_guarded_connection() -> type:
     from websockets.asyncio.server import ServerConnection
 
     class GuardedConnection(ServerConnection):
@@ -155,7 +177,7 @@ def _guarded_connection() -> type:
 
         async def recv(self, decode: bool | None = None) -> Any:
             data = await super().recv(decode)
-            refusal = refused_message(data)
+            refusal = check_message(data)
             if refusal:
                 await self.close(POLICY_VIOLATION, refusal)
                 return await super().recv(decode)  # raises: the connection is closed

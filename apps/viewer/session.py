@@ -9,26 +9,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from apps.viewer.clock import Clock
-from apps.viewer.colouring import Colouring, Scale, colours_of, full_light, scale_for
+from apps.viewer.clock import PlaybackClock
+from apps.viewer.colouring import Colouring, Scale, colour_points, find_full_light, make_scale
 from apps.viewer.filters import Filters
-from apps.viewer.panes import front_pictures
-from apps.viewer.picking import Pick, distance, picked, point_on_ray
-from apps.viewer.source import Gate, Source, Triangles, View
+from apps.viewer.picking import Pick, find_point_on_ray, make_pick, measure_distance
+from apps.viewer.side_pictures import project_front
+from apps.viewer.source import Gate, Source, TriangleMesh, View
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
-from tofclip.lidar.processing import selected
+from tofclip.lidar.processing import select_points
 
-UP_TO, AROUND, ALL = "up to the frame", "around the frame", "all times"
-GATES = (UP_TO, AROUND, ALL)
-"""Which points of a transient are shown: those of light that has come back by now, comes back now, or ever does."""
+GATE_UP_TO_FRAME, GATE_AROUND_FRAME, GATE_ALL_TIMES = (
+    "up to the frame",
+    "around the frame",
+    "all times",
+)
+GATE_MODES = (GATE_UP_TO_FRAME, GATE_AROUND_FRAME, GATE_ALL_TIMES)
+"""Which points of a transient are shown: those of light that has come back by now, comes back now,
+or ever does.
+"""
 
-HALF_GATE = 12
-"""Frames on either side of the current one, in the gate `AROUND`, unless set."""
+HALF_GATE_FRAMES = 12
+"""Frames on either side of the current one, in the gate `GATE_AROUND_FRAME`, unless set."""
 
 
 @dataclass(frozen=True)
-class Shown:
+class DisplayedFrame:
     """Everything that is drawn of one frame.
 
     Parameters
@@ -48,13 +54,14 @@ class Shown:
     colours: NDArray[np.uint8]
     scale: Scale
     pixels: NDArray[np.int32] | None = None
-    surface: Triangles | None = None
+    surface: TriangleMesh | None = None
 
 
 class Session:
     """A source being looked at.
 
-    Not to be used by two threads at once. Public attributes may be set at any time; `shown` then draws accordingly.
+    Not to be used by two threads at once. Public attributes may be set at any time; `frame_at` then
+    draws accordingly.
 
     Parameters
     ----------
@@ -63,23 +70,23 @@ class Session:
 
     def __init__(self, source: Source) -> None:
         self.source = source
-        self.clock = Clock(source.rate)
+        self.clock = PlaybackClock(source.rate)
         self.colouring, self.filters = Colouring(), Filters()
-        self.gate, self.half_gate = UP_TO, HALF_GATE
+        self.gate, self.half_gate = GATE_UP_TO_FRAME, HALF_GATE_FRAMES
         self.shear: float | None = None
         self.following = source.is_live
         self.picks: list[Pick] = []
         self._key: tuple[Any, ...] = ()
-        self._shown: Shown | None = None
-        self._focused: tuple[tuple[Any, ...], View] | None = None
-        if source.abilities.times is not None:
+        self._displayed: DisplayedFrame | None = None
+        self._refocus_cache: tuple[tuple[Any, ...], View] | None = None
+        if source.capabilities.times is not None:
             self.clock.position = float(len(source) - 1)  # a transient is complete at its end
             self.clock.loop = False
 
     @property
-    def latest(self) -> Shown | None:
+    def latest(self) -> DisplayedFrame | None:
         """What was drawn last."""
-        return self._shown
+        return self._displayed
 
     @property
     def label(self) -> str:
@@ -111,22 +118,35 @@ class Session:
         self.following = True
         self.clock.pause()
 
-    def shown(self, now: float) -> Shown:
-        """Return what is to be drawn at time `now`, s of a steady clock; the same object while nothing changed."""
+    def frame_at(self, now: float) -> DisplayedFrame:
+        """Return what is to be drawn at time `now`, s of a steady clock; the same object while
+        nothing changed.
+        """
         if self.following:
             self.clock.position = float(max(0, len(self.source) - 1))
         frame = self.clock.tick(now, self.source.oldest, len(self.source))
-        ways = self.source.ways
-        key = (frame, self.colouring, self.filters, self.gate, self.half_gate, self.shear, ways.chosen, ways.threshold)
-        if self._shown is None or key != self._key:
-            self._key, self._shown = key, self._drawn(frame)
-        return self._shown
+        display_modes = self.source.display_modes
+        key = (
+            frame,
+            self.colouring,
+            self.filters,
+            self.gate,
+            self.half_gate,
+            self.shear,
+            display_modes.current,
+            display_modes.threshold,
+        )
+        if self._displayed is None or key != self._key:
+            self._key, self._displayed = key, self._render_frame(frame)
+        return self._displayed
 
     def pick(self, origin: ArrayLike, direction: ArrayLike) -> Pick | None:
-        """Choose the point that a ray hits, m; the last two choices are kept, and a miss forgets them."""
-        if self._shown is None:
+        """Choose the point that a ray hits, m; the last two choices are kept, and a miss forgets
+        them.
+        """
+        if self._displayed is None:
             return None
-        number = point_on_ray(self._shown.cloud.xyz, origin, direction)
+        number = find_point_on_ray(self._displayed.cloud.xyz, origin, direction)
         if number is None:
             self.picks = []
             return None
@@ -134,57 +154,73 @@ class Session:
 
     def pick_point(self, number: int) -> Pick:
         """Choose point `number` of those that are shown."""
-        shown = self._shown
+        shown = self._displayed
         if shown is None or not 0 <= number < len(shown.cloud):
             raise InputError(f"there is no point {number}")
-        pixel = None if shown.pixels is None else (int(shown.pixels[number, 0]), int(shown.pixels[number, 1]))
+        pixel = (
+            None
+            if shown.pixels is None
+            else (int(shown.pixels[number, 0]), int(shown.pixels[number, 1]))
+        )
         waveform = None if pixel is None else self.source.waveform(shown.frame, pixel)
-        pick = picked(shown.cloud, number, pixel, waveform)
+        pick = make_pick(shown.cloud, number, pixel, waveform)
         self.picks = [*self.picks, pick][-2:]
         return pick
 
     @property
     def distance(self) -> float | None:
         """Distance of the last two picks, m."""
-        return distance(*self.picks) if len(self.picks) == 2 else None
+        return measure_distance(*self.picks) if len(self.picks) == 2 else None
 
     def gate_at(self, frame: int) -> Gate:
         """Return the frames of a transient whose points are shown."""
         frames = len(self.source)
-        if self.gate == AROUND:
+        if self.gate == GATE_AROUND_FRAME:
             return Gate(max(0, frame - self.half_gate), min(frames, frame + self.half_gate + 1))
-        return Gate(0, frame + 1 if self.gate == UP_TO else frames)
+        return Gate(0, frame + 1 if self.gate == GATE_UP_TO_FRAME else frames)
 
-    def pictures(self, shown: Shown) -> Mapping[str, NDArray[np.float32]]:
-        """Return the flat pictures beside the scene; the scene itself seen from the front where there are no others."""
-        return self.source.pictures(shown.frame, self.gate_at(shown.frame)) or front_pictures(shown.cloud)
+    def pictures(self, shown: DisplayedFrame) -> Mapping[str, NDArray[np.float32]]:
+        """Return the flat pictures beside the scene; the scene itself seen from the front where
+        there are no others.
+        """
+        return self.source.pictures(shown.frame, self.gate_at(shown.frame)) or project_front(
+            shown.cloud
+        )
 
-    def _drawn(self, frame: int) -> Shown:
-        view = self._view(frame)
-        kept = self._filters(frame).kept(view.cloud)
-        cloud = view.cloud if kept.all() else selected(view.cloud, kept)
+    def _render_frame(self, frame: int) -> DisplayedFrame:
+        view = self._find_view(frame)
+        kept = self._gate_filters(frame).select(view.cloud)
+        cloud = view.cloud if kept.all() else select_points(view.cloud, kept)
         # The scale is that of all points, so that colours keep their meaning while time passes.
-        scale = scale_for(view.cloud, self.colouring)
-        brightest = full_light(view.cloud) if self.colouring.shaded else 0.0
+        scale = make_scale(view.cloud, self.colouring)
+        brightest = find_full_light(view.cloud) if self.colouring.shaded else 0.0
         pixels = view.pixels if view.pixels is None or kept.all() else view.pixels[kept]
-        return Shown(frame, cloud, colours_of(cloud, scale, brightest), scale, pixels, self.source.surface())
+        return DisplayedFrame(
+            frame,
+            cloud,
+            colour_points(cloud, scale, brightest),
+            scale,
+            pixels,
+            self.source.surface(),
+        )
 
-    def _view(self, frame: int) -> View:
+    def _find_view(self, frame: int) -> View:
         if self.shear is None:
             return self.source.view(frame)
-        # Only a gate around the frame changes with it; else all instants are recovered once and filtered.
-        gate = self.gate_at(frame) if self.gate == AROUND else Gate(0, len(self.source))
-        return self._refocused(frame, self.shear, gate)
+        # Only a gate around the frame changes with it; else all instants are recovered once and
+        # filtered.
+        gate = self.gate_at(frame) if self.gate == GATE_AROUND_FRAME else Gate(0, len(self.source))
+        return self._refocus_view(frame, self.shear, gate)
 
-    def _refocused(self, frame: int, shear: float, gate: Gate) -> View:
-        key = (0 if self.source.abilities.times is not None else frame, shear, gate)
-        if self._focused is None or self._focused[0] != key:
-            self._focused = key, self.source.refocused(frame, shear, gate)
-        return self._focused[1]
+    def _refocus_view(self, frame: int, shear: float, gate: Gate) -> View:
+        key = (0 if self.source.capabilities.times is not None else frame, shear, gate)
+        if self._refocus_cache is None or self._refocus_cache[0] != key:
+            self._refocus_cache = key, self.source.refocus(frame, shear, gate)
+        return self._refocus_cache[1]
 
-    def _filters(self, frame: int) -> Filters:
-        times = self.source.abilities.times
-        if times is None or self.gate == ALL:
+    def _gate_filters(self, frame: int) -> Filters:
+        times = self.source.capabilities.times
+        if times is None or self.gate == GATE_ALL_TIMES:
             return self.filters
         gate = self.gate_at(frame)
         if gate.first == 0 and gate.stop == times.size:
@@ -192,4 +228,7 @@ class Session:
         half = (times[-1] - times[0]) / (2 * max(1, times.size - 1))
         low, high = times[gate.first] - half, times[gate.stop - 1] + half
         low = -np.inf if gate.first == 0 else low
-        return replace(self.filters, time=(max(low, self.filters.time[0]), max(low, min(high, self.filters.time[1]))))
+        return replace(
+            self.filters,
+            time=(max(low, self.filters.time[0]), max(low, min(high, self.filters.time[1]))),
+        )

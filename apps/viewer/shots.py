@@ -10,14 +10,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.viewer.linear_path import SHEARS, LinearPath, Readings
-from apps.viewer.source import Abilities, Gate, Source, View, Waveform
-from apps.viewer.transient import depth_picture
+from apps.viewer.linear_recovery import SHEAR_LIMITS, LinearRecovery, Readings
+from apps.viewer.source import Capabilities, Gate, Source, View, Waveform
+from apps.viewer.transient import render_depth
 from tofclip.camera import Camera, Rectifier
 from tofclip.shots import Streak
 
-SHOTS_PER_SECOND = 10.0
-MOST_KEPT = 16
+SHOT_RATE_HZ = 10.0
+MAX_CACHED_VIEWS = 16
 
 
 class ShotSource(Source):
@@ -33,8 +33,10 @@ class ShotSource(Source):
     """
 
     def __init__(self, title: str, camera: Camera, row_times: NDArray[np.float64]) -> None:
-        super().__init__(title, SHOTS_PER_SECOND, Abilities(shears=SHEARS if camera.views > 1 else None))
-        self.linear = LinearPath(camera, row_times - camera.time_zero)
+        super().__init__(
+            title, SHOT_RATE_HZ, Capabilities(shears=SHEAR_LIMITS if camera.views > 1 else None)
+        )
+        self.linear = LinearRecovery(camera, row_times - camera.time_zero)
         self._views: OrderedDict[int, View] = OrderedDict()
 
     @cached_property
@@ -43,47 +45,47 @@ class ShotSource(Source):
         return Rectifier(self.linear.camera, self.linear.times.size)
 
     @abc.abstractmethod
-    def readings(self, number: int) -> Readings:
+    def measurements(self, number: int) -> Readings:
         """Return the rectified readings of a shot, (columns, rows)."""
 
-    def rectified(self, streak: Streak) -> Readings:
+    def rectify(self, streak: Streak) -> Readings:
         """Take dark level and sweep off a shot."""
-        return self.rectifier.measure(streak.counts, streak.saturated).readings
+        return self.rectifier.measure(streak.counts, streak.saturated).measurements
 
     def view(self, number: int) -> View:
         if number not in self._views:
-            self._views[number] = self.linear.view(self.readings(number), 0.0, self._all)
-            if len(self._views) > MOST_KEPT:
+            self._views[number] = self.linear.view(self.measurements(number), 0.0, self._full_gate)
+            if len(self._views) > MAX_CACHED_VIEWS:
                 self._views.popitem(last=False)
         return self._views[number]
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
-        readings = self.readings(number)
-        bright = self.linear.frames(readings, 0.0, self._around_the_light(readings))
+        measurements = self.measurements(number)
+        bright = self.linear.frames(measurements, 0.0, self._find_bright_gate(measurements))
         return {
-            "streak": readings.T,
+            "streak": measurements.T,
             "intensity": bright.values.sum(axis=0),
-            "depth": depth_picture(self.view(number)),
+            "depth": render_depth(self.view(number)),
         }
 
     def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform:
-        frames = self.linear.frames(self.readings(number), 0.0, self._all)
+        frames = self.linear.frames(self.measurements(number), 0.0, self._full_gate)
         return Waveform(frames.times, frames.values[:, pixel[0], pixel[1]].copy())
 
-    def refocused(self, number: int, shear: float, gate: Gate) -> View:
-        return self.linear.view(self.readings(number), shear, self._all)
+    def refocus(self, number: int, shear: float, gate: Gate) -> View:
+        return self.linear.view(self.measurements(number), shear, self._full_gate)
 
     @property
-    def _all(self) -> Gate:
+    def _full_gate(self) -> Gate:
         return Gate(0, int(self.linear.times.size))
 
-    def _around_the_light(self, readings: Readings) -> Gate:
+    def _find_bright_gate(self, measurements: Readings) -> Gate:
         """The 64 frames about the brightest one: a picture of all would cost as much as the cloud."""
-        brightest = int(readings.sum(axis=0).argmax())
+        brightest = int(measurements.sum(axis=0).argmax())
         return Gate(max(0, brightest - 32), min(int(self.linear.times.size), brightest + 32))
 
 
-class StoredShots(ShotSource):
+class StoredShotSource(ShotSource):
     """Shots in files, read when they are looked at.
 
     Parameters
@@ -107,7 +109,7 @@ class StoredShots(ShotSource):
     def __len__(self) -> int:
         return len(self._shots)
 
-    def readings(self, number: int) -> Readings:
+    def measurements(self, number: int) -> Readings:
         if self._last is None or self._last[0] != number:
-            self._last = (number, self.rectified(self._shots[number]()))
+            self._last = (number, self.rectify(self._shots[number]()))
         return self._last[1]

@@ -47,7 +47,7 @@ class Waveform:
 
 
 @dataclass(frozen=True)
-class Triangles:
+class TriangleMesh:
     """A surface: vertices (v, 3) in m and corners (f, 3) of each triangle."""
 
     vertices: NDArray[np.float32]
@@ -68,25 +68,25 @@ class Gate:
 
 
 @dataclass
-class Ways:
+class DisplayModes:
     """How a source shows itself, where it can be shown in several ways.
 
     Parameters
     ----------
     names : tuple of str
         The ways there are; empty where there is one only.
-    chosen : str
+    current : str
     threshold : float
         Share of the brightest voxel below which nothing is shown.
     """
 
     names: tuple[str, ...] = ()
-    chosen: str = ""
+    current: str = ""
     threshold: float = 0.3
 
 
 @dataclass(frozen=True)
-class Abilities:
+class Capabilities:
     """What a source can do beyond showing its frames.
 
     Parameters
@@ -94,7 +94,8 @@ class Abilities:
     times : (frames,) array, optional
         Time of flight of each frame, s, of a source whose frames are the instants of one transient.
     shears : (float, float), optional
-        Least and largest shear of a refocus, pixels per view step; None where it cannot be refocused.
+        Least and largest shear of a refocus, pixels per view step; None where it cannot be
+        refocused.
     """
 
     times: FloatArray | None = None
@@ -115,8 +116,8 @@ class Source(abc.ABC):
 
     title: str
     rate: float
-    abilities: Abilities = field(default_factory=Abilities)
-    ways: Ways = field(default_factory=Ways)
+    capabilities: Capabilities = field(default_factory=Capabilities)
+    display_modes: DisplayModes = field(default_factory=DisplayModes)
 
     @abc.abstractmethod
     def __len__(self) -> int:
@@ -143,7 +144,9 @@ class Source(abc.ABC):
 
     @property
     def latency(self) -> float:
-        """Time from when a live shot was there until it could be shown, s; NaN where nothing comes in."""
+        """Time from when a live shot was there until it could be shown, s; NaN where nothing comes
+        in.
+        """
         return float("nan")
 
     @property
@@ -152,23 +155,25 @@ class Source(abc.ABC):
         return 0
 
     @property
-    def trouble(self) -> str:
+    def failure_text(self) -> str:
         """What ended a live source early, in a line; empty while all is well."""
         return ""
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
-        """Return pictures of frame `number`, or of a transient's gate, by name: "streak", "intensity", "depth" (m)."""
+        """Return pictures of frame `number`, or of a transient's gate, by name: "streak",
+        "intensity", "depth" (m).
+        """
         return {}
 
     def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform | None:
         """Return the signal of a pixel (row, column) in frame `number`, None where it is not known."""
         return None
 
-    def refocused(self, number: int, shear: float, gate: Gate) -> View:
+    def refocus(self, number: int, shear: float, gate: Gate) -> View:
         """Recover the frames of a gate once more, at another shear, pixels per view step."""
         raise InputError(f"{self.title} holds no readings that could be focused anew")
 
-    def surface(self) -> Triangles | None:
+    def surface(self) -> TriangleMesh | None:
         """Return the surface to draw instead of points, None where points are shown."""
         return None
 
@@ -176,7 +181,9 @@ class Source(abc.ABC):
         """Let go of files and instruments."""
 
 
-def nothing() -> PointCloud:
+def make_empty_cloud() -> PointCloud:
     """Return a cloud without points."""
     empty: Any = np.empty(0, np.float32)
-    return PointCloud(np.empty((0, 3), np.float32), empty, empty, empty, np.empty(0, np.uint8), empty)
+    return PointCloud(
+        np.empty((0, 3), np.float32), empty, empty, empty, np.empty(0, np.uint8), empty
+    )

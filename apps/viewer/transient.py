@@ -9,27 +9,34 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.viewer.linear_path import SHEARS, LinearPath, Readings, least_intensity, view_of
-from apps.viewer.source import Abilities, Gate, Source, View, Waveform
+from apps.viewer.linear_recovery import (
+    SHEAR_LIMITS,
+    LinearRecovery,
+    Readings,
+    find_min_intensity,
+    make_view,
+)
+from apps.viewer.source import Capabilities, Gate, Source, View, Waveform
 from tofclip.lidar import PointCloud, depth
 from tofclip.shots import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
-SECONDS_TO_PLAY = 12.0
+PLAY_TIME_S = 12.0
 """A whole transient at natural speed."""
 
 
 class TransientSource(Source):
     """Recovered frames: frame `n` of the source is instant `n`; the cloud is that of all instants.
 
-    To be focused anew, readings are needed. Where they are not at hand, as with a file of frames, the camera predicts
-    them from the frames, which explain the measured ones but for the recovery's residual.
+    To be focused anew, readings are needed. Where they are not at hand, as with a file of frames,
+    the camera predicts them from the frames, which explain the measured ones but for the recovery's
+    residual.
 
     Parameters
     ----------
     title : str
     frames : Frames
-    readings : (columns, frames) array, optional
+    measurements : (columns, frames) array, optional
         Rectified readings from which the frames were recovered.
 
     Notes
@@ -37,58 +44,70 @@ class TransientSource(Source):
     Memory: the frames, and on the first refocus their readings (columns, frames).
     """
 
-    def __init__(self, title: str, frames: Frames, readings: Readings | None = None) -> None:
-        shears = SHEARS if frames.camera.views > 1 else None
-        super().__init__(title, frames.times.size / SECONDS_TO_PLAY, Abilities(frames.times, shears))
+    def __init__(self, title: str, frames: Frames, measurements: Readings | None = None) -> None:
+        shears = SHEAR_LIMITS if frames.camera.views > 1 else None
+        super().__init__(title, frames.times.size / PLAY_TIME_S, Capabilities(frames.times, shears))
         self.frames = frames
-        self._linear = LinearPath(frames.camera, frames.times)
-        self._measured = readings
+        self._linear = LinearRecovery(frames.camera, frames.times)
+        self._measured = measurements
 
     def __len__(self) -> int:
         return int(self.frames.times.size)
 
     def view(self, number: int) -> View:
-        return self._whole
+        return self._full_view
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
         distance = np.maximum(self.frames.times[gate.frames], 0) * SPEED_OF_LIGHT / 2
         # As the intensity of a point, referred to 1 m: far objects would be lost beside near ones.
         light = np.tensordot((distance**2).astype(np.float32), self.frames.values[gate.frames], 1)
-        return {"streak": self._readings.T, "intensity": light, "depth": depth_picture(self._whole)}
+        return {
+            "streak": self._measurements.T,
+            "intensity": light,
+            "depth": render_depth(self._full_view),
+        }
 
     def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform:
         row, column = pixel
         return Waveform(self.frames.times, self.frames.values[:, row, column])
 
-    def refocused(self, number: int, shear: float, gate: Gate) -> View:
-        return self._linear.view(self._readings, shear, gate, least_intensity(self._whole))
+    def refocus(self, number: int, shear: float, gate: Gate) -> View:
+        return self._linear.view(
+            self._measurements, shear, gate, find_min_intensity(self._full_view)
+        )
 
     @functools.cached_property
-    def _whole(self) -> View:
-        return view_of(depth(self.frames))
+    def _full_view(self) -> View:
+        return make_view(depth(self.frames))
 
     @functools.cached_property
-    def _readings(self) -> Readings:
-        """What the camera read or would read, (columns, frames); neighbouring frames of one shear share an operator."""
+    def _measurements(self) -> Readings:
+        """What the camera read or would read, (columns, frames); neighbouring frames of one shear
+        share an operator.
+        """
         if self._measured is not None:
             return self._measured
         frames, shears = self.frames, self.frames.shears
-        readings = np.empty((frames.camera.slit_width_px, frames.times.size), np.float32)
+        measurements = np.empty((frames.camera.slit_width_px, frames.times.size), np.float32)
         cuts = np.flatnonzero(np.concatenate([[True], np.diff(shears) != 0, [True]]))
         for first, stop in pairwise(cuts.tolist()):
             operator = frames.camera.operator(float(shears[first]))
-            readings[:, first:stop] = operator(np.ascontiguousarray(np.moveaxis(frames.values[first:stop], 0, -1)))
-        return readings
+            measurements[:, first:stop] = operator(
+                np.ascontiguousarray(np.moveaxis(frames.values[first:stop], 0, -1))
+            )
+        return measurements
 
 
-def depth_picture(view: View) -> NDArray[np.float32]:
-    """Return the range of each pixel's most intense return, (rows, columns) in m; NaN where nothing came back."""
+def render_depth(view: View) -> NDArray[np.float32]:
+    """Return the range of each pixel's most intense return, (rows, columns) in m; NaN where nothing
+    came back.
+    """
     if view.pixels is None or len(view.cloud) == 0:
         return np.full((1, 1), np.nan, np.float32)
-    return _picture(view.cloud, view.pixels)
+    return _scatter_depth(view.cloud, view.pixels)
 
 
-def _picture(cloud: PointCloud, pixels: NDArray[np.int32]) -> NDArray[np.float32]:
+def _scatter_depth(cloud: PointCloud, pixels: NDArray[np.int32]) -> NDArray[np.float32]:
     picture = np.full(tuple(pixels.max(axis=0) + 1), np.nan, np.float32)
     upwards = np.argsort(cloud.intensity, kind="stable")  # the last one written wins
     row, column = pixels[upwards].T

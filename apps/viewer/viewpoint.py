@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 from tofclip.errors import InputError
 
-FIELD_OF_VIEW = np.deg2rad(35.0)
-WIDEST = np.deg2rad(60.0)
+FIELD_OF_VIEW_RAD = np.deg2rad(35.0)
+MAX_FIELD_OF_VIEW_RAD = np.deg2rad(60.0)
 """A cloud that fills more than this is looked at from further back than from where it was taken."""
 
-SIDEWAYS, ABOVE = np.deg2rad(-1.0), np.deg2rad(0.8)
+SIDEWAYS_TILT_RAD, UPWARD_TILT_RAD = np.deg2rad(-1.0), np.deg2rad(0.8)
 """How far the eye is moved off the camera's place, as seen from the scene's middle: objects do not hide each other
 more than they did, and depth can be seen."""
 
-MARGIN = 1.1
+VIEW_MARGIN = 1.1
 DOWN = np.array([0.0, 1.0, 0.0])
 FloatArray = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ class Viewpoint:
 
     eye: FloatArray
     target: FloatArray
-    field_of_view: float = float(FIELD_OF_VIEW)
+    field_of_view: float = float(FIELD_OF_VIEW_RAD)
 
     @property
     def axes(self) -> FloatArray:
@@ -50,15 +50,23 @@ class Viewpoint:
         right /= np.linalg.norm(right)
         return np.stack([right, np.cross(forward, right), forward])
 
-    def project(self, xyz: NDArray[np.floating], shape: tuple[int, int]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return row, column and depth (m) of points in a picture of `shape` pixels; NaN behind the eye."""
+    def project(
+        self, xyz: NDArray[np.floating], shape: tuple[int, int]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return row, column and depth (m) of points in a picture of `shape` pixels; NaN behind the
+        eye.
+        """
         right, down, depth = self.axes @ (np.asarray(xyz, dtype=np.float64) - self.eye).T
         depth = np.where(depth > 0, depth, np.nan)
         focal = shape[0] / 2 / np.tan(self.field_of_view / 2)
-        return (shape[0] - 1) / 2 + focal * down / depth, (shape[1] - 1) / 2 + focal * right / depth, depth
+        return (
+            (shape[0] - 1) / 2 + focal * down / depth,
+            (shape[1] - 1) / 2 + focal * right / depth,
+            depth,
+        )
 
 
-def in_front_of(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
+def place_viewpoint(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
     """Return a viewpoint close to the camera's own, the origin, from which a cloud is seen whole.
 
     Parameters
@@ -74,19 +82,21 @@ def in_front_of(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
     middle = (low + high) / 2
     away = float(np.linalg.norm(middle))
     backwards = -middle / away if low[2] > 0 else np.array([0.0, 0.0, -1.0])
-    aside = np.array([np.tan(SIDEWAYS), -np.tan(ABOVE), 0.0])
+    aside = np.array([np.tan(SIDEWAYS_TILT_RAD), -np.tan(UPWARD_TILT_RAD), 0.0])
     direction = (backwards + aside) / np.linalg.norm(backwards + aside)
     near = Viewpoint(middle + max(away, 1e-3) * direction, middle)
-    if low[2] > 0 and (found := _field_of_view(near, xyz, aspect)) <= WIDEST:
+    if low[2] > 0 and (found := _fit_field_of_view(near, xyz, aspect)) <= MAX_FIELD_OF_VIEW_RAD:
         return Viewpoint(near.eye, middle, found)
-    half_width, half_height, half_depth = np.abs(near.axes) @ ((high - low) / 2)  # of the tilted box
-    slope = np.tan(FIELD_OF_VIEW / 2)
-    away = half_depth + MARGIN * max(half_height / slope, half_width / (slope * aspect), 0.05)
+    half_width, half_height, half_depth = np.abs(near.axes) @ (
+        (high - low) / 2
+    )  # of the tilted box
+    slope = np.tan(FIELD_OF_VIEW_RAD / 2)
+    away = half_depth + VIEW_MARGIN * max(half_height / slope, half_width / (slope * aspect), 0.05)
     return Viewpoint(middle + away * direction, middle)
 
 
-def _field_of_view(viewpoint: Viewpoint, xyz: NDArray[np.float32], aspect: float) -> float:
+def _fit_field_of_view(viewpoint: Viewpoint, xyz: NDArray[np.float32], aspect: float) -> float:
     """Return the field of view that holds nearly all points."""
     right, down, depth = np.abs(viewpoint.axes @ (xyz - viewpoint.eye).T)
     slopes = np.maximum(down, right / aspect) / np.maximum(depth, 1e-6)
-    return float(2 * np.arctan(MARGIN * np.percentile(slopes, 99.5)))
+    return float(2 * np.arctan(VIEW_MARGIN * np.percentile(slopes, 99.5)))

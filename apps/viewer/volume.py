@@ -9,14 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.viewer.clouds import cloud_of
-from apps.viewer.source import Gate, Source, Triangles, View, Ways, nothing
+from apps.viewer.clouds import make_cloud
+from apps.viewer.source import DisplayModes, Gate, Source, TriangleMesh, View, make_empty_cloud
 from nlos import Volume
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
 
-VOXELS, SURFACE, PROJECTION, SLICE = "voxels", "surface", "maximum projection", "slices"
-SECONDS_TO_PLAY = 8.0
+VOXEL_MODE, SURFACE_MODE, PROJECTION_MODE, SLICE_MODE = (
+    "voxels",
+    "surface",
+    "maximum projection",
+    "slices",
+)
+PLAY_TIME_S = 8.0
 
 
 class VolumeSource(Source):
@@ -33,10 +38,14 @@ class VolumeSource(Source):
     """
 
     def __init__(self, title: str, volume: Volume) -> None:
-        super().__init__(title, max(1.0, volume.grid.z.size / SECONDS_TO_PLAY))
+        super().__init__(title, max(1.0, volume.grid.z.size / PLAY_TIME_S))
         can_have_surface = min(volume.grid.shape) > 1 and bool(volume.magnitude.any())
-        names = (VOXELS, SURFACE, PROJECTION, SLICE) if can_have_surface else (VOXELS, PROJECTION, SLICE)
-        self.ways = Ways(names, VOXELS)
+        names = (
+            (VOXEL_MODE, SURFACE_MODE, PROJECTION_MODE, SLICE_MODE)
+            if can_have_surface
+            else (VOXEL_MODE, PROJECTION_MODE, SLICE_MODE)
+        )
+        self.display_modes = DisplayModes(names, VOXEL_MODE)
         self.volume = volume
         self._magnitude = volume.magnitude.astype(np.float32)
         self._views: dict[tuple[str, float, int], View] = {}
@@ -45,53 +54,61 @@ class VolumeSource(Source):
         return int(self.volume.grid.z.size)
 
     def view(self, number: int) -> View:
-        chosen = self.ways.chosen
-        key = (chosen, self.ways.threshold, number if chosen == SLICE else 0)
+        chosen = self.display_modes.current
+        key = (chosen, self.display_modes.threshold, number if chosen == SLICE_MODE else 0)
         if key not in self._views:
-            self._views = {key: self._made(number)}
+            self._views = {key: self._make_view(number)}
         return self._views[key]
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
         projection = self.volume.maximum_projection()
-        bright = projection.brightness >= self.ways.threshold * self._magnitude.max()
+        bright = projection.brightness >= self.display_modes.threshold * self._magnitude.max()
         return {
-            "intensity": self._magnitude[number] if self.ways.chosen == SLICE else projection.brightness,
+            "intensity": self._magnitude[number]
+            if self.display_modes.current == SLICE_MODE
+            else projection.brightness,
             "depth": np.where(bright, projection.depth, np.nan).astype(np.float32),
         }
 
-    def surface(self) -> Triangles | None:
-        if self.ways.chosen != SURFACE:
+    def surface(self) -> TriangleMesh | None:
+        if self.display_modes.current != SURFACE_MODE:
             return None
-        mesh = self.volume.surface(min(max(self.ways.threshold, 0.01), 0.99))
-        return Triangles(mesh.vertices, mesh.faces)
+        mesh = self.volume.surface(min(max(self.display_modes.threshold, 0.01), 0.99))
+        return TriangleMesh(mesh.vertices, mesh.faces)
 
-    def _made(self, number: int) -> View:
-        if self.ways.chosen == SURFACE:
+    def _make_view(self, number: int) -> View:
+        if self.display_modes.current == SURFACE_MODE:
             found = self.surface()
-            return View(nothing() if found is None else self._cloud(found.vertices, np.ones(len(found.vertices))))
-        if self.ways.chosen not in self.ways.names:
-            raise InputError(f"a volume is shown as {', '.join(self.ways.names)}, not as '{self.ways.chosen}'")
-        shown = self._shown(number)
+            return View(
+                make_empty_cloud()
+                if found is None
+                else self._make_cloud(found.vertices, np.ones(len(found.vertices)))
+            )
+        if self.display_modes.current not in self.display_modes.names:
+            raise InputError(
+                f"a volume is shown as {', '.join(self.display_modes.names)}, not as '{self.display_modes.current}'"
+            )
+        shown = self._select_voxels(number)
         z, y, x = np.nonzero(shown)
         grid = self.volume.grid
         xyz = np.stack([grid.x[x], grid.y[y], grid.z[z]], axis=-1)
-        return View(self._cloud(xyz, self._magnitude[z, y, x]))
+        return View(self._make_cloud(xyz, self._magnitude[z, y, x]))
 
-    def _shown(self, number: int) -> NDArray[np.bool_]:
+    def _select_voxels(self, number: int) -> NDArray[np.bool_]:
         """Which voxels are drawn, (z, y, x)."""
-        bright: NDArray[np.bool_] = (self._magnitude >= self.ways.threshold * self._magnitude.max()) & (
-            self._magnitude > 0
-        )
-        if self.ways.chosen == SLICE:
+        bright: NDArray[np.bool_] = (
+            self._magnitude >= self.display_modes.threshold * self._magnitude.max()
+        ) & (self._magnitude > 0)
+        if self.display_modes.current == SLICE_MODE:
             bright[:] = False
             bright[number] = True  # all of it: a slice shows the dark as well
-        elif self.ways.chosen == PROJECTION:
+        elif self.display_modes.current == PROJECTION_MODE:
             front = np.zeros_like(bright)
             np.put_along_axis(front, self._magnitude.argmax(axis=0)[np.newaxis], True, axis=0)
             bright &= front
         return bright
 
-    def _cloud(self, xyz: NDArray[Any], brightness: NDArray[Any]) -> PointCloud:
-        cloud = cloud_of(xyz, {"brightness": brightness})
+    def _make_cloud(self, xyz: NDArray[Any], brightness: NDArray[Any]) -> PointCloud:
+        cloud = make_cloud(xyz, {"brightness": brightness})
         # Depth behind the wall tells more than the distance from the origin of its coordinates.
         return replace(cloud, range=cloud.xyz[:, 2])

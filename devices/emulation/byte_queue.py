@@ -23,7 +23,7 @@ class ByteQueue:
             self._pieces.append(piece.data)
             self._length += len(piece)
 
-    def take(self, buffer: memoryview) -> int:
+    def read_into(self, buffer: memoryview) -> int:
         """Move bytes from the front into `buffer`, as many as fit, and return how many."""
         taken = 0
         while self._pieces and taken < len(buffer):

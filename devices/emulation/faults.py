@@ -9,10 +9,12 @@ import numpy as np
 
 from tofclip.errors import InputError
 
-Kind = Literal["timeout", "stall", "unplug", "powerloss", "short", "overflow", "corrupt", "lost"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
+FaultKind = Literal[
+    "timeout", "stall", "unplug", "powerloss", "short", "overflow", "corrupt", "lost"
+]
+FAULT_KINDS: tuple[FaultKind, ...] = get_args(FaultKind)
 
-FOR_GOOD = 1_000_000
+PERMANENT_ENUMERATIONS = 1_000_000
 """Enumerations after which nobody looks any more."""
 
 
@@ -25,15 +27,16 @@ class Fault:
     transfer : int
         Number of the data transfer in which it happens, from 0.
     kind : str
-        ``timeout``: nothing comes. ``stall``: the endpoint halts, `amount` times in a row. ``unplug``: gone for
-        `amount` enumerations, keeping its power; ``powerloss``: without. ``short``: only `amount` bytes come now.
-        ``overflow``: the transfer is lost on the wire. ``corrupt``: `amount` records are no records. ``lost``:
-        `amount` records find the instrument's memory full.
+        ``timeout``: nothing comes. ``stall``: the endpoint halts, `amount` times in a row.
+        ``unplug``: gone for `amount` enumerations, keeping its power; ``powerloss``: without.
+        ``short``: only `amount` bytes come now. ``overflow``: the transfer is lost on the wire.
+        ``corrupt``: `amount` records are no records. ``lost``: `amount` records find the
+        instrument's memory full.
     amount : int
     """
 
     transfer: int
-    kind: Kind
+    kind: FaultKind
     amount: int = 1
 
     @classmethod
@@ -50,24 +53,26 @@ class Fault:
     def _parse_one(cls, word: str) -> Fault:
         kind, _, rest = word.partition("@")
         transfer, _, amount = rest.partition(":")
-        known = next((known for known in KINDS if known == kind), None)
+        known = next((known for known in FAULT_KINDS if known == kind), None)
         if known is None or not transfer.isdecimal() or not (amount or "1").isdecimal():
-            raise InputError(f"'{word}' is no fault; write KIND@TRANSFER:AMOUNT with one of {', '.join(KINDS)}")
+            raise InputError(
+                f"'{word}' is no fault; write KIND@TRANSFER:AMOUNT with one of {', '.join(FAULT_KINDS)}"
+            )
         return cls(int(transfer), known, int(amount or 1))
 
 
-def random_script(seed: int, transfers: int) -> tuple[Fault, ...]:
+def draw_fault_script(seed: int, transfers: int) -> tuple[Fault, ...]:
     """Draw up to six faults of any kind, at most one per transfer, within the first `transfers`."""
     rng = np.random.default_rng(seed)
     when = rng.permutation(transfers)[: rng.integers(0, 7)]
-    return tuple(Fault(int(transfer), *_drawn(rng)) for transfer in sorted(when))
+    return tuple(Fault(int(transfer), *_draw_fault(rng)) for transfer in sorted(when))
 
 
-def _drawn(rng: np.random.Generator) -> tuple[Kind, int]:
-    kind = KINDS[rng.integers(len(KINDS))]
+def _draw_fault(rng: np.random.Generator) -> tuple[FaultKind, int]:
+    kind = FAULT_KINDS[rng.integers(len(FAULT_KINDS))]
     if kind in ("stall", "unplug", "powerloss"):
         often = int(rng.choice([1, 2], p=[0.85, 0.15]))
         if kind == "stall" or often == 1:
             return kind, often
-        return kind, FOR_GOOD
+        return kind, PERMANENT_ENUMERATIONS
     return kind, int(rng.integers(0, 600))

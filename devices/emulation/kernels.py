@@ -11,12 +11,14 @@ from devices.timetag.kernels import RECORD_BYTES, TIME_BITS, TIME_MASK, WRAP
 
 compiled = njit(nogil=True, cache=True, error_model="numpy")
 
-_DOUBLE = 2.0**-53
+_DOUBLE_STEP = 2.0**-53
 
 
 @compiled
-def _next(state):
-    """One step of splitmix64 (Steele, Lea, Flood, OOPSLA 2014); returns the new state and 64 random bits."""
+def _next_random(state):
+    """One step of splitmix64 (Steele, Lea, Flood, OOPSLA 2014); returns the new state and 64 random
+    bits.
+    """
     state = state + np.uint64(0x9E3779B97F4A7C15)
     mixed = state
     mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -25,7 +27,7 @@ def _next(state):
 
 
 @compiled
-def poisson_words(state, now, scale, shares, last, words):
+def fill_poisson_words(state, now, scale, weights, last, words):
     """Write the words of photons that arrive at random on four channels, one at most per tick.
 
     Parameters
@@ -35,12 +37,13 @@ def poisson_words(state, now, scale, shares, last, words):
     now : (1,) int64 array
         Tick of the last record; changed in place.
     scale : float
-        Of the exponential distribution of which the whole part is the number of ticks between two photons.
-    shares : (4,) float64 array
+        Of the exponential distribution of which the whole part is the number of ticks between two
+        photons.
+    weights : (4,) float64 array
         Of all photons, the share of each channel, added up.
     last : int
         No record is later than this tick.
-    words : bytes
+    next_words : bytes
         Filled with as many records as fit.
 
     Returns
@@ -50,17 +53,17 @@ def poisson_words(state, now, scale, shares, last, words):
     """
     written = 0
     while written < words.size // RECORD_BYTES:
-        after, bits = _next(state[0])
-        gap = -math.log(((bits >> np.uint64(11)) + np.uint64(1)) * _DOUBLE) * scale
+        after, bits = _next_random(state[0])
+        gap = -math.log(((bits >> np.uint64(11)) + np.uint64(1)) * _DOUBLE_STEP) * scale
         tick = now[0] + 1 + np.int64(gap)
-        after, bits = _next(after)
-        where = (bits >> np.uint64(11)) * _DOUBLE
+        after, bits = _next_random(after)
+        where = (bits >> np.uint64(11)) * _DOUBLE_STEP
         wrap = ((now[0] >> TIME_BITS) + 1) << TIME_BITS
         lines, kind = 0, WRAP
         if tick < wrap:
             lines, kind = 1, 0
             for channel in range(3):
-                if where >= shares[channel]:
+                if where >= weights[channel]:
                     lines <<= 1
         else:
             tick, after = wrap, state[0]

@@ -1,4 +1,6 @@
-"""A USB of software: the interface that pyusb expects of a backend, over instruments that are objects."""
+"""A USB of software: the interface that pyusb expects of a backend, over instruments that are
+objects.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +14,16 @@ from typing import Any
 import usb.backend
 import usb.core
 
-from devices.usb import INTERFACE, UsbIdentity
+from devices.usb import INTERFACE_NUMBER, UsbIdentity
 
-BULK = 2
+BULK_TRANSFER = 2
 HIGH_SPEED = 3
 PACKET_BYTES = 512
-ENGLISH = 0x0409
+ENGLISH_LANGID = 0x0409
 GET_DESCRIPTOR, STRING = 6, 3
 
 
-def usb_error(number: int) -> usb.core.USBError:
+def make_usb_error(number: int) -> usb.core.USBError:
     """Return the exception that pyusb raises for a system error."""
     kind = usb.core.USBTimeoutError if number == errno.ETIMEDOUT else usb.core.USBError
     return kind(errno.errorcode[number], None, number)
@@ -39,22 +41,24 @@ class VirtualDevice(abc.ABC):
         Addresses of its bulk endpoints.
     """
 
-    def __init__(self, identity: UsbIdentity, strings: tuple[str, str, str], endpoints: tuple[int, ...]) -> None:
+    def __init__(
+        self, identity: UsbIdentity, strings: tuple[str, str, str], endpoints: tuple[int, ...]
+    ) -> None:
         self.identity, self.strings, self.endpoints = identity, strings, endpoints
         self.halted: set[int] = set()
-        self.looks_until_replug: float = 0
+        self.enumerations_until_replug: float = 0
         """Enumerations in which it does not show; infinite: it is gone for good."""
-        self.may_be_opened = True
-        self.held_by_other = False
+        self.is_accessible = True
+        self.is_claimed_elsewhere = False
 
     @property
     def is_plugged(self) -> bool:
         """Whether it answers."""
-        return self.looks_until_replug <= 0
+        return self.enumerations_until_replug <= 0
 
     def unplug(self, looks: float) -> None:
         """Take it off the bus for so many enumerations."""
-        self.looks_until_replug = looks
+        self.enumerations_until_replug = looks
 
     def clear_halt(self, endpoint: int) -> None:
         """End an endpoint's stall."""
@@ -66,7 +70,9 @@ class VirtualDevice(abc.ABC):
 
     @abc.abstractmethod
     def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
-        """Write what the host asks for into `buffer` and return how many bytes; raise `usb_error` for faults."""
+        """Write what the host asks for into `buffer` and return how many bytes; raise
+        `make_usb_error` for faults.
+        """
 
 
 class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no types
@@ -85,7 +91,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
             if device.is_plugged:
                 yield device
             else:
-                device.looks_until_replug -= 1
+                device.enumerations_until_replug -= 1
 
     def get_device_descriptor(self, dev: VirtualDevice) -> SimpleNamespace:
         return SimpleNamespace(
@@ -96,54 +102,60 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         )  # fmt: skip
 
     def get_configuration_descriptor(self, dev: VirtualDevice, config: int) -> SimpleNamespace:
-        _require(config == 0)
+        _require_descriptor(config == 0)
         return SimpleNamespace(
             bLength=9, bDescriptorType=2, wTotalLength=18 + 7 * len(dev.endpoints), bNumInterfaces=1,
             bConfigurationValue=1, iConfiguration=0, bmAttributes=0x80, bMaxPower=250, extra_descriptors=[],
         )  # fmt: skip
 
-    def get_interface_descriptor(self, dev: VirtualDevice, intf: int, alt: int, config: int) -> SimpleNamespace:
-        _require((intf, alt, config) == (INTERFACE, 0, 0))
+    def get_interface_descriptor(
+        self, dev: VirtualDevice, intf: int, alt: int, config: int
+    ) -> SimpleNamespace:
+        _require_descriptor((intf, alt, config) == (INTERFACE_NUMBER, 0, 0))
         return SimpleNamespace(
-            bLength=9, bDescriptorType=4, bInterfaceNumber=INTERFACE, bAlternateSetting=0,
+            bLength=9, bDescriptorType=4, bInterfaceNumber=INTERFACE_NUMBER, bAlternateSetting=0,
             bNumEndpoints=len(dev.endpoints), bInterfaceClass=255, bInterfaceSubClass=255, bInterfaceProtocol=255,
             iInterface=0, extra_descriptors=[],
         )  # fmt: skip
 
-    def get_endpoint_descriptor(self, dev: VirtualDevice, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
-        _require(ep < len(dev.endpoints) and (intf, alt, config) == (INTERFACE, 0, 0))
+    def get_endpoint_descriptor(
+        self, dev: VirtualDevice, ep: int, intf: int, alt: int, config: int
+    ) -> SimpleNamespace:
+        _require_descriptor(
+            ep < len(dev.endpoints) and (intf, alt, config) == (INTERFACE_NUMBER, 0, 0)
+        )
         return SimpleNamespace(
-            bLength=7, bDescriptorType=5, bEndpointAddress=dev.endpoints[ep], bmAttributes=BULK,
+            bLength=7, bDescriptorType=5, bEndpointAddress=dev.endpoints[ep], bmAttributes=BULK_TRANSFER,
             wMaxPacketSize=PACKET_BYTES, bInterval=0, bRefresh=0, bSynchAddress=0, extra_descriptors=[],
         )  # fmt: skip
 
     def open_device(self, dev: VirtualDevice) -> VirtualDevice:
-        _present(dev)
-        if not dev.may_be_opened:
-            raise usb_error(errno.EACCES)
+        _require_plugged(dev)
+        if not dev.is_accessible:
+            raise make_usb_error(errno.EACCES)
         return dev
 
     def close_device(self, dev_handle: VirtualDevice) -> None:
         """Nothing is held open."""
 
     def get_configuration(self, dev_handle: VirtualDevice) -> int:
-        _present(dev_handle)
+        _require_plugged(dev_handle)
         return 1
 
     def is_kernel_driver_active(self, dev_handle: VirtualDevice, intf: int) -> bool:
-        _present(dev_handle)
+        _require_plugged(dev_handle)
         return False
 
     def claim_interface(self, dev_handle: VirtualDevice, intf: int) -> None:
-        _present(dev_handle)
-        if dev_handle.held_by_other:
-            raise usb_error(errno.EBUSY)
+        _require_plugged(dev_handle)
+        if dev_handle.is_claimed_elsewhere:
+            raise make_usb_error(errno.EBUSY)
 
     def release_interface(self, dev_handle: VirtualDevice, intf: int) -> None:
-        _present(dev_handle)
+        _require_plugged(dev_handle)
 
     def clear_halt(self, dev_handle: VirtualDevice, ep: int) -> None:
-        _present(dev_handle)
+        _require_plugged(dev_handle)
         dev_handle.clear_halt(ep)
 
     def ctrl_transfer(
@@ -151,38 +163,46 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         timeout: int,
     ) -> int:  # fmt: skip
         """Answer requests for string descriptors, the only control requests that pyusb needs here."""
-        _present(dev_handle)
+        _require_plugged(dev_handle)
         number = wValue & 0xFF
         if (bRequest, wValue >> 8) != (GET_DESCRIPTOR, STRING) or number > len(dev_handle.strings):
-            raise usb_error(errno.EPIPE)
-        text = dev_handle.strings[number - 1].encode("utf-16-le") if number else ENGLISH.to_bytes(2, "little")
+            raise make_usb_error(errno.EPIPE)
+        text = (
+            dev_handle.strings[number - 1].encode("utf-16-le")
+            if number
+            else ENGLISH_LANGID.to_bytes(2, "little")
+        )
         answer = bytes([2 + len(text), STRING]) + text
         length = min(len(answer), len(data))
         data[:length] = array.array("B", answer[:length])
         return length
 
-    def bulk_write(self, dev_handle: VirtualDevice, ep: int, intf: int, data: array.array[int], timeout: int) -> int:
-        self._ready(dev_handle, ep)
+    def bulk_write(
+        self, dev_handle: VirtualDevice, ep: int, intf: int, data: array.array[int], timeout: int
+    ) -> int:
+        self._require_ready(dev_handle, ep)
         dev_handle.receive(ep, data.tobytes())
         return len(data)
 
-    def bulk_read(self, dev_handle: VirtualDevice, ep: int, intf: int, buff: array.array[int], timeout: int) -> int:
-        self._ready(dev_handle, ep)
+    def bulk_read(
+        self, dev_handle: VirtualDevice, ep: int, intf: int, buff: array.array[int], timeout: int
+    ) -> int:
+        self._require_ready(dev_handle, ep)
         return dev_handle.fill(ep, memoryview(buff), timeout / 1000)
 
     @staticmethod
-    def _ready(device: VirtualDevice, endpoint: int) -> None:
-        _present(device)
+    def _require_ready(device: VirtualDevice, endpoint: int) -> None:
+        _require_plugged(device)
         if endpoint in device.halted:
-            raise usb_error(errno.EPIPE)
+            raise make_usb_error(errno.EPIPE)
 
 
-def _present(device: VirtualDevice) -> None:
+def _require_plugged(device: VirtualDevice) -> None:
     if not device.is_plugged:
-        raise usb_error(errno.ENODEV)
+        raise make_usb_error(errno.ENODEV)
 
 
-def _require(exists: bool) -> None:
+def _require_descriptor(exists: bool) -> None:
     """Say, as pyusb expects, that a descriptor is the last of its kind."""
     if not exists:
         raise IndexError

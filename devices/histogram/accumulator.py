@@ -15,16 +15,16 @@ from tofclip.errors import InputError
 from tofclip.shots import Streak
 from tofclip.threads import run_blocks, thread_count
 
-MOST_CELLS = 1 << 26
+MAX_CELLS = 1 << 26
 """Bins of all pixels together: half a gigabyte for each thread."""
 
-NARROWEST = 1e-3
+MIN_WIDTH_BINS = 1e-3
 """Bins over which a photon is shared out at least; a step of no width would be infinitely high."""
 
-NOTHING = 1e-6
+ROUNDING_PHOTONS = 1e-6
 """Photons in a bin that are rounding errors of adding up steps, not photons."""
 
-_LEAST_PIECE = 1 << 16
+_MIN_PIECE = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class BinAxis:
     start : float
         Middle of the first bin, s after the laser's pulse.
     period : float or None
-        Time between two pulses of the laser, s: photons of all periods add up. None: there is one pulse only, or every
-        photon is already counted from its own pulse.
+        Time between two pulses of the laser, s: photons of all periods add up. None: there is one
+        pulse only, or every photon is already counted from its own pulse.
 
     Raises
     ------
@@ -54,12 +54,19 @@ class BinAxis:
     period: float | None = None
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.bin_width) and self.bin_width > 0 and math.isfinite(self.start) and self.bins >= 1):
+        if not (
+            math.isfinite(self.bin_width)
+            and self.bin_width > 0
+            and math.isfinite(self.start)
+            and self.bins >= 1
+        ):
             raise InputError(f"bins need a positive width, a number and a start, got {self}")
         if self.period is None:
             return
         if not (math.isfinite(self.period) and self.period > 0):
-            raise InputError(f"the laser's period must be a positive number of seconds, got {self.period}")
+            raise InputError(
+                f"the laser's period must be a positive number of seconds, got {self.period}"
+            )
         if self.bins * self.bin_width > self.period * (1 + 1e-9):
             raise InputError(
                 f"{self.bins} bins of {self.bin_width:.4g} s are longer than the laser's period of {self.period:.4g} s"
@@ -95,25 +102,32 @@ class Accumulator:
         Pixels of which nothing can be believed.
     """
 
-    def __init__(self, pixels: int, axis: BinAxis, hot_pixels: NDArray[np.int64] | tuple[int, ...] = ()) -> None:
-        if pixels < 1 or pixels * axis.bins > MOST_CELLS:
-            raise InputError(f"{pixels} pixels of {axis.bins} bins are none, or more than {MOST_CELLS} cells")
+    def __init__(
+        self, pixels: int, axis: BinAxis, hot_pixels: NDArray[np.int64] | tuple[int, ...] = ()
+    ) -> None:
+        if pixels < 1 or pixels * axis.bins > MAX_CELLS:
+            raise InputError(
+                f"{pixels} pixels of {axis.bins} bins are none, or more than {MAX_CELLS} cells"
+            )
         self.pixels, self.axis = pixels, axis
         self._hot = np.asarray(hot_pixels, np.int64)
         self._parts: list[NDArray[np.float64]] = []
 
     @property
     def counts(self) -> NDArray[np.float64]:
-        """Photons in each bin of each pixel so far, (bins, pixels); right to a millionth of a photon."""
+        """Photons in each bin of each pixel so far, (bins, pixels); right to a millionth of a
+        photon.
+        """
         total = np.zeros((self.pixels, self.axis.bins + 2))
         for part in self._parts:
             total += part
         photons = np.cumsum(total[:, : self.axis.bins], axis=1).T
-        photons[photons < NOTHING] = 0
+        photons[photons < ROUNDING_PHOTONS] = 0
         return photons
 
-    def streak(self, camera: Camera | None = None, source: str = "photon histogram") -> Streak:
-        """Return the sum so far as a streak image: rows are instants after the laser's pulse, columns are pixels.
+    def to_streak(self, camera: Camera | None = None, source: str = "photon histogram") -> Streak:
+        """Return the sum so far as a streak image: rows are instants after the laser's pulse,
+        columns are pixels.
 
         Hot pixels are marked in ``Streak.saturated``, so that recovery does not rely on them.
 
@@ -127,9 +141,11 @@ class Accumulator:
         untrusted[:, self._hot] = True
         return Streak(counts, self.axis.times, untrusted, camera=camera, source=source)
 
-    def _spread(self, add: Callable[[slice, NDArray[Any]], None], total: int) -> None:
-        """Call `add` on pieces of ``range(total)``, each with an array of steps that no other thread uses."""
-        size = max(_LEAST_PIECE, -(-total // thread_count()))
+    def _add_in_parallel(self, add: Callable[[slice, NDArray[Any]], None], total: int) -> None:
+        """Call `add` on pieces of ``range(total)``, each with an array of steps that no other
+        thread uses.
+        """
+        size = max(_MIN_PIECE, -(-total // thread_count()))
         while len(self._parts) * size < total:
             self._parts.append(np.zeros((self.pixels, self.axis.bins + 2)))
         run_blocks(lambda piece: add(piece, self._parts[piece.start // size]), total, size)

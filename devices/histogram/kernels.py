@@ -1,14 +1,16 @@
 """Compiled loops that put photons into bins.
 
-A photon is known to lie within an interval, the width of its converter's code: it is shared out evenly over the
-interval, bin by bin. So codes of uneven width leave no ripple, which rounding every photon to one bin would.
+A photon is known to lie within an interval, the width of its converter's code: it is shared out
+evenly over the interval, bin by bin. So codes of uneven width leave no ripple, which rounding every
+photon to one bin would.
 
-An interval may cover many bins. Its density is a step up by ``1 / width`` where it begins and a step down where it
-ends, so only *steps* are added, each in two neighbouring bins, and the sum over all earlier bins turns them into
-photons (`devices.histogram.accumulator`). The cost of a photon does not depend on its interval, and there is no branch
-that the processor could guess wrong.
+An interval may cover many bins. Its density is a step up by ``1 / width`` where it begins and a
+step down where it ends, so only *steps* are added, each in two neighbouring bins, and the sum over
+all earlier bins turns them into photons (`devices.histogram.accumulator`). The cost of a photon
+does not depend on its interval, and there is no branch that the processor could guess wrong.
 
-Positions are in bins: bin k reaches from k to k + 1. An array of steps is (pixels, bins + 2) float64.
+Positions are in bins: bin k reaches from k to k + 1. An array of steps is (pixels, bins + 2)
+float64.
 """
 
 from __future__ import annotations
@@ -23,8 +25,10 @@ inlined = njit(inline="always", error_model="numpy")
 
 
 @inlined
-def _step(row, position, height):
-    """Add a step at `position`; one before the first bin counts from there, one behind the last makes no difference."""
+def _add_step(row, position, height):
+    """Add a step at `position`; one before the first bin counts from there, one behind the last
+    makes no difference.
+    """
     inside = min(max(position, 0.0), row.size - 2.0)
     place = int(inside)
     late = height * (inside - place)
@@ -33,15 +37,17 @@ def _step(row, position, height):
 
 
 @inlined
-def _add(row, position, width, density, period, per_period):
+def _add_photon(row, position, width, density, period, per_period):
     """Add one photon, folded into the first of all periods; a period of 0 means that there is none."""
     if period > 0:
         position -= math.floor(position * per_period) * period
-        if position + width > period:  # what reaches beyond the end of a period belongs to the beginning of the next
-            _step(row, position - period, density)
-            _step(row, position - period + width, -density)
-    _step(row, position, density)
-    _step(row, position + width, -density)
+        if (
+            position + width > period
+        ):  # what reaches beyond the end of a period belongs to the beginning of the next
+            _add_step(row, position - period, density)
+            _add_step(row, position - period + width, -density)
+    _add_step(row, position, density)
+    _add_step(row, position + width, -density)
 
 
 @compiled
@@ -55,7 +61,8 @@ def add_stamps(stamps, clock_bins, codes, period, steps):
     clock_bins : float
         Period of the board's clock.
     codes : (pixels, codes, 2) float32 array
-        Where a code begins within the first period of the clock, offset and start of the axis included; its length.
+        Where a code begins within the first period of the clock, offset and start of the axis
+        included; its length.
     period : float
         Time between two laser pulses, 0 for none.
     steps : (pixels, bins + 2) float64 array
@@ -77,7 +84,9 @@ def add_stamps(stamps, clock_bins, codes, period, steps):
         periods = code // number
         phase = code - periods * number
         begin, width = np.float64(codes[pixel, phase, 0]), np.float64(codes[pixel, phase, 1])
-        _add(steps[pixel], periods * clock_bins + begin, width, 1.0 / width, period, per_period)
+        _add_photon(
+            steps[pixel], periods * clock_bins + begin, width, 1.0 / width, period, per_period
+        )
     return strays
 
 
@@ -86,11 +95,13 @@ def add_times(pixels, times, scale, shift, width, period, steps):
     """Add photons of which pixel and time are known; ``position = times * scale + shift``."""
     density, per_period = 1.0 / width, 1.0 / period
     for photon in range(times.size):
-        _add(steps[pixels[photon]], times[photon] * scale + shift, width, density, period, per_period)
+        _add_photon(
+            steps[pixels[photon]], times[photon] * scale + shift, width, density, period, per_period
+        )
 
 
 @compiled
-def last_sync(ticks, channels, flags, ignored, sync, before, known):
+def find_last_sync(ticks, channels, flags, ignored, sync, before, known):
     """Return the time of the last sync pulse before record `before`, `known` if there is none.
 
     A record with one of the `ignored` flags tells of levels, not of edges.
@@ -114,8 +125,8 @@ def add_tags(ticks, channels, flags, ignored, sync, known, pixel_of, scale, shif
     sync : int
         The sync's bit.
     known : int
-        Ticks at the last sync before the first record, -1 where there was none: photons before the first one are left
-        out.
+        Ticks at the last sync before the first record, -1 where there was none: photons before the
+        first one are left out.
     pixel_of : (channels,) int64 array
         Negative: not a pixel.
     scale, shift : float
@@ -135,4 +146,4 @@ def add_tags(ticks, channels, flags, ignored, sync, known, pixel_of, scale, shif
         position = (ticks[record] - known) * scale + shift
         for channel in range(pixel_of.size):
             if (lines >> channel) & 1 and pixel_of[channel] >= 0:
-                _add(steps[pixel_of[channel]], position, scale, density, period, per_period)
+                _add_photon(steps[pixel_of[channel]], position, scale, density, period, per_period)

@@ -8,22 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from devices.codec import Records
-from devices.histogram.accumulator import NARROWEST, Accumulator, BinAxis
-from devices.histogram.kernels import add_stamps, add_tags, add_times, last_sync
-from devices.linospad2.calibration import CLOCK_PERIOD, BoardCalibration
+from devices.histogram.accumulator import MIN_WIDTH_BINS, Accumulator, BinAxis
+from devices.histogram.kernels import add_stamps, add_tags, add_times, find_last_sync
+from devices.linospad2.calibration import CLOCK_PERIOD_S, BoardCalibration
 from devices.linospad2.codec import PIXELS
 from devices.timetag.codec import DELTA
 from tofclip.errors import InputError, ShapeError
 
-_WORD = np.dtype("<u4")
+_WORD_DTYPE = np.dtype("<u4")
 
 
 class StampHistogram(Accumulator):
     """Time stamps of LinoSPAD2.
 
-    The laser's pulses are locked to the board's clock and a cycle begins with one of them, so that a stamp's time since
-    its cycle began, modulo the laser's period, is its time after a pulse. A photon is shared out evenly over the
-    instants that its code covers.
+    The laser's pulses are locked to the board's clock and a cycle begins with one of them, so that
+    a stamp's time since its cycle began, modulo the laser's period, is its time after a pulse. A
+    photon is shared out evenly over the instants that its code covers.
 
     Parameters
     ----------
@@ -33,33 +33,42 @@ class StampHistogram(Accumulator):
 
     def __init__(self, axis: BinAxis, calibration: BoardCalibration) -> None:
         super().__init__(PIXELS, axis, calibration.hot_pixels)
-        begins = (calibration.code_begins + calibration.offsets[:, np.newaxis]) / axis.bin_width + axis.shift_bins
-        widths = np.maximum((calibration.code_ends - calibration.code_begins) / axis.bin_width, NARROWEST)
+        begins = (
+            calibration.code_begins + calibration.offsets[:, np.newaxis]
+        ) / axis.bin_width + axis.shift_bins
+        widths = np.maximum(
+            (calibration.code_ends - calibration.code_begins) / axis.bin_width, MIN_WIDTH_BINS
+        )
         if axis.period is not None:
             begins %= axis.period_bins  # small numbers keep their digits in float32
         self._codes = np.stack([begins, widths], axis=-1).astype(np.float32)
 
     def add(self, records: Records) -> None:
-        """Add time stamps, an array of `devices.linospad2.codec.STAMP` (with or without counter)."""
+        """Add time stamps, an array of `devices.linospad2.codec.STAMP_DTYPE` (with or without
+        counter).
+        """
         if records.dtype.names is None or records.dtype.names[-2:] != ("code", "pixel"):
             raise InputError(f"LinoSPAD2's time stamps end in code and pixel, got {records.dtype}")
-        rows = np.ascontiguousarray(records).view(_WORD).reshape(len(records), -1)
-        clock, period = CLOCK_PERIOD / self.axis.bin_width, self.axis.period_bins
+        rows = np.ascontiguousarray(records).view(_WORD_DTYPE).reshape(len(records), -1)
+        clock, period = CLOCK_PERIOD_S / self.axis.bin_width, self.axis.period_bins
 
         strays: list[int] = []  # appending is safe on several threads
 
         def add(piece: slice, steps: NDArray[Any]) -> None:
             strays.append(add_stamps(rows[piece], clock, self._codes, period, steps))
 
-        self._spread(add, len(records))
+        self._add_in_parallel(add, len(records))
         if any(strays):
-            raise InputError(f"LinoSPAD2 has {PIXELS} pixels; {sum(strays)} time stamps are of others")
+            raise InputError(
+                f"LinoSPAD2 has {PIXELS} pixels; {sum(strays)} time stamps are of others"
+            )
 
 
 class TagHistogram(Accumulator):
     """Time tags of a counter with a few channels, one of which sees the laser.
 
-    A photon's time is counted from the last pulse before it; after a gap, photons are left out until the next pulse.
+    A photon's time is counted from the last pulse before it; after a gap, photons are left out
+    until the next pulse.
 
     Parameters
     ----------
@@ -72,11 +81,15 @@ class TagHistogram(Accumulator):
         Duration of a tick of the counter, s.
     """
 
-    def __init__(self, axis: BinAxis, sync_channel: int, pixel_channels: tuple[int, ...], tick: float) -> None:
+    def __init__(
+        self, axis: BinAxis, sync_channel: int, pixel_channels: tuple[int, ...], tick: float
+    ) -> None:
         super().__init__(len(pixel_channels), axis)
         channels = [sync_channel, *pixel_channels]
         if len(set(channels)) < len(channels) or not all(0 <= channel < 8 for channel in channels):
-            raise InputError(f"sync and pixels need channels of their own within 0..7, got {channels}")
+            raise InputError(
+                f"sync and pixels need channels of their own within 0..7, got {channels}"
+            )
         if not (np.isfinite(tick) and tick > 0):
             raise InputError(f"a tick must be a positive number of seconds, got {tick}")
         self._sync = 1 << sync_channel
@@ -86,18 +99,25 @@ class TagHistogram(Accumulator):
         self._known = -1
 
     def add(self, records: Records, after_gap: bool = False) -> None:
-        """Add time tags, an array of `devices.timetag.codec.RECORD`; `after_gap`: some are missing before them."""
+        """Add time tags, an array of `devices.timetag.codec.RECORD_DTYPE`; `after_gap`: some are
+        missing before them.
+        """
         if after_gap:
             self._known = -1
-        known, columns = self._known, [records[name] for name in ("time_ticks", "channels", "flags")]
+        known, columns = (
+            self._known,
+            [records[name] for name in ("time_ticks", "channels", "flags")],
+        )
 
         def add(piece: slice, steps: NDArray[Any]) -> None:
-            start = last_sync(*columns, DELTA, self._sync, piece.start, known)
+            start = find_last_sync(*columns, DELTA, self._sync, piece.start, known)
             place = (self._pixel_of, self._tick_bins, self.axis.shift_bins, self.axis.period_bins)
-            add_tags(*(column[piece] for column in columns), DELTA, self._sync, start, *place, steps)
+            add_tags(
+                *(column[piece] for column in columns), DELTA, self._sync, start, *place, steps
+            )
 
-        self._spread(add, len(records))
-        self._known = last_sync(*columns, DELTA, self._sync, len(records), known)
+        self._add_in_parallel(add, len(records))
+        self._known = find_last_sync(*columns, DELTA, self._sync, len(records), known)
 
 
 class TimeHistogram(Accumulator):
@@ -115,7 +135,7 @@ class TimeHistogram(Accumulator):
         super().__init__(pixels, axis)
         if not (np.isfinite(resolution) and resolution >= 0):
             raise InputError(f"a resolution must be a number of seconds from 0, got {resolution}")
-        self._width = max(resolution / axis.bin_width, NARROWEST)
+        self._width = max(resolution / axis.bin_width, MIN_WIDTH_BINS)
 
     def add(self, pixels: NDArray[Any], times: NDArray[Any]) -> None:
         """Add photons.
@@ -137,4 +157,4 @@ class TimeHistogram(Accumulator):
         def add(piece: slice, steps: NDArray[Any]) -> None:
             add_times(pixels[piece], times[piece], scale, shift, self._width, period, steps)
 
-        self._spread(add, len(pixels))
+        self._add_in_parallel(add, len(pixels))

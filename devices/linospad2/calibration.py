@@ -1,4 +1,6 @@
-"""What a LinoSPAD2 board's calibration knows: how wide each code is, how late each pixel, and which pixels are hot."""
+"""What a LinoSPAD2 board's calibration knows: how wide each code is, how late each pixel, and which
+pixels are hot.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +15,16 @@ from numpy.typing import NDArray
 from devices.codec import Records
 from devices.linospad2.codec import PIXELS
 from tofclip.errors import FileFormatError, InputError, ShapeError
-from tofclip.storage import Field, Record, one_line, reading
+from tofclip.storage import Field, Record, format_error_line, translate_read_errors
 
-CODES = 140
+CODES_PER_PERIOD = 140
 """Codes in one period of the board's clock."""
 
-CLOCK_PERIOD = 2500e-12
+CLOCK_PERIOD_S = 2500e-12
 """Period of the board's clock, s."""
 
-_LARGEST_FILE = 1 << 23
-_ROUNDING = 1e-6 * CLOCK_PERIOD
+_MAX_FILE_BYTES = 1 << 23
+_ROUNDING_S = 1e-6 * CLOCK_PERIOD_S
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,8 @@ class BoardCalibration:
     Parameters
     ----------
     code_ends : (256, 140) array
-        Instant at which each code ends, s since the clock's tick, for each pixel; the converters' steps are uneven.
+        Instant at which each code ends, s since the clock's tick, for each pixel; the converters'
+        steps are uneven.
     offsets : (256,) array
         Added to a pixel's times, s.
     hot_pixels : (k,) int array
@@ -41,7 +44,8 @@ class BoardCalibration:
     Raises
     ------
     ShapeError, InputError
-        A table has another shape, is not finite, goes back, or leaves the clock's period; or there is no such pixel.
+        A table has another shape, is not finite, goes back, or leaves the clock's period; or there
+        is no such pixel.
     """
 
     code_ends: NDArray[np.float64]
@@ -49,7 +53,7 @@ class BoardCalibration:
     hot_pixels: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
 
     def __post_init__(self) -> None:
-        for name, shape in (("code_ends", (PIXELS, CODES)), ("offsets", (PIXELS,))):
+        for name, shape in (("code_ends", (PIXELS, CODES_PER_PERIOD)), ("offsets", (PIXELS,))):
             table = np.ascontiguousarray(getattr(self, name), np.float64)
             object.__setattr__(self, name, table)
             if table.shape != shape:
@@ -57,15 +61,21 @@ class BoardCalibration:
             if not np.all(np.isfinite(table)):
                 raise InputError(f"LinoSPAD2's {name} must be finite")
         ends = self.code_ends
-        if np.any(np.diff(ends, axis=1) < 0) or ends.min() < -_ROUNDING or ends.max() > CLOCK_PERIOD + _ROUNDING:
-            raise InputError("LinoSPAD2's code_ends must not go back, and stay within the clock's 2.5 ns")
+        if (
+            np.any(np.diff(ends, axis=1) < 0)
+            or ends.min() < -_ROUNDING_S
+            or ends.max() > CLOCK_PERIOD_S + _ROUNDING_S
+        ):
+            raise InputError(
+                "LinoSPAD2's code_ends must not go back, and stay within the clock's 2.5 ns"
+            )
         if np.any((self.hot_pixels < 0) | (self.hot_pixels >= PIXELS)):
             raise InputError(f"LinoSPAD2's hot pixels must lie within 0..{PIXELS - 1}")
 
     @classmethod
     def ideal(cls) -> BoardCalibration:
         """Return a board of even codes and pixels that are all in step."""
-        ends = np.arange(1, CODES + 1) * (CLOCK_PERIOD / CODES)
+        ends = np.arange(1, CODES_PER_PERIOD + 1) * (CLOCK_PERIOD_S / CODES_PER_PERIOD)
         return cls(np.tile(ends, (PIXELS, 1)), np.zeros(PIXELS))
 
     @property
@@ -77,10 +87,11 @@ class BoardCalibration:
     def times(self, records: Records) -> NDArray[np.float64]:
         """Return when each photon came, s since its cycle began: the end of its code.
 
-        ``time = (code - code % 140) * 2500 ps / 140 + code_ends[pixel, code % 140] + offsets[pixel]``
+        ``time = (code - code % 140) * 2500 ps / 140 + code_ends[pixel, code % 140] +
+        offsets[pixel]``
         """
-        periods, code = np.divmod(records["code"], CODES)
-        found: NDArray[np.float64] = periods * CLOCK_PERIOD
+        periods, code = np.divmod(records["code"], CODES_PER_PERIOD)
+        found: NDArray[np.float64] = periods * CLOCK_PERIOD_S
         found += self.code_ends[records["pixel"], code]
         found += self.offsets[records["pixel"]]
         return found
@@ -98,7 +109,10 @@ class BoardCalibration:
     @classmethod
     def from_record(cls, record: Record) -> BoardCalibration:
         """Rebuild the tables from what was stored."""
-        ends, offsets = record.array("code_ends", np.float64, 2, "s"), record.array("offsets", np.float64, 1, "s")
+        ends, offsets = (
+            record.array("code_ends", np.float64, 2, "s"),
+            record.array("offsets", np.float64, 1, "s"),
+        )
         if "hot_pixels" not in record.fields:
             return cls(ends, offsets)
         return cls(ends, offsets, record.array("hot_pixels", np.int64, 1, "px"))
@@ -126,25 +140,36 @@ def load_calibration(
         A file holds something else.
     """
     picosecond = 1e-12
-    table = _numbers(code_table, lambda path: np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2))
-    # Mapped, not read: a header that claims more than the file holds is refused before memory is taken.
-    offsets = _numbers(offset_table, lambda path: np.array(np.load(path, mmap_mode="r", allow_pickle=False)))
+    table = _read_numbers(
+        code_table, lambda path: np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+    )
+    # Mapped, not read: a header that claims more than the file holds is refused before memory is
+    # taken.
+    offsets = _read_numbers(
+        offset_table, lambda path: np.array(np.load(path, mmap_mode="r", allow_pickle=False))
+    )
     hot = np.empty(0)
     if hot_pixels is not None:
-        hot = _numbers(hot_pixels, lambda path: [int(word) for word in path.read_text("ascii").split()])
+        hot = _read_numbers(
+            hot_pixels, lambda path: [int(word) for word in path.read_text("ascii").split()]
+        )
         if np.any((hot < 0) | (hot >= PIXELS)):
             raise FileFormatError(hot_pixels, f"names pixels beyond 0..{PIXELS - 1}")
-    if table.ndim != 2 or table.shape[1] != CODES + 1:
-        raise FileFormatError(code_table, f"must have {CODES + 1} columns, found shape {table.shape}")
+    if table.ndim != 2 or table.shape[1] != CODES_PER_PERIOD + 1:
+        raise FileFormatError(
+            code_table, f"must have {CODES_PER_PERIOD + 1} columns, found shape {table.shape}"
+        )
     return BoardCalibration(table[:, 1:] * picosecond, offsets * picosecond, hot.astype(np.int64))
 
 
-def _numbers(path: str | Path, reader: Callable[[Path], Any]) -> NDArray[np.float64]:
-    with reading(path):
+def _read_numbers(path: str | Path, reader: Callable[[Path], Any]) -> NDArray[np.float64]:
+    with translate_read_errors(path):
         size = Path(path).stat().st_size
-        if size > _LARGEST_FILE:
+        if size > _MAX_FILE_BYTES:
             raise FileFormatError(path, f"is larger than any table of LinoSPAD2: {size} bytes")
         try:
             return np.asarray(reader(Path(path)), np.float64)
         except Exception as fault:  # whatever NumPy stumbles over, it is the file that is damaged
-            raise FileFormatError(path, f"holds no table of numbers ({one_line(fault)})") from fault
+            raise FileFormatError(
+                path, f"holds no table of numbers ({format_error_line(fault)})"
+            ) from fault

@@ -1,8 +1,9 @@
-"""LinoSPAD2's stream (S. Burri et al., Instruments 2018, 2, 28; layout as the authors' and daplis' readers have it).
+"""LinoSPAD2's stream (S. Burri et al., Instruments 2018, 2, 28; layout as the authors' and daplis'
+readers have it).
 
-A stream is a row of *cycles*, little-endian words of 32 bits: where the option is on, two words of an absolute counter
-(low word first, ticks of 7.5 ns), then N words of each of 65 time-to-digital converters, of which the last serves no
-pixels. A word::
+A stream is a row of *cycles*, little-endian words of 32 bits: where the option is on, two words of
+an absolute counter (low word first, ticks of 7.5 ns), then N words of each of 65 time-to-digital
+converters, of which the last serves no pixels. A word::
 
     bit 31      it holds a time stamp
     bits 29-28  which of the converter's four pixels
@@ -21,7 +22,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from devices.codec import ByteView, Decoded, Records, as_bytes
+from devices.codec import ByteView, DecodeResult, Records, as_bytes
 from devices.linospad2.kernels import (
     ADDRESSES,
     CODE_MASK,
@@ -40,20 +41,22 @@ from tofclip.threads import run_blocks
 
 PIXELS = PIXEL_CONVERTERS * ADDRESSES
 FIRMWARES = ("2212b", "2212s")
-MOST_TIMESTAMPS = 1 << 14
+MAX_TIMESTAMPS = 1 << 14
 """Time stamps per converter and cycle at most; the boards' memory ends far below."""
 
-STAMP = np.dtype([("cycle", "<u4"), ("code", "<u4"), ("pixel", "<u4")])
-"""`cycle`: from 0. `code`: time since the cycle began, 140 for each 2500 ps. `pixel`: place on the line, 0..255."""
+STAMP_DTYPE = np.dtype([("cycle", "<u4"), ("code", "<u4"), ("pixel", "<u4")])
+"""`encode_cycle`: from 0. `code`: time since the cycle began, 140 for each 2500 ps. `pixel`: place
+on the line, 0..255.
+"""
 
-STAMP_WITH_COUNTER = np.dtype([("counter", "<u8"), *STAMP.descr])
-"""As `STAMP`, with the absolute time at which the cycle began, in ticks of 7.5 ns."""
+STAMP_WITH_COUNTER_DTYPE = np.dtype([("counter", "<u8"), *STAMP_DTYPE.descr])
+"""As `STAMP_DTYPE`, with the absolute time at which the cycle began, in ticks of 7.5 ns."""
 
 COUNTER_WORDS = 2
-_WORD = np.dtype("<u4")
-_MOST_ENCODED = 1 << 30
+_WORD_DTYPE = np.dtype("<u4")
+_MAX_ENCODED_BYTES = 1 << 30
 _BLOCK_BYTES = 1 << 21
-_REASONS = {
+_ENCODE_ERRORS = {
     OUT_OF_ORDER: "time stamps must be in order of cycle and converter; sort_stamps brings them there",
     OVERFULL: "a converter has more time stamps in a cycle than it can hold",
     COUNTERS_DIFFER: "all time stamps of a cycle must have the same counter",
@@ -64,13 +67,14 @@ _REASONS = {
 class LinoSpad2Codec:
     """Bytes of LinoSPAD2 to time stamps and back.
 
-    A valid word of the converter that serves no pixels is malformed. Decoding allocates at most 5 bytes for each byte
-    of the stream: rows for the valid words only.
+    A valid word of the converter that serves no pixels is malformed. Decoding allocates at most 5
+    bytes for each byte of the stream: rows for the valid words only.
 
     Parameters
     ----------
     firmware : str
-        ``"2212b"`` (blocks: pixel = 4 * converter + address) or ``"2212s"`` (skipping: converter + 64 * address).
+        ``"2212b"`` (blocks: pixel = 4 * converter + address) or ``"2212s"`` (skipping: converter +
+        64 * address).
     timestamps : int
         Words per converter and cycle.
     counter : bool
@@ -92,14 +96,18 @@ class LinoSpad2Codec:
 
     def __post_init__(self) -> None:
         if self.firmware not in FIRMWARES:
-            raise InputError(f"LinoSPAD2's firmware must be {' or '.join(FIRMWARES)}, got '{self.firmware}'")
-        if not 1 <= self.timestamps <= MOST_TIMESTAMPS:
-            raise InputError(f"time stamps per cycle must be within 1..{MOST_TIMESTAMPS}, got {self.timestamps}")
+            raise InputError(
+                f"LinoSPAD2's firmware must be {' or '.join(FIRMWARES)}, got '{self.firmware}'"
+            )
+        if not 1 <= self.timestamps <= MAX_TIMESTAMPS:
+            raise InputError(
+                f"time stamps per cycle must be within 1..{MAX_TIMESTAMPS}, got {self.timestamps}"
+            )
 
     @property
     def dtype(self) -> np.dtype[Any]:
         """Type of a time stamp."""
-        return STAMP_WITH_COUNTER if self.counter else STAMP
+        return STAMP_WITH_COUNTER_DTYPE if self.counter else STAMP_DTYPE
 
     @property
     def settings(self) -> Mapping[str, Scalar]:
@@ -119,7 +127,7 @@ class LinoSpad2Codec:
     @property
     def cycle_bytes(self) -> int:
         """Bytes of a cycle."""
-        return self.cycle_words * _WORD.itemsize
+        return self.cycle_words * _WORD_DTYPE.itemsize
 
     @cached_property
     def pixel_of(self) -> NDArray[np.uint32]:
@@ -130,39 +138,46 @@ class LinoSpad2Codec:
         return converter + PIXEL_CONVERTERS * address
 
     @cached_property
-    def place_of(self) -> NDArray[np.uint32]:
+    def address_of(self) -> NDArray[np.uint32]:
         """Converter * 4 + address of each pixel, (256,)."""
         return np.argsort(self.pixel_of, axis=None).astype(np.uint32)
 
-    def whole(self, data: ByteView) -> int:
+    def count_complete_bytes(self, data: ByteView) -> int:
         """Return how many bytes at the front of `data` form whole cycles."""
         return len(data) - len(data) % self.cycle_bytes
 
-    def count(self, data: ByteView) -> int:
+    def count_records(self, data: ByteView) -> int:
         """Return how many words of `data` are valid."""
-        kept, malformed = self._counts(self._cycles(data))
+        kept, malformed = self._count_per_cycle(self._view_cycles(data))
         return int(kept.sum()) + malformed
 
-    def count_good(self, data: ByteView) -> int:
+    def count_valid(self, data: ByteView) -> int:
         """Return how many records `decode` would make of `data`."""
-        kept, _ = self._counts(self._cycles(data))
+        kept, _ = self._count_per_cycle(self._view_cycles(data))
         return int(kept.sum())
 
-    def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> Decoded:
-        """Decode whole cycles; `state` is how many came before. Cycles that were lost are not counted."""
-        cycles = self._cycles(data)
-        kept, malformed = self._counts(cycles)
+    def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
+        """Decode whole cycles; `state` is how many came before. Cycles that were lost are not
+        counted.
+        """
+        cycles = self._view_cycles(data)
+        kept, malformed = self._count_per_cycle(cycles)
         ends = np.cumsum(kept)
         total = int(ends[-1]) if len(ends) else 0
         records = np.empty(total, self.dtype)
-        rows = records.view(_WORD).reshape(total, self.dtype.itemsize // _WORD.itemsize)
+        rows = records.view(_WORD_DTYPE).reshape(total, self.dtype.itemsize // _WORD_DTYPE.itemsize)
 
         def work(block: slice) -> None:
-            first, last = (int(ends[block.start - 1]) if block.start else 0), int(ends[block.stop - 1])
-            decode_stamps(cycles[block], self.header, state + block.start, self.pixel_of, rows[first:last])
+            first, last = (
+                (int(ends[block.start - 1]) if block.start else 0),
+                int(ends[block.stop - 1]),
+            )
+            decode_stamps(
+                cycles[block], self.header, state + block.start, self.pixel_of, rows[first:last]
+            )
 
         run_blocks(work, len(cycles), max(1, _BLOCK_BYTES // self.cycle_bytes))
-        return Decoded(records, malformed, state + len(cycles))
+        return DecodeResult(records, malformed, state + len(cycles))
 
     def encode(self, records: Records) -> bytes:
         """Return the bytes of all cycles from 0 up to that of the last time stamp.
@@ -175,25 +190,29 @@ class LinoSpad2Codec:
         self._require_valid(records)
         if len(records) == 0:
             return b""
-        cycles = np.zeros((int(records["cycle"].max()) + 1, self.cycle_words), _WORD)
-        rows = np.ascontiguousarray(records).view(_WORD).reshape(len(records), -1)
-        outcome = encode_stamps(rows, self.header, self.place_of, cycles)
-        if outcome in _REASONS:
-            raise InputError(_REASONS[outcome])
+        cycles = np.zeros((int(records["cycle"].max()) + 1, self.cycle_words), _WORD_DTYPE)
+        rows = np.ascontiguousarray(records).view(_WORD_DTYPE).reshape(len(records), -1)
+        outcome = encode_stamps(rows, self.header, self.address_of, cycles)
+        if outcome in _ENCODE_ERRORS:
+            raise InputError(_ENCODE_ERRORS[outcome])
         return cycles.tobytes()
 
     def sort_stamps(self, records: Records) -> Records:
-        """Return time stamps in the order of the stream: by cycle, then converter, else as they were."""
-        converter = self.place_of[records["pixel"]] // ADDRESSES
+        """Return time stamps in the order of the stream: by cycle, then converter, else as they
+        were.
+        """
+        converter = self.address_of[records["pixel"]] // ADDRESSES
         return records[np.lexsort([converter, records["cycle"]])]
 
-    def _cycles(self, data: ByteView) -> NDArray[np.uint32]:
+    def _view_cycles(self, data: ByteView) -> NDArray[np.uint32]:
         words = as_bytes(data)
         if words.size % self.cycle_bytes:
-            raise InputError(f"{words.size} bytes are not a whole number of {self.cycle_bytes}-byte cycles")
-        return np.ascontiguousarray(words).view(_WORD).reshape(-1, self.cycle_words)
+            raise InputError(
+                f"{words.size} bytes are not a whole number of {self.cycle_bytes}-byte cycles"
+            )
+        return np.ascontiguousarray(words).view(_WORD_DTYPE).reshape(-1, self.cycle_words)
 
-    def _counts(self, cycles: NDArray[np.uint32]) -> tuple[NDArray[np.int64], int]:
+    def _count_per_cycle(self, cycles: NDArray[np.uint32]) -> tuple[NDArray[np.int64], int]:
         """Count the time stamps of each cycle, and all malformed words."""
         kept = np.empty(len(cycles), np.int64)
         strays: list[int] = []  # appending is safe on several threads
@@ -210,5 +229,7 @@ class LinoSpad2Codec:
         if np.any(records["pixel"] >= PIXELS) or np.any(records["code"] > CODE_MASK):
             raise InputError(f"a time stamp has a pixel below {PIXELS} and a code below 2**28")
         cycles = int(records["cycle"].max(initial=0)) + 1
-        if cycles * self.cycle_bytes > _MOST_ENCODED:
-            raise InputError(f"{cycles} cycles take more than {_MOST_ENCODED} bytes; encode them in pieces")
+        if cycles * self.cycle_bytes > _MAX_ENCODED_BYTES:
+            raise InputError(
+                f"{cycles} cycles take more than {_MAX_ENCODED_BYTES} bytes; encode them in pieces"
+            )

@@ -1,4 +1,6 @@
-"""Compiled loops over the words of LinoSPAD2's stream; see `devices.linospad2.codec` for what the bits mean."""
+"""Compiled loops over the words of LinoSPAD2's stream; see `devices.linospad2.codec` for what the
+bits mean.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,9 @@ CONVERTERS = 65
 PIXEL_CONVERTERS = 64
 ADDRESSES = 4
 CODE_MASK = np.uint32(0x0FFFFFFF)
-VALID = np.uint32(0x80000000)
+VALID_BIT = np.uint32(0x80000000)
 
-WELL, OUT_OF_ORDER, OVERFULL, COUNTERS_DIFFER = 0, 1, 2, 3
+ENCODED_OK, OUT_OF_ORDER, OVERFULL, COUNTERS_DIFFER = 0, 1, 2, 3
 
 
 @compiled
@@ -50,8 +52,9 @@ def count_stamps(cycles, header, kept_of_cycle):
 def decode_stamps(cycles, header, first_cycle, pixel_of, records):
     """Write the valid words of all converters that have pixels, as rows of `records`.
 
-    Every word is written to the next free row, and only a valid one moves on to the row behind it: no branch that the
-    processor could guess wrong. It ends with the last row, behind which there are no valid words.
+    Every word is written to the next free row, and only a valid one moves on to the row behind it:
+    no branch that the processor could guess wrong. It ends with the last row, behind which there
+    are no valid words.
 
     Parameters
     ----------
@@ -85,7 +88,7 @@ def decode_stamps(cycles, header, first_cycle, pixel_of, records):
 
 
 @compiled
-def encode_stamps(records, header, place_of, cycles):
+def encode_stamps(records, header, address_of, cycles):
     """Put records into the words of empty cycles.
 
     Parameters
@@ -93,7 +96,7 @@ def encode_stamps(records, header, place_of, cycles):
     records : (rows, header + 3) uint32 array
         As `decode_stamps` writes them, in order of cycle and converter.
     header : int
-    place_of : (pixels,) uint32 array
+    address_of : (pixels,) uint32 array
         Converter * 4 + address.
     cycles : (cycles, words) uint32 array
         Zeros; gets the words.
@@ -101,12 +104,12 @@ def encode_stamps(records, header, place_of, cycles):
     Returns
     -------
     int
-        `WELL`, or what keeps the records from being encoded.
+        `ENCODED_OK`, or what keeps the records from being encoded.
     """
     depth = (cycles.shape[1] - header) // CONVERTERS
     previous, slot = np.int64(-1), 0
     for row in range(records.shape[0]):
-        cycle, place = np.int64(records[row, header]), place_of[records[row, header + 2]]
+        cycle, place = np.int64(records[row, header]), address_of[records[row, header + 2]]
         converter = np.int64(place) // ADDRESSES
         queue = cycle * CONVERTERS + converter
         if queue < previous:
@@ -122,5 +125,7 @@ def encode_stamps(records, header, place_of, cycles):
             if cycles[cycle, column] != records[row, column]:
                 return COUNTERS_DIFFER
         address = place % np.uint32(ADDRESSES)
-        cycles[cycle, header + converter * depth + slot] = VALID | (address << np.uint32(28)) | records[row, header + 1]
-    return WELL
+        cycles[cycle, header + converter * depth + slot] = (
+            VALID_BIT | (address << np.uint32(28)) | records[row, header + 1]
+        )
+    return ENCODED_OK

@@ -10,10 +10,10 @@ from typing import Any
 from devices.linospad2.calibration import BoardCalibration, load_calibration
 from devices.linospad2.codec import LinoSpad2Codec
 from tofclip.errors import FileFormatError, InputError, StorageError
-from tofclip.storage import reading
+from tofclip.storage import translate_read_errors
 
-_LARGEST_FILE = 1 << 16
-_KEYS: dict[str, type] = {
+_MAX_FILE_BYTES = 1 << 16
+_KEY_TYPES: dict[str, type] = {
     "firmware": str,
     "timestamps_per_cycle": int,
     "absolute_counter": bool,
@@ -24,7 +24,7 @@ _KEYS: dict[str, type] = {
     "laser_period_ps": float,
     "camera": str,
 }
-_NEEDED = ("firmware", "timestamps_per_cycle", "absolute_counter")
+_REQUIRED_KEYS = ("firmware", "timestamps_per_cycle", "absolute_counter")
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,10 @@ class Sidecar:
 def read_sidecar(recording: str | Path) -> Sidecar:
     """Read the TOML file that lies beside `recording` and has its name.
 
-    Its keys are ``firmware`` ("2212b" or "2212s"), ``timestamps_per_cycle`` and ``absolute_counter`` (true or false),
-    and optionally ``board``, ``code_table`` with ``offset_table``, ``hot_pixels``, ``laser_period_ps`` and ``camera``.
-    Names of files are relative to the TOML file.
+    Its keys are ``firmware`` ("2212b" or "2212s"), ``timestamps_per_cycle`` and
+    ``absolute_counter`` (true or false), and optionally ``board``, ``code_table`` with
+    ``offset_table``, ``hot_pixels``, ``laser_period_ps`` and ``camera``. Names of files are
+    relative to the TOML file.
 
     Raises
     ------
@@ -66,12 +67,16 @@ def read_sidecar(recording: str | Path) -> Sidecar:
         It is no TOML, lacks a key, has one too many, or a value of another kind.
     """
     path = Path(recording).with_suffix(".toml")
-    values = _checked(_parsed(path, recording), path)
+    values = _check_keys(_parse_toml(path, recording), path)
     if ("code_table" in values) != ("offset_table" in values):
-        raise FileFormatError(path, "code_table and offset_table belong together: give both or neither")
+        raise FileFormatError(
+            path, "code_table and offset_table belong together: give both or neither"
+        )
     try:
-        codec = LinoSpad2Codec(values["firmware"], values["timestamps_per_cycle"], values["absolute_counter"])
-        calibration = _calibration(values, path.parent)
+        codec = LinoSpad2Codec(
+            values["firmware"], values["timestamps_per_cycle"], values["absolute_counter"]
+        )
+        calibration = _read_calibration(values, path.parent)
     except InputError as fault:
         raise FileFormatError(path, str(fault)) from fault
     period = values.get("laser_period_ps")
@@ -86,37 +91,42 @@ def read_sidecar(recording: str | Path) -> Sidecar:
     )
 
 
-def _parsed(path: Path, recording: str | Path) -> dict[str, Any]:
+def _parse_toml(path: Path, recording: str | Path) -> dict[str, Any]:
     if not path.exists():
-        keys = ", ".join(_NEEDED)
+        keys = ", ".join(_REQUIRED_KEYS)
         raise StorageError(
             f"{recording}: its format is not in the file itself; write {keys} into {path.name} beside it"
         )
-    with reading(path), open(path, "rb") as file:
-        data = file.read(_LARGEST_FILE + 1)
-    if len(data) > _LARGEST_FILE:
-        raise FileFormatError(path, f"is larger than any description of a recording: more than {_LARGEST_FILE} bytes")
+    with translate_read_errors(path), open(path, "rb") as file:
+        data = file.read(_MAX_FILE_BYTES + 1)
+    if len(data) > _MAX_FILE_BYTES:
+        raise FileFormatError(
+            path,
+            f"is larger than any description of a recording: more than {_MAX_FILE_BYTES} bytes",
+        )
     try:
         return tomllib.loads(data.decode())
     except ValueError as fault:
         raise FileFormatError(path, f"is no TOML ({fault})") from fault
 
 
-def _checked(found: dict[str, Any], path: Path) -> dict[str, Any]:
-    for key in _NEEDED:
+def _check_keys(found: dict[str, Any], path: Path) -> dict[str, Any]:
+    for key in _REQUIRED_KEYS:
         if key not in found:
             raise FileFormatError(path, f"lacks the key '{key}'")
     for key, value in found.items():
-        if key not in _KEYS:
-            raise FileFormatError(path, f"has the unknown key '{key}'; known are {', '.join(_KEYS)}")
-        kind = _KEYS[key]
+        if key not in _KEY_TYPES:
+            raise FileFormatError(
+                path, f"has the unknown key '{key}'; known are {', '.join(_KEY_TYPES)}"
+            )
+        kind = _KEY_TYPES[key]
         is_number = kind is float and type(value) is int
         if type(value) is not kind and not is_number:
             raise FileFormatError(path, f"{key} must be a {kind.__name__}, found {value!r}")
     return found
 
 
-def _calibration(values: dict[str, Any], folder: Path) -> BoardCalibration:
+def _read_calibration(values: dict[str, Any], folder: Path) -> BoardCalibration:
     hot = folder / values["hot_pixels"] if "hot_pixels" in values else None
     if "code_table" in values:
         return load_calibration(folder / values["code_table"], folder / values["offset_table"], hot)

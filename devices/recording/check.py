@@ -8,15 +8,22 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from devices.codec import Codec, as_bytes
-from devices.recording.blocks import Kind
-from devices.recording.reader import Block, BlockReader, Damage, Recording, codec_of, head_in
+from devices.recording.blocks import BlockKind
+from devices.recording.reader import (
+    Block,
+    BlockReader,
+    Damage,
+    Recording,
+    build_codec_from_head,
+    parse_head,
+)
 from devices.recording.writer import RecordingWriter
 from devices.ring import Gap, Piece
 from devices.statistics import Stats
 from tofclip.errors import FileFormatError
-from tofclip.storage import reading
+from tofclip.storage import translate_read_errors
 
-BUFFER = 1 << 22
+BUFFER_BYTES = 1 << 22
 
 
 @dataclass
@@ -28,12 +35,13 @@ class Findings:
     bytes : int
         Of the instrument, as they came.
     blocks, records, malformed, gaps : int
-        Sound blocks; records that decode, and such that do not; places where the recording says that something is
-        missing.
+        Sound blocks; records that decode, and such that do not; places where the recording says
+        that something is missing.
     damaged_blocks, damaged_bytes : int
         What is not what was written. Bytes behind the last block count as well.
     complete : bool
-        The recording was ended in order. One of a program that was killed is not, and good up to its end.
+        The recording was ended in order. One of a program that was killed is not, and good up to
+        its end.
     stats : mapping
         The accounts at the end, empty where it was not ended in order.
     fault : str
@@ -53,14 +61,16 @@ class Findings:
 
     @property
     def is_sound(self) -> bool:
-        """Whether everything in the file is what was written, and the accounts agree with the records."""
+        """Whether everything in the file is what was written, and the accounts agree with the
+        records.
+        """
         if self.damaged_blocks or not self.stats:
             return not self.damaged_blocks
-        told = Stats(**self.stats)
-        # A piece that was being decoded when the recording was interrupted is in the file and in the accounts as
-        # unread; a record of which the end never came is in the accounts only.
-        most = told.delivered + told.malformed + told.unread
-        return told.delivered <= self.records and self.records + self.malformed <= most
+        reported = Stats(**self.stats)
+        # A piece that was being decoded when the recording was interrupted is in the file and in
+        # the accounts as unread; a record of which the end never came is in the accounts only.
+        most = reported.delivered + reported.malformed + reported.unread
+        return reported.delivered <= self.records and self.records + self.malformed <= most
 
     def as_dict(self) -> dict[str, object]:
         """Return everything by name."""
@@ -68,7 +78,8 @@ class Findings:
 
 
 def verify(path: Path) -> Findings:
-    """Read a recording from end to end, decode it, and compare it with its checksums and its accounts.
+    """Read a recording from end to end, decode it, and compare it with its checksums and its
+    accounts.
 
     Memory: one block and its records.
 
@@ -78,14 +89,15 @@ def verify(path: Path) -> Findings:
         FileFormatError where the file cannot be opened as a recording at all.
     """
     with Recording(path) as recording:
-        survey = _Survey(recording.codec)
+        survey = _Inspector(recording.codec)
         for entry in recording.blocks:
-            survey.look(recording.blocks, entry)
+            survey.inspect(recording.blocks, entry)
         return survey.findings
 
 
 def repair(path: Path, out: Path) -> Findings:
-    """Copy every sound block of a recording into a new one; gaps are marked where something had to be left out.
+    """Copy every sound block of a recording into a new one; gaps are marked where something had to
+    be left out.
 
     The file need not be readable as HDF5: its blocks are found by their own marks and checksums.
 
@@ -94,27 +106,36 @@ def repair(path: Path, out: Path) -> Findings:
     StorageError, FileFormatError
         FileFormatError where not even the block that describes the instrument is left.
     """
-    with reading(path), open(path, "rb", buffering=BUFFER) as file:
+    with translate_read_errors(path), open(path, "rb", buffering=BUFFER_BYTES) as file:
 
         def fetch(position: int, length: int) -> bytes:
             file.seek(position)
             return file.read(length)
 
         blocks = BlockReader(path, fetch, os.fstat(file.fileno()).st_size)
-        return _copied(blocks, out)
+        return _copy_blocks(blocks, out)
 
 
-def _copied(blocks: BlockReader, out: Path) -> Findings:
+def _copy_blocks(blocks: BlockReader, out: Path) -> Findings:
     entries = iter(blocks)
-    head = next((entry for entry in entries if isinstance(entry, Block) and entry.header.kind is Kind.HEAD), None)
+    head = next(
+        (
+            entry
+            for entry in entries
+            if isinstance(entry, Block) and entry.header.kind is BlockKind.HEAD
+        ),
+        None,
+    )
     if head is None:
-        raise FileFormatError(blocks.path, "holds no sound description of its instrument; nothing can be saved")
-    described = head_in(blocks.payload(head), blocks.path)
-    survey = _Survey(codec_of(described, blocks.path))
+        raise FileFormatError(
+            blocks.path, "holds no sound description of its instrument; nothing can be saved"
+        )
+    described = parse_head(blocks.read_payload(head), blocks.path)
+    survey = _Inspector(build_codec_from_head(described, blocks.path))
     writer = RecordingWriter(out, described)
     try:
         for entry in entries:
-            piece = survey.look(blocks, entry)
+            piece = survey.inspect(blocks, entry)
             if piece is not None:
                 writer.add(piece)
         writer.finish(survey.stats, survey.findings.fault)
@@ -123,7 +144,7 @@ def _copied(blocks: BlockReader, out: Path) -> Findings:
     return survey.findings
 
 
-class _Survey:
+class _Inspector:
     """Looks at one block after the other."""
 
     def __init__(self, codec: Codec) -> None:
@@ -137,32 +158,32 @@ class _Survey:
         found = self.findings
         return Stats(found.records + found.malformed, found.records, malformed=found.malformed)
 
-    def look(self, blocks: BlockReader, entry: Block | Damage) -> Piece | None:
+    def inspect(self, blocks: BlockReader, entry: Block | Damage) -> Piece | None:
         """Enter a block into the findings; return its piece if it is a sound one."""
         if isinstance(entry, Damage):
-            self._damaged(entry.length)
+            self._count_damage(entry.length)
             return None
         try:
-            payload = blocks.payload(entry)
+            payload = blocks.read_payload(entry)
         except FileFormatError:
-            self._damaged(entry.end - entry.position)
+            self._count_damage(entry.end - entry.position)
             return None
         self.findings.blocks += 1
-        if entry.header.kind is Kind.END:
-            self._end(payload)
-        return self._piece(entry, payload) if entry.header.kind is Kind.PIECE else None
+        if entry.header.kind is BlockKind.END:
+            self._read_ending(payload)
+        return self._decode_piece(entry, payload) if entry.header.kind is BlockKind.PIECE else None
 
-    def _damaged(self, length: int) -> None:
+    def _count_damage(self, length: int) -> None:
         self.findings.damaged_blocks += 1
         self.findings.damaged_bytes += length
         self._gap = Gap.LOSS
 
-    def _end(self, payload: bytes) -> None:
+    def _read_ending(self, payload: bytes) -> None:
         ending = json.loads(payload)
         self.findings.complete = True
         self.findings.stats, self.findings.fault = ending["stats"], ending["fault"]
 
-    def _piece(self, block: Block, payload: bytes) -> Piece:
+    def _decode_piece(self, block: Block, payload: bytes) -> Piece:
         piece = Piece(payload, block.header.records, max(block.header.gap, self._gap))
         self._gap = Gap.NONE
         if piece.gap is Gap.RESTART:

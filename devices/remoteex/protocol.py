@@ -1,8 +1,9 @@
 """RemoteEx's messages as text, after Hamamatsu's RemoteEx Programmers Handbook (HPD-TA 9.5).
 
-A command is ``Name(argument,argument)`` and a carriage return, its answer ``code,Name,argument,argument`` and another.
-Answers of code 4 come unasked, when something happened. Pictures and tables travel on a second connection, as long as
-the answer says; both connections begin with a greeting.
+A command is ``Name(argument,argument)`` and a carriage return, its answer
+``code,Name,argument,argument`` and another. Answers of code 4 come unasked, when something
+happened. Pictures and tables travel on a second connection, as long as the answer says; both
+connections begin with a greeting.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from dataclasses import dataclass
 from tofclip.errors import DeviceBusyError, DeviceError, InputError, ProtocolError
 
 COMMAND_PORT, DATA_PORT = 1001, 1002
-END = b"\r"
+TERMINATOR = b"\r"
 GREETING, DATA_GREETING = "RemoteEx Ready", "RemoteEx Data Ready"
-LONGEST_MESSAGE = 1 << 16
+MAX_MESSAGE_BYTES = 1 << 16
 
 _COMMAND = re.compile(r"([A-Za-z]\w*)\((.*)\)", re.ASCII)
 _NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
@@ -24,7 +25,7 @@ _ARGUMENT = re.compile(r"[^,()\x00-\x1f\x7f-\x9f]*")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
-class Code(enum.IntEnum):
+class AnswerCode(enum.IntEnum):
     """What became of a command."""
 
     DONE = 0
@@ -40,21 +41,21 @@ class Code(enum.IntEnum):
     OUT_OF_RANGE = 10
 
 
-REASONS = {
-    Code.SYNTAX: "its syntax is wrong",
-    Code.UNKNOWN: "it, or one of its parameters, is unknown",
-    Code.NOT_NOW: "it is not possible now",
-    Code.MISSING: "a parameter is missing",
-    Code.IMPOSSIBLE: "it cannot be executed",
-    Code.FAILED: "it failed",
-    Code.NO_DATA_LINK: "its data cannot be sent",
-    Code.OUT_OF_RANGE: "a value is out of range",
+REFUSAL_REASONS = {
+    AnswerCode.SYNTAX: "its syntax is wrong",
+    AnswerCode.UNKNOWN: "it, or one of its parameters, is unknown",
+    AnswerCode.NOT_NOW: "it is not possible now",
+    AnswerCode.MISSING: "a parameter is missing",
+    AnswerCode.IMPOSSIBLE: "it cannot be executed",
+    AnswerCode.FAILED: "it failed",
+    AnswerCode.NO_DATA_LINK: "its data cannot be sent",
+    AnswerCode.OUT_OF_RANGE: "a value is out of range",
 }
-_ERRORS: dict[Code, type[DeviceError]] = {
-    Code.NOT_NOW: DeviceBusyError,
-    Code.IMPOSSIBLE: DeviceError,
-    Code.FAILED: DeviceError,
-    Code.NO_DATA_LINK: DeviceError,
+_ERRORS: dict[AnswerCode, type[DeviceError]] = {
+    AnswerCode.NOT_NOW: DeviceBusyError,
+    AnswerCode.IMPOSSIBLE: DeviceError,
+    AnswerCode.FAILED: DeviceError,
+    AnswerCode.NO_DATA_LINK: DeviceError,
 }
 
 
@@ -80,13 +81,13 @@ class Command:
         InputError
             A name or argument holds what the protocol cannot carry.
         """
-        _require_plain(self.name, self.arguments)
-        return f"{self.name}({','.join(self.arguments)})".encode() + END
+        _require_valid(self.name, self.arguments)
+        return f"{self.name}({','.join(self.arguments)})".encode() + TERMINATOR
 
     @classmethod
     def decode(cls, message: bytes) -> Command:
         """Read a command, its end taken off."""
-        text = _text(message)
+        text = _decode_text(message)
         found = _COMMAND.fullmatch(text)
         if found is None:
             raise ProtocolError(f"{text[:80]!r} is no command Name(argument,...)")
@@ -108,14 +109,14 @@ class Answer:
     arguments : tuple of str
     """
 
-    code: Code
+    code: AnswerCode
     name: str
     arguments: tuple[str, ...] = ()
 
     @property
     def is_message(self) -> bool:
         """Whether it came unasked."""
-        return self.code in (Code.MESSAGE, Code.NOTICE)
+        return self.code in (AnswerCode.MESSAGE, AnswerCode.NOTICE)
 
     def encode(self) -> bytes:
         """Return the bytes to send.
@@ -125,8 +126,8 @@ class Answer:
         InputError
             A name or argument holds what the protocol cannot carry.
         """
-        _require_plain(self.name, self.arguments)
-        return ",".join([str(int(self.code)), self.name, *self.arguments]).encode() + END
+        _require_valid(self.name, self.arguments)
+        return ",".join([str(int(self.code)), self.name, *self.arguments]).encode() + TERMINATOR
 
     @classmethod
     def decode(cls, message: bytes) -> Answer:
@@ -137,12 +138,18 @@ class Answer:
         ProtocolError
             It does not begin with a known code and a name.
         """
-        text = _text(message)
+        text = _decode_text(message)
         code, _, rest = text.partition(",")
         name, *arguments = rest.split(",")
-        if not (code.isascii() and code.isdecimal() and len(code) < 4 and int(code) in list(Code) and name):
+        if not (
+            code.isascii()
+            and code.isdecimal()
+            and len(code) < 4
+            and int(code) in list(AnswerCode)
+            and name
+        ):
             raise ProtocolError(f"{text[:80]!r} is no answer of RemoteEx")
-        return cls(Code(int(code)), name, tuple(arguments))
+        return cls(AnswerCode(int(code)), name, tuple(arguments))
 
     def require_done(self, command: Command) -> tuple[str, ...]:
         """Return the arguments, or raise what the code means.
@@ -156,21 +163,23 @@ class Answer:
         ProtocolError
             RemoteEx does not understand it.
         """
-        if self.code is Code.DONE:
+        if self.code is AnswerCode.DONE:
             return self.arguments
         said = f" ({', '.join(self.arguments)[:120]})" if self.arguments else ""
         error = _ERRORS.get(self.code, ProtocolError)
-        raise error(f"RemoteEx refused {command}: {REASONS.get(self.code, 'no reason given')}{said}")
+        raise error(
+            f"RemoteEx refused {command}: {REFUSAL_REASONS.get(self.code, 'no reason given')}{said}"
+        )
 
 
-def whole_number(text: str, what: str) -> int:
+def parse_integer(text: str, what: str) -> int:
     """Return a number that RemoteEx sent, refusing anything else."""
     if not (text.isascii() and text.isdecimal() and len(text) < 16):
         raise ProtocolError(f"RemoteEx sent {text[:40]!r} as {what}, expected a whole number")
     return int(text)
 
 
-def _require_plain(name: str, arguments: tuple[str, ...]) -> None:
+def _require_valid(name: str, arguments: tuple[str, ...]) -> None:
     if not _NAME.fullmatch(name):
         raise InputError(f"'{name}' is no name of a RemoteEx command")
     for argument in arguments:
@@ -180,7 +189,7 @@ def _require_plain(name: str, arguments: tuple[str, ...]) -> None:
         raise InputError("RemoteEx cannot carry a single argument that is empty")
 
 
-def _text(message: bytes) -> str:
+def _decode_text(message: bytes) -> str:
     try:
         text = message.decode().strip("\n")
     except UnicodeDecodeError as fault:

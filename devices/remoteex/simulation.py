@@ -7,13 +7,13 @@ from dataclasses import replace
 from devices.emulation.faults import Fault
 from devices.ledger import Ledger
 from devices.loopback import HOST
-from devices.remoteex.client import RemoteEx
-from devices.remoteex.emulator import FOREVER, EmulatedLight, EmulatedStreakCamera
-from devices.remoteex.source import OPTIONS, LiveSettings, RemoteExFeed, live_settings
-from devices.scenes import demonstration_light, line_light
+from devices.remoteex.client import RemoteExClient
+from devices.remoteex.emulator import UNLIMITED_FRAMES, EmulatedLight, EmulatedStreakCamera
+from devices.remoteex.source import OPTIONS, LiveSettings, RemoteExFeed, parse_live_settings
+from devices.scenes import simulate_demonstration_light, simulate_line_light
 from devices.source import Info
 from devices.stream import StreamSource
-from devices.stream_options import buffering
+from devices.stream_options import parse_buffer_settings
 from devices.uri import Uri
 from tofclip.camera import Camera
 from tofclip.errors import InputError
@@ -26,10 +26,14 @@ class EmulatedFeed(RemoteExFeed):
     Closing switches the emulated camera off.
     """
 
-    def __init__(self, server: EmulatedStreakCamera, camera: Camera, ledger: Ledger, settings: LiveSettings) -> None:
+    def __init__(
+        self, server: EmulatedStreakCamera, camera: Camera, ledger: Ledger, settings: LiveSettings
+    ) -> None:
         self._server, self._camera = server, camera
         port, data_port = server.ports
-        super().__init__(lambda: RemoteEx(HOST, port, data_port, settings.timeout), ledger, settings)
+        super().__init__(
+            lambda: RemoteExClient(HOST, port, data_port, settings.timeout), ledger, settings
+        )
 
     @property
     def info(self) -> Info:
@@ -39,7 +43,9 @@ class EmulatedFeed(RemoteExFeed):
     @property
     def calibration(self) -> Record | None:
         known = super().calibration
-        return None if known is None else replace(known, children={"camera": self._camera.to_record()})
+        return (
+            None if known is None else replace(known, children={"camera": self._camera.to_record()})
+        )
 
     def close(self) -> None:
         try:
@@ -49,19 +55,32 @@ class EmulatedFeed(RemoteExFeed):
 
 
 def open_emulated(uri: Uri) -> StreamSource:
-    """Open ``sim+remoteex://?seed=1&scene=demo&frame_rate=10&frames=N&faults=...``, an emulated camera behind TCP.
+    """Open ``sim+remoteex://?seed=1&scene=demo&frame_rate=10&frames=N&faults=...``, an emulated
+    camera behind TCP.
 
-    Besides the driver's own (`devices.remoteex.source.OPTIONS`) it takes ``scene`` (``demo``, or ``small`` for a slit
-    of 256 pixels), ``frames`` (then it is dark) and ``faults`` (as `devices.emulation.faults.Fault.parse` reads them).
+    Besides the driver's own (`devices.remoteex.source.OPTIONS`) it takes ``scene`` (``demo``, or
+    ``small`` for a slit of 256 pixels), ``frames`` (then it is dark) and ``faults`` (as
+    `devices.emulation.faults.Fault.parse` reads them).
     """
-    uri.only(*(name for name in OPTIONS if name != "data_port"), "seed", "scene", "frame_rate", "frames", "faults")
+    uri.reject_unknown(
+        *(name for name in OPTIONS if name != "data_port"),
+        "seed",
+        "scene",
+        "frame_rate",
+        "frames",
+        "faults",
+    )
     seed = uri.value("seed", int, 0)
     if seed < 0:
         raise InputError(f"'{uri.text}': a seed must not be negative")
-    settings, held = live_settings(uri), buffering(uri)
-    rate, frames = uri.value("frame_rate", float, 10.0), uri.value("frames", int, FOREVER)
+    settings, held = parse_live_settings(uri), parse_buffer_settings(uri)
+    rate, frames = uri.value("frame_rate", float, 10.0), uri.value("frames", int, UNLIMITED_FRAMES)
     faults = Fault.parse(uri.value("faults", str, ""))
-    scene = demonstration_light() if uri.choice("scene", "demo", "small") == "demo" else line_light()
+    scene = (
+        simulate_demonstration_light()
+        if uri.choice("scene", "demo", "small") == "demo"
+        else simulate_line_light()
+    )
     server = EmulatedStreakCamera(EmulatedLight.of(scene, seed), rate, frames, faults)
     ledger = Ledger()
     try:

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from devices.frames import FrameCodec
 from devices.ledger import Ledger
-from devices.persistence import persistently
-from devices.remoteex.client import Picture, RemoteEx
-from devices.remoteex.protocol import COMMAND_PORT, whole_number
+from devices.remoteex.client import CameraFrame, RemoteExClient
+from devices.remoteex.protocol import COMMAND_PORT, parse_integer
+from devices.retry import retry_connect
 from devices.ring import Gap
 from devices.source import Info
-from devices.stream import Arrival, StreamSource
+from devices.stream import StreamSource, Transfer
 from devices.stream_options import OPTIONS as STREAM_OPTIONS
-from devices.stream_options import buffering
+from devices.stream_options import parse_buffer_settings
 from devices.uri import Uri
 from tofclip.errors import DeviceDisconnectedError, DeviceError, InputError, ProtocolError
 from tofclip.io.hpdta import TIME_UNITS
@@ -27,13 +27,17 @@ from tofclip.storage import Field, Record, Scalar
 
 INSTRUMENT = "Hamamatsu streak camera (RemoteEx)"
 STREAK_TUBE = "TD"
-GAIN = "MCP Gain"
+GAIN_PARAMETER = "MCP Gain"
 OPTIONS = ("data_port", "buffers", "mcp_gain", "timeout_s", "reconnect_s", *STREAM_OPTIONS)
 
-_PARAMETERS = {"time_range": "Time Range", "mode": "Mode", "mcp_gain": GAIN}
-_STOP = (("DevParamSet", STREAK_TUBE, GAIN, "0"), ("AcqStop",), ("AcqLiveMonitor", "Off"))
+_PARAMETERS = {"time_range": "Time Range", "mode": "Mode", "mcp_gain": GAIN_PARAMETER}
+_STOP_COMMANDS = (
+    ("DevParamSet", STREAK_TUBE, GAIN_PARAMETER, "0"),
+    ("AcqStop",),
+    ("AcqLiveMonitor", "Off"),
+)
 
-Connect = Callable[[], RemoteEx]
+ConnectFunction = Callable[[], RemoteExClient]
 
 
 @dataclass(frozen=True)
@@ -45,8 +49,8 @@ class LiveSettings:
     buffers : int
         Pictures that HPD-TA keeps for a client that is late.
     gain : int or None
-        Of the micro-channel plate, set before the start; None leaves it as it is. It is 0 after the stop in any case:
-        an intensified tube that nobody watches must not age in strong light.
+        Of the micro-channel plate, set before the start; None leaves it as it is. It is 0 after the
+        stop in any case: an intensified tube that nobody watches must not age in strong light.
     timeout : float
         Seconds to wait for an answer.
     reconnect : float
@@ -62,7 +66,9 @@ class LiveSettings:
         if not 1 <= self.buffers <= 4096:
             raise InputError(f"the number of buffers must be within 1..4096, got {self.buffers}")
         if self.gain is not None and not 0 <= self.gain <= 63:
-            raise InputError(f"the gain of the micro-channel plate must be within 0..63, got {self.gain}")
+            raise InputError(
+                f"the gain of the micro-channel plate must be within 0..63, got {self.gain}"
+            )
         if not (0 < self.timeout <= 600 and 0 <= self.reconnect <= 600):
             raise InputError("times to wait must be within 0 s and 600 s")
 
@@ -70,8 +76,8 @@ class LiveSettings:
 class RemoteExFeed:
     """Live pictures in the order of their numbers; see `devices.stream.Feed`.
 
-    Pictures that fell out of the ring buffer before they were asked for are lost by the instrument. When the connection
-    breaks, so are those that had been announced.
+    Pictures that fell out of the ring buffer before they were asked for are lost by the instrument.
+    When the connection breaks, so are those that had been announced.
 
     Parameters
     ----------
@@ -81,34 +87,40 @@ class RemoteExFeed:
     settings : LiveSettings
     """
 
-    def __init__(self, connect: Connect, ledger: Ledger, settings: LiveSettings) -> None:
+    def __init__(self, connect: ConnectFunction, ledger: Ledger, settings: LiveSettings) -> None:
         self._connect, self._ledger, self._settings = connect, ledger, settings
         self._gap = Gap.NONE
-        self._begin()
+        self._start_camera()
         first = self._first
         self.codec = FrameCodec(first.rows, first.columns, 8 * first.pixel_bytes)
         self._parameters = self._read_parameters()
-        self._table = self._read_table()
+        self._row_times = self._read_row_times()
 
     @property
     def info(self) -> Info:
-        details: dict[str, Scalar] = {**self._parameters, "rows": self.codec.rows, "columns": self.codec.columns}
+        details: dict[str, Scalar] = {
+            **self._parameters,
+            "rows": self.codec.rows,
+            "columns": self.codec.columns,
+        }
         return Info(INSTRUMENT, "", details)
 
     @property
     def calibration(self) -> Record | None:
         """Time of each row in s, where the camera sweeps."""
-        if self._table is None:
+        if self._row_times is None:
             return None
-        return Record("streak_calibration", {"row_times": Field(self._table, "s", ("row",))})
+        return Record("streak_calibration", {"row_times": Field(self._row_times, "s", ("row",))})
 
     def start(self) -> None:
-        """Do nothing: the camera runs since the connection was made, which is how the pictures' size is known."""
+        """Do nothing: the camera runs since the connection was made, which is how the pictures'
+        size is known.
+        """
 
-    def pull(self, timeout: float) -> Arrival | None:
+    def pull(self, timeout: float) -> Transfer | None:
         while True:
             try:
-                picture = self._next_picture(timeout)
+                picture = self._read_next_frame(timeout)
             except DeviceDisconnectedError:
                 self._reconnect()
                 continue
@@ -119,75 +131,77 @@ class RemoteExFeed:
             ):
                 raise ProtocolError("the pictures' size has changed; open the camera anew")
             gap, self._gap = self._gap, Gap.NONE
-            return Arrival(memoryview(self.codec.numbered(picture.number, picture.pixels)), gap)
+            return Transfer(memoryview(self.codec.pack_frame(picture.number, picture.pixels)), gap)
 
     def stop(self) -> None:
         """Turn the gain down first, whatever the state of the connection, and stop the acquisition."""
         self._stopped = True
-        self._link.conclude(*_STOP)
+        self._link.send_and_wait(*_STOP_COMMANDS)
 
     def close(self) -> None:
         try:
             if not self._stopped:
                 self.stop()
         finally:
-            self._lose_announced()
+            self._count_announced_lost()
             self._link.close()
 
-    def _begin(self) -> None:
+    def _start_camera(self) -> None:
         """Connect, start the camera and wait for its first picture."""
         self._link = link = self._connect()
         self._stopped = False
         try:
             if self._settings.gain is not None:
-                link.ask("DevParamSet", STREAK_TUBE, GAIN, str(self._settings.gain))
+                link.ask("DevParamSet", STREAK_TUBE, GAIN_PARAMETER, str(self._settings.gain))
             link.ask("AcqLiveMonitor", "RingBuffer", str(self._settings.buffers))
             link.ask("AcqStart", "Live")
-            self._newest = self._announced(self._settings.timeout)
-            self._first = link.picture(self._newest)
+            self._newest = self._wait_for_announcement(self._settings.timeout)
+            self._first = link.read_frame(self._newest)
         except BaseException:
             with contextlib.suppress(DeviceError):
                 self.stop()
             link.close()
             raise
-        self._held: Picture | None = self._first
+        self._unread_frame: CameraFrame | None = self._first
         self._next, self._newest = self._first.number, max(self._newest, self._first.number)
 
-    def _next_picture(self, timeout: float) -> Picture:
+    def _read_next_frame(self, timeout: float) -> CameraFrame:
         deadline = monotonic() + timeout
-        picture = self._held
+        picture = self._unread_frame
         if picture is None:
             while self._newest < self._next:
-                self._newest = max(self._newest, self._announced(max(deadline - monotonic(), 0)))
-            picture = self._link.picture(self._next)
+                self._newest = max(
+                    self._newest, self._wait_for_announcement(max(deadline - monotonic(), 0))
+                )
+            picture = self._link.read_frame(self._next)
         lost = picture.number - self._next
         if lost < 0:
             raise ProtocolError(f"RemoteEx sent picture {picture.number}, asked for {self._next}")
         if lost:
             self._ledger.lose(lost)
             self._gap = max(self._gap, Gap.LOSS)
-        self._held, self._next = None, picture.number + 1
+        self._unread_frame, self._next = None, picture.number + 1
         self._newest = max(self._newest, picture.number)
         return picture
 
-    def _announced(self, timeout: float) -> int:
+    def _wait_for_announcement(self, timeout: float) -> int:
         """Return the number of the picture that the next message announces."""
         while True:
-            words = self._link.message(timeout).arguments
+            words = self._link.read_message(timeout).arguments
             if len(words) >= 2 and words[0].casefold() == "ringbuffer":
-                return whole_number(words[1], "a picture's number")
+                return parse_integer(words[1], "a picture's number")
 
     def _reconnect(self) -> None:
-        self._lose_announced()
+        self._count_announced_lost()
         self._link.close()
-        persistently(self._begin, self._settings.reconnect)
+        retry_connect(self._start_camera, self._settings.reconnect)
         self._ledger.reconnect()
         self._gap = Gap.RESTART
 
-    def _lose_announced(self) -> None:
+    def _count_announced_lost(self) -> None:
         """Enter pictures that were announced and will not come."""
         self._ledger.lose(max(0, self._newest - self._next + 1))
-        self._newest, self._held = self._next - 1, None
+        self._newest, self._unread_frame = self._next - 1, None
 
     def _read_parameters(self) -> dict[str, Scalar]:
         found: dict[str, Scalar] = {}
@@ -196,28 +210,40 @@ class RemoteExFeed:
                 found[name] = ",".join(self._link.ask("DevParamGet", STREAK_TUBE, parameter))
         return found
 
-    def _read_table(self) -> NDArray[np.float64] | None:
+    def _read_row_times(self) -> NDArray[np.float64] | None:
         """Return the rows' times, s; the table is in the unit of the time range, as the files show."""
         unit = TIME_UNITS.get(str(self._parameters.get("time_range", "")).rpartition(" ")[2])
         if unit is None or self._parameters.get("mode") == "Focus":
             return None
-        table = self._link.scaling_table().astype(np.float64)
-        if table.shape != (self.codec.rows,) or not np.all(np.isfinite(table)) or np.any(np.diff(table) <= 0):
+        table = self._link.read_scaling_table().astype(np.float64)
+        if (
+            table.shape != (self.codec.rows,)
+            or not np.all(np.isfinite(table))
+            or np.any(np.diff(table) <= 0)
+        ):
             raise ProtocolError("RemoteEx's scaling table does not rise row by row of the picture")
         return table * unit
 
 
 def open_remoteex(uri: Uri) -> StreamSource:
-    """Open ``remoteex://HOST:1001?data_port=1002&buffers=16&mcp_gain=N&timeout_s=5&reconnect_s=5&buffer_mib=64``."""
-    uri.only(*OPTIONS)
+    """Open
+    ``remoteex://HOST:1001?data_port=1002&buffers=16&mcp_gain=N&timeout_s=5&reconnect_s=5&buffer_mib=64``.
+    """
+    uri.reject_unknown(*OPTIONS)
     host, port = uri.host_and_port(COMMAND_PORT)
-    data_port, settings, held = uri.value("data_port", int, port + 1), live_settings(uri), buffering(uri)
+    data_port, settings, held = (
+        uri.value("data_port", int, port + 1),
+        parse_live_settings(uri),
+        parse_buffer_settings(uri),
+    )
     ledger = Ledger()
-    feed = RemoteExFeed(lambda: RemoteEx(host, port, data_port, settings.timeout), ledger, settings)
+    feed = RemoteExFeed(
+        lambda: RemoteExClient(host, port, data_port, settings.timeout), ledger, settings
+    )
     return StreamSource(feed, feed.codec, ledger, held)
 
 
-def live_settings(uri: Uri) -> LiveSettings:
+def parse_live_settings(uri: Uri) -> LiveSettings:
     """Read the values of an address (`OPTIONS`) that say how to acquire."""
     standard = LiveSettings()
     return LiveSettings(

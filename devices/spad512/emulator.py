@@ -12,20 +12,20 @@ from numpy.typing import NDArray
 from devices.emulation.faults import Fault
 from devices.ledger import Ledger
 from devices.loopback import HOST, Connection, LoopbackServer
-from devices.scenes import array_light
+from devices.scenes import render_array_light
 from devices.source import Info
-from devices.spad512.protocol import DONE, END, ERROR, ROWS, Exposure
-from devices.spad512.source import OPTIONS, Spad512Feed, exposure_of, waiting
+from devices.spad512.protocol import DONE_MARK, ERROR_MARK, ROWS, TERMINATOR, ExposureRequest
+from devices.spad512.source import OPTIONS, Spad512Feed, parse_exposure, parse_timeouts
 from devices.stream import StreamSource
-from devices.stream_options import buffering
+from devices.stream_options import parse_buffer_settings
 from devices.tcp import TcpLink
 from devices.uri import Uri
 from tofclip.errors import InputError, ProtocolError, ShapeError
 
-FAULTS = ("timeout", "short", "unplug", "corrupt", "stall")
+SUPPORTED_FAULTS = ("timeout", "short", "unplug", "corrupt", "stall")
 GREETING = b"SPAD512S emulated server, ready\n"
-FOREVER = 1 << 62
-TENTH = 0.1
+UNLIMITED_FRAMES = 1 << 62
+FAULT_DELAY_S = 0.1
 """Seconds by which a fault of amount 1 delays an answer."""
 
 
@@ -40,69 +40,79 @@ class EmulatedSpadArray:
     pictures : int
         Until it is dark: then a request finds no answer.
     faults : sequence of Fault
-        By number of the request, from 0: ``timeout`` answers `amount` tenths of a second late, ``short`` pauses so long
-        in the middle of a picture, ``unplug`` hangs up there, ``corrupt`` ends with other letters, ``stall`` answers
-        that it failed.
+        By number of the request, from 0: ``timeout`` answers `amount` tenths of a second late,
+        ``short`` pauses so long in the middle of a picture, ``unplug`` hangs up there, ``corrupt``
+        ends with other letters, ``stall`` answers that it failed.
     """
 
     def __init__(
-        self, photons: NDArray[np.float64], seed: int, pictures: int = FOREVER, faults: Sequence[Fault] = ()
+        self,
+        photons: NDArray[np.float64],
+        seed: int,
+        pictures: int = UNLIMITED_FRAMES,
+        faults: Sequence[Fault] = (),
     ) -> None:
         if photons.shape != (ROWS, ROWS):
             raise ShapeError("a SPAD512's light", (ROWS, ROWS), photons.shape)
         for fault in faults:
-            if fault.kind not in FAULTS:
-                raise InputError(f"a SPAD array's faults are {', '.join(FAULTS)}, not {fault.kind}")
+            if fault.kind not in SUPPORTED_FAULTS:
+                raise InputError(
+                    f"a SPAD array's faults are {', '.join(SUPPORTED_FAULTS)}, not {fault.kind}"
+                )
         self._photons, self._seed, self._left = photons, seed, pictures
         self._faults = {fault.transfer: fault for fault in faults}
         self._requests = 0
-        self._server = LoopbackServer(self._serve)
+        self._server = LoopbackServer(self._serve_client)
 
     @property
     def port(self) -> int:
         """Where it listens."""
         return self._server.port
 
-    def picture(self, request: int, number: int, exposure: Exposure) -> NDArray[np.uint8]:
-        """Return the bytes of picture `number` of a request; the same numbers give the same picture."""
+    def draw_frame(self, request: int, number: int, exposure: ExposureRequest) -> NDArray[np.uint8]:
+        """Return the bytes of picture `number` of a request; the same numbers give the same
+        picture.
+        """
         light = self._photons[:, : exposure.width] * exposure.seconds
         drawn = np.random.default_rng([self._seed, request, number]).poisson(light)
         counts = np.minimum(drawn, 2**exposure.bits - 1)
         if exposure.bits == 1:
             return np.packbits(counts.astype(np.uint8), axis=1).ravel()
-        pixels: NDArray[np.uint8] = counts.astype("<u2" if exposure.codec.bits == 16 else "u1").ravel().view(np.uint8)
+        pixels: NDArray[np.uint8] = (
+            counts.astype("<u2" if exposure.codec.bits == 16 else "u1").ravel().view(np.uint8)
+        )
         return pixels
 
     def close(self) -> None:
         """Switch it off."""
         self._server.close()
 
-    def _serve(self, connection: Connection) -> None:
+    def _serve_client(self, connection: Connection) -> None:
         connection.send(GREETING)
         pile_up = False
-        while (line := connection.request(END)) is not None:
+        while (line := connection.read_request(TERMINATOR)) is not None:
             if line.startswith(b"PU,"):
                 pile_up = line == b"PU,1"
                 connection.send(b"Pile-up correction is " + (b"on\n" if pile_up else b"off\n"))
                 continue
             try:
-                self._expose(Exposure.decode(line, pile_up), connection)
+                self._send_exposure(ExposureRequest.decode(line, pile_up), connection)
             except ProtocolError:
-                connection.send(b"unknown command\n" + ERROR)
+                connection.send(b"unknown command\n" + ERROR_MARK)
 
-    def _expose(self, exposure: Exposure, connection: Connection) -> None:
+    def _send_exposure(self, exposure: ExposureRequest, connection: Connection) -> None:
         request, self._requests = self._requests, self._requests + 1
         fault = self._faults.get(request)
-        kind, pause = (fault.kind, fault.amount * TENTH) if fault else ("", 0.0)
+        kind, pause = (fault.kind, fault.amount * FAULT_DELAY_S) if fault else ("", 0.0)
         if kind == "stall":
-            connection.send(b"The FIFO is full.\n" + ERROR)
+            connection.send(b"The FIFO is full.\n" + ERROR_MARK)
             return
         time.sleep(pause if kind == "timeout" else 0)
         for number in range(exposure.images):
             if self._left <= 0:
                 return
             self._left -= 1
-            data = self.picture(request, number, exposure).tobytes()
+            data = self.draw_frame(request, number, exposure).tobytes()
             half = len(data) // 2
             connection.send(data[:half])
             if kind == "unplug":
@@ -110,17 +120,24 @@ class EmulatedSpadArray:
                 return
             time.sleep(pause if kind == "short" else 0)
             connection.send(data[half:])
-        connection.send(b"GONE" if kind == "corrupt" else DONE)
+        connection.send(b"GONE" if kind == "corrupt" else DONE_MARK)
 
 
 class EmulatedFeed(Spad512Feed):
     """Pictures of an emulated array, which is switched off when they are closed."""
 
     def __init__(
-        self, server: EmulatedSpadArray, ledger: Ledger, exposure: Exposure, patience: float, reconnect: float
+        self,
+        server: EmulatedSpadArray,
+        ledger: Ledger,
+        exposure: ExposureRequest,
+        patience: float,
+        reconnect: float,
     ) -> None:
         self._server = server
-        super().__init__(lambda: TcpLink(HOST, server.port, patience), ledger, exposure, patience, reconnect)
+        super().__init__(
+            lambda: TcpLink(HOST, server.port, patience), ledger, exposure, patience, reconnect
+        )
 
     @property
     def info(self) -> Info:
@@ -133,18 +150,26 @@ class EmulatedFeed(Spad512Feed):
 
 
 def open_emulated(uri: Uri) -> StreamSource:
-    """Open ``sim+spad512://?seed=1&rate=20000&faults=...``: an emulated array that sees the demonstration.
+    """Open ``sim+spad512://?seed=1&rate=20000&faults=...``: an emulated array that sees the
+    demonstration.
 
-    Besides the driver's own (`devices.spad512.source.OPTIONS`) it takes ``rate`` (photons per second on a white
-    pixel), ``pictures`` (then it is dark) and ``faults`` (as `devices.emulation.faults.Fault.parse` reads them).
+    Besides the driver's own (`devices.spad512.source.OPTIONS`) it takes ``rate`` (photons per
+    second on a white pixel), ``pictures`` (then it is dark) and ``faults`` (as
+    `devices.emulation.faults.Fault.parse` reads them).
     """
-    uri.only(*OPTIONS, "seed", "rate", "pictures", "faults")
+    uri.reject_unknown(*OPTIONS, "seed", "rate", "pictures", "faults")
     seed, rate = uri.value("seed", int, 0), uri.value("rate", float, 2e4)
     if seed < 0 or not 0 <= rate <= 1e9:
         raise InputError(f"'{uri.text}': a seed must not be negative, a rate within 0..1e9")
-    (patience, back), exposure, held = waiting(uri), exposure_of(uri), buffering(uri)
-    pictures = uri.value("pictures", int, FOREVER)
-    server = EmulatedSpadArray(array_light() * rate, seed, pictures, Fault.parse(uri.value("faults", str, "")))
+    (patience, back), exposure, held = (
+        parse_timeouts(uri),
+        parse_exposure(uri),
+        parse_buffer_settings(uri),
+    )
+    pictures = uri.value("pictures", int, UNLIMITED_FRAMES)
+    server = EmulatedSpadArray(
+        render_array_light() * rate, seed, pictures, Fault.parse(uri.value("faults", str, ""))
+    )
     ledger = Ledger()
     try:
         feed = EmulatedFeed(server, ledger, exposure, patience, back)

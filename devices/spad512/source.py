@@ -7,31 +7,47 @@ from collections.abc import Callable
 from time import monotonic
 
 from devices.ledger import Ledger
-from devices.persistence import persistently
+from devices.retry import retry_connect
 from devices.ring import Gap
 from devices.source import Info
-from devices.spad512.protocol import DONE, ERROR, LONGEST_TEXT, PORT, Exposure
-from devices.stream import Arrival, StreamSource
+from devices.spad512.protocol import (
+    DEFAULT_PORT,
+    DONE_MARK,
+    ERROR_MARK,
+    MAX_TEXT_BYTES,
+    ExposureRequest,
+)
+from devices.stream import StreamSource, Transfer
 from devices.stream_options import OPTIONS as STREAM_OPTIONS
-from devices.stream_options import buffering, seconds
+from devices.stream_options import parse_buffer_settings, parse_seconds
 from devices.tcp import TcpLink
 from devices.uri import Uri
 from tofclip.errors import DeviceDisconnectedError, DeviceError, DeviceTimeoutError, ProtocolError
 from tofclip.storage import Record
 
 INSTRUMENT = "SPAD512 array"
-OPTIONS = ("bits", "exposure_us", "images", "width", "pile_up", "timeout_s", "reconnect_s", *STREAM_OPTIONS)
+OPTIONS = (
+    "bits",
+    "exposure_us",
+    "images",
+    "width",
+    "pile_up",
+    "timeout_s",
+    "reconnect_s",
+    *STREAM_OPTIONS,
+)
 
-_QUIET = 0.2
+_SILENCE_S = 0.2
 """Seconds after which a text of unknown length has ended."""
 
-Connect = Callable[[], TcpLink]
+ConnectFunction = Callable[[], TcpLink]
 
 
 class Spad512Feed:
     """One picture after the other; see `devices.stream.Feed`.
 
-    Pictures are asked for a request at a time, and a request that finds no answer in time is not sent again.
+    Pictures are asked for a request at a time, and a request that finds no answer in time is not
+    sent again.
 
     Parameters
     ----------
@@ -43,14 +59,21 @@ class Spad512Feed:
         Seconds to wait for an answer beyond the exposure, and for a server that went away.
     """
 
-    def __init__(self, connect: Connect, ledger: Ledger, exposure: Exposure, patience: float, reconnect: float) -> None:
+    def __init__(
+        self,
+        connect: ConnectFunction,
+        ledger: Ledger,
+        exposure: ExposureRequest,
+        patience: float,
+        reconnect: float,
+    ) -> None:
         self._connect, self._ledger, self._exposure = connect, ledger, exposure
         self._patience, self._reconnect_time = patience, reconnect
         self.codec = exposure.codec
-        self._number, self._due, self._gap = 0, 0, Gap.NONE
-        self._came = bytearray()
+        self._number, self._frames_due, self._gap = 0, 0, Gap.NONE
+        self._received = bytearray()
         self._stopped = False
-        self._begin()
+        self._open_link()
 
     @property
     def info(self) -> Info:
@@ -74,14 +97,14 @@ class Spad512Feed:
     def start(self) -> None:
         """Do nothing: the first request starts the instrument."""
 
-    def pull(self, timeout: float) -> Arrival | None:
+    def pull(self, timeout: float) -> Transfer | None:
         while True:
-            if self._due == 0:
+            if self._frames_due == 0:
                 if self._stopped:
                     return None
-                self._request()
+                self._request_frames()
             try:
-                return self._picture(timeout)
+                return self._read_frame(timeout)
             except DeviceDisconnectedError:
                 self._reconnect()
 
@@ -89,94 +112,111 @@ class Spad512Feed:
         self._stopped = True
 
     def close(self) -> None:
-        self._break_off()
+        self._count_truncated()
         self._link.close()
 
-    def _begin(self) -> None:
+    def _open_link(self) -> None:
         self._link = link = self._connect()
         try:
-            self._greeting = self._text(self._patience)
+            self._greeting = self._read_text(self._patience)
             link.send(self._exposure.encode_pile_up(), self._patience)
-            self._text(self._patience)
+            self._read_text(self._patience)
         except BaseException:
             link.close()
             raise
 
-    def _text(self, patience: float) -> str:
+    def _read_text(self, patience: float) -> str:
         """Return a text of unknown length: what comes until it is quiet."""
-        text = self._link.some(LONGEST_TEXT, patience)
+        text = self._link.read_available(MAX_TEXT_BYTES, patience)
         with contextlib.suppress(DeviceTimeoutError):
-            while len(text) < LONGEST_TEXT:
-                text += self._link.some(LONGEST_TEXT - len(text), _QUIET)
+            while len(text) < MAX_TEXT_BYTES:
+                text += self._link.read_available(MAX_TEXT_BYTES - len(text), _SILENCE_S)
         return text.decode("ascii", "replace").strip()
 
-    def _request(self) -> None:
+    def _request_frames(self) -> None:
         self._link.send(self._exposure.encode(), self._patience)
-        self._due = self._exposure.images
+        self._frames_due = self._exposure.images
         self._deadline = monotonic() + self._exposure.seconds + self._patience
 
-    def _picture(self, timeout: float) -> Arrival:
+    def _read_frame(self, timeout: float) -> Transfer:
         """Return the next picture; with the last one of a request comes the end of the answer."""
-        is_last = self._due == 1
-        length = self.codec.pixel_bytes + (len(DONE) if is_last else 0)
-        self._fill(length, timeout)
-        pixels, end = bytes(self._came[: self.codec.pixel_bytes]), bytes(self._came[self.codec.pixel_bytes :])
-        if is_last and end != DONE:
-            raise ProtocolError(f"the SPAD array's answer ended in {end!r}, expected {DONE!r}; is its width another?")
-        self._came.clear()
-        self._due -= 1
+        is_last = self._frames_due == 1
+        length = self.codec.pixel_bytes + (len(DONE_MARK) if is_last else 0)
+        self._fill_buffer(length, timeout)
+        pixels, end = (
+            bytes(self._received[: self.codec.pixel_bytes]),
+            bytes(self._received[self.codec.pixel_bytes :]),
+        )
+        if is_last and end != DONE_MARK:
+            raise ProtocolError(
+                f"the SPAD array's answer ended in {end!r}, expected {DONE_MARK!r}; is its width another?"
+            )
+        self._received.clear()
+        self._frames_due -= 1
         self._deadline = monotonic() + self._exposure.seconds + self._patience
         self._number += 1
         gap, self._gap = self._gap, Gap.NONE
-        return Arrival(memoryview(self.codec.numbered(self._number - 1, pixels)), gap)
+        return Transfer(memoryview(self.codec.pack_frame(self._number - 1, pixels)), gap)
 
-    def _fill(self, length: int, timeout: float) -> None:
-        """Wait until `length` bytes came, a length that was computed, not told; what came in time is kept."""
+    def _fill_buffer(self, length: int, timeout: float) -> None:
+        """Wait until `length` bytes came, a length that was computed, not told; what came in time
+        is kept.
+        """
         deadline = monotonic() + timeout
-        while len(self._came) < length:
+        while len(self._received) < length:
             try:
-                self._came += self._link.some(length - len(self._came), max(deadline - monotonic(), 0))
+                self._received += self._link.read_available(
+                    length - len(self._received), max(deadline - monotonic(), 0)
+                )
             except DeviceTimeoutError:
-                self._require_no_error()
+                self._raise_server_error()
                 raise
 
-    def _require_no_error(self) -> None:
+    def _raise_server_error(self) -> None:
         """Raise what the server says instead of a picture, or that it says nothing at all."""
-        if self._came.endswith(ERROR) and self._came.isascii():
-            said = self._came[-160:].decode("ascii").strip()
+        if self._received.endswith(ERROR_MARK) and self._received.isascii():
+            said = self._received[-160:].decode("ascii").strip()
             raise DeviceError(f"the SPAD array could not take pictures: {' '.join(said.split())}")
         if monotonic() > self._deadline:
-            raise DeviceDisconnectedError(f"the SPAD array sent nothing for {self._patience:g} s beyond the exposure")
+            raise DeviceDisconnectedError(
+                f"the SPAD array sent nothing for {self._patience:g} s beyond the exposure"
+            )
 
     def _reconnect(self) -> None:
-        self._break_off()
+        self._count_truncated()
         self._link.close()
-        persistently(self._begin, self._reconnect_time)
+        retry_connect(self._open_link, self._reconnect_time)
         self._ledger.reconnect()
         self._gap = Gap.RESTART
 
-    def _break_off(self) -> None:
-        """Enter a picture of which only a part came; of those that never began nobody knows whether they were taken."""
-        if self._came:
-            self._ledger.break_off()
-        self._due = 0
-        self._came.clear()
+    def _count_truncated(self) -> None:
+        """Enter a picture of which only a part came; of those that never began nobody knows whether
+        they were taken.
+        """
+        if self._received:
+            self._ledger.truncate()
+        self._frames_due = 0
+        self._received.clear()
 
 
 def open_spad512(uri: Uri) -> StreamSource:
-    """Open ``spad512://HOST:9999?bits=8&exposure_us=1000&images=1&width=512&pile_up=0&timeout_s=5&reconnect_s=5``."""
-    uri.only(*OPTIONS)
-    host, port = uri.host_and_port(PORT)
-    patience, back = waiting(uri)
-    held, ledger = buffering(uri), Ledger()
-    feed = Spad512Feed(lambda: TcpLink(host, port, patience), ledger, exposure_of(uri), patience, back)
+    """Open
+    ``spad512://HOST:9999?bits=8&exposure_us=1000&images=1&width=512&pile_up=0&timeout_s=5&reconnect_s=5``.
+    """
+    uri.reject_unknown(*OPTIONS)
+    host, port = uri.host_and_port(DEFAULT_PORT)
+    patience, back = parse_timeouts(uri)
+    held, ledger = parse_buffer_settings(uri), Ledger()
+    feed = Spad512Feed(
+        lambda: TcpLink(host, port, patience), ledger, parse_exposure(uri), patience, back
+    )
     return StreamSource(feed, feed.codec, ledger, held)
 
 
-def exposure_of(uri: Uri) -> Exposure:
+def parse_exposure(uri: Uri) -> ExposureRequest:
     """Read the values of an address that say what pictures to take."""
-    standard = Exposure()
-    return Exposure(
+    standard = ExposureRequest()
+    return ExposureRequest(
         uri.value("bits", int, standard.bits),
         uri.value("exposure_us", float, standard.seconds * 1e6) * 1e-6,
         uri.value("images", int, standard.images),
@@ -185,6 +225,6 @@ def exposure_of(uri: Uri) -> Exposure:
     )
 
 
-def waiting(uri: Uri) -> tuple[float, float]:
+def parse_timeouts(uri: Uri) -> tuple[float, float]:
     """Read how long to wait for an answer and for a server that went away, s."""
-    return seconds(uri, "timeout_s", 5.0), seconds(uri, "reconnect_s", 5.0)
+    return parse_seconds(uri, "timeout_s", 5.0), parse_seconds(uri, "reconnect_s", 5.0)

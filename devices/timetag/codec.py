@@ -1,16 +1,15 @@
-"""The record stream of the FX2 time tagger (S. V. Polyakov, B. Gamari; gateware and format are public).
+"""The record stream of the FX2 time tagger (S. V. Polyakov, B. Gamari; gateware and format are
+public).
 
 A record is 6 bytes, the highest first::
 
-    bit 47     records were lost right before this one (the instrument's memory was full)
-    bit 46     the counter is at zero: it has wrapped
-    bit 45     0: strobe, the channels that saw an edge; 1: delta, the new levels of the delta channels
-    bits 44-40 unused, zero
-    bits 39-36 channels 3..0
+    bit 47     records were lost right before this one (the instrument's memory was full) bit 46
+    the counter is at zero: it has wrapped bit 45     0: strobe, the channels that saw an edge; 1:
+    delta, the new levels of the delta channels bits 44-40 unused, zero bits 39-36 channels 3..0
     bits 35-0  the counter, in ticks of the instrument's clock
 
-The counter wraps every 2**36 ticks (about nine minutes at 128 MHz), and the instrument sends a record each time it is
-at zero, whether or not a channel saw anything, so that none is missed.
+The counter wraps every 2**36 ticks (about nine minutes at 128 MHz), and the instrument sends a
+record each time it is at zero, whether or not a channel saw anything, so that none is missed.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from devices.codec import ByteView, Decoded, Records, as_bytes
+from devices.codec import ByteView, DecodeResult, Records, as_bytes
 from devices.timetag.kernels import (
     DELTA,
     LOST,
@@ -34,19 +33,30 @@ from devices.timetag.kernels import (
 from tofclip.errors import InputError
 from tofclip.storage import Scalar
 
-__all__ = ["DELTA", "LOST", "RANGE", "RECORD", "RECORD_BYTES", "WRAP", "TimeTagCodec", "mark_wraps"]
+__all__ = [
+    "COUNTER_RANGE",
+    "DELTA",
+    "LOST",
+    "RECORD_BYTES",
+    "RECORD_DTYPE",
+    "WRAP",
+    "TimeTagCodec",
+    "mark_wraps",
+]
 
-RANGE = 1 << TIME_BITS
+COUNTER_RANGE = 1 << TIME_BITS
 """Ticks after which the counter begins at zero again."""
 
-CHANNELS = 0xF
-FLAGS = DELTA | WRAP | LOST
+CHANNEL_MASK = 0xF
+FLAG_MASK = DELTA | WRAP | LOST
 
-RECORD = np.dtype([("time_ticks", np.int64), ("channels", np.uint32), ("flags", np.uint32)])
-"""`time_ticks`: since the counter was reset, wraps added up. `channels`: one bit each. `flags`: DELTA, WRAP, LOST."""
+RECORD_DTYPE = np.dtype([("time_ticks", np.int64), ("channels", np.uint32), ("flags", np.uint32)])
+"""`time_ticks`: since the counter was reset, wraps added up. `channels`: one bit each. `flags`:
+DELTA, WRAP, LOST.
+"""
 
 
-class Position(NamedTuple):
+class CounterState(NamedTuple):
     """How often the counter has wrapped, and its last value."""
 
     epoch: int = 0
@@ -56,38 +66,41 @@ class Position(NamedTuple):
 class TimeTagCodec:
     """Bytes of the time tagger to records and back.
 
-    A record is malformed if an unused bit is set, if it tells of nothing (no channel, no wrap), or if the counter goes
-    back although it has not wrapped. After a loss, a counter that went back by more than half its range has wrapped.
+    A record is malformed if an unused bit is set, if it tells of nothing (no channel, no wrap), or
+    if the counter goes back although it has not wrapped. After a loss, a counter that went back by
+    more than half its range has wrapped.
 
     Decoding allocates 16 bytes for each 6 of the stream.
     """
 
     name: ClassVar[str] = "timetag"
-    dtype = RECORD
-    start = Position()
+    dtype = RECORD_DTYPE
+    start = CounterState()
 
     @property
     def settings(self) -> Mapping[str, Scalar]:
         """Nothing about this format can be set."""
         return {}
 
-    def whole(self, data: ByteView) -> int:
+    def count_complete_bytes(self, data: ByteView) -> int:
         """Return how many bytes at the front of `data` form whole records."""
         return len(data) - len(data) % RECORD_BYTES
 
-    def count(self, data: ByteView) -> int:
+    def count_records(self, data: ByteView) -> int:
         """Return the number of records in `data`."""
         return len(data) // RECORD_BYTES
 
-    def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> Decoded:
-        """Decode whole records; `state` is a `Position`."""
+    def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
+        """Decode whole records; `state` is a `CounterState`."""
         words = as_bytes(data)
         if words.size % RECORD_BYTES:
-            raise InputError(f"{words.size} bytes are not a whole number of {RECORD_BYTES}-byte records")
-        records = np.empty(words.size // RECORD_BYTES, RECORD)
+            raise InputError(
+                f"{words.size} bytes are not a whole number of {RECORD_BYTES}-byte records"
+            )
+        records = np.empty(words.size // RECORD_BYTES, RECORD_DTYPE)
         columns = (records[name] for name in ("time_ticks", "channels", "flags"))
         kept, *position = decode_timetags(words, *state, after_loss, *columns)
-        return Decoded(records[:kept], len(records) - kept, Position(*position))
+        return DecodeResult(records[:kept], len(records) - kept, CounterState(*position))
 
     def encode(self, records: Records) -> bytes:
         """Return the bytes that the instrument would have sent.
@@ -114,29 +127,29 @@ def mark_wraps(records: Records) -> Records:
     Returns
     -------
     (m,) array of RECORD
-        With one record of flag WRAP at every multiple of `RANGE` ticks up to the last time. A record that is already
-        at such a time gets the flag instead.
+        With one record of flag WRAP at every multiple of `COUNTER_RANGE` ticks up to the last time.
+        A record that is already at such a time gets the flag instead.
     """
     ticks = records["time_ticks"]
     if len(ticks) == 0:
         return records.copy()
     marked = records.copy()
     _, firsts = np.unique(ticks, return_index=True)
-    at_zero = firsts[(ticks[firsts] % RANGE == 0) & (ticks[firsts] > 0)]
+    at_zero = firsts[(ticks[firsts] % COUNTER_RANGE == 0) & (ticks[firsts] > 0)]
     marked["flags"][at_zero] |= WRAP
-    wraps = np.arange(1, int(ticks[-1]) // RANGE + 1, dtype=np.int64) * RANGE
+    wraps = np.arange(1, int(ticks[-1]) // COUNTER_RANGE + 1, dtype=np.int64) * COUNTER_RANGE
     missing = np.setdiff1d(wraps, ticks[at_zero])
-    markers = np.zeros(len(missing), RECORD)
+    markers = np.zeros(len(missing), RECORD_DTYPE)
     markers["time_ticks"], markers["flags"] = missing, WRAP
     return np.insert(marked, np.searchsorted(ticks, missing), markers)
 
 
 def _require_valid(records: Records) -> None:
     """Refuse records that would not come back from `TimeTagCodec.decode` as they are."""
-    if records.dtype != RECORD or records.ndim != 1:
-        raise InputError(f"time tags must be a one-dimensional array of {RECORD}")
-    ticks, channels, flags = (records[name] for name in RECORD.names or ())
-    if np.any(channels > CHANNELS) or np.any(flags > FLAGS):
+    if records.dtype != RECORD_DTYPE or records.ndim != 1:
+        raise InputError(f"time tags must be a one-dimensional array of {RECORD_DTYPE}")
+    ticks, channels, flags = (records[name] for name in RECORD_DTYPE.names or ())
+    if np.any(channels > CHANNEL_MASK) or np.any(flags > FLAG_MASK):
         raise InputError("a time tag has 4 channels and 3 flags")
     if np.any((channels == 0) & (flags & (DELTA | WRAP) == 0)):
         raise InputError("a strobe needs a channel")
@@ -146,6 +159,8 @@ def _require_valid(records: Records) -> None:
     marked = flags & WRAP != 0
     wraps = np.diff(ticks >> TIME_BITS, prepend=0)
     counter = ticks & TIME_MASK
-    skipped = (flags & LOST != 0) & (steps < RANGE // 2) & ~marked
-    if np.any(wraps != np.where(skipped, np.minimum(wraps, 1), marked)) or np.any(marked & (counter != 0)):
+    skipped = (flags & LOST != 0) & (steps < COUNTER_RANGE // 2) & ~marked
+    if np.any(wraps != np.where(skipped, np.minimum(wraps, 1), marked)) or np.any(
+        marked & (counter != 0)
+    ):
         raise InputError("each wrap of the counter needs a record of its own; mark_wraps adds them")

@@ -1,4 +1,6 @@
-"""Compiled loops over the words of the time tagger's stream; see `devices.timetag.codec` for what the bits mean."""
+"""Compiled loops over the words of the time tagger's stream; see `devices.timetag.codec` for what
+the bits mean.
+"""
 
 from __future__ import annotations
 

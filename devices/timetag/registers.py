@@ -9,14 +9,14 @@ import struct
 from devices.usb import UsbIdentity, UsbLink
 from tofclip.errors import ProtocolError
 
-IDENTITY = UsbIdentity(0x04B4, 0x1004)
-BARE_CHIP = UsbIdentity(0x04B4, 0x8613)
+USB_IDENTITY = UsbIdentity(0x04B4, 0x1004)
+BARE_CHIP_IDENTITY = UsbIdentity(0x04B4, 0x8613)
 """The same chip before its firmware was loaded."""
 
 INSTRUMENT = "FX2 time tagger"
-COMMANDS, DATA, REPLIES = 0x02, 0x86, 0x88
+COMMAND_ENDPOINT, DATA_ENDPOINT, REPLY_ENDPOINT = 0x02, 0x86, 0x88
 PACKET_BYTES = 512
-REPLY_TIMEOUT = 1.0
+REPLY_TIMEOUT_S = 1.0
 
 _MAGIC, _READ, _WRITE = 0xAA, 0, 1
 
@@ -72,16 +72,24 @@ class TimeTagger:
         for counter in (Register.RECORDS, Register.LOST, Register.CLEAR):
             self.write(counter, 1)
 
-    def run(self, channels: int, delta: int, capture: Capture = Capture.COUNT | Capture.REGISTER) -> None:
-        """Start the counter, then the registration, so that the first zero of the counter is not taken for a wrap."""
+    def run(
+        self, channels: int, delta: int, capture: Capture = Capture.COUNT | Capture.REGISTER
+    ) -> None:
+        """Start the counter, then the registration, so that the first zero of the counter is not
+        taken for a wrap.
+        """
         self.write(Register.STROBE, channels)
         self.write(Register.DELTA, delta)
         self.write(Register.CAPTURE, Capture.COUNT)
         self.write(Register.CAPTURE, capture)
 
     def _exchange(self, what: int, register: Register, value: int) -> int:
-        self._link.write(COMMANDS, struct.pack("<BBHI", _MAGIC, what, register, value), REPLY_TIMEOUT)
-        length = self._link.read(REPLIES, self._reply, REPLY_TIMEOUT)
+        self._link.write(
+            COMMAND_ENDPOINT, struct.pack("<BBHI", _MAGIC, what, register, value), REPLY_TIMEOUT_S
+        )
+        length = self._link.read(REPLY_ENDPOINT, self._reply, REPLY_TIMEOUT_S)
         if length != 4:
-            raise ProtocolError(f"the time tagger answered {length} bytes about register {register}, expected 4")
+            raise ProtocolError(
+                f"the time tagger answered {length} bytes about register {register}, expected 4"
+            )
         return int.from_bytes(self._reply[:4].tobytes(), "little")

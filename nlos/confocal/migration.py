@@ -9,10 +9,15 @@ from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.confocal.kernels import migrate_row
-from nlos.confocal.scan import ConfocalScan, confocal_support, onto_grid, padded
+from nlos.confocal.scan import (
+    ConfocalScan,
+    check_confocal_support,
+    find_padded_length,
+    resample_to_grid,
+)
 from nlos.geometry import Grid
-from nlos.method import Progress, Support, silent
-from nlos.plane import step
+from nlos.method import Progress, Support, ignore_progress
+from nlos.plane import axis_step
 from nlos.volume import Volume
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks, thread_count
@@ -22,22 +27,26 @@ from tofclip.threads import run_blocks, thread_count
 class FKMigration:
     """Confocal imaging by f-k (Stolt) migration.
 
-    The signals are taken for a wave that all hidden points sent out at once and that travelled to the wall at half the
-    speed of light. A resampling of its spectrum, from frequency to depth wavenumber, gives the wave at that one
-    instant. Needs a confocal scan of a lattice on a plane z = const; copes with glossy and retroreflective things.
+    The signals are taken for a wave that all hidden points sent out at once and that travelled to
+    the wall at half the speed of light. A resampling of its spectrum, from frequency to depth
+    wavenumber, gives the wave at that one instant. Needs a confocal scan of a lattice on a plane z
+    = const; copes with glossy and retroreflective things.
 
-    The spectrum is interpolated about the middle of the record, where linear interpolation dims late signals least.
+    The spectrum is interpolated about the middle of the record, where linear interpolation dims
+    late signals least.
 
-    Memory: for P wall points and T bins, two half spectra of the box padded to twice its size along all three axes,
-    some 100 * P * T bytes (0.2 GB for 64 x 64 x 512); time: two transforms of that box.
+    Memory: for P wall points and T bins, two half spectra of the box padded to twice its size along
+    all three axes, some 100 * P * T bytes (0.2 GB for 64 x 64 x 512); time: two transforms of that
+    box.
 
-    Lindell, Wetzstein, O'Toole, "Wave-based non-line-of-sight imaging using fast f-k migration", ACM Trans. Graph. 38,
-    116 (2019), Eq. 7-9.
+    Lindell, Wetzstein, O'Toole, "Wave-based non-line-of-sight imaging using fast f-k migration",
+    ACM Trans. Graph. 38, 116 (2019), Eq. 7-9.
 
     Parameters
     ----------
     falloff : float
-        Power of the distance with which brightness falls: 4 for diffuse things, 2 for retroreflective ones.
+        Power of the distance with which brightness falls: 4 for diffuse things, 2 for
+        retroreflective ones.
     """
 
     falloff: float = 4.0
@@ -47,16 +56,21 @@ class FKMigration:
             raise InputError(f"falloff must be a power of 0 or more, got {self.falloff}")
 
     def supports(self, capture: Capture, grid: Grid) -> Support:
-        """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with ``.reason``."""
-        return confocal_support(capture, grid)
+        """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with
+        ``.reason``.
+        """
+        return check_confocal_support(capture, grid)
 
-    def reconstruct(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
+    def reconstruct(
+        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
+    ) -> Volume:
         """Image the hidden scene.
 
         Parameters
         ----------
         capture : Capture
-            Without the light that the wall returns at once; see `nlos.preparation.without_first_bounce`.
+            Without the light that the wall returns at once; see
+            `nlos.preparation.remove_first_bounce`.
         grid : Grid
             Up to half a wall beyond the wall's edges; read by linear interpolation.
         progress : callable, optional
@@ -74,45 +88,56 @@ class FKMigration:
         """
         self.supports(capture, grid).require()
         scan = ConfocalScan.of(capture, grid)
-        energy = _energy(_migrated(self._spectrum(scan), scan), scan.signal.shape[2])
-        image = onto_grid(energy, scan, grid, (grid.z - scan.plane.z) / scan.spacing)
+        energy = _compute_energy(
+            _migrate_spectrum(self._compute_spectrum(scan), scan), scan.signal.shape[2]
+        )
+        image = resample_to_grid(energy, scan, grid, (grid.z - scan.plane.z) / scan.spacing)
         progress(grid.size)
         settings = {"method": "fk", "falloff": self.falloff}
         return Volume(image, grid, {**capture.provenance, "imaging": settings})
 
-    def _spectrum(self, scan: ConfocalScan) -> NDArray[np.complex64]:
-        """Spectrum (ky, kx, frequency >= 0) of the wave's amplitude; its middle in time stands at time 0."""
+    def _compute_spectrum(self, scan: ConfocalScan) -> NDArray[np.complex64]:
+        """Spectrum (ky, kx, frequency >= 0) of the wave's amplitude; its middle in time stands at
+        time 0.
+        """
         from scipy.fft import fft2, rfft
 
         rows, columns, bins = scan.signal.shape
-        brightness = scan.weighted(self.falloff)
+        brightness = scan.correct_falloff(self.falloff)
         wave = np.copysign(np.sqrt(np.abs(brightness)), brightness)
-        period, workers = padded(bins), thread_count()
+        period, workers = find_padded_length(bins), thread_count()
         spectrum = rfft(wave, period, workers=workers)
-        spectrum *= np.exp(2j * np.pi * (bins // 2) / period * np.arange(spectrum.shape[2])).astype(np.complex64)
-        lateral: NDArray[np.complex64] = fft2(spectrum, (padded(rows), padded(columns)), axes=(0, 1), workers=workers)
+        spectrum *= np.exp(2j * np.pi * (bins // 2) / period * np.arange(spectrum.shape[2])).astype(
+            np.complex64
+        )
+        lateral: NDArray[np.complex64] = fft2(
+            spectrum,
+            (find_padded_length(rows), find_padded_length(columns)),
+            axes=(0, 1),
+            workers=workers,
+        )
         return lateral
 
 
-def _migrated(spectrum: NDArray[np.complex64], scan: ConfocalScan) -> NDArray[np.complex64]:
+def _migrate_spectrum(spectrum: NDArray[np.complex64], scan: ConfocalScan) -> NDArray[np.complex64]:
     """Resample the spectrum from frequency to depth wavenumber, in place."""
     bins = scan.signal.shape[2]
-    period = padded(bins)
+    period = find_padded_length(bins)
     ky, kx = (
-        np.fft.fftfreq(n, step(axis)) * period * scan.spacing
+        np.fft.fftfreq(n, axis_step(axis)) * period * scan.spacing
         for n, axis in zip(spectrum.shape[:2], (scan.plane.y, scan.plane.x), strict=True)
     )
     delay = 2 * np.pi * (bins // 2) / period
 
-    def work(rows: slice) -> None:
+    def process_block(rows: slice) -> None:
         for r in range(rows.start, rows.stop):
             migrate_row(spectrum[r], ky[r], kx, delay)
 
-    run_blocks(work, spectrum.shape[0], 8)
+    run_blocks(process_block, spectrum.shape[0], 8)
     return spectrum
 
 
-def _energy(spectrum: NDArray[np.complex64], bins: int) -> NDArray[np.float32]:
+def _compute_energy(spectrum: NDArray[np.complex64], bins: int) -> NDArray[np.float32]:
     """Return the wave's energy (y, x, depth), from its spectrum without negative depth wavenumbers."""
     from scipy.fft import ifft, ifft2
 
@@ -120,9 +145,9 @@ def _energy(spectrum: NDArray[np.complex64], bins: int) -> NDArray[np.float32]:
     wave = ifft2(spectrum, axes=(0, 1), workers=workers, overwrite_x=True)
     energy = np.empty((*wave.shape[:2], bins), np.float32)
 
-    def work(rows: slice) -> None:
-        field = ifft(wave[rows], padded(bins))[..., :bins]
+    def process_block(rows: slice) -> None:
+        field = ifft(wave[rows], find_padded_length(bins))[..., :bins]
         energy[rows] = field.real**2 + field.imag**2
 
-    run_blocks(work, wave.shape[0], 8)
+    run_blocks(process_block, wave.shape[0], 8)
     return energy

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.geometry import FloatArray, Grid
-from nlos.kernels import delayed_reading
-from nlos.method import Support, common_support, numpy_support
-from nlos.plane import Plane, step
+from nlos.kernels import shift_signals
+from nlos.method import Support, check_common_support, check_numpy_support
+from nlos.plane import Plane, axis_step
 from nlos.rsd.wall import PlanarWall
 from tofclip.errors import InputError
 
-OFF_LATTICE = 0.02
+LATTICE_TOLERANCE = 0.02
 """Points may be off the lattice by this fraction of its step."""
 
 MEMORY_LIMIT_BYTES = 4 << 30
@@ -25,7 +25,7 @@ BYTES_PER_SAMPLE = 12
 """Of the padded box (2 rows, 2 columns, 2 bins): two half spectra in complex64, and the signals and what is cut out of
 the result besides."""
 
-NOTHING_TO_MOVE = 1e-3
+WHOLE_BIN_TOLERANCE = 1e-3
 """A start that lies this close to a whole bin, in bins, is taken for one."""
 
 
@@ -49,67 +49,87 @@ class ConfocalScan:
 
     @classmethod
     def of(cls, capture: Capture, grid: Grid) -> ConfocalScan:
-        """Sort a capture onto its lattice, from distance 0 as far as any voxel of the grid is from any wall point."""
-        wall = PlanarWall.of(capture.points, OFF_LATTICE)
-        traces = _from_distance_zero(capture, _useful_bins(capture, wall.plane, grid))
+        """Sort a capture onto its lattice, from distance 0 as far as any voxel of the grid is from
+        any wall point.
+        """
+        wall = PlanarWall.of(capture.points, LATTICE_TOLERANCE)
+        traces = _shift_to_distance_zero(capture, _count_useful_bins(capture, wall.plane, grid))
         return cls(wall.field(traces), wall.plane, capture.axis.spacing / 2)
 
-    def weighted(self, falloff: float) -> NDArray[np.float32]:
-        """Undo the loss of brightness with distance d by the factor d^falloff; the farthest bin keeps its scale."""
+    def correct_falloff(self, falloff: float) -> NDArray[np.float32]:
+        """Undo the loss of brightness with distance d by the factor d^falloff; the farthest bin
+        keeps its scale.
+        """
         relative = np.arange(self.signal.shape[2], dtype=np.float32) / (self.signal.shape[2] - 1)
         return np.asarray(self.signal * relative**falloff, dtype=np.float32)
 
 
-def confocal_support(capture: Capture, grid: Grid) -> Support:
-    """Check what both methods need: a confocal scan on a lattice of a plane, a grid close by, and memory."""
-    basic = numpy_support("a light-cone transform or f-k migration", capture) and common_support(capture, grid)
+def check_confocal_support(capture: Capture, grid: Grid) -> Support:
+    """Check what both methods need: a confocal scan on a lattice of a plane, a grid close by, and
+    memory.
+    """
+    basic = check_numpy_support(
+        "a light-cone transform or f-k migration", capture
+    ) and check_common_support(capture, grid)
     if not basic:
         return basic
     try:
-        plane = PlanarWall.of(capture.points, OFF_LATTICE).plane
+        plane = PlanarWall.of(capture.points, LATTICE_TOLERANCE).plane
     except InputError as problem:
         return Support(f"a lattice of points on a plane is needed: {problem}")
-    return Support(_laser_problem(capture, plane) or _reach_problem(plane, grid) or _size_problem(capture, plane))
+    return Support(
+        _find_laser_problem(capture, plane)
+        or _find_extent_problem(plane, grid)
+        or _find_memory_problem(capture, plane)
+    )
 
 
-def padded(count: int) -> int:
+def find_padded_length(count: int) -> int:
     """At least twice as many samples: an even number that Fourier transforms are quick with."""
     from scipy.fft import next_fast_len
 
     return 2 * int(next_fast_len(count))
 
 
-def interpolated(values: NDArray[np.float32], position: FloatArray, axis: int) -> NDArray[np.float32]:
+def interpolate_axis(
+    values: NDArray[np.float32], position: FloatArray, axis: int
+) -> NDArray[np.float32]:
     """Read an axis at fractional positions by linear interpolation; it is periodic."""
     below = np.floor(position).astype(np.intp)
-    share = (position - below).astype(np.float32)
-    share = share.reshape([-1 if i == axis else 1 for i in range(values.ndim)])
+    weight = (position - below).astype(np.float32)
+    weight = weight.reshape([-1 if i == axis else 1 for i in range(values.ndim)])
     count = values.shape[axis]
     lower, upper = (np.take(values, index % count, axis) for index in (below, below + 1))
-    return np.asarray(lower + share * (upper - lower))
+    return np.asarray(lower + weight * (upper - lower))
 
 
-def onto_grid(
+def resample_to_grid(
     values: NDArray[np.float32], scan: ConfocalScan, grid: Grid, depth_position: FloatArray
 ) -> NDArray[np.float32]:
     """Read an image (y, x, depth) on the padded lattice at the voxels of a grid, shape (z, y, x)."""
-    image = interpolated(values, depth_position, 2)
-    row, column = ((wanted - axis[0]) / step(axis) for wanted, axis in ((grid.y, scan.plane.y), (grid.x, scan.plane.x)))
-    return np.ascontiguousarray(np.moveaxis(interpolated(interpolated(image, column, 1), row, 0), 2, 0))
+    image = interpolate_axis(values, depth_position, 2)
+    row, column = (
+        (wanted - axis[0]) / axis_step(axis)
+        for wanted, axis in ((grid.y, scan.plane.y), (grid.x, scan.plane.x))
+    )
+    return np.ascontiguousarray(
+        np.moveaxis(interpolate_axis(interpolate_axis(image, column, 1), row, 0), 2, 0)
+    )
 
 
-def _laser_problem(capture: Capture, plane: Plane) -> str:
+def _find_laser_problem(capture: Capture, plane: Plane) -> str:
     if len(capture.lasers) != len(capture.points):
         return "a confocal scan is needed, where every wall point is its own laser spot; use another method"
     apart = float(np.abs(capture.lasers - capture.points).max())
-    if apart > OFF_LATTICE * min(plane.steps):
+    if apart > LATTICE_TOLERANCE * min(plane.steps):
         return (
-            f"a confocal scan is needed, but lasers are up to {apart:.3g} m from their wall points; use another method"
+            f"a confocal scan is needed, but lasers are up to {apart:.3g} m from their wall points; "
+            "use another method"
         )
     return ""
 
 
-def _reach_problem(plane: Plane, grid: Grid) -> str:
+def _find_extent_problem(plane: Plane, grid: Grid) -> str:
     for name, axis, wanted in (("x", plane.x, grid.x), ("y", plane.y, grid.y)):
         margin = (axis[-1] - axis[0]) / 2
         low, high = axis[0] - margin, axis[-1] + margin
@@ -121,7 +141,7 @@ def _reach_problem(plane: Plane, grid: Grid) -> str:
     return ""
 
 
-def _size_problem(capture: Capture, plane: Plane) -> str:
+def _find_memory_problem(capture: Capture, plane: Plane) -> str:
     places = plane.x.size * plane.y.size
     bins = capture.axis.bins + max(0, int(capture.start / capture.axis.spacing))
     needed = 8 * places * bins * BYTES_PER_SAMPLE
@@ -133,10 +153,12 @@ def _size_problem(capture: Capture, plane: Plane) -> str:
     )
 
 
-def _useful_bins(capture: Capture, plane: Plane, grid: Grid) -> int:
+def _count_useful_bins(capture: Capture, plane: Plane, grid: Grid) -> int:
     """Bins from path 0 to the end of the record, or as far as light of the grid can come from."""
     across = [
-        max(abs(voxel - point) for voxel in (wanted[0], wanted[-1]) for point in (axis[0], axis[-1]))
+        max(
+            abs(voxel - point) for voxel in (wanted[0], wanted[-1]) for point in (axis[0], axis[-1])
+        )
         for axis, wanted in ((plane.x, grid.x), (plane.y, grid.y))
     ]
     farthest = float(np.hypot(np.hypot(*across), grid.z[-1] - plane.z))
@@ -144,14 +166,16 @@ def _useful_bins(capture: Capture, plane: Plane, grid: Grid) -> int:
     return max(2, min(recorded, int(np.ceil(2 * farthest / capture.axis.spacing)) + 2))
 
 
-def _from_distance_zero(capture: Capture, bins: int) -> NDArray[np.float32]:
-    """Signals (points, bins) whose bin 0 is path 0: moved by whole bins where that suffices, else interpolated."""
-    late = capture.start / capture.axis.spacing
-    whole = round(late)
+def _shift_to_distance_zero(capture: Capture, bins: int) -> NDArray[np.float32]:
+    """Signals (points, bins) whose bin 0 is path 0: moved by whole bins where that suffices, else
+    interpolated.
+    """
+    delay = capture.start / capture.axis.spacing
+    whole = round(delay)
     traces = capture.traces()
-    if abs(late - whole) > NOTHING_TO_MOVE:
+    if abs(delay - whole) > WHOLE_BIN_TOLERANCE:
         by_bin = np.ascontiguousarray(traces.T)
-        traces = np.ascontiguousarray(delayed_reading(by_bin, np.full(len(traces), whole - late)).T)
+        traces = np.ascontiguousarray(shift_signals(by_bin, np.full(len(traces), whole - delay)).T)
     moved = np.zeros((len(traces), bins), np.float32)
     first, last = max(0, whole), min(bins, whole + traces.shape[1])
     if first < last:

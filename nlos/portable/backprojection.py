@@ -1,4 +1,6 @@
-"""Back-projection on the arrays of any library: every voxel looks up its paths in the wall points' waveforms."""
+"""Back-projection on the arrays of any library: every voxel looks up its paths in the wall points'
+waveforms.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +12,12 @@ import numpy as np
 from nlos.band import Band
 from nlos.capture import Capture
 from nlos.geometry import Grid
-from nlos.kernels import NEAREST
+from nlos.kernels import MIN_DISTANCE_M
 from nlos.method import Progress
-from nlos.portable.library import Library
-from nlos.portable.signals import Analysis, traces_of
+from nlos.portable.library import ArrayLibrary
+from nlos.portable.signals import BandTransform, get_traces
 from tofclip.arrays import Array
-from tofclip.threads import blocks
+from tofclip.threads import split_blocks
 
 if TYPE_CHECKING:
     from nlos.backprojection import Weighting
@@ -23,15 +25,17 @@ if TYPE_CHECKING:
 TABLE_BYTES = 64 << 20
 """Waveforms held at a time."""
 
-PAIR_BYTES = 16
+BYTES_PER_PAIR = 16
 """A pair of voxel and wall point takes five times as much, in several arrays."""
 
 
-def smeared_elsewhere(capture: Capture, grid: Grid, band: Band, weighting: Weighting, progress: Progress) -> Array:
+def backproject_on_device(
+    capture: Capture, grid: Grid, band: Band, weighting: Weighting, progress: Progress
+) -> Array:
     """Return the complex sum of `nlos.Backprojection` where the capture's signal lives.
 
-    Memory: the volume, 64 MiB of waveforms, and five chunks (`Library.chunk_bytes`) for the pairs of voxel and wall
-    point that are looked up at a time.
+    Memory: the volume, 64 MiB of waveforms, and five chunks (`ArrayLibrary.chunk_bytes`) for the
+    pairs of voxel and wall point that are looked up at a time.
 
     Parameters
     ----------
@@ -46,16 +50,19 @@ def smeared_elsewhere(capture: Capture, grid: Grid, band: Band, weighting: Weigh
     -------
     (z, y, x) complex64 array
     """
-    library = Library(capture.place)
-    rows = _Rows(grid, library, weighting)
+    library = ArrayLibrary(capture.device)
+    rows = _VoxelRows(grid, library, weighting)
     total = library.zeros((rows.count, grid.x.size))
-    analysis, pairs = Analysis(band, capture.axis.bins, library), library.chunk_bytes // PAIR_BYTES
-    size = min(TABLE_BYTES // (8 * band.samples), max(1, pairs // grid.x.size))
-    for points in blocks(len(capture.points), max(1, size)):
+    analysis, pairs = (
+        BandTransform(band, capture.axis.bins, library),
+        library.chunk_bytes // BYTES_PER_PAIR,
+    )
+    size = min(TABLE_BYTES // (8 * band.sample_count), max(1, pairs // grid.x.size))
+    for points in split_blocks(len(capture.points), max(1, size)):
         waveforms = _Waveforms.of(capture, points, band, analysis)
         count = points.stop - points.start
-        for some in blocks(rows.count, max(1, pairs // (grid.x.size * count))):
-            total[some, :] += rows.looked_up(some, waveforms)
+        for some in split_blocks(rows.count, max(1, pairs // (grid.x.size * count))):
+            total[some, :] += rows.look_up(some, waveforms)
             progress((some.stop - some.start) * grid.x.size * count)
     return library.xp.reshape(total, grid.shape)
 
@@ -68,7 +75,7 @@ class _Waveforms:
     ----------
     values : (points * samples,) complex64 array
         The first and the last two samples of a point are 0.
-    samples : int
+    sample_count : int
     start, spacing : float
         Path length of the first sample, and path between samples, m.
     first : (points,) int64 array
@@ -78,7 +85,7 @@ class _Waveforms:
     """
 
     values: Array
-    samples: int
+    sample_count: int
     start: float
     spacing: float
     first: Array
@@ -86,14 +93,14 @@ class _Waveforms:
     lasers: Array
 
     @classmethod
-    def of(cls, capture: Capture, points: slice, band: Band, analysis: Analysis) -> _Waveforms:
-        library, (carriers, start, spacing) = Library(capture.place), band.carriers
-        values = analysis.of(traces_of(capture, points)) @ library.put(carriers)
-        first = band.samples * np.arange(values.shape[0])
+    def of(cls, capture: Capture, points: slice, band: Band, analysis: BandTransform) -> _Waveforms:
+        library, (carriers, start, spacing) = ArrayLibrary(capture.device), band.carriers
+        values = analysis.of(get_traces(capture, points)) @ library.put(carriers)
+        first = band.sample_count * np.arange(values.shape[0])
         lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[points]
         return cls(
             library.xp.reshape(values, (-1,)),
-            band.samples,
+            band.sample_count,
             start,
             spacing,
             library.put(first),
@@ -102,33 +109,45 @@ class _Waveforms:
         )
 
 
-class _Rows:
+class _VoxelRows:
     """The rows of voxels along x of a grid, row after row."""
 
-    def __init__(self, grid: Grid, library: Library, weighting: Weighting) -> None:
+    def __init__(self, grid: Grid, library: ArrayLibrary, weighting: Weighting) -> None:
         self.library, self.weighting = library, weighting
         z, y = np.meshgrid(grid.z, grid.y, indexing="ij")
         self.count = y.size
         self.x = library.put(grid.x[:, np.newaxis])
         self.y, self.z = (library.put(axis.reshape(-1, 1, 1)) for axis in (y, z))
 
-    def looked_up(self, some: slice, waveforms: _Waveforms) -> Array:
+    def look_up(self, some: slice, waveforms: _Waveforms) -> Array:
         """Return what some rows (rows, x) find in the waveforms."""
         xp, wall = self.library.xp, waveforms.wall
         y, z = self.y[some, ...], self.z[some, ...]
-        squared = xp.clip((y - wall[1, :]) ** 2 + (z - wall[2, :]) ** 2, NEAREST**2, None) + (self.x - wall[0, :]) ** 2
+        squared = (
+            xp.clip((y - wall[1, :]) ** 2 + (z - wall[2, :]) ** 2, MIN_DISTANCE_M**2, None)
+            + (self.x - wall[0, :]) ** 2
+        )
         distance, laser = xp.sqrt(squared), waveforms.lasers
-        outward = xp.sqrt((self.x - laser[0, :]) ** 2 + (y - laser[1, :]) ** 2 + (z - laser[2, :]) ** 2)
+        outward = xp.sqrt(
+            (self.x - laser[0, :]) ** 2 + (y - laser[1, :]) ** 2 + (z - laser[2, :]) ** 2
+        )
         # Samples that the path is late by, in the order in which single precision loses least.
-        place = (outward - waveforms.start) * (1 / waveforms.spacing) + distance * (1 / waveforms.spacing)
-        place = xp.clip(place, 0.0, float(waveforms.samples - 2))
+        place = (outward - waveforms.start) * (1 / waveforms.spacing) + distance * (
+            1 / waveforms.spacing
+        )
+        place = xp.clip(place, 0.0, float(waveforms.sample_count - 2))
         before = xp.astype(place, xp.int64)
-        share = place - xp.astype(before, place.dtype)
+        weight = place - xp.astype(before, place.dtype)
         index = xp.reshape(before + waveforms.first, (-1,))
-        here, there = (xp.reshape(xp.take(waveforms.values, one), share.shape) for one in (index, index + 1))
-        return xp.sum((here + share * (there - here)) * self._weight(distance, z - wall[2, :]), axis=-1)
+        here, there = (
+            xp.reshape(xp.take(waveforms.values, one), weight.shape) for one in (index, index + 1)
+        )
+        return xp.sum(
+            (here + weight * (there - here)) * self._compute_weights(distance, z - wall[2, :]),
+            axis=-1,
+        )
 
-    def _weight(self, distance: Array, ahead: Array) -> Array:
+    def _compute_weights(self, distance: Array, ahead: Array) -> Array:
         falloff, obliquity = self.weighting.falloff, self.weighting.obliquity
         weight = 1 / distance if falloff == 1 else distance**-falloff
         if obliquity == 0:

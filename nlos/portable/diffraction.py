@@ -1,4 +1,6 @@
-"""From a plane to all depths on the arrays of any library: the diffraction of `nlos.rsd.meeting` in matrix products."""
+"""From a plane to all depths on the arrays of any library: the diffraction of
+`nlos.rsd.image_planes` in matrix products.
+"""
 
 from __future__ import annotations
 
@@ -9,22 +11,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.depths import Depths
-from nlos.method import Progress, silent
-from nlos.portable.library import Library, whole_turns_off
-from nlos.rsd.diffraction import Diffraction
+from nlos.depths import DepthPropagator
+from nlos.method import Progress, ignore_progress
+from nlos.portable.library import ArrayLibrary, remove_whole_turns
+from nlos.rsd.diffraction import DiffractionPlan
 from nlos.rsd.illumination import Illumination
+from nlos.rsd.image_planes import LaserSource
 from nlos.rsd.kernels import TAPS
-from nlos.rsd.meeting import Source
 from tofclip.arrays import Array
-from tofclip.threads import blocks, run_blocks
+from tofclip.threads import run_blocks, split_blocks
 
-KEPT_BYTES = 1 << 30
-"""Transfer functions and illuminations of all depths are kept for the next field if they take no more."""
+MAX_CACHE_BYTES = 1 << 30
+"""Transfer functions and illuminations of all depths are kept for the next field if they take no
+more.
+"""
 
 
 @dataclass(frozen=True, eq=False)
-class _Planes:
+class _DepthBlock:
     """What some neighbouring depths need, as arrays of the library.
 
     Parameters
@@ -37,45 +41,47 @@ class _Planes:
         Of the illumination's functions, 0 where a depth has fewer.
     table : (z * samples, m) float32 array
         The functions themselves.
-    ahead : (z, 1, 1) float32 array
+    axial_distance : (z, 1, 1) float32 array
         Distance along z from the laser spot, m.
     turns : (z, 1, 1) float32 array
-        What the illumination's carrier turns by over `ahead`.
-    place : (z, 1, 1) and (z, 1, 1) float32 arrays
-        Of `ahead` in the table, and samples per metre.
+        What the illumination's carrier turns by over `axial_distance`.
+    table_position : (z, 1, 1) and (z, 1, 1) float32 arrays
+        Of `axial_distance` in the table, and samples per metre.
     """
 
     indices: slice
     transfer: Array
     coefficients: Array
     table: Array
-    ahead: Array
+    axial_distance: Array
     turns: Array
-    place: tuple[Array, Array]
+    table_position: tuple[Array, Array]
 
 
 class PortableDiffraction:
     """Fields on one plane carried to all depths of a grid, where they meet the laser's wave.
 
-    Holding one is the cache: the second field of the same geometry needs no planning. Transfer functions and
-    illuminations of all depths are kept up to 1 GiB (50 MB for 128 depths, 120 frequencies and 400 nodes), beyond that
-    made anew for every field. Memory besides: four chunks (`Library.chunk_bytes`) for the depths that are treated
-    together, and at least 60 bytes per plane wave and frequency.
+    Holding one is the cache: the second field of the same geometry needs no planning. Transfer
+    functions and illuminations of all depths are kept up to 1 GiB (50 MB for 128 depths, 120
+    frequencies and 400 nodes), beyond that made anew for every field. Memory besides: four chunks
+    (`ArrayLibrary.chunk_bytes`) for the depths that are treated together, and at least 60 bytes per
+    plane wave and frequency.
 
     Parameters
     ----------
-    way : Diffraction
+    plan : Diffraction
     source : Source
     library : Library
     """
 
-    def __init__(self, way: Diffraction, source: Source, library: Library) -> None:
-        self.way, self.source, self.library = way, source, library
-        self._depths = Depths(way)
-        self._kept: list[_Planes] = []
+    def __init__(self, plan: DiffractionPlan, source: LaserSource, library: ArrayLibrary) -> None:
+        self.plan, self.source, self.library = plan, source, library
+        self._depths = DepthPropagator(plan)
+        self._cached_blocks: list[_DepthBlock] = []
 
-    def add(self, values: Array, total: Array, progress: Progress = silent) -> None:
-        """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r; see `nlos.rsd.meeting.diffract`.
+    def add(self, values: Array, total: Array, progress: Progress = ignore_progress) -> None:
+        """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r; see
+        `nlos.rsd.image_planes.diffract_to_grid`.
 
         Parameters
         ----------
@@ -86,120 +92,153 @@ class PortableDiffraction:
         progress : callable, optional
             Called with the number of voxels just done.
         """
-        spectrum = self._spectrum(values)
-        for planes in self._planes():
-            total[planes.indices, ...] += self._lit(planes, self._images(planes, spectrum))
+        spectrum = self._to_spectrum(values)
+        for planes in self._iterate_blocks():
+            total[planes.indices, ...] += self._illuminate(
+                planes, self._to_images(planes, spectrum)
+            )
             progress((planes.indices.stop - planes.indices.start) * total.shape[1] * total.shape[2])
 
-    def _spectrum(self, values: Array) -> Array:
+    def _to_spectrum(self, values: Array) -> Array:
         """Plane waves (waves, frequencies) of a field (y, x, frequencies)."""
         xp, (along_y, along_x) = self.library.xp, self._from_plane
         rows, columns, count = values.shape
-        half = xp.reshape(along_y @ xp.reshape(values, (rows, columns * count)), (-1, columns, count))
-        return xp.take(xp.reshape(along_x @ half, (-1, count)), self._cell, axis=0) * self._share
+        half = xp.reshape(
+            along_y @ xp.reshape(values, (rows, columns * count)), (-1, columns, count)
+        )
+        return (
+            xp.take(xp.reshape(along_x @ half, (-1, count)), self._cell_indices, axis=0)
+            * self._wave_weights
+        )
 
-    def _images(self, planes: _Planes, spectrum: Array) -> Array:
+    def _to_images(self, planes: _DepthBlock, spectrum: Array) -> Array:
         """Images (z, m, y, x) of the terms of some depths."""
         xp, (along_y, along_x) = self.library.xp, self._to_voxels
-        node, shares, turn = self._interpolation
-        at_laterals = shares[0] * xp.take(planes.transfer, node, axis=1)
+        node, weights, turn = self._node_interpolation
+        at_laterals = weights[0] * xp.take(planes.transfer, node, axis=1)
         for tap in range(1, TAPS):
-            at_laterals = at_laterals + shares[tap] * xp.take(planes.transfer, node + tap, axis=1)
+            at_laterals = at_laterals + weights[tap] * xp.take(planes.transfer, node + tap, axis=1)
         terms = (spectrum * xp.take(at_laterals, turn, axis=1)) @ planes.coefficients
         depths, _, count = terms.shape
         # One wave more, which is 0: that is what stands in the corners, where no wave travels.
-        padded = xp.concat([xp.permute_dims(terms, (0, 2, 1)), self.library.zeros((depths, count, 1))], axis=2)
+        padded = xp.concat(
+            [xp.permute_dims(terms, (0, 2, 1)), self.library.zeros((depths, count, 1))], axis=2
+        )
         spectra = xp.take(padded, self._wave_in_cell, axis=2)
-        return along_y @ xp.reshape(spectra, (depths, count, along_y.shape[1], along_x.shape[0])) @ along_x
+        return (
+            along_y
+            @ xp.reshape(spectra, (depths, count, along_y.shape[1], along_x.shape[0]))
+            @ along_x
+        )
 
-    def _lit(self, planes: _Planes, images: Array) -> Array:
+    def _illuminate(self, planes: _DepthBlock, images: Array) -> Array:
         """Let the laser's wave meet the images: the field (z, y, x)."""
         xp = self.library.xp
         if self.source.laser is None:
             return images[:, 0, :, :]
-        # How much longer the way is than straight along z: shorter than the way, and so with finer digits.
-        longer = self._across / (xp.sqrt(self._across + planes.ahead**2) + planes.ahead)
-        start, per_metre = planes.place
+        # How much longer the way is than straight along z: shorter than the way, and so with finer
+        # digits.
+        longer = self._lateral_distance_squared / (
+            xp.sqrt(self._lateral_distance_squared + planes.axial_distance**2)
+            + planes.axial_distance
+        )
+        start, per_metre = planes.table_position
         place = xp.clip(start + longer * per_metre, 0.0, None)
-        samples = planes.table.shape[0] // planes.ahead.shape[0]
+        samples = planes.table.shape[0] // planes.axial_distance.shape[0]
         before = xp.clip(xp.astype(place, xp.int64), None, samples - 2)
-        share = (place - xp.astype(before, place.dtype))[:, None, :, :]
-        first = before + samples * xp.reshape(self._numbers[: planes.ahead.shape[0]], (-1, 1, 1))
+        weight = (place - xp.astype(before, place.dtype))[:, None, :, :]
+        first = before + samples * xp.reshape(
+            self._depth_numbers[: planes.axial_distance.shape[0]], (-1, 1, 1)
+        )
         here, there = (
-            xp.permute_dims(xp.reshape(xp.take(planes.table, index, axis=0), (*before.shape, -1)), (0, 3, 1, 2))
+            xp.permute_dims(
+                xp.reshape(xp.take(planes.table, index, axis=0), (*before.shape, -1)), (0, 3, 1, 2)
+            )
             for index in (xp.reshape(first, (-1,)), xp.reshape(first + 1, (-1,)))
         )
-        field = xp.sum(images * (here + share * (there - here)), axis=1)
-        return field * self.library.turned(planes.turns + longer * (self.source.centre / (2 * np.pi)))
+        field = xp.sum(images * (here + weight * (there - here)), axis=1)
+        return field * self.library.exp_turns(
+            planes.turns + longer * (self.source.centre_wavenumber / (2 * np.pi))
+        )
 
-    def _planes(self) -> Any:
+    def _iterate_blocks(self) -> Any:
         """Yield the depths, some at a time."""
-        if self._kept:
-            yield from self._kept
+        if self._cached_blocks:
+            yield from self._cached_blocks
             return
-        waves, frequencies = self._share.shape
+        waves, frequencies = self._wave_weights.shape
         size = max(1, self.library.chunk_bytes // (8 * waves * frequencies))
-        nodes = self.way.transfer.nodes.size
-        keeping = 8 * self.way.grid.z.size * nodes * frequencies <= KEPT_BYTES
+        nodes = self.plan.transfer.nodes.size
+        is_cached = 8 * self.plan.grid.z.size * nodes * frequencies <= MAX_CACHE_BYTES
         made = []
-        for some in blocks(self.way.grid.z.size, size):
-            planes = self._planned(some)
-            if keeping:
+        for some in split_blocks(self.plan.grid.z.size, size):
+            planes = self._plan_block(some)
+            if is_cached:
                 made.append(planes)
             yield planes
-        self._kept = made
+        self._cached_blocks = made
 
-    def _planned(self, some: slice) -> _Planes:
+    def _plan_block(self, some: slice) -> _DepthBlock:
         """Plan some depths on this machine's processor, and bring what they need to the library."""
-        depths, count = self.way.grid.z[some], some.stop - some.start
+        depths, count = self.plan.grid.z[some], some.stop - some.start
         lights: list[Any] = [None] * count
-        transfer = np.empty((count, self.way.transfer.nodes.size, self.way.waves.count), np.complex64)
-        _ = self.way.transfer.prepared
+        transfer = np.empty(
+            (count, self.plan.transfer.nodes.size, self.plan.waves.count), np.complex64
+        )
+        _ = self.plan.transfer.bessel_matrix
 
         def plan(planes: slice) -> None:
             for i in range(planes.start, planes.stop):
-                light = lights[i] = self.source.on_plane(self.way, float(depths[i]))
-                delay = np.array([light.span.mean(), self.source.centre])
-                nodes = self.way.transfer.at(float(depths[i]) - self.way.plane.z, delay)
+                light = lights[i] = self.source.illuminate_plane(self.plan, float(depths[i]))
+                delay = np.array([light.span.mean(), self.source.centre_wavenumber])
+                nodes = self.plan.transfer.evaluate(float(depths[i]) - self.plan.plane.z, delay)
                 transfer[i].real, transfer[i].imag = nodes[:, 0], nodes[:, 1]
 
         run_blocks(plan, count, size=1)
-        coefficients, table = _together(lights)
+        coefficients, table = _stack_illuminations(lights)
         put = self.library.put
         ahead = np.abs(depths - (0.0 if self.source.laser is None else self.source.laser[2]))
         spans = np.array([light.span for light in lights])
         per_metre = (len(lights[0].table) - 1) / np.maximum(spans[:, 1] - spans[:, 0], 1e-12)
-        turns = whole_turns_off(self.source.centre / (2 * np.pi) * ahead)
+        turns = remove_whole_turns(self.source.centre_wavenumber / (2 * np.pi) * ahead)
         ends = (ahead, turns, (ahead - spans[:, 0]) * per_metre, per_metre)
         far, turned, start, scale = (put(values[:, np.newaxis, np.newaxis]) for values in ends)
-        return _Planes(some, put(transfer), put(coefficients), put(table), far, turned, (start, scale))
+        return _DepthBlock(
+            some, put(transfer), put(coefficients), put(table), far, turned, (start, scale)
+        )
 
     @cached_property
-    def _numbers(self) -> Array:
-        return self.library.put(np.arange(self.way.grid.z.size))
+    def _depth_numbers(self) -> Array:
+        return self.library.put(np.arange(self.plan.grid.z.size))
 
     @cached_property
-    def _across(self) -> Array:
-        """Squared distance of every column of voxels from the laser spot along x and y, (1, y, x), m^2."""
+    def _lateral_distance_squared(self) -> Array:
+        """Squared distance of every column of voxels from the laser spot along x and y, (1, y, x),
+        m^2.
+        """
         laser = np.zeros(3) if self.source.laser is None else self.source.laser
-        y, x = self.way.grid.y[:, np.newaxis] - laser[1], self.way.grid.x - laser[0]
+        y, x = self.plan.grid.y[:, np.newaxis] - laser[1], self.plan.grid.x - laser[0]
         return self.library.put((y**2 + x**2)[np.newaxis])
 
     @cached_property
-    def _share(self) -> Array:
-        """1 / area of a period, or 0 where a wave is left out at a frequency, shape (waves, frequencies)."""
-        waves = self.way.plane_waves
-        counted = waves.lateral[:, np.newaxis] <= waves.limits
+    def _wave_weights(self) -> Array:
+        """1 / area of a period, or 0 where a wave is left out at a frequency, shape (waves,
+        frequencies).
+        """
+        waves = self.plan.plane_waves
+        counted = waves.lateral_wavenumbers[:, np.newaxis] <= waves.lateral_limits
         return self.library.put(counted.astype(np.float32) / np.float32(np.prod(waves.period)))
 
     @cached_property
-    def _cell(self) -> Array:
-        return self.library.put(self._depths.cell)
+    def _cell_indices(self) -> Array:
+        return self.library.put(self._depths.cell_indices)
 
     @cached_property
     def _wave_in_cell(self) -> Array:
-        """Number of the wave in every cell of a rectangle of them; one too many where there is none."""
-        cell = self._depths.cell
+        """Number of the wave in every cell of a rectangle of them; one too many where there is
+        none.
+        """
+        cell = self._depths.cell_indices
         along_y, along_x = self._depths.to_voxels
         wave = np.full(len(along_y) * len(along_x), cell.size)
         wave[cell] = np.arange(cell.size)
@@ -216,21 +255,27 @@ class PortableDiffraction:
         return self.library.put(along_y.T), self.library.put(along_x)
 
     @cached_property
-    def _interpolation(self) -> tuple[Array, list[Array], Array]:
-        """First node of every different lateral wavenumber, the shares of all taps, and which of these a wave has."""
-        lateral, turn = np.unique(self.way.plane_waves.lateral, return_inverse=True)
-        node, share = self.way.transfer.interpolation(lateral)
-        shares = [self.library.put(share[:, tap, np.newaxis]) for tap in range(TAPS)]
-        return self.library.put(node), shares, self.library.put(turn.ravel())
+    def _node_interpolation(self) -> tuple[Array, list[Array], Array]:
+        """First node of every different lateral wavenumber, the shares of all taps, and which of
+        these a wave has.
+        """
+        lateral, turn = np.unique(self.plan.plane_waves.lateral_wavenumbers, return_inverse=True)
+        node, weight = self.plan.transfer.interpolation(lateral)
+        weights = [self.library.put(weight[:, tap, np.newaxis]) for tap in range(TAPS)]
+        return self.library.put(node), weights, self.library.put(turn.ravel())
 
 
-def _together(lights: list[Illumination]) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
-    """Coefficients (z, frequencies, m) and functions (z * samples, m) of several depths, with 0 for missing ones."""
-    most = max(light.coefficients.shape[1] for light in lights)
-    coefficients = np.zeros((len(lights), len(lights[0].coefficients), most), np.complex64)
-    table = np.zeros((len(lights), len(lights[0].table), most), np.float32)
+def _stack_illuminations(
+    lights: list[Illumination],
+) -> tuple[NDArray[np.complex64], NDArray[np.float32]]:
+    """Coefficients (z, frequencies, m) and functions (z * samples, m) of several depths, with 0 for
+    missing ones.
+    """
+    max_terms = max(light.coefficients.shape[1] for light in lights)
+    coefficients = np.zeros((len(lights), len(lights[0].coefficients), max_terms), np.complex64)
+    table = np.zeros((len(lights), len(lights[0].table), max_terms), np.float32)
     for i, light in enumerate(lights):
         count = light.coefficients.shape[1]
         coefficients[i, :, :count], table[i, :, :count] = light.coefficients, light.table
         coefficients[i, :, light.even : count] *= 1j
-    return coefficients, table.reshape(-1, most)
+    return coefficients, table.reshape(-1, max_terms)

@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 
 from nlos.band import Band
 from nlos.capture import Capture
-from nlos.exposure import Exposure
-from nlos.portable.library import Library
+from nlos.illumination_groups import IlluminationGroup
+from nlos.portable.library import ArrayLibrary
 from nlos.rsd.wall import WallLattice
 from tofclip.arrays import Array
 
 
-class Analysis:
-    """The Fourier transform of signals at a band's frequencies, as a matrix that is kept where the signals live.
+class BandTransform:
+    """The Fourier transform of signals at a band's frequencies, as a matrix that is kept where the
+    signals live.
 
     Parameters
     ----------
@@ -26,42 +27,52 @@ class Analysis:
     library : Library
     """
 
-    def __init__(self, band: Band, bins: int, library: Library) -> None:
+    def __init__(self, band: Band, bins: int, library: ArrayLibrary) -> None:
         paths = band.axis.start + band.axis.spacing * np.arange(bins)
         waves = band.weights * np.exp(-1j * np.outer(paths, band.wavenumbers))
-        self._library, self._real, self._imaginary = library, library.put(waves.real), library.put(waves.imag)
+        self._library, self._real, self._imaginary = (
+            library,
+            library.put(waves.real),
+            library.put(waves.imag),
+        )
 
     def of(self, traces: Array) -> Array:
-        """Return the phasors (points, frequencies) of signals (points, t); see `nlos.band.Band.phasors`."""
-        return self._library.joined(traces @ self._real, traces @ self._imaginary)
+        """Return the phasors (points, frequencies) of signals (points, t); see
+        `nlos.band.Band.compute_phasors`.
+        """
+        return self._library.make_complex(traces @ self._real, traces @ self._imaginary)
 
 
-def exposed(capture: Capture, part: Exposure) -> Array:
+def get_group_traces(capture: Capture, group: IlluminationGroup) -> Array:
     """Return the signals (points, t) of one exposure's members."""
-    return Library.of(capture.signal).xp.permute_dims(_in_time(capture, part.members), (1, 0))
+    return ArrayLibrary.of(capture.signal).xp.permute_dims(
+        _select_signals(capture, group.indices), (1, 0)
+    )
 
 
-def traces_of(capture: Capture, some: slice) -> Array:
+def get_traces(capture: Capture, some: slice) -> Array:
     """Return the signals (points, t) of some valid wall points."""
-    xp = Library.of(capture.signal).xp
-    members = np.arange(len(capture.points))[some]
-    return xp.permute_dims(_in_time(capture, members), (1, 0))
+    xp = ArrayLibrary.of(capture.signal).xp
+    indices = np.arange(len(capture.points))[some]
+    return xp.permute_dims(_select_signals(capture, indices), (1, 0))
 
 
-def on_lattice(values: Array, wall: WallLattice, library: Library) -> Array:
-    """Put values (..., points) into their places on a lattice, (..., rows, columns); the others are 0."""
+def arrange_on_lattice(values: Array, wall: WallLattice, library: ArrayLibrary) -> Array:
+    """Put values (..., points) into their places on a lattice, (..., rows, columns); the others are
+    0.
+    """
     xp = library.xp
-    if not wall.complete:
+    if not wall.is_complete:
         padded = xp.concat([values, library.zeros((*values.shape[:-1], 1))], axis=-1)
-        values = xp.take(padded, library.put(wall.occupants), axis=-1)
+        values = xp.take(padded, library.put(wall.point_numbers), axis=-1)
     return xp.reshape(values, (*values.shape[:-1], *wall.shape))
 
 
-def _in_time(capture: Capture, members: NDArray[Any]) -> Array:
+def _select_signals(capture: Capture, indices: NDArray[Any]) -> Array:
     """Signals (t, points) of some of the valid wall points."""
-    library = Library.of(capture.signal)
+    library = ArrayLibrary.of(capture.signal)
     flat = library.xp.reshape(capture.signal, (capture.axis.bins, -1))
-    places = np.flatnonzero(capture.valid)[members]
+    places = np.flatnonzero(capture.valid)[indices]
     if places.size == flat.shape[1] and np.array_equal(places, np.arange(places.size)):
         return flat
     return library.xp.take(flat, library.put(places), axis=1)

@@ -7,39 +7,42 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.rsd.inverse import PLANNING, PLANS
+from nlos.rsd.inverse import FFTW_FLAGS, PLANNING_LOCK
 from nlos.rsd.kernels import transpose
 from nlos.rsd.wall import WallLattice
 
 if TYPE_CHECKING:
     import pyfftw
 
-COLUMNS_AT_A_TIME = 8
+COLUMN_STEP = 8
 """Plans for Fourier transforms of so many columns more."""
 
 
-class Analysis(Protocol):
+class PlaneWaveAnalysis(Protocol):
     """Sums ``sum_p values(p) * exp(-1j * q r_p)`` of several terms, on one thread."""
 
     def spectra(
         self, values: NDArray[np.complex64], weights: NDArray[np.complex64], reach: int
     ) -> NDArray[np.complex64]:
-        """Analyse ``values * weights[m]`` up to an index along x, (terms, columns, rows); see `LatticeAnalysis`."""
+        """Analyse ``values * weights[m]`` up to an index along x, (terms, columns, rows); see
+        `LatticeAnalysis`.
+        """
         ...
 
 
 class LatticeAnalysis:
-    """Sums ``sum_p values(p) * exp(-1j * q r_p)`` of several terms, for points that stand above an even lattice.
+    """Sums ``sum_p values(p) * exp(-1j * q r_p)`` of several terms, for points that stand above an
+    even lattice.
 
-    Along x only the rows with points in them are transformed, along y only the columns that count. Not to be shared
-    between threads.
+    Along x only the rows with points in them are transformed, along y only the columns that count.
+    Not to be shared between threads.
 
     Parameters
     ----------
     wall : WallLattice
     lattice : (int, int)
         Places in a period along y and x; at least the wall's.
-    reach : int
+    max_indices : int
         Largest index along x.
     terms : int
         At most.
@@ -51,19 +54,21 @@ class LatticeAnalysis:
         high, wide = lattice
         self._wide, self._shape = wide, wall.shape
         rows, columns = wall.shape
-        self._place = None if wall.complete else wall.row * columns + wall.column
-        most = min(2 * self._columns(reach), wide)
+        self._place = None if wall.is_complete else wall.row * columns + wall.column
+        most = min(2 * self._count_columns(reach), wide)
         shapes = ((rows, wide), (rows, wide), (most, high), (terms * most, high))
         arrays = [pyfftw.zeros_aligned(shape, np.complex64) for shape in shapes]
         self._points, self._lines, self._middle = arrays[:3]
         self._spectra: NDArray[np.complex64] = arrays[3]
-        with PLANNING:
-            self._along_x = pyfftw.FFTW(self._points, self._lines, axes=(1,), flags=PLANS)
+        with PLANNING_LOCK:
+            self._along_x = pyfftw.FFTW(self._points, self._lines, axes=(1,), flags=FFTW_FLAGS)
         self._along_y: dict[int, pyfftw.FFTW] = {}
 
-    def _columns(self, reach: int) -> int:
-        """How many columns from index 0 on are transformed; as many before it, unless these are all."""
-        needed = -(-(reach + 1) // COLUMNS_AT_A_TIME) * COLUMNS_AT_A_TIME
+    def _count_columns(self, reach: int) -> int:
+        """How many columns from index 0 on are transformed; as many before it, unless these are
+        all.
+        """
+        needed = -(-(reach + 1) // COLUMN_STEP) * COLUMN_STEP
         return needed if 2 * needed < self._wide else self._wide
 
     def spectra(
@@ -75,22 +80,26 @@ class LatticeAnalysis:
         ----------
         values : (points,) complex64 array
         weights : (terms, points) complex64 array
-        reach : int
+        max_indices : int
 
         Returns
         -------
         (terms, columns, rows) complex64 array
-            Columns and rows in the order of Fourier transforms, first 0 and last -1; an index beyond them is found
-            modulo their number. Valid until the next call.
+            Columns and rows in the order of Fourier transforms, first 0 and last -1; an index
+            beyond them is found modulo their number. Valid until the next call.
         """
-        columns, (rows, wide) = self._columns(reach), self._lines.shape
-        ends = (slice(0, columns), slice(wide - columns, wide)) if columns < wide else (slice(0, wide),)
+        columns, (rows, wide) = self._count_columns(reach), self._lines.shape
+        ends = (
+            (slice(0, columns), slice(wide - columns, wide))
+            if columns < wide
+            else (slice(0, wide),)
+        )
         count = len(ends) * columns
-        plan, middle = self._plan(count), self._middle[:count]
+        plan, middle = self._get_plan(count), self._middle[:count]
         # In one piece, whatever its size: compiled loops are quicker then.
         spectra = self._spectra[: len(weights) * count].reshape(len(weights), count, -1)
         for spectrum, weight in zip(spectra, weights, strict=True):
-            self._spread(values, weight)
+            self._place_values(values, weight)
             self._along_x.execute()
             for number, end in enumerate(ends):
                 turned = middle[number * columns : (number + 1) * columns, :rows]
@@ -99,21 +108,25 @@ class LatticeAnalysis:
             plan.execute()
         return spectra
 
-    def _spread(self, values: NDArray[np.complex64], weight: NDArray[np.complex64]) -> None:
+    def _place_values(self, values: NDArray[np.complex64], weight: NDArray[np.complex64]) -> None:
         """Put weighted values into their places."""
         rows, columns = self._shape
         if self._place is None:
-            np.multiply(values.reshape(self._shape), weight.reshape(self._shape), out=self._points[:, :columns])
+            np.multiply(
+                values.reshape(self._shape),
+                weight.reshape(self._shape),
+                out=self._points[:, :columns],
+            )
         else:
             flat = np.zeros(rows * columns, np.complex64)
             flat[self._place] = values * weight
             self._points[:, :columns] = flat.reshape(self._shape)
 
-    def _plan(self, columns: int) -> pyfftw.FFTW:
+    def _get_plan(self, columns: int) -> pyfftw.FFTW:
         import pyfftw
 
         if columns not in self._along_y:
-            with PLANNING:
+            with PLANNING_LOCK:
                 arrays = self._middle[:columns], self._spectra[:columns]
-                self._along_y[columns] = pyfftw.FFTW(*arrays, axes=(1,), flags=PLANS)
+                self._along_y[columns] = pyfftw.FFTW(*arrays, axes=(1,), flags=FFTW_FLAGS)
         return self._along_y[columns]

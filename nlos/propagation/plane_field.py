@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from nlos.geometry import Grid
 from nlos.plane import Plane
-from nlos.rsd.transfer import Waves
+from nlos.rsd.transfer import SphericalWaves
 
 FloatArray = NDArray[np.float64]
 
-NEAREST_GAP, WIDEST_GAP = 0.05, 0.1
+MIN_GAP_M, MAX_GAP_M = 0.05, 0.1
 """The virtual plane keeps this far from the foremost wall point, m."""
 
 
@@ -24,7 +24,8 @@ class PlaneField:
     Parameters
     ----------
     values : (y, x, frequencies) complex64 array
-        ``S_k(r_v) = sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|``, of the library of the capture's signal.
+        ``S_k(r_v) = sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|``, of the library of
+        the capture's signal.
     plane : Plane
     wavenumbers : (frequencies,) array
         Of the waves on the plane, rad/m: the band's, doubled for a confocal scan.
@@ -35,11 +36,13 @@ class PlaneField:
     wavenumbers: FloatArray
 
 
-def virtual_plane(points: FloatArray, grid: Grid, waves: Waves, zones: float, z: float | None = None) -> Plane:
+def choose_virtual_plane(
+    points: FloatArray, grid: Grid, waves: SphericalWaves, zones: float, z: float | None = None
+) -> Plane:
     """Choose a plane between a wall and the hidden scene that misses little of what passes.
 
-    It holds the straight way from every wall point to every voxel behind it, and around these some Fresnel zones of the
-    middle wave; its points are half the shortest wavelength apart.
+    It holds the straight way from every wall point to every voxel behind it, and around these some
+    Fresnel zones of the middle wave; its points are half the shortest wavelength apart.
 
     Parameters
     ----------
@@ -50,20 +53,24 @@ def virtual_plane(points: FloatArray, grid: Grid, waves: Waves, zones: float, z:
     zones : float
         Room beside the straight ways, in radii of the first Fresnel zone.
     z : float, optional
-        Where, m. Defaults to the shortest wavelength, but 5 to 10 cm, in front of the foremost wall point.
+        Where, m. Defaults to the shortest wavelength, but 5 to 10 cm, in front of the foremost wall
+        point.
     """
     low, high = points.min(axis=0), points.max(axis=0)
-    shortest, middle = 2 * np.pi / waves.highest, 4 * np.pi / (waves.first + waves.highest)
+    shortest, middle = (
+        2 * np.pi / waves.max_wavenumber,
+        4 * np.pi / (waves.first + waves.max_wavenumber),
+    )
     if z is None:
-        z = float(high[2] + np.clip(shortest, NEAREST_GAP, WIDEST_GAP))
+        z = float(high[2] + np.clip(shortest, MIN_GAP_M, MAX_GAP_M))
     gap = z - float(low[2])
     behind = grid.z[grid.z > z]
-    share = gap / (gap + float(behind[0]) - z) if behind.size else 1.0
+    weight = gap / (gap + float(behind[0]) - z) if behind.size else 1.0
     room = zones * np.sqrt(middle * gap)
     axes = []
     for first, last, voxels in zip(low[:2], high[:2], (grid.x, grid.y), strict=True):
-        start = first + share * min(0.0, voxels[0] - first) - room
-        stop = last + share * max(0.0, voxels[-1] - last) + room
+        start = first + weight * min(0.0, voxels[0] - first) - room
+        stop = last + weight * max(0.0, voxels[-1] - last) + room
         count = max(1, int(np.ceil((stop - start) / (shortest / 2))))
         axes.append(np.linspace(start, stop, count + 1))
     return Plane(axes[0], axes[1], z)

@@ -9,22 +9,22 @@ from numpy.typing import NDArray
 
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
-from nlos.exposure import Exposure, exposures
-from nlos.method import Progress, silent
+from nlos.illumination_groups import IlluminationGroup, group_by_illumination
+from nlos.method import Progress, ignore_progress
 from nlos.plane import Plane
-from nlos.propagation.direct import direct_sum
-from nlos.propagation.layered import layered_sum
-from nlos.propagation.passage import Passage
+from nlos.propagation.direct import propagate_direct
+from nlos.propagation.low_rank_propagation import propagate_low_rank
 from nlos.propagation.plane_field import PlaneField
-from nlos.propagation.scattered import ScatteredPassage, scattered_transforms
-from nlos.propagation.shift_and_sum import delayed_sum
-from nlos.rsd.planar import require_tolerance, waves_of
+from nlos.propagation.scattered import ScatteredWallToPlanePlan, has_finufft
+from nlos.propagation.shift_and_sum import propagate_in_time
+from nlos.propagation.wall_to_plane_plan import WallToPlanePlan
+from nlos.rsd.planar import build_waves, require_tolerance
 from tofclip.arrays import is_numpy, require_numpy
 from tofclip.errors import InputError
 
 Propagation = Literal["spectral", "time"]
 
-SAMPLED_POINTS = 1024
+STRENGTH_POINTS = 1024
 """Enough wall points to tell the strength of a frequency from."""
 
 
@@ -37,7 +37,8 @@ def propagate(
 ) -> PlaneField:
     """Carry a capture's phasor field from its wall onto a plane between wall and scene.
 
-    The wall may have any shape and any number of pieces; its points need no order, and masked ones are left out.
+    The wall may have any shape and any number of pieces; its points need no order, and masked ones
+    are left out.
 
     Parameters
     ----------
@@ -47,12 +48,12 @@ def propagate(
         In front of every wall point.
     pulse : VirtualPulse
     propagation : {"spectral", "time"}
-        At the band's frequencies only; or the paper's shifting and adding of transients, whose error is that of linear
-        interpolation between bins.
+        At the band's frequencies only; or the paper's shifting and adding of transients, whose
+        error is that of linear interpolation between bins.
     tolerance : float
-        Relative error of the field that is allowed for the sake of speed, 1e-4 to 0.1; "spectral" only. Walls of many
-        points go by Fourier transforms, those of scattered points if finufft is installed (``tofclip[scattered]``),
-        others by direct sums, good to 1e-5.
+        Relative error of the field that is allowed for the sake of speed, 1e-4 to 0.1; "spectral"
+        only. Walls of many points go by Fourier transforms, those of scattered points if finufft is
+        installed (``tofclip[scattered]``), others by direct sums, good to 1e-5.
 
     Returns
     -------
@@ -63,61 +64,82 @@ def propagate(
     InputError
         Several laser spots, an empty band, or a plane that is not in front of the wall.
     """
-    parts = exposures(capture)
-    if len(parts) > 1:
-        raise InputError(f"{len(parts)} laser spots make as many fields: propagate the wall points of one at a time")
+    groups = group_by_illumination(capture)
+    if len(groups) > 1:
+        raise InputError(
+            f"{len(groups)} laser spots make as many fields: propagate the wall points of one at a time"
+        )
     require_tolerance(tolerance)
-    return carried(capture, parts[0], plane, Band(pulse, capture.axis), propagation, tolerance)
+    return propagate_group(
+        capture, groups[0], plane, Band(pulse, capture.axis), propagation, tolerance
+    )
 
 
-def carried(
+def propagate_group(
     capture: Capture,
-    part: Exposure,
+    group: IlluminationGroup,
     plane: Plane,
     band: Band,
     propagation: Propagation,
     tolerance: float = 1e-2,
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> PlaneField:
     """Carry one exposure of a capture at a band's frequencies; see `propagate`.
 
-    Progress, which another library's arrays leave out, counts points of the plane times frequencies.
+    Progress, which another library's arrays leave out, counts points of the plane times
+    frequencies.
     """
     require_propagation(propagation)
-    points = capture.points[part.members]
+    points = capture.points[group.indices]
     foremost = float(points[:, 2].max())
     if plane.z <= foremost:
         raise InputError(
             f"the plane at z = {plane.z:.4g} m must lie in front of the wall, which reaches up to {foremost:.4g} m"
         )
-    wavenumbers = part.passes * band.wavenumbers
+    wavenumbers = group.legs * band.wavenumbers
     if propagation == "time":
         require_numpy("propagation in time", capture.signal)
-        traces = np.ascontiguousarray(capture.traces()[part.members])
-        return PlaneField(delayed_sum(points, traces, plane, band, part.passes, progress), plane, wavenumbers)
+        traces = np.ascontiguousarray(capture.traces()[group.indices])
+        return PlaneField(
+            propagate_in_time(points, traces, plane, band, group.legs, progress), plane, wavenumbers
+        )
     if not is_numpy(capture.signal):
-        from nlos.portable.propagation import carried_elsewhere
+        from nlos.portable.propagation import propagate_on_device
 
-        return carried_elsewhere(capture, part, plane, band, tolerance)
-    phasors = part.phasors(capture, band)
-    way = points, plane, waves_of(part, band, continued=False), strength(phasors), tolerance
-    passage = Passage.of(*way)
-    if passage is None and scattered_transforms():
-        passage = ScatteredPassage.of(*way)
-    if passage is not None and passage.quicker:
-        return PlaneField(layered_sum(passage, phasors, progress), plane, wavenumbers)
-    return PlaneField(direct_sum(points, phasors, plane, wavenumbers, progress), plane, wavenumbers)
+        return propagate_on_device(capture, group, plane, band, tolerance)
+    phasors = group.compute_phasors(capture, band)
+    wall_and_plane = (
+        points,
+        plane,
+        build_waves(group, band, continued=False),
+        estimate_strength(phasors),
+        tolerance,
+    )
+    plan = WallToPlanePlan.of(*wall_and_plane)
+    if plan is None and has_finufft():
+        plan = ScatteredWallToPlanePlan.of(*wall_and_plane)
+    if plan is not None and plan.is_faster_than_direct:
+        return PlaneField(propagate_low_rank(plan, phasors, progress), plane, wavenumbers)
+    return PlaneField(
+        propagate_direct(points, phasors, plane, wavenumbers, progress), plane, wavenumbers
+    )
 
 
-def strength(phasors: NDArray[np.complex64]) -> NDArray[np.float64]:
-    """Estimate how strong phasors (points, frequencies) are at each frequency, relative to the strongest."""
-    some = np.abs(phasors[:: len(phasors) // SAMPLED_POINTS + 1])
+def estimate_strength(phasors: NDArray[np.complex64]) -> NDArray[np.float64]:
+    """Estimate how strong phasors (points, frequencies) are at each frequency, relative to the
+    strongest.
+    """
+    some = np.abs(phasors[:: len(phasors) // STRENGTH_POINTS + 1])
     energy = np.mean(some.astype(np.float64) ** 2, axis=0)
-    relative: NDArray[np.float64] = np.sqrt(energy / energy.max()) if energy.any() else np.ones(energy.size)
+    relative: NDArray[np.float64] = (
+        np.sqrt(energy / energy.max()) if energy.any() else np.ones(energy.size)
+    )
     return relative
 
 
 def require_propagation(propagation: str) -> None:
     """Refuse a word that names no way of propagating."""
     if propagation not in get_args(Propagation):
-        raise InputError(f"propagation must be one of {', '.join(get_args(Propagation))}, got '{propagation}'")
+        raise InputError(
+            f"propagation must be one of {', '.join(get_args(Propagation))}, got '{propagation}'"
+        )

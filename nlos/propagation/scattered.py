@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.plane import Plane
-from nlos.propagation.passage import CALL, Passage
-from nlos.rsd.transfer import Waves
+from nlos.propagation.wall_to_plane_plan import TERM_S, WallToPlanePlan
+from nlos.rsd.transfer import SphericalWaves
 from nlos.rsd.wall import WallLattice
 
 if TYPE_CHECKING:
@@ -18,33 +18,40 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-ANALYSIS_SHARE = 0.1
+ANALYSIS_ERROR_FRACTION = 0.1
 """Of the error allowed, what the transforms of scattered points may take."""
 
 UPSAMPLING = 1.25
 """Of the transforms' own grids; half as slow as the usual 2 for as few points as walls have."""
 
-INDICES_AT_A_TIME = 8
+INDEX_STEP = 8
 """Plans for so many indices along an axis more serve several frequencies."""
 
-PLACE, WAVE = 2.5e-8, 9e-9
+POINT_S, WAVE_S = 2.5e-8, 9e-9
 """Seconds on one core per term, roughly, for a wall point and for a plane wave."""
 
 
-def scattered_transforms() -> bool:
+def has_finufft() -> bool:
     """Whether the library for them, finufft, is installed."""
     return importlib.util.find_spec("finufft") is not None
 
 
-class ScatteredPassage(Passage):
+class ScatteredWallToPlanePlan(WallToPlanePlan):
     """How fields get from scattered points to a plane: as from a lattice, but for the first step.
 
-    Parameters are those of `Passage`; no point need stand on the lattice `wall`, which only says where they begin and
-    how long a period is.
+    Parameters are those of `WallToPlanePlan`; no point need stand on the lattice `wall`, which only
+    says where they begin and how long a period is.
     """
 
     @classmethod
-    def of(cls, points: FloatArray, plane: Plane, waves: Waves, strength: FloatArray, tolerance: float) -> Passage:
+    def of(
+        cls,
+        points: FloatArray,
+        plane: Plane,
+        waves: SphericalWaves,
+        strength: FloatArray,
+        tolerance: float,
+    ) -> WallToPlanePlan:
         """Return the passage from any wall points (n, 3), in the steps of the plane."""
         x, y = (
             low + step * np.arange(max(2, int(np.ceil((high - low) / step)) + 1))
@@ -58,20 +65,28 @@ class ScatteredPassage(Passage):
     @property
     def seconds_per_term(self) -> float:
         """Roughly, on one core."""
-        y, x = self.reach
-        return CALL + PLACE * len(self.points) + WAVE * 4 * y * x
+        y, x = self.max_indices
+        return TERM_S + POINT_S * len(self.points) + WAVE_S * 4 * y * x
 
     def analysis(self, terms: int) -> ScatteredAnalysis:
         """Return what analyses a field on the wall; not to be shared between threads."""
         along_y, along_x = (
             spacing * (self.points[:, axis] - start)
-            for spacing, axis, start in zip(self.steps, (1, 0), (self.wall.y[0], self.wall.x[0]), strict=True)
+            for spacing, axis, start in zip(
+                self.steps, (1, 0), (self.wall.y[0], self.wall.x[0]), strict=True
+            )
         )
-        return ScatteredAnalysis(along_y, along_x, self.steps[1] / self.steps[0], ANALYSIS_SHARE * self.tolerance)
+        return ScatteredAnalysis(
+            along_y,
+            along_x,
+            self.steps[1] / self.steps[0],
+            ANALYSIS_ERROR_FRACTION * self.tolerance,
+        )
 
 
 class ScatteredAnalysis:
-    """Sums ``sum_p values(p) * exp(-1j * q r_p)`` of several terms, for points anywhere: what `LatticeAnalysis` gives.
+    """Sums ``sum_p values(p) * exp(-1j * q r_p)`` of several terms, for points anywhere: what
+    `LatticeAnalysis` gives.
 
     Parameters
     ----------
@@ -84,12 +99,17 @@ class ScatteredAnalysis:
 
     References
     ----------
-    A. H. Barnett, J. Magland, L. af Klinteberg, "A parallel nonuniform fast Fourier transform library based on an
-    'exponential of semicircle' kernel", SIAM J. Sci. Comput. 41, C479 (2019).
+    A. H. Barnett, J. Magland, L. af Klinteberg, "A parallel nonuniform fast Fourier transform
+    library based on an 'exponential of semicircle' kernel", SIAM J. Sci. Comput. 41, C479 (2019).
     """
 
-    def __init__(self, along_y: FloatArray, along_x: FloatArray, tall: float, tolerance: float) -> None:
-        self._places = [np.asarray((phase + np.pi) % (2 * np.pi) - np.pi, np.float32) for phase in (along_x, along_y)]
+    def __init__(
+        self, along_y: FloatArray, along_x: FloatArray, tall: float, tolerance: float
+    ) -> None:
+        self._places = [
+            np.asarray((phase + np.pi) % (2 * np.pi) - np.pi, np.float32)
+            for phase in (along_x, along_y)
+        ]
         self._tall, self._tolerance = tall, max(tolerance, 10 * float(np.finfo(np.float32).eps))
         self._plans: dict[tuple[int, int, int], finufft.Plan] = {}
 
@@ -102,7 +122,7 @@ class ScatteredAnalysis:
         ----------
         values : (points,) complex64 array
         weights : (terms, points) complex64 array
-        reach : int
+        max_indices : int
 
         Returns
         -------
@@ -110,18 +130,26 @@ class ScatteredAnalysis:
             Columns and rows in the order of Fourier transforms, first 0 and last -1.
         """
         sizes = (
-            2 * INDICES_AT_A_TIME * (int(largest) // INDICES_AT_A_TIME + 1)
+            2 * INDEX_STEP * (int(largest) // INDEX_STEP + 1)
             for largest in (reach + 1, (reach + 1) * self._tall + 1)
         )
         columns, rows = sizes
-        spectra: NDArray[np.complex64] = self._plan(len(weights), columns, rows).execute(values * weights)
+        spectra: NDArray[np.complex64] = self._get_plan(len(weights), columns, rows).execute(
+            values * weights
+        )
         return spectra.reshape(len(weights), columns, rows)
 
-    def _plan(self, terms: int, columns: int, rows: int) -> finufft.Plan:
+    def _get_plan(self, terms: int, columns: int, rows: int) -> finufft.Plan:
         import finufft
 
         if (terms, columns, rows) not in self._plans:
-            options = {"isign": -1, "dtype": "complex64", "nthreads": 1, "modeord": 1, "upsampfac": UPSAMPLING}
+            options = {
+                "isign": -1,
+                "dtype": "complex64",
+                "nthreads": 1,
+                "modeord": 1,
+                "upsampfac": UPSAMPLING,
+            }
             plan = finufft.Plan(1, (columns, rows), n_trans=terms, eps=self._tolerance, **options)
             plan.setpts(*self._places)
             # Frequencies come in order: only the latest plan will be asked for again.

@@ -6,28 +6,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.band import Band
-from nlos.method import Progress, silent
+from nlos.method import Progress, ignore_progress
 from nlos.plane import Plane
 from nlos.propagation.kernels import shift_and_sum
 from tofclip.threads import run_blocks
 
 FloatArray = NDArray[np.float64]
 
-POINTS_AT_A_TIME = 64
+POINTS_PER_BLOCK = 64
 
 
-def delayed_sum(
+def propagate_in_time(
     points: FloatArray,
     traces: NDArray[np.float32],
     plane: Plane,
     band: Band,
-    passes: int,
-    progress: Progress = silent,
+    legs: int,
+    progress: Progress = ignore_progress,
 ) -> NDArray[np.complex64]:
     """Return the band's phasors of transients carried onto a plane bin by bin.
 
-    Every signal arrives on the plane earlier by its way there, interpolated linearly between bins: an error of some
-    0.5 % for 15 bins per wavelength, growing as the square of their width. Costs a product per pair of points and bin,
+    Every signal arrives on the plane earlier by its way there, interpolated linearly between bins:
+    an error of some
+    0.5 % for 15 bins per wavelength, growing as the square of their width. Costs a product per pair
+      of points and bin,
     and memory for a few transients.
 
     Supplementary Note 12 of X. Feng, Y. Ma, L. Gao, Nat. Commun. 13, 3333 (2022).
@@ -39,7 +41,7 @@ def delayed_sum(
     traces : (n, t) float32 array
     plane : Plane
     band : Band
-    passes : int
+    legs : int
         How often light runs between wall and plane: 2 in a confocal scan.
     progress : callable, optional
         Called with the number of values just done.
@@ -49,25 +51,25 @@ def delayed_sum(
     (y, x, frequencies) complex64 array
     """
     targets = plane.points.reshape(-1, 3)
-    scale = passes / band.axis.spacing
-    nearest, farthest = _bounds(points, plane)
+    scale = legs / band.axis.spacing
+    nearest, farthest = _find_distance_bounds(points, plane)
     latest = np.ceil(farthest * scale)
     bins = traces.shape[1] + int(latest - np.floor(nearest * scale)) + 2
     paths = band.axis.start + band.axis.spacing * (np.arange(bins) - latest)
     analysis = (band.weights * np.exp(-1j * np.outer(paths, band.wavenumbers))).astype(np.complex64)
     field = np.empty((len(targets), band.wavenumbers.size), np.complex64)
 
-    def work(some: slice) -> None:
+    def process_block(some: slice) -> None:
         sums = np.zeros((some.stop - some.start, bins), np.float32)
         shift_and_sum(traces, points, targets[some], scale, float(latest), sums)
         field[some] = sums @ analysis
         progress(field[some].size)
 
-    run_blocks(work, len(targets), size=POINTS_AT_A_TIME)
+    run_blocks(process_block, len(targets), size=POINTS_PER_BLOCK)
     return field.reshape(*plane.shape, -1)
 
 
-def _bounds(points: FloatArray, plane: Plane) -> tuple[float, float]:
+def _find_distance_bounds(points: FloatArray, plane: Plane) -> tuple[float, float]:
     """Bounds of the distance between a wall point and a point of the plane, m."""
     low = np.array([plane.x[0], plane.y[0], plane.z])
     high = np.array([plane.x[-1], plane.y[-1], plane.z])

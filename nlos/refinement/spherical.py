@@ -7,21 +7,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.propagation.direct import waves_at
-from tofclip.threads import blocks
+from nlos.propagation.direct import sum_spherical_waves
+from tofclip.threads import split_blocks
 
 Array = NDArray[Any]
 FloatArray = NDArray[np.float64]
 
-PAIRS_AT_A_TIME = 1 << 20
+PAIRS_PER_BLOCK = 1 << 20
 """Distances held at a time in double precision: 16 MB of waves."""
 
 
-def spherical_sum(sources: FloatArray, values: Array, targets: FloatArray, wavenumbers: FloatArray) -> Array:
+def propagate_spherical_waves(
+    sources: FloatArray, values: Array, targets: FloatArray, wavenumbers: FloatArray
+) -> Array:
     """Return ``sum_s values_k(s) * exp(1j * k * |t - s|) / |t - s|`` at every target t.
 
-    With sources and targets exchanged it is its own transpose. In single precision good to 1e-5 and quick; in double
-    precision plain.
+    With sources and targets exchanged it is its own transpose. In single precision good to 1e-5 and
+    quick; in double precision plain.
 
     Parameters
     ----------
@@ -37,13 +39,15 @@ def spherical_sum(sources: FloatArray, values: Array, targets: FloatArray, waven
         Of the type of `values`.
     """
     if values.dtype == np.complex128:
-        return _in_double_precision(sources, values, targets, wavenumbers)
-    return waves_at(targets, sources, values, wavenumbers)
+        return _propagate_in_double_precision(sources, values, targets, wavenumbers)
+    return sum_spherical_waves(targets, sources, values, wavenumbers)
 
 
-def _in_double_precision(sources: FloatArray, values: Array, targets: FloatArray, wavenumbers: FloatArray) -> Array:
+def _propagate_in_double_precision(
+    sources: FloatArray, values: Array, targets: FloatArray, wavenumbers: FloatArray
+) -> Array:
     field = np.empty((len(targets), wavenumbers.size), np.complex128)
-    for some in blocks(len(targets), max(1, PAIRS_AT_A_TIME // len(sources))):
+    for some in split_blocks(len(targets), max(1, PAIRS_PER_BLOCK // len(sources))):
         distance = np.linalg.norm(targets[some, np.newaxis] - sources, axis=-1)
         for i, k in enumerate(wavenumbers):
             field[some, i] = (np.exp(1j * k * distance) / distance) @ values[:, i]

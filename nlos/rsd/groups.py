@@ -9,15 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.plane import Plane
-from nlos.rsd.kernels import LANES, MIRRORED, NODES, STEPS, TAPS, group_waves
+from nlos.rsd.kernels import (
+    FREQUENCY_STEPS,
+    LANES,
+    MIRROR_IMAGES,
+    NODE_STEPS,
+    TAPS,
+    assemble_groups,
+)
 from nlos.rsd.spectrum import PlaneWaves
-from nlos.rsd.transfer import Transfer
+from nlos.rsd.transfer import TransferFunction
 from tofclip.threads import run_blocks
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-FREQUENCIES_AT_A_TIME = 4
+FREQUENCIES_PER_BLOCK = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,21 +36,22 @@ class Interpolation:
     begin : (groups,) int64 array
         First node.
     offset : (groups + 1,) int64 array
-        Where a group's weights begin, one row of `shares` for each node from `begin` on.
-    shares : (some, LANES) float32 array
+        Where a group's weights begin, one row of `weights` for each node from `begin` on.
+    weights : (some, LANES) float32 array
     """
 
     begin: IntArray
     offset: IntArray
-    shares: NDArray[np.float32]
+    weights: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class Groups:
+class WaveGroups:
     """Plane waves of neighbouring lateral wavenumbers, with those mirrored in the axes.
 
-    A group is `LANES` waves whose indices are not negative, and their `MIRRORED` images. Waves on an axis are images of
-    themselves; a share of 0 marks repeated ones, and those that fill up the last group.
+    A group is `LANES` waves whose indices are not negative, and their `MIRROR_IMAGES` images. Waves
+    on an axis are images of themselves; a share of 0 marks repeated ones, and those that fill up
+    the last group.
 
     Parameters
     ----------
@@ -55,59 +63,77 @@ class Groups:
     @property
     def shape(self) -> tuple[int, int, int, int]:
         """Of the real and imaginary parts of all waves: (groups, 2, MIRRORED, LANES)."""
-        return len(self.first), 2, MIRRORED, LANES
+        return len(self.first_frequency), 2, MIRROR_IMAGES, LANES
 
     @cached_property
-    def _quarter(self) -> tuple[IntArray, IntArray, FloatArray, int]:
-        """Indices and lateral wavenumbers (groups, LANES) of waves without a negative index, and how many there are."""
+    def _quadrant(self) -> tuple[IntArray, IntArray, FloatArray, int]:
+        """Indices and lateral wavenumbers (groups, LANES) of waves without a negative index, and
+        how many there are.
+        """
         waves = self.waves
         inside = np.flatnonzero((waves.row >= 0) & (waves.column >= 0))
-        filled = np.concatenate([inside, np.repeat(inside[-1:], -inside.size % LANES)]).reshape(-1, LANES)
-        return waves.row[filled], waves.column[filled], waves.lateral[filled], inside.size
+        filled = np.concatenate([inside, np.repeat(inside[-1:], -inside.size % LANES)]).reshape(
+            -1, LANES
+        )
+        return (
+            waves.row[filled],
+            waves.column[filled],
+            waves.lateral_wavenumbers[filled],
+            inside.size,
+        )
 
     @cached_property
     def indices(self) -> tuple[IntArray, IntArray]:
         """Indices along y and along x, (groups, MIRRORED, LANES)."""
-        row, column, _, _ = self._quarter
-        return np.stack([row, -row, row, -row], axis=1), np.stack([column, column, -column, -column], axis=1)
+        row, column, _, _ = self._quadrant
+        return np.stack([row, -row, row, -row], axis=1), np.stack(
+            [column, column, -column, -column], axis=1
+        )
 
     @cached_property
-    def distinct(self) -> NDArray[np.bool_]:
+    def is_distinct(self) -> NDArray[np.bool_]:
         """Whether a wave stands there for the first time, (groups, MIRRORED, LANES)."""
-        row, column, _, count = self._quarter
+        row, column, _, count = self._quadrant
         once = np.arange(row.size).reshape(row.shape) < count
-        return np.stack([once, once & (row > 0), once & (column > 0), once & (row > 0) & (column > 0)], axis=1)
+        return np.stack(
+            [once, once & (row > 0), once & (column > 0), once & (row > 0) & (column > 0)], axis=1
+        )
 
     @property
-    def ahead(self) -> int:
-        """Zeros before the lowest frequency that make their number a multiple of `STEPS`."""
-        return -self.waves.limits.size % STEPS
+    def leading_zeros(self) -> int:
+        """Zeros before the lowest frequency that make their number a multiple of `FREQUENCY_STEPS`."""
+        return -self.waves.lateral_limits.size % FREQUENCY_STEPS
 
     @cached_property
-    def first(self) -> IntArray:
+    def first_frequency(self) -> IntArray:
         """Where every group's frequencies begin, zeros included."""
-        nearest = self._quarter[2][:, 0]
-        frequency = np.searchsorted(self.waves.limits, nearest) + self.ahead
-        return frequency // STEPS * STEPS
+        nearest = self._quadrant[2][:, 0]
+        frequency = np.searchsorted(self.waves.lateral_limits, nearest) + self.leading_zeros
+        return frequency // FREQUENCY_STEPS * FREQUENCY_STEPS
 
-    def interpolation(self, transfer: Transfer) -> Interpolation:
+    def interpolation(self, transfer: TransferFunction) -> Interpolation:
         """Find the groups between the nodes of a transfer function."""
-        lateral = self._quarter[2]
-        node, share = (found.reshape(*lateral.shape, -1) for found in transfer.interpolation(lateral.ravel()))
+        lateral = self._quadrant[2]
+        node, weight = (
+            found.reshape(*lateral.shape, -1) for found in transfer.interpolation(lateral.ravel())
+        )
         begin, end = node.min(axis=(1, 2)), node.max(axis=(1, 2)) + TAPS
-        count = -(-(end - begin) // NODES) * NODES
+        count = -(-(end - begin) // NODE_STEPS) * NODE_STEPS
         begin = np.minimum(begin, transfer.nodes.size - count)
         offset = np.concatenate([[0], np.cumsum(count)])
         shares = np.zeros((offset[-1], LANES), np.float32)
         place = (offset[:-1] - begin)[:, np.newaxis, np.newaxis] + node + np.arange(TAPS)
-        shares[place, np.arange(LANES)[:, np.newaxis]] = share
+        shares[place, np.arange(LANES)[:, np.newaxis]] = weight
         return Interpolation(begin, offset, shares)
 
-    def analysed(self, values: NDArray[np.complex64], plane: Plane, origin: tuple[float, float]) -> NDArray[np.float32]:
-        """Return ``sum_p values(p) * exp(-1j * q (r_p - origin)) / area`` of every wave q, area that of a period.
+    def to_plane_waves(
+        self, values: NDArray[np.complex64], plane: Plane, origin: tuple[float, float]
+    ) -> NDArray[np.float32]:
+        """Return ``sum_p values(p) * exp(-1j * q (r_p - origin)) / area`` of every wave q, area
+        that of a period.
 
-        By matrix products: the plane's spacing need not fit the lattice, and a coarse one repeats itself in q as it
-        should. Waves beyond their limit are 0.
+        By matrix products: the plane's spacing need not fit the lattice, and a coarse one repeats
+        itself in q as it should. Waves beyond their limit are 0.
 
         Parameters
         ----------
@@ -122,28 +148,41 @@ class Groups:
             Real and imaginary parts.
         """
         waves, count = self.waves, values.shape[-1]
-        row, column, lateral, distinct = self._quarter
-        share = (self.distinct / np.prod(waves.period)).astype(np.float32)
-        lanes = np.searchsorted(lateral.ravel()[:distinct], waves.limits, side="right")
+        row, column, lateral, distinct = self._quadrant
+        weight = (self.is_distinct / np.prod(waves.period)).astype(np.float32)
+        lanes = np.searchsorted(lateral.ravel()[:distinct], waves.lateral_limits, side="right")
         y, x = (
-            _Analysis.of(axis, start, 2 * np.pi / side, reach)
-            for axis, start, side, reach in zip((plane.y, plane.x), origin, waves.period, waves.reach, strict=True)
+            _AxisTransform.of(axis, start, 2 * np.pi / side, reach)
+            for axis, start, side, reach in zip(
+                (plane.y, plane.x), origin, waves.period, waves.max_indices, strict=True
+            )
         )
-        spectrum = np.zeros((len(row), self.ahead + count, 2, MIRRORED, LANES), np.float32)
+        spectrum = np.zeros(
+            (len(row), self.leading_zeros + count, 2, MIRROR_IMAGES, LANES), np.float32
+        )
 
         def analyse(some: slice) -> None:
-            high, wide = (reach + 1 for reach in waves.reach_within(float(waves.limits[some][-1])))
-            lines = y.sums(np.ascontiguousarray(np.swapaxes(values[..., some], 1, 2)), high)
-            parts = [part for line in lines for part in x.sums(np.ascontiguousarray(np.swapaxes(line, 0, 2)), wide)]
-            at = self.ahead + some.start
-            group_waves(np.stack(parts), row, column, y.turns, x.turns, share, lanes[some], at, spectrum)
+            high, wide = (
+                reach + 1
+                for reach in waves.max_indices_within(float(waves.lateral_limits[some][-1]))
+            )
+            lines = y.project(np.ascontiguousarray(np.swapaxes(values[..., some], 1, 2)), high)
+            parts = [
+                part
+                for line in lines
+                for part in x.project(np.ascontiguousarray(np.swapaxes(line, 0, 2)), wide)
+            ]
+            at = self.leading_zeros + some.start
+            assemble_groups(
+                np.stack(parts), row, column, y.turns, x.turns, weight, lanes[some], at, spectrum
+            )
 
-        run_blocks(analyse, count, size=FREQUENCIES_AT_A_TIME)
+        run_blocks(analyse, count, size=FREQUENCIES_PER_BLOCK)
         return spectrum
 
 
 @dataclass(frozen=True, eq=False)
-class _Analysis:
+class _AxisTransform:
     """Waves along an axis of evenly spaced points, about its middle: real, and half as many points.
 
     Parameters
@@ -158,15 +197,21 @@ class _Analysis:
     turns: NDArray[np.complex64]
 
     @classmethod
-    def of(cls, axis: FloatArray, origin: float, step: float, reach: int) -> _Analysis:
+    def of(cls, axis: FloatArray, origin: float, step: float, reach: int) -> _AxisTransform:
         numbers = step * np.arange(reach + 1)
         half = (axis.size + 1) // 2
         phases = np.outer(numbers, (axis[::-1] - axis)[:half] / 2)
         turns = np.exp(-1j * numbers * ((axis[0] + axis[-1]) / 2 - origin))
-        return cls(np.cos(phases).astype(np.float32), np.sin(phases).astype(np.float32), turns.astype(np.complex64))
+        return cls(
+            np.cos(phases).astype(np.float32),
+            np.sin(phases).astype(np.float32),
+            turns.astype(np.complex64),
+        )
 
-    def sums(self, values: NDArray[np.complex64], count: int) -> list[NDArray[np.complex64]]:
-        """Sums of complex values (points, ...) with the first cosines and with the first sines, (count, ...)."""
+    def project(self, values: NDArray[np.complex64], count: int) -> list[NDArray[np.complex64]]:
+        """Sums of complex values (points, ...) with the first cosines and with the first sines,
+        (count, ...).
+        """
         half = self.cosines.shape[1]
         before, after = values[:half], values[::-1][:half]
         even, odd = after + before, after - before

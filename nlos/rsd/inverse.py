@@ -1,4 +1,6 @@
-"""From plane waves to the voxels of a plane: inverse Fourier transforms without the parts that are 0 or unwanted."""
+"""From plane waves to the voxels of a plane: inverse Fourier transforms without the parts that are
+0 or unwanted.
+"""
 
 from __future__ import annotations
 
@@ -9,32 +11,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.rsd.kernels import transpose
-from nlos.rsd.window import VECTOR
+from nlos.rsd.window import VECTOR_LENGTH
 
 if TYPE_CHECKING:
     import pyfftw
 
-PLANNING = threading.Lock()
+PLANNING_LOCK = threading.Lock()
 """FFTW plans one transform at a time."""
 
-PLANS = ("FFTW_ESTIMATE",)
-"""Plans that are measured are no faster here, and differ from run to run, as the last bits of an image would."""
+FFTW_FLAGS = ("FFTW_ESTIMATE",)
+"""Plans that are measured are no faster here, and differ from run to run, as the last bits of an
+image would.
+"""
 
 CACHE_BYTES = 1 << 19
 """Spectra that are transformed at a time: they stay in a core's second cache, and calls stay few."""
 
-PRODUCT_RATE = 3
-"""How many operations of a matrix product take as long as one of a pruned Fourier transform; measured."""
+PRODUCT_SPEEDUP = 3
+"""How many operations of a matrix product take as long as one of a pruned Fourier transform;
+measured.
+"""
 
 
-Indices = tuple[NDArray[np.int64], NDArray[np.int64]]
+WaveIndices = tuple[NDArray[np.int64], NDArray[np.int64]]
 """Of plane waves along y and x, in arrays of one shape; these reach as far below 0 as above."""
 
 
 class Inverse(Protocol):
-    """From the spectra of several terms to their images, with memory of its own; not to be shared between threads."""
+    """From the spectra of several terms to their images, with memory of its own; not to be shared
+    between threads.
+    """
 
-    cell: NDArray[np.int64]
+    cell_indices: NDArray[np.int64]
     """Where in a spectrum every plane wave goes, in the shape of its indices."""
 
     spare: int
@@ -54,18 +62,25 @@ class Inverse(Protocol):
         ...
 
 
-def inverse(waves: Indices, lattice: tuple[float, float], wanted: tuple[int, int], terms: int) -> Inverse:
-    """Choose the quicker way: few voxels of a long period by matrix products, many by Fourier transforms.
+def choose_inverse(
+    waves: WaveIndices, lattice: tuple[float, float], wanted: tuple[int, int], terms: int
+) -> Inverse:
+    """Choose the quicker way: few voxels of a long period by matrix products, many by Fourier
+    transforms.
 
-    Parameters are those of `InverseTransform`; a period that is no whole number of voxels leaves matrix products only.
+    Parameters are those of `InverseTransform`; a period that is no whole number of voxels leaves
+    matrix products only.
     """
     rows, columns = (2 * int(np.max(index)) + 1 for index in waves)
     high, wide = (int(length) for length in lattice)
     if (high, wide) != lattice:
         return InverseProduct(waves, lattice, wanted, terms)
     products = 8 * columns * wanted[0] * (rows + wanted[1])
-    transforms = 5 * (columns * lattice[0] * np.log2(lattice[0] + 1) + wanted[0] * lattice[1] * np.log2(lattice[1] + 1))
-    if products < PRODUCT_RATE * transforms:
+    transforms = 5 * (
+        columns * lattice[0] * np.log2(lattice[0] + 1)
+        + wanted[0] * lattice[1] * np.log2(lattice[1] + 1)
+    )
+    if products < PRODUCT_SPEEDUP * transforms:
         return InverseProduct(waves, lattice, wanted, terms)
     return InverseTransform(waves, (high, wide), wanted, terms)
 
@@ -76,16 +91,20 @@ class InverseProduct:
     Parameters are those of `InverseTransform`.
     """
 
-    def __init__(self, waves: Indices, lattice: tuple[float, float], wanted: tuple[int, int], terms: int) -> None:
+    def __init__(
+        self, waves: WaveIndices, lattice: tuple[float, float], wanted: tuple[int, int], terms: int
+    ) -> None:
         reach = rows, columns = tuple(int(np.max(index)) for index in waves)
         self._shape = (2 * columns + 1, 2 * rows + 1)
         self.spare = self._shape[0] * self._shape[1]
-        self.cell = (waves[1] + columns) * self._shape[1] + waves[0] + rows
+        self.cell_indices = (waves[1] + columns) * self._shape[1] + waves[0] + rows
         self.carrier = np.ones(wanted[1], np.complex64)
-        self.spectra = np.zeros((_at_a_time(self.spare, terms), self.spare + 1), np.complex64)
+        self.spectra = np.zeros((_count_per_batch(self.spare, terms), self.spare + 1), np.complex64)
         self.images = np.empty((terms, *wanted), np.complex64)
         self._along_y, self._along_x = (
-            np.exp(2j * np.pi / length * np.outer(np.arange(-reach, reach + 1), np.arange(count))).astype(np.complex64)
+            np.exp(
+                2j * np.pi / length * np.outer(np.arange(-reach, reach + 1), np.arange(count))
+            ).astype(np.complex64)
             for reach, length, count in zip(reach, lattice, wanted, strict=True)
         )
 
@@ -99,8 +118,9 @@ class InverseProduct:
 class InverseTransform:
     """Inverse transforms of several spectra by pruned Fourier transforms.
 
-    Along y only the columns that plane waves fall into are transformed, along x only the rows that voxels lie in. Where
-    voxels are too coarse for the finest waves, these are folded into the lattice, as the voxels see them.
+    Along y only the columns that plane waves fall into are transformed, along x only the rows that
+    voxels lie in. Where voxels are too coarse for the finest waves, these are folded into the
+    lattice, as the voxels see them.
 
     Parameters
     ----------
@@ -114,7 +134,9 @@ class InverseTransform:
         Spectra at most.
     """
 
-    def __init__(self, waves: Indices, lattice: tuple[int, int], wanted: tuple[int, int], terms: int) -> None:
+    def __init__(
+        self, waves: WaveIndices, lattice: tuple[int, int], wanted: tuple[int, int], terms: int
+    ) -> None:
         from pyfftw import zeros_aligned
 
         self._high, self._wide = high, wide = lattice
@@ -122,22 +144,34 @@ class InverseTransform:
         columns = min(2 * reach + 1, wide)
         # Unfolded columns are shifted so that none is negative; `carrier` takes the shift back.
         shift = reach if 2 * reach + 1 < wide else 0
-        self.spare = columns * _padded(high)
-        self.cell: NDArray[np.int64] = (waves[1] + shift) % wide * _padded(high) + waves[0] % high
-        self.carrier = np.exp(-2j * np.pi * shift / wide * np.arange(wanted[1])).astype(np.complex64)
-        some = _at_a_time(self.spare, terms)
-        self.spectra: NDArray[np.complex64] = zeros_aligned((some, self.spare + VECTOR), np.complex64)
-        self._columns = self.spectra[:, : self.spare].reshape(some, columns, _padded(high))[..., :high]
-        self._lines = zeros_aligned((some, columns, _padded(high)), np.complex64)[..., :high]
-        self._middle = zeros_aligned((some, wanted[0], _padded(wide)), np.complex64)[..., :wide]
-        self._rows = zeros_aligned((terms, wanted[0], _padded(wide)), np.complex64)[..., :wide]
+        self.spare = columns * _pad_to_vector(high)
+        self.cell_indices: NDArray[np.int64] = (waves[1] + shift) % wide * _pad_to_vector(
+            high
+        ) + waves[0] % high
+        self.carrier = np.exp(-2j * np.pi * shift / wide * np.arange(wanted[1])).astype(
+            np.complex64
+        )
+        some = _count_per_batch(self.spare, terms)
+        self.spectra: NDArray[np.complex64] = zeros_aligned(
+            (some, self.spare + VECTOR_LENGTH), np.complex64
+        )
+        self._columns = self.spectra[:, : self.spare].reshape(some, columns, _pad_to_vector(high))[
+            ..., :high
+        ]
+        self._lines = zeros_aligned((some, columns, _pad_to_vector(high)), np.complex64)[..., :high]
+        self._middle = zeros_aligned((some, wanted[0], _pad_to_vector(wide)), np.complex64)[
+            ..., :wide
+        ]
+        self._rows = zeros_aligned((terms, wanted[0], _pad_to_vector(wide)), np.complex64)[
+            ..., :wide
+        ]
         self.images: NDArray[np.complex64] = self._rows[..., : wanted[1]]
         self._plans: dict[int, tuple[pyfftw.FFTW, pyfftw.FFTW]] = {}
 
     def transform(self, terms: slice) -> None:
         """Turn the first spectra into the images of these terms."""
         count = terms.stop - terms.start
-        along_y, along_x = self._planned(count)
+        along_y, along_x = self._get_plans(count)
         along_y.execute()
         wanted, columns = self._middle.shape[1], self._lines.shape[1]
         lines, middles = self._lines.view(np.float64), self._middle.view(np.float64)
@@ -146,23 +180,25 @@ class InverseTransform:
         along_x.update_arrays(self._middle[:count], self._rows[terms])
         along_x.execute()
 
-    def _planned(self, count: int) -> tuple[pyfftw.FFTW, pyfftw.FFTW]:
+    def _get_plans(self, count: int) -> tuple[pyfftw.FFTW, pyfftw.FFTW]:
         import pyfftw
 
         if count not in self._plans:
             arrays = (self._columns, self._lines), (self._middle, self._rows)
-            with PLANNING:
+            with PLANNING_LOCK:
                 y, x = (
-                    pyfftw.FFTW(a[:count], b[:count], direction="FFTW_BACKWARD", axes=(2,), flags=PLANS)
+                    pyfftw.FFTW(
+                        a[:count], b[:count], direction="FFTW_BACKWARD", axes=(2,), flags=FFTW_FLAGS
+                    )
                     for a, b in arrays
                 )
             self._plans[count] = y, x
         return self._plans[count]
 
 
-def _at_a_time(cells: int, terms: int) -> int:
+def _count_per_batch(cells: int, terms: int) -> int:
     return max(1, min(terms, CACHE_BYTES // (8 * cells)))
 
 
-def _padded(count: int) -> int:
-    return -(-count // VECTOR) * VECTOR
+def _pad_to_vector(count: int) -> int:
+    return -(-count // VECTOR_LENGTH) * VECTOR_LENGTH

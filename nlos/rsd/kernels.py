@@ -9,33 +9,37 @@ from numba import njit
 
 from nlos.kernels import inlined
 
-compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "reassoc", "arcp"}, error_model="numpy")
+compiled = njit(
+    nogil=True, cache=True, fastmath={"contract", "nsz", "reassoc", "arcp"}, error_model="numpy"
+)
 
-SQUARE = 16
+TILE_SIDE = 16
 """Side of the squares that matrices are transposed in: two cache lines of complex64."""
 
 TAPS = 6
 """Nodes that the interpolation along the radius takes."""
 
-LANES, MIRRORED = 32, 4
+LANES, MIRROR_IMAGES = 32, 4
 """Plane waves treated together: neighbours in lateral wavenumber, two full vectors of 512 bits, and their mirror images
 in the axes."""
 
-GROUP = 2 * MIRRORED * LANES
+GROUP_FLOATS = 2 * MIRROR_IMAGES * LANES
 """Real numbers of such a group at one frequency."""
 
-STEPS, NODES = 8, 4
+FREQUENCY_STEPS, NODE_STEPS = 8, 4
 """Frequencies, and nodes of the transfer function, that stay in registers."""
 
-TWO = np.uint64(2)
+UINT64_TWO = np.uint64(2)
 
 
 @compiled
-def sample_waves(radius, distance, first, step, delay, continued, ahead, waves):
-    """Spherical waves of all frequencies at every radius about their source: ``exp(1j * (k * R + (k - k_0) * delay))``.
+def sample_waves(radius, distance, first, step, delay, continued, leading_zeros, waves):
+    """Spherical waves of all frequencies at every radius about their source: ``exp(1j * (k * R + (k
+    - k_0) * delay))``.
 
-    They are divided by R; or, if `continued`, weighted as in the first Rayleigh-Sommerfeld integral; at a negative
-    distance they run backwards. Steps from one frequency to the next with one complex product.
+    They are divided by R; or, if `continued`, weighted as in the first Rayleigh-Sommerfeld
+    integral; at a negative distance they run backwards. Steps from one frequency to the next with
+    one complex product.
 
     Parameters
     ----------
@@ -47,7 +51,7 @@ def sample_waves(radius, distance, first, step, delay, continued, ahead, waves):
     delay : (2,) float64 array
         A path added to all, m, and the wavenumber k_0 whose phase it leaves alone.
     continued : bool
-    ahead : int
+    leading_zeros : int
         Entries before the lowest frequency, left alone.
     waves : (n, 2, ahead + frequencies) float32 array
         Real and imaginary parts, overwritten.
@@ -57,21 +61,26 @@ def sample_waves(radius, distance, first, step, delay, continued, ahead, waves):
         path = math.sqrt(radius[i] ** 2 + distance**2)
         phase = first * direction * path + (first - delay[1]) * delay[0]
         turn = step * (direction * path + delay[0])
-        wave, factor = complex(math.cos(phase), math.sin(phase)), complex(math.cos(turn), math.sin(turn))
+        wave, factor = (
+            complex(math.cos(phase), math.sin(phase)),
+            complex(math.cos(turn), math.sin(turn)),
+        )
         steady, rising = 1 / path, 0.0
         if continued:
             rising = abs(distance) / (2 * math.pi * path**2)
             steady = rising / path
-        for w in range(waves.shape[2] - ahead):
+        for w in range(waves.shape[2] - leading_zeros):
             value = wave * complex(steady, -direction * rising * (first + w * step))
-            waves[i, 0, ahead + w] = value.real
-            waves[i, 1, ahead + w] = value.imag
+            waves[i, 0, leading_zeros + w] = value.real
+            waves[i, 1, leading_zeros + w] = value.imag
             wave *= factor
 
 
 @compiled
-def interpolation(place, node, share):
-    """Find the first of the `TAPS` nodes about every place, and their Lagrange weights (places, taps)."""
+def find_interpolation_weights(place, node, share):
+    """Find the first of the `TAPS` nodes about every place, and their Lagrange weights (places,
+    taps).
+    """
     for b in range(place.size):
         node[b] = int(place[b]) - TAPS // 2 + 1
         for i in range(TAPS):
@@ -83,12 +92,14 @@ def interpolation(place, node, share):
 
 
 @compiled
-def carry(spectrum, first, nodes, begin, offset, shares, coefficients, terms):
-    """``terms[m] = sum_k coefficients[m, k] * transfer_k * spectrum_k`` for all plane waves and some depths.
+def propagate_spectrum(spectrum, first, nodes, begin, offset, node_weights, coefficients, terms):
+    """``terms[m] = sum_k coefficients[m, k] * transfer_k * spectrum_k`` for all plane waves and
+    some depths.
 
-    The transfer function depends on a wave's lateral wavenumber alone and is interpolated between its nodes, once for
-    waves mirrored in the axes. A group is carried to all depths while its spectrum is in cache, and nothing between
-    spectrum and terms leaves it. Frequencies come in steps of `STEPS`.
+    The transfer function depends on a wave's lateral wavenumber alone and is interpolated between
+    its nodes, once for waves mirrored in the axes. A group is carried to all depths while its
+    spectrum is in cache, and nothing between spectrum and terms leaves it. Frequencies come in
+    steps of `FREQUENCY_STEPS`.
 
     Parameters
     ----------
@@ -101,8 +112,8 @@ def carry(spectrum, first, nodes, begin, offset, shares, coefficients, terms):
     begin : (groups,) int64 array
         First node that each group takes.
     offset : (groups + 1,) int64 array
-        Where its interpolation weights begin; it has a multiple of `NODES` of them.
-    shares : (some, LANES) float32 array
+        Where its interpolation weights begin; it has a multiple of `NODE_STEPS` of them.
+    node_weights : (some, LANES) float32 array
         Interpolation weights.
     coefficients : (depths, m, frequencies) float32 array
         An even number of terms.
@@ -110,51 +121,65 @@ def carry(spectrum, first, nodes, begin, offset, shares, coefficients, terms):
         Overwritten.
     """
     groups, frequencies, count = spectrum.shape[0], spectrum.shape[1], coefficients.shape[1]
-    waves, weights, flat = spectrum.reshape(-1), shares.reshape(-1), terms.reshape(-1)
-    transfer, products = np.empty(2 * STEPS * LANES, np.float32), np.empty(STEPS * GROUP, np.float32)
-    sums = np.empty(count * GROUP, np.float32)
+    waves, weights, flat = spectrum.reshape(-1), node_weights.reshape(-1), terms.reshape(-1)
+    transfer, products = (
+        np.empty(2 * FREQUENCY_STEPS * LANES, np.float32),
+        np.empty(FREQUENCY_STEPS * GROUP_FLOATS, np.float32),
+    )
+    sums = np.empty(count * GROUP_FLOATS, np.float32)
     for group in range(groups):
         for depth in range(coefficients.shape[0]):
             sums[:] = 0
-            for k in range(first[group], frequencies, STEPS):
-                _interpolate(nodes[depth], begin[group], k, weights, offset[group], offset[group + 1], transfer)
-                _multiply(waves, (group * frequencies + k) * GROUP, transfer, products)
-                _reduce(coefficients[depth], k, products, sums)
+            for k in range(first[group], frequencies, FREQUENCY_STEPS):
+                _interpolate_transfer(
+                    nodes[depth],
+                    begin[group],
+                    k,
+                    weights,
+                    offset[group],
+                    offset[group + 1],
+                    transfer,
+                )
+                _apply_transfer(waves, (group * frequencies + k) * GROUP_FLOATS, transfer, products)
+                _sum_frequencies(coefficients[depth], k, products, sums)
             for m in range(count):
-                to = ((depth * count + m) * groups + group) * GROUP
-                flat[to : to + GROUP] = sums[m * GROUP : (m + 1) * GROUP]
+                to = ((depth * count + m) * groups + group) * GROUP_FLOATS
+                flat[to : to + GROUP_FLOATS] = sums[m * GROUP_FLOATS : (m + 1) * GROUP_FLOATS]
 
 
-# Unsigned indices into flat arrays: an index that might be negative would keep the loops from becoming vector code.
+# Unsigned indices into flat arrays: an index that might be negative would keep the loops from
+# becoming vector code.
 
 
 @compiled
-def _interpolate(nodes, node, k, weights, begin, end, transfer):
-    """Transfer function (`STEPS`, 2, `LANES`) of a group at some frequencies, `NODES` at a time."""
+def _interpolate_transfer(nodes, node, k, weights, begin, end, transfer):
+    """Transfer function (`FREQUENCY_STEPS`, 2, `LANES`) of a group at some frequencies,
+    `NODE_STEPS` at a time.
+    """
     flat, lanes, imaginary = nodes.reshape(-1), np.uint64(LANES), np.uint64(nodes.shape[2])
     transfer[:] = 0
-    for i in range(begin, end, NODES):
-        for step in range(np.uint64(STEPS)):
+    for i in range(begin, end, NODE_STEPS):
+        for step in range(np.uint64(FREQUENCY_STEPS)):
             at = np.uint64((node + i - begin) * 2 * nodes.shape[2] + k) + step
             of, to = np.uint64(i * LANES), np.uint64(2) * lanes * step
             for j in range(lanes):
                 along = aside = np.float32(0)
-                for n in range(np.uint64(NODES)):
+                for n in range(np.uint64(NODE_STEPS)):
                     share = weights[of + lanes * n + j]
-                    along += flat[at + TWO * imaginary * n] * share
-                    aside += flat[at + TWO * imaginary * n + imaginary] * share
+                    along += flat[at + UINT64_TWO * imaginary * n] * share
+                    aside += flat[at + UINT64_TWO * imaginary * n + imaginary] * share
                 transfer[to + j] += along
                 transfer[to + lanes + j] += aside
 
 
 @compiled
-def _multiply(waves, start, transfer, products):
+def _apply_transfer(waves, start, transfer, products):
     """Products of a group's waves with their transfer function at some frequencies."""
-    of, lanes, half = np.uint64(start), np.uint64(LANES), np.uint64(GROUP // 2)
-    for step in range(np.uint64(STEPS)):
+    of, lanes, half = np.uint64(start), np.uint64(LANES), np.uint64(GROUP_FLOATS // 2)
+    for step in range(np.uint64(FREQUENCY_STEPS)):
         at = np.uint64(2) * lanes * step
-        for mirrored in range(np.uint64(MIRRORED)):
-            to = np.uint64(GROUP) * step + lanes * mirrored
+        for mirrored in range(np.uint64(MIRROR_IMAGES)):
+            to = np.uint64(GROUP_FLOATS) * step + lanes * mirrored
             for j in range(lanes):
                 real, imaginary = waves[of + to + j], waves[of + to + half + j]
                 along, aside = transfer[at + j], transfer[at + lanes + j]
@@ -163,14 +188,18 @@ def _multiply(waves, start, transfer, products):
 
 
 @compiled
-def _reduce(coefficients, k, products, sums):
-    """Add `STEPS` frequencies to all terms, two terms at a time."""
-    size = np.uint64(GROUP)
+def _sum_frequencies(coefficients, k, products, sums):
+    """Add `FREQUENCY_STEPS` frequencies to all terms, two terms at a time."""
+    size = np.uint64(GROUP_FLOATS)
     for m in range(0, coefficients.shape[0], 2):
-        even, odd, to = coefficients[m, k : k + STEPS], coefficients[m + 1, k : k + STEPS], np.uint64(m * GROUP)
+        even, odd, to = (
+            coefficients[m, k : k + FREQUENCY_STEPS],
+            coefficients[m + 1, k : k + FREQUENCY_STEPS],
+            np.uint64(m * GROUP_FLOATS),
+        )
         for j in range(size):
             low = high = np.float32(0)
-            for step in range(np.uint64(STEPS)):
+            for step in range(np.uint64(FREQUENCY_STEPS)):
                 product = products[size * step + j]
                 low += even[step] * product
                 high += odd[step] * product
@@ -179,8 +208,9 @@ def _reduce(coefficients, k, products, sums):
 
 
 @compiled
-def group_waves(parts, row, column, along_y, along_x, share, counts, first, spectrum):
-    """Put together the plane waves of some frequencies, as many as count there, and put them into their groups.
+def assemble_groups(parts, row, column, along_y, along_x, share, counts, first, spectrum):
+    """Put together the plane waves of some frequencies, as many as count there, and put them into
+    their groups.
 
     Parameters
     ----------
@@ -203,9 +233,14 @@ def group_waves(parts, row, column, along_y, along_x, share, counts, first, spec
         for lane in range(counts[k]):
             group, j = lane // LANES, lane % LANES
             r, c = row[group, j], column[group, j]
-            cosines, across, along, sines = parts[0, c, k, r], parts[1, c, k, r], parts[2, c, k, r], parts[3, c, k, r]
+            cosines, across, along, sines = (
+                parts[0, c, k, r],
+                parts[1, c, k, r],
+                parts[2, c, k, r],
+                parts[3, c, k, r],
+            )
             same, other = along_y[r] * along_x[c], np.conj(along_y[r]) * along_x[c]
-            sums = turned_back(along + across), turned_back(across - along)
+            sums = multiply_by_minus_i(along + across), multiply_by_minus_i(across - along)
             for mirrored, wave in enumerate(
                 (
                     (cosines - sines + sums[0]) * same,
@@ -219,48 +254,53 @@ def group_waves(parts, row, column, along_y, along_x, share, counts, first, spec
 
 
 @inlined
-def turned_back(number):
+def multiply_by_minus_i(number):
     """Return -1j times a number."""
     return complex(number.imag, -number.real)
 
 
 @compiled
 def transpose(source, target):
-    """Copy ``target[i, j] = source[j, i]``, in squares that stay in cache; quickest for complex64 seen as float64."""
+    """Copy ``target[i, j] = source[j, i]``, in squares that stay in cache; quickest for complex64
+    seen as float64.
+    """
     rows, columns = target.shape
-    for top in range(0, rows, SQUARE):
-        for left in range(0, columns, SQUARE):
-            if top + SQUARE <= rows and left + SQUARE <= columns:
-                square, turned = source[left : left + SQUARE, top : top + SQUARE], target[top:, left : left + SQUARE]
+    for top in range(0, rows, TILE_SIDE):
+        for left in range(0, columns, TILE_SIDE):
+            if top + TILE_SIDE <= rows and left + TILE_SIDE <= columns:
+                square, turned = (
+                    source[left : left + TILE_SIDE, top : top + TILE_SIDE],
+                    target[top:, left : left + TILE_SIDE],
+                )
                 # A fixed number of steps becomes vector code.
-                for i in range(np.uint64(SQUARE)):
-                    for j in range(np.uint64(SQUARE)):
+                for i in range(np.uint64(TILE_SIDE)):
+                    for j in range(np.uint64(TILE_SIDE)):
                         turned[i, j] = square[j, i]
             else:
-                for i in range(top, min(top + SQUARE, rows)):
-                    for j in range(left, min(left + SQUARE, columns)):
+                for i in range(top, min(top + TILE_SIDE, rows)):
+                    for j in range(left, min(left + TILE_SIDE, columns)):
                         target[i, j] = source[j, i]
 
 
 @compiled
-def scatter(terms, cell, folded, spectra):
+def scatter_terms(terms, cell, folded, spectra):
     """Put the waves of some terms into their cells.
 
     Parameters
     ----------
     terms : (m, groups, 2, MIRRORED, LANES) float32 array
         Real and imaginary parts.
-    cell : (groups, MIRRORED, LANES) int64 array
+    cell_indices : (groups, MIRRORED, LANES) int64 array
     folded : bool
         Waves may meet in one cell, and then add up.
     spectra : (m, cells) complex64 array
     """
-    flat, cells, half = terms.reshape(-1), cell.reshape(-1), np.uint64(GROUP // 2)
+    flat, cells, half = terms.reshape(-1), cell.reshape(-1), np.uint64(GROUP_FLOATS // 2)
     for m in range(terms.shape[0]):
         if folded:
             spectra[m] = 0
         for group in range(terms.shape[1]):
-            of, to = np.uint64((m * terms.shape[1] + group) * GROUP), np.uint64(group) * half
+            of, to = np.uint64((m * terms.shape[1] + group) * GROUP_FLOATS), np.uint64(group) * half
             for j in range(half):
                 wave = complex(flat[of + j], flat[of + half + j])
                 if folded:

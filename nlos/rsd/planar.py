@@ -1,4 +1,6 @@
-"""Phasor-field imaging from a planar wall, by Rayleigh-Sommerfeld diffraction in the frequency domain."""
+"""Phasor-field imaging from a planar wall, by Rayleigh-Sommerfeld diffraction in the frequency
+domain.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +11,18 @@ from numpy.typing import NDArray
 
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
-from nlos.exposure import Exposure, exposure_support, exposures, unfolded_band
 from nlos.geometry import Grid
-from nlos.method import PhasorMethod, Progress, Support, common_support, silent
-from nlos.plane import Plane, evenly_spaced
-from nlos.rsd.diffraction import Diffraction
-from nlos.rsd.meeting import Source, diffract
-from nlos.rsd.transfer import Waves
+from nlos.illumination_groups import (
+    IlluminationGroup,
+    check_illumination_support,
+    choose_unaliased_band,
+    group_by_illumination,
+)
+from nlos.method import PhasorMethod, Progress, Support, check_common_support, ignore_progress
+from nlos.plane import Plane, is_evenly_spaced
+from nlos.rsd.diffraction import DiffractionPlan
+from nlos.rsd.image_planes import LaserSource, diffract_to_grid
+from nlos.rsd.transfer import SphericalWaves
 from nlos.rsd.wall import PlanarWall
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
@@ -25,20 +32,23 @@ from tofclip.errors import InputError
 
 @dataclass(frozen=True)
 class PlanarRSD(PhasorMethod):
-    """Diffraction from a planar wall to all depths: the image of `Backprojection`, thousands of times faster.
+    """Diffraction from a planar wall to all depths: the image of `Backprojection`, thousands of
+    times faster.
 
-    ``I(r) = | sum_k exp(1j * k * |r_L - r|) * sum_p P_k(r_p) * exp(1j * k * |r_p - r|) / |r_p - r| |``: the inner sum
-    is a convolution over the wall, done in the frequency domain; the outer one takes a few inverse Fourier transforms
-    per depth, since the laser's wave varies little across the band. For a confocal scan the wavenumber is doubled and
-    the laser's wave drops out; several laser spots add up.
+    ``I(r) = | sum_k exp(1j * k * |r_L - r|) * sum_p P_k(r_p) * exp(1j * k * |r_p - r|) / |r_p - r|
+    |``: the inner sum is a convolution over the wall, done in the frequency domain; the outer one
+    takes a few inverse Fourier transforms per depth, since the laser's wave varies little across
+    the band. For a confocal scan the wavenumber is doubled and the laser's wave drops out; several
+    laser spots add up.
 
-    Errs by less than `tolerance` at depths of a wavelength and more; nearer to the wall, waves that fade within a
-    wavelength are missing. Holds the wall's spectrum, 8 bytes per plane wave and frequency (60 MB for 128 x 128
-    points and 120 frequencies), the volume, and per thread the waves of all terms of two depths (30 MB). A capture of
-    another library's arrays is imaged in that library; see `nlos.portable`.
+    Errs by less than `tolerance` at depths of a wavelength and more; nearer to the wall, waves that
+    fade within a wavelength are missing. Holds the wall's spectrum, 8 bytes per plane wave and
+    frequency (60 MB for 128 x 128 points and 120 frequencies), the volume, and per thread the waves
+    of all terms of two depths (30 MB). A capture of another library's arrays is imaged in that
+    library; see `nlos.portable`.
 
-    Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight imaging systems",
-    Nat. Commun. 11, 1645 (2020).
+    Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight
+    imaging systems", Nat. Commun. 11, 1645 (2020).
 
     Parameters
     ----------
@@ -62,28 +72,42 @@ class PlanarRSD(PhasorMethod):
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why.
 
-        True in a condition if it can; ``.reason`` tells why not. Needed are a planar, evenly sampled wall at z = const,
-        voxels evenly spaced along x and y and in front of the wall, few laser spots, and memory.
+        True in a condition if it can; ``.reason`` tells why not. Needed are a planar, evenly
+        sampled wall at z = const, voxels evenly spaced along x and y and in front of the wall, few
+        laser spots, and memory.
         """
-        general = common_support(capture, grid) and grid_support(grid) and exposure_support(capture)
+        general = (
+            check_common_support(capture, grid)
+            and check_grid_support(grid)
+            and check_illumination_support(capture)
+        )
         if not general:
             return general
         try:
-            band = unfolded_band(capture, grid, self.pulse)
-            walls = [PlanarWall.of(capture.points[part.members]) for part in exposures(capture)]
+            band = choose_unaliased_band(capture, grid, self.pulse)
+            walls = [
+                PlanarWall.of(capture.points[group.indices])
+                for group in group_by_illumination(capture)
+            ]
         except InputError as problem:
             return Support(str(problem))
         if grid.z[0] <= walls[0].plane.z:
-            return Support(f"the grid must begin in front of the wall, which is at z = {walls[0].plane.z:.4g} m")
-        return self._way(walls[0].plane, grid, band, exposures(capture)[0]).supports()
+            return Support(
+                f"the grid must begin in front of the wall, which is at z = {walls[0].plane.z:.4g} m"
+            )
+        return self._plan(walls[0].plane, grid, band, group_by_illumination(capture)[0]).supports()
 
-    def phasor_field(self, capture: Capture, grid: Grid, progress: Progress = silent) -> Volume:
-        """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in the signal."""
+    def phasor_field(
+        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
+    ) -> Volume:
+        """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in
+        the signal.
+        """
         self.supports(capture, grid).require()
-        band = unfolded_band(capture, grid, self.pulse)
+        band = choose_unaliased_band(capture, grid, self.pulse)
         warn_of_aliasing(capture, band)
         if is_numpy(capture.signal):
-            total = self._compiled(capture, grid, band, progress)
+            total = self._diffract_compiled(capture, grid, band, progress)
         else:
             from nlos.portable.prepared import PreparedField
 
@@ -93,18 +117,35 @@ class PlanarRSD(PhasorMethod):
     @property
     def settings(self) -> dict[str, str | float]:
         """What a volume tells of how it was imaged."""
-        return {"method": "rsd", "wavelength_m": self.wavelength, "cycles": self.cycles, "tolerance": self.tolerance}
+        return {
+            "method": "rsd",
+            "wavelength_m": self.wavelength,
+            "cycles": self.cycles,
+            "tolerance": self.tolerance,
+        }
 
-    def _compiled(self, capture: Capture, grid: Grid, band: Band, progress: Progress) -> NDArray[np.complex64]:
+    def _diffract_compiled(
+        self, capture: Capture, grid: Grid, band: Band, progress: Progress
+    ) -> NDArray[np.complex64]:
         total = np.zeros(grid.shape, np.complex64)
-        for part in exposures(capture):
-            wall = PlanarWall.of(capture.points[part.members])
-            values = wall.field(part.phasors(capture, band))
-            diffract(self._way(wall.plane, grid, band, part), values, source_of(part, band), total, progress)
+        for group in group_by_illumination(capture):
+            wall = PlanarWall.of(capture.points[group.indices])
+            values = wall.field(group.compute_phasors(capture, band))
+            diffract_to_grid(
+                self._plan(wall.plane, grid, band, group),
+                values,
+                build_source(group, band),
+                total,
+                progress,
+            )
         return total
 
-    def _way(self, plane: Plane, grid: Grid, band: Band, part: Exposure) -> Diffraction:
-        return Diffraction(plane, grid, waves_of(part, band, continued=False), self.tolerance)
+    def _plan(
+        self, plane: Plane, grid: Grid, band: Band, group: IlluminationGroup
+    ) -> DiffractionPlan:
+        return DiffractionPlan(
+            plane, grid, build_waves(group, band, continued=False), self.tolerance
+        )
 
 
 def require_tolerance(tolerance: float) -> None:
@@ -113,21 +154,23 @@ def require_tolerance(tolerance: float) -> None:
         raise InputError(f"the tolerance must lie between 1e-4 and 0.1, got {tolerance}")
 
 
-def grid_support(grid: Grid) -> Support:
+def check_grid_support(grid: Grid) -> Support:
     """Check that Fourier transforms can reach the voxels."""
     for name in ("x", "y"):
-        if not evenly_spaced(getattr(grid, name)):
-            return Support(f"the voxels are not evenly spaced along {name}: Fourier transforms need them to be")
+        if not is_evenly_spaced(getattr(grid, name)):
+            return Support(
+                f"the voxels are not evenly spaced along {name}: Fourier transforms need them to be"
+            )
     return Support()
 
 
-def waves_of(part: Exposure, band: Band, continued: bool) -> Waves:
+def build_waves(group: IlluminationGroup, band: Band, continued: bool) -> SphericalWaves:
     """Return the waves between wall and voxels in one exposure."""
-    k = part.passes * band.wavenumbers
+    k = group.legs * band.wavenumbers
     step = float(k[1] - k[0]) if k.size > 1 else 1.0
-    return Waves(float(k[0]), step, k.size, continued)
+    return SphericalWaves(float(k[0]), step, k.size, continued)
 
 
-def source_of(part: Exposure, band: Band) -> Source:
+def build_source(group: IlluminationGroup, band: Band) -> LaserSource:
     """Return what shines on the scene in one exposure."""
-    return Source(part.laser, band.wavenumbers, band.weights / band.weights.max())
+    return LaserSource(group.laser, band.wavenumbers, band.weights / band.weights.max())

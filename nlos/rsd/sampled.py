@@ -1,4 +1,5 @@
-"""Diffraction by convolution with the sampled wave: exact for sources and voxels of one lattice, and slow.
+"""Diffraction by convolution with the sampled wave: exact for sources and voxels of one lattice,
+and slow.
 
 What the quick way answers to where direct sums would take too long.
 """
@@ -11,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.geometry import Grid
-from nlos.plane import Plane, step
-from nlos.rsd.transfer import Waves
+from nlos.plane import Plane, axis_step
+from nlos.rsd.transfer import SphericalWaves
 from tofclip.errors import InputError
 
 
-def sampled_diffraction(values: NDArray[Any], plane: Plane, grid: Grid, waves: Waves) -> NDArray[np.complex128]:
+def diffract_by_convolution(
+    values: NDArray[Any], plane: Plane, grid: Grid, waves: SphericalWaves
+) -> NDArray[np.complex128]:
     """Return the field of every frequency at every voxel, complex128, shape (frequencies, z, y, x).
 
     Parameters
@@ -31,16 +34,20 @@ def sampled_diffraction(values: NDArray[Any], plane: Plane, grid: Grid, waves: W
     """
     from scipy.fft import fft2, ifft2
 
-    pitches = (step(grid.y), step(grid.x))
+    pitches = (axis_step(grid.y), axis_step(grid.x))
     if waves.continued or not np.allclose(pitches, plane.steps):
-        raise InputError("the sampled wave is that of points, at voxels as far from each other as the points")
+        raise InputError(
+            "the sampled wave is that of points, at voxels as far from each other as the points"
+        )
     lattice = tuple(a + b - 1 for a, b in zip(plane.shape, grid.shape[1:], strict=True))
     spectrum = fft2(values.astype(np.complex128), lattice, axes=(0, 1))
     wavenumbers = waves.first + waves.step * np.arange(waves.count)
     # Offsets from the last source to the first voxel up to from the first source to the last voxel.
     y, x = (
         start[0] - end[-1] + pitch * np.arange(count)
-        for start, end, pitch, count in zip((grid.y, grid.x), (plane.y, plane.x), pitches, lattice, strict=True)
+        for start, end, pitch, count in zip(
+            (grid.y, grid.x), (plane.y, plane.x), pitches, lattice, strict=True
+        )
     )
     field = np.empty((waves.count, *grid.shape), np.complex128)
     for i, depth in enumerate(grid.z):

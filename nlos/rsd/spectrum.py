@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-ROUNDING = 1e-9
+LATERAL_ROUNDING = 1e-9
 """Lateral wavenumbers nearer to each other are one, rad/m."""
 
 
@@ -23,45 +23,50 @@ class PlaneWaves:
     ----------
     period : (float, float)
         Of the lattice in space along y and x, m.
-    limits : (frequencies,) array
+    lateral_limits : (frequencies,) array
         Largest lateral wavenumber that counts at each frequency, rad/m; increasing.
     """
 
     period: tuple[float, float]
-    limits: FloatArray
+    lateral_limits: FloatArray
 
     @property
-    def reach(self) -> tuple[int, int]:
+    def max_indices(self) -> tuple[int, int]:
         """Largest index along y and x."""
-        return self.reach_within(float(self.limits[-1]))
+        return self.max_indices_within(float(self.lateral_limits[-1]))
 
-    def reach_within(self, lateral: float) -> tuple[int, int]:
+    def max_indices_within(self, lateral: float) -> tuple[int, int]:
         """Largest index along y and x up to a lateral wavenumber."""
-        y, x = (int((lateral + ROUNDING) * side / (2 * np.pi)) for side in self.period)
+        y, x = (int((lateral + LATERAL_ROUNDING) * side / (2 * np.pi)) for side in self.period)
         return y, x
 
     @cached_property
-    def _ordered(self) -> tuple[IntArray, IntArray, FloatArray]:
+    def _sorted_waves(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Indices along y and x, and lateral wavenumbers."""
-        rows, columns = (np.arange(-n, n + 1) for n in self.reach)
-        qy, qx = (2 * np.pi / side * index for side, index in zip(self.period, (rows, columns), strict=True))
+        rows, columns = (np.arange(-n, n + 1) for n in self.max_indices)
+        qy, qx = (
+            2 * np.pi / side * index
+            for side, index in zip(self.period, (rows, columns), strict=True)
+        )
         # Rounded, so that waves mirrored in an axis or in the diagonal are equal.
-        lateral = ROUNDING * np.rint(np.hypot(qy[:, np.newaxis], qx) / ROUNDING).ravel()
-        inside = np.flatnonzero(lateral <= self.limits[-1])
+        lateral = (
+            LATERAL_ROUNDING * np.rint(np.hypot(qy[:, np.newaxis], qx) / LATERAL_ROUNDING).ravel()
+        )
+        inside = np.flatnonzero(lateral <= self.lateral_limits[-1])
         order = inside[np.argsort(lateral[inside], kind="stable")]
         return rows[order // columns.size], columns[order % columns.size], lateral[order]
 
     @property
     def row(self) -> IntArray:
         """Index along y of every wave."""
-        return self._ordered[0]
+        return self._sorted_waves[0]
 
     @property
     def column(self) -> IntArray:
         """Index along x of every wave."""
-        return self._ordered[1]
+        return self._sorted_waves[1]
 
     @property
-    def lateral(self) -> FloatArray:
+    def lateral_wavenumbers(self) -> FloatArray:
         """Lateral wavenumber of every wave, rad/m."""
-        return self._ordered[2]
+        return self._sorted_waves[2]

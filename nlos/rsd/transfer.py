@@ -8,12 +8,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.rsd.kernels import TAPS, interpolation, sample_waves
+from nlos.rsd.kernels import TAPS, find_interpolation_weights, sample_waves
 from nlos.rsd.window import Window
 
 FloatArray = NDArray[np.float64]
 
-OVERSAMPLING = 2.5
+NODE_OVERSAMPLING = 2.5
 """Nodes along the lateral wavenumber, relative to the Nyquist rate of the window's radius; interpolation then errs by
 5e-5."""
 
@@ -25,7 +25,7 @@ WINDOW_STEEPNESS = 1.6
 
 
 @dataclass(frozen=True, eq=False)
-class Waves:
+class SphericalWaves:
     """The spherical waves that carry a field on.
 
     Parameters
@@ -33,8 +33,9 @@ class Waves:
     first, step, count : float, float, int
         Evenly spaced wavenumbers, rad/m.
     continued : bool
-        False for ``exp(1j * k * R) / R``, the wave of a point; True for the first Rayleigh-Sommerfeld integral's
-        ``z / (2 pi R^2) * (1 / R - 1j * k) * exp(1j * k * R)``, which continues a field known on a plane.
+        False for ``exp(1j * k * R) / R``, the wave of a point; True for the first
+        Rayleigh-Sommerfeld integral's ``z / (2 pi R^2) * (1 / R - 1j * k) * exp(1j * k * R)``,
+        which continues a field known on a plane.
     """
 
     first: float
@@ -43,88 +44,111 @@ class Waves:
     continued: bool
 
     @property
-    def numbers(self) -> FloatArray:
+    def wavenumbers(self) -> FloatArray:
         """Wavenumbers, rad/m."""
         return self.first + self.step * np.arange(self.count, dtype=np.float64)
 
     @property
-    def highest(self) -> float:
+    def max_wavenumber(self) -> float:
         """Largest wavenumber, rad/m."""
         return self.first + self.step * (self.count - 1)
 
 
 @dataclass(frozen=True, eq=False)
-class Transfer:
-    """Fourier transform of a wave's cross-section at some distance, cut off smoothly outside a circle.
+class TransferFunction:
+    """Fourier transform of a wave's cross-section at some distance, cut off smoothly outside a
+    circle.
 
-    It is the Hankel transform ``2 pi * int g(sqrt(rho^2 + z^2)) * window(rho) * J_0(q * rho) * rho d rho``. Since the
-    window, not a period, ends the wave, a convolution through it is as exact as one with the sampled wave, wherever
-    source and target are nearer to each other than the window's reach; and since it depends on q alone, few values make
-    it up.
+    It is the Hankel transform ``2 pi * int g(sqrt(rho^2 + z^2)) * window(rho) * J_0(q * rho) * rho
+    d rho``. Since the window, not a period, ends the wave, a convolution through it is as exact as
+    one with the sampled wave, wherever source and target are nearer to each other than the window's
+    reach; and since it depends on q alone, few values make it up.
 
     Parameters
     ----------
     waves : Waves
     window : Window
-    lateral : float
+    max_lateral_wavenumber : float
         Largest lateral wavenumber q wanted, rad/m.
-    finest : float
+    min_distance : float
         Smallest distance that will be asked for, m: the nearer, the more sharply peaked the wave.
     """
 
-    waves: Waves
+    waves: SphericalWaves
     window: Window
-    lateral: float
-    finest: float
+    max_lateral_wavenumber: float
+    min_distance: float
 
     @cached_property
     def node_step(self) -> float:
         """Distance of neighbouring nodes in q, rad/m."""
-        return np.pi / (self.window.edge * OVERSAMPLING)
+        return np.pi / (self.window.outer_radius * NODE_OVERSAMPLING)
 
     @cached_property
     def nodes(self) -> FloatArray:
         """Lateral wavenumbers of the nodes, rad/m."""
-        # The transfer function is even in q: nodes on both sides of 0 serve the interpolation there.
-        return self.node_step * np.arange(-(TAPS // 2), np.ceil(self.lateral / self.node_step) + TAPS // 2 + 1)
+        # The transfer function is even in q: nodes on both sides of 0 serve the interpolation
+        # there.
+        return self.node_step * np.arange(
+            -(TAPS // 2), np.ceil(self.max_lateral_wavenumber / self.node_step) + TAPS // 2 + 1
+        )
 
     @cached_property
     def _radii(self) -> tuple[FloatArray, FloatArray]:
-        """Radii, m, and the weights of an integral over the plane; exponentially accurate for smooth waves.
+        """Radii, m, and the weights of an integral over the plane; exponentially accurate for
+        smooth waves.
 
-        A trapezoidal rule in t with ``rho = h * log(1 + exp(t))``: evenly spaced but for a few ever smaller radii.
+        A trapezoidal rule in t with ``rho = h * log(1 + exp(t))``: evenly spaced but for a few ever
+        smaller radii.
         """
-        fastest = self.waves.highest + self.lateral
-        h = min(2 * np.pi / (fastest * RADII_PER_PERIOD), self.finest)
-        t = np.arange(-8.0, self.window.edge / h + 1)
+        fastest = self.waves.max_wavenumber + self.max_lateral_wavenumber
+        h = min(2 * np.pi / (fastest * RADII_PER_PERIOD), self.min_distance)
+        t = np.arange(-8.0, self.window.outer_radius / h + 1)
         radii = h * np.logaddexp(0, t)
         return radii, 2 * np.pi * radii * h / (1 + np.exp(-t))
 
     @cached_property
-    def prepared(self) -> NDArray[np.float32]:
+    def bessel_matrix(self) -> NDArray[np.float32]:
         """``J_0(q * rho)`` with all weights, shape (nodes, radii)."""
         from scipy.special import erfc, j0
 
         radii, weights = self._radii
-        ramp = (radii - self.window.reach) / (self.window.edge - self.window.reach)
+        ramp = (radii - self.window.inner_radius) / (
+            self.window.outer_radius - self.window.inner_radius
+        )
         falling = np.where(ramp <= 1, erfc(WINDOW_STEEPNESS * (2 * ramp - 1)) / 2, 0)
         return np.asarray(j0(np.outer(self.nodes, radii)) * (weights * falling), np.float32)
 
     def interpolation(self, lateral: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Find lateral wavenumbers among the nodes: the first node to take, and the weights of `TAPS` from it on."""
-        node, share = np.empty(lateral.size, np.int64), np.empty((lateral.size, TAPS), np.float32)
-        interpolation(lateral / self.node_step + TAPS // 2, node, share)
-        return node, share
+        """Find lateral wavenumbers among the nodes: the first node to take, and the weights of
+        `TAPS` from it on.
+        """
+        node, weight = np.empty(lateral.size, np.int64), np.empty((lateral.size, TAPS), np.float32)
+        find_interpolation_weights(lateral / self.node_step + TAPS // 2, node, weight)
+        return node, weight
 
-    def at(self, distance: float, delay: FloatArray, ahead: int = 0) -> NDArray[np.float32]:
-        """Return the transfer function over a distance, shape (nodes, 2, frequencies), real and imaginary parts.
+    def evaluate(
+        self, distance: float, delay: FloatArray, leading_zeros: int = 0
+    ) -> NDArray[np.float32]:
+        """Return the transfer function over a distance, shape (nodes, 2, frequencies), real and
+        imaginary parts.
 
-        A delay (path, k_0) turns every frequency by ``(k - k_0) * path`` besides. A negative distance undoes a
-        positive one, as far as waves travel at all. `ahead` zeros stand before the lowest frequency.
+        A delay (path, k_0) turns every frequency by ``(k - k_0) * path`` besides. A negative
+        distance undoes a positive one, as far as waves travel at all. `leading_zeros` zeros stand
+        before the lowest frequency.
         """
         radii, _ = self._radii
-        waves = np.zeros((radii.size, 2, ahead + self.waves.count), np.float32)
-        sample_waves(radii, distance, self.waves.first, self.waves.step, delay, self.waves.continued, ahead, waves)
-        flat = self.prepared @ waves.reshape(radii.size, -1)
+        waves = np.zeros((radii.size, 2, leading_zeros + self.waves.count), np.float32)
+        sample_waves(
+            radii,
+            distance,
+            self.waves.first,
+            self.waves.step,
+            delay,
+            self.waves.continued,
+            leading_zeros,
+            waves,
+        )
+        flat = self.bessel_matrix @ waves.reshape(radii.size, -1)
         nodes: NDArray[np.float32] = flat.reshape(-1, *waves.shape[1:])
         return nodes

@@ -9,18 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.plane import EVENNESS, Plane
+from nlos.plane import EVENNESS_TOLERANCE, Plane
 from tofclip.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
-SAME_PLACE = 0.02
+SAME_COORDINATE_FRACTION = 0.02
 """Coordinates nearer to each other than this fraction of the widest gap are one."""
 
 
 @dataclass(frozen=True, eq=False)
 class WallLattice:
-    """Wall points above the places of an even lattice, at whatever depth; some places may stay empty.
+    """Wall points above the places of an even lattice, at whatever depth; some places may stay
+    empty.
 
     Parameters
     ----------
@@ -36,20 +37,23 @@ class WallLattice:
     column: NDArray[np.intp]
 
     @classmethod
-    def of(cls, points: FloatArray, evenness: float = EVENNESS) -> WallLattice:
-        """Find the lattice that wall points (n, 3) stand above; they may be off it by a fraction of its step.
+    def of(cls, points: FloatArray, evenness: float = EVENNESS_TOLERANCE) -> WallLattice:
+        """Find the lattice that wall points (n, 3) stand above; they may be off it by a fraction of
+        its step.
 
         Raises
         ------
         InputError
             There is none, or two points stand in one place.
         """
-        x, column = _lattice(points[:, 0], "x", evenness)
-        y, row = _lattice(points[:, 1], "y", evenness)
+        x, column = _fit_lattice_axis(points[:, 0], "x", evenness)
+        y, row = _fit_lattice_axis(points[:, 1], "y", evenness)
         places = row * x.size + column
         # Points are mostly listed in order, which tells without sorting that none stands twice.
         if not np.all(np.diff(places) > 0) and not np.all(np.diff(np.sort(places)) > 0):
-            raise InputError("two wall points stand in one place; use the hybrid method, which takes them as they are")
+            raise InputError(
+                "two wall points stand in one place; use the hybrid method, which takes them as they are"
+            )
         return cls(x, y, row, column)
 
     @property
@@ -58,13 +62,13 @@ class WallLattice:
         return self.y.size, self.x.size
 
     @cached_property
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether the points are all places in C order."""
         places = self.row * self.x.size + self.column
         return places.size == self.x.size * self.y.size and bool(np.all(np.diff(places) == 1))
 
     @cached_property
-    def occupants(self) -> NDArray[np.intp]:
+    def point_numbers(self) -> NDArray[np.intp]:
         """Number of the wall point in every place, in C order; one too many where none stands."""
         occupants = np.full(self.x.size * self.y.size, self.row.size)
         occupants[self.row * self.x.size + self.column] = np.arange(self.row.size)
@@ -85,8 +89,9 @@ class PlanarWall:
     lattice: WallLattice
 
     @classmethod
-    def of(cls, points: FloatArray, evenness: float = EVENNESS) -> PlanarWall:
-        """Find the lattice that wall points (n, 3) stand on; they may be off it by a fraction of its step.
+    def of(cls, points: FloatArray, evenness: float = EVENNESS_TOLERANCE) -> PlanarWall:
+        """Find the lattice that wall points (n, 3) stand on; they may be off it by a fraction of
+        its step.
 
         Raises
         ------
@@ -104,20 +109,25 @@ class PlanarWall:
         return cls(plane, lattice)
 
     def field(self, samples: NDArray[Any]) -> NDArray[Any]:
-        """Put phasors (points, frequencies), or signals (points, t), into their places, shape (y, x, ...)."""
-        if self.lattice.complete:
+        """Put phasors (points, frequencies), or signals (points, t), into their places, shape (y,
+        x, ...).
+        """
+        if self.lattice.is_complete:
             return samples.reshape(*self.plane.shape, -1)
         values = np.zeros((*self.plane.shape, samples.shape[1]), samples.dtype)
         values[self.lattice.row, self.lattice.column] = samples
         return values
 
 
-def _lattice(coordinates: FloatArray, name: str, evenness: float) -> tuple[FloatArray, NDArray[np.intp]]:
+def _fit_lattice_axis(
+    coordinates: FloatArray, name: str, evenness: float
+) -> tuple[FloatArray, NDArray[np.intp]]:
     """Even axis that all coordinates lie on, and the place of each."""
     ordered = np.sort(coordinates)
     gaps = np.diff(ordered)
-    # Points of one column differ by far less than columns, even where some columns between are missing.
-    apart = gaps[gaps > SAME_PLACE * gaps.max(initial=0)]
+    # Points of one column differ by far less than columns, even where some columns between are
+    # missing.
+    apart = gaps[gaps > SAME_COORDINATE_FRACTION * gaps.max(initial=0)]
     if apart.size == 0:
         raise InputError(f"the wall's points need at least two different {name}")
     steps = round(float((ordered[-1] - ordered[0]) / np.median(apart)))

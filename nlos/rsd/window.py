@@ -12,20 +12,24 @@ from nlos.plane import Plane
 FloatArray = NDArray[np.float64]
 Sides = tuple[float, float]
 
-REACH = 0.88
-"""Where the window begins to fall at least, relative to the largest distance of a source and a target."""
+INNER_RADIUS_FRACTION = 0.88
+"""Where the window begins to fall at least, relative to the largest distance of a source and a
+target.
+"""
 
-EDGE, WIDEST_EDGE = 0.25, 0.5
+MIN_EDGE_FRACTION, MAX_EDGE_FRACTION = 0.25, 0.5
 """Width of the window's edge, relative to the largest distance along one axis."""
 
-SPREAD = 0.6
+SPREAD_FACTOR = 0.6
 """Widening of a grazing wave's spectrum by the window's edge, per squared digit of the tolerance and edge width;
 measured on point scenes."""
 
-QUICK_FACTORS = (1, 3, 5, 15, 25)
-"""Of these times a power of 2, single-precision Fourier transforms take half as long as of other lengths; measured."""
+FFT_LENGTH_FACTORS = (1, 3, 5, 15, 25)
+"""Of these times a power of 2, single-precision Fourier transforms take half as long as of other
+lengths; measured.
+"""
 
-VECTOR = 8
+VECTOR_LENGTH = 8
 """complex64 numbers in 64 bytes: where vector instructions like rows to start."""
 
 
@@ -35,49 +39,54 @@ class Window:
 
     Parameters
     ----------
-    reach, edge : float
+    inner_radius, outer_radius : float
         Radii up to which waves are whole, and from which on they are gone, m.
     """
 
-    reach: float
-    edge: float
+    inner_radius: float
+    outer_radius: float
 
     @classmethod
     def within(cls, farthest: Sides, periods: Sides) -> Window:
-        """Return the widest window that lets no image of a source in a periodic lattice meet a target.
+        """Return the widest window that lets no image of a source in a periodic lattice meet a
+        target.
 
         Parameters
         ----------
         farthest : (float, float)
-            As `farthest_apart` gives it.
+            As `find_max_offsets` gives it.
         periods : (float, float)
-            Along y and x, m; at least `shortest_periods`.
+            Along y and x, m; at least `find_min_periods`.
         """
         corner, along = float(np.hypot(*farthest)), max(farthest)
         room = min(period - far for period, far in zip(periods, farthest, strict=True))
-        reach = min(corner, room - EDGE * along)
-        return cls(reach, min(room, reach + WIDEST_EDGE * along))
+        reach = min(corner, room - MIN_EDGE_FRACTION * along)
+        return cls(reach, min(room, reach + MAX_EDGE_FRACTION * along))
 
-    def spread(self, tolerance: float) -> float:
+    def spectral_spread(self, tolerance: float) -> float:
         """Lateral wavenumbers by which the window's edge spreads grazing waves, rad/m."""
-        return float(SPREAD * np.log10(tolerance) ** 2 / (self.edge - self.reach))
+        return float(
+            SPREAD_FACTOR * np.log10(tolerance) ** 2 / (self.outer_radius - self.inner_radius)
+        )
 
 
-def farthest_apart(sources: Plane, y: FloatArray, x: FloatArray) -> Sides:
+def find_max_offsets(sources: Plane, y: FloatArray, x: FloatArray) -> Sides:
     """Return the largest distance of a source on a plane from a target along y and along x, m."""
     pairs = ((y, sources.y), (x, sources.x))
     along_y, along_x = (float(max(abs(a[-1] - b[0]), abs(a[0] - b[-1]))) for a, b in pairs)
     return along_y, along_x
 
 
-def shortest_periods(farthest: Sides) -> Sides:
+def find_min_periods(farthest: Sides) -> Sides:
     """Return the shortest periods along y and x in which a window has room, m."""
-    edge = REACH * float(np.hypot(*farthest)) + EDGE * max(farthest)
+    edge = INNER_RADIUS_FRACTION * float(np.hypot(*farthest)) + MIN_EDGE_FRACTION * max(farthest)
     y, x = (edge + far for far in farthest)
     return y, x
 
 
-def convenient(count: float) -> int:
+def find_fast_length(count: float) -> int:
     """Next length that Fourier transforms are quick at."""
-    lengths = (factor * 2 * VECTOR << power for factor in QUICK_FACTORS for power in range(20))
+    lengths = (
+        factor * 2 * VECTOR_LENGTH << power for factor in FFT_LENGTH_FACTORS for power in range(20)
+    )
     return min(length for length in lengths if length >= count)

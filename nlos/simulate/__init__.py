@@ -1,14 +1,15 @@
 """Captures of known hidden scenes: the truth that reconstructions are compared with.
 
-`PointScene` is the plainest and exact to float64; `HiddenScene` has letters and triangle meshes that hide one another.
+`PointScene` is the plainest and exact to float64; `HiddenScene` has letters and triangle meshes
+that hide one another.
 """
 
 from nlos.simulate.materials import Lambert, Material, Retroreflector
-from nlos.simulate.noise import counted
+from nlos.simulate.noise import add_poisson_noise
 from nlos.simulate.points import PointScene
 from nlos.simulate.scene import HiddenScene
 from nlos.simulate.surfaces import Surface
-from nlos.simulate.walls import WALLS, relay_wall
+from nlos.simulate.walls import WALLS, build_relay_wall
 
 __all__ = [
     "WALLS",
@@ -18,6 +19,6 @@ __all__ = [
     "PointScene",
     "Retroreflector",
     "Surface",
-    "counted",
-    "relay_wall",
+    "add_poisson_noise",
+    "build_relay_wall",
 ]

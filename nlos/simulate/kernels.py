@@ -8,19 +8,24 @@ import numpy as np
 
 from nlos.kernels import compiled
 
-TOUCHING = 1e-4
-"""Share of a way at either end where a triangle hides nothing: the facet's own triangle begins there."""
+CONTACT_FRACTION = 1e-4
+"""Share of a way at either end where a triangle hides nothing: the facet's own triangle begins
+there.
+"""
 
 
 @compiled
-def is_hidden(start, end, triangles):
-    """Whether a triangle crosses the way between two points (T. Moller, B. Trumbore, J. Graph. Tools 2, 21 (1997))."""
+def is_occluded(start, end, triangles):
+    """Whether a triangle crosses the way between two points (T. Moller, B. Trumbore, J. Graph.
+    Tools 2, 21 (1997)).
+    """
     dx, dy, dz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     near, far = min(start[2], end[2]), max(start[2], end[2])
     for i in range(triangles.shape[0]):
         ax, ay, az = triangles[i, 0, 0], triangles[i, 0, 1], triangles[i, 0, 2]
         bz, cz = triangles[i, 1, 2], triangles[i, 2, 2]
-        # Most triangles lie wholly behind the facet: this asks three numbers of them instead of nine.
+        # Most triangles lie wholly behind the facet: this asks three numbers of them instead of
+        # nine.
         if (az >= far and bz >= far and cz >= far) or (az <= near and bz <= near and cz <= near):
             continue
         ux, uy, uz = triangles[i, 1, 0] - ax, triangles[i, 1, 1] - ay, triangles[i, 1, 2] - az
@@ -38,13 +43,13 @@ def is_hidden(start, end, triangles):
         if v < 0 or u + v > 1:
             continue
         along = (vx * qx + vy * qy + vz * qz) / determinant
-        if TOUCHING < along < 1 - TOUCHING:
+        if CONTACT_FRACTION < along < 1 - CONTACT_FRACTION:
             return True
     return False
 
 
 @compiled
-def cosine(normal, from_point, to_point, distance):
+def cosine_to_normal(normal, from_point, to_point, distance):
     """Cosine of the angle between a normal and a way, 0 behind the surface."""
     inner = 0.0
     for i in range(3):
@@ -53,8 +58,19 @@ def cosine(normal, from_point, to_point, distance):
 
 
 @compiled
-def expose(
-    wall, wall_normals, lasers, laser_normals, positions, normals, areas, material, triangles, start, fine, bins
+def add_facet_light(
+    wall,
+    wall_normals,
+    lasers,
+    laser_normals,
+    positions,
+    normals,
+    areas,
+    material,
+    triangles,
+    start,
+    fine,
+    bins,
 ):
     """Add the light of all facets to fine bins, shared between the two that it falls between.
 
@@ -78,42 +94,50 @@ def expose(
     for p in range(wall.shape[0]):
         if p < lasers.shape[0]:
             for f in range(positions.shape[0]):
-                way = distance_of(lasers[p], positions[f])
+                way = distance_between(lasers[p], positions[f])
                 outward[f] = way
-                arriving = cosine(normals[f], positions[f], lasers[p], way) * cosine(
-                    laser_normals[p], lasers[p], positions[f], way
-                )
-                if arriving > 0 and is_hidden(positions[f], lasers[p], triangles):
+                arriving = cosine_to_normal(
+                    normals[f], positions[f], lasers[p], way
+                ) * cosine_to_normal(laser_normals[p], lasers[p], positions[f], way)
+                if arriving > 0 and is_occluded(positions[f], lasers[p], triangles):
                     arriving = 0.0
                 lit[f] = arriving * areas[f] / (way * way)
         laser = lasers[min(p, lasers.shape[0] - 1)]
         for f in range(positions.shape[0]):
             if lit[f] <= 0:
                 continue
-            way = distance_of(wall[p], positions[f])
-            leaving = cosine(normals[f], positions[f], wall[p], way) * cosine(
+            way = distance_between(wall[p], positions[f])
+            leaving = cosine_to_normal(normals[f], positions[f], wall[p], way) * cosine_to_normal(
                 wall_normals[p], wall[p], positions[f], way
             )
             place = (outward[f] + way - start) / fine
-            if leaving <= 0 or place < 0 or place >= bins.shape[1] - 1 or is_hidden(positions[f], wall[p], triangles):
+            if (
+                leaving <= 0
+                or place < 0
+                or place >= bins.shape[1] - 1
+                or is_occluded(positions[f], wall[p], triangles)
+            ):
                 continue
             brightness = (
-                lit[f] * leaving * reflectance(material, positions[f], laser, wall[p], outward[f], way) / (way * way)
+                lit[f]
+                * leaving
+                * evaluate_reflectance(material, positions[f], laser, wall[p], outward[f], way)
+                / (way * way)
             )
             index = int(place)
-            share = place - index
-            bins[p, index] += brightness * (1 - share)
-            bins[p, index + 1] += brightness * share
+            weight = place - index
+            bins[p, index] += brightness * (1 - weight)
+            bins[p, index + 1] += brightness * weight
 
 
 @compiled
-def distance_of(one, other):
+def distance_between(one, other):
     """Distance of two points."""
     return math.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)
 
 
 @compiled
-def reflectance(material, position, laser, observer, to_laser, to_observer):
+def evaluate_reflectance(material, position, laser, observer, to_laser, to_observer):
     """Reflectance per steradian; see `nlos.simulate.materials.Material`."""
     value = material[0] / math.pi
     if material[1] > 0:

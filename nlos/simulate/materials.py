@@ -1,4 +1,6 @@
-"""How hidden surfaces scatter light: bidirectional reflectance for an incoming and an outgoing direction."""
+"""How hidden surfaces scatter light: bidirectional reflectance for an incoming and an outgoing
+direction.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from tofclip.errors import InputError
 
 
 class Material(Protocol):
-    """Reflectance ``diffuse / pi + retro * exp(-angle^2 / (2 * spread^2)) / (2 * pi * spread^2)`` per steradian.
+    """Reflectance ``diffuse / pi + retro * exp(-angle^2 / (2 * spread^2)) / (2 * pi * spread^2)``
+    per steradian.
 
     `angle` is that between the directions towards the light and towards the observer.
     """
@@ -45,7 +48,7 @@ class Lambert:
     albedo: float = 1.0
 
     def __post_init__(self) -> None:
-        _require_share(self.albedo)
+        _require_albedo(self.albedo)
 
     @property
     def diffuse(self) -> float:
@@ -76,9 +79,11 @@ class Retroreflector:
     spread: float = 0.1
 
     def __post_init__(self) -> None:
-        _require_share(self.albedo)
+        _require_albedo(self.albedo)
         if not (np.isfinite(self.spread) and self.spread > 0):
-            raise InputError(f"the spread of a retroreflector must be a positive angle, got {self.spread}")
+            raise InputError(
+                f"the spread of a retroreflector must be a positive angle, got {self.spread}"
+            )
 
     @property
     def diffuse(self) -> float:
@@ -89,6 +94,6 @@ class Retroreflector:
         return self.albedo
 
 
-def _require_share(albedo: float) -> None:
+def _require_albedo(albedo: float) -> None:
     if not 0 <= albedo <= 1:
         raise InputError(f"an albedo is a share between 0 and 1, got {albedo}")

@@ -20,9 +20,9 @@ FloatArray = NDArray[np.float64]
 class PointScene:
     """Hidden points that scatter evenly in all directions, see each other not, and hide nothing.
 
-    A point of albedo a, at distance d_L from the laser spot and d_p from wall point p, returns ``a / (d_L * d_p)^2``
-    after a path of ``d_L + d_p``. No grid of voxels takes part, so the simulation shares nothing with a method that
-    images it.
+    A point of albedo a, at distance d_L from the laser spot and d_p from wall point p, returns ``a
+    / (d_L * d_p)^2`` after a path of ``d_L + d_p``. No grid of voxels takes part, so the simulation
+    shares nothing with a method that images it.
 
     Parameters
     ----------
@@ -37,7 +37,11 @@ class PointScene:
 
     def __post_init__(self) -> None:
         positions = np.atleast_2d(np.asarray(self.positions, dtype=np.float64))
-        albedo = np.ones(len(positions)) if self.albedo is None else np.asarray(self.albedo, dtype=np.float64)
+        albedo = (
+            np.ones(len(positions))
+            if self.albedo is None
+            else np.asarray(self.albedo, dtype=np.float64)
+        )
         if positions.ndim != 2 or positions.shape[1] != 3:
             raise ShapeError("positions of hidden points", "(n, 3)", positions.shape)
         if albedo.shape != (len(positions),):
@@ -45,7 +49,7 @@ class PointScene:
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "albedo", albedo)
 
-    def seen_from(self, wall: Any, laser: Any, axis: TimeAxis, jitter: float) -> Capture:
+    def simulate_capture(self, wall: Any, laser: Any, axis: TimeAxis, jitter: float) -> Capture:
         """Simulate a capture without noise.
 
         Parameters
@@ -56,7 +60,8 @@ class PointScene:
             Laser spot, m, or one per wall point.
         axis : TimeAxis
         jitter : float
-            Standard deviation of the instrument's Gaussian response, s; its integral over every time bin is exact.
+            Standard deviation of the instrument's Gaussian response, s; its integral over every
+            time bin is exact.
 
         Returns
         -------
@@ -70,12 +75,16 @@ class PointScene:
             outward = np.linalg.norm(laser - position, axis=-1)
             back = np.linalg.norm(wall - position, axis=-1)
             brightness = albedo / (outward * back) ** 2
-            signal += brightness * _gaussian_bins(axis, outward + back, SPEED_OF_LIGHT * jitter)
+            signal += brightness * _integrate_gaussian(
+                axis, outward + back, SPEED_OF_LIGHT * jitter
+            )
         return Capture(np.nan_to_num(signal), wall, laser, axis.bin_width, axis.start)
 
 
-def _gaussian_bins(axis: TimeAxis, path: FloatArray, sigma: float) -> FloatArray:
-    """Share of a unit Gaussian about `path` (...) in every bin, shape (t, ...); bin i is centred on its path."""
+def _integrate_gaussian(axis: TimeAxis, path: FloatArray, sigma: float) -> FloatArray:
+    """Share of a unit Gaussian about `path` (...) in every bin, shape (t, ...); bin i is centred on
+    its path.
+    """
     from scipy.special import ndtr
 
     edges = axis.start + axis.spacing * (np.arange(axis.bins + 1) - 0.5)

@@ -1,4 +1,6 @@
-"""Hidden surfaces: small flat facets of known place, direction and material, and the triangles that hide others."""
+"""Hidden surfaces: small flat facets of known place, direction and material, and the triangles that
+hide others.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +13,12 @@ from numpy.typing import NDArray
 
 from nlos.simulate.materials import Lambert, Material
 from tofclip.errors import FileFormatError, InputError, ShapeError
-from tofclip.storage import one_line, reading
+from tofclip.storage import format_error_line, translate_read_errors
 
 FloatArray = NDArray[np.float64]
 
 TOWARDS_WALL = (0.0, 0.0, -1.0)
-MOST_FACETS = 200_000
+MAX_FACETS = 200_000
 """A surface is refused rather than cut into more."""
 
 
@@ -42,7 +44,9 @@ class Surface:
     triangles: FloatArray
 
     @classmethod
-    def mesh(cls, vertices: Any, faces: Any, spacing: float, material: Material | None = None) -> Surface:
+    def mesh(
+        cls, vertices: Any, faces: Any, spacing: float, material: Material | None = None
+    ) -> Surface:
         """Cut a triangle mesh into facets.
 
         Parameters
@@ -52,45 +56,67 @@ class Surface:
         faces : (m, 3) int array
             Corners of each triangle, counter-clockwise as seen from the side that scatters.
         spacing : float
-            Largest distance of neighbouring facets, m: a quarter of what the capture resolves is enough.
+            Largest distance of neighbouring facets, m: a quarter of what the capture resolves is
+            enough.
         material : Material, optional
             Defaults to white Lambert.
         """
         vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-            raise ShapeError("vertices and faces", "(v, 3) and (m, 3)", (vertices.shape, faces.shape))
-        if faces.dtype.kind not in "ui" or faces.size == 0 or faces.min() < 0 or faces.max() >= len(vertices):
-            raise InputError("faces must name vertices by their index, and there must be one at least")
+            raise ShapeError(
+                "vertices and faces", "(v, 3) and (m, 3)", (vertices.shape, faces.shape)
+            )
+        if (
+            faces.dtype.kind not in "ui"
+            or faces.size == 0
+            or faces.min() < 0
+            or faces.max() >= len(vertices)
+        ):
+            raise InputError(
+                "faces must name vertices by their index, and there must be one at least"
+            )
         if not (np.isfinite(spacing) and spacing > 0 and np.all(np.isfinite(vertices))):
             raise InputError(f"a mesh needs finite vertices and a positive spacing, got {spacing}")
         triangles = vertices[faces]
-        positions, crosses, areas = _cut(triangles, spacing)
+        positions, crosses, areas = _subdivide_triangles(triangles, spacing)
         normals = crosses / np.linalg.norm(crosses, axis=1, keepdims=True)
         return cls(positions, normals, areas, material or Lambert(), triangles)
 
     @classmethod
     def load(cls, path: str | Path, spacing: float, material: Material | None = None) -> Surface:
-        """Read a mesh in m (PLY, OBJ, STL, VTP) by PyVista and cut it into facets; arguments as of `mesh`."""
+        """Read a mesh in m (PLY, OBJ, STL, VTP) by PyVista and cut it into facets; arguments as of
+        `mesh`.
+        """
         import pyvista
 
-        with reading(path), open(path, "rb"):
+        with translate_read_errors(path), open(path, "rb"):
             try:
                 mesh = pyvista.read(path).triangulate()
                 vertices, faces = np.asarray(mesh.points), np.asarray(mesh.regular_faces)
-            except Exception as fault:  # whatever the decoder stumbles over, it is the file that is no mesh
-                raise FileFormatError(path, f"is no triangle mesh ({one_line(fault)})") from fault
+            except (
+                Exception
+            ) as fault:  # whatever the decoder stumbles over, it is the file that is no mesh
+                raise FileFormatError(
+                    path, f"is no triangle mesh ({format_error_line(fault)})"
+                ) from fault
         if not len(faces):
             raise FileFormatError(path, "holds no triangles")
         return cls.mesh(vertices, faces, spacing, material)
 
     @classmethod
     def rectangle(
-        cls, centre: Any, size: tuple[float, float], spacing: float, material: Material | None = None
+        cls,
+        centre: Any,
+        size: tuple[float, float],
+        spacing: float,
+        material: Material | None = None,
     ) -> Surface:
         """Build a rectangle that faces the wall, (width, height) in m about its centre (x, y, z)."""
         x, y = size[0] / 2, size[1] / 2
         # Counter-clockwise from the wall, which looks along +z with y down.
-        corners = np.array([[-x, -y, 0], [-x, y, 0], [x, y, 0], [x, -y, 0]]) + np.asarray(centre, dtype=np.float64)
+        corners = np.array([[-x, -y, 0], [-x, y, 0], [x, y, 0], [x, -y, 0]]) + np.asarray(
+            centre, dtype=np.float64
+        )
         return cls.mesh(corners, [[0, 1, 2], [0, 2, 3]], spacing, material)
 
     @classmethod
@@ -112,19 +138,27 @@ class Surface:
         material : Material, optional
             Defaults to white Lambert.
         """
-        x, y = _inked(text, height, spacing)
+        x, y = _rasterize_letters(text, height, spacing)
         if x.size == 0:
             raise InputError(f"'{text}' has no ink at a spacing of {spacing} m")
-        positions = np.stack([x, y, np.zeros_like(x)], axis=-1) + np.asarray(centre, dtype=np.float64)
+        positions = np.stack([x, y, np.zeros_like(x)], axis=-1) + np.asarray(
+            centre, dtype=np.float64
+        )
         normals = np.tile(TOWARDS_WALL, (x.size, 1))
         half = spacing / 2 * np.array([[-1, -1, 0], [-1, 1, 0], [1, 1, 0], [1, -1, 0]])
         corners = positions[:, np.newaxis] + half
         triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
-        return cls(positions, normals, np.full(x.size, spacing**2), material or Lambert(), triangles)
+        return cls(
+            positions, normals, np.full(x.size, spacing**2), material or Lambert(), triangles
+        )
 
 
-def _cut(triangles: FloatArray, spacing: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Halve triangles at their longest side until none is longer than `spacing`: centres, normals, areas."""
+def _subdivide_triangles(
+    triangles: FloatArray, spacing: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Halve triangles at their longest side until none is longer than `spacing`: centres, normals,
+    areas.
+    """
     finished: list[FloatArray] = []
     count, pending = 0, triangles
     while len(pending):
@@ -133,22 +167,28 @@ def _cut(triangles: FloatArray, spacing: float) -> tuple[FloatArray, FloatArray,
         small = sides.max(axis=1) <= spacing
         finished.append(pending[small])
         count += int(small.sum())
-        if count + len(pending) > MOST_FACETS:
+        if count + len(pending) > MAX_FACETS:
             raise InputError(
-                f"the mesh needs more than {MOST_FACETS} facets at a spacing of {spacing} m; use a larger one"
+                f"the mesh needs more than {MAX_FACETS} facets at a spacing of {spacing} m; use a larger one"
             )
         turn = (longest[~small, np.newaxis] + np.arange(3)) % 3
-        a, b, c = np.moveaxis(np.take_along_axis(pending[~small], turn[..., np.newaxis], axis=1), 1, 0)
+        a, b, c = np.moveaxis(
+            np.take_along_axis(pending[~small], turn[..., np.newaxis], axis=1), 1, 0
+        )
         middle = (a + b) / 2
-        pending = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+        pending = np.concatenate(
+            [np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)]
+        )
     small_triangles = np.concatenate(finished)
-    crosses = np.cross(small_triangles[:, 1] - small_triangles[:, 0], small_triangles[:, 2] - small_triangles[:, 0])
+    crosses = np.cross(
+        small_triangles[:, 1] - small_triangles[:, 0], small_triangles[:, 2] - small_triangles[:, 0]
+    )
     areas = np.linalg.norm(crosses, axis=1) / 2
     flat = areas > 0
     return small_triangles[flat].mean(axis=1), crosses[flat], areas[flat]
 
 
-def _inked(text: str, height: float, spacing: float) -> tuple[FloatArray, FloatArray]:
+def _rasterize_letters(text: str, height: float, spacing: float) -> tuple[FloatArray, FloatArray]:
     """Centres of the squares inside the letters' outlines, about the text's middle; y down."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.path import Path as Outline
@@ -160,10 +200,13 @@ def _inked(text: str, height: float, spacing: float) -> tuple[FloatArray, FloatA
     capital = TextPath((0, 0), "H", size=1, prop=font).get_extents().height
     outline: Outline = TextPath((0, 0), text, size=height / capital, prop=font)
     box = outline.get_extents()
-    columns, rows = (np.arange(-n, n + 1) * spacing for n in (int(s / spacing / 2) + 1 for s in box.size))
+    columns, rows = (
+        np.arange(-n, n + 1) * spacing for n in (int(s / spacing / 2) + 1 for s in box.size)
+    )
     x, y = (grid.ravel() for grid in np.meshgrid(columns, rows))
     middle = (box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2
-    # Fonts have y up. Holes run the other way round, which the even-odd rule of a polygon test needs no word of.
+    # Fonts have y up. Holes run the other way round, which the even-odd rule of a polygon test
+    # needs no word of.
     inside = np.zeros(x.size, dtype=bool)
     for polygon in outline.to_polygons():
         inside ^= Outline(polygon).contains_points(np.stack([x + middle[0], middle[1] - y], axis=1))

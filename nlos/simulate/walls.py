@@ -10,19 +10,23 @@ from numpy.typing import NDArray
 from tofclip.errors import InputError
 
 FloatArray = NDArray[np.float64]
-Relief = Callable[[FloatArray, FloatArray, float], FloatArray]
-"""Depth z of the wall, m, at x and y in half wall widths, from -1 to 1; the third argument is that half width, m."""
+DepthFunction = Callable[[FloatArray, FloatArray, float], FloatArray]
+"""Depth z of the wall, m, at x and y in half wall widths, from -1 to 1; the third argument is that
+half width, m.
+"""
 
-CYLINDER_RADIUS = 2.5
-WAVE_HEIGHT = 0.1
-RELIEF_DEPTH = 0.3
-PLATE_GAP, PLATE_STEP = 0.1, 0.25
-"""Half the gap between the plates in half wall widths, and by how much the right one stands back, m."""
+CYLINDER_RADIUS_M = 2.5
+WAVE_HEIGHT_M = 0.1
+RELIEF_DEPTH_M = 0.3
+PLATE_GAP_FRACTION, PLATE_STEP_M = 0.1, 0.25
+"""Half the gap between the plates in half wall widths, and by how much the right one stands back,
+m.
+"""
 
-_NARROWEST = 2
+MIN_POINTS = 2
 
 
-def relay_wall(name: str, points: int = 64, width: float = 2.0) -> FloatArray:
+def build_relay_wall(name: str, points: int = 64, width: float = 2.0) -> FloatArray:
     """Build one of the walls in `WALLS`.
 
     Parameters
@@ -32,7 +36,8 @@ def relay_wall(name: str, points: int = 64, width: float = 2.0) -> FloatArray:
         * ``"cylinder"``: upright, radius 2.5 m, bulging towards the scene, foremost at z = 0;
         * ``"wavy"``: waves of +-0.1 m in both directions;
         * ``"relief"``: smooth hills of 0.3 m from the lowest to the highest;
-        * ``"plates"``: two that hang apart, the right one 0.25 m further back and turned towards the left.
+        * ``"plates"``: two that hang apart, the right one 0.25 m further back and turned towards
+          the left.
     points : int
         Rows, and columns; at least 2.
     width : float
@@ -41,12 +46,15 @@ def relay_wall(name: str, points: int = 64, width: float = 2.0) -> FloatArray:
     Returns
     -------
     (rows, columns, 3) array
-        m; x to the right, y down, z towards the hidden scene. Points in the gap between the plates are NaN.
+        m; x to the right, y down, z towards the hidden scene. Points in the gap between the plates
+        are NaN.
     """
     if name not in WALLS:
         raise InputError(f"no wall is called '{name}'; choose one of {', '.join(WALLS)}")
-    if points < _NARROWEST or not (np.isfinite(width) and width > 0):
-        raise InputError(f"a wall needs at least 2 x 2 points and a positive width, got {points} and {width} m")
+    if points < MIN_POINTS or not (np.isfinite(width) and width > 0):
+        raise InputError(
+            f"a wall needs at least 2 x 2 points and a positive width, got {points} and {width} m"
+        )
     axis = np.linspace(-1, 1, points)
     x, y = np.meshgrid(axis, axis)
     half = width / 2
@@ -56,11 +64,13 @@ def relay_wall(name: str, points: int = 64, width: float = 2.0) -> FloatArray:
     return wall
 
 
-def wall_normals(wall: FloatArray) -> FloatArray:
-    """Unit normals towards larger z of a wall (rows, columns, 3), by differences of neighbours; +z where unknown."""
+def compute_wall_normals(wall: FloatArray) -> FloatArray:
+    """Unit normals towards larger z of a wall (rows, columns, 3), by differences of neighbours; +z
+    where unknown.
+    """
     normals = np.zeros_like(wall)
     normals[..., 2] = 1.0
-    if wall.ndim != 3 or min(wall.shape[:2]) < _NARROWEST:
+    if wall.ndim != 3 or min(wall.shape[:2]) < MIN_POINTS:
         return normals
     down, right = np.gradient(wall, axis=(0, 1))
     found = np.cross(right, down)
@@ -68,36 +78,38 @@ def wall_normals(wall: FloatArray) -> FloatArray:
     return np.where(np.isfinite(found), found * np.sign(found[..., 2:]), normals)
 
 
-def _planar(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
+def _planar_depth(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
     return np.zeros_like(x)
 
 
-def _cylinder(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
-    if half >= CYLINDER_RADIUS:
-        raise InputError(f"a cylinder of radius {CYLINDER_RADIUS} m is narrower than {2 * half:.3g} m")
-    return np.asarray(np.sqrt(CYLINDER_RADIUS**2 - (half * x) ** 2) - CYLINDER_RADIUS)
+def _cylinder_depth(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
+    if half >= CYLINDER_RADIUS_M:
+        raise InputError(
+            f"a cylinder of radius {CYLINDER_RADIUS_M} m is narrower than {2 * half:.3g} m"
+        )
+    return np.asarray(np.sqrt(CYLINDER_RADIUS_M**2 - (half * x) ** 2) - CYLINDER_RADIUS_M)
 
 
-def _wavy(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
-    return np.asarray(WAVE_HEIGHT * np.sin(2 * np.pi * x) * np.cos(1.5 * np.pi * y))
+def _wavy_depth(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
+    return np.asarray(WAVE_HEIGHT_M * np.sin(2 * np.pi * x) * np.cos(1.5 * np.pi * y))
 
 
-def _relief(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
+def _relief_depth(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
     hills = np.sin(3 * x + 0.7) * np.cos(2.5 * y - 0.4) + 0.5 * np.sin(5 * y + 2 * x)
     low, high = float(hills.min()), float(hills.max())
-    return np.asarray(RELIEF_DEPTH * ((hills - low) / (high - low) - 0.5))
+    return np.asarray(RELIEF_DEPTH_M * ((hills - low) / (high - low) - 0.5))
 
 
-def _plates(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
-    z = np.where(x > 0, 0.15 * (x - PLATE_GAP) - PLATE_STEP, 0.0)
-    return np.where(np.abs(x) < PLATE_GAP, np.nan, z)
+def _plates_depth(x: FloatArray, y: FloatArray, half: float) -> FloatArray:
+    z = np.where(x > 0, 0.15 * (x - PLATE_GAP_FRACTION) - PLATE_STEP_M, 0.0)
+    return np.where(np.abs(x) < PLATE_GAP_FRACTION, np.nan, z)
 
 
-WALLS: Mapping[str, Relief] = {
-    "planar": _planar,
-    "cylinder": _cylinder,
-    "wavy": _wavy,
-    "relief": _relief,
-    "plates": _plates,
+WALLS: Mapping[str, DepthFunction] = {
+    "planar": _planar_depth,
+    "cylinder": _cylinder_depth,
+    "wavy": _wavy_depth,
+    "relief": _relief_depth,
+    "plates": _plates_depth,
 }
 """Shapes by name."""

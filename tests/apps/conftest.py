@@ -44,12 +44,16 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 def camera() -> Camera:
     """Camera without skew, whose numbers made the small streak image."""
     at_rest = SkewSweep(CENTRES_PX, np.zeros(7), np.zeros(7))
-    return Camera(CENTRES_PX, ANGLES, IMAGE_SHAPE, SLIT_WIDTH_PX, sweep=at_rest, focal_length_px=140.0)
+    return Camera(
+        CENTRES_PX, ANGLES, IMAGE_SHAPE, SLIT_WIDTH_PX, sweep=at_rest, focal_length_px=140.0
+    )
 
 
 @pytest.fixture(scope="session")
 def scene() -> np.ndarray:
-    """Frames (time, y, x): a square at the upper left, later one at the lower right, each as long as a pulse."""
+    """Frames (time, y, x): a square at the upper left, later one at the lower right, each as long
+    as a pulse.
+    """
     frames = np.zeros((ROWS, *IMAGE_SHAPE), np.float32)
     sigma_bins = 60e-12 / BIN_WIDTH / 2.355
     for row, place in zip(SQUARE_ROWS, (np.s_[8:14, 9:15], np.s_[18:25, 17:24]), strict=True):

@@ -11,7 +11,16 @@ from small_instrument import Run
 from apps import cli
 
 POINT = (0.1, -0.05, 0.6)
-SCENE = ("--points", "0.1,-0.05,0.6", "--wall-width-m", "0.8", "--bin-width-ps", "16", "--jitter-ps", "15")
+SCENE = (
+    "--points",
+    "0.1,-0.05,0.6",
+    "--wall-width-m",
+    "0.8",
+    "--bin-width-ps",
+    "16",
+    "--jitter-ps",
+    "15",
+)
 
 
 def curved_capture(path: Path) -> Path:

@@ -1,4 +1,6 @@
-"""A small instrument and its files: seven views of 32 x 32 pixels, two bright squares at two ranges."""
+"""A small instrument and its files: seven views of 32 x 32 pixels, two bright squares at two
+ranges.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ def wall_shot(streak: Streak) -> Streak:
         },
         {"row_offset": 10, "column_offset": 10, "receive_delay_bins": 0.0},
     )
-    return Streak(streak.counts, streak.row_times, camera=streak.camera, attachments={"relay_wall": wall})
+    return Streak(
+        streak.counts, streak.row_times, camera=streak.camera, attachments={"relay_wall": wall}
+    )
 
 
 def focus_pictures() -> dict[str, np.ndarray]:
@@ -57,6 +61,8 @@ def focus_pictures() -> dict[str, np.ndarray]:
         across = (column - centre - (row - slit_row) * np.tan(angle)) * np.cos(angle)
         along = (column - centre) * np.sin(angle) + (row - slit_row) * np.cos(angle)
         lines = lines + 900 * np.exp(-((across / 1.5) ** 2) / 2) * (np.abs(along) < 22)
-        dots = dots + 900 * np.exp(-(((column - centre) / 1.5) ** 2 + ((row - slit_row) / 1.5) ** 2) / 2)
+        dots = dots + 900 * np.exp(
+            -(((column - centre) / 1.5) ** 2 + ((row - slit_row) / 1.5) ** 2) / 2
+        )
     light = {"line": lines, "line_background": 0 * lines, "dot": dots, "dot_background": 0 * dots}
     return {name: noise.poisson(picture + 100).astype(np.uint16) for name, picture in light.items()}

@@ -35,17 +35,44 @@ def of_bytes(path: Path, content: bytes) -> Path:
 STREAKS: dict[str, tuple[Maker, str]] = {
     "absent": (lambda files, new: new / "absent.tif", "no such file"),
     "an empty folder": (lambda files, new: new, "there is no file"),
-    "truncated TIFF": (lambda files, new: cut_short(files / "streak.tif", new / "bad.tif"), "truncated"),
-    "truncated HDF5": (lambda files, new: cut_short(files / "streak.h5", new / "bad.h5"), "damaged or incomplete"),
+    "truncated TIFF": (
+        lambda files, new: cut_short(files / "streak.tif", new / "bad.tif"),
+        "truncated",
+    ),
+    "truncated HDF5": (
+        lambda files, new: cut_short(files / "streak.h5", new / "bad.h5"),
+        "damaged or incomplete",
+    ),
     "empty": (lambda files, new: of_bytes(new / "bad.tif", b""), "is empty"),
-    "another format": (lambda files, new: of_bytes(new / "bad.tif", b"a letter to a friend"), "is no TIFF"),
+    "another format": (
+        lambda files, new: of_bytes(new / "bad.tif", b"a letter to a friend"),
+        "is no TIFF",
+    ),
     "another record": (lambda files, new: files / "camera.h5", "holds a camera record"),
-    "all zero": (lambda files, new: picture(new, np.zeros((96, SLIT_WIDTH_PX), np.uint16)), "every pixel is zero"),
-    "saturated": (lambda files, new: picture(new, np.full((96, SLIT_WIDTH_PX), 65535, np.uint16)), "saturated"),
-    "NaN": (lambda files, new: picture(new, np.full((96, SLIT_WIDTH_PX), np.nan, np.float32)), "NaN"),
-    "negative": (lambda files, new: picture(new, np.full((96, SLIT_WIDTH_PX), -3, np.int16)), "negative"),
-    "wrong width": (lambda files, new: picture(new, np.arange(96 * 200, dtype=np.uint16).reshape(96, 200)), "columns"),
-    "no light": (lambda files, new: picture(new, np.full((96, SLIT_WIDTH_PX), 7, np.uint16)), "was there any light"),
+    "all zero": (
+        lambda files, new: picture(new, np.zeros((96, SLIT_WIDTH_PX), np.uint16)),
+        "every pixel is zero",
+    ),
+    "saturated": (
+        lambda files, new: picture(new, np.full((96, SLIT_WIDTH_PX), 65535, np.uint16)),
+        "saturated",
+    ),
+    "NaN": (
+        lambda files, new: picture(new, np.full((96, SLIT_WIDTH_PX), np.nan, np.float32)),
+        "NaN",
+    ),
+    "negative": (
+        lambda files, new: picture(new, np.full((96, SLIT_WIDTH_PX), -3, np.int16)),
+        "negative",
+    ),
+    "wrong width": (
+        lambda files, new: picture(new, np.arange(96 * 200, dtype=np.uint16).reshape(96, 200)),
+        "columns",
+    ),
+    "no light": (
+        lambda files, new: picture(new, np.full((96, SLIT_WIDTH_PX), 7, np.uint16)),
+        "was there any light",
+    ),
 }
 
 
@@ -68,7 +95,16 @@ def folder(tmp_path: Path) -> Path:
 def test_streaks(run: Run, files: Path, tmp_path: Path, folder: Path, case: str) -> None:
     make, reason = STREAKS[case]
     bad = make(files, tmp_path)
-    words = ["recover", bad, "--camera", files / "camera.h5", "--out", folder / "frames.h5", "--bin-width-ps", 20]
+    words = [
+        "recover",
+        bad,
+        "--camera",
+        files / "camera.h5",
+        "--out",
+        folder / "frames.h5",
+        "--bin-width-ps",
+        20,
+    ]
     assert_refused(run(*words), reason)
     assert list(folder.iterdir()) == []
 
@@ -90,7 +126,12 @@ def test_streaks(run: Run, files: Path, tmp_path: Path, folder: Path, case: str)
     ],
 )
 def test_flags(
-    run: Run, files: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, flags: list[str], reason: str
+    run: Run,
+    files: Path,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    flags: list[str],
+    reason: str,
 ) -> None:
     monkeypatch.chdir(folder)
     assert_refused(run("recover", files / "streak.h5", "--out", "frames.h5", *flags), reason)
@@ -98,7 +139,14 @@ def test_flags(
 
 
 def test_missing_time_axis_names_the_flag(run: Run, files: Path, folder: Path) -> None:
-    words = ["recover", files / "streak.tif", "--camera", files / "camera.h5", "--out", folder / "frames.h5"]
+    words = [
+        "recover",
+        files / "streak.tif",
+        "--camera",
+        files / "camera.h5",
+        "--out",
+        folder / "frames.h5",
+    ]
     assert_refused(run(*words), "--bin-width-ps")
 
 
@@ -107,7 +155,9 @@ def test_missing_camera(run: Run, files: Path, folder: Path) -> None:
     assert_refused(run(*words), "--camera")
 
 
-def test_camera_with_a_slit_centre_off_the_sensor(run: Run, files: Path, tmp_path: Path, folder: Path) -> None:
+def test_camera_with_a_slit_centre_off_the_sensor(
+    run: Run, files: Path, tmp_path: Path, folder: Path
+) -> None:
     camera = of_bytes(tmp_path / "camera.h5", (files / "camera.h5").read_bytes())
     with h5py.File(camera, "r+") as file:
         file["centres"][6] = SLIT_WIDTH_PX + 20.0
@@ -122,25 +172,43 @@ def test_view_that_does_not_follow_the_others(
     moved = camera.centres_px.copy()
     moved[6] = 299.0
     replace(streak, camera=camera.replace(centres_px=moved, sweep=None)).save(tmp_path / "shot.h5")
-    assert_refused(run("recover", tmp_path / "shot.h5", "--out", folder / "frames.h5"), "check the slit centres")
+    assert_refused(
+        run("recover", tmp_path / "shot.h5", "--out", folder / "frames.h5"),
+        "check the slit centres",
+    )
 
 
 def test_an_input_is_never_overwritten(run: Run, files: Path) -> None:
     before = (files / "streak.h5").read_bytes()
-    assert_refused(run("recover", files / "streak.h5", "--out", files / "streak.h5"), "is an input too")
+    assert_refused(
+        run("recover", files / "streak.h5", "--out", files / "streak.h5"), "is an input too"
+    )
     assert (files / "streak.h5").read_bytes() == before
 
 
 def test_a_result_that_exists_survives_a_failure(run: Run, files: Path, folder: Path) -> None:
     (folder / "frames.h5").write_text("last week's frames")
-    words = ["recover", files / "streak.tif", "--camera", files / "camera.h5", "--out", folder / "frames.h5"]
+    words = [
+        "recover",
+        files / "streak.tif",
+        "--camera",
+        files / "camera.h5",
+        "--out",
+        folder / "frames.h5",
+    ]
     assert_refused(run(*words), "--bin-width-ps")
     assert (folder / "frames.h5").read_text() == "last week's frames"
 
 
 @pytest.mark.parametrize("dot", ["line_background", "streak"])
 def test_focus_pictures_without_dots(run: Run, files: Path, folder: Path, dot: str) -> None:
-    words = ["calibrate", "--line", files / "line.tif", "--line-background", files / "line_background.tif"]
+    words = [
+        "calibrate",
+        "--line",
+        files / "line.tif",
+        "--line-background",
+        files / "line_background.tif",
+    ]
     words += ["--dot", files / f"{dot}.tif", "--dot-background", files / "dot_background.tif"]
     outcome = run(*words, "--out", folder / "camera.h5")
     assert_refused(outcome, "dots on the slit" if dot == "line_background" else "must have shape")
@@ -148,7 +216,9 @@ def test_focus_pictures_without_dots(run: Run, files: Path, folder: Path, dot: s
 
 
 def test_clouds(run: Run, files: Path, tmp_path: Path, folder: Path) -> None:
-    assert_refused(run("cloud", files / "streak.h5", "--out", folder / "c.ply"), "holds a streak record")
+    assert_refused(
+        run("cloud", files / "streak.h5", "--out", folder / "c.ply"), "holds a streak record"
+    )
     assert_refused(run("cloud", files / "streak.h5", "--out", folder / "c.stl"), "must end in .ply")
     assert_refused(run("cloud", tmp_path / "absent.h5", "--out", folder / "c.ply"), "no such file")
     assert list(folder.iterdir()) == []
@@ -159,14 +229,18 @@ def test_frames_without_any_return(run: Run, camera: Camera, tmp_path: Path, fol
 
     dark = np.zeros((8, *camera.image_shape), np.float32)
     Frames(dark, np.arange(8) * 20e-12, camera).save(tmp_path / "dark.h5")
-    assert_refused(run("cloud", tmp_path / "dark.h5", "--out", folder / "c.ply"), "no return stands out")
+    assert_refused(
+        run("cloud", tmp_path / "dark.h5", "--out", folder / "c.ply"), "no return stands out"
+    )
 
 
 def test_around_the_corner(run: Run, files: Path, tmp_path: Path, folder: Path) -> None:
     def reconstruct(source: Path, *flags: object) -> Outcome:
         return run("nlos", "reconstruct", source, "--out", folder / "volume.h5", *flags)
 
-    assert_refused(reconstruct(files / "streak.h5"), "holds a streak record, expected capture or frames")
+    assert_refused(
+        reconstruct(files / "streak.h5"), "holds a streak record, expected capture or frames"
+    )
     assert_refused(reconstruct(tmp_path / "absent.h5"), "no such file")
     assert_refused(reconstruct(files / "wall.h5", "--method", "guess"), "unknown method 'guess'")
     assert_refused(reconstruct(files / "wall.h5", "--png", folder / "mip.bmp"), "must end in .png")
@@ -175,12 +249,18 @@ def test_around_the_corner(run: Run, files: Path, tmp_path: Path, folder: Path) 
 
 
 def test_conversions(run: Run, files: Path, folder: Path) -> None:
-    assert_refused(run("convert", files / "streak.tif", "--out", folder / "streak.npz"), "must end in .h5")
-    assert_refused(run("convert", files / "camera.h5", "--out", folder / "streak.h5"), "holds a camera record")
+    assert_refused(
+        run("convert", files / "streak.tif", "--out", folder / "streak.npz"), "must end in .h5"
+    )
+    assert_refused(
+        run("convert", files / "camera.h5", "--out", folder / "streak.h5"), "holds a camera record"
+    )
     assert list(folder.iterdir()) == []
 
 
-@pytest.mark.parametrize("words", [["frobnicate"], ["recover"], ["nlos", "frobnicate"], ["info", "a", "b"], ["--frob"]])
+@pytest.mark.parametrize(
+    "words", [["frobnicate"], ["recover"], ["nlos", "frobnicate"], ["info", "a", "b"], ["--frob"]]
+)
 def test_usage(run: Run, words: list[str]) -> None:
     assert_refused(run(*words), "(see --help)")
 

@@ -12,11 +12,11 @@ import pytest
 from small_instrument import Run
 
 from apps.benchmarks import registry
-from apps.benchmarks.case import AbsentPeerError, Case, Prepared
-from apps.benchmarks.machine import machine
-from apps.benchmarks.measure import measure
-from apps.benchmarks.page import TITLES, page
-from apps.benchmarks.peers import seconds_told
+from apps.benchmarks.case import Case, PeerUnavailableError, PreparedCase
+from apps.benchmarks.machine import describe_machine
+from apps.benchmarks.measure import measure_case
+from apps.benchmarks.page import GROUP_TITLES, render_page
+from apps.benchmarks.peers import run_peer
 from apps.benchmarks.run import run_cases
 from apps.verbs.bench import bench
 from tofclip.errors import InputError
@@ -31,41 +31,51 @@ def test_every_case_runs(case: Case) -> None:
     ready.action()
     ready.floor()
     assert ready.amount > 0
-    assert ready.floor_share > 0
+    assert ready.floor_fraction > 0
 
 
 def test_every_case_has_a_place_on_the_page() -> None:
     names = [case.name for case in registry.CASES]
     assert len(set(names)) == len(names)
-    assert {case.group for case in registry.CASES} == set(TITLES)
+    assert {case.group for case in registry.CASES} == set(GROUP_TITLES)
     for case in registry.CASES:
         assert case.floor
         assert list(case.sizes) == sorted(set(case.sizes))
         assert len(case.sizes) >= 2  # otherwise there is no growth
 
 
-def made_up(size: int) -> Prepared:
+def made_up(size: int) -> PreparedCase:
     def absent() -> float:
-        raise AbsentPeerError("other: is not here")
+        raise PeerUnavailableError("other: is not here")
 
     def work() -> None:
         np.ones(size << 17)  # so many MiB
         time.sleep(0.04)
 
-    return Prepared(work, lambda: time.sleep(0.01), 2, {"other": absent, "twice": lambda: 0.08}, floor_share=0.5)
+    return PreparedCase(
+        work,
+        lambda: time.sleep(0.01),
+        2,
+        {"other": absent, "twice": lambda: 0.08},
+        floor_fraction=0.5,
+    )
 
 
-MADE_UP = Case("decode-made-up", "made up", "MiB", (32, 64), "things", "half as long a sleep", made_up)
+MADE_UP = Case(
+    "decode-made-up", "made up", "MiB", (32, 64), "things", "half as long a sleep", made_up
+)
 
 
 def test_what_is_measured_is_what_was_done() -> None:
     np.ones(1)
-    found = measure(MADE_UP, 256)
+    found = measure_case(MADE_UP, 256)
     assert found["seconds"]["least"] >= 0.04
     assert found["seconds"]["least"] <= found["seconds"]["median"] <= found["seconds"]["greatest"]
     assert found["per_second"] == pytest.approx(2 / found["seconds"]["median"])
     assert found["floor_seconds"] >= 0.02  # half of it takes 10 ms
-    assert found["times_floor"] == pytest.approx(found["seconds"]["median"] / found["floor_seconds"])
+    assert found["times_floor"] == pytest.approx(
+        found["seconds"]["median"] / found["floor_seconds"]
+    )
     assert found["own_mib"] <= 257  # less where an earlier test left memory behind
     assert found["peak_mib"] > 256
     assert found["peers"] == {"other": {"absent": "other: is not here"}, "twice": {"seconds": 0.08}}
@@ -74,7 +84,7 @@ def test_what_is_measured_is_what_was_done() -> None:
 def test_the_verb_measures_in_fresh_processes_and_writes_the_page(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    small = [replace(case, sizes=(1,)) for case in registry.cases_called("decode-tags")]
+    small = [replace(case, sizes=(1,)) for case in registry.find_cases("decode-tags")]
     monkeypatch.setattr(registry, "CASES", tuple(small))
     monkeypatch.setenv("TOFCLIP_THREADS", "1")
     outcome = run("bench", "decode-tags", "--page", tmp_path / "page.md", "--json")
@@ -93,16 +103,16 @@ def test_the_verb_measures_in_fresh_processes_and_writes_the_page(
 
 def test_a_case_that_fails_is_told_and_stops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TOFCLIP_THREADS", "1")
-    broken = replace(registry.cases_called("decode-tags")[0], sizes=(-1,))
+    broken = replace(registry.find_cases("decode-tags")[0], sizes=(-1,))
     figures = run_cases([broken], None, lambda _: None)
     (found,) = figures["entries"][0]["runs"]
     assert "ValueError" in found["problem"]
     assert figures["entries"][0]["growth"] is None
-    assert found["problem"] in page(figures, "tofclip bench")
-    monkeypatch.setattr("apps.benchmarks.run.LONGEST_SECONDS", 0.01)
+    assert found["problem"] in render_page(figures, "tofclip bench")
+    monkeypatch.setattr("apps.benchmarks.run.CASE_TIMEOUT_S", 0.01)
     figures = run_cases([broken], None, lambda _: None)
     assert "took more than" in figures["entries"][0]["runs"][0]["problem"]
-    monkeypatch.setattr("apps.benchmarks.run.ALL_SECONDS", 0)
+    monkeypatch.setattr("apps.benchmarks.run.TOTAL_TIMEOUT_S", 0)
     figures = run_cases([broken], None, lambda _: None)
     assert "left out" in figures["entries"][0]["runs"][0]["problem"]
 
@@ -112,22 +122,43 @@ def test_the_page_tells_growth_spread_and_peers() -> None:
         return {
             "size": size,
             "threads": threads,
-            "seconds": {"median": median, "least": 0.9 * median, "greatest": 1.2 * median, "repeats": 5},
+            "seconds": {
+                "median": median,
+                "least": 0.9 * median,
+                "greatest": 1.2 * median,
+                "repeats": 5,
+            },
             "per_second": 1 / median,
             "peak_mib": 300.2,
             "own_mib": 50.0,
             "floor_seconds": median / 2,
             "times_floor": 2.0,
-            "peers": {"y-tal": {"seconds": 3 * median}, "ASTRA": {"absent": "ASTRA: --peers names no Python"}},
+            "peers": {
+                "y-tal": {"seconds": 3 * median},
+                "ASTRA": {"absent": "ASTRA: --peers names no Python"},
+            },
         }
 
     runs = [result(64, 2, 0.01), result(128, 1, 0.15), result(128, 2, 0.08)]
-    entry = {"name": "rsd-planar", "title": "planar", "size": "points", "unit": "volumes", "floor": "FFTs"}
-    text = page({"machine": machine(), "entries": [{**entry, "runs": runs, "growth": 3.0}]}, "tofclip bench")
-    assert (
-        "| planar | 128 | 2 | 80 ms (72 ms to 96 ms) | 12.5 volumes/s | 300 MiB, own 50 | 40 ms | 2.00 | 3.0 |" in text
+    entry = {
+        "name": "rsd-planar",
+        "title": "planar",
+        "size": "points",
+        "unit": "volumes",
+        "floor": "FFTs",
+    }
+    text = render_page(
+        {"machine": describe_machine(), "entries": [{**entry, "runs": runs, "growth": 3.0}]},
+        "tofclip bench",
     )
-    assert "y-tal: 30 ms at 64, 2 threads (3.0 times ours); 450 ms at 128, 1 thread (3.0 times ours);" in text
+    assert (
+        "| planar | 128 | 2 | 80 ms (72 ms to 96 ms) | 12.5 volumes/s | 300 MiB, own 50 | 40 ms | 2.00 | 3.0 |"
+        in text
+    )
+    assert (
+        "y-tal: 30 ms at 64, 2 threads (3.0 times ours); 450 ms at 128, 1 thread (3.0 times ours);"
+        in text
+    )
     assert "Not compared: ASTRA: --peers names no Python." in text
     assert "cores" in text
     assert "wanted a core in the minute before: " in text
@@ -137,20 +168,20 @@ def test_peers_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
     monkeypatch.delenv("TOFCLIP_PEERS", raising=False)
-    with pytest.raises(AbsentPeerError, match="--peers names no Python"):
-        seconds_told("", "other")
+    with pytest.raises(PeerUnavailableError, match="--peers names no Python"):
+        run_peer("", "other")
     monkeypatch.setenv("TOFCLIP_PEERS", sys.executable)
-    with pytest.raises(AbsentPeerError, match="No module named 'no_such_peer'"):
-        seconds_told("import no_such_peer", "other")
-    assert seconds_told("print('seconds', 0.25)", "other") == 0.25
-    monkeypatch.setattr("apps.benchmarks.peers.LONGEST_SECONDS", 0.01)
-    with pytest.raises(AbsentPeerError, match="takes more than"):
-        seconds_told("import time; time.sleep(5)", "other")
+    with pytest.raises(PeerUnavailableError, match="No module named 'no_such_peer'"):
+        run_peer("import no_such_peer", "other")
+    assert run_peer("print('seconds', 0.25)", "other") == 0.25
+    monkeypatch.setattr("apps.benchmarks.peers.PEER_TIMEOUT_S", 0.01)
+    with pytest.raises(PeerUnavailableError, match="takes more than"):
+        run_peer("import time; time.sleep(5)", "other")
 
 
 def test_names() -> None:
-    assert len(registry.cases_called("all")) == len(registry.CASES)
-    assert [case.name for case in registry.cases_called("clip")] == ["clip-1d", "clip-0d", "clip-2d"]
-    assert all(group in str(bench.__annotations__["name"]) for group in TITLES)
+    assert len(registry.find_cases("all")) == len(registry.CASES)
+    assert [case.name for case in registry.find_cases("clip")] == ["clip-1d", "clip-0d", "clip-2d"]
+    assert all(group in str(bench.__annotations__["name"]) for group in GROUP_TITLES)
     with pytest.raises(InputError, match="recovery, clip"):
-        registry.cases_called("nothing")
+        registry.find_cases("nothing")

@@ -18,8 +18,10 @@ SHAPE = (24, 32)
 
 
 @pytest.fixture
-def readings(run: Run, tmp_path: Path) -> Path:
-    """Readings of a slope without parallax: bright at the upper left, so that no turn or mirror goes unseen."""
+def measurements(run: Run, tmp_path: Path) -> Path:
+    """Readings of a slope without parallax: bright at the upper left, so that no turn or mirror
+    goes unseen.
+    """
     row, column = np.indices(SHAPE)
     slope = (0.2 + 0.5 * (1 - row / SHAPE[0]) + 0.3 * (1 - column / SHAPE[1])).astype(np.float32)
     views = np.array([(v, u) for v in (-1, 0, 1) for u in (-1, 0, 1)], float)
@@ -29,10 +31,15 @@ def readings(run: Run, tmp_path: Path) -> Path:
     return tmp_path / "readings.h5"
 
 
-def test_every_format_holds_the_same_picture(run: Run, readings: Path, tmp_path: Path) -> None:
+def test_every_format_holds_the_same_picture(run: Run, measurements: Path, tmp_path: Path) -> None:
     for suffix in ("h5", "exr", "png"):
         out = tmp_path / f"picture.{suffix}"
-        assert run("clip", "recover", readings, "--shear", "0", "--weight", "0.001", "--out", out).status == 0
+        assert (
+            run(
+                "clip", "recover", measurements, "--shear", "0", "--weight", "0.001", "--out", out
+            ).status
+            == 0
+        )
     with h5py.File(tmp_path / "picture.h5") as file:
         stored = next(node for node in _datasets(file) if node.shape == SHAPE)
         picture = stored[...]

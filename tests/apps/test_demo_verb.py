@@ -16,8 +16,14 @@ def test_demo(run: Run, tmp_path: Path) -> None:
     assert (outcome.status, outcome.err) == (0, "")
     found = json.loads(outcome.out)
     folder = tmp_path / "new" / "demo"
-    assert {path.name for path in folder.iterdir()} == {"streak.h5", "frames.h5", "cloud.ply", "preview.png"}
-    # Half a bin at the median and one bin for 95 % of the pixels with a return are what the demonstration promises.
+    assert {path.name for path in folder.iterdir()} == {
+        "streak.h5",
+        "frames.h5",
+        "cloud.ply",
+        "preview.png",
+    }
+    # Half a bin at the median and one bin for 95 % of the pixels with a return are what the
+    # demonstration promises.
     assert found["median_depth_error_m"] < found["bin_m"] / 2
     assert found["share_within_one_bin"] > 0.95
     assert found["share_with_return"] > 0.9

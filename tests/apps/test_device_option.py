@@ -1,4 +1,6 @@
-"""`--device`: the same files from arrays elsewhere; PyTorch on this processor stands in for a graphics processor."""
+"""`--device`: the same files from arrays elsewhere; PyTorch on this processor stands in for a
+graphics processor.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ import pytest
 from small_instrument import Run
 
 from tofclip import Frames, PointCloud, Streak, arrays, recover
-from tofclip.recovery import DepthLocked, Focus, SharpestFocus
+from tofclip.recovery import DepthLockedFocus, Focus, SharpestFocus
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +42,9 @@ def difference(found: Frames, expected: Frames) -> float:
 
 @pytest.mark.usefixtures("torch")
 @pytest.mark.parametrize("method", ["tv", "linear"])
-def test_frames_and_cloud_are_those_of_the_compiled_loops(run: Run, files: Path, tmp_path: Path, method: str) -> None:
+def test_frames_and_cloud_are_those_of_the_compiled_loops(
+    run: Run, files: Path, tmp_path: Path, method: str
+) -> None:
     frames, points, devices = {}, {}, {}
     for device in ("cpu", "torch:cpu"):
         out, cloud = (tmp_path / f"{device.replace(':', '-')}{end}" for end in (".h5", ".npz"))
@@ -50,10 +54,14 @@ def test_frames_and_cloud_are_those_of_the_compiled_loops(run: Run, files: Path,
         devices[device] = found["device"], frames[device].figures["device"]
     assert devices == {"cpu": ("cpu", "cpu"), "torch:cpu": ("torch:cpu", "torch:cpu")}
     there, here = frames["torch:cpu"], frames["cpu"]
-    assert difference(there, here) < 1e-4  # what is promised; sums in another order differ by some 1e-6
+    assert (
+        difference(there, here) < 1e-4
+    )  # what is promised; sums in another order differ by some 1e-6
     for name in ("iterations", "stopped_because"):
         assert there.figures[name] == here.figures[name]
-    assert there.figures["relative_residual"] == pytest.approx(here.figures["relative_residual"], rel=1e-4)
+    assert there.figures["relative_residual"] == pytest.approx(
+        here.figures["relative_residual"], rel=1e-4
+    )
     np.testing.assert_allclose(points["torch:cpu"].range, points["cpu"].range, atol=1e-4)  # m
 
 
@@ -63,7 +71,9 @@ def test_frames_of_a_file_to_a_cloud(run: Run, files: Path, streak: Streak, tmp_
     told = {}
     for device in ("cpu", "torch:cpu"):
         out = tmp_path / f"{device[:3]}.npz"
-        told[device] = object_of(run, "cloud", tmp_path / "frames.h5", "--out", out, "--device", device)
+        told[device] = object_of(
+            run, "cloud", tmp_path / "frames.h5", "--out", out, "--device", device
+        )
     there, here = told["torch:cpu"], told["cpu"]
     assert (there.pop("device"), here.pop("device")) == ("torch:cpu", "cpu")
     assert there["points"] == here["points"] > 50
@@ -71,12 +81,16 @@ def test_frames_of_a_file_to_a_cloud(run: Run, files: Path, streak: Streak, tmp_
 
 
 @pytest.mark.usefixtures("torch")
-@pytest.mark.parametrize("focus", [DepthLocked(), SharpestFocus(-0.2, 0.2, 2)], ids=str)
+@pytest.mark.parametrize("focus", [DepthLockedFocus(), SharpestFocus(-0.2, 0.2, 2)], ids=str)
 @pytest.mark.parametrize("method", ["l1", "linear"])
 def test_pieces_of_their_own_shear(streak: Streak, focus: Focus, method: str) -> None:
     assert streak.camera is not None
-    shot = Streak(streak.counts, camera=streak.camera.replace(lenslet_pitch=1e-3)).with_bin_width(20e-12)
-    here, there = (recover(shot, method=method, focus=focus, device=device) for device in ("cpu", "torch:cpu"))
+    shot = Streak(streak.counts, camera=streak.camera.replace(lenslet_pitch=1e-3)).with_bin_width(
+        20e-12
+    )
+    here, there = (
+        recover(shot, method=method, focus=focus, device=device) for device in ("cpu", "torch:cpu")
+    )
     assert len(set(here.shears)) > 1
     np.testing.assert_array_equal(there.shears, here.shears)
     assert difference(there, here) < 1e-4
@@ -94,7 +108,9 @@ def test_a_folder_belongs_to_one_device(run: Run, files: Path, tmp_path: Path) -
     assert outcome.status == 2
     assert "device torch:cpu instead of None" in outcome.err
     for clouds, device in (("clouds", "torch:cpu"), ("more", "cpu")):
-        found = object_of(run, "cloud", tmp_path / "frames", "--out", tmp_path / clouds, "--device", device)
+        found = object_of(
+            run, "cloud", tmp_path / "frames", "--out", tmp_path / clouds, "--device", device
+        )
         assert (found["results"], found["device"]) == (1, device)
 
 
@@ -111,7 +127,9 @@ def test_a_device_that_is_not_there_is_refused_in_one_line(
 
 
 @pytest.mark.usefixtures("no_graphics")
-def test_auto_is_this_processor_where_there_is_no_other(run: Run, files: Path, tmp_path: Path) -> None:
+def test_auto_is_this_processor_where_there_is_no_other(
+    run: Run, files: Path, tmp_path: Path
+) -> None:
     words = ("recover", files / "streak.h5", "--out", tmp_path / "frames.h5", "--method", "adjoint")
     assert object_of(run, *words, "--device", "auto")["device"] == "cpu"
     words = ("cloud", tmp_path / "frames.h5", "--out", tmp_path / "cloud.ply")

@@ -24,10 +24,10 @@ ROOT = Path(tofclip.__file__).parents[1]
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     import devices
-    from devices.recorder import record
+    from devices.recorder import record_source
 
     path = tmp_path_factory.mktemp("recording") / "run.h5"
-    record(devices.open(SIM), path, 0.3)
+    record_source(devices.open(SIM), path, 0.3)
     return path
 
 
@@ -50,14 +50,18 @@ def test_what_is_connected_is_listed(run: Run, monkeypatch: pytest.MonkeyPatch) 
 
 
 def find_one() -> list[object]:
-    from devices.registry import Found
+    from devices.registry import DiscoveredInstrument
 
-    return [Found("timetag://T9", "a tagger", "asleep")]
+    return [DiscoveredInstrument("timetag://T9", "a tagger", "asleep")]
 
 
 def test_information(run: Run, recording: Path) -> None:
     live = json.loads(run("devices", "info", SIM, "--json").out)
-    assert (live["instrument"], live["clock_hz"], live["is_live"]) == ("FX2 time tagger", 128_000_000, True)
+    assert (live["instrument"], live["clock_hz"], live["is_live"]) == (
+        "FX2 time tagger",
+        128_000_000,
+        True,
+    )
     assert live["calibration_tick_s"] == 1 / 128e6
     replayed = json.loads(run("devices", "info", f"file://{recording}", "--json").out)
     assert replayed == {**live, "is_live": False, "is_seekable": True}
@@ -70,7 +74,9 @@ def test_trying_out(run: Run) -> None:
     counted = {"delivered", "dropped_host", "lost_device", "malformed", "timeouts", "reconnects"}
     assert counted | {"bytes_per_second", "records"} <= set(found)
     assert found["records"] == found["delivered"] > 300_000
-    assert found["bytes_per_second"] == pytest.approx(6e6, rel=0.25)  # a million records of 6 bytes a second
+    assert found["bytes_per_second"] == pytest.approx(
+        6e6, rel=0.25
+    )  # a million records of 6 bytes a second
     assert found["lost_device"] == found["dropped_host"] == found["malformed"] == 0
     assert "bytes per second" in run("devices", "test", SIM, "--seconds", "0.1").out
 
@@ -112,7 +118,10 @@ def test_damage_is_named_and_repaired(run: Run, recording: Path, tmp_path: Path)
     outcome = run("devices", "verify", damaged, "--json")
     assert outcome.status == 2
     assert json.loads(outcome.out)["damaged_blocks"] == 1
-    assert outcome.err == f"tofclip: error: {damaged}: is damaged; tofclip devices repair makes a sound copy\n"
+    assert (
+        outcome.err
+        == f"tofclip: error: {damaged}: is damaged; tofclip devices repair makes a sound copy\n"
+    )
     assert f"wrote {out}" in run("devices", "repair", damaged, "--out", out).out
     assert run("devices", "verify", out).status == 0
 
@@ -126,7 +135,10 @@ def test_damage_is_named_and_repaired(run: Run, recording: Path, tmp_path: Path)
         (("devices", "info", "timetag://"), "04b4:1004"),
         (("devices", "verify", "absent.h5"), "no such file"),
         (("record", "sim+timetag://", "--out", "run.txt"), "must end in .h5"),
-        (("record", "sim+timetag://", "--out", "run.h5", "--seconds", "-1"), "--seconds must be positive"),
+        (
+            ("record", "sim+timetag://", "--out", "run.h5", "--seconds", "-1"),
+            "--seconds must be positive",
+        ),
     ],
 )
 def test_unusable_input_is_one_line(
@@ -148,9 +160,12 @@ def test_an_input_is_not_overwritten(run: Run, recording: Path) -> None:
 def test_ctrl_c_leaves_a_whole_recording(tmp_path: Path) -> None:
     path = tmp_path / "run.h5"
     command = [sys.executable, "-m", "apps", "record", SIM, "--out", str(path)]
-    # A shell that puts the tests into the background has them ignore Ctrl-C, and children inherit that.
+    # A shell that puts the tests into the background has them ignore Ctrl-C, and children inherit
+    # that.
     heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    recorder = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, env=os.environ, preexec_fn=heed)
+    recorder = subprocess.Popen(
+        command, cwd=ROOT, stderr=subprocess.PIPE, env=os.environ, preexec_fn=heed
+    )
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and not (path.exists() and verify(path).records):
         time.sleep(0.05)

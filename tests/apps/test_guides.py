@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 import tofclip
-from apps.documentation import verbs
-from apps.guides import commands_for_hardware, make_pictures, shown_pictures, steps, walk
+from apps.documentation import collect_verbs
+from apps.guides import find_hardware_commands, find_pictures, make_pictures, read_steps, run_guide
 
 DOCS = Path(tofclip.__file__).parents[1] / "docs"
 GUIDES = [DOCS / f"{name}.md" for name in ("tutorial", "own_camera", "own_wall", "own_light_field")]
@@ -24,13 +24,15 @@ RECORDED = {
     "DotPattern_bkg.tif": "dot_background.tif",
     "scene5.tif": "streak.h5",  # files are known by content
 }
-OWN = {name: name for name in RECORDED.values() if name.endswith("tif")} | {"my_picture.tif": "streak.tif"}
+OWN = {name: name for name in RECORDED.values() if name.endswith("tif")} | {
+    "my_picture.tif": "streak.tif"
+}
 
 
 def walked(guide: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> set[str]:
     """Run a guide in a folder and return the files that are there afterwards."""
     monkeypatch.chdir(folder)
-    for step, status in walk(DOCS / guide):
+    for step, status in run_guide(DOCS / guide):
         assert status == 0, step
     return {path.name for path in folder.iterdir()}
 
@@ -43,10 +45,14 @@ def provide(files: Path, names: Mapping[str, str], folder: Path) -> None:
 def test_the_tutorial(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     provide(files, RECORDED, tmp_path)
     there = walked("tutorial.md", tmp_path, monkeypatch)
-    assert {"camera.h5", "frames.h5", "look.h5", "scene.ply"} | set(shown_pictures(GUIDES[0])) <= there
+    assert {"camera.h5", "frames.h5", "look.h5", "scene.ply"} | set(
+        find_pictures(GUIDES[0])
+    ) <= there
 
 
-def test_the_guide_to_ones_own_camera(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_guide_to_ones_own_camera(
+    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     provide(files, OWN, tmp_path)
     there = walked("own_camera.md", tmp_path, monkeypatch)
     assert {"shot.h5", "frames.h5", "scene.ply", "fitted.h5", "photons.ply"} <= there
@@ -54,15 +60,17 @@ def test_the_guide_to_ones_own_camera(files: Path, tmp_path: Path, monkeypatch: 
 
 def test_the_guide_to_ones_own_wall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     there = walked("own_wall.md", tmp_path, monkeypatch)
-    assert {"capture.h5", "volume.h5"} | set(shown_pictures(GUIDES[2])) <= there
+    assert {"capture.h5", "volume.h5"} | set(find_pictures(GUIDES[2])) <= there
 
 
 def test_the_guide_to_ones_own_light_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     there = walked("own_light_field.md", tmp_path, monkeypatch)
-    assert {"field.h5", "spoilt.png"} | set(shown_pictures(GUIDES[3])) <= there
+    assert {"field.h5", "spoilt.png"} | set(find_pictures(GUIDES[3])) <= there
 
 
-def test_the_page_on_graphics_processors(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_on_graphics_processors(
+    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     provide(files, {"shot.h5": "streak.h5"}, tmp_path)
     assert {"frames.h5", "scene.ply"} <= walked("graphics_processor.md", tmp_path, monkeypatch)
 
@@ -77,8 +85,8 @@ def test_pictures_are_there_and_small(guide: Path) -> None:
 
 @pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)
 def test_commands_that_need_hardware_are_understood(guide: Path) -> None:
-    known = verbs()
-    for command in commands_for_hardware(guide):
+    known = collect_verbs()
+    for command in find_hardware_commands(guide):
         words = shlex.split(command)[1:]
         name = " ".join(words[:2]) if " ".join(words[:2]) in known else words[0]
         with known[name].make_context(name, words[len(name.split()) :]) as context:
@@ -87,7 +95,9 @@ def test_commands_that_need_hardware_are_understood(guide: Path) -> None:
 
 def test_every_line_of_a_shell_block_is_a_command_of_this_program() -> None:
     for guide in GUIDES:
-        assert all(text.startswith("tofclip ") for language, text in steps(guide) if language == "sh")
+        assert all(
+            text.startswith("tofclip ") for language, text in read_steps(guide) if language == "sh"
+        )
 
 
 def test_pictures_of_a_guide_are_kept_beside_it(tmp_path: Path) -> None:

@@ -1,4 +1,6 @@
-"""Every verb explains itself, and shells complete it; verbs are found in the program, so that none is forgotten."""
+"""Every verb explains itself, and shells complete it; verbs are found in the program, so that none
+is forgotten.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +15,13 @@ import typer
 from small_instrument import Run
 
 import tofclip
-from apps.cli import COMPLETION_VARIABLE, MAP
-from apps.documentation import page, verbs, write_pages
-from apps.help import folded, told
-from apps.studies.registry import studies_called
+from apps.cli import COMPLETION_VARIABLE, VERB_OVERVIEW
+from apps.documentation import collect_verbs, render_page, write_pages
+from apps.help import split_docstring, wrap_command
+from apps.studies.registry import find_studies
 
 ROOT = Path(tofclip.__file__).parents[1]
-VERBS = verbs()
+VERBS = collect_verbs()
 
 
 @pytest.mark.parametrize("name", VERBS)
@@ -30,14 +32,14 @@ def test_help_of_a_verb(run: Run, monkeypatch: pytest.MonkeyPatch, name: str) ->
     assert f"Usage: tofclip {name} " in outcome.out
     assert "--json" in outcome.out
     assert "Exit status: 0 done; 2 unusable input" in outcome.out
-    for example in told(VERBS[name].callback.__doc__)[1]:
-        assert all(line.strip() in outcome.out for line in folded(example).splitlines())
+    for example in split_docstring(VERBS[name].callback.__doc__)[1]:
+        assert all(line.strip() in outcome.out for line in wrap_command(example).splitlines())
 
 
 @pytest.mark.parametrize("name", VERBS)
 def test_examples_of_a_verb_are_understood(name: str) -> None:
     """Every word of an example is one the verb takes, and none that it needs is missing."""
-    _, examples = told(VERBS[name].callback.__doc__)
+    _, examples = split_docstring(VERBS[name].callback.__doc__)
     assert examples, f"the docstring of '{name}' needs a paragraph 'Example: tofclip {name} ...'"
     for example in examples:
         program, *words = shlex.split(example)
@@ -50,20 +52,24 @@ def test_examples_of_a_verb_are_understood(name: str) -> None:
 @pytest.mark.parametrize("name", VERBS)
 def test_the_map_shows_the_verb(name: str) -> None:
     group = name.split()[0]
-    assert f"\n  {name} " in MAP or f"\n  {group} " in MAP
+    assert f"\n  {name} " in VERB_OVERVIEW or f"\n  {group} " in VERB_OVERVIEW
 
 
 def test_prose_is_joined_and_examples_are_taken_out() -> None:
-    prose, examples = told("Do a\nthing.\n\n  a  table\n\nExample: tofclip do\n    it --now\n\nMore.")
+    prose, examples = split_docstring(
+        "Do a\nthing.\n\n  a  table\n\nExample: tofclip do\n    it --now\n\nMore."
+    )
     assert prose == ["Do a thing.", "  a  table", "More."]
     assert examples == ["tofclip do it --now"]
-    assert told(None) == ([], [])
+    assert split_docstring(None) == ([], [])
 
 
 def test_a_long_example_is_still_one_command_for_a_shell() -> None:
-    command = "tofclip calibrate " + " ".join(f"--picture-number-{n} picture_{n}.tif" for n in range(6))
-    assert len(folded(command).splitlines()) > 2
-    assert shlex.split(folded(command).replace("\\\n", "")) == shlex.split(command)
+    command = "tofclip calibrate " + " ".join(
+        f"--picture-number-{n} picture_{n}.tif" for n in range(6)
+    )
+    assert len(wrap_command(command).splitlines()) > 2
+    assert shlex.split(wrap_command(command).replace("\\\n", "")) == shlex.split(command)
 
 
 def asked(run: Run, monkeypatch: pytest.MonkeyPatch, shell: str, line: str) -> str:
@@ -80,7 +86,9 @@ def asked(run: Run, monkeypatch: pytest.MonkeyPatch, shell: str, line: str) -> s
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_shells_complete_verbs_options_and_names(run: Run, monkeypatch: pytest.MonkeyPatch, shell: str) -> None:
+def test_shells_complete_verbs_options_and_names(
+    run: Run, monkeypatch: pytest.MonkeyPatch, shell: str
+) -> None:
     assert "lidar" in asked(run, monkeypatch, shell, "tofclip lid")
     assert "parallax" in asked(run, monkeypatch, shell, "tofclip lidar ")
     assert "--sampling-ratio" in asked(run, monkeypatch, shell, "tofclip clip simulate --samp")
@@ -105,7 +113,7 @@ def test_every_completed_study_exists() -> None:
     completed = [item.value for item in name.shell_complete(context, "table1")]
     assert completed == ["table1", "table10"]
     for word in completed:
-        assert studies_called(word)
+        assert find_studies(word)
 
 
 def test_bash_takes_the_script(tmp_path: Path) -> None:
@@ -119,14 +127,18 @@ def test_bash_takes_the_script(tmp_path: Path) -> None:
         echo "${{COMPREPLY[@]}}"
     """
     there = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(["bash", "-c", session], env=there, cwd=tmp_path, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        ["bash", "-c", session], env=there, cwd=tmp_path, capture_output=True, text=True, check=True
+    )
     assert (done.stdout.strip(), done.stderr) == ("verify", "")
 
 
 def test_completion_is_installed_for_the_shell_that_asks(tmp_path: Path) -> None:
     command = f"{shlex.quote(sys.executable)} -m apps --install-completion; exit $?"
     there = {**os.environ, "HOME": str(tmp_path)}
-    done = subprocess.run(["bash", "-c", command], env=there, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["bash", "-c", command], env=there, cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     script = tmp_path / ".bash_completions" / "tofclip.sh"
     assert f"{COMPLETION_VARIABLE}=complete_bash" in script.read_text()
@@ -149,17 +161,22 @@ def test_pages_that_are_the_same_stay_untouched(tmp_path: Path) -> None:
 
 
 def test_what_a_page_says() -> None:
-    text = page("lidar scene", VERBS["lidar scene"])
+    text = render_page("lidar scene", VERBS["lidar scene"])
     assert text.startswith("# tofclip lidar scene\n\nList the objects")
     assert "```sh\ntofclip lidar scene frames.h5 --out scene.png\n```" in text
     assert "`--reach-mm MM`\n: Points this close belong together. \\[default: 40.0\\]" in text
     assert "## Arguments\n\n`FRAMES" in text
-    assert "## Arguments" not in page("devices list", VERBS["devices list"])
+    assert "## Arguments" not in render_page("devices list", VERBS["devices list"])
 
 
 def test_a_page_keeps_the_headings_of_the_help() -> None:
-    text = page("nlos info", VERBS["nlos info"])
+    text = render_page("nlos info", VERBS["nlos info"])
     headings = [line for line in text.splitlines() if line.startswith("## ")]
     assert headings[:2] == ["## Arguments", "## Options"]
     assert headings[2].startswith("## Settings")
-    assert text.index("## Options") < text.index("`--json`") < text.index("## Settings") < text.index("`--cycles")
+    assert (
+        text.index("## Options")
+        < text.index("`--json`")
+        < text.index("## Settings")
+        < text.index("`--cycles")
+    )

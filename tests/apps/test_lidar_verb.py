@@ -12,8 +12,15 @@ from small_instrument import Run
 from tofclip.camera import Camera, SkewSweep
 from tofclip.shots import Frames
 from tofclip.shots.stack import save_stack
-from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate, true_frames
-from tofclip.simulate.shapes import checkerboard
+from tofclip.simulate import (
+    Instrument,
+    Plate,
+    Scene,
+    StreakDetector,
+    render_true_frames,
+    simulate_shot,
+)
+from tofclip.simulate.shapes import make_checkerboard
 
 CENTRES = 40.0 + 60 * np.arange(5)
 CAMERA = Camera(
@@ -32,7 +39,11 @@ CAMERA = Camera(
 
 def plate(distance: float, place_px: float) -> Plate:
     pixel = distance / 100.0
-    return Plate((place_px * pixel, place_px * pixel, distance), (9 * pixel, 9 * pixel), checkerboard(3, 0.1, 0.9))
+    return Plate(
+        (place_px * pixel, place_px * pixel, distance),
+        (9 * pixel, 9 * pixel),
+        make_checkerboard(3, 0.1, 0.9),
+    )
 
 
 def test_accuracy_prints_the_figures_of_the_contract(run: Run) -> None:
@@ -41,7 +52,9 @@ def test_accuracy_prints_the_figures_of_the_contract(run: Run) -> None:
     assert (outcome.status, outcome.err) == (0, "")
     figures = json.loads(outcome.out)
     assert list(figures) == ["rms_m", "bound_m", "ratio", "detection_rate", "false_alarm_rate"]
-    assert 3.9e-4 < figures["bound_m"] < 4.1e-4  # c/2 * 26.1 ps (pulse and bin) / root 100, and a little background
+    assert (
+        3.9e-4 < figures["bound_m"] < 4.1e-4
+    )  # c/2 * 26.1 ps (pulse and bin) / root 100, and a little background
     assert 0.8 < figures["ratio"] < 1.2  # 200 trials: 5 percent
 
 
@@ -54,7 +67,13 @@ def test_a_tail_costs_accuracy(run: Run) -> None:
 
 
 def test_unusable_numbers_end_in_one_line(run: Run) -> None:
-    for words in (("--photons", "0"), ("--background=-1",), ("--bins", "5"), ("--trials", "0"), ("--pulse-ps", "nan")):
+    for words in (
+        ("--photons", "0"),
+        ("--background=-1",),
+        ("--bins", "5"),
+        ("--trials", "0"),
+        ("--pulse-ps", "nan"),
+    ):
         outcome = run("lidar", "accuracy", *words)
         assert outcome.status == 2
         assert outcome.err.startswith("tofclip: error: ")
@@ -65,15 +84,39 @@ def test_alone_it_explains_itself(run: Run) -> None:
     assert "accuracy" in run("lidar").out
 
 
-def test_parallax_makes_the_camera_that_depth_locked_recovery_needs(run: Run, tmp_path: Path) -> None:
-    scene = Scene(tuple(plate(distance, place) for distance, place in ((0.8, -9), (1.3, 0), (4.0, 9))))
-    shot = simulate(scene, Instrument(CAMERA, StreakDetector(360, 100e-12, peak_photons=2e5)), seed=0)
+def test_parallax_makes_the_camera_that_depth_locked_recovery_needs(
+    run: Run, tmp_path: Path
+) -> None:
+    scene = Scene(
+        tuple(plate(distance, place) for distance, place in ((0.8, -9), (1.3, 0), (4.0, 9)))
+    )
+    shot = simulate_shot(
+        scene, Instrument(CAMERA, StreakDetector(360, 100e-12, peak_photons=2e5)), seed=0
+    )
     replace(shot.streak, camera=CAMERA.replace(lenslet_pitch=0.0)).save(tmp_path / "shot.h5")
-    locked = ("recover", tmp_path / "shot.h5", "--out", tmp_path / "frames.h5", "--method", "l1", "--iterations", "5")
+    locked = (
+        "recover",
+        tmp_path / "shot.h5",
+        "--out",
+        tmp_path / "frames.h5",
+        "--method",
+        "l1",
+        "--iterations",
+        "5",
+    )
     refused = run(*locked, "--focus", "depth-locked")
     assert refused.status == 2
     assert "lenslet pitch" in refused.err
-    words = ("lidar", "parallax", tmp_path / "shot.h5", "--out", tmp_path / "camera.h5", "--gates", "4", "--json")
+    words = (
+        "lidar",
+        "parallax",
+        tmp_path / "shot.h5",
+        "--out",
+        tmp_path / "camera.h5",
+        "--gates",
+        "4",
+        "--json",
+    )
     found = run(*words, "--shears", "-1.5", "0.9", "9")
     assert found.status == 0, found.err
     figures = json.loads(found.out)
@@ -87,30 +130,41 @@ def test_parallax_makes_the_camera_that_depth_locked_recovery_needs(run: Run, tm
 
 def test_clouds_are_tidied_and_become_depth_pictures(run: Run, tmp_path: Path) -> None:
     scene = Scene((plate(1.3, 0),))
-    shot = simulate(scene, Instrument(CAMERA, StreakDetector(150, 100e-12, peak_photons=2e5)), seed=0)
-    true_frames(scene, Instrument(CAMERA, StreakDetector(150, 100e-12)), shot.exposure).save(tmp_path / "frames.h5")
+    shot = simulate_shot(
+        scene, Instrument(CAMERA, StreakDetector(150, 100e-12, peak_photons=2e5)), seed=0
+    )
+    render_true_frames(scene, Instrument(CAMERA, StreakDetector(150, 100e-12)), shot.exposure).save(
+        tmp_path / "frames.h5"
+    )
     whole, thin = (
-        json.loads(run("cloud", tmp_path / "frames.h5", "--out", tmp_path / name, "--json", *words).out)["points"]
+        json.loads(
+            run("cloud", tmp_path / "frames.h5", "--out", tmp_path / name, "--json", *words).out
+        )["points"]
         for name, words in (("a.laz", ()), ("b.ply", ("--voxel-mm", "30", "--drop-outliers")))
     )
     assert 0 < thin < whole / 2
     assert run("cloud", tmp_path / "frames.h5", "--out", tmp_path / "depth.exr").status == 0
     assert (tmp_path / "depth.exr").read_bytes()[:4] == b"\x76\x2f\x31\x01"
-    assert run("cloud", tmp_path / "frames.h5", "--out", tmp_path / "c.ply", "--voxel-mm", "0").status == 2
+    assert (
+        run("cloud", tmp_path / "frames.h5", "--out", tmp_path / "c.ply", "--voxel-mm", "0").status
+        == 2
+    )
 
 
 def test_a_sequence_is_made_and_goes_on(run: Run, tmp_path: Path) -> None:
     shots, out = tmp_path / "shots", tmp_path / "clouds"
     shots.mkdir()
     made = Instrument(CAMERA, StreakDetector(150, 100e-12, peak_photons=2e4))
-    streaks = [simulate(Scene((plate(1.3, 0),)), made, seed).streak for seed in range(3)]
+    streaks = [simulate_shot(Scene((plate(1.3, 0),)), made, seed).streak for seed in range(3)]
     for number, streak in enumerate(streaks):
         streak.save(shots / f"{number}.h5")
     first = run("lidar", "sequence", shots, "--out", out, "--focus", "depth-locked", "--json")
     assert first.status == 0, first.err
     assert json.loads(first.out)["shots"] == 3
     (out / "cloud_000002.ply").unlink()
-    again = json.loads(run("lidar", "sequence", shots, "--out", out, "--focus", "depth-locked", "--json").out)
+    again = json.loads(
+        run("lidar", "sequence", shots, "--out", out, "--focus", "depth-locked", "--json").out
+    )
     assert (again["shots"], again["results"], again["kept_from_before"]) == (1, 1, 2)
     assert run("lidar", "sequence", shots, "--out", out).status == 2  # another focus
     save_stack(streaks, tmp_path / "stack.h5")
@@ -128,15 +182,24 @@ def test_a_sequence_is_made_and_goes_on(run: Run, tmp_path: Path) -> None:
     )
     assert run(*words).status == 2  # a stack carries no camera
     assert run(*words, "--camera", tmp_path / "camera.h5", "--bin-width-ps", "100").status == 0
-    assert sorted(path.name for path in (tmp_path / "more").glob("*.npz")) == ["cloud_000000.npz", "cloud_000001.npz"]
+    assert sorted(path.name for path in (tmp_path / "more").glob("*.npz")) == [
+        "cloud_000000.npz",
+        "cloud_000001.npz",
+    ]
     (tmp_path / "empty").mkdir()
-    for unusable in ((tmp_path / "empty",), (shots, "--suffix", ".xyz"), (shots, "--focus", "stack:0:1:3")):
+    for unusable in (
+        (tmp_path / "empty",),
+        (shots, "--suffix", ".xyz"),
+        (shots, "--focus", "stack:0:1:3"),
+    ):
         assert run("lidar", "sequence", *unusable, "--out", out).status == 2
 
 
 def test_a_scene_is_listed_and_drawn(run: Run, tmp_path: Path) -> None:
     made = Instrument(CAMERA, StreakDetector(150, 100e-12))
-    true_frames(Scene((plate(1.1, -9), plate(1.6, 9))), made, 1e4).save(tmp_path / "frames.h5")
+    render_true_frames(Scene((plate(1.1, -9), plate(1.6, 9))), made, 1e4).save(
+        tmp_path / "frames.h5"
+    )
     words = ("lidar", "scene", tmp_path / "frames.h5", "--out", tmp_path / "scene.png")
     found = run(*words, "--reach-mm", "60", "--json")
     assert found.status == 0, found.err

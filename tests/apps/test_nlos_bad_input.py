@@ -20,7 +20,10 @@ def refused(outcome: Outcome, complaint: str) -> None:
         (["--method", "guess"], "unknown method 'guess'; choose from rsd, hybrid"),
         (["--method", "rsd,hybrid"], "nlos compare takes several"),
         (["--method", "rsd"], "use the hybrid method"),
-        (["--method", "hybrid", "--sigma-mm", "3"], "sigma_mm is a setting of filtered-backprojection"),
+        (
+            ["--method", "hybrid", "--sigma-mm", "3"],
+            "sigma_mm is a setting of filtered-backprojection",
+        ),
         (["--point-fraction", "2"], "point_fraction is a share"),
         (["--cycles", "0"], "cycles"),
         (["--voxel-mm", "-1"], "voxel"),
@@ -31,7 +34,9 @@ def refused(outcome: Outcome, complaint: str) -> None:
         (["--voxel-mm", "abc"], "(see --help)"),
     ],
 )
-def test_imaging_that_makes_no_sense(run: Run, curved: Path, tmp_path: Path, words: list[str], complaint: str) -> None:
+def test_imaging_that_makes_no_sense(
+    run: Run, curved: Path, tmp_path: Path, words: list[str], complaint: str
+) -> None:
     refused(run("nlos", "reconstruct", curved, "--out", tmp_path / "v.h5", *words), complaint)
     assert list(tmp_path.iterdir()) == []
 
@@ -52,8 +57,12 @@ def test_imaging_that_makes_no_sense(run: Run, curved: Path, tmp_path: Path, wor
         (["--mesh", "absent.ply"], "no such file"),
     ],
 )
-def test_scenes_that_make_no_sense(run: Run, tmp_path: Path, words: list[str], complaint: str) -> None:
-    refused(run("nlos", "simulate", "--wall-points", 3, "--out", tmp_path / "c.h5", *words), complaint)
+def test_scenes_that_make_no_sense(
+    run: Run, tmp_path: Path, words: list[str], complaint: str
+) -> None:
+    refused(
+        run("nlos", "simulate", "--wall-points", 3, "--out", tmp_path / "c.h5", *words), complaint
+    )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -63,11 +72,16 @@ def test_names_that_cannot_be_written(run: Run, curved: Path, tmp_path: Path) ->
     settings = ["--settings", tmp_path / "mine.toml"]
     reconstruct, compare = ["nlos", "reconstruct", source], ["nlos", "compare", source]
     refused(run(*reconstruct, "--out", source), "is an input too")
-    refused(run(*reconstruct, *settings, "--out", tmp_path / "mine.h5"), "mine.toml: is an input too")
+    refused(
+        run(*reconstruct, *settings, "--out", tmp_path / "mine.h5"), "mine.toml: is an input too"
+    )
     refused(run(*reconstruct, "--out", tmp_path / "v.stl"), "the name must end in .h5")
     refused(run(*compare, *settings, "--out", tmp_path / "mine.png"), "mine.toml: is an input too")
     refused(run(*compare, "--out", tmp_path / "c.bmp"), "must end in .png")
-    refused(run(*compare, "--out", tmp_path / "c.png", "--methods", "fk"), "fk does not suit this capture")
+    refused(
+        run(*compare, "--out", tmp_path / "c.png", "--methods", "fk"),
+        "fk does not suit this capture",
+    )
     refused(run(*compare, "--out", tmp_path / "c.png", "--methods", "hybrid,hybrid"), "named twice")
     refused(run("nlos", "info", tmp_path / "mine.toml"), "is no capture of a known format")
     (tmp_path / "captures").mkdir()
@@ -75,7 +89,12 @@ def test_names_that_cannot_be_written(run: Run, curved: Path, tmp_path: Path) ->
     refused(run(*folder, "--out", tmp_path / "captures"), "choose another one for the results")
     refused(run(*folder, "--out", tmp_path / "results"), "no capture is in there")
     refused(run(*folder, "--out", source), "is a file; a folder of captures needs a folder")
-    refused(run(*folder, "--out", tmp_path / "results", "--suffix", ".stl"), "no format of volumes is called '.stl'")
+    refused(
+        run(*folder, "--out", tmp_path / "results", "--suffix", ".stl"),
+        "no format of volumes is called '.stl'",
+    )
     (tmp_path / "captures" / "a.h5").touch()
     (tmp_path / "captures" / "a.npz").touch()
-    refused(run(*folder, "--out", tmp_path / "results"), "a.h5 and a.npz would have results of one name")
+    refused(
+        run(*folder, "--out", tmp_path / "results"), "a.h5 and a.npz would have results of one name"
+    )

@@ -30,9 +30,13 @@ def test_a_curved_wall(run: Run, curved: Path, tmp_path: Path) -> None:
         assert stored.grid.shape == tuple(found["voxels"])
         assert figures["seconds"] > 0
         assert figures["sharpness"] > 1
-        # The ball about the point is a small part of the box, and holds more than that part of the energy: by the
-        # unsharpest method 2.5 times as much.
-        share = HiddenTruth(np.array([POINT]), 0.0).near(stored.grid, figures["truth_reach_m"]).mean()
+        # The ball about the point is a small part of the box, and holds more than that part of the
+        # energy: by the unsharpest method 2.5 times as much.
+        share = (
+            HiddenTruth(np.array([POINT]), 0.0)
+            .mask_near(stored.grid, figures["truth_reach_m"])
+            .mean()
+        )
         assert figures["energy_near_truth"] > 2 * share
         assert figures["contrast_to_truth"] > 2
     assert out.read_bytes().startswith(PNG)
@@ -41,17 +45,19 @@ def test_a_curved_wall(run: Run, curved: Path, tmp_path: Path) -> None:
 def test_its_settings_give_the_same_comparison(run: Run, confocal: Path, tmp_path: Path) -> None:
     words = ["compare", confocal, "--methods", "fk,rsd", "--voxel-mm", 60]
     one = object_of(run, *words, "--out", tmp_path / "one.png")
-    two = object_of(run, "compare", confocal, "--settings", tmp_path / "one.toml", "--out", tmp_path / "two.png")
+    two = object_of(
+        run, "compare", confocal, "--settings", tmp_path / "one.toml", "--out", tmp_path / "two.png"
+    )
     for figures in (*one["methods"].values(), *two["methods"].values()):
         del figures["seconds"], figures["peak_mib"]
     assert one == two
 
 
 def test_memory_is_that_of_the_method() -> None:
-    from apps.nlos.measure import _memory_from_now, measured
+    from apps.nlos.measure import _reset_peak_memory, measure_imaging
     from nlos import Grid
 
-    if _memory_from_now() is None:
+    if _reset_peak_memory() is None:
         pytest.skip("this system does not tell how much memory a program took")
 
     class Greedy:
@@ -67,9 +73,10 @@ def test_memory_is_that_of_the_method() -> None:
             return Volume(np.full(grid.shape, taken.mean(), np.float32), grid)
 
     capture = Capture(np.zeros((4, 2)), np.array([[0.0, 0, 0], [1, 0, 0]]), np.zeros(3), 1e-11)
-    found = measured("greedy", Greedy(), capture, Grid([0.0], [0.0], [1.0]))
+    found = measure_imaging("greedy", Greedy(), capture, Grid([0.0], [0.0], [1.0]))
     assert found.peak_bytes is not None
-    # The allocator may reuse memory that it holds already, and threads may take a little for themselves.
+    # The allocator may reuse memory that it holds already, and threads may take a little for
+    # themselves.
     assert 48 << 20 < found.peak_bytes < 96 << 20
 
 
@@ -77,19 +84,30 @@ def test_the_demonstration(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyP
     """As it is, with a coarser wall and fewer voxels."""
     from apps.verbs.nlos import demo
 
-    for name, value in {"WALL_POINTS": 24, "FACET": 0.06, "WAVELENGTH": 0.34, "VOXEL": 0.06}.items():
+    for name, value in {
+        "WALL_POINTS": 24,
+        "FACET": 0.06,
+        "WAVELENGTH": 0.34,
+        "VOXEL": 0.06,
+    }.items():
         monkeypatch.setattr(demo, name, value)
     found = object_of(run, "demo", "--out", tmp_path / "demo", "--png", tmp_path / "picture.png")
     assert found["hybrid"]["correlation"] > 0.999
     assert found["flat"]["correlation"] < 0.95
     assert found["flat"]["energy_near_truth"] < found["hybrid"]["energy_near_truth"]
     assert (tmp_path / "picture.png").read_bytes().startswith(PNG)
-    assert {path.name for path in (tmp_path / "demo").iterdir()} == {"capture.h5", "hybrid.h5", "backprojection.h5"}
-    assert HiddenTruth.inside(tmp_path / "demo" / "capture.h5") is not None
+    assert {path.name for path in (tmp_path / "demo").iterdir()} == {
+        "capture.h5",
+        "hybrid.h5",
+        "backprojection.h5",
+    }
+    assert HiddenTruth.load(tmp_path / "demo" / "capture.h5") is not None
 
 
 def test_memory_is_foretold_within_a_factor(run: Run, confocal: Path, tmp_path: Path) -> None:
-    """The estimate is within a factor of 4 of what is measured, and 32 MiB that libraries take when they are loaded."""
+    """The estimate is within a factor of 4 of what is measured, and 32 MiB that libraries take when
+    they are loaded.
+    """
     box = ["--voxel-mm", 12, "--everywhere"]
     foretold = object_of(run, "info", confocal, *box[:2])["methods"]
     words = ["compare", confocal, "--methods", "rsd,fk", *box, "--out", tmp_path / "compare.png"]
@@ -102,20 +120,30 @@ def test_memory_is_foretold_within_a_factor(run: Run, confocal: Path, tmp_path: 
 
 
 def test_figures_of_merit_of_volumes_that_need_no_computing() -> None:
-    from apps.nlos.measure import sharpness, truth_figures
+    from apps.nlos.measure import compare_with_truth, measure_sharpness
     from nlos import Grid
 
     grid = Grid(np.arange(4) * 0.03, np.arange(3) * 0.03, [1.0, 1.03])
     even, single = np.ones(grid.shape, np.float32), np.zeros(grid.shape, np.float32)
     single[1, 2, 3] = 5
-    assert sharpness(Volume(even, grid)) == pytest.approx(1)
-    assert sharpness(Volume(single, grid)) == pytest.approx(12)  # pixels of the front view
-    assert np.isnan(sharpness(Volume(0 * even, grid)))
+    assert measure_sharpness(Volume(even, grid)) == pytest.approx(1)
+    assert measure_sharpness(Volume(single, grid)) == pytest.approx(12)  # pixels of the front view
+    assert np.isnan(measure_sharpness(Volume(0 * even, grid)))
     truth = HiddenTruth(np.array([[0.09, 0.06, 1.03]]), 0.0)
-    for values, share, contrast in ((even, 4 / 24, 1.0), (single, 1.0, float("nan")), (0 * even, None, None)):
-        figures = truth_figures(Volume(values, grid), truth)
-        assert figures["truth_reach_m"] == 0.04  # from a corner: its own voxel and three neighbours, no diagonal
-        assert figures["energy_near_truth"] == pytest.approx(float("nan") if share is None else share, nan_ok=True)
+    for values, share, contrast in (
+        (even, 4 / 24, 1.0),
+        (single, 1.0, float("nan")),
+        (0 * even, None, None),
+    ):
+        figures = compare_with_truth(Volume(values, grid), truth)
+        assert (
+            figures["truth_reach_m"] == 0.04
+        )  # from a corner: its own voxel and three neighbours, no diagonal
+        assert figures["energy_near_truth"] == pytest.approx(
+            float("nan") if share is None else share, nan_ok=True
+        )
         assert figures["contrast_to_truth"] == pytest.approx(contrast or float("nan"), nan_ok=True)
     coarse = Grid(grid.x * 10, grid.y, grid.z)
-    assert truth_figures(Volume(even, coarse), truth)["truth_reach_m"] == pytest.approx(0.3)  # no finer than voxels
+    assert compare_with_truth(Volume(even, coarse), truth)["truth_reach_m"] == pytest.approx(
+        0.3
+    )  # no finer than voxels

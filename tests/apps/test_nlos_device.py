@@ -17,7 +17,9 @@ torch = pytest.importorskip("torch")
 
 AGREEMENT = 1e-4
 """Promised; see the tests of nlos.portable for how near they are."""
-WITHOUT_A_GRAPHICS_PROCESSOR = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a graphics processor")
+WITHOUT_A_GRAPHICS_PROCESSOR = pytest.mark.skipif(
+    torch.cuda.is_available(), reason="there is a graphics processor"
+)
 
 
 def imaged(run: Run, capture: Path, out: Path, *more: object) -> tuple[dict[str, object], Volume]:
@@ -33,7 +35,9 @@ def test_the_image_is_the_same_elsewhere(
 ) -> None:
     capture = request.getfixturevalue(fixture)
     here, expected = imaged(run, capture, tmp_path / "here.h5", "--method", method)
-    there, found = imaged(run, capture, tmp_path / "there.h5", "--method", method, "--device", "torch:cpu")
+    there, found = imaged(
+        run, capture, tmp_path / "there.h5", "--method", method, "--device", "torch:cpu"
+    )
     assert (here["device"], there["device"]) == ("cpu", "torch:cpu")
     assert found.provenance["settings"]["device"] == "torch:cpu"
     assert here["peak_m"] == there["peak_m"]
@@ -66,7 +70,9 @@ def test_what_has_compiled_loops_only_says_so(run: Run, confocal: Path, tmp_path
 def test_a_device_that_is_not_there_is_refused_at_once(
     run: Run, curved: Path, tmp_path: Path, device: str, reason: str
 ) -> None:
-    refused = run("nlos", "reconstruct", curved, "--out", tmp_path / "volume.h5", "--device", device)
+    refused = run(
+        "nlos", "reconstruct", curved, "--out", tmp_path / "volume.h5", "--device", device
+    )
     assert refused.status == 2
     assert reason in refused.err
     assert refused.err.count("\n") == 1
@@ -74,8 +80,10 @@ def test_a_device_that_is_not_there_is_refused_at_once(
 
 
 def test_the_name_travels_with_a_folders_jobs(curved: Path, tmp_path: Path) -> None:
-    order = reconstruct._Order(reconstruct.ReconstructSettings(voxel_mm=80.0), "torch:cpu")
-    jobs, _ = reconstruct._jobs([curved], tmp_path, order, [".h5"])
+    order = reconstruct._ImagingRequest(reconstruct.ReconstructSettings(voxel_mm=80.0), "torch:cpu")
+    jobs, _ = reconstruct._plan_jobs([curved], tmp_path, order, [".h5"])
     (job,) = pickle.loads(pickle.dumps(jobs))  # as a worker gets it
     assert job.work()["device"] == "torch:cpu"
-    assert Volume.load(tmp_path / f"{curved.stem}.h5").provenance["settings"]["device"] == "torch:cpu"
+    assert (
+        Volume.load(tmp_path / f"{curved.stem}.h5").provenance["settings"]["device"] == "torch:cpu"
+    )

@@ -17,13 +17,25 @@ from tofclip.units import SPEED_OF_LIGHT
 QUICK = ["--voxel-mm", 40, "--instants", 5]
 
 
-def test_the_point_lights_up_when_the_flash_reaches_it(run: Run, curved: Path, tmp_path: Path) -> None:
-    words = ["film", curved, "--every-depth", "--voxel-mm", 20, "--instants", 41, "--out", tmp_path / "film.h5"]
+def test_the_point_lights_up_when_the_flash_reaches_it(
+    run: Run, curved: Path, tmp_path: Path
+) -> None:
+    words = [
+        "film",
+        curved,
+        "--every-depth",
+        "--voxel-mm",
+        20,
+        "--instants",
+        41,
+        "--out",
+        tmp_path / "film.h5",
+    ]
     found = object_of(run, *words)
     video = TransientVideo.load(tmp_path / "film.h5")
     assert video.values.shape == (41, *found["voxels"])
     arrival = np.linalg.norm(Capture.load(curved).laser - POINT) / SPEED_OF_LIGHT
-    lit = video.times[video.values[:, *video.grid.nearest(POINT)].argmax()]
+    lit = video.times[video.values[:, *video.grid.find_nearest(POINT)].argmax()]
     # A tenth of a nanosecond is the distance to the voxel's middle and half the step of time.
     assert lit == pytest.approx(arrival, abs=0.1e-9)
     # By default it begins before the flash arrives, and ends after it left.
@@ -34,7 +46,18 @@ def test_the_point_lights_up_when_the_flash_reaches_it(run: Run, curved: Path, t
 def test_films_and_numbers_of_front_views(run: Run, curved: Path, tmp_path: Path) -> None:
     pytest.importorskip("cv2")
     for suffix in (".gif", ".mp4", ".h5"):
-        object_of(run, "film", curved, *QUICK, "--first-ns", 1, "--last-ns", 3, "--out", tmp_path / f"film{suffix}")
+        object_of(
+            run,
+            "film",
+            curved,
+            *QUICK,
+            "--first-ns",
+            1,
+            "--last-ns",
+            3,
+            "--out",
+            tmp_path / f"film{suffix}",
+        )
     with Image.open(tmp_path / "film.gif") as film:
         assert film.n_frames == 5
     assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
@@ -45,7 +68,9 @@ def test_films_and_numbers_of_front_views(run: Run, curved: Path, tmp_path: Path
 
 def test_its_settings_give_the_same_film(run: Run, curved: Path, tmp_path: Path) -> None:
     object_of(run, "film", curved, *QUICK, "--out", tmp_path / "one.h5")
-    object_of(run, "film", curved, "--settings", tmp_path / "one.toml", "--out", tmp_path / "two.h5")
+    object_of(
+        run, "film", curved, "--settings", tmp_path / "one.toml", "--out", tmp_path / "two.h5"
+    )
     one, two = (TransientVideo.load(tmp_path / f"{name}.h5") for name in ("one", "two"))
     np.testing.assert_array_equal(one.values, two.values)
     np.testing.assert_array_equal(one.times, two.times)
@@ -54,7 +79,11 @@ def test_its_settings_give_the_same_film(run: Run, curved: Path, tmp_path: Path)
 @pytest.mark.parametrize(
     ("words", "out", "reason"),
     [
-        (["--method", "backprojection"], "film.gif", "films are made by rsd or hybrid, not by backprojection"),
+        (
+            ["--method", "backprojection"],
+            "film.gif",
+            "films are made by rsd or hybrid, not by backprojection",
+        ),
         (["--method", "telepathy"], "film.gif", "unknown method 'telepathy'"),
         (["--instants", 0], "film.gif", "at least one instant"),
         (["--every-depth"], "film.gif", "write every depth to a .h5 file"),

@@ -13,9 +13,9 @@ import pytest
 from hidden_point import object_of
 from small_instrument import Run
 
-from apps.nlos.files import Results
+from apps.nlos.files import ResultFiles
 from nlos import Volume
-from tofclip.storage import SIGNATURE
+from tofclip.storage import HDF5_SIGNATURE
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def folder(curved: Path, tmp_path: Path) -> Path:
     folder.mkdir()
     for name in ("a.h5", "c.h5"):
         shutil.copy(curved, folder / name)
-    (folder / "b.h5").write_bytes(SIGNATURE + b"and nothing more")
+    (folder / "b.h5").write_bytes(HDF5_SIGNATURE + b"and nothing more")
     (folder / "notes.txt").write_text("no capture")
     return folder
 
@@ -38,12 +38,12 @@ def _imaging_is_quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which captures are imaged is what matters here, not what comes out."""
     from apps.verbs.nlos import reconstruct
 
-    def pretended(_: Path, results: Results, __: object) -> dict[str, Any]:
-        for path in results.all:
+    def pretended(_: Path, results: ResultFiles, __: object) -> dict[str, Any]:
+        for path in results.paths:
             path.write_text("a result")
         return {}
 
-    monkeypatch.setattr(reconstruct, "_reconstructed", pretended)
+    monkeypatch.setattr(reconstruct, "_reconstruct_single", pretended)
 
 
 def test_the_broken_one_is_listed_and_the_others_are_whole(run: Run, folder: Path) -> None:
@@ -54,7 +54,9 @@ def test_the_broken_one_is_listed_and_the_others_are_whole(run: Run, folder: Pat
     assert [one["capture"] for one in found["imaged"]] == ["a.h5", "c.h5"]
     assert list(found["failed"]) == ["b.h5"]
     expected = {f"{name}{suffix}" for name in "ac" for suffix in (".h5", ".vti", ".png", ".toml")}
-    assert {path.name for path in (folder.parent / "out").iterdir()} == expected | {".settings.toml"}
+    assert {path.name for path in (folder.parent / "out").iterdir()} == expected | {
+        ".settings.toml"
+    }
     assert Volume.load(folder.parent / "out" / "a.h5").provenance["inputs"][0]["name"] == "a.h5"
 
 
@@ -66,7 +68,10 @@ def test_what_is_finished_is_skipped(run: Run, folder: Path) -> None:
     (out / "b.png").unlink()
     (out / "c.toml").unlink()  # as if interrupted before it was finished
     found = object_of(run, *words(folder))
-    assert (found["skipped"], [one["capture"] for one in found["imaged"]]) == (["a.h5"], ["b.h5", "c.h5"])
+    assert (found["skipped"], [one["capture"] for one in found["imaged"]]) == (
+        ["a.h5"],
+        ["b.h5", "c.h5"],
+    )
     assert (out / "a.h5").stat().st_mtime_ns == before
     later = (out / "a.toml").stat().st_mtime + 10
     os.utime(folder / "a.h5", (later, later))  # the capture was written anew
@@ -81,17 +86,19 @@ def test_results_of_other_settings_are_not_mixed_in(run: Run, folder: Path) -> N
     assert "made with cycles = 3.0, now it is 4.0" in refused.err
 
 
-def test_an_interruption_leaves_whole_results(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interruption_leaves_whole_results(
+    run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from apps.verbs.nlos import reconstruct
 
-    original: Callable[..., dict[str, Any]] = reconstruct._reconstructed
+    original: Callable[..., dict[str, Any]] = reconstruct._reconstruct_single
 
     def interrupted(source: Path, *others: Any) -> dict[str, Any]:
         if source.name == "c.h5":
             raise KeyboardInterrupt
         return original(source, *others)
 
-    monkeypatch.setattr(reconstruct, "_reconstructed", interrupted)
+    monkeypatch.setattr(reconstruct, "_reconstruct_single", interrupted)
     outcome = run("nlos", *words(folder))
     assert (outcome.status, outcome.out) == (130, "")
     assert {path.name for path in (folder.parent / "out").iterdir()} == {

@@ -24,7 +24,9 @@ def energy_near_the_point(volume: Volume) -> float:
 def test_iterations_gather_the_light(run: Run, curved: Path, tmp_path: Path, prior: str) -> None:
     words = ["reconstruct", curved, *BOX, "--voxel-mm", 20, "--wavelength-mm", 150]
     object_of(run, *words, "--method", "hybrid", "--out", tmp_path / "plain.h5")
-    found = object_of(run, *words, "--refine", prior, "--iterations", 8, "--out", tmp_path / "refined.h5")
+    found = object_of(
+        run, *words, "--refine", prior, "--iterations", 8, "--out", tmp_path / "refined.h5"
+    )
     assert (found["method"], found["refine"], found["iterations"]) == ("hybrid", prior, 8)
     assert found["stopped_because"] == "iteration limit"
     plain, refined = (Volume.load(tmp_path / f"{name}.h5") for name in ("plain", "refined"))
@@ -36,10 +38,20 @@ def test_iterations_gather_the_light(run: Run, curved: Path, tmp_path: Path, pri
 
 
 def test_its_settings_give_the_same_volume(run: Run, curved: Path, tmp_path: Path) -> None:
-    (tmp_path / "mine.toml").write_text("refine = 'l1'\niterations = 2\nprior_weight = 0.1\nvoxel_mm = 30\n")
+    (tmp_path / "mine.toml").write_text(
+        "refine = 'l1'\niterations = 2\nprior_weight = 0.1\nvoxel_mm = 30\n"
+    )
     words = ["reconstruct", curved, "--wavelength-mm", 200]
     object_of(run, *words, *BOX, "--settings", tmp_path / "mine.toml", "--out", tmp_path / "one.h5")
-    object_of(run, "reconstruct", curved, "--settings", tmp_path / "one.toml", "--out", tmp_path / "two.h5")
+    object_of(
+        run,
+        "reconstruct",
+        curved,
+        "--settings",
+        tmp_path / "one.toml",
+        "--out",
+        tmp_path / "two.h5",
+    )
     one, two = (Volume.load(tmp_path / f"{name}.h5") for name in ("one", "two"))
     np.testing.assert_array_equal(one.values, two.values)
 
@@ -52,7 +64,10 @@ def test_its_settings_give_the_same_volume(run: Run, curved: Path, tmp_path: Pat
         (["--prior-weight", 0.1], "prior_weight is a setting of --refine"),
         (["--refine", "l1", "--iterations", 0], "iterations must be 1 or more"),
         (["--refine", "tv", "--prior-weight", 1], "share from 0 to less than 1"),
-        (["--refine", "l1", "--method", "backprojection"], "iterates the hybrid method, not backprojection"),
+        (
+            ["--refine", "l1", "--method", "backprojection"],
+            "iterates the hybrid method, not backprojection",
+        ),
         (["--refine", "l1", "--signal-to-noise", 1], "changes nothing for"),
         (["--refine", "l1", "--wavelength-mm", 100, "--voxel-mm", 50], "too coarse to refine"),
     ],
@@ -68,8 +83,23 @@ def test_what_makes_no_sense_is_refused(
 
 def test_it_stays_with_the_compiled_loops(run: Run, curved: Path, tmp_path: Path) -> None:
     pytest.importorskip("torch")
-    words = ["reconstruct", curved, *BOX, "--voxel-mm", 50, "--wavelength-mm", 300, "--refine", "l1", "--iterations", 1]
+    words = [
+        "reconstruct",
+        curved,
+        *BOX,
+        "--voxel-mm",
+        50,
+        "--wavelength-mm",
+        300,
+        "--refine",
+        "l1",
+        "--iterations",
+        1,
+    ]
     refused = run("nlos", *words, "--out", tmp_path / "volume.h5", "--device", "torch:cpu")
     assert refused.status == 2
     assert "iterative refinement works on NumPy arrays only" in refused.err
-    assert object_of(run, *words, "--out", tmp_path / "volume.h5", "--device", "auto")["device"] == "cpu"
+    assert (
+        object_of(run, *words, "--out", tmp_path / "volume.h5", "--device", "auto")["device"]
+        == "cpu"
+    )

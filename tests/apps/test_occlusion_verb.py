@@ -14,12 +14,21 @@ from small_instrument import Run
 
 from apps.cli import main
 from apps.figures import occlusion_film
-from apps.occlusion.scenes import SCENES, occlusion_scene
+from apps.occlusion.scenes import SCENES, make_occlusion_scene
 from apps.verbs.occlusion import SCENE_NAMES
 
 
 def test_the_inactive_length_of_the_papers_experiment(run: Run, tmp_path: Path) -> None:
-    words = ("--baseline-mm", 15, "--width-mm", 6, "--distance-mm", 50, "--out", tmp_path / "region.png")
+    words = (
+        "--baseline-mm",
+        15,
+        "--width-mm",
+        6,
+        "--distance-mm",
+        50,
+        "--out",
+        tmp_path / "region.png",
+    )
     outcome = run("occlusion", "region", *words, "--json")
     assert outcome.status == 0
     assert json.loads(outcome.out)["inactive_length_m"] == pytest.approx(0.1 / 3)
@@ -46,32 +55,53 @@ def test_alone_it_shows_its_verbs(run: Run) -> None:
 @pytest.fixture(scope="module")
 def demonstrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     folder = tmp_path_factory.mktemp("occlusion") / "made"
-    words = ["occlusion", "demo", "--scene", "plate", "--side-px", "40", "--sampling-ratio", "1", "--moving"]
+    words = [
+        "occlusion",
+        "demo",
+        "--scene",
+        "plate",
+        "--side-px",
+        "40",
+        "--sampling-ratio",
+        "1",
+        "--moving",
+    ]
     with contextlib.redirect_stdout(io.StringIO()) as out, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(occlusion_film, "STEPS", 3)
+        patch.setattr(occlusion_film, "WALK_STEPS", 3)
         assert main([*words, "--out", str(folder), "--json"]) == 0
     return folder, json.loads(out.getvalue())
 
 
-def test_the_demonstration_agrees_with_the_formula(demonstrated: tuple[Path, dict[str, Any]]) -> None:
+def test_the_demonstration_agrees_with_the_formula(
+    demonstrated: tuple[Path, dict[str, Any]],
+) -> None:
     _, told = demonstrated
     assert told["inactive_length_m"] == pytest.approx(0.1 / 3)
     assert len(told["targets"]) == 4
     for target in told["targets"]:
         assert (target["correlation"] >= 0.8) == target["expected_visible"]
-        assert target["expected_visible"] == (target["distance_m"] > 0.05 + told["inactive_length_m"])
+        assert target["expected_visible"] == (
+            target["distance_m"] > 0.05 + told["inactive_length_m"]
+        )
     assert told["nmse"] < 0.3
     others = ("single_view", "light_field_camera", "without_model_of_occluder")
     assert all(told["correlation"] > told[f"correlation_{name}"] for name in others)
 
 
-def test_the_demonstration_leaves_a_picture_and_a_film(demonstrated: tuple[Path, dict[str, Any]]) -> None:
+def test_the_demonstration_leaves_a_picture_and_a_film(
+    demonstrated: tuple[Path, dict[str, Any]],
+) -> None:
     from PIL import Image
 
     folder, _ = demonstrated
-    assert sorted(path.name for path in folder.iterdir()) == ["occlusion.gif", "occlusion.png", "occlusion_moving.gif"]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "occlusion.gif",
+        "occlusion.png",
+        "occlusion_moving.gif",
+    ]
     assert matplotlib.image.imread(folder / "occlusion.png").std() > 0.05
-    # three steps to the right and one on the way back; the flash has some six bright instants at each return
+    # three steps to the right and one on the way back; the flash has some six bright instants at
+    # each return
     for name, fewest, most in (("occlusion_moving.gif", 4, 4), ("occlusion.gif", 10, 20)):
         with Image.open(folder / name) as film:
             assert fewest <= film.n_frames <= most
@@ -79,8 +109,8 @@ def test_the_demonstration_leaves_a_picture_and_a_film(demonstrated: tuple[Path,
 
 
 def test_in_the_film_the_target_moves_from_left_to_right_and_the_occluder_stays() -> None:
-    scene = occlusion_scene("plate")
-    moved = scene.with_target_moved(0.01)
+    scene = make_occlusion_scene("plate")
+    moved = scene.move_target(0.01)
     assert moved.target[0].centre[0] == pytest.approx(scene.target[0].centre[0] + 0.01)
     assert moved.occluder is scene.occluder
 
@@ -89,7 +119,9 @@ def test_behind_a_board_nothing_is_promised(run: Run, tmp_path: Path) -> None:
     words = ("--scene", "board", "--side-px", 32, "--out", tmp_path)
     told = json.loads(run("occlusion", "demo", *words, "--json").out)
     assert told["inactive_length_m"] is None
-    assert told["targets"] == [{"distance_m": pytest.approx(0.12), "correlation": 0.0, "expected_visible": False}]
+    assert told["targets"] == [
+        {"distance_m": pytest.approx(0.12), "correlation": 0.0, "expected_visible": False}
+    ]
 
 
 @pytest.mark.parametrize(

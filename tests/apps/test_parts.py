@@ -1,4 +1,6 @@
-"""The small parts behind the verbs: reports, progress, names of files, and what the pictures choose to show."""
+"""The small parts behind the verbs: reports, progress, names of files, and what the pictures choose
+to show.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apps.figures.preview import MOST_MOMENTS, preview_figure, telling_moments
-from apps.figures.style import page, save
-from apps.files import history, make_folder, require_writable
-from apps.progress import progress
-from apps.report import plainly, report
+from apps.figures.preview import MAX_MOMENTS, choose_moments, make_preview_figure
+from apps.figures.style import make_figure, save_figure
+from apps.files import build_provenance, make_folder, require_writable
+from apps.progress import show_progress
+from apps.report import report, to_json_value
 from tofclip import Camera, Frames, Streak
 from tofclip.errors import StorageError
 from tofclip.storage import Record
@@ -23,7 +25,12 @@ from tofclip.storage import Record
 
 class TestReport:
     def test_json_has_no_nan_and_no_numpy(self, capsys: pytest.CaptureFixture[str]) -> None:
-        figures = {"a": np.float32(0.5), "b": np.array([1.0, np.nan]), "c": (1, Path("x")), "d": {"e": np.int64(3)}}
+        figures = {
+            "a": np.float32(0.5),
+            "b": np.array([1.0, np.nan]),
+            "c": (1, Path("x")),
+            "d": {"e": np.int64(3)},
+        }
         report(figures, as_json=True, written=[Path("out.h5")])
         found = json.loads(capsys.readouterr().out)
         assert found == {"a": 0.5, "b": [1.0, None], "c": [1, "x"], "d": {"e": 3}}
@@ -35,12 +42,18 @@ class TestReport:
         assert capsys.readouterr().out.splitlines() == lines
 
     def test_infinity_is_unknown(self) -> None:
-        assert plainly([np.inf, -np.inf, True, None, "text"]) == [None, None, True, None, "text"]
+        assert to_json_value([np.inf, -np.inf, True, None, "text"]) == [
+            None,
+            None,
+            True,
+            None,
+            "text",
+        ]
 
 
 class TestProgress:
     def test_silent_where_nobody_watches(self, capsys: pytest.CaptureFixture[str]) -> None:
-        with progress("working", 10) as advance:
+        with show_progress("working", 10) as advance:
             advance(10)
         assert capsys.readouterr() == ("", "")
 
@@ -55,7 +68,7 @@ class TestProgress:
                 stopped.set()
 
         before = signal.getsignal(signal.SIGINT)
-        with progress("working", 10) as advance:
+        with show_progress("working", 10) as advance:
             worker = threading.Thread(target=work)
             worker.start()
             with pytest.raises(KeyboardInterrupt):
@@ -68,7 +81,7 @@ class TestProgress:
         amounts: list[int] = []
 
         def work() -> None:
-            with progress("working", 1) as advance:
+            with show_progress("working", 1) as advance:
                 advance(1)
                 amounts.append(1)
 
@@ -79,8 +92,12 @@ class TestProgress:
 
 
 class TestFiles:
-    def test_folder_without_permission(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("os.access", lambda *_: False)  # a test may run as root, whom nothing stops
+    def test_folder_without_permission(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(
+            "os.access", lambda *_: False
+        )  # a test may run as root, whom nothing stops
         with pytest.raises(StorageError, match="not permitted"):
             require_writable(tmp_path / "a.h5")
         with pytest.raises(StorageError, match="not permitted"):
@@ -92,14 +109,21 @@ class TestFiles:
 
     def test_history_keeps_the_past(self, tmp_path: Path) -> None:
         (tmp_path / "in.txt").write_text("x")
-        told = history({"verb": "test"}, tmp_path / "in.txt", earlier={"software": "older"})
+        told = build_provenance(
+            {"verb": "test"}, tmp_path / "in.txt", earlier={"software": "older"}
+        )
         assert told["earlier"] == {"software": "older"}
         # SHA-256 of the letter x
-        assert told["inputs"][0]["sha256"] == "2d711642b726b04401627ca9fbac32f5c8530fb1903cc4db02258717921a4881"
-        assert "earlier" not in history({})
+        assert (
+            told["inputs"][0]["sha256"]
+            == "2d711642b726b04401627ca9fbac32f5c8530fb1903cc4db02258717921a4881"
+        )
+        assert "earlier" not in build_provenance({})
 
 
-def frames_with(camera: Camera, energy: np.ndarray, attachments: dict[str, Record] | None = None) -> Frames:
+def frames_with(
+    camera: Camera, energy: np.ndarray, attachments: dict[str, Record] | None = None
+) -> Frames:
     """Frames whose only bright pixel has the given brightness over time, at ranges around 3 m."""
     camera = camera.replace(time_zero=-10e-9)
     values = np.zeros((energy.size, *camera.image_shape), np.float32)
@@ -111,8 +135,10 @@ def frames_with(camera: Camera, energy: np.ndarray, attachments: dict[str, Recor
 class TestMoments:
     def test_separate_objects_make_separate_peaks(self, camera: Camera) -> None:
         rows, bins = np.array([20, 60, 110, 170, 199]), np.arange(200)
-        energy = np.exp(-(((bins[:, np.newaxis] - rows) / 2.5) ** 2) / 2) @ np.array([5.0, 1, 3, 2, 4])
-        found = telling_moments(frames_with(camera, energy))
+        energy = np.exp(-(((bins[:, np.newaxis] - rows) / 2.5) ** 2) / 2) @ np.array(
+            [5.0, 1, 3, 2, 4]
+        )
+        found = choose_moments(frames_with(camera, energy))
         assert [moment.frame for moment in found] == pytest.approx(rows, abs=1)
         # Half height of a Gaussian of 2.5 bins, smoothed by 1.5, is 3.4 bins away from its peak.
         assert [moment.last - moment.first for moment in found[:4]] == pytest.approx([7] * 4, abs=1)
@@ -120,47 +146,63 @@ class TestMoments:
     def test_only_the_strongest_are_shown(self, camera: Camera) -> None:
         energy = np.zeros(600)
         energy[10::30] = np.arange(1, 21)
-        found = [moment.frame for moment in telling_moments(frames_with(camera, energy))]
+        found = [moment.frame for moment in choose_moments(frames_with(camera, energy))]
         assert found == list(range(250, 600, 30))
-        assert len(found) == MOST_MOMENTS
+        assert len(found) == MAX_MOMENTS
 
     def test_light_without_a_pause_is_cut_into_even_shares(self, camera: Camera) -> None:
         energy = np.exp(-(((np.arange(300) - 150) / 40) ** 2) / 2)
-        moments = telling_moments(frames_with(camera, energy, {"relay_wall": Record("relay_wall")}))
-        assert len(moments) == MOST_MOMENTS
+        moments = choose_moments(frames_with(camera, energy, {"relay_wall": Record("relay_wall")}))
+        assert len(moments) == MAX_MOMENTS
         shares = [energy[moment.first : moment.last + 1].sum() / energy.sum() for moment in moments]
         # A twelfth each, up to the frame that a cut falls on (at most 1 % of the light).
-        np.testing.assert_allclose(shares, 0.98 / MOST_MOMENTS, atol=0.011)
+        np.testing.assert_allclose(shares, 0.98 / MAX_MOMENTS, atol=0.011)
 
     def test_overlapping_peaks_are_cut_into_even_shares(self, camera: Camera) -> None:
         bins = np.arange(300)
-        bumps = np.exp(-(((bins[:, np.newaxis] - [90, 120, 150, 180, 210]) / 3) ** 2) / 2).sum(axis=1)
-        energy = np.exp(-(((bins - 150) / 60) ** 2) / 2) + 0.2 * bumps  # the middle one stands on all of the others
-        moments = telling_moments(frames_with(camera, energy))
+        bumps = np.exp(-(((bins[:, np.newaxis] - [90, 120, 150, 180, 210]) / 3) ** 2) / 2).sum(
+            axis=1
+        )
+        energy = (
+            np.exp(-(((bins - 150) / 60) ** 2) / 2) + 0.2 * bumps
+        )  # the middle one stands on all of the others
+        moments = choose_moments(frames_with(camera, energy))
         assert all(earlier.last < later.first for earlier, later in pairwise(moments))
-        assert len(moments) == MOST_MOMENTS
+        assert len(moments) == MAX_MOMENTS
 
-    def test_brightness_is_compensated_only_where_time_tells_the_range(self, camera: Camera) -> None:
-        """A far peak is below the limit as measured, and above it once the fall-off with range is undone."""
+    def test_brightness_is_compensated_only_where_time_tells_the_range(
+        self, camera: Camera
+    ) -> None:
+        """A far peak is below the limit as measured, and above it once the fall-off with range is
+        undone.
+        """
         energy = np.zeros(1000)
         energy[[20, 500, 980]] = [1.0, 0.3, 0.008]
         energy[[100, 200, 300, 400]] = 0.5
         wall = {"relay_wall": Record("relay_wall")}
-        assert 980 in [moment.frame for moment in telling_moments(frames_with(camera, energy))]
-        assert 980 not in [moment.frame for moment in telling_moments(frames_with(camera, energy, wall))]
+        assert 980 in [moment.frame for moment in choose_moments(frames_with(camera, energy))]
+        assert 980 not in [
+            moment.frame for moment in choose_moments(frames_with(camera, energy, wall))
+        ]
 
     def test_few_frames_are_shown_one_by_one(self, camera: Camera) -> None:
-        moments = telling_moments(frames_with(camera, np.ones(5)))
-        assert [(moment.first, moment.last) for moment in moments] == [(frame, frame) for frame in range(5)]
+        moments = choose_moments(frames_with(camera, np.ones(5)))
+        assert [(moment.first, moment.last) for moment in moments] == [
+            (frame, frame) for frame in range(5)
+        ]
 
     @pytest.mark.parametrize("energy", [np.ones(1), np.zeros(5), np.zeros(50)])
-    def test_the_picture_can_always_be_drawn(self, camera: Camera, tmp_path: Path, energy: np.ndarray) -> None:
-        streak = Streak(np.ones((energy.size, camera.slit_width_px)), camera=camera).with_bin_width(20e-12)
-        save(preview_figure(streak, frames_with(camera, energy)), tmp_path / "look.png")
+    def test_the_picture_can_always_be_drawn(
+        self, camera: Camera, tmp_path: Path, energy: np.ndarray
+    ) -> None:
+        streak = Streak(np.ones((energy.size, camera.slit_width_px)), camera=camera).with_bin_width(
+            20e-12
+        )
+        save_figure(make_preview_figure(streak, frames_with(camera, energy)), tmp_path / "look.png")
         assert (tmp_path / "look.png").stat().st_size > 10_000
 
 
 def test_a_picture_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(StorageError):
-        save(page(2, 2), tmp_path / "absent" / "look.png")
+        save_figure(make_figure(2, 2), tmp_path / "absent" / "look.png")
     assert list(tmp_path.iterdir()) == []

@@ -24,13 +24,24 @@ LONGEST_WAIT_S = 60.0  # compiling the kernels on a slow, cold machine
 
 def ran(*words: object) -> subprocess.CompletedProcess[str]:
     command = [*PROGRAM, *map(str, words)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=LONGEST_WAIT_S, check=False)
+    return subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=LONGEST_WAIT_S, check=False
+    )
 
 
 def test_alone_it_shows_the_map_of_verbs(run: Run) -> None:
     outcome = run()
     assert (outcome.status, outcome.err) == (0, "")
-    for verb in ("demo", "calibrate", "recover", "cloud", "lidar accuracy", "nlos reconstruct", "convert", "info"):
+    for verb in (
+        "demo",
+        "calibrate",
+        "recover",
+        "cloud",
+        "lidar accuracy",
+        "nlos reconstruct",
+        "convert",
+        "info",
+    ):
         assert f"\n  {verb} " in outcome.out
 
 
@@ -50,7 +61,9 @@ def test_version(run: Run) -> None:
 
 def test_help_needs_nothing_heavy() -> None:
     code = "import sys; from apps.cli import main; main(['--help']); print(*sorted(sys.modules), file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
     assert "Usage: tofclip" in done.stdout
     heavy = {"numpy", "scipy", "numba", "h5py", "matplotlib", "tifffile", "open3d", "pyvista"}
     assert heavy.isdisjoint(done.stderr.split())
@@ -70,14 +83,18 @@ def test_debug_shows_where_an_error_came_from(run: Run, tmp_path: Path) -> None:
     assert traced.status == 2
 
 
-def test_a_defect_is_one_line_as_well(run: Run, monkeypatch: pytest.MonkeyPatch, files: Path) -> None:
+def test_a_defect_is_one_line_as_well(
+    run: Run, monkeypatch: pytest.MonkeyPatch, files: Path
+) -> None:
     def fail(*_: object) -> None:
         raise ZeroDivisionError("a defect\nin two lines")
 
-    monkeypatch.setattr("apps.verbs.info._record_in", fail)
+    monkeypatch.setattr("apps.verbs.info._read_record", fail)
     outcome = run("info", files / "camera.h5")
-    assert outcome.status == cli.DEFECT
-    assert outcome.err.startswith("tofclip: error: unforeseen ZeroDivisionError: a defect in two lines")
+    assert outcome.status == cli.EXIT_DEFECT
+    assert outcome.err.startswith(
+        "tofclip: error: unforeseen ZeroDivisionError: a defect in two lines"
+    )
     assert outcome.err.count("\n") == 1
 
 
@@ -85,16 +102,25 @@ def test_a_reader_that_goes_away(files: Path) -> None:
     read, write = os.pipe()
     os.close(read)  # nobody will ever read
     done = subprocess.run(
-        [*PROGRAM, "info", files / "camera.h5"], cwd=ROOT, stdout=write, stderr=subprocess.PIPE, text=True, check=False
+        [*PROGRAM, "info", files / "camera.h5"],
+        cwd=ROOT,
+        stdout=write,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
     )
     os.close(write)
-    assert (done.returncode, done.stderr) == (cli.READER_GONE, "")
+    assert (done.returncode, done.stderr) == (cli.EXIT_BROKEN_PIPE, "")
 
 
 def test_a_disk_without_room(files: Path, tmp_path: Path) -> None:
-    """A limit on the size of files stands for the disk: both refuse to write on, in the middle of a file."""
+    """A limit on the size of files stands for the disk: both refuse to write on, in the middle of a
+    file.
+    """
     limited = f"ulimit -f 8; exec {shlex.join(PROGRAM)} convert {files / 'streak.h5'} --out {tmp_path / 'copy.h5'}"
-    done = subprocess.run(["bash", "-c", limited], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["bash", "-c", limited], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert "copy.h5: cannot be written" in done.stderr
     assert list(tmp_path.iterdir()) == []
@@ -103,7 +129,14 @@ def test_a_disk_without_room(files: Path, tmp_path: Path) -> None:
 def test_ctrl_c_during_recovery_leaves_nothing_behind(files: Path, tmp_path: Path) -> None:
     import pty  # exists only where the test can run
 
-    words = ["recover", files / "streak.h5", "--out", tmp_path / "frames.h5", "--iterations", "1000000"]
+    words = [
+        "recover",
+        files / "streak.h5",
+        "--out",
+        tmp_path / "frames.h5",
+        "--iterations",
+        "1000000",
+    ]
     terminal, child_side = pty.openpty()
     process = subprocess.Popen(
         [*PROGRAM, *map(str, words)], cwd=ROOT, stdout=subprocess.PIPE, stderr=child_side, text=True
@@ -115,7 +148,8 @@ def test_ctrl_c_during_recovery_leaves_nothing_behind(files: Path, tmp_path: Pat
     out, _ = process.communicate(timeout=LONGEST_WAIT_S)
     assert process.returncode == 130
     assert out == ""
-    # A million iterations would take an hour; the end must not wait for them. The margin is for a busy machine.
+    # A million iterations would take an hour; the end must not wait for them. The margin is for a
+    # busy machine.
     assert time.monotonic() - pressed < 20
     assert wait_for(terminal, "tofclip: interrupted").count("Traceback") == 0
     os.close(terminal)

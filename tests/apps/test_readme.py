@@ -31,10 +31,13 @@ def write_light_field(path: Path) -> None:
     np.savez(path, lf=np.tile(card, (8, 8, 1, 1)), scale=1 / 65535, v=steps, u=steps)
 
 
-def test_the_walk_through(run: Run, files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_walk_through(
+    run: Run, files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("line", "line_background", "dot", "dot_background"):
         shutil.copy(files / f"{name}.tif", tmp_path)
-    # A shot whose file has a time axis, under the README's names: files are known by content, not by suffix.
+    # A shot whose file has a time axis, under the README's names: files are known by content, not
+    # by suffix.
     shutil.copy(files / "streak.h5", tmp_path / "shot.tif")
     shutil.copy(files / "wall.h5", tmp_path / "wall.npz")
     write_light_field(tmp_path / "light_field.npz")
@@ -46,9 +49,14 @@ def test_the_walk_through(run: Run, files: Path, tmp_path: Path, monkeypatch: py
         assert (outcome.status, outcome.err) == (0, ""), command
     expected = "camera.h5 camera.png frames.h5 frames.png mip.png scene.ply volume.h5 wall.h5 wall_frames.h5"
     expected += " scene.png clouds occlusion-output nlos-demo-output"
-    assert {*expected.split(), "readings.h5", "picture.png", "run.h5", "photons.h5", "photons.ply"} <= {
-        path.name for path in tmp_path.iterdir()
-    }
+    assert {
+        *expected.split(),
+        "readings.h5",
+        "picture.png",
+        "run.h5",
+        "photons.h5",
+        "photons.ply",
+    } <= {path.name for path in tmp_path.iterdir()}
 
 
 def test_the_python_example(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

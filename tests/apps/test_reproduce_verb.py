@@ -29,7 +29,9 @@ def test_a_study_is_written_and_not_made_again(run: Run, tmp_path: Path) -> None
     assert first.status == 0
     figures = json.loads(first.out)
     assert figures["table7"]["rows"] == 20
-    assert figures["table7"]["mean_paper"] == pytest.approx(3.65, abs=0.05)  # of the paper's sixteen
+    assert figures["table7"]["mean_paper"] == pytest.approx(
+        3.65, abs=0.05
+    )  # of the paper's sixteen
     folder = tmp_path / "made" / "reproduction"
     made = {path.name for path in folder.iterdir()}
     assert made == {"table7.md", "table7.csv", "table7.png", "table7.json"}
@@ -47,15 +49,15 @@ def test_a_study_is_written_and_not_made_again(run: Run, tmp_path: Path) -> None
 
 
 def test_a_damaged_or_other_result_is_made_again(tmp_path: Path) -> None:
-    from apps.reproduction import kept_result
+    from apps.reproduction import load_result
 
     path = tmp_path / "table7.json"
-    assert kept_result(path, {"seeds": 1}) is None
+    assert load_result(path, {"seeds": 1}) is None
     for text in ("{", "[]", '{"settings": {"seeds": 2}}'):
         path.write_text(text)
-        assert kept_result(path, {"seeds": 1}) is None
+        assert load_result(path, {"seeds": 1}) is None
     path.write_text('{"settings": {"seeds": 1}}')
-    assert kept_result(path, {"seeds": 1}) is not None
+    assert load_result(path, {"seeds": 1}) is not None
 
 
 def test_unknown_names_and_folders_are_refused(run: Run, tmp_path: Path) -> None:

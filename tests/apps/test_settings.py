@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from apps.nlos.scene import WALLS, SceneSettings
-from apps.settings import plain, save, setting, told
+from apps.settings import load_settings, save_settings, setting_field, settings_to_dict
 from apps.verbs.nlos.compare import CompareSettings
 from apps.verbs.nlos.reconstruct import ReconstructSettings
 from tofclip.errors import FileFormatError, InputError, StorageError
@@ -20,11 +20,11 @@ from tofclip.errors import FileFormatError, InputError, StorageError
 class Sample:
     """One setting of every type."""
 
-    name: str | None = setting("TEXT", "A text.")
-    length_m: float | None = setting("M", "A length.")
-    count: int = setting("N", "A number.", 2)
-    whole: bool = setting(None, "A choice.", False)
-    ends_m: tuple[float, float] | None = setting("M M", "A pair.")
+    name: str | None = setting_field("TEXT", "A text.")
+    length_m: float | None = setting_field("M", "A length.")
+    count: int = setting_field("N", "A number.", 2)
+    whole: bool = setting_field(None, "A choice.", False)
+    ends_m: tuple[float, float] | None = setting_field("M M", "A pair.")
 
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
@@ -39,20 +39,22 @@ SAMPLES = st.builds(
 
 
 @given(sample=SAMPLES)
-def test_what_is_written_is_read_back_to_the_last_bit(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_what_is_written_is_read_back_to_the_last_bit(
+    sample: Sample, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     path = tmp_path_factory.getbasetemp() / "sample.toml"
-    save(sample, path, "a sample")
-    assert repr(told(Sample, path, {})) == repr(sample)  # as text, for -0.0 equals 0.0
+    save_settings(sample, path, "a sample")
+    assert repr(load_settings(Sample, path, {})) == repr(sample)  # as text, for -0.0 equals 0.0
 
 
 def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) -> None:
     path = tmp_path / "settings.toml"
     path.write_text("length_m = 3\ncount = 5\nends_m = [1, 2.5]\n")
-    found = told(Sample, path, {"count": 7, "name": None, "whole": False})
+    found = load_settings(Sample, path, {"count": 7, "name": None, "whole": False})
     assert found == Sample(length_m=3.0, count=7, ends_m=(1.0, 2.5))
     assert isinstance(found.length_m, float)
-    assert told(Sample, None, {}) == Sample()
-    assert plain(Sample(count=3)) == {"count": 3, "whole": False}
+    assert load_settings(Sample, None, {}) == Sample()
+    assert settings_to_dict(Sample(count=3)) == {"count": 3, "whole": False}
 
 
 @pytest.mark.parametrize(
@@ -75,7 +77,7 @@ def test_what_makes_no_sense_is_refused(text: str, complaint: str, tmp_path: Pat
     path = tmp_path / "settings.toml"
     path.write_text(text)
     with pytest.raises(InputError, match=r"settings\.toml") as caught:
-        told(Sample, path, {})
+        load_settings(Sample, path, {})
     assert complaint in str(caught.value)
 
 
@@ -84,9 +86,9 @@ def test_files_that_are_no_toml(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "settings.toml"
     path.write_bytes(content)
     with pytest.raises(FileFormatError, match="is no TOML file of settings"):
-        told(Sample, path, {})
+        load_settings(Sample, path, {})
     with pytest.raises(StorageError, match="no such file"):
-        told(Sample, tmp_path / "absent.toml", {})
+        load_settings(Sample, tmp_path / "absent.toml", {})
 
 
 def test_walls_are_those_of_the_simulation() -> None:
@@ -99,6 +101,8 @@ def test_walls_are_those_of_the_simulation() -> None:
 def test_every_setting_can_be_told_by_a_file(kind: type, tmp_path: Path) -> None:
     """Values of each field's own type go out and come back."""
     examples = {"float": 0.5, "int": 3, "str": "a", "bool": True, "tuple[float, float]": (0.5, 1.5)}
-    values = {field.name: examples[str(field.type).removesuffix(" | None")] for field in fields(kind)}
-    save(kind(**values), tmp_path / "all.toml", "all of them")
-    assert told(kind, tmp_path / "all.toml", {}) == kind(**values)
+    values = {
+        field.name: examples[str(field.type).removesuffix(" | None")] for field in fields(kind)
+    }
+    save_settings(kind(**values), tmp_path / "all.toml", "all of them")
+    assert load_settings(kind, tmp_path / "all.toml", {}) == kind(**values)

@@ -1,4 +1,6 @@
-"""Shots to clouds while they come, from the command line: instruments made of software, stacks, folders."""
+"""Shots to clouds while they come, from the command line: instruments made of software, stacks,
+folders.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 
 from apps.cli import main
-from devices.scenes import exposed, line_light
+from devices.scenes import draw_exposure, simulate_line_light
 from devices.transients import read_transient, read_transients
 from tofclip.lidar import PointCloud
 from tofclip.shots import Streak
@@ -18,8 +20,8 @@ from tofclip.shots.stack import save_stack
 
 
 def shots(number: int) -> list[Streak]:
-    light = line_light()
-    return [exposed(light, seed) for seed in range(number)]
+    light = simulate_line_light()
+    return [draw_exposure(light, seed) for seed in range(number)]
 
 
 def told(capsys: pytest.CaptureFixture[str]) -> dict:
@@ -27,7 +29,14 @@ def told(capsys: pytest.CaptureFixture[str]) -> dict:
 
 
 def test_a_streaming_camera_becomes_clouds(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    words = ["stream", "sim+remoteex://?seed=1&scene=small&frame_rate=40", "--shots", "3", "--out", str(tmp_path)]
+    words = [
+        "stream",
+        "sim+remoteex://?seed=1&scene=small&frame_rate=40",
+        "--shots",
+        "3",
+        "--out",
+        str(tmp_path),
+    ]
     assert main([*words, "--json"]) == 0
     figures = told(capsys)
     assert figures["clouds"] == 3
@@ -54,7 +63,9 @@ def test_shots_of_a_source_add_up_to_its_whole():
     parts = list(read_transients(f"{address}&records=20000"))
     assert len(parts) == 4  # 12 cycles of about 6000 photons
     # an uneven code is shared between bins, and float32 sums of shares depend on their order
-    np.testing.assert_allclose(sum(part.counts for part in parts), whole.counts, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(
+        sum(part.counts for part in parts), whole.counts, rtol=1e-5, atol=1e-5
+    )
     assert all(19000 < part.counts.sum() < 20001 for part in parts[:-1])
     assert parts[0].camera is not None
 
@@ -81,7 +92,14 @@ def test_files_are_streamed_too(kind: str, tmp_path: Path, capsys: pytest.Captur
         source.mkdir()
         for number, shot in enumerate(made):
             replace(shot, camera=None).save(source / f"{number}.h5")
-    words = ["stream", str(source), "--camera", str(tmp_path / "camera.h5"), "--time-zero-ns", "-11.0"]
+    words = [
+        "stream",
+        str(source),
+        "--camera",
+        str(tmp_path / "camera.h5"),
+        "--time-zero-ns",
+        "-11.0",
+    ]
     assert main([*words, "--json"]) == 0
     assert told(capsys)["clouds"] == 3
 

@@ -43,10 +43,13 @@ class TestCalibrate:
         flags = [[f"--{name.replace('_', '-')}", files / f"{name}.tif"] for name in pictures]
         return ["calibrate", *itertools.chain(*flags), "--out", out]
 
-    def test_angles_and_centres_in_json_and_file(self, run: Run, files: Path, tmp_path: Path) -> None:
+    def test_angles_and_centres_in_json_and_file(
+        self, run: Run, files: Path, tmp_path: Path
+    ) -> None:
         found = object_of(run, *self.words(files, tmp_path / "camera.h5"))
         assert list(found) == ["angles_deg", "centres_px", "centre_uncertainty_px"]
-        # Pictures of 900 counts above 100 with lines 1.5 px wide fix a centre to some 0.05 px, an angle to 0.1 degree.
+        # Pictures of 900 counts above 100 with lines 1.5 px wide fix a centre to some 0.05 px, an
+        # angle to 0.1 degree.
         np.testing.assert_allclose(found["angles_deg"], np.rad2deg(ANGLES), atol=0.5)
         np.testing.assert_allclose(found["centres_px"], CENTRES_PX, atol=0.2)
         assert 0 < max(found["centre_uncertainty_px"]) < 0.2
@@ -55,7 +58,9 @@ class TestCalibrate:
         assert camera.time_zero == 0
         assert (tmp_path / "camera.png").read_bytes().startswith(PNG)
 
-    def test_what_pictures_cannot_show_and_table(self, run: Run, files: Path, tmp_path: Path) -> None:
+    def test_what_pictures_cannot_show_and_table(
+        self, run: Run, files: Path, tmp_path: Path
+    ) -> None:
         out, picture = tmp_path / "camera.h5", tmp_path / "fits.png"
         known = ("--time-zero-ns", "-10.784", "--focal-length-px", "411.5", "--pulse-ps", "45")
         outcome = run(*self.words(files, out), *known, "--preview", picture)
@@ -88,7 +93,8 @@ class TestRecover:
         ]
         assert (found["frames"], found["image_shape"], found["method"]) == (ROWS, [32, 32], "tv")
         assert (len(found["view_gains"]), found["time_shift_bins"]) == (7, [0.0] * 7)
-        # About 10 photons rms per reading of noise against some 300 of signal, and the prior's bias.
+        # About 10 photons rms per reading of noise against some 300 of signal, and the prior's
+        # bias.
         assert found["relative_residual"] < 0.15
         frames = Frames.load(out)
         energy = frames.values.sum(axis=(1, 2))
@@ -102,7 +108,14 @@ class TestRecover:
         self, run: Run, files: Path, camera: Camera, tmp_path: Path
     ) -> None:
         camera.replace(sweep=None).save(tmp_path / "nominal.h5")
-        words = ["recover", files / "streak.h5", "--camera", tmp_path / "nominal.h5", "--out", tmp_path / "frames.h5"]
+        words = [
+            "recover",
+            files / "streak.h5",
+            "--camera",
+            tmp_path / "nominal.h5",
+            "--out",
+            tmp_path / "frames.h5",
+        ]
         found = object_of(run, *words, "--method", "l1")
         # The shot has no skew; the estimate is good to about a tenth of a row at this brightness.
         np.testing.assert_allclose(found["time_shift_bins"], 0, atol=0.5)
@@ -110,13 +123,38 @@ class TestRecover:
 
     @pytest.mark.parametrize("method", ["linear", "adjoint"])
     def test_direct_methods(self, run: Run, files: Path, tmp_path: Path, method: str) -> None:
-        found = object_of(run, "recover", files / "streak.h5", "--out", tmp_path / "f.h5", "--method", method)
-        assert (found["method"], found["iterations"], found["stopped_because"]) == (method, 0, "direct method")
+        found = object_of(
+            run, "recover", files / "streak.h5", "--out", tmp_path / "f.h5", "--method", method
+        )
+        assert (found["method"], found["iterations"], found["stopped_because"]) == (
+            method,
+            0,
+            "direct method",
+        )
 
     def test_time_axis_flags_override_the_file(self, run: Run, files: Path, tmp_path: Path) -> None:
         out, picture = tmp_path / "frames.h5", tmp_path / "look.png"
-        words = ["recover", files / "streak.tif", "--camera", files / "camera.h5", "--out", out, "--preview", picture]
-        outcome = run(*words, "--bin-width-ps", 10, "--time-zero-ns", "-2.5", "--method", "l1", "--iterations", 3)
+        words = [
+            "recover",
+            files / "streak.tif",
+            "--camera",
+            files / "camera.h5",
+            "--out",
+            out,
+            "--preview",
+            picture,
+        ]
+        outcome = run(
+            *words,
+            "--bin-width-ps",
+            10,
+            "--time-zero-ns",
+            "-2.5",
+            "--method",
+            "l1",
+            "--iterations",
+            3,
+        )
         assert outcome.status == 0, outcome.err
         frames = Frames.load(out)
         np.testing.assert_allclose(frames.times, 2.5e-9 + np.arange(ROWS) * 10e-12)
@@ -139,9 +177,13 @@ class TestCloud:
         truth = [SPEED_OF_LIGHT * row * BIN_WIDTH / 2 for row in SQUARE_ROWS]
         np.testing.assert_allclose(found["range_m"], truth, atol=SPEED_OF_LIGHT * BIN_WIDTH / 2)
         near = cloud.xyz[cloud.range < np.mean(truth)]
-        assert near[:, :2].mean(axis=0).max() < 0  # the first square is at the upper left: x and y negative
+        assert (
+            near[:, :2].mean(axis=0).max() < 0
+        )  # the first square is at the upper left: x and y negative
 
-    def test_provenance_reaches_back_to_the_frames(self, run: Run, frames_file: Path, tmp_path: Path) -> None:
+    def test_provenance_reaches_back_to_the_frames(
+        self, run: Run, frames_file: Path, tmp_path: Path
+    ) -> None:
         assert run("cloud", frames_file, "--out", tmp_path / "scene.h5").status == 0
         past = PointCloud.load(tmp_path / "scene.h5").provenance
         assert past["settings"] == {"verb": "cloud"}
@@ -149,40 +191,63 @@ class TestCloud:
 
 
 class TestConvertAndNlos:
-    def test_tiff_with_a_bin_width_becomes_hdf5(self, run: Run, files: Path, tmp_path: Path) -> None:
+    def test_tiff_with_a_bin_width_becomes_hdf5(
+        self, run: Run, files: Path, tmp_path: Path
+    ) -> None:
         out = tmp_path / "streak.h5"
         found = object_of(run, "convert", files / "streak.tif", "--out", out, "--bin-width-ps", 20)
-        assert (found["rows"], found["columns"], found["has_time_axis"], found["has_camera"]) == (96, 300, True, False)
-        np.testing.assert_array_equal(Streak.load(out).counts, tifffile.imread(files / "streak.tif"))
+        assert (found["rows"], found["columns"], found["has_time_axis"], found["has_camera"]) == (
+            96,
+            300,
+            True,
+            False,
+        )
+        np.testing.assert_array_equal(
+            Streak.load(out).counts, tifffile.imread(files / "streak.tif")
+        )
         assert Streak.load(out).provenance["inputs"][0]["name"] == "streak.tif"
 
     def test_a_wall_goes_from_streak_to_volume(self, run: Run, files: Path, tmp_path: Path) -> None:
         copy, frames, volume = (tmp_path / name for name in ("wall.h5", "frames.h5", "volume.h5"))
-        assert object_of(run, "convert", files / "wall.h5", "--out", copy)["attachments"] == ["relay_wall"]
+        assert object_of(run, "convert", files / "wall.h5", "--out", copy)["attachments"] == [
+            "relay_wall"
+        ]
         assert run("recover", copy, "--out", frames, "--method", "linear").status == 0
         words = ["nlos", "reconstruct", frames, "--out", volume, "--png", tmp_path / "mip.png"]
         found = object_of(run, *words, "--voxel-mm", 40, "--far-m", 0.4)
         stored = Volume.load(volume)
         assert list(stored.values.shape) == found["voxels"]
         assert found["wall_points"] == 144
-        assert stored.brightest() == pytest.approx([found["peak_m"][axis] for axis in "xyz"])
+        assert stored.find_brightest() == pytest.approx([found["peak_m"][axis] for axis in "xyz"])
         assert (tmp_path / "mip.png").read_bytes().startswith(PNG)
         assert stored.provenance["settings"]["verb"] == "nlos reconstruct"
 
     def test_a_capture_is_taken_as_it_is(self, run: Run, tmp_path: Path) -> None:
         x, y = np.meshgrid(np.linspace(-0.3, 0.3, 48), np.linspace(-0.3, 0.3, 48))
-        wall = np.stack([x, y, 0 * x], axis=-1)  # spaced by less than half the pulse's shortest wave: no grating lobes
+        wall = np.stack(
+            [x, y, 0 * x], axis=-1
+        )  # spaced by less than half the pulse's shortest wave: no grating lobes
         hidden = np.array([0.1, -0.05, 0.3])
         path = np.linalg.norm(hidden) + np.linalg.norm(wall - hidden, axis=-1)
         bins = np.arange(200)[:, np.newaxis, np.newaxis]
         signal = np.exp(-(((bins - path / (SPEED_OF_LIGHT * 10e-12)) / 2) ** 2) / 2)
         Capture(signal, wall, np.zeros(3), 10e-12).save(tmp_path / "capture.h5")
-        words = ["nlos", "reconstruct", tmp_path / "capture.h5", "--out", tmp_path / "volume.h5", "--everywhere"]
+        words = [
+            "nlos",
+            "reconstruct",
+            tmp_path / "capture.h5",
+            "--out",
+            tmp_path / "volume.h5",
+            "--everywhere",
+        ]
         found = object_of(run, *words, "--voxel-mm", 20, "--wavelength-mm", 60)
-        # Within a voxel across; along z the pulse of three cycles is 18 cm of path long, peaked within a voxel.
+        # Within a voxel across; along z the pulse of three cycles is 18 cm of path long, peaked
+        # within a voxel.
         assert [found["peak_m"][axis] for axis in "xyz"] == pytest.approx(hidden, abs=0.025)
         for method in ("rsd", "hybrid"):
-            again = object_of(run, *words, "--voxel-mm", 20, "--wavelength-mm", 60, "--method", method)
+            again = object_of(
+                run, *words, "--voxel-mm", 20, "--wavelength-mm", 60, "--method", method
+            )
             assert (again["method"], again["peak_m"]) == (method, found["peak_m"])
         refused = run(*words, "--method", "lct")
         assert refused.status == 2
@@ -191,7 +256,8 @@ class TestConvertAndNlos:
 
 class TestInfo:
     @pytest.mark.parametrize(
-        ("name", "kind"), [("streak.h5", "streak"), ("streak.tif", "streak"), ("camera.h5", "camera")]
+        ("name", "kind"),
+        [("streak.h5", "streak"), ("streak.tif", "streak"), ("camera.h5", "camera")],
     )
     def test_kind_and_shapes(self, run: Run, files: Path, name: str, kind: str) -> None:
         found = object_of(run, "info", files / name)
@@ -203,8 +269,12 @@ class TestInfo:
             assert found["fields"]["angles"]["units"] == "rad"
             np.testing.assert_allclose(found["fields"]["centres"]["values"], CENTRES_PX)
 
-    @pytest.mark.parametrize("name", ["scene.ply", "scene.pcd", "scene.csv", "scene.npz", "scene.h5"])
-    def test_clouds_of_every_format(self, run: Run, frames_file: Path, tmp_path: Path, name: str) -> None:
+    @pytest.mark.parametrize(
+        "name", ["scene.ply", "scene.pcd", "scene.csv", "scene.npz", "scene.h5"]
+    )
+    def test_clouds_of_every_format(
+        self, run: Run, frames_file: Path, tmp_path: Path, name: str
+    ) -> None:
         points = object_of(run, "cloud", frames_file, "--out", tmp_path / name)["points"]
         found = object_of(run, "info", tmp_path / name)
         assert found["kind"] == "cloud"
@@ -228,9 +298,16 @@ def test_recorded_shots_can_be_described(run: Run, shared_data: Path) -> None:
 def test_the_recorded_focus_pictures(run: Run, shared_data: Path, tmp_path: Path) -> None:
     names = {"line": "LinePattern", "line-background": "LinePattern_bkg", "dot": "DotPattern"}
     flags = [(f"--{flag}", shared_data / "clip" / f"{name}.tif") for flag, name in names.items()]
-    words = [*itertools.chain(*flags), "--dot-background", shared_data / "clip" / "DotPattern_bkg.tif"]
+    words = [
+        *itertools.chain(*flags),
+        "--dot-background",
+        shared_data / "clip" / "DotPattern_bkg.tif",
+    ]
     found = object_of(run, "calibrate", *words, "--out", tmp_path / "camera.h5")
-    # An independent trial on the same pictures; half a degree and half a pixel is what the two may differ by.
-    np.testing.assert_allclose(found["angles_deg"], [-43.3, -25.7, -12.7, 0.6, 22.9, 37.5, 48.0], atol=0.5)
+    # An independent trial on the same pictures; half a degree and half a pixel is what the two may
+    # differ by.
+    np.testing.assert_allclose(
+        found["angles_deg"], [-43.3, -25.7, -12.7, 0.6, 22.9, 37.5, 48.0], atol=0.5
+    )
     trial = [147.7, 320.0, 490.2, 664.1, 835.5, 1011.5, 1192.3]
     np.testing.assert_allclose(found["centres_px"], trial, atol=0.5)

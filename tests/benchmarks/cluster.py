@@ -1,8 +1,10 @@
-"""A sequence on workers: the same clouds, how much faster two are than one, and what is left after every mishap.
+"""A sequence on workers: the same clouds, how much faster two are than one, and what is left after
+every mishap.
 
-Run with ``python tests/benchmarks/cluster.py [--shots N] [--json]``; no less than 400 shots say anything about speed.
-Workers have one thread each and are warm when the clock starts. Then a worker is killed, a shot in the middle is
-broken and the disk, a small one in memory, fills up (that last part needs the right to mount; without, it is left out).
+Run with ``python tests/benchmarks/cluster.py [--shots N] [--json]``; no less than 400 shots say
+anything about speed. Workers have one thread each and are warm when the clock starts. Then a worker
+is killed, a shot in the middle is broken and the disk, a small one in memory, fills up (that last
+part needs the right to mount; without, it is left out).
 """
 
 from __future__ import annotations
@@ -26,9 +28,9 @@ from typing import Any
 
 from distributed import LocalCluster
 
-from tofclip.sequences import Ranging, shots_in
-from tofclip.sequences.jobs import Summary, run
-from tofclip.simulate import default_instrument, default_scene, simulate
+from tofclip.sequences import RangingSettings, list_shots
+from tofclip.sequences.jobs import Summary, run_jobs
+from tofclip.simulate import make_default_instrument, make_default_scene, simulate_shot
 
 ROWS = 254
 DISTINCT = 10
@@ -52,14 +54,14 @@ def workers(number: int) -> Iterator[LocalCluster]:
 
 def record_shots(folder: Path, number: int) -> Path:
     """Simulate some shots and lay down as many files as asked for."""
-    instrument = default_instrument()
+    instrument = make_default_instrument()
     instrument = replace(instrument, detector=replace(instrument.detector, rows=ROWS))
     shots = folder / "shots"
     shots.mkdir()
     for place in range(number):
         path = shots / f"shot{place:04d}.h5"
         if place < DISTINCT:
-            simulate(default_scene(), instrument, place).streak.save(path)
+            simulate_shot(make_default_scene(), instrument, place).streak.save(path)
         else:
             os.link(shots / f"shot{place % DISTINCT:04d}.h5", path)
     instrument.camera.save(folder / "camera.h5")
@@ -68,8 +70,8 @@ def record_shots(folder: Path, number: int) -> Path:
 
 def ranged(shots: Path, out: Path, cluster: str | None, number: int | None = None) -> Summary:
     """Make the clouds of the first `number` shots."""
-    jobs = Ranging(shots.parent / "camera.h5").jobs(shots_in(shots), out, SUFFIX)
-    return run(jobs[:number], cluster)
+    jobs = RangingSettings(shots.parent / "camera.h5").jobs(list_shots(shots), out, SUFFIX)
+    return run_jobs(jobs[:number], cluster)
 
 
 def timed(shots: Path, out: Path, number: int, one: str) -> tuple[float, int]:
@@ -87,7 +89,9 @@ def content(folder: Path) -> dict[str, str]:
     found = {}
     for path in sorted(folder.glob(f"*{SUFFIX}")):
         with np.load(path) as arrays:
-            found[path.name] = hashlib.sha256(b"".join(arrays[name].tobytes() for name in sorted(arrays))).hexdigest()
+            found[path.name] = hashlib.sha256(
+                b"".join(arrays[name].tobytes() for name in sorted(arrays))
+            ).hexdigest()
     return found
 
 
@@ -97,7 +101,9 @@ def speed(shots: Path, folder: Path) -> dict[str, Any]:
     seconds, peaks = {}, {}
     for number in (1, 2):
         with workers(number) as cluster:
-            seconds[number], peaks[number] = timed(shots, folder / f"of{number}", number, cluster.scheduler_address)
+            seconds[number], peaks[number] = timed(
+                shots, folder / f"of{number}", number, cluster.scheduler_address
+            )
     truth = content(folder / "here")
     return {
         "seconds_here": here.seconds,
@@ -111,7 +117,18 @@ def speed(shots: Path, folder: Path) -> dict[str, Any]:
 
 def verb(shots: Path, out: Path, address: str) -> list[str]:
     """The command line of a sequence."""
-    program = [sys.executable, "-m", "apps", "lidar", "sequence", str(shots), "--out", str(out), "--suffix", SUFFIX]
+    program = [
+        sys.executable,
+        "-m",
+        "apps",
+        "lidar",
+        "sequence",
+        str(shots),
+        "--out",
+        str(out),
+        "--suffix",
+        SUFFIX,
+    ]
     return [*program, "--camera", str(shots.parent / "camera.h5"), "--cluster", address, "--json"]
 
 
@@ -122,14 +139,18 @@ def told(command: list[str]) -> dict[str, Any]:
 
 
 def mishaps(shots: Path, out: Path, truth: dict[str, str], grow: Any = None) -> dict[str, Any]:
-    """Kill a worker in the middle, with a broken shot (and on a disk too small); then mend all and start again."""
+    """Kill a worker in the middle, with a broken shot (and on a disk too small); then mend all and
+    start again.
+    """
     broken = sorted(shots.iterdir())[len(truth) // 2]
     whole = broken.read_bytes()
     broken.unlink()
     broken.write_bytes(whole[:5000])
     with workers(2) as cluster:
         command = verb(shots, out, cluster.scheduler_address)
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
         while len(list(out.glob(f"*{SUFFIX}"))) < len(truth) // 4:
             time.sleep(0.05)
         os.kill(cluster.workers[0].process.pid, signal.SIGKILL)
@@ -176,14 +197,20 @@ def on_small_disk(shots: Path, folder: Path, truth: dict[str, str]) -> dict[str,
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--shots", type=int, default=400)
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         shots = record_shots(folder, asked.shots)
-        figures: dict[str, Any] = {"shots": asked.shots, "rows": ROWS, "speed": speed(shots, folder)}
+        figures: dict[str, Any] = {
+            "shots": asked.shots,
+            "rows": ROWS,
+            "speed": speed(shots, folder),
+        }
         truth = content(folder / "here")
         figures["killed worker, broken shot"] = mishaps(shots, folder / "mishaps", truth)
         figures["the same on a full disk"] = on_small_disk(shots, folder, truth)

@@ -1,8 +1,8 @@
 """How close ranges from counted photons come to the Cramer-Rao bound, over the whole span of use.
 
-Run with ``python tests/benchmarks/depth.py [--trials N] [--plot PNG] [--json]``. Every cell is simulated histograms of
-256 bins of 20 ps with a pulse of 60 ps; cells in which a return goes unseen now and then lie below the threshold at
-which the bound holds, and are marked so.
+Run with ``python tests/benchmarks/depth.py [--trials N] [--plot PNG] [--json]``. Every cell is
+simulated histograms of 256 bins of 20 ps with a pulse of 60 ps; cells in which a return goes unseen
+now and then lie below the threshold at which the bound holds, and are marked so.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ def main() -> None:
         print(json.dumps(cells))
         return
     low, high = binom.interval(0.95, asked.trials, RATE)
-    print(f"false alarms: {RATE:.3f} stated, {low / asked.trials:.4f}..{high / asked.trials:.4f} expected in 95 of 100")
+    print(
+        f"false alarms: {RATE:.3f} stated, {low / asked.trials:.4f}..{high / asked.trials:.4f} expected in 95 of 100"
+    )
     print("background  photons   rms (mm)  bound (mm)  ratio  detected  false alarms")
     for one in cells:
         note = "" if one["above_threshold"] else "  below threshold"
@@ -56,7 +58,9 @@ def grid() -> list[tuple[float, int]]:
     return [(b, n) for b in BACKGROUNDS for n in PHOTONS]
 
 
-def cell(detector: PhotonDetector, photons: int, background: float, trials: int, seed: int) -> dict[str, Any]:
+def cell(
+    detector: PhotonDetector, photons: int, background: float, trials: int, seed: int
+) -> dict[str, Any]:
     """Run one cell of the table."""
     figures = asdict(measure_accuracy(detector, photons, background, trials, seed))
     above = figures["detection_rate"] >= ALWAYS_SEEN
@@ -65,24 +69,35 @@ def cell(detector: PhotonDetector, photons: int, background: float, trials: int,
 
 def plot(cells: list[dict[str, Any]], path: Path) -> None:
     """Draw errors over photons, one colour for each background, beside the bounds."""
-    from apps.figures.style import label, page, save
+    from apps.figures.style import label_axes, make_figure, save_figure
 
-    figure = page(9, 4)
+    figure = make_figure(9, 4)
     left, right = figure.subplots(1, 2)
     for number, background in enumerate(BACKGROUNDS):
         row = [one for one in cells if one["background"] == background]
         colour = f"C{number}"
-        left.loglog(PHOTONS, [one["bound_m"] / MILLIMETRE for one in row], color=colour, linewidth=1)
-        left.loglog(PHOTONS, [one["rms_m"] / MILLIMETRE for one in row], "o", color=colour, markersize=4)
+        left.loglog(
+            PHOTONS, [one["bound_m"] / MILLIMETRE for one in row], color=colour, linewidth=1
+        )
+        left.loglog(
+            PHOTONS, [one["rms_m"] / MILLIMETRE for one in row], "o", color=colour, markersize=4
+        )
         right.semilogx(
-            PHOTONS, [one["ratio"] for one in row], "o-", color=colour, markersize=4, label=f"{background:g}"
+            PHOTONS,
+            [one["ratio"] for one in row],
+            "o-",
+            color=colour,
+            markersize=4,
+            label=f"{background:g}",
         )
     right.axhline(1.1, color="black", linestyle=":", linewidth=0.8)
     right.set_ylim(0.9, 1.3)
     right.legend(title="background photons a bin", fontsize=8, title_fontsize=8)
-    label(left, "RMS range error (dots) and Cramer-Rao bound (lines)", "signal photons", "mm")
-    label(right, "error / bound; cells above the frame lie below threshold", "signal photons", "ratio")
-    save(figure, path)
+    label_axes(left, "RMS range error (dots) and Cramer-Rao bound (lines)", "signal photons", "mm")
+    label_axes(
+        right, "error / bound; cells above the frame lie below threshold", "signal photons", "ratio"
+    )
+    save_figure(figure, path)
 
 
 if __name__ == "__main__":

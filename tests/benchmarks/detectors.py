@@ -1,8 +1,8 @@
 """The long run of LinoSPAD2's path: words in real time through buffer, decoder and histogram.
 
-Run with ``python tests/benchmarks/detectors.py [--steady S] [--json]``; ``--steady 60`` is the acceptance's. Words
-arrive at half of the required rate; nothing may be dropped and memory must not grow. How fast each part is alone,
-`tofclip bench decode` tells.
+Run with ``python tests/benchmarks/detectors.py [--steady S] [--json]``; ``--steady 60`` is the
+acceptance's. Words arrive at half of the required rate; nothing may be dropped and memory must not
+grow. How fast each part is alone, `tofclip bench decode` tells.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from devices.codec import as_bytes
 from devices.histogram import BinAxis, StampHistogram
 from devices.ledger import Ledger
 from devices.linospad2.codec import LinoSpad2Codec
-from devices.linospad2.simulation import LASER_PERIOD, uneven_board
+from devices.linospad2.simulation import LASER_PERIOD_S, draw_uneven_calibration
 from devices.source import Info
-from devices.stream import Arrival, Buffering, StreamSource
+from devices.stream import BufferSettings, StreamSource, Transfer
 from tofclip.storage import Record
 from tofclip.threads import thread_count
 
@@ -57,13 +57,13 @@ class SteadyFeed:
     def start(self) -> None:
         self._began = time.monotonic()
 
-    def pull(self, timeout: float) -> Arrival | None:
+    def pull(self, timeout: float) -> Transfer | None:
         if self._sent >= self._total:
             return None
         at = self._sent % len(self._data)
         self._sent += self._piece
         time.sleep(max(0.0, self._began + self._sent / self._rate - time.monotonic()))
-        return Arrival(self._data[at : at + self._piece])
+        return Transfer(self._data[at : at + self._piece])
 
     def stop(self) -> None:
         self._total = self._sent
@@ -78,9 +78,11 @@ def steady(seconds: float) -> Figures:
     data = words(FILLED, 80)
     share = codec.count(as_bytes(data)) / len(data)
     feed = SteadyFeed(data, 8 * codec.cycle_bytes, STEADY_RATE / share, seconds)
-    histogram = StampHistogram(BinAxis(20e-12, 576, 0.0, LASER_PERIOD), uneven_board(0))
+    histogram = StampHistogram(
+        BinAxis(20e-12, 576, 0.0, LASER_PERIOD_S), draw_uneven_calibration(0)
+    )
     memory, began, looked = [], time.monotonic(), 0.0
-    with StreamSource(feed, codec, Ledger(), Buffering(policy="drop_oldest")) as source:
+    with StreamSource(feed, codec, Ledger(), BufferSettings(policy="drop_oldest")) as source:
         for batch in source:
             histogram.add(batch.records)
             passed = time.monotonic() - began
@@ -113,7 +115,9 @@ def main() -> None:
     options = parser.parse_args()
     figures = {"threads": thread_count(), **steady(options.steady)}
     print(
-        json.dumps(figures) if options.json else "\n".join(f"{name:20} {value:.6g}" for name, value in figures.items())
+        json.dumps(figures)
+        if options.json
+        else "\n".join(f"{name:20} {value:.6g}" for name, value in figures.items())
     )
 
 

@@ -1,8 +1,10 @@
-"""How fast the time tagger's path is, whether it drops anything at half of that, and a thousand random faults.
+"""How fast the time tagger's path is, whether it drops anything at half of that, and a thousand
+random faults.
 
-Run with ``python tests/benchmarks/instruments.py [--seconds S] [--steady S] [--scripts N] [--json]``. Everything goes
-through the real driver and pyusb's own code, on the emulated instrument, which makes its photons on the same machine.
-``--steady 60`` is the long run of the acceptance; its memory is looked at once a second.
+Run with ``python tests/benchmarks/instruments.py [--seconds S] [--steady S] [--scripts N]
+[--json]``. Everything goes through the real driver and pyusb's own code, on the emulated
+instrument, which makes its photons on the same machine. ``--steady 60`` is the long run of the
+acceptance; its memory is looked at once a second.
 """
 
 from __future__ import annotations
@@ -20,12 +22,12 @@ from typing import Any
 
 import devices
 from devices.codec import as_bytes
-from devices.emulation.faults import random_script
-from devices.emulation.photons import FOREVER, Poisson
+from devices.emulation.faults import draw_fault_script
+from devices.emulation.photons import MAX_TICK, PoissonStream
 from devices.emulation.timetag import CLOCK_HZ
-from devices.recorder import record
+from devices.recorder import record_source
+from devices.throughput import measure_throughput
 from devices.timetag.codec import RECORD_BYTES, TimeTagCodec
-from devices.trial import try_out
 from tofclip.errors import DeviceDisconnectedError
 
 MEGA = 1e6
@@ -37,7 +39,7 @@ PAGE_KIB = resource.getpagesize() // 1024
 def decoding(repeats: int) -> dict[str, float]:
     """The bare codec, both ways, on a piece of half a megabyte."""
     codec = TimeTagCodec()
-    words = as_bytes(Poisson(1.28e7, CLOCK_HZ, 1).words((1 << 19) // RECORD_BYTES, FOREVER))
+    words = as_bytes(PoissonStream(1.28e7, CLOCK_HZ, 1).words((1 << 19) // RECORD_BYTES, MAX_TICK))
     records = codec.decode(words, codec.start).records
 
     def rate(action: Any) -> float:
@@ -57,17 +59,24 @@ def decoding(repeats: int) -> dict[str, float]:
 
 def flat_out(seconds: float, repeats: int) -> dict[str, float]:
     """As fast as it goes: emulator, pyusb, driver, ring, decoding to NumPy."""
-    try_out(devices.open(SIM), 0.5)
-    rates = [try_out(devices.open(SIM), seconds).figures["bytes_per_second"] / MEGA for _ in range(repeats)]
-    return {"pyusb_path_mb_per_s": statistics.median(rates), "least": min(rates), "greatest": max(rates)}
+    measure_throughput(devices.open(SIM), 0.5)
+    rates = [
+        measure_throughput(devices.open(SIM), seconds).figures["bytes_per_second"] / MEGA
+        for _ in range(repeats)
+    ]
+    return {
+        "pyusb_path_mb_per_s": statistics.median(rates),
+        "least": min(rates),
+        "greatest": max(rates),
+    }
 
 
 def to_disk_and_back(seconds: float) -> dict[str, float]:
     """Recording with decoding, and the replay of that."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "run.h5")
-        done = record(devices.open(SIM), path, seconds)
-        replay = try_out(devices.open(f"file://{path}"), 600.0)
+        done = record_source(devices.open(SIM), path, seconds)
+        replay = measure_throughput(devices.open(f"file://{path}"), 600.0)
     return {
         "record_mb_per_s": done.bytes / done.seconds / MEGA,
         "replay_mb_per_s": replay.figures["bytes_per_second"] / MEGA,
@@ -83,7 +92,7 @@ def steady(seconds: float, rate_mb: float) -> dict[str, float]:
         if not memory or passed > memory[-1][0] + min(1.0, seconds / 10):
             memory.append((passed, resident_mib()))
 
-    trial = try_out(devices.open(address), seconds, look)
+    trial = measure_throughput(devices.open(address), seconds, look)
     settled = [size for passed, size in memory if passed >= seconds / 4]
     return {
         "steady_seconds": seconds,
@@ -106,12 +115,12 @@ def faults(number: int) -> dict[str, float]:
     sys.path.append(str(Path(__file__).parents[1] / "devices"))
     import fault_scripts  # shared with the tests
 
-    scripts = [random_script(seed, fault_scripts.TRANSFERS) for seed in range(number)]
+    scripts = [draw_fault_script(seed, fault_scripts.TRANSFERS) for seed in range(number)]
     with ThreadPoolExecutor(AT_ONCE) as pool:
         outcomes = list(pool.map(fault_scripts.run, scripts, range(number)))
     unbalanced = sum(not outcome.stats.is_balanced for outcome in outcomes)
     untrue = sum(
-        outcome.stats.acquired != outcome.truth.registered - outcome.truth.forgotten
+        outcome.stats.acquired != outcome.truth.registered - outcome.truth.lost_power_off
         for outcome in outcomes
         if not isinstance(outcome.fault, DeviceDisconnectedError)
     )
@@ -124,7 +133,9 @@ def faults(number: int) -> dict[str, float]:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=float, default=3.0, help="of each repeat at full speed")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--steady", type=float, default=10.0, help="seconds at constant rate")

@@ -1,10 +1,12 @@
-"""How fast the light-field cameras' models are, as ratios to the bare products and transforms they stand for.
+"""How fast the light-field cameras' models are, as ratios to the bare products and transforms they
+stand for.
 
-Run with ``python tests/benchmarks/operators.py [--sampling-ratio R] [--repeats N] [--json]``. Light fields of 8 x 8
-views of 128 x 128 pixels, one picture at a time on one core; medians of one run on one machine. `set-up` makes camera
-and model; the first of a process also loads compiled loops, which a warm-up does before. The floor of a sparse model is
-one product with its CSR matrix by scipy, that of a model with transforms a forward and an inverse FFT of its padded
-size by scipy, that of the single pixel one Hadamard matrix product on either side for each view by BLAS.
+Run with ``python tests/benchmarks/operators.py [--sampling-ratio R] [--repeats N] [--json]``. Light
+fields of 8 x 8 views of 128 x 128 pixels, one picture at a time on one core; medians of one run on
+one machine. `set-up` makes camera and model; the first of a process also loads compiled loops,
+which a warm-up does before. The floor of a sparse model is one product with its CSR matrix by
+scipy, that of a model with transforms a forward and an inverse FFT of its padded size by scipy,
+that of the single pixel one Hadamard matrix product on either side for each view by BLAS.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import scipy.fft
@@ -20,7 +23,7 @@ import scipy.linalg
 
 from tofclip.operators import LinearOperator
 from tofclip.operators.light_field_camera import CAMERAS, LineCamera
-from tofclip.threads import one_blas_thread
+from tofclip.threads import limit_blas_threads
 
 SHAPE = (128, 128)
 VIEWS = [(float(v), float(u)) for v in range(-4, 4) for u in range(-4, 4)]
@@ -61,7 +64,10 @@ def bare_transforms(size: int) -> Callable[[], object]:
 
 def bare_codes() -> Callable[[], object]:
     """A Hadamard product on either side of one picture for each view."""
-    hadamard, picture = scipy.linalg.hadamard(SHAPE[0]).astype(np.float32), np.ones(SHAPE, np.float32)
+    hadamard, picture = (
+        scipy.linalg.hadamard(SHAPE[0]).astype(np.float32),
+        np.ones(SHAPE, np.float32),
+    )
     return lambda: [hadamard @ picture @ hadamard for _ in VIEWS]
 
 
@@ -73,10 +79,10 @@ def table(ratio: float, repeats: int) -> list[dict[str, object]]:
     for name in CAMERAS:
         operator = model(name, min(ratio, 1.0) if name in AREA_SENSORS else ratio)
         picture = np.random.default_rng(0).random(operator.shape_in).astype(np.float32)
-        readings = operator(picture)
+        measurements = operator(picture)
         floor = median_ms(floors.get(name, bare_transforms(192)), repeats)
         forward = median_ms(lambda: operator(picture), repeats)  # noqa: B023 - called at once
-        adjoint = median_ms(lambda: operator.adjoint(readings), repeats)  # noqa: B023
+        adjoint = median_ms(lambda: operator.adjoint(measurements), repeats)  # noqa: B023
         rows.append(
             {
                 "camera": name,
@@ -94,7 +100,11 @@ def table(ratio: float, repeats: int) -> list[dict[str, object]]:
 def set_up(repeats: int) -> list[dict[str, object]]:
     """Milliseconds that camera and model take to make, for each sampling ratio that the camera has."""
     return [
-        {"camera": name, "ratio": ratio, "set_up_ms": round(median_ms(lambda: model(name, ratio), repeats), 1)}  # noqa: B023
+        {
+            "camera": name,
+            "ratio": ratio,
+            "set_up_ms": round(median_ms(partial(model, name, ratio), repeats), 1),
+        }
         for name in CAMERAS
         for ratio in RATIOS
         if ratio <= 1 or name not in AREA_SENSORS
@@ -108,14 +118,20 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    with one_blas_thread():
+    with limit_blas_threads():
         speed = table(arguments.sampling_ratio, arguments.repeats)
         making = set_up(max(3, arguments.repeats // 10))
     if arguments.json:
-        print(json.dumps({"sampling_ratio": arguments.sampling_ratio, "speed": speed, "set_up": making}))
+        print(
+            json.dumps(
+                {"sampling_ratio": arguments.sampling_ratio, "speed": speed, "set_up": making}
+            )
+        )
         return
     print(f"sampling ratio {arguments.sampling_ratio}, one core")
-    print(f"{'':16}{'readings':>9}{'floor ms':>10}{'forward':>9}{'adjoint':>9}{'x floor':>9}{'x floor':>9}")
+    print(
+        f"{'':16}{'readings':>9}{'floor ms':>10}{'forward':>9}{'adjoint':>9}{'x floor':>9}{'x floor':>9}"
+    )
     for row in speed:
         print(
             f"{row['camera']:16}{row['readings']:9}{row['floor_ms']:10}{row['forward_ms']:9}{row['adjoint_ms']:9}"

@@ -1,10 +1,11 @@
-"""How good pictures of CLIP are on recorded and rendered light fields, without telling the recovery anything.
+"""How good pictures of CLIP are on recorded and rendered light fields, without telling the recovery
+anything.
 
-Run with ``python tests/benchmarks/pictures.py --data DIR [--seeds N] [--only WORDS] [--oracle] [--json]``, where
-DIR/lightfields holds the NPZ files. NMSE in per cent of shift-and-add of the true views, 12 pixels at the border left
-out: mean and spread over seeds of the angles or codes. Seconds are medians: of the search for the prior's weight, and
-of the solve itself. ``--oracle`` also recovers with weights over two decades around the one found, and tells the least
-NMSE of all.
+Run with ``python tests/benchmarks/pictures.py --data DIR [--seeds N] [--only WORDS] [--oracle]
+[--json]``, where DIR/lightfields holds the NPZ files. NMSE in per cent of shift-and-add of the true
+views, 12 pixels at the border left out: mean and spread over seeds of the angles or codes. Seconds
+are medians: of the search for the prior's weight, and of the solve itself. ``--oracle`` also
+recovers with weights over two decades around the one found, and tells the least NMSE of all.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from tofclip.io.light_fields import read_light_field
-from tofclip.light_field.measurement import Setup, measure, spoilt
+from tofclip.light_field.measurement import CameraSetup, corrupt_measurement, measure
 from tofclip.metrics import nmse
 from tofclip.recovery.light_field import ClipRecovery
 
@@ -33,7 +34,9 @@ LINE = (
 
 @dataclass(frozen=True)
 class Sheet:
-    """What is asked of one light field: the shear, and cases of (encoder, preset, bad fraction, {ratio: limit})."""
+    """What is asked of one light field: the shear, and cases of (encoder, preset, bad fraction,
+    {ratio: limit}).
+    """
 
     shear: float
     cases: tuple[tuple[str, str, float, dict[float, float]], ...]
@@ -47,13 +50,21 @@ SHEETS = {
             ("line", "quality", 0.0, {2.0: 2.0, 1.0: 3.0, 0.5: 4.5, 0.25: 10.0}),
             ("single-pixel", "fast", 0.0, {1.0: 2.6, 0.5: 4.3, 0.25: 7.6}),
             ("single-pixel", "quality", 0.0, {1.0: 1.8, 0.5: 3.0, 0.25: 5.5}),
-            *((("line", preset, bad, {1.0: 5.5})) for preset in ("fast", "quality") for bad in (0.01, 0.05, 0.1)),
+            *(
+                (("line", preset, bad, {1.0: 5.5}))
+                for preset in ("fast", "quality")
+                for bad in (0.01, 0.05, 0.1)
+            ),
         ),
     ),
-    "render_planes": Sheet(0.0, (("line", "fast", 0.0, {2.0: 2.6, 1.0: 4.1, 0.5: 6.9, 0.25: 10.8}),)),
+    "render_planes": Sheet(
+        0.0, (("line", "fast", 0.0, {2.0: 2.6, 1.0: 4.1, 0.5: 6.9, 0.25: 10.8}),)
+    ),
     "hci_antinous": Sheet(0.0, (("line", "fast", 0.0, {2.0: 0.5, 1.0: 0.7, 0.5: 1.2, 0.25: 2.1}),)),
 }
-"""Limits in per cent; those of the last two are what the trials of total variation with the best weight reached."""
+"""Limits in per cent; those of the last two are what the trials of total variation with the best
+weight reached.
+"""
 
 
 @dataclass(frozen=True)
@@ -67,31 +78,46 @@ class Score:
 
 
 def scored(
-    path: Path, shear: float, setup: Setup, settings: ClipRecovery, bad: float, factors: Sequence[float]
+    path: Path,
+    shear: float,
+    setup: CameraSetup,
+    settings: ClipRecovery,
+    bad: float,
+    factors: Sequence[float],
 ) -> Score:
     """Recover once as a user would, and again with the weight found times each of the factors."""
     light_field = read_light_field(path)
-    truth, measured = light_field.refocus(shear), spoilt(measure(light_field, setup), None, bad)
+    truth, measured = (
+        light_field.refocus(shear),
+        corrupt_measurement(measure(light_field, setup), None, bad),
+    )
     found = settings.recover(measured, shear)
     percent = 100 * nmse(found.picture, truth, BORDER_PX)
-    others = (replace(settings, weight=found.weight * factor).recover(measured, shear).picture for factor in factors)
+    others = (
+        replace(settings, weight=found.weight * factor).recover(measured, shear).picture
+        for factor in factors
+    )
     oracle = min([percent, *(100 * nmse(picture, truth, BORDER_PX) for picture in others)])
     return Score(percent, oracle, found.seconds_weight, found.seconds)
 
 
 def rows(folder: Path, seeds: int, only: str, factors: Sequence[float]) -> list[dict[str, Any]]:
-    """Score every case whose description contains `only`, telling each as it is done."""
+    """Score every case whose description contains `reject_unknown`, telling each as it is done."""
     found = []
     for name, sheet in SHEETS.items():
         for encoder, preset, bad, limits in sheet.cases:
             settings = ClipRecovery(preset=preset, data_term="huber" if bad else "squares")
             for ratio, limit in limits.items():
-                label = f"{name} {encoder} {preset} SR {ratio:g}" + (f" bad {bad:.0%}" if bad else "")
+                label = f"{name} {encoder} {preset} SR {ratio:g}" + (
+                    f" bad {bad:.0%}" if bad else ""
+                )
                 if only not in label:
                     continue
                 path = folder / "lightfields" / f"{name}.npz"
-                setups = [Setup(encoder, ratio, seed) for seed in range(seeds)]
-                scores = [scored(path, sheet.shear, setup, settings, bad, factors) for setup in setups]
+                setups = [CameraSetup(encoder, ratio, seed) for seed in range(seeds)]
+                scores = [
+                    scored(path, sheet.shear, setup, settings, bad, factors) for setup in setups
+                ]
                 found.append(row := {"case": label, "limit": limit, **_summary(scores)})
                 print(LINE.format(**row), flush=True)
     return found
@@ -117,7 +143,12 @@ def main() -> None:
     parser.add_argument("--oracle", action="store_true")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    found = rows(arguments.data, arguments.seeds, arguments.only, FACTORS if arguments.oracle else ())
+    found = rows(
+        arguments.data,
+        arguments.seeds,
+        arguments.reject_unknown,
+        FACTORS if arguments.oracle else (),
+    )
     if arguments.json:
         print(json.dumps({"seeds": arguments.seeds, "rows": found}))
 

@@ -1,8 +1,10 @@
-"""How long recovery and ranging take where the arrays are put, beside the compiled loops, and how far results differ.
+"""How long recovery and ranging take where the arrays are put, beside the compiled loops, and how
+far results differ.
 
-Run with ``python tests/benchmarks/places.py [--device NAME ...] [--side PX] [--frames N] [--repeats N] [--json]``, for
-instance ``--device cuda``; without a name PyTorch on this processor. The size of a LIFT shot (letters hidden around a
-corner): 1016 instants of 128 x 128 pixels, 7 views. Medians without the set-up, with readings and frames already there.
+Run with ``python tests/benchmarks/places.py [--device NAME ...] [--side PX] [--frames N] [--repeats
+N] [--json]``, for instance ``--device cuda``; without a name PyTorch on this processor. The size of
+a LIFT shot (letters hidden around a corner): 1016 instants of 128 x 128 pixels, 7 views. Medians
+without the set-up, with readings and frames already there.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import HERE, Array, Place, namespace, place_named, to_numpy
+from tofclip.arrays import CPU, Array, ComputeDevice, namespace, parse_device, to_numpy
 from tofclip.camera import Camera
 from tofclip.lidar import Detection
 from tofclip.lidar.portable import PortableTraces
@@ -40,12 +42,14 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
-    places = [place_named(name) for name in asked.device or ["torch:cpu"]]
-    found = table(shot(asked.side, asked.frames), places, asked.repeats)
+    devices = [parse_device(name) for name in asked.device or ["torch:cpu"]]
+    found = table(shot(asked.side, asked.frames), devices, asked.repeats)
     if asked.json:
         print(json.dumps(found))
         return
-    print(f"{asked.frames} frames of {asked.side} x {asked.side}; difference relative to the largest value")
+    print(
+        f"{asked.frames} frames of {asked.side} x {asked.side}; difference relative to the largest value"
+    )
     print("what     where            seconds  compiled  difference")
     for row in found:
         print(
@@ -55,7 +59,9 @@ def main() -> None:
 
 
 def shot(side: int, frames: int) -> tuple[Camera, NDArray[np.float32]]:
-    """A camera, and what it reads of cards at as many ranges as there are instants, (readings, frames)."""
+    """A camera, and what it reads of cards at as many ranges as there are instants, (readings,
+    frames).
+    """
     random = np.random.default_rng(0)
     spacing = 0.8 * side
     angles = np.radians(np.linspace(-41, 41, VIEWS))
@@ -68,30 +74,43 @@ def shot(side: int, frames: int) -> tuple[Camera, NDArray[np.float32]]:
     part = side // 8
     for row in range(8):
         for column in range(8):
-            truth[row * part : (row + 1) * part, column * part : (column + 1) * part] = cards[row, column]
-    readings = camera.operator()(truth)
-    return camera, readings + NOISE * random.standard_normal(readings.shape, np.float32)
+            truth[row * part : (row + 1) * part, column * part : (column + 1) * part] = cards[
+                row, column
+            ]
+    measurements = camera.operator()(truth)
+    return camera, measurements + NOISE * random.standard_normal(measurements.shape, np.float32)
 
 
-def table(measured: tuple[Camera, NDArray[np.float32]], places: list[Place], repeats: int) -> list[dict[str, Any]]:
+def table(
+    measured: tuple[Camera, NDArray[np.float32]], devices: list[ComputeDevice], repeats: int
+) -> list[dict[str, Any]]:
     """One row for each method and place."""
-    camera, readings = measured
+    camera, measurements = measured
     operator, rows = camera.operator(), []
     inverse = LinearInverse().prepare(operator)
     recoveries: dict[str, Callable[[Array], Array]] = {
         "l1": lambda given: Sparse(iterations=ITERATIONS).recover(operator, given).frames,
         "tv": lambda given: TotalVariation(iterations=ITERATIONS).recover(operator, given).frames,
         "linear": lambda given: inverse.recover(given).frames,
-        "depth": Ranging(camera, readings.shape[1]),
+        "depth": Ranging(camera, measurements.shape[1]),
     }
     for name, recover in recoveries.items():
-        given = inverse.recover(readings).frames if name == "depth" else readings
+        given = inverse.recover(measurements).frames if name == "depth" else measurements
         expected, compiled = timed(recover, given, repeats)
-        for place in places:
-            result, seconds = timed(recover, place.put(given), repeats)
+        for device in devices:
+            result, seconds = timed(recover, device.put(given), repeats)
             same = result.shape == expected.shape  # as many returns
-            off = float(np.abs(result - expected).max() / np.abs(expected).max()) if same else float("inf")
-            told = {"what": name, "where": str(place), "seconds": seconds, "seconds_compiled": compiled}
+            off = (
+                float(np.abs(result - expected).max() / np.abs(expected).max())
+                if same
+                else float("inf")
+            )
+            told = {
+                "what": name,
+                "where": str(device),
+                "seconds": seconds,
+                "seconds_compiled": compiled,
+            }
             rows.append({**told, "difference": off})
     return rows
 
@@ -106,11 +125,17 @@ class Ranging:
     def __call__(self, values: Array) -> Array:
         """Search frames (time, y, x)."""
         frames = Frames(values, self._times, self._camera)
-        return self._search.returns(FrameTraces(frames) if Place.of(values) == HERE else PortableTraces(frames)).range
+        return self._search.find_returns(
+            FrameTraces(frames) if ComputeDevice.of(values) == CPU else PortableTraces(frames)
+        ).range
 
 
-def timed(action: Callable[[Array], Array], given: Array, repeats: int) -> tuple[NDArray[Any], float]:
-    """Result and median seconds of an action, after a first one that sets things up and loads loops."""
+def timed(
+    action: Callable[[Array], Array], given: Array, repeats: int
+) -> tuple[NDArray[Any], float]:
+    """Result and median seconds of an action, after a first one that sets things up and loads
+    loops.
+    """
     result, seconds = action(given), []
     for _ in range(repeats):
         start = time.perf_counter()

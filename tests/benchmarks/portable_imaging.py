@@ -1,9 +1,11 @@
-"""How long imaging around a corner takes where the arrays are put, beside the compiled loops, and how far it differs.
+"""How long imaging around a corner takes where the arrays are put, beside the compiled loops, and
+how far it differs.
 
-Run with ``python tests/benchmarks/portable_imaging.py [--device NAME ...] [--side N] [--repeats N] [--json]``, for
-instance ``--device cuda --side 128``; without a name PyTorch on this processor. N x N wall points over 2 m see four
-points; N^3 voxels; for back-projection half as many along every side. Medians of the imaging alone, signals being there
-already; "prepared" is what the second capture of one geometry takes.
+Run with ``python tests/benchmarks/portable_imaging.py [--device NAME ...] [--side N] [--repeats N]
+[--json]``, for instance ``--device cuda --side 128``; without a name PyTorch on this processor. N x
+N wall points over 2 m see four points; N^3 voxels; for back-projection half as many along every
+side. Medians of the imaging alone, signals being there already; "prepared" is what the second
+capture of one geometry takes.
 """
 
 from __future__ import annotations
@@ -21,9 +23,9 @@ import numpy as np
 from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD, PreparedImaging, Volume
 from nlos.method import Reconstructor
 from nlos.sampling import AliasingWarning
-from nlos.simulate import PointScene, relay_wall
+from nlos.simulate import PointScene, build_relay_wall
 from nlos.time_axis import TimeAxis
-from tofclip.arrays import Place, place_named
+from tofclip.arrays import ComputeDevice, parse_device
 
 POINTS = [[0.3, -0.2, 1.0], [-0.5, 0.4, 0.9], [0.1, 0.6, 1.4], [-0.6, -0.6, 1.1]]
 SPOT = [0.1, 0.05, 0.02]
@@ -41,9 +43,9 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
-    places = [place_named(name) for name in asked.device or ["torch:cpu"]]
+    devices = [parse_device(name) for name in asked.device or ["torch:cpu"]]
     warnings.simplefilter("ignore", AliasingWarning)
-    found = [row for case in cases(asked.side) for row in rows(*case, places, asked.repeats)]
+    found = [row for case in cases(asked.side) for row in rows(*case, devices, asked.repeats)]
     if asked.json:
         print(json.dumps(found))
         return
@@ -65,17 +67,39 @@ def cases(side: int) -> list[tuple[str, Reconstructor, Capture, Grid]]:
     wavelength = WALL_POINTS_PER_WAVELENGTH * WIDTH / (side - 1)
     few = side // 2
     return [
-        ("rsd, one laser", PlanarRSD(wavelength), seen("planar", side, confocal=False), voxels(side)),
-        ("rsd, confocal", PlanarRSD(2 * wavelength), seen("planar", side, confocal=True), voxels(side)),
-        ("hybrid, one laser", Hybrid(wavelength), seen("cylinder", side, confocal=False), voxels(side)),
-        ("backprojection", Backprojection(2 * wavelength), seen("cylinder", few, confocal=False), voxels(few)),
+        (
+            "rsd, one laser",
+            PlanarRSD(wavelength),
+            seen("planar", side, confocal=False),
+            voxels(side),
+        ),
+        (
+            "rsd, confocal",
+            PlanarRSD(2 * wavelength),
+            seen("planar", side, confocal=True),
+            voxels(side),
+        ),
+        (
+            "hybrid, one laser",
+            Hybrid(wavelength),
+            seen("cylinder", side, confocal=False),
+            voxels(side),
+        ),
+        (
+            "backprojection",
+            Backprojection(2 * wavelength),
+            seen("cylinder", few, confocal=False),
+            voxels(few),
+        ),
     ]
 
 
 def seen(shape: str, side: int, confocal: bool) -> Capture:
     """Simulate the capture of the points before a wall."""
-    wall = relay_wall(shape, side, WIDTH)
-    return PointScene(np.array(POINTS)).seen_from(wall, wall if confocal else SPOT, AXIS, JITTER)
+    wall = build_relay_wall(shape, side, WIDTH)
+    return PointScene(np.array(POINTS)).simulate_capture(
+        wall, wall if confocal else SPOT, AXIS, JITTER
+    )
 
 
 def voxels(side: int) -> Grid:
@@ -85,23 +109,30 @@ def voxels(side: int) -> Grid:
 
 
 def rows(
-    name: str, method: Reconstructor, capture: Capture, grid: Grid, places: list[Place], repeats: int
+    name: str,
+    method: Reconstructor,
+    capture: Capture,
+    grid: Grid,
+    devices: list[ComputeDevice],
+    repeats: int,
 ) -> list[dict[str, Any]]:
     """Measure one case everywhere."""
     compiled_seconds, expected = _measured(partial(method.reconstruct, capture, grid), repeats)
     found = []
-    for place in places:
-        moved = capture.on(place)
+    for device in devices:
+        moved = capture.on(device)
         seconds, volume = _measured(partial(method.reconstruct, moved, grid), repeats)
         prepared_seconds: float | None = None
         if isinstance(method, PlanarRSD | Hybrid):
             prepared = PreparedImaging(method, moved, grid)
             prepared_seconds, volume = _measured(partial(prepared.reconstruct, moved), repeats)
-        difference = np.linalg.norm(volume.values - expected.values) / np.linalg.norm(expected.values)
+        difference = np.linalg.norm(volume.values - expected.values) / np.linalg.norm(
+            expected.values
+        )
         found.append(
             {
                 "what": name,
-                "where": str(place),
+                "where": str(device),
                 "voxels": list(grid.shape),
                 "wall_points": len(capture.points),
                 "seconds": seconds,
@@ -122,7 +153,7 @@ def _measured(image: Callable[[], Volume], repeats: int) -> tuple[float, Volume]
         volume = image()
         _ = float(abs(volume.values).max())  # graphics processors answer before they are done
         times.append(time.perf_counter() - started)
-    return float(np.median(times)), volume.on(Place())
+    return float(np.median(times)), volume.on(ComputeDevice())
 
 
 if __name__ == "__main__":

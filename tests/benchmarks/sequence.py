@@ -1,10 +1,11 @@
 """How many shots of 1016 rows become clouds in a second, and how much memory that takes.
 
-Run with ``python tests/benchmarks/sequence.py [--shots N] [--iterative] [--json]``. The shots are three simulated ones
-over and over, 128 x 128 pixels behind 1344 slit pixels, read from memory; each becomes a cloud by the linear inverse.
-Peak memory is that of the process before the iterative path; to see that it stays, compare ``--shots 20`` with
-``--shots 200``. Processor time counts all threads, so that a busy machine changes it little. ``--iterative`` times one
-shot by total variation as well.
+Run with ``python tests/benchmarks/sequence.py [--shots N] [--iterative] [--json]``. The shots are
+three simulated ones over and over, 128 x 128 pixels behind 1344 slit pixels, read from memory; each
+becomes a cloud by the linear inverse. Peak memory is that of the process before the iterative path;
+to see that it stays, compare ``--shots 20`` with ``--shots 200``. Processor time counts all
+threads, so that a busy machine changes it little. ``--iterative`` times one shot by total variation
+as well.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ from functools import partial
 
 from tofclip.lidar import depth, point_cloud
 from tofclip.recovery import recover
-from tofclip.sequences.ranger import Ranger, clouds
+from tofclip.sequences.ranger import RangingPipeline, make_clouds
 from tofclip.shots import Streak
-from tofclip.simulate import default_instrument, default_scene, simulate
+from tofclip.simulate import make_default_instrument, make_default_scene, simulate_shot
 from tofclip.threads import thread_count
 
 ROW = 10
@@ -33,14 +34,14 @@ def main() -> None:
     parser.add_argument("--iterative", action="store_true")
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
-    instrument = default_instrument()
+    instrument = make_default_instrument()
     instrument = replace(instrument, detector=replace(instrument.detector, rows=1016))
-    streaks = [simulate(default_scene(), instrument, seed).streak for seed in range(3)]
-    ranger = Ranger(instrument.camera, streaks[0].times)
+    streaks = [simulate_shot(make_default_scene(), instrument, seed).streak for seed in range(3)]
+    pipeline = RangingPipeline(instrument.camera, streaks[0].times)
     shots = [partial(_one, streaks, number) for number in range(asked.shots)]
-    next(clouds(shots[:1], ranger))  # loads the compiled loops
+    next(make_clouds(shots[:1], pipeline))  # loads the compiled loops
     began, busy = time.perf_counter(), time.process_time()
-    finished = [began, *(time.perf_counter() for _ in clouds(shots, ranger))]
+    finished = [began, *(time.perf_counter() for _ in make_clouds(shots, pipeline))]
     # Clouds come in bursts, one of each core: some of them in a row tell the rate.
     rates = [ROW / (late - early) for early, late in zip(finished, finished[ROW:], strict=False)]
     figures = {
@@ -55,7 +56,11 @@ def main() -> None:
         began = time.perf_counter()
         point_cloud(depth(recover(streaks[0], method="tv")))
         figures["tv_seconds_per_shot"] = time.perf_counter() - began
-    print(json.dumps(figures) if asked.json else "\n".join(f"{name:22} {value:g}" for name, value in figures.items()))
+    print(
+        json.dumps(figures)
+        if asked.json
+        else "\n".join(f"{name:22} {value:g}" for name, value in figures.items())
+    )
 
 
 def _one(streaks: list[Streak], number: int) -> Streak:

@@ -1,14 +1,18 @@
-"""The viewer in a headless browser on this machine: updates a second, latency, and how soon a large cloud is seen.
+"""The viewer in a headless browser on this machine: updates a second, latency, and how soon a large
+cloud is seen.
 
     python tests/benchmarks/viewer.py [--json] [--seconds 10] [--points 15625]
 
-Needs playwright and chromium. The browser draws with a software renderer, on the same cores as the program.
+Needs playwright and chromium. The browser draws with a software renderer, on the same cores as the
+program.
 
 * updates: frames that the page says it has, in the step of its loop that draws them, per second;
-* processor: time that the program, and the browser with its software renderer, need for an update; these do not
-  depend on what else the machine does;
-* latency: from the moment a frame is handed to the server until the page's answer that it has it is back;
-* large: a PLY file of a million points, from opening it to all of it being drawn in a tab that was open already.
+* processor: time that the program, and the browser with its software renderer, need for an update;
+  these do not depend on what else the machine does;
+* latency: from the moment a frame is handed to the server until the page's answer that it has it is
+  back;
+* large: a PLY file of a million points, from opening it to all of it being drawn in a tab that was
+  open already.
 """
 
 from __future__ import annotations
@@ -27,13 +31,13 @@ from typing import Any
 import numpy as np
 from playwright.sync_api import sync_playwright
 
-from apps.viewer.clouds import cloud_of
-from apps.viewer.door import Door
+from apps.viewer.access_control import AccessControl
+from apps.viewer.clouds import make_cloud
 from apps.viewer.page import Page
-from apps.viewer.server import echoes
-from apps.viewer.session import Session, Shown
+from apps.viewer.server import make_echo_request
+from apps.viewer.session import DisplayedFrame, Session
 from apps.viewer.source import Source, View
-from apps.viewer.sources import open_source
+from apps.viewer.source_factory import open_source
 
 FLAGS = (
     "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run "
@@ -61,36 +65,48 @@ class Waves(Source):
 
 
 class Timed(Page):
-    """A page that remembers when each frame was handed over, and when the browser answered that it had it."""
+    """A page that remembers when each frame was handed over, and when the browser answered that it
+    had it.
+    """
 
     def __init__(self, *arguments: Any) -> None:
         self.handed: list[float] = []
         self.answered: list[float] = []
         super().__init__(*arguments)
-        echoes(self.server, lambda: self.answered.append(time.perf_counter()))
+        make_echo_request(self.server, lambda: self.answered.append(time.perf_counter()))
 
-    def _draw(self, shown: Shown, now: float) -> None:
+    def _draw(self, shown: DisplayedFrame, now: float) -> None:
         self.handed.append(time.perf_counter())
         super()._draw(shown, now)
 
 
 def main() -> None:
     """Print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--points", type=int, default=15_625)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
     with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS.split())
+        browser = driver.chromium.launch(
+            executable_path=shutil.which("chromium"), args=FLAGS.split()
+        )
         figures = {**_streamed(browser, asked.points, asked.seconds), **_large(browser)}
         browser.close()
-    print(json.dumps(figures) if asked.json else "\n".join(f"{name:28} {value:g}" for name, value in figures.items()))
+    print(
+        json.dumps(figures)
+        if asked.json
+        else "\n".join(f"{name:28} {value:g}" for name, value in figures.items())
+    )
 
 
 def _wave(x: Any, y: Any, phase: float) -> Any:
     z = 3 + 0.2 * np.sin(4 * x + phase) * np.cos(3 * y)
-    return cloud_of(np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32), {"intensity": z.ravel()})
+    return make_cloud(
+        np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32), {"intensity": z.ravel()}
+    )
 
 
 def _served(page: Page) -> threading.Thread:
@@ -100,7 +116,7 @@ def _served(page: Page) -> threading.Thread:
 
 
 def _streamed(browser: Any, points: int, seconds: float) -> dict[str, float]:
-    page = Timed(Session(Waves(points)), Door())
+    page = Timed(Session(Waves(points)), AccessControl())
     _served(page)
     tab = browser.new_page(viewport=WINDOW)
     tab.goto(page.address)
@@ -114,7 +130,9 @@ def _streamed(browser: Any, points: int, seconds: float) -> dict[str, float]:
     program, family = time.process_time(), _processor_seconds()
     time.sleep(seconds)
     program, family = time.process_time() - program, _processor_seconds() - family
-    latencies = [1e3 * (then - now) for now, then in zip(page.handed, page.answered, strict=False)][begin:]
+    latencies = [1e3 * (then - now) for now, then in zip(page.handed, page.answered, strict=False)][
+        begin:
+    ]
     updates = len(page.answered) - begin
     tab.close()
     page.close()
@@ -146,7 +164,9 @@ def _processor_seconds() -> float:
 
 
 def _latencies(sent: list[tuple[int, float]], seen: list[list[float]]) -> list[float]:
-    """Time from handing a frame over to seeing its number; a number comes round again only after seconds."""
+    """Time from handing a frame over to seeing its number; a number comes round again only after
+    seconds.
+    """
     found = []
     for frame, at in seen:
         earlier = [then for number, then in sent if number == frame and then <= at]
@@ -159,14 +179,16 @@ def _large(browser: Any) -> dict[str, float]:
     tab = browser.new_page(viewport=WINDOW)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "large.ply"
-        xyz = np.random.default_rng(0).uniform(-1, 1, (LARGE, 3)).astype(np.float32) + np.float32([0, 0, 3])
-        cloud_of(xyz).save(path)
+        xyz = np.random.default_rng(0).uniform(-1, 1, (LARGE, 3)).astype(np.float32) + np.float32(
+            [0, 0, 3]
+        )
+        make_cloud(xyz).save(path)
         started = time.perf_counter()
         session = Session(open_source(str(path)))
-        page = Page(session, Door())
+        page = Page(session, AccessControl())
         ready = time.perf_counter()
         drawn = threading.Event()
-        echoes(page.server, drawn.set)
+        make_echo_request(page.server, drawn.set)
         _served(page)
         tab.goto(page.address)
         drawn.wait(60)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofclip.camera.calibration import calibrate
+from tofclip.camera.calibration import calibrate_views
 from tofclip.errors import CalibrationError, InputError, ShapeError
 
 CENTRES = np.array([95.3, 250.8, 405.1, 560.6])
@@ -14,7 +14,9 @@ SHAPE, SLIT_ROW = (220, 660), 108
 
 
 def pictures(seed: int, noise: float = 5.0) -> list[np.ndarray]:
-    """Lines, their background, dots and theirs, as a camera with an offset and read noise takes them."""
+    """Lines, their background, dots and theirs, as a camera with an offset and read noise takes
+    them.
+    """
     rng = np.random.default_rng(seed)
     row, column = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
     lines, dots = np.zeros(SHAPE), np.zeros(SHAPE)
@@ -28,7 +30,7 @@ def pictures(seed: int, noise: float = 5.0) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_known_geometry_comes_back(seed):
-    found = calibrate(*pictures(seed), views=4)
+    found = calibrate_views(*pictures(seed), views=4)
     # Centroids of well-exposed dots and lines are good to some hundredths of a pixel.
     np.testing.assert_allclose(found.centres_px, CENTRES, atol=0.1)
     np.testing.assert_allclose(np.rad2deg(found.angles), np.rad2deg(ANGLES), atol=0.1)
@@ -37,16 +39,16 @@ def test_known_geometry_comes_back(seed):
 
 
 def test_uncertainties_match_the_spread():
-    found = [calibrate(*pictures(seed, noise=15), views=4) for seed in range(12)]
+    found = [calibrate_views(*pictures(seed, noise=15), views=4) for seed in range(12)]
     spread = np.std([f.centres_px - CENTRES for f in found])
     stated = np.mean([f.centre_uncertainty_px for f in found])
-    # Twelve draws of four centres know their standard deviation to about 10 %; correlated neighbouring pixels of the
-    # profile and the fit's own estimate add to that.
+    # Twelve draws of four centres know their standard deviation to about 10 %; correlated
+    # neighbouring pixels of the profile and the fit's own estimate add to that.
     assert 0.4 < stated / spread < 2.5
 
 
 def test_the_camera_takes_over_every_number():
-    found = calibrate(*pictures(0), views=4)
+    found = calibrate_views(*pictures(0), views=4)
     camera = found.camera(time_zero=1e-9)
     np.testing.assert_array_equal(camera.centres_px, found.centres_px)
     assert camera.slit_width_px == SHAPE[1]
@@ -61,19 +63,19 @@ def test_pictures_that_do_not_belong_together_are_refused(position):
     wrong = pictures(0)
     wrong[position] = wrong[position][:, :-3]
     with pytest.raises(ShapeError):
-        calibrate(*wrong, views=4)
+        calibrate_views(*wrong, views=4)
 
 
 def test_unusable_pictures_are_refused():
     lines, lines_dark, dots, dots_dark = pictures(0)
     with pytest.raises(CalibrationError, match="found 0 dots"):
-        calibrate(lines, lines_dark, dots_dark, dots_dark, views=4)
+        calibrate_views(lines, lines_dark, dots_dark, dots_dark, views=4)
     with pytest.raises(CalibrationError, match="found 4 dots on the slit, expected 6"):
-        calibrate(lines, lines_dark, dots, dots_dark, views=6)
+        calibrate_views(lines, lines_dark, dots, dots_dark, views=6)
     with pytest.raises(CalibrationError, match=r"no line|only"):
-        calibrate(lines_dark, lines_dark, dots, dots_dark, views=4)
+        calibrate_views(lines_dark, lines_dark, dots, dots_dark, views=4)
     with pytest.raises(InputError, match="NaN"):
-        calibrate(np.full(SHAPE, np.nan), lines_dark, dots, dots_dark, views=4)
+        calibrate_views(np.full(SHAPE, np.nan), lines_dark, dots, dots_dark, views=4)
 
 
 def test_the_instrument_s_own_pictures(shared_data):
@@ -83,9 +85,14 @@ def test_the_instrument_s_own_pictures(shared_data):
     if not folder.is_dir():
         pytest.skip("no clip pictures in the recorded data")
     names = ("LinePattern", "LinePattern_bkg", "DotPattern", "DotPattern_bkg")
-    found = calibrate(*(tifffile.imread(folder / f"{name}.tif") for name in names))
-    # An independent trial on the same pictures; half a pixel and half a degree are its own repeatability.
-    np.testing.assert_allclose(found.centres_px, [147.7, 320.0, 490.2, 664.1, 835.5, 1011.5, 1192.3], atol=0.5)
-    np.testing.assert_allclose(np.rad2deg(found.angles), [-43.3, -25.7, -12.7, 0.6, 22.9, 37.5, 48.0], atol=0.5)
+    found = calibrate_views(*(tifffile.imread(folder / f"{name}.tif") for name in names))
+    # An independent trial on the same pictures; half a pixel and half a degree are its own
+    # repeatability.
+    np.testing.assert_allclose(
+        found.centres_px, [147.7, 320.0, 490.2, 664.1, 835.5, 1011.5, 1192.3], atol=0.5
+    )
+    np.testing.assert_allclose(
+        np.rad2deg(found.angles), [-43.3, -25.7, -12.7, 0.6, 22.9, 37.5, 48.0], atol=0.5
+    )
     assert np.all(found.centre_uncertainty_px < 0.5)
     assert np.all(np.rad2deg(found.angle_uncertainty) < 0.5)

@@ -4,14 +4,26 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from tofclip.camera import Camera, ProjectiveSweep, Rectifier, SkewSweep, dark_level, measure
+from tofclip.camera import (
+    Camera,
+    ProjectiveSweep,
+    Rectifier,
+    SkewSweep,
+    estimate_dark_level,
+    measure,
+)
 from tofclip.errors import CalibrationError, InputError
 
 WIDTH, ROWS = 61, 80
 
 
 def camera(**changes: object) -> Camera:
-    settings = {"centres_px": [15.0, 45.0], "angles": [0.1, 0.2], "image_shape": (9, 9), "slit_width_px": WIDTH}
+    settings = {
+        "centres_px": [15.0, 45.0],
+        "angles": [0.1, 0.2],
+        "image_shape": (9, 9),
+        "slit_width_px": WIDTH,
+    }
     return Camera(**{**settings, **changes})
 
 
@@ -24,36 +36,41 @@ def streak(dark: float = 100.0) -> np.ndarray:
 def test_the_dark_level_comes_off_and_time_becomes_the_last_axis():
     counts = streak()
     measured = measure(counts, None, camera())
-    np.testing.assert_allclose(measured.readings, (counts - 100).T)
-    assert measured.good.all()
+    np.testing.assert_allclose(measured.measurements, (counts - 100).T)
+    assert measured.valid.all()
 
 
 def test_noise_about_the_dark_level_stays_centred():
     rng = np.random.default_rng(1)
     counts = (streak() + 8 * rng.standard_normal((ROWS, WIDTH))).astype(np.float32)
-    # The quietest 4 of 60 dark rows: the median of their 244 pixels scatters by 8 * 1.25 / sqrt(244) = 0.64, and
-    # choosing the quietest rows pulls it down by less than two standard errors of a row's mean (2.0).
-    assert dark_level(counts) == pytest.approx(100, abs=4)
-    assert measure(counts, None, camera()).readings.min() < 0
+    # The quietest 4 of 60 dark rows: the median of their 244 pixels scatters by 8 * 1.25 /
+    # sqrt(244) = 0.64, and choosing the quietest rows pulls it down by less than two standard
+    # errors of a row's mean (2.0).
+    assert estimate_dark_level(counts) == pytest.approx(100, abs=4)
+    assert measure(counts, None, camera()).measurements.min() < 0
 
 
 def test_a_given_dark_level_is_used():
     counts = streak()
-    np.testing.assert_allclose(measure(counts, None, camera(), dark=90.0).readings, (counts - 90).T)
+    np.testing.assert_allclose(
+        measure(counts, None, camera(), dark=90.0).measurements, (counts - 90).T
+    )
 
 
 def test_a_skew_is_undone():
     rows = np.arange(ROWS, dtype=float)[:, np.newaxis]
     column = np.arange(WIDTH)[np.newaxis]
-    late = 4.0 * (column - 15) / 30  # 0 rows at the first view's centre, 4 at the second's
-    counts = np.exp(-((rows - 40 - late) ** 2) / (2 * 6.0**2)).astype(np.float32)
+    delay = 4.0 * (column - 15) / 30  # 0 rows at the first view's centre, 4 at the second's
+    counts = np.exp(-((rows - 40 - delay) ** 2) / (2 * 6.0**2)).astype(np.float32)
     sweep = SkewSweep([15.0, 45.0], [0.0, 4.0], [0.0, 0.0])
     measured = measure(counts, None, camera(sweep=sweep), dark=0.0)
     expected = np.exp(-((rows - 40) ** 2) / (2 * 6.0**2)).T
-    inside = measured.good
+    inside = measured.valid
     # Linear interpolation of a Gaussian is off by at most max|f''| / 8 = 1 / (8 * 36).
     np.testing.assert_allclose(
-        measured.readings[inside], np.broadcast_to(expected, (WIDTH, ROWS))[inside], atol=1 / 288
+        measured.measurements[inside],
+        np.broadcast_to(expected, (WIDTH, ROWS))[inside],
+        atol=1 / 288,
     )
     assert not inside[-1, -6:].any()  # the late view's last instants lie beyond the picture
     assert inside[15].all()
@@ -63,16 +80,16 @@ def test_what_touches_a_saturated_pixel_is_masked():
     saturated = np.zeros((ROWS, WIDTH), bool)
     saturated[40, 20] = True
     plain = measure(streak(), saturated, camera())
-    assert np.argwhere(~plain.good).tolist() == [[20, 40]]
+    assert np.argwhere(~plain.valid).tolist() == [[20, 40]]
     sweep = SkewSweep([15.0, 45.0], [0.5, 0.5], [0.0, 0.0])
     shifted = measure(streak(), saturated, camera(sweep=sweep))
-    assert np.argwhere(~shifted.good[:, :-1]).tolist() == [[20, 39], [20, 40]]
+    assert np.argwhere(~shifted.valid[:, :-1]).tolist() == [[20, 39], [20, 40]]
 
 
 def test_dead_columns_are_masked():
     dead = np.arange(WIDTH) == 33
     measured = measure(streak(), None, camera(dead_columns=dead))
-    np.testing.assert_array_equal(~measured.good, np.repeat(dead[:, np.newaxis], ROWS, axis=1))
+    np.testing.assert_array_equal(~measured.valid, np.repeat(dead[:, np.newaxis], ROWS, axis=1))
 
 
 def test_what_cannot_be_measured_is_refused():
@@ -87,28 +104,36 @@ def test_what_cannot_be_measured_is_refused():
 def test_a_sweep_that_moves_light_across_columns_is_undone_bilinearly():
     matrix = np.array([[1.01, 0.02, -0.7], [-0.03, 0.98, 1.3], [1e-4, -2e-4, 1.0]])
     turned = camera(sweep=ProjectiveSweep(matrix), dead_columns=np.arange(WIDTH) == 20)
-    counts, late = streak(), 0.4
+    counts, delay = streak(), 0.4
     saturated = np.zeros(counts.shape, bool)
     saturated[35, 30] = True
-    found = Rectifier(turned, ROWS).measure(counts, saturated, late=late)
+    found = Rectifier(turned, ROWS).measure(counts, saturated, delay=delay)
     row, column = turned.sweep.raw_position(*np.mgrid[:ROWS, :WIDTH].astype(float))
-    row += late
+    row += delay
     inside = (row >= 0) & (row <= ROWS - 1) & (column >= 0) & (column <= WIDTH - 1)
-    expected = np.where(inside, map_coordinates(counts - 100.0, [row, column], order=1, mode="nearest"), 0)
+    expected = np.where(
+        inside, map_coordinates(counts - 100.0, [row, column], order=1, mode="nearest"), 0
+    )
     expected[:, 20] = 0
     # positions in float32 are good to 1e-5 pixels, times steps of 500 counts
-    np.testing.assert_allclose(found.readings.T, expected, atol=0.02)
-    np.testing.assert_array_equal(found.readings, Rectifier(turned, ROWS).readings(counts, late=late))
+    np.testing.assert_allclose(found.measurements.T, expected, atol=0.02)
+    np.testing.assert_array_equal(
+        found.measurements, Rectifier(turned, ROWS).measurements(counts, delay=delay)
+    )
     touched = map_coordinates(saturated.astype(float), [row, column], order=1, mode="nearest") > 0
-    good = inside & ~touched
-    good[:, 20] = False
-    np.testing.assert_array_equal(found.good.T, good)
+    valid = inside & ~touched
+    valid[:, 20] = False
+    np.testing.assert_array_equal(found.valid.T, valid)
     assert (inside & touched).sum() >= 3
 
 
 def test_a_single_row_or_column_is_sampled_too():
     low = camera(sweep=SkewSweep(np.array([15.0]), np.array([0.0]), np.array([0.0])))
     counts = np.arange(WIDTH, dtype=np.float32)[np.newaxis]
-    np.testing.assert_array_equal(measure(counts, None, low, dark=0.0).readings[:, 0], counts[0])
+    np.testing.assert_array_equal(
+        measure(counts, None, low, dark=0.0).measurements[:, 0], counts[0]
+    )
     narrow = Camera([0.0], [0.0], (1, 1), 1, sweep=ProjectiveSweep(np.diag([1.0, 1.0, 1.0])))
-    np.testing.assert_array_equal(measure(counts.T, None, narrow, dark=0.0).readings[0], counts[0])
+    np.testing.assert_array_equal(
+        measure(counts.T, None, narrow, dark=0.0).measurements[0], counts[0]
+    )

@@ -10,7 +10,12 @@ CENTRES = [20.5, 50.0, 80.25]
 
 
 def camera(**changes: object) -> Camera:
-    settings = {"centres_px": CENTRES, "angles": [-0.5, 0.0, 0.5], "image_shape": (21, 25), "slit_width_px": 101}
+    settings = {
+        "centres_px": CENTRES,
+        "angles": [-0.5, 0.0, 0.5],
+        "image_shape": (21, 25),
+        "slit_width_px": 101,
+    }
     return Camera(**{**settings, **changes})
 
 
@@ -52,7 +57,8 @@ def test_a_camera_is_not_changed_by_accident():
 
 
 @pytest.mark.parametrize(
-    "sweep", [None, SkewSweep(CENTRES, [1.0, 0.0, -2.0], [0.01, 0.0, 0.002]), ProjectiveSweep(np.eye(3))]
+    "sweep",
+    [None, SkewSweep(CENTRES, [1.0, 0.0, -2.0], [0.01, 0.0, 0.002]), ProjectiveSweep(np.eye(3))],
 )
 def test_saved_and_loaded_again(tmp_path, sweep):
     made = camera(
@@ -67,7 +73,14 @@ def test_saved_and_loaded_again(tmp_path, sweep):
     )
     made.save(tmp_path / "camera.h5")
     back = Camera.load(tmp_path / "camera.h5")
-    for name in ("centres_px", "angles", "gains", "view_positions", "dead_columns", "centre_uncertainty_px"):
+    for name in (
+        "centres_px",
+        "angles",
+        "gains",
+        "view_positions",
+        "dead_columns",
+        "centre_uncertainty_px",
+    ):
         np.testing.assert_array_equal(getattr(back, name), getattr(made, name))
     for name in ("image_shape", "slit_width_px", "time_zero", "pulse_fwhm", "focal_length_px"):
         assert getattr(back, name) == getattr(made, name)

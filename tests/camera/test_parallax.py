@@ -8,27 +8,36 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tofclip.camera import Camera, Measurement
-from tofclip.camera.calibration import parallax_from_centres, parallax_from_shears, sharpest_shears, sharpness
+from tofclip.camera.calibration import (
+    find_sharpest_shears,
+    fit_parallax_to_centres,
+    fit_parallax_to_shears,
+    measure_sharpness,
+)
 from tofclip.errors import CalibrationError, InputError, ShapeError
 
 CENTRES = 60.0 + 90 * np.arange(7)
 
 
 def camera(**settings: object) -> Camera:
-    return Camera(CENTRES, np.linspace(-0.7, 0.8, 7), (16, 16), 660, focal_length_px=250.0, **settings)
+    return Camera(
+        CENTRES, np.linspace(-0.7, 0.8, 7), (16, 16), 660, focal_length_px=250.0, **settings
+    )
 
 
 @settings(max_examples=40, deadline=None)
 @given(
     pitch=st.floats(1e-4, 1e-2),
     focus=st.floats(0.3, 20.0),
-    distances=st.lists(st.floats(0.3, 8.0), min_size=2, max_size=6, unique_by=lambda d: round(d, 2)),
+    distances=st.lists(
+        st.floats(0.3, 8.0), min_size=2, max_size=6, unique_by=lambda d: round(d, 2)
+    ),
 )
 def test_the_camera_s_own_shears_give_its_parallax_back(pitch, focus, distances):
     made = camera(lenslet_pitch=pitch, focus_distance=focus)
     if np.ptp(1 / np.array(distances)) < 0.05:
         return
-    found = parallax_from_shears(made.shear_at(distances), distances).applied(camera())
+    found = fit_parallax_to_shears(made.shear_at(distances), distances).apply_to(camera())
     assert found.lenslet_pitch == pytest.approx(pitch, rel=1e-6)
     assert 1 / found.focus_distance == pytest.approx(1 / focus, abs=1e-6)
 
@@ -37,11 +46,13 @@ def test_the_camera_s_own_shears_give_its_parallax_back(pitch, focus, distances)
 def test_slit_centres_at_known_distances_give_the_parallax_and_its_sense(sense):
     distances = np.array([0.5, 0.8, 1.5, 4.0])
     truth = camera(lenslet_pitch=4e-3, focus_distance=1.2)
-    moved = CENTRES[:, np.newaxis] + sense * np.outer(truth.view_positions, truth.shear_at(distances))
+    moved = CENTRES[:, np.newaxis] + sense * np.outer(
+        truth.view_positions, truth.shear_at(distances)
+    )
     moved = moved + np.array([0.0, 3.0, -1.0, 2.0])  # the target was put up at other places
-    found = parallax_from_centres(camera(), moved, distances)
+    found = fit_parallax_to_centres(camera(), moved, distances)
     assert found.misfit_px == pytest.approx(0, abs=1e-9)
-    fitted = found.applied(camera())
+    fitted = found.apply_to(camera())
     assert fitted.lenslet_pitch == pytest.approx(4e-3)
     assert fitted.focus_distance == pytest.approx(1.2)
     np.testing.assert_array_equal(fitted.view_positions, sense * truth.view_positions)
@@ -56,10 +67,11 @@ def test_the_fibre_recordings_centres_follow_the_inverse_of_distance(shared_data
     spacing = np.diff(centres, axis=0).mean(axis=0)
     distances = lens * pitch / (spacing * pixel - pitch)  # the authors' own formula
     made = Camera(centres[:, -1], np.zeros(7), (180, 180), 1344, focal_length_px=lens / pixel)
-    found = parallax_from_centres(made, centres, distances)
+    found = fit_parallax_to_centres(made, centres, distances)
     assert found.strength < 0  # seen through lenses: near objects move the other way along the slit
-    fitted = found.applied(made)
-    # the least-squares spacing of seven views is not quite the mean one of the authors; centres are good to 1 px
+    fitted = found.apply_to(made)
+    # the least-squares spacing of seven views is not quite the mean one of the authors; centres are
+    # good to 1 px
     assert fitted.lenslet_pitch == pytest.approx(pitch, rel=0.03)
     assert found.misfit_px < 1.0
     assert fitted.focus_distance == pytest.approx(distances[-1], rel=0.05)
@@ -67,33 +79,37 @@ def test_the_fibre_recordings_centres_follow_the_inverse_of_distance(shared_data
 
 
 def test_a_focus_beyond_infinity_counts_as_infinity():
-    found = parallax_from_shears([-2.1, -1.1, -0.6], [0.5, 1.0, 2.0])
-    assert found.nearness < 0
-    assert found.applied(camera()).focus_distance == np.inf
+    found = fit_parallax_to_shears([-2.1, -1.1, -0.6], [0.5, 1.0, 2.0])
+    assert found.focus_dioptres < 0
+    assert found.apply_to(camera()).focus_distance == np.inf
 
 
 def test_wrong_numbers_are_refused():
-    for shears, distances in (([0.0, 1.0], [1.0, 1.0]), ([0.0, np.nan], [1.0, 2.0]), ([0.0, 1.0], [-1.0, 2.0])):
+    for shears, distances in (
+        ([0.0, 1.0], [1.0, 1.0]),
+        ([0.0, np.nan], [1.0, 2.0]),
+        ([0.0, 1.0], [-1.0, 2.0]),
+    ):
         with pytest.raises(CalibrationError, match="two or more"):
-            parallax_from_shears(shears, distances)
+            fit_parallax_to_shears(shears, distances)
     with pytest.raises(ShapeError):
-        parallax_from_shears([0.0, 1.0], [1.0])
+        fit_parallax_to_shears([0.0, 1.0], [1.0])
     with pytest.raises(ShapeError, match="slit centres"):
-        parallax_from_centres(camera(), np.zeros((6, 2)), [1.0, 2.0])
+        fit_parallax_to_centres(camera(), np.zeros((6, 2)), [1.0, 2.0])
     dark = Measurement(np.zeros((660, 4), np.float32), np.ones((660, 4), bool))
     with pytest.raises(InputError, match="two finite shears"):
-        sharpest_shears(dark, camera(), [slice(0, 4)], [0.0])
-    curve = sharpest_shears(dark, camera(), [slice(0, 4)], [-1.0, 0.0, 1.0])
+        find_sharpest_shears(dark, camera(), [slice(0, 4)], [0.0])
+    curve = find_sharpest_shears(dark, camera(), [slice(0, 4)], [-1.0, 0.0, 1.0])
     assert not curve.agreement.any()
     assert not curve.weight.any()
 
 
 def test_sharpness_counts_how_few_pixels_hold_the_light():
     picture = np.zeros((1, 8, 8), np.float32)
-    assert sharpness(picture) == 0
-    assert sharpness(picture + 1) == pytest.approx(1)
+    assert measure_sharpness(picture) == 0
+    assert measure_sharpness(picture + 1) == pytest.approx(1)
     picture[0, 2:4, 2:4] = 5
-    assert sharpness(picture) == pytest.approx(16)
+    assert measure_sharpness(picture) == pytest.approx(16)
 
 
 def test_cameras_refuse_impossible_optics():
@@ -107,7 +123,8 @@ def test_displacement_is_the_part_of_parallax_that_moves_the_picture():
     positions = np.arange(-3.0, 4.0)
     even = Camera(CENTRES, np.arctan(0.3 * positions + 0.05), (16, 16), 660)
     rows, columns = even.displacement_per_shear
-    # slit: X - Y tan + s u with u = (tan - 0.05)/0.3, so Y shows up s/0.3 too high and X by -s/6 aside
+    # slit: X - Y tan + s u with u = (tan - 0.05)/0.3, so Y shows up s/0.3 too high and X by -s/6
+    # aside
     assert rows == pytest.approx(-1 / 0.3)
     assert columns == pytest.approx(-0.05 / 0.3)
     alone = Camera([60.0], [0.2], (16, 16), 121)

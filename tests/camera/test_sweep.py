@@ -43,7 +43,9 @@ def test_skew_by_hand(column: float, expected_row: float) -> None:
 
 
 def test_skew_of_a_single_view_is_the_same_everywhere() -> None:
-    raw_row, _ = SkewSweep([7.0], [3.0], [0.5]).raw_position(np.array(10.0), np.array([0.0, 7.0, 900.0]))
+    raw_row, _ = SkewSweep([7.0], [3.0], [0.5]).raw_position(
+        np.array(10.0), np.array([0.0, 7.0, 900.0])
+    )
     np.testing.assert_array_equal(raw_row, 18.0)
 
 
@@ -93,7 +95,9 @@ def test_an_unknown_sweep_is_refused() -> None:
 
 
 def test_numbers_that_describe_no_map_are_refused() -> None:
-    with pytest.raises(ShapeError, match=r"sweep skew must have shape \(views,\) in all three arrays"):
+    with pytest.raises(
+        ShapeError, match=r"sweep skew must have shape \(views,\) in all three arrays"
+    ):
         SkewSweep([1.0, 2.0], [0.0], [0.0, 0.0])
     with pytest.raises(ShapeError, match="sweep centres"):
         SkewSweep([], [], [])

@@ -1,4 +1,5 @@
-"""The contract of linear operators: every operator of the package is listed here and passes all of it.
+"""The contract of linear operators: every operator of the package is listed here and passes all of
+it.
 
 On NumPy's arrays all of them, those that are portable on the arrays of other libraries as well.
 """
@@ -9,11 +10,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from array_places import PLACES, place_called
+from array_places import DEVICE_NAMES, find_device
 
 from nlos import Capture, Grid, Hybrid
 from nlos.refinement.model import WallModel
-from tofclip.arrays import Place, is_numpy, to_numpy
+from tofclip.arrays import ComputeDevice, is_numpy, to_numpy
 from tofclip.errors import InputError, ShapeError, TofclipError
 from tofclip.operators import (
     BlockDiagonal,
@@ -53,7 +54,9 @@ def line_projection(dtype: type) -> LinearOperator:
 def sparse_matrix(dtype: type) -> LinearOperator:
     import scipy.sparse
 
-    matrix = scipy.sparse.random_array((15, 21), density=0.2, rng=np.random.default_rng(3), dtype=dtype)
+    matrix = scipy.sparse.random_array(
+        (15, 21), density=0.2, rng=np.random.default_rng(3), dtype=dtype
+    )
     return SparseMatrix(matrix.tocsr(), (3, 7), (15,))
 
 
@@ -117,7 +120,8 @@ def refocused_single_pixel(dtype: type) -> LinearOperator:
     """The model of supplement Eq. 21: every view's codes after its shear, stacked and weighted."""
     views = [(-1, 0), (0, 2)]
     codes = [
-        HadamardCodes((11, 14), 5, k, dtype) @ LinearShear((11, 14), 0.4, v, (0, 0), dtype) for k, v in enumerate(views)
+        HadamardCodes((11, 14), 5, k, dtype) @ LinearShear((11, 14), 0.4, v, (0, 0), dtype)
+        for k, v in enumerate(views)
     ]
     return MeanWeighting([5, 5], 0.1, dtype) @ Stack(codes)
 
@@ -201,11 +205,15 @@ def hidden_to_scanned_wall(dtype: type) -> LinearOperator:
 
 
 def views_of_their_own(dtype: type) -> LinearOperator:
-    return BlockDiagonal([LineProjection((5, 7), 9 + k, [4.0], [0.1 * k], [1.0], dtype) for k in range(3)])
+    return BlockDiagonal(
+        [LineProjection((5, 7), 9 + k, [4.0], [0.1 * k], [1.0], dtype) for k in range(3)]
+    )
 
 
 def views_on_one_slit(dtype: type) -> LinearOperator:
-    return Integration([LineProjection((5, 7), 9, [4.0], [0.1 * k], [1.0], dtype) for k in range(3)])
+    return Integration(
+        [LineProjection((5, 7), 9, [4.0], [0.1 * k], [1.0], dtype) for k in range(3)]
+    )
 
 
 def unseen_pixels_and_empty_readings(dtype: type) -> LinearOperator:
@@ -257,7 +265,8 @@ BATCHES = [(), (1,), (3,), (32,), (33,)]
 every_operator = pytest.mark.parametrize("build", BUILDERS, ids=lambda build: build.__name__)
 everywhere = pytest.mark.parametrize(
     ("build", "library"),
-    [(build, "numpy") for build in BUILDERS] + [(build, library) for build in PORTABLE for library in PLACES],
+    [(build, "numpy") for build in BUILDERS]
+    + [(build, library) for build in PORTABLE for library in DEVICE_NAMES],
     ids=lambda value: value if isinstance(value, str) else value.__name__,
 )
 both_types = pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -266,12 +275,12 @@ every_batch = pytest.mark.parametrize("batch", BATCHES, ids=str)
 
 def put(library: str, *arrays: np.ndarray) -> tuple[object, ...]:
     """The same values as arrays of a library."""
-    return tuple(place_called(library).put(array) for array in arrays)
+    return tuple(find_device(library).put(array) for array in arrays)
 
 
 def fetched(library: str, array: object) -> np.ndarray:
     """Values of a result, which has to be where the operand was."""
-    assert Place.of(array) == place_called(library)
+    assert ComputeDevice.of(array) == find_device(library)
     return to_numpy(array)
 
 
@@ -296,7 +305,9 @@ def test_adjoint_matches_forward(build, library, dtype, batch):
     seen, back = fetched(library, operator(x_there)), fetched(library, operator.adjoint(y_there))
     forward, backward = np.vdot(seen, y), np.vdot(x, back)
     scale = np.linalg.norm(seen) * np.linalg.norm(y)
-    assert abs(forward - backward) <= tolerance(dtype) * scale, f"adjoint is off by a factor {backward / forward}"
+    assert abs(forward - backward) <= tolerance(dtype) * scale, (
+        f"adjoint is off by a factor {backward / forward}"
+    )
 
 
 @everywhere
@@ -305,7 +316,9 @@ def test_linear(build, library, dtype):
     operator = build(dtype)
     a, _ = random_pair(operator, (3,))
     b = a[::-1] ** 2
-    of_both, of_a, of_b = (fetched(library, operator(*put(library, x))) for x in (2.5 * a - 1.5 * b, a, b))
+    of_both, of_a, of_b = (
+        fetched(library, operator(*put(library, x))) for x in (2.5 * a - 1.5 * b, a, b)
+    )
     parts = 2.5 * of_a - 1.5 * of_b
     assert np.linalg.norm(of_both - parts) <= 10 * tolerance(dtype) * np.linalg.norm(of_a + of_b)
 
@@ -331,7 +344,8 @@ def test_every_frame_of_a_batch_is_treated_alone(build, library, dtype):
     for frame in (0, 31, 32, 34):
         pairs = ((forward, operator(x[..., frame])), (backward, operator.adjoint(y[..., frame])))
         for whole, alone in ((to_numpy(whole), to_numpy(alone)) for whole, alone in pairs):
-            # Relative to the largest value: where terms cancel, a small one is only as exact as they are.
+            # Relative to the largest value: where terms cancel, a small one is only as exact as
+            # they are.
             bound = tolerance(dtype) * np.abs(alone).max()
             np.testing.assert_allclose(whole[..., frame], alone, rtol=tolerance(dtype), atol=bound)
 
@@ -350,7 +364,9 @@ def test_refuses_every_other_shape(build, library):
         with pytest.raises(ShapeError, match="must have shape"):
             operator(*put(library, np.zeros(shape)))
     with pytest.raises(ShapeError, match="must have shape"):
-        operator.adjoint(*put(library, np.zeros((operator.shape_out[0] + 1, *operator.shape_out[1:]))))
+        operator.adjoint(
+            *put(library, np.zeros((operator.shape_out[0] + 1, *operator.shape_out[1:])))
+        )
     with pytest.raises(InputError, match="must be real"):
         operator(*put(library, np.zeros(operator.shape_in, complex)))
 
@@ -367,21 +383,26 @@ def test_leaves_its_input_alone(build, library):
 
 
 @pytest.mark.parametrize("build", PORTABLE, ids=lambda build: build.__name__)
-@pytest.mark.parametrize("library", PLACES)
+@pytest.mark.parametrize("library", DEVICE_NAMES)
 def test_other_libraries_get_what_numpy_gets(build, library):
     operator = build(np.float32)
     x, y = (array.astype(np.float32) for array in random_pair(operator, (5,)))
     x_there, y_there = put(library, x, y)
-    for there, here in ((operator(x_there), operator(x)), (operator.adjoint(y_there), operator.adjoint(y))):
+    for there, here in (
+        (operator(x_there), operator(x)),
+        (operator.adjoint(y_there), operator.adjoint(y)),
+    ):
         # Sums of up to some hundred terms in float32, added in another order.
         np.testing.assert_allclose(to_numpy(there), here, rtol=1e-5, atol=1e-5 * np.abs(here).max())
 
 
-@pytest.mark.parametrize("library", PLACES)
+@pytest.mark.parametrize("library", DEVICE_NAMES)
 def test_entries_that_are_given_twice_and_out_of_order_count_together(library):
     import scipy.sparse
 
-    matrix = scipy.sparse.csr_array((np.array([1.0, 2, 4, 8]), [3, 0, 3, 1], [0, 3, 4]), shape=(2, 4))
+    matrix = scipy.sparse.csr_array(
+        (np.array([1.0, 2, 4, 8]), [3, 0, 3, 1], [0, 3, 4]), shape=(2, 4)
+    )
     assert not matrix.has_canonical_format
     (picture,) = put(library, np.array([1.0, 10, 100, 1000]))
     np.testing.assert_array_equal(to_numpy(SparseMatrix(matrix, (4,), (2,))(picture)), [5002, 80])
@@ -394,7 +415,9 @@ def test_what_has_only_compiled_loops_refuses_other_arrays(build):
     if not operator.portable:
         x, y = put("array_api_strict", *random_pair(operator, ()))
         for apply, operand in ((operator, x), (operator.adjoint, y)):
-            with pytest.raises(InputError, match="works on NumPy arrays, not on array_api_strict's"):
+            with pytest.raises(
+                InputError, match="works on NumPy arrays, not on array_api_strict's"
+            ):
                 apply(operand)
         assert is_numpy(operator(to_numpy(x)))
 

@@ -1,7 +1,7 @@
 """The contract of sources: every kind is listed here and passes all of it.
 
-A kind is a function that takes a folder and returns the address of a source with a few thousand records, after which
-a live one is silent and any other at its end.
+A kind is a function that takes a folder and returns the address of a source with a few thousand
+records, after which a live one is silent and any other at its end.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import pytest
 
 import devices
 from devices.codec import Records, as_bytes
-from devices.decoded import DecodedSource
+from devices.decoded_source import DecodedSource
 from devices.linospad2.codec import LinoSpad2Codec
-from devices.linospad2.simulation import SimulatedBoard, uneven_board
-from devices.recorder import record
+from devices.linospad2.simulation import SimulatedBoard, draw_uneven_calibration
+from devices.recorder import record_source
 from devices.recording.check import verify
-from devices.scenes import line_light
+from devices.scenes import simulate_line_light
 from devices.source import Batch, Source
 from tofclip.errors import DeviceTimeoutError, InputError
 
@@ -48,7 +48,7 @@ def emulated_with_faults(folder: Path) -> str:
 def recorded(folder: Path) -> str:
     path = folder / "run.h5"
     if not path.exists():
-        record(devices.open(emulated_with_faults(folder)), path, ENOUGH)
+        record_source(devices.open(emulated_with_faults(folder)), path, ENOUGH)
     return f"file://{path}"
 
 
@@ -63,15 +63,17 @@ def simulated_linospad2(folder: Path) -> str:
 def recorded_linospad2(folder: Path) -> str:
     path = folder / "linospad2.h5"
     if not path.exists():
-        record(devices.open(simulated_linospad2(folder)), path)
+        record_source(devices.open(simulated_linospad2(folder)), path)
     return f"file://{path}"
 
 
 def words_of_linospad2(folder: Path) -> str:
     path = folder / "words.dat"
     if not path.exists():
-        board = SimulatedBoard(line_light(), uneven_board(2), LinoSpad2Codec(), 100, 2)
-        path.write_bytes(b"".join(board.cycle(number) for number in range(45)))
+        board = SimulatedBoard(
+            simulate_line_light(), draw_uneven_calibration(2), LinoSpad2Codec(), 100, 2
+        )
+        path.write_bytes(b"".join(board.encode_cycle(number) for number in range(45)))
         path.with_suffix(".toml").write_text(
             'firmware = "2212b"\ntimestamps_per_cycle = 512\nabsolute_counter = false\n'
         )
@@ -83,7 +85,9 @@ def photons_of_a_ptu(folder: Path) -> str:
     path = folder / "photons.ptu"
     if not path.exists():
         counts = np.random.default_rng(1).poisson(900, (1, 1, 1, 2, 250)).astype(np.uint16)
-        ptufile.imwrite(path, counts, global_resolution=25e-9, tcspc_resolution=32e-12, pixel_time=1e-2)
+        ptufile.imwrite(
+            path, counts, global_resolution=25e-9, tcspc_resolution=32e-12, pixel_time=1e-2
+        )
     return f"file://{path}"
 
 
@@ -128,7 +132,9 @@ def opened(address: str) -> Open:
 
 
 def read_on(source: Source, batches: list[Batch]) -> None:
-    """Read until nothing more comes: a live source is stopped once it falls silent, a paced replay is waited for."""
+    """Read until nothing more comes: a live source is stopped once it falls silent, a paced replay
+    is waited for.
+    """
     wait = LONG
     try:
         while (batch := source.read(wait)) is not None:
@@ -278,10 +284,10 @@ def test_its_recording_replays_what_it_gave(opened: Open, tmp_path: Path) -> Non
     path, recorded_from = tmp_path / "again.h5", opened()
     if not isinstance(recorded_from, DecodedSource):
         with recorded_from, pytest.raises(InputError, match="nothing to record"):
-            record(recorded_from, path, ENOUGH)
+            record_source(recorded_from, path, ENOUGH)
         return
     # What is replayed at its own pace is late on a busy machine, but comes to an end.
-    record(recorded_from, path, ENOUGH if recorded_from.is_live else LONG)
+    record_source(recorded_from, path, ENOUGH if recorded_from.is_live else LONG)
     assert verify(path).is_sound
     live: list[Batch] = []
     with opened() as source:

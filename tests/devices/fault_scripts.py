@@ -7,15 +7,20 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from devices.emulation.faults import FOR_GOOD, Fault
-from devices.emulation.photons import Poisson
-from devices.emulation.timetag import CLOCK_HZ, EmulatedTimeTagger, Setting, Truth
+from devices.emulation.faults import PERMANENT_ENUMERATIONS, Fault
+from devices.emulation.photons import PoissonStream
+from devices.emulation.timetag import CLOCK_HZ, EmulatedTimeTagger, EmulatorSettings, GroundTruth
 from devices.emulation.usb import VirtualUsb
 from devices.source import Batch, Source
 from devices.statistics import Stats
-from devices.timetag.source import opened
+from devices.timetag.source import open_on_backend
 from devices.uri import Uri
-from tofclip.errors import DeviceDisconnectedError, DeviceError, DeviceStalledError, DeviceTimeoutError
+from tofclip.errors import (
+    DeviceDisconnectedError,
+    DeviceError,
+    DeviceStalledError,
+    DeviceTimeoutError,
+)
 
 RECORDS = 8000
 TRANSFERS = 36
@@ -30,19 +35,23 @@ class Outcome:
 
     batches: list[Batch]
     stats: Stats
-    truth: Truth
+    truth: GroundTruth
     fault: Exception | None = None
     is_over: bool = False
 
 
-def light(seed: int, resets: int = 0) -> Poisson:
+def light(seed: int, resets: int = 0) -> PoissonStream:
     """Return what the instrument sees after its counter was reset so often."""
-    return Poisson(1e6, CLOCK_HZ, seed + 100_000 * resets)
+    return PoissonStream(1e6, CLOCK_HZ, seed + 100_000 * resets)
 
 
-def run(script: Sequence[Fault], seed: int, records: int = RECORDS, address: str = ADDRESS) -> Outcome:
+def run(
+    script: Sequence[Fault], seed: int, records: int = RECORDS, address: str = ADDRESS
+) -> Outcome:
     """Read an emulated instrument until it is dark or fails, under a watchdog."""
-    instrument = EmulatedTimeTagger(lambda resets: light(seed, resets), "T1", Setting(records=records), script)
+    instrument = EmulatedTimeTagger(
+        lambda resets: light(seed, resets), "T1", EmulatorSettings(records=records), script
+    )
     outcome = Outcome([], Stats(), instrument.truth)
     thread = threading.Thread(target=_read, args=(instrument, address, outcome), daemon=True)
     thread.start()
@@ -52,7 +61,7 @@ def run(script: Sequence[Fault], seed: int, records: int = RECORDS, address: str
 
 
 def _read(instrument: EmulatedTimeTagger, address: str, outcome: Outcome) -> None:
-    source = opened(Uri.parse(address), "", VirtualUsb(instrument))
+    source = open_on_backend(Uri.parse(address), "", VirtualUsb(instrument))
     try:
         with source:
             while instrument.truth.registered < instrument.setting.records:
@@ -78,6 +87,6 @@ def expected_fault(script: Sequence[Fault]) -> type[DeviceError] | None:
     for fault in script:
         if fault.kind == "stall" and (fault.amount > 1 or fault.transfer + 1 in stalls):
             return DeviceStalledError
-        if fault.kind in ("unplug", "powerloss") and fault.amount >= FOR_GOOD:
+        if fault.kind in ("unplug", "powerloss") and fault.amount >= PERMANENT_ENUMERATIONS:
             return DeviceDisconnectedError
     return None

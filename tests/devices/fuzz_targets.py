@@ -1,4 +1,6 @@
-"""What takes bytes from outside: every codec, the drivers' conversations, and the files beside recordings."""
+"""What takes bytes from outside: every codec, the drivers' conversations, and the files beside
+recordings.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +17,15 @@ from devices.frames import FrameCodec
 from devices.ledger import Ledger
 from devices.linospad2.codec import LinoSpad2Codec
 from devices.linospad2.sidecar import read_sidecar
-from devices.recording.blocks import BlockHeader, Kind
+from devices.recording.blocks import BlockHeader, BlockKind
 from devices.recording.reader import Block, BlockReader
-from devices.remoteex.client import RemoteEx, announced
-from devices.remoteex.protocol import Answer, Code, Command, whole_number
+from devices.remoteex.client import RemoteExClient, parse_data_length
+from devices.remoteex.protocol import Answer, AnswerCode, Command, parse_integer
 from devices.remoteex.source import LiveSettings, RemoteExFeed
 from devices.ring import Gap
-from devices.spad512.protocol import Exposure
+from devices.spad512.protocol import ExposureRequest
 from devices.spad512.source import Spad512Feed
-from devices.timetag.codec import RECORD, TimeTagCodec, mark_wraps
+from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec, mark_wraps
 from devices.uri import Uri
 from tofclip.errors import DeviceDisconnectedError, DeviceTimeoutError, ProtocolError
 from tofclip.io import hpdta, itex
@@ -35,7 +37,8 @@ Decode = Callable[[bytes], object]
 class Target:
     """Something that takes bytes from outside, with a few inputs that it likes.
 
-    `slowness`: so many times fewer inputs are tried. `room`: bytes that decoding may take whatever the input.
+    `slowness`: so many times fewer inputs are tried. `room`: bytes that decoding may take whatever
+    the input.
     """
 
     decode: Decode
@@ -53,17 +56,17 @@ def stream(codec: Codec) -> Decode:
 
     def decode(data: bytes) -> None:
         view = as_bytes(data)
-        view = view[: codec.whole(view)]
+        view = view[: codec.count_complete_bytes(view)]
         found = codec.decode(view, codec.start)
-        assert len(found.records) + found.malformed == codec.count(view)
+        assert len(found.records) + found.malformed == codec.count_records(view)
         again = codec.decode(view, found.state, after_loss=True)
-        assert len(again.records) + again.malformed == codec.count(view)
+        assert len(again.records) + again.malformed == codec.count_records(view)
 
     return decode
 
 
 def _time_tags() -> Target:
-    records = np.zeros(200, RECORD)
+    records = np.zeros(200, RECORD_DTYPE)
     records["time_ticks"], records["channels"] = np.arange(200) << 30, 5
     codec = TimeTagCodec()
     return Target(stream(codec), (codec.encode(mark_wraps(records)), b""))
@@ -88,27 +91,32 @@ def _frames(bits: int) -> Target:
 def _itex() -> Target:
     text = '[Scaling],ScalingXScalingFile="",ScalingYUnit="ns",ScalingYScalingFile=""'
     tables = {"X": np.arange(9, dtype=np.float32), "Y": np.arange(7, dtype=np.float32)}
-    seeds = [itex.encode(itex.ItexImage(np.ones((7, 9), dtype), text, tables=tables)) for dtype in ("u1", "<u2", "<u4")]
-    return Target(lambda data: itex.encode(itex.decode(data)), tuple(seeds))
+    seeds = [
+        itex.encode_itex(itex.ItexImage(np.ones((7, 9), dtype), text, tables=tables))
+        for dtype in ("u1", "<u2", "<u4")
+    ]
+    return Target(lambda data: itex.encode_itex(itex.decode_itex(data)), tuple(seeds))
 
 
 def _answer(data: bytes) -> None:
     answer = Answer.decode(data)
-    assert announced(answer) >= 0
-    if answer.code is Code.DONE:
+    assert parse_data_length(answer) >= 0
+    if answer.code is AnswerCode.DONE:
         for word in answer.arguments:
-            whole_number(word, "a number")
+            parse_integer(word, "a number")
 
 
 def _recording() -> Target:
     payload = _time_tags().seeds[0]
-    blocks = [BlockHeader.of(Kind.PIECE, payload, 5, 200, gap).packed() + payload for gap in Gap]
+    blocks = [BlockHeader.of(BlockKind.PIECE, payload, 5, 200, gap).pack() + payload for gap in Gap]
 
     def decode(data: bytes) -> None:
-        reader = BlockReader(Path("run.h5"), lambda position, length: data[position : position + length], len(data))
+        reader = BlockReader(
+            Path("run.h5"), lambda position, length: data[position : position + length], len(data)
+        )
         for entry in reader:
             if isinstance(entry, Block):
-                reader.payload(entry)
+                reader.read_payload(entry)
 
     return Target(decode, (b"".join(blocks),))
 
@@ -127,19 +135,19 @@ class Replayed:
     def close(self) -> None:
         pass
 
-    def some(self, limit: int, timeout: float) -> bytes:
+    def read_available(self, limit: int, timeout: float) -> bytes:
         if not self._left:
             raise DeviceDisconnectedError("the replay is over")
         return self._taken(limit)
 
-    def exactly(self, length: int, limit: int, timeout: float) -> bytes:
+    def read_exactly(self, length: int, limit: int, timeout: float) -> bytes:
         if not 0 <= length <= limit:
             raise ProtocolError("too much")
         if length > len(self._left):
             raise DeviceDisconnectedError("the replay is over")
         return self._taken(length)
 
-    def until(self, end: bytes, limit: int, timeout: float) -> bytes:
+    def read_until(self, end: bytes, limit: int, timeout: float) -> bytes:
         found = self._left.find(end)
         if found < 0:
             raise DeviceDisconnectedError("the replay is over")
@@ -153,7 +161,9 @@ class Replayed:
 
 
 def _remoteex_session() -> Target:
-    """A whole conversation: greetings, the start, messages, pictures, a table; then the end, whatever comes."""
+    """A whole conversation: greetings, the start, messages, pictures, a table; then the end,
+    whatever comes.
+    """
     picture = np.arange(24, dtype="<u2").tobytes()
     said = (
         b"RemoteEx Ready\r0,AcqLiveMonitor\r4,LiveMonitor,RingBuffer,0,1\r0,AcqStart\r"
@@ -167,9 +177,13 @@ def _remoteex_session() -> Target:
     def decode(both: bytes) -> None:
         links = [Replayed(part) for part in both.partition(border)[::2]]
         with mock.patch("devices.remoteex.client.TcpLink", side_effect=lambda *_: links.pop(0)):
-            feed = RemoteExFeed(lambda: RemoteEx("replayed", 1, 2, 0.01), Ledger(), LiveSettings(reconnect=0))
+            feed = RemoteExFeed(
+                lambda: RemoteExClient("replayed", 1, 2, 0.01), Ledger(), LiveSettings(reconnect=0)
+            )
             assert feed.calibration is None or feed.info.instrument
-        with mock.patch.object(feed, "_reconnect", side_effect=DeviceDisconnectedError("it stays away")):
+        with mock.patch.object(
+            feed, "_reconnect", side_effect=DeviceDisconnectedError("it stays away")
+        ):
             try:
                 for _ in range(2):
                     feed.pull(0.01)
@@ -181,22 +195,24 @@ def _remoteex_session() -> Target:
 
 def _spad512_session() -> Target:
     """Greeting, two requests of two pictures, the end."""
-    exposure = Exposure(8, 1e-3, 2, 4)
+    exposure = ExposureRequest(8, 1e-3, 2, 4)
     pictures = bytes(range(256)) * (exposure.codec.pixel_bytes * 2 // 256)
 
     def decode(data: bytes) -> None:
         texts = [b"hello", b"", b"off", b""]
 
         class Server(Replayed):
-            def some(self, limit: int, timeout: float) -> bytes:
-                text = texts.pop(0) if texts else super().some(limit, timeout)
+            def read_available(self, limit: int, timeout: float) -> bytes:
+                text = texts.pop(0) if texts else super().read_available(limit, timeout)
                 if not text:
                     raise DeviceTimeoutError("it is quiet")
                 return text
 
-        with mock.patch("devices.spad512.source._QUIET", 0):
+        with mock.patch("devices.spad512.source._SILENCE_S", 0):
             feed = Spad512Feed(lambda: Server(data), Ledger(), exposure, 0.0, 0.0)  # type: ignore[arg-type,return-value]
-        with mock.patch.object(feed, "_reconnect", side_effect=DeviceDisconnectedError("it stays away")):
+        with mock.patch.object(
+            feed, "_reconnect", side_effect=DeviceDisconnectedError("it stays away")
+        ):
             try:
                 for _ in range(4):
                     feed.pull(0.0)
@@ -232,19 +248,26 @@ TARGETS = {
     "frames of 32 bits": _frames(32),
     "ITEX": _itex(),
     "HPD-TA text": Target(
-        lambda data: hpdta.row_times(hpdta.parse_text(data.decode("latin-1")), "/nowhere", 5),
-        (b'[Scaling],ScalingYUnit="ns",ScalingYType=1,ScalingYScale=0.3,ScalingYScalingFile="Other"[Camera],Type=1',),
+        lambda data: hpdta.read_row_times(hpdta.parse_text(data.decode("latin-1")), "/nowhere", 5),
+        (
+            b'[Scaling],ScalingYUnit="ns",ScalingYType=1,ScalingYScale=0.3,ScalingYScalingFile="Other"[Camera],Type=1',
+        ),
     ),
     "RemoteEx answers": Target(
         _answer,
         (
-            Answer(Code.DONE, "ImgRingBufferGet", ("672", "508", "2", "0", "14", "99")).encode()[:-1],
-            Answer(Code.MESSAGE, "LiveMonitor", ("RingBuffer", "7")).encode()[:-1],
+            Answer(
+                AnswerCode.DONE, "ImgRingBufferGet", ("672", "508", "2", "0", "14", "99")
+            ).encode()[:-1],
+            Answer(AnswerCode.MESSAGE, "LiveMonitor", ("RingBuffer", "7")).encode()[:-1],
         ),
     ),
-    "RemoteEx commands": Target(lambda data: Command.decode(data), (b"DevParamSet(TD,MCP Gain,0)", b"AcqStop()")),
+    "RemoteEx commands": Target(
+        lambda data: Command.decode(data), (b"DevParamSet(TD,MCP Gain,0)", b"AcqStop()")
+    ),
     "SPAD512 requests": Target(
-        lambda data: Exposure.decode(data), (b"I,8,2,3,0,1,0,1,128", b"I,1,2.5e-3,1,0,1,0,1,512")
+        lambda data: ExposureRequest.decode(data),
+        (b"I,8,2,3,0,1,0,1,128", b"I,1,2.5e-3,1,0,1,0,1,512"),
     ),
     "addresses": Target(
         lambda data: Uri.parse(data.decode("latin-1")).host_and_port(9),

@@ -1,7 +1,7 @@
 """Records in processes that are killed at random moments; a script, because it forks.
 
-``killed_recorders.py FOLDER NUMBER SEED`` prints one line per recording: its file's name and the bytes that its
-recorder had reported as flushed.
+``killed_recorders.py FOLDER NUMBER SEED`` prints one line per recording: its file's name and the
+bytes that its recorder had reported as flushed.
 """
 
 from __future__ import annotations
@@ -36,12 +36,14 @@ def live(path: Path, seed: int, pipe: int) -> None:
     """Record until somebody ends it."""
     Reporting.pipe = pipe
     vars(recorder)["RecordingWriter"] = Reporting
-    writer.FLUSH_SECONDS = 0.005
-    recorder.record(devices.open(ADDRESS.format(seed=seed)), path)
+    writer.FLUSH_INTERVAL_S = 0.005
+    recorder.record_source(devices.open(ADDRESS.format(seed=seed)), path)
 
 
 def killed(path: Path, seed: int, life: float) -> int:
-    """Let a recorder live for some seconds; return what it had flushed, -1 if it had not come so far."""
+    """Let a recorder live for some seconds; return what it had flushed, -1 if it had not come so
+    far.
+    """
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:

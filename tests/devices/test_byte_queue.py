@@ -20,9 +20,9 @@ def test_it_is_a_queue(moves: list[bytes | int]) -> None:
             model += move
         else:
             buffer = bytearray(move)
-            taken = queue.take(memoryview(buffer))
+            taken = queue.read_into(memoryview(buffer))
             assert bytes(buffer[:taken]) == model[:move]
             model = model[move:]
         assert len(queue) == len(model)
     queue.clear()
-    assert len(queue) == queue.take(memoryview(bytearray(5))) == 0
+    assert len(queue) == queue.read_into(memoryview(bytearray(5))) == 0

@@ -1,7 +1,7 @@
 """Every record is accounted for, whatever goes wrong.
 
-The accounts are compared with what the emulator knows: they balance by construction, so balancing alone says nothing.
-`tests/benchmarks/instruments.py` runs a thousand of these.
+The accounts are compared with what the emulator knows: they balance by construction, so balancing
+alone says nothing. `tests/benchmarks/instruments.py` runs a thousand of these.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from fault_scripts import RECORDS, TRANSFERS, Outcome, expected_fault, light, ru
 from numpy.typing import NDArray
 
 from devices.codec import Records, as_bytes
-from devices.emulation.faults import FOR_GOOD, Fault, random_script
-from devices.emulation.photons import FOREVER
-from devices.timetag.codec import RECORD, TimeTagCodec
+from devices.emulation.faults import PERMANENT_ENUMERATIONS, Fault, draw_fault_script
+from devices.emulation.photons import MAX_TICK
+from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
 from tofclip.errors import DeviceDisconnectedError, DeviceStalledError, InputError
 
 SCRIPTS = 300
@@ -26,11 +26,15 @@ AT_ONCE = 16
 
 def true_records(seed: int, count: int, resets: int = 0) -> Records:
     codec = TimeTagCodec()
-    return codec.decode(as_bytes(light(seed, resets).words(count, FOREVER)), codec.start).records
+    return codec.decode(
+        as_bytes(light(seed, resets).next_words(count, MAX_TICK)), codec.start
+    ).records
 
 
 def joined(outcome: Outcome) -> Records:
-    return np.concatenate([np.empty(0, RECORD), *(batch.records for batch in outcome.batches)])
+    return np.concatenate(
+        [np.empty(0, RECORD_DTYPE), *(batch.records for batch in outcome.batches)]
+    )
 
 
 def require_account(seed: int, script: Sequence[Fault], outcome: Outcome) -> None:
@@ -39,10 +43,10 @@ def require_account(seed: int, script: Sequence[Fault], outcome: Outcome) -> Non
     assert stats.is_balanced
     assert stats.delivered == sum(map(len, outcome.batches))
     assert stats.dropped_host == 0
-    assert truth.garbled <= stats.malformed  # and records of which a gap has cut off the end
+    assert truth.corrupted <= stats.malformed  # and records of which a gap has cut off the end
     if not isinstance(outcome.fault, DeviceDisconnectedError):
-        assert stats.acquired == truth.registered - truth.forgotten
-        assert stats.lost_device >= truth.not_kept or truth.forgotten
+        assert stats.acquired == truth.registered - truth.lost_power_off
+        assert stats.lost_device >= truth.lost_memory_full or truth.lost_power_off
     else:
         assert stats.acquired <= truth.registered
     require_true_records(seed, outcome)
@@ -66,13 +70,13 @@ def require_true_records(seed: int, outcome: Outcome) -> None:
 
 
 def are_among(some: NDArray[np.int64], known: NDArray[np.int64]) -> bool:
-    """Whether all of `some` are in `known`, which rises."""
+    """Whether all of `read_available` are in `known`, which rises."""
     return bool(np.all(known[np.searchsorted(known, some) % len(known)] == some))
 
 
 def test_random_faults() -> None:
     seeds = range(SCRIPTS)
-    scripts = [random_script(seed, TRANSFERS) for seed in seeds]
+    scripts = [draw_fault_script(seed, TRANSFERS) for seed in seeds]
     with ThreadPoolExecutor(AT_ONCE) as pool:  # they wait most of the time
         outcomes = list(pool.map(run, scripts, seeds))
     for seed, script, outcome in zip(seeds, scripts, outcomes, strict=True):
@@ -94,7 +98,11 @@ def test_what_goes_unnoticed() -> None:
     """Short transfers, single stalls and timeouts lose nothing."""
     script = [Fault(3, "short", 7), Fault(5, "stall"), Fault(8, "timeout"), Fault(9, "short", 1)]
     outcome = run(script, 1)
-    assert (outcome.stats.delivered, outcome.stats.malformed, outcome.stats.lost_device) == (RECORDS, 0, 0)
+    assert (outcome.stats.delivered, outcome.stats.malformed, outcome.stats.lost_device) == (
+        RECORDS,
+        0,
+        0,
+    )
     assert outcome.stats.timeouts >= 1
 
 
@@ -114,13 +122,13 @@ def test_an_instrument_that_lost_its_power_begins_anew() -> None:
     gap = next(batch for batch in outcome.batches if batch.after_gap)
     assert outcome.stats.reconnects == 1
     assert outcome.truth.registered == RECORDS
-    assert outcome.stats.acquired + outcome.truth.forgotten == RECORDS
+    assert outcome.stats.acquired + outcome.truth.lost_power_off == RECORDS
     assert gap.first > 800  # ten transfers of 85 records
     assert gap.records["time_ticks"][0] == true_records(3, 1, resets=1)["time_ticks"][0]
 
 
 def test_gone_for_good() -> None:
-    outcome = run([Fault(10, "unplug", FOR_GOOD)], 4)
+    outcome = run([Fault(10, "unplug", PERMANENT_ENUMERATIONS)], 4)
     assert isinstance(outcome.fault, DeviceDisconnectedError)
     assert "did not come back within 0.5 s" in str(outcome.fault)
     assert outcome.stats.delivered == 10 * 512 // 6  # all that came before was read first
@@ -136,11 +144,11 @@ def test_losses_are_told_apart() -> None:
     # A transfer of 512 bytes holds 85 or 86 records of which it has the beginning.
     assert 50 + 85 <= stats.lost_device <= 50 + 87
     assert 9 <= stats.malformed <= 10
-    assert [batch.after_gap for batch in outcome.batches].count(True) == 1
+    assert [batch.after_gap for batch in outcome.batches].count_records(True) == 1
 
 
 def test_scripts_are_drawn_from_their_seed_and_read_from_text() -> None:
-    assert random_script(5, 30) == random_script(5, 30) != random_script(6, 30)
+    assert draw_fault_script(5, 30) == draw_fault_script(5, 30) != draw_fault_script(6, 30)
     assert Fault.parse("stall@3,unplug@10:2") == (Fault(3, "stall"), Fault(10, "unplug", 2))
     for text in ("boom@3", "stall", "stall@x", "stall@3:-1"):
         with pytest.raises(InputError, match="is no fault"):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from devices.codec import as_bytes
 from devices.frames import FrameCodec
-from devices.registry import codec_named
+from devices.registry import build_codec
 from tofclip.errors import InputError
 
 
@@ -35,30 +35,36 @@ def test_decoding_gives_back_the_frames(film: tuple[FrameCodec, NDArray[Any]]) -
     data = as_bytes(codec.encode(records))
     found = codec.decode(data, codec.start)
     np.testing.assert_array_equal(found.records, records)
-    assert (found.malformed, codec.count(data), codec.whole(data)) == (0, len(records), len(data))
+    assert (found.malformed, codec.count_records(data), codec.count_complete_bytes(data)) == (
+        0,
+        len(records),
+        len(data),
+    )
     assert found.state == (int(records["number"][-1]) if len(records) else codec.start)
-    assert codec_named("frames", codec.settings) == codec
+    assert build_codec("frames", codec.settings) == codec
 
 
 def test_pixels_lie_where_they_should() -> None:
     codec = FrameCodec(2, 8, 1)
-    found = codec.decode(as_bytes(codec.numbered(5, bytes([0b10000001, 0b00001111]))), 4).records
+    found = codec.decode(as_bytes(codec.pack_frame(5, bytes([0b10000001, 0b00001111]))), 4).records
     assert found["counts"].tolist() == [[[1, 0, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 1, 1, 1, 1]]]
     codec = FrameCodec(1, 2, 16)
-    assert codec.decode(as_bytes(codec.numbered(0, b"\x01\x02\x03\x04")), -1).records["counts"].tolist() == [
-        [[0x201, 0x403]]
-    ]
+    assert codec.decode(as_bytes(codec.pack_frame(0, b"\x01\x02\x03\x04")), -1).records[
+        "counts"
+    ].tolist() == [[[0x201, 0x403]]]
 
 
 def test_a_frame_that_comes_again_is_malformed() -> None:
     codec = FrameCodec(1, 1, 8)
-    data = b"".join(codec.numbered(number, b"x") for number in (3, 3, 2, 4, 1, 9))
+    data = b"".join(codec.pack_frame(number, b"x") for number in (3, 3, 2, 4, 1, 9))
     found = codec.decode(as_bytes(data), 2)
     assert (found.records["number"].tolist(), found.malformed, found.state) == ([3, 4, 9], 3, 9)
     assert codec.decode(as_bytes(data), 9).malformed == 6
 
 
-@pytest.mark.parametrize("shape", [(0, 8, 8), (1, -8, 8), (3, 7, 1), (1 << 14, 1 << 14, 16), (8, 8, 12)])
+@pytest.mark.parametrize(
+    "shape", [(0, 8, 8), (1, -8, 8), (3, 7, 1), (1 << 14, 1 << 14, 16), (8, 8, 12)]
+)
 def test_pictures_that_cannot_be_are_refused(shape: tuple[int, int, int]) -> None:
     with pytest.raises(InputError):
         FrameCodec(*shape)

@@ -1,7 +1,8 @@
 """Damaged bytes, in every way that a wire or a disk can damage them, through every codec.
 
-Whatever comes in, only our own exceptions come out, and no more memory is taken than `Target.bound` says. In the suite
-it is a sample; ``python tests/devices/test_fuzz.py 200000`` runs as many mutations as it is told and prints a table.
+Whatever comes in, only our own exceptions come out, and no more memory is taken than `Target.bound`
+says. In the suite it is a sample; ``python tests/devices/test_fuzz.py 200000`` runs as many
+mutations as it is told and prints a table.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ TELLING = np.array([0, 1, 0x7F, 0x80, 0xFF, 0x20, 0x2C, 0x0D, 0x23, 0x30, 0x39],
 
 
 def mutations(seeds: tuple[bytes, ...], random: np.random.Generator) -> Iterator[bytes]:
-    """Damage inputs for ever: bits flipped, bytes replaced, pieces cut, repeated, moved, filled and invented."""
+    """Damage inputs for ever: bits flipped, bytes replaced, pieces cut, repeated, moved, filled and
+    invented.
+    """
     while True:
         data = bytearray(seeds[random.integers(len(seeds))])
         for _ in range(random.integers(1, 4)):
@@ -54,7 +57,8 @@ def _damage(data: bytearray, random: np.random.Generator) -> None:
 
 
 def attack(target: Target, count: int, seed: int) -> tuple[int, int]:
-    """Decode `count` damaged inputs; return how many were refused, and most bytes taken beyond the bound's share.
+    """Decode `count_records` damaged inputs; return how many were refused, and most bytes taken
+    beyond the bound's share.
 
     Raises
     ------
@@ -103,9 +107,14 @@ def main(total: int) -> None:
         began = time.perf_counter()
         count = -(-total // len(TARGETS)) // target.slowness
         refused, most = attack(target, count, seed=2)
-        assert refused < count, f"{name}: the damage is so heavy that nothing ever gets beyond the first check"
+        assert refused < count, (
+            f"{name}: the damage is so heavy that nothing ever gets beyond the first check"
+        )
         assert most > 0, f"{name}: no memory was watched"
-        print(f"{name:24} {count:9} {refused:9} {most:11} {count / (time.perf_counter() - began):11.0f}", flush=True)
+        print(
+            f"{name:24} {count:9} {refused:9} {most:11} {count / (time.perf_counter() - began):11.0f}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from numpy.typing import NDArray
 
 from devices.histogram import Accumulator, BinAxis, StampHistogram, TagHistogram, TimeHistogram
-from devices.linospad2.calibration import CLOCK_PERIOD, CODES, BoardCalibration
-from devices.linospad2.codec import STAMP, STAMP_WITH_COUNTER
-from devices.timetag.codec import DELTA, RECORD
+from devices.linospad2.calibration import CLOCK_PERIOD_S, CODES_PER_PERIOD, BoardCalibration
+from devices.linospad2.codec import STAMP_DTYPE, STAMP_WITH_COUNTER_DTYPE
+from devices.timetag.codec import DELTA, RECORD_DTYPE
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.threads import THREADS_VARIABLE
@@ -23,7 +23,9 @@ PS = 1e-12
 
 
 def overlaps(first: NDArray[Any], last: NDArray[Any], axis: BinAxis) -> NDArray[Any]:
-    """Share of each interval in each bin, (photons, bins), straight from the definition; all periods added up."""
+    """Share of each interval in each bin, (photons, bins), straight from the definition; all
+    periods added up.
+    """
     edges = axis.start + (np.arange(axis.bins + 1) - 0.5) * axis.bin_width
     total = np.zeros((len(first), axis.bins))
     turns = range(-8, 9) if axis.period else (0,)
@@ -45,14 +47,17 @@ axes = st.builds(
 
 @unhurried
 @given(axes, st.integers(0, 2**32 - 1), st.sampled_from([5 * PS, 250 * PS, 5000 * PS]))
-def test_times_are_shared_out_over_the_bins_they_cover(axis: BinAxis, seed: int, resolution: float) -> None:
+def test_times_are_shared_out_over_the_bins_they_cover(
+    axis: BinAxis, seed: int, resolution: float
+) -> None:
     random = np.random.default_rng(seed)
     pixels, times = random.integers(0, 3, 40), random.uniform(-3e-9, 60e-9, 40)
     histogram = TimeHistogram(3, axis, resolution)
     histogram.add(pixels, times)
     shares = overlaps(times, times + resolution, axis)
     expected = np.stack([shares[pixels == pixel].sum(axis=0) for pixel in range(3)], axis=1)
-    # Positions of 60 ns / 20 ps = 3000 bins in float64 and widths of a quarter bin, summed 40 times; see NOTHING.
+    # Positions of 60 ns / 20 ps = 3000 bins in float64 and widths of a quarter bin, summed 40
+    # times; see NOTHING.
     np.testing.assert_allclose(histogram.counts, expected, atol=1e-6)
 
 
@@ -60,25 +65,37 @@ def test_times_are_shared_out_over_the_bins_they_cover(axis: BinAxis, seed: int,
 def board() -> BoardCalibration:
     """Codes of very uneven widths, some of them empty, and pixels out of step."""
     random = np.random.default_rng(3)
-    widths = random.uniform(0, 2, (256, CODES)) * (random.random((256, CODES)) < 0.9)
+    widths = random.uniform(0, 2, (256, CODES_PER_PERIOD)) * (
+        random.random((256, CODES_PER_PERIOD)) < 0.9
+    )
     ends = np.cumsum(widths, axis=1)
-    return BoardCalibration(ends * (CLOCK_PERIOD / ends[:, -1:]), random.uniform(-6e-9, 4e-9, 256), np.array([17, 200]))
+    return BoardCalibration(
+        ends * (CLOCK_PERIOD_S / ends[:, -1:]),
+        random.uniform(-6e-9, 4e-9, 256),
+        np.array([17, 200]),
+    )
 
 
 def stamps_at(times: NDArray[Any], pixels: NDArray[Any], board: BoardCalibration) -> NDArray[Any]:
     """What the board stamps on photons that come at `times`, s since the cycle began."""
     local = times - board.offsets[pixels]
-    periods, phase = np.divmod(local, CLOCK_PERIOD)
+    periods, phase = np.divmod(local, CLOCK_PERIOD_S)
     codes = [
-        int(np.searchsorted(board.code_ends[pixel], at, side="right")) for pixel, at in zip(pixels, phase, strict=True)
+        int(np.searchsorted(board.code_ends[pixel], at, side="right"))
+        for pixel, at in zip(pixels, phase, strict=True)
     ]
-    records = np.zeros(len(times), STAMP)
-    records["pixel"], records["code"] = pixels, periods.astype(int) * CODES + np.minimum(codes, CODES - 1)
+    records = np.zeros(len(times), STAMP_DTYPE)
+    records["pixel"], records["code"] = (
+        pixels,
+        periods.astype(int) * CODES_PER_PERIOD + np.minimum(codes, CODES_PER_PERIOD - 1),
+    )
     return records
 
 
 @pytest.mark.parametrize("period", [None, 25e-9, 17.3e-9])
-def test_stamps_are_shared_out_over_their_codes(board: BoardCalibration, period: float | None) -> None:
+def test_stamps_are_shared_out_over_their_codes(
+    board: BoardCalibration, period: float | None
+) -> None:
     random = np.random.default_rng(5)
     pixels = random.integers(0, 256, 500)
     records = stamps_at(random.uniform(10e-9, 120e-9, 500), pixels, board)
@@ -86,28 +103,32 @@ def test_stamps_are_shared_out_over_their_codes(board: BoardCalibration, period:
     histogram = StampHistogram(axis, board)
     histogram.add(records)
     last = board.times(records)
-    width = (board.code_ends - board.code_begins)[pixels, records["code"] % CODES]
+    width = (board.code_ends - board.code_begins)[pixels, records["code"] % CODES_PER_PERIOD]
     shares = overlaps(last - width, last, axis)
     expected = np.zeros((400, 256))
     np.add.at(expected.T, pixels, shares)
-    # float32 tables: 700 bins to 6e-8 of their value, divided by codes as narrow as a hundredth of a bin.
+    # float32 tables: 700 bins to 6e-8 of their value, divided by codes as narrow as a hundredth of
+    # a bin.
     np.testing.assert_allclose(histogram.counts, expected, atol=5e-3)
     np.testing.assert_allclose(histogram.counts.sum(), expected.sum(), rtol=1e-5)
 
 
 def test_even_light_gives_even_bins_whatever_the_codes(board: BoardCalibration) -> None:
-    """Uncorrected, the ripple is as deep as the codes are uneven; corrected, only the photons' own noise remains."""
+    """Uncorrected, the ripple is as deep as the codes are uneven; corrected, only the photons' own
+    noise remains.
+    """
     random = np.random.default_rng(6)
     photons = 400_000
     pixels = np.full(photons, 40)
     records = stamps_at(random.uniform(10e-9, 110e-9, photons), pixels, board)
-    axis = BinAxis(CLOCK_PERIOD / 50, 50, 0.0, CLOCK_PERIOD)
+    axis = BinAxis(CLOCK_PERIOD_S / 50, 50, 0.0, CLOCK_PERIOD_S)
     corrected, plain = StampHistogram(axis, board), StampHistogram(axis, BoardCalibration.ideal())
     corrected.add(records)
     plain.add(records)
     mean = photons / 50
     assert np.std(plain.counts[:, 40]) > 0.2 * mean
-    # Poisson noise is sqrt(8000) = 89; sharing out makes neighbours alike and never noisier. 1.3: 50 bins' own scatter.
+    # Poisson noise is sqrt(8000) = 89; sharing out makes neighbours alike and never noisier. 1.3:
+    # 50 bins' own scatter.
     assert np.std(corrected.counts[:, 40]) < 1.3 * np.sqrt(mean)
     assert corrected.counts[:, 40].sum() == pytest.approx(photons, rel=1e-6)
 
@@ -120,20 +141,25 @@ def test_a_pulse_comes_back_in_all_pixels_at_once(board: BoardCalibration) -> No
     times = pulse + 7.77e-9 * random.integers(2, 500, len(pixels))
     histogram = StampHistogram(BinAxis(2 * PS, 3880, 0.0, 7.77e-9), board)
     histogram.add(stamps_at(times, pixels, board))
-    centre = (histogram.counts * histogram.axis.times[:, None]).sum(axis=0) / histogram.counts.sum(axis=0)
-    # A code is 18 ps wide on average and up to 45 ps here; 300 photons in 250 places on the codes average that out.
-    # Bins are narrow, because the centre of wide ones is not that of the photons in them.
+    centre = (histogram.counts * histogram.axis.times[:, None]).sum(axis=0) / histogram.counts.sum(
+        axis=0
+    )
+    # A code is 18 ps wide on average and up to 45 ps here; 300 photons in 250 places on the codes
+    # average that out. Bins are narrow, because the centre of wide ones is not that of the photons
+    # in them.
     assert np.abs(centre - pulse).max() < 5 * PS
     assert np.median(np.abs(centre - pulse)) < 1 * PS
 
 
-def test_stamps_with_a_counter_and_in_pieces(board: BoardCalibration, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stamps_with_a_counter_and_in_pieces(
+    board: BoardCalibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
     random = np.random.default_rng(9)
     pixels = random.integers(0, 256, 200_000)
-    plain = np.zeros(200_000, STAMP)
+    plain = np.zeros(200_000, STAMP_DTYPE)
     plain["pixel"], plain["code"] = pixels, random.integers(0, 1 << 20, 200_000)
-    counted = np.zeros(200_000, STAMP_WITH_COUNTER)
-    for name in STAMP.names or ():
+    counted = np.zeros(200_000, STAMP_WITH_COUNTER_DTYPE)
+    for name in STAMP_DTYPE.names or ():
         counted[name] = plain[name]
     axis = BinAxis(20 * PS, 576, 0.0, 25e-9)
     monkeypatch.setenv(THREADS_VARIABLE, "1")
@@ -148,7 +174,7 @@ def test_stamps_with_a_counter_and_in_pieces(board: BoardCalibration, monkeypatc
 
 
 def tags(rows: list[tuple[int, int, int]]) -> NDArray[Any]:
-    return np.array(rows, RECORD)
+    return np.array(rows, RECORD_DTYPE)
 
 
 def test_tags_count_from_the_last_pulse() -> None:
@@ -185,7 +211,7 @@ def test_tags_after_a_gap_wait_for_the_next_pulse() -> None:
 def test_tags_on_threads_know_the_pulse_before_their_piece(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pulses are so rare that a piece may hold none."""
     random = np.random.default_rng(4)
-    records = np.zeros(300_000, RECORD)
+    records = np.zeros(300_000, RECORD_DTYPE)
     records["time_ticks"] = np.cumsum(random.integers(0, 3, 300_000))
     records["channels"] = random.choice([2, 4], 300_000)
     records["channels"][[5, 120_000]] |= 1
@@ -197,7 +223,9 @@ def test_tags_on_threads_know_the_pulse_before_their_piece(monkeypatch: pytest.M
         histogram.add(records)
         found.append(histogram.counts)
     np.testing.assert_allclose(found[1], found[0], atol=1e-6)
-    assert found[0].sum() == pytest.approx(300_000 - 5, abs=1)  # an interval at either end may stick out
+    assert found[0].sum() == pytest.approx(
+        300_000 - 5, abs=1
+    )  # an interval at either end may stick out
 
 
 def test_the_sum_is_a_streak_image_that_does_not_trust_hot_pixels(board: BoardCalibration) -> None:
@@ -205,7 +233,7 @@ def test_the_sum_is_a_streak_image_that_does_not_trust_hot_pixels(board: BoardCa
     pixels = np.arange(256)
     histogram.add(stamps_at(np.full(256, 27e-9), pixels, board))
     camera = Camera(np.array([128.0]), np.array([0.0]), (9, 9), 256)
-    streak = histogram.streak(camera, "a board")
+    streak = histogram.to_streak(camera, "a board")
     np.testing.assert_allclose(streak.times, 1e-9 + np.arange(100) * 20 * PS, rtol=1e-12)
     assert streak.saturated is not None
     assert np.flatnonzero(streak.saturated.any(axis=0)).tolist() == [17, 200]
@@ -216,11 +244,19 @@ def test_the_sum_is_a_streak_image_that_does_not_trust_hot_pixels(board: BoardCa
 
 def test_nothing_came() -> None:
     with pytest.raises(InputError, match="every pixel is zero"):
-        TimeHistogram(2, BinAxis(1e-9, 5)).streak()
+        TimeHistogram(2, BinAxis(1e-9, 5)).to_streak()
 
 
 @pytest.mark.parametrize(
-    "arguments", [(0.0, 5), (np.nan, 5), (1e-9, 0), (1e-9, 5, np.inf), (1e-9, 5, 0.0, -1.0), (1e-9, 5, 0.0, 4e-9)]
+    "arguments",
+    [
+        (0.0, 5),
+        (np.nan, 5),
+        (1e-9, 0),
+        (1e-9, 5, np.inf),
+        (1e-9, 5, 0.0, -1.0),
+        (1e-9, 5, 0.0, 4e-9),
+    ],
 )
 def test_impossible_axes_are_refused(arguments: tuple[Any, ...]) -> None:
     with pytest.raises(InputError):
@@ -253,4 +289,4 @@ def test_photons_that_cannot_be_are_refused() -> None:
     with pytest.raises(InputError, match="end in code and pixel"):
         stamps.add(tags([(3, 1, 0)]))
     with pytest.raises(InputError, match="256 pixels; 1 time stamps"):
-        stamps.add(np.array([(0, 5, 256), (0, 5, 255)], STAMP))
+        stamps.add(np.array([(0, 5, 256), (0, 5, 255)], STAMP_DTYPE))

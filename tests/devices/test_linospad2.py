@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from numpy.typing import NDArray
 
 from devices.codec import Records, as_bytes
-from devices.linospad2.calibration import CODES, BoardCalibration, load_calibration
-from devices.linospad2.codec import FIRMWARES, MOST_TIMESTAMPS, LinoSpad2Codec
+from devices.linospad2.calibration import CODES_PER_PERIOD, BoardCalibration, load_calibration
+from devices.linospad2.codec import FIRMWARES, MAX_TIMESTAMPS, LinoSpad2Codec
 from devices.linospad2.sidecar import read_sidecar
-from devices.registry import codec_named
+from devices.registry import build_codec
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
 from tofclip.threads import THREADS_VARIABLE
 
@@ -37,7 +37,7 @@ def streams(draw: st.DrawFn) -> tuple[LinoSpad2Codec, Records]:
     if codec.counter:
         records["counter"] = random.integers(0, 1 << 63, 5, dtype=np.uint64)[records["cycle"]]
     records = codec.sort_stamps(records)
-    queue = records["cycle"].astype(int) * 64 + codec.place_of[records["pixel"]] // 4
+    queue = records["cycle"].astype(int) * 64 + codec.address_of[records["pixel"]] // 4
     first = np.searchsorted(queue, queue)
     return codec, records[np.arange(len(records)) - first < codec.timestamps]
 
@@ -55,16 +55,18 @@ def test_decoding_gives_back_what_was_encoded(stream: tuple[LinoSpad2Codec, Reco
     assert found.malformed == 0
     assert found.records.dtype == codec.dtype
     np.testing.assert_array_equal(found.records, records)
-    assert codec.count(data) == len(records)
-    assert codec.whole(data) == len(data)
+    assert codec.count_records(data) == len(records)
+    assert codec.count_complete_bytes(data) == len(data)
 
 
 @unhurried
 @given(streams(), st.data())
-def test_a_stream_may_be_cut_between_cycles(stream: tuple[LinoSpad2Codec, Records], data: st.DataObject) -> None:
+def test_a_stream_may_be_cut_between_cycles(
+    stream: tuple[LinoSpad2Codec, Records], data: st.DataObject
+) -> None:
     codec, records = stream
     whole = as_bytes(codec.encode(records))
-    cut = codec.whole(whole[: data.draw(st.integers(0, len(whole)))])
+    cut = codec.count_complete_bytes(whole[: data.draw(st.integers(0, len(whole)))])
     first = codec.decode(whole[:cut], codec.start)
     second = codec.decode(whole[cut:], first.state)
     np.testing.assert_array_equal(np.concatenate([first.records, second.records]), records)
@@ -72,7 +74,13 @@ def test_a_stream_may_be_cut_between_cycles(stream: tuple[LinoSpad2Codec, Record
 
 @pytest.mark.parametrize(
     ("firmware", "converter", "address", "pixel"),
-    [("2212b", 0, 3, 3), ("2212b", 63, 1, 253), ("2212b", 5, 0, 20), ("2212s", 0, 3, 192), ("2212s", 63, 1, 127)],
+    [
+        ("2212b", 0, 3, 3),
+        ("2212b", 63, 1, 253),
+        ("2212b", 5, 0, 20),
+        ("2212s", 0, 3, 192),
+        ("2212s", 63, 1, 127),
+    ],
 )
 def test_words_written_by_hand(firmware: str, converter: int, address: int, pixel: int) -> None:
     codec = LinoSpad2Codec(firmware, timestamps=3)
@@ -99,12 +107,16 @@ def test_stamps_of_the_converter_without_pixels_are_malformed() -> None:
     stream[1, 0] = stream[2, 64 * 4 : 64 * 4 + 2] = 1 << 31 | 5
     data = as_bytes(stream.tobytes())
     found = codec.decode(data, 0)
-    assert (len(found.records), found.malformed, codec.count(data)) == (1, 2, 3)
+    assert (len(found.records), found.malformed, codec.count_records(data)) == (1, 2, 3)
 
 
 def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     codec = LinoSpad2Codec(timestamps=20)
-    stream = np.random.default_rng(1).integers(0, 1 << 32, (1500, codec.cycle_words), dtype=np.uint64).astype("<u4")
+    stream = (
+        np.random.default_rng(1)
+        .integers(0, 1 << 32, (1500, codec.cycle_words), dtype=np.uint64)
+        .astype("<u4")
+    )
     data = as_bytes(stream.tobytes())
     monkeypatch.setenv(THREADS_VARIABLE, "1")
     alone = codec.decode(data, 0)
@@ -117,12 +129,16 @@ def test_threads_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_codec_is_built_again_from_its_settings() -> None:
     codec = LinoSpad2Codec("2212s", 20, True)
-    assert codec_named("linospad2", codec.settings) == codec
+    assert build_codec("linospad2", codec.settings) == codec
 
 
 @pytest.mark.parametrize(
     ("arguments", "problem"),
-    [(("2208",), "2212b or 2212s"), (("2212b", 0), "1..16384"), (("2212b", MOST_TIMESTAMPS + 1), "1..16384")],
+    [
+        (("2208",), "2212b or 2212s"),
+        (("2212b", 0), "1..16384"),
+        (("2212b", MAX_TIMESTAMPS + 1), "1..16384"),
+    ],
 )
 def test_impossible_settings_are_refused(arguments: tuple[Any, ...], problem: str) -> None:
     with pytest.raises(InputError, match=problem):
@@ -163,20 +179,29 @@ def test_a_cycle_has_one_counter() -> None:
 def uneven() -> BoardCalibration:
     """Codes of random widths that fill the period, random offsets, two hot pixels."""
     random = np.random.default_rng(7)
-    ends = np.cumsum(random.uniform(0.2, 2, (256, CODES)), axis=1)
-    return BoardCalibration(ends * (2500e-12 / ends[:, -1:]), random.uniform(-6e-9, 4e-9, 256), np.array([15, 231]))
+    ends = np.cumsum(random.uniform(0.2, 2, (256, CODES_PER_PERIOD)), axis=1)
+    return BoardCalibration(
+        ends * (2500e-12 / ends[:, -1:]), random.uniform(-6e-9, 4e-9, 256), np.array([15, 231])
+    )
 
 
 def test_times_follow_the_formula(uneven: BoardCalibration) -> None:
     records = np.zeros(1000, LinoSpad2Codec().dtype)
     random = np.random.default_rng(2)
-    records["pixel"], records["code"] = random.integers(0, 256, 1000), random.integers(0, 1 << 28, 1000)
+    records["pixel"], records["code"] = (
+        random.integers(0, 256, 1000),
+        random.integers(0, 1 << 28, 1000),
+    )
     expected = [
-        (code - code % 140) * 2500 / 140 + uneven.code_ends[pixel, code % 140] * 1e12 + uneven.offsets[pixel] * 1e12
+        (code - code % 140) * 2500 / 140
+        + uneven.code_ends[pixel, code % 140] * 1e12
+        + uneven.offsets[pixel] * 1e12
         for _, code, pixel in records.tolist()
     ]
     # float64 resolves 5 ms to 1e-18 s; the table's own digits were multiplied by 1e12 and back.
-    np.testing.assert_allclose(uneven.times(records), np.array(expected) * 1e-12, atol=1e-16, rtol=1e-14)
+    np.testing.assert_allclose(
+        uneven.times(records), np.array(expected) * 1e-12, atol=1e-16, rtol=1e-14
+    )
 
 
 def test_recorded_boards(shared_data: Path) -> None:
@@ -212,7 +237,9 @@ def test_a_calibration_survives_storage(uneven: BoardCalibration, tmp_path: Path
         ({"hot_pixels": np.array([256])}, "hot pixels must lie within"),
     ],
 )
-def test_impossible_tables_are_refused(uneven: BoardCalibration, change: dict[str, Any], problem: str) -> None:
+def test_impossible_tables_are_refused(
+    uneven: BoardCalibration, change: dict[str, Any], problem: str
+) -> None:
     arguments = {"code_ends": uneven.code_ends, "offsets": uneven.offsets, **change}
     with pytest.raises((ShapeError, InputError), match=problem):
         BoardCalibration(**arguments)
@@ -234,12 +261,15 @@ NEEDED = 'firmware = "2212s"\ntimestamps_per_cycle = 20\nabsolute_counter = true
 
 def test_a_complete_sidecar(recording: Path, uneven: BoardCalibration) -> None:
     recording.with_suffix(".toml").write_text(
-        NEEDED + 'board = "B7d"\ncode_table = "codes.csv"\noffset_table = "offsets.npy"\nhot_pixels = "hot.txt"\n'
+        NEEDED
+        + 'board = "B7d"\ncode_table = "codes.csv"\noffset_table = "offsets.npy"\nhot_pixels = "hot.txt"\n'
         'laser_period_ps = 25000\ncamera = "camera.h5"\n'
     )
     found = read_sidecar(recording)
     assert found.codec == LinoSpad2Codec("2212s", 20, True)
-    np.testing.assert_allclose(found.calibration.code_ends, uneven.code_ends, rtol=1e-15, atol=1e-24)
+    np.testing.assert_allclose(
+        found.calibration.code_ends, uneven.code_ends, rtol=1e-15, atol=1e-24
+    )
     assert found.calibration.hot_pixels.tolist() == [15, 231]
     assert (found.board, found.camera) == ("B7d", recording.parent / "camera.h5")
     assert found.laser_period == pytest.approx(25e-9, rel=1e-12)
@@ -253,7 +283,9 @@ def test_the_least_sidecar_means_an_ideal_board(recording: Path) -> None:
 
 
 def test_a_recording_without_a_sidecar_is_refused(recording: Path) -> None:
-    with pytest.raises(StorageError, match=r"firmware, timestamps_per_cycle, absolute_counter into run\.toml"):
+    with pytest.raises(
+        StorageError, match=r"firmware, timestamps_per_cycle, absolute_counter into run\.toml"
+    ):
         read_sidecar(recording)
 
 
@@ -270,7 +302,10 @@ def test_a_recording_without_a_sidecar_is_refused(recording: Path) -> None:
         (NEEDED.replace("2212s", "x"), "2212b or 2212s"),
         (NEEDED + 'code_table = "codes.csv"\n', "belong together"),
         (NEEDED + 'hot_pixels = "hot.txt"\n', "needs code_table"),
-        (NEEDED + 'code_table = "hot.txt"\noffset_table = "offsets.npy"\n', "must have 141 columns"),
+        (
+            NEEDED + 'code_table = "hot.txt"\noffset_table = "offsets.npy"\n',
+            "must have 141 columns",
+        ),
         (NEEDED + 'code_table = "codes.csv"\noffset_table = "hot.txt"\n', "holds no table"),
         (NEEDED + "laser_period_ps = -1.0\n", "must be a positive number"),
         (NEEDED + "laser_period_ps = nan\n", "must be a positive number"),
@@ -292,7 +327,9 @@ def test_a_table_whose_header_lies(recording: Path, shape: bytes) -> None:
         load_calibration(recording.parent / "codes.csv", path)
 
 
-@pytest.mark.parametrize(("text", "problem"), [("15\n256", "beyond"), ("1e400", "no table"), ("9" * 30, "beyond")])
+@pytest.mark.parametrize(
+    ("text", "problem"), [("15\n256", "beyond"), ("1e400", "no table"), ("9" * 30, "beyond")]
+)
 def test_hot_pixels_that_are_none(recording: Path, text: str, problem: str) -> None:
     folder = recording.parent
     (folder / "hot.txt").write_text(text)
@@ -304,7 +341,9 @@ def test_hot_pixels_that_are_none(recording: Path, text: str, problem: str) -> N
 
 
 def test_companions_that_are_absent_or_too_large(recording: Path) -> None:
-    recording.with_suffix(".toml").write_text(NEEDED + 'code_table = "absent"\noffset_table = "offsets.npy"\n')
+    recording.with_suffix(".toml").write_text(
+        NEEDED + 'code_table = "absent"\noffset_table = "offsets.npy"\n'
+    )
     with pytest.raises(StorageError, match="absent: no such file"):
         read_sidecar(recording)
     with open(recording.parent / "codes.csv", "wb") as file:

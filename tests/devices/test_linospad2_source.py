@@ -16,8 +16,8 @@ from devices.histogram import BinAxis, StampHistogram
 from devices.linospad2 import source as recordings
 from devices.linospad2.calibration import BoardCalibration
 from devices.linospad2.codec import LinoSpad2Codec
-from devices.linospad2.simulation import SimulatedBoard, uneven_board
-from devices.scenes import LineLight, line_instrument, line_light
+from devices.linospad2.simulation import SimulatedBoard, draw_uneven_calibration
+from devices.scenes import LineLight, make_line_instrument, simulate_line_light
 from devices.source import Source
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
@@ -28,20 +28,20 @@ SIDECAR = 'firmware = "2212s"\ntimestamps_per_cycle = 24\nabsolute_counter = tru
 
 @pytest.fixture(scope="module")
 def light() -> LineLight:
-    return line_light()
+    return simulate_line_light()
 
 
 @pytest.fixture
 def board(light: LineLight) -> SimulatedBoard:
-    return SimulatedBoard(light, uneven_board(3), CODEC, 300, 3)
+    return SimulatedBoard(light, draw_uneven_calibration(3), CODEC, 300, 3)
 
 
 @pytest.fixture
 def recording(tmp_path: Path, board: SimulatedBoard, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Twenty cycles, read five at a time."""
-    monkeypatch.setattr(recordings, "PIECE", 5 * CODEC.cycle_bytes)
+    monkeypatch.setattr(recordings, "PIECE_BYTES", 5 * CODEC.cycle_bytes)
     path = tmp_path / "run.dat"
-    path.write_bytes(b"".join(board.cycle(number) for number in range(20)))
+    path.write_bytes(b"".join(board.encode_cycle(number) for number in range(20)))
     path.with_suffix(".toml").write_text(SIDECAR)
     return path
 
@@ -103,8 +103,10 @@ def test_what_cannot_be_opened(recording: Path) -> None:
 
 
 def test_a_recordings_calibration_has_laser_and_camera(recording: Path) -> None:
-    line_instrument().camera.to_record().save(recording.parent / "camera.h5")
-    recording.with_suffix(".toml").write_text(SIDECAR + 'laser_period_ps = 25000\ncamera = "camera.h5"\n')
+    make_line_instrument().camera.to_record().save(recording.parent / "camera.h5")
+    recording.with_suffix(".toml").write_text(
+        SIDECAR + 'laser_period_ps = 25000\ncamera = "camera.h5"\n'
+    )
     with devices.open(f"linospad2://{recording}") as source:
         known = source.calibration
     assert known is not None
@@ -115,7 +117,9 @@ def test_a_recordings_calibration_has_laser_and_camera(recording: Path) -> None:
 def test_a_simulation_is_the_same_again() -> None:
     found = []
     for _ in range(2):
-        with devices.open("sim+linospad2://?seed=5&cycles=3&photons=2000&counter=1&firmware=2212s") as source:
+        with devices.open(
+            "sim+linospad2://?seed=5&cycles=3&photons=2000&counter=1&firmware=2212s"
+        ) as source:
             found.append(records_of(source))
             assert source.stats.is_balanced
     np.testing.assert_array_equal(found[0], found[1])
@@ -126,7 +130,9 @@ def test_a_simulation_is_the_same_again() -> None:
 
 
 def test_the_light_comes_back_out_of_the_words(light: LineLight) -> None:
-    """Through uneven codes and pixels out of step, the histogram is the scene's own streak image, up to its noise."""
+    """Through uneven codes and pixels out of step, the histogram is the scene's own streak image,
+    up to its noise.
+    """
     with devices.open("sim+linospad2://?seed=2&cycles=60") as source:
         known = source.calibration
         assert known is not None
@@ -137,9 +143,12 @@ def test_the_light_comes_back_out_of_the_words(light: LineLight) -> None:
     counts = histogram.counts
     expected = light.photons * (counts.sum() / light.photons.sum())
     assert counts.sum() == pytest.approx(60 * 6000, rel=0.01)
-    # A photon's place is known to about a code, 18 ps: edges are softer than the light's own, sums over 3 rows are not.
+    # A photon's place is known to about a code, 18 ps: edges are softer than the light's own, sums
+    # over 3 rows are not.
     rows = len(expected) // 3
-    coarse, wanted = (values[: rows * 3].reshape(rows, 3, 256).sum(axis=1) for values in (counts, expected))
+    coarse, wanted = (
+        values[: rows * 3].reshape(rows, 3, 256).sum(axis=1) for values in (counts, expected)
+    )
     bright = wanted > 20
     assert np.corrcoef(coarse[bright], wanted[bright])[0, 1] > 0.98
     centre = (coarse * np.arange(rows)[:, None]).sum(axis=0) / coarse.sum(axis=0)
@@ -149,22 +158,27 @@ def test_the_light_comes_back_out_of_the_words(light: LineLight) -> None:
 
 
 def test_a_cycle_that_is_full_keeps_the_first_stamps(light: LineLight) -> None:
-    crowded = SimulatedBoard(light, uneven_board(0), LinoSpad2Codec(timestamps=4), 256, 1)
-    data = np.frombuffer(crowded.cycle(0), np.uint8)
-    assert 100 < LinoSpad2Codec(timestamps=4).count(data) < 256
-    nearly_dark = SimulatedBoard(light, uneven_board(0), CODEC, 1e-9, 1)
-    assert nearly_dark.cycle(0) == bytes(CODEC.cycle_bytes)
+    crowded = SimulatedBoard(
+        light, draw_uneven_calibration(0), LinoSpad2Codec(timestamps=4), 256, 1
+    )
+    data = np.frombuffer(crowded.encode_cycle(0), np.uint8)
+    assert 100 < LinoSpad2Codec(timestamps=4).count_records(data) < 256
+    nearly_dark = SimulatedBoard(light, draw_uneven_calibration(0), CODEC, 1e-9, 1)
+    assert nearly_dark.encode_cycle(0) == bytes(CODEC.cycle_bytes)
 
 
 def test_in_real_time_a_cycle_takes_its_time() -> None:
     with devices.open("sim+linospad2://?cycles=30&photons=10&timestamps=4&pace=realtime") as source:
         began = time.monotonic()
         records_of(source)
-        assert time.monotonic() - began > 29 * 4e-3 - 0.02  # the thread began a moment before the clock was read
+        assert (
+            time.monotonic() - began > 29 * 4e-3 - 0.02
+        )  # the thread began a moment before the clock was read
 
 
 @pytest.mark.parametrize(
-    "query", ["seed=-1", "cycles=-1", "photons=0", "photons=1e9", "firmware=1", "timestamps=0", "x=1"]
+    "query",
+    ["seed=-1", "cycles=-1", "photons=0", "photons=1e9", "firmware=1", "timestamps=0", "x=1"],
 )
 def test_simulations_that_cannot_be(query: str) -> None:
     with pytest.raises(InputError):
@@ -173,4 +187,6 @@ def test_simulations_that_cannot_be(query: str) -> None:
 
 def test_a_board_needs_its_own_number_of_pixels(light: LineLight) -> None:
     with pytest.raises(ShapeError):
-        SimulatedBoard(replace(light, photons=np.ones((5, 3))), uneven_board(0), CODEC, 5, 0)
+        SimulatedBoard(
+            replace(light, photons=np.ones((5, 3))), draw_uneven_calibration(0), CODEC, 5, 0
+        )

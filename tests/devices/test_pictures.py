@@ -23,7 +23,10 @@ TEXT = (
 def picture(tmp_path: Path) -> Path:
     """Six rows of four pixels with a time axis."""
     pixels = np.arange(24, dtype="<u2").reshape(6, 4)
-    write_itex(ItexImage(pixels, TEXT, tables={"Y": np.arange(6, dtype=np.float32) ** 1.5}), tmp_path / "shot.img")
+    write_itex(
+        ItexImage(pixels, TEXT, tables={"Y": np.arange(6, dtype=np.float32) ** 1.5}),
+        tmp_path / "shot.img",
+    )
     return tmp_path / "shot.img"
 
 
@@ -46,7 +49,9 @@ def test_a_picture_is_one_frame(picture: Path) -> None:
     assert source.stats.is_balanced
     assert (info["camera"], info["serial"], info["date"]) == ("C1", "S/N: 5", "1/2/2023")
     assert known is not None
-    np.testing.assert_allclose(known.array("row_times", float, 1, "s"), np.arange(6) ** 1.5 * 1e-9, rtol=1e-6)
+    np.testing.assert_allclose(
+        known.array("row_times", float, 1, "s"), np.arange(6) ** 1.5 * 1e-9, rtol=1e-6
+    )
 
 
 def test_a_picture_becomes_a_streak_image(picture: Path) -> None:
@@ -59,7 +64,9 @@ def test_pictures_without_a_time_axis(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "plain.tif", np.ones((3, 5), np.uint16))
     with devices.open(f"file://{tmp_path}/plain.tif") as source:
         assert source.calibration is None
-    assert read_transient(f"file://{tmp_path}/plain.tif", bin_width=1e-12).times[2] == pytest.approx(2e-12)
+    assert read_transient(f"file://{tmp_path}/plain.tif", bin_width=1e-12).times[
+        2
+    ] == pytest.approx(2e-12)
 
 
 def test_recorded_pictures(shared_data: Path) -> None:

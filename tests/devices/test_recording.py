@@ -17,25 +17,33 @@ from hypothesis import given, settings
 
 import devices
 from devices.codec import Records, as_bytes
-from devices.decoded import DecodedSource
-from devices.emulation.faults import random_script
-from devices.recorder import record
-from devices.recording.blocks import HEADER_BYTES, BlockHeader, Kind
+from devices.decoded_source import DecodedSource
+from devices.emulation.faults import draw_fault_script
+from devices.recorder import record_source
+from devices.recording.appendable_file import DATASET_NAME, AppendableFile
+from devices.recording.blocks import HEADER_BYTES, BlockHeader, BlockKind
 from devices.recording.check import repair, verify
 from devices.recording.checksum import lookup3
-from devices.recording.growing import DATASET, GrowingFile
 from devices.recording.reader import Block, Recording
-from devices.recording.writer import RecordingWriter, head_of
+from devices.recording.writer import RecordingWriter, make_head
 from devices.replay import ReplaySource
 from devices.ring import Gap, Piece
 from devices.source import Batch, Info, Source
 from devices.statistics import Stats
-from devices.timetag.codec import RECORD, TimeTagCodec
-from tofclip.errors import DeviceDisconnectedError, DeviceTimeoutError, FileFormatError, InputError, StorageError
+from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
+from tofclip.errors import (
+    DeviceDisconnectedError,
+    DeviceTimeoutError,
+    FileFormatError,
+    InputError,
+    StorageError,
+)
 from tofclip.storage import Field, Record
 
 CODEC = TimeTagCodec()
-CALIBRATION = Record("calibration", {"table": Field(np.arange(5.0), "s", ("code",))}, {"tick_s": 1e-9})
+CALIBRATION = Record(
+    "calibration", {"table": Field(np.arange(5.0), "s", ("code",))}, {"tick_s": 1e-9}
+)
 SIM = "sim+timetag://?seed=4&transfer_kib=1&records=8000&reconnect_s=2"
 PIECES = 12
 
@@ -49,11 +57,11 @@ def compiled() -> None:
 
 def written(path: Path, finish: bool = True, stats: Stats = Stats(600, 600)) -> list[Records]:  # noqa: B008
     """Write a small recording and return its records, piece by piece."""
-    head = head_of(CODEC, Info("a tagger", "7", {"clock_hz": 5}), CALIBRATION, {"verb": "test"})
+    head = make_head(CODEC, Info("a tagger", "7", {"clock_hz": 5}), CALIBRATION, {"verb": "test"})
     writer = RecordingWriter(path, head)
     found = []
     for number in range(PIECES):
-        records = np.zeros(50, RECORD)
+        records = np.zeros(50, RECORD_DTYPE)
         records["time_ticks"] = 1000 * number + 10 * np.arange(1, 51)
         records["channels"] = 1 + number % 15
         writer.add(Piece(CODEC.encode(records), 50))
@@ -70,15 +78,20 @@ def replayed(path: Path) -> list[Batch]:
 
 
 def joined(batches: list[Batch]) -> Records:
-    return np.concatenate([np.empty(0, RECORD), *(batch.records for batch in batches)])
+    return np.concatenate([np.empty(0, RECORD_DTYPE), *(batch.records for batch in batches)])
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_replay_is_what_was_live_bit_for_bit(tmp_path: Path, seed: int) -> None:
-    script = ",".join(f"{f.kind}@{f.transfer}:{f.amount if f.amount < 600 else 1}" for f in random_script(seed, 30))
+    script = ",".join(
+        f"{f.kind}@{f.transfer}:{f.amount if f.amount < 600 else 1}"
+        for f in draw_fault_script(seed, 30)
+    )
     source = devices.open(f"{SIM}&faults={script}")
     assert isinstance(source, DecodedSource)
-    writer = RecordingWriter(tmp_path / "run.h5", head_of(source.codec, source.info, source.calibration, {}))
+    writer = RecordingWriter(
+        tmp_path / "run.h5", make_head(source.codec, source.info, source.calibration, {})
+    )
     source.tap = writer.add
     live: list[Batch] = []
     with source:
@@ -89,7 +102,9 @@ def test_a_replay_is_what_was_live_bit_for_bit(tmp_path: Path, seed: int) -> Non
             pass
     writer.close()
     again = replayed(tmp_path / "run.h5")
-    assert [(one.first, one.after_gap) for one in again] == [(one.first, one.after_gap) for one in live]
+    assert [(one.first, one.after_gap) for one in again] == [
+        (one.first, one.after_gap) for one in live
+    ]
     assert [one.records.tobytes() for one in again] == [one.records.tobytes() for one in live]
     assert len(live) > 5
 
@@ -111,25 +126,29 @@ def test_everything_about_the_instrument_is_kept(tmp_path: Path) -> None:
 def test_any_hdf5_program_opens_it_at_every_moment(tmp_path: Path) -> None:
     path = tmp_path / "run.h5"
     content = b"begin"
-    file = GrowingFile(path, Record("recording", {}, {"note": "x"}, {"calibration": CALIBRATION}), lambda _: content)
+    file = AppendableFile(
+        path,
+        Record("recording", {}, {"note": "x"}, {"calibration": CALIBRATION}),
+        lambda _: content,
+    )
     for number in range(1, 30):
         piece = np.random.default_rng(number).bytes(997 * number)
         file.append(piece[:100], piece[100:])
         with h5py.File(path) as opened:
-            assert opened[DATASET].shape == (len(content),)
+            assert opened[DATASET_NAME].shape == (len(content),)
         file.tell()
         file.tell()
         content += piece
         assert file.length == len(content)
         with h5py.File(path) as opened:
-            assert opened[DATASET][:].tobytes() == content
+            assert opened[DATASET_NAME][:].tobytes() == content
             assert opened["calibration/table"][3] == 3
     file.close()
     file.close()
     with h5py.File(path, "r+") as opened:  # and may go on with it
         opened.attrs["looked_at"] = 1
     with h5py.File(path) as opened:
-        assert opened[DATASET][:].tobytes() == content
+        assert opened[DATASET_NAME][:].tobytes() == content
 
 
 def test_the_checksum_is_the_published_one() -> None:
@@ -142,7 +161,9 @@ def test_killed_recorders_leave_what_they_flushed(tmp_path: Path) -> None:
     script = Path(__file__).with_name("killed_recorders.py")
     command = [sys.executable, str(script), str(tmp_path), "20", "5"]
     root = {**os.environ, "PYTHONPATH": str(script.parents[2])}
-    done = subprocess.run(command, env=root, capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run(
+        command, env=root, capture_output=True, text=True, timeout=120, check=True
+    )
     with_records = 0
     for line in done.stdout.splitlines():
         name, flushed = line.split()
@@ -155,18 +176,20 @@ def test_killed_recorders_leave_what_they_flushed(tmp_path: Path) -> None:
         assert not found.complete
         assert found.bytes >= int(flushed)
         require_true_records(path, int(name.removeprefix("run").removesuffix(".h5")))
-        assert repair(path, tmp_path / "whole.h5").bytes >= found.bytes  # with what was written but not yet told
+        assert (
+            repair(path, tmp_path / "whole.h5").bytes >= found.bytes
+        )  # with what was written but not yet told
         with_records += found.records > 0
     assert with_records >= 12  # most moments are after the first flush
 
 
 def require_true_records(path: Path, seed: int) -> None:
     """Compare a recording with the photons that there were: all come in order, none is made up."""
-    from devices.emulation.photons import FOREVER, Poisson
+    from devices.emulation.photons import MAX_TICK, PoissonStream
     from devices.emulation.timetag import CLOCK_HZ
 
     ticks = joined(replayed(path))["time_ticks"]
-    words = Poisson(5e5, CLOCK_HZ, seed).words(len(ticks) + 200, FOREVER)
+    words = PoissonStream(5e5, CLOCK_HZ, seed).next_words(len(ticks) + 200, MAX_TICK)
     known = CODEC.decode(as_bytes(words), CODEC.start).records["time_ticks"]
     assert np.all(np.isin(ticks, known))
     assert np.all(np.diff(ticks) > 0)
@@ -179,7 +202,7 @@ def test_a_full_disk_keeps_what_was_recorded(tmp_path: Path) -> None:
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, before[1]))
         with pytest.raises(StorageError, match="what was recorded so far is safe"):
-            record(devices.open("sim+timetag://?transfer_kib=8"), path)
+            record_source(devices.open("sim+timetag://?transfer_kib=8"), path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     found = verify(path)
@@ -190,7 +213,13 @@ def test_a_full_disk_keeps_what_was_recorded(tmp_path: Path) -> None:
 
 def test_recording_for_some_time(tmp_path: Path) -> None:
     seen: list[float] = []
-    done = record(devices.open(f"{SIM}&pace=realtime&rate=1e5"), tmp_path / "run.h5", 0.3, {"a": 1}, seen.append)
+    done = record_source(
+        devices.open(f"{SIM}&pace=realtime&rate=1e5"),
+        tmp_path / "run.h5",
+        0.3,
+        {"a": 1},
+        seen.append,
+    )
     found = verify(tmp_path / "run.h5")
     assert found.is_sound
     assert found.complete
@@ -219,14 +248,19 @@ def test_accounts_must_agree_with_the_records(tmp_path: Path, stats: Stats, soun
 
 def test_a_recording_can_be_recorded(tmp_path: Path) -> None:
     written(tmp_path / "run.h5")
-    record(devices.open(f"file://{tmp_path / 'run.h5'}"), tmp_path / "again.h5")
-    assert joined(replayed(tmp_path / "again.h5")).tobytes() == joined(replayed(tmp_path / "run.h5")).tobytes()
+    record_source(devices.open(f"file://{tmp_path / 'run.h5'}"), tmp_path / "again.h5")
+    assert (
+        joined(replayed(tmp_path / "again.h5")).tobytes()
+        == joined(replayed(tmp_path / "run.h5")).tobytes()
+    )
 
 
 def test_an_instrument_that_fails_leaves_a_whole_recording(tmp_path: Path) -> None:
     with pytest.raises(DeviceDisconnectedError):
-        record(
-            devices.open(f"{SIM}&reconnect_s=0.1&faults=unplug@9:99999".replace("reconnect_s=2&", "")),
+        record_source(
+            devices.open(
+                f"{SIM}&reconnect_s=0.1&faults=unplug@9:99999".replace("reconnect_s=2&", "")
+            ),
             tmp_path / "r.h5",
         )
     found = verify(tmp_path / "r.h5")
@@ -246,7 +280,7 @@ def test_a_source_without_bytes_cannot_be_recorded(tmp_path: Path) -> None:
             pass
 
     with pytest.raises(InputError, match="nothing to record"):
-        record(Wordless(), tmp_path / "run.h5")
+        record_source(Wordless(), tmp_path / "run.h5")
 
 
 def test_seeking(tmp_path: Path) -> None:
@@ -267,8 +301,8 @@ def test_seeking(tmp_path: Path) -> None:
 
 
 def test_pace_of_the_recording(tmp_path: Path) -> None:
-    writer = RecordingWriter(tmp_path / "run.h5", head_of(CODEC, Info("x"), None, {}))
-    one = np.array([(5, 1, 0)], RECORD)
+    writer = RecordingWriter(tmp_path / "run.h5", make_head(CODEC, Info("x"), None, {}))
+    one = np.array([(5, 1, 0)], RECORD_DTYPE)
     for _ in range(2):
         writer.add(Piece(CODEC.encode(one), 1))
         time.sleep(0.5)
@@ -285,7 +319,9 @@ def test_pace_of_the_recording(tmp_path: Path) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.data())
-def test_damage_is_found_and_the_rest_is_saved(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+def test_damage_is_found_and_the_rest_is_saved(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
     folder = tmp_path_factory.mktemp("damage")
     path, out = folder / "run.h5", folder / "out.h5"
     pieces = written(path)
@@ -339,7 +375,7 @@ def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
     with pytest.raises(StorageError, match="no such file"):
         repair(tmp_path / "absent.h5", tmp_path / "out.h5")
     with pytest.raises(StorageError, match="folder does not exist"):
-        RecordingWriter(tmp_path / "absent" / "run.h5", head_of(CODEC, Info("x"), None, {}))
+        RecordingWriter(tmp_path / "absent" / "run.h5", make_head(CODEC, Info("x"), None, {}))
 
 
 def test_records_of_other_kinds_and_unknown_codecs_are_refused(tmp_path: Path) -> None:
@@ -353,13 +389,13 @@ def test_records_of_other_kinds_and_unknown_codecs_are_refused(tmp_path: Path) -
 
 
 def test_headers_that_cannot_be_are_none() -> None:
-    good = BlockHeader.of(Kind.PIECE, b"abc", 5, 1, Gap.LOSS)
-    assert BlockHeader.unpacked(good.packed()) == good
-    assert good.fits(b"abc")
-    assert not good.fits(b"abd")
+    good = BlockHeader.of(BlockKind.PIECE, b"abc", 5, 1, Gap.LOSS)
+    assert BlockHeader.unpack(good.pack()) == good
+    assert good.matches(b"abc")
+    assert not good.matches(b"abd")
     for wrong in (
-        good.packed()[:-1],
-        b"x" + good.packed()[1:],
-        BlockHeader(Kind.PIECE, Gap.NONE, 0, 0, 1 << 40, 0).packed(),
+        good.pack()[:-1],
+        b"x" + good.pack()[1:],
+        BlockHeader(BlockKind.PIECE, Gap.NONE, 0, 0, 1 << 40, 0).pack(),
     ):
-        assert BlockHeader.unpacked(wrong) is None
+        assert BlockHeader.unpack(wrong) is None

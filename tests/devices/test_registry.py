@@ -29,7 +29,7 @@ class Nothing(Source):
 
 
 def open_nothing(uri: Uri) -> Nothing:
-    uri.only("seed")
+    uri.reject_unknown("seed")
     return Nothing()
 
 
@@ -41,14 +41,16 @@ def test_public_names_are_importable() -> None:
         _ = devices.absent
 
 
-@pytest.mark.parametrize("entry", [*registry.OPENERS.values(), *registry.FILES.values(), *registry.FINDERS])
+@pytest.mark.parametrize(
+    "entry", [*registry.OPENERS.values(), *registry.FILE_OPENERS.values(), *registry.FINDERS]
+)
 def test_every_function_in_the_tables_exists(entry: str) -> None:
-    assert callable(registry.named(entry))
+    assert callable(registry.import_entry(entry))
 
 
 @pytest.mark.parametrize("name", registry.CODECS)
 def test_every_codec_in_the_table_goes_by_its_name(name: str) -> None:
-    codec = registry.named(registry.CODECS[name])
+    codec = registry.import_entry(registry.CODECS[name])
     assert inspect.isclass(codec)
     assert vars(codec)["name"] == name
 
@@ -104,12 +106,16 @@ def test_a_place_that_is_no_computer_is_refused(place: str) -> None:
 
 def test_an_unknown_codec_is_refused() -> None:
     with pytest.raises(InputError, match="no codec is called 'absent'"):
-        registry.codec_named("absent", {})
+        registry.build_codec("absent", {})
 
 
 def test_accounts_balance_or_do_not() -> None:
     assert Stats(15, 1, 2, 3, 4, 5).is_balanced
     assert not Stats(16, 1, 2, 3, 4, 5).is_balanced
     assert Stats(1, 1).as_dict()["delivered"] == 1
-    assert Info("a tagger", "7", {"clock_hz": 5}).as_dict() == {"instrument": "a tagger", "serial": "7", "clock_hz": 5}
+    assert Info("a tagger", "7", {"clock_hz": 5}).as_dict() == {
+        "instrument": "a tagger",
+        "serial": "7",
+        "clock_hz": 5,
+    }
     assert len(Batch(records=[])) == 0  # type: ignore[arg-type]

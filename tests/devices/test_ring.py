@@ -7,23 +7,23 @@ import threading
 import pytest
 
 from devices.ledger import Ledger
-from devices.ring import Gap, Piece, Policy, Ring
+from devices.ring import Gap, OverflowPolicy, Piece, RingBuffer
 from devices.statistics import Stats
 from tofclip.errors import BufferOverflowError, DeviceDisconnectedError, DeviceTimeoutError
 
 SOON = 0.02
 
 
-def filled(policy: Policy, pieces: int) -> tuple[Ring, Ledger]:
+def filled(policy: OverflowPolicy, pieces: int) -> tuple[RingBuffer, Ledger]:
     """A ring with room for three pieces of two records."""
     ledger = Ledger()
-    ring = Ring(30, policy, ledger)
+    ring = RingBuffer(30, policy, ledger)
     for number in range(pieces):
         ring.put(Piece(bytes([number]) * 10, 2))
     return ring, ledger
 
 
-def numbers(ring: Ring) -> list[tuple[int, Gap]]:
+def numbers(ring: RingBuffer) -> list[tuple[int, Gap]]:
     ring.end()
     found = []
     while (piece := ring.get(SOON)) is not None:
@@ -46,14 +46,14 @@ def test_the_oldest_go_and_the_gap_is_marked() -> None:
 
 def test_a_dropped_restart_stays_a_restart() -> None:
     ledger = Ledger()
-    ring = Ring(10, "drop_oldest", ledger)
+    ring = RingBuffer(10, "drop_oldest", ledger)
     ring.put(Piece(b"a" * 10, 1, Gap.RESTART))
     ring.put(Piece(b"b" * 10, 1))
     assert numbers(ring) == [(ord("b"), Gap.RESTART)]
 
 
 def test_one_piece_always_fits() -> None:
-    ring = Ring(1, "fail", Ledger())
+    ring = RingBuffer(1, "fail", Ledger())
     ring.put(Piece(b"larger than that", 1))
     assert numbers(ring) == [(ord("l"), Gap.NONE)]
 

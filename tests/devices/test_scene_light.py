@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 
 from devices.codec import Records, as_bytes
-from devices.emulation.photons import FOREVER
-from devices.emulation.scene_light import BLOCK_TICKS, ENLARGEMENT, PERIOD_TICKS, SYNC, PulsedScene
+from devices.emulation.photons import MAX_TICK
+from devices.emulation.scene_light import (
+    BLOCK_TICKS,
+    PERIOD_TICKS,
+    SCENE_SCALE,
+    SYNC_MASK,
+    PulsedSceneStream,
+)
 from devices.emulation.timetag import CLOCK_HZ
-from devices.scenes import LineLight, line_light
-from devices.timetag.codec import RANGE, WRAP, TimeTagCodec
+from devices.scenes import LineLight, simulate_line_light
+from devices.timetag.codec import COUNTER_RANGE, WRAP, TimeTagCodec
 from devices.transients import read_transient
 from tofclip.errors import InputError
 
@@ -23,18 +29,18 @@ STEPS = 50
 
 @pytest.fixture(scope="module")
 def light() -> LineLight:
-    return line_light()
+    return simulate_line_light()
 
 
-def seen(scene: PulsedScene, limit: int, last: int = FOREVER) -> Records:
-    found = TimeTagCodec().decode(as_bytes(scene.words(limit, last)), TimeTagCodec.start)
+def seen(scene: PulsedSceneStream, limit: int, last: int = MAX_TICK) -> Records:
+    found = TimeTagCodec().decode(as_bytes(scene.next_words(limit, last)), TimeTagCodec.start)
     assert found.malformed == 0
     return found.records
 
 
 def test_delays_are_those_of_the_scene(light: LineLight) -> None:
-    records = seen(PulsedScene(light, RATE, CLOCK_HZ, 4), 400_000)
-    is_pulse = records["channels"] & SYNC != 0
+    records = seen(PulsedSceneStream(light, RATE, CLOCK_HZ, 4), 400_000)
+    is_pulse = records["channels"] & SYNC_MASK != 0
     assert np.all(records["time_ticks"][is_pulse] % PERIOD_TICKS == 0)
     assert np.all(np.diff(records["time_ticks"][is_pulse]) == PERIOD_TICKS)
     pulses = np.count_nonzero(is_pulse)
@@ -42,7 +48,7 @@ def test_delays_are_those_of_the_scene(light: LineLight) -> None:
     expected = expected * (RATE * PERIOD_TICKS / CLOCK_HZ * pulses / expected.sum())
     width = light.row_times[1] - light.row_times[0]
     instants = light.row_times[:, np.newaxis] + width * (np.arange(0.5, STEPS) / STEPS - 0.5)
-    ticks = np.floor(instants * ENLARGEMENT * CLOCK_HZ).astype(int).ravel() % PERIOD_TICKS
+    ticks = np.floor(instants * SCENE_SCALE * CLOCK_HZ).astype(int).ravel() % PERIOD_TICKS
     for pixel, channel in enumerate((2, 4, 8)):
         delays = records["time_ticks"][records["channels"] & channel != 0] % PERIOD_TICKS
         counts = np.bincount(delays, minlength=PERIOD_TICKS)
@@ -54,31 +60,35 @@ def test_delays_are_those_of_the_scene(light: LineLight) -> None:
 
 
 def test_cuts_do_not_change_the_stream(light: LineLight) -> None:
-    whole = seen(PulsedScene(light, RATE, CLOCK_HZ, 5), 40_000)
-    scene = PulsedScene(light, RATE, CLOCK_HZ, 5)
-    halves = scene.words(10_000, FOREVER), scene.words(40_000, BLOCK_TICKS), scene.words(5, BLOCK_TICKS)
-    rest = scene.words(40_000 - sum(len(half) for half in halves) // 6, FOREVER)
+    whole = seen(PulsedSceneStream(light, RATE, CLOCK_HZ, 5), 40_000)
+    scene = PulsedSceneStream(light, RATE, CLOCK_HZ, 5)
+    halves = (
+        scene.next_words(10_000, MAX_TICK),
+        scene.next_words(40_000, BLOCK_TICKS),
+        scene.next_words(5, BLOCK_TICKS),
+    )
+    rest = scene.next_words(40_000 - sum(len(half) for half in halves) // 6, MAX_TICK)
     joined = np.concatenate([*halves, rest])
     assert len(halves[2]) == 0
     np.testing.assert_array_equal(TimeTagCodec().decode(joined, TimeTagCodec.start).records, whole)
-    assert len(scene.words(0, FOREVER)) == 0
+    assert len(scene.next_words(0, MAX_TICK)) == 0
 
 
 def test_the_counter_wraps_where_a_block_begins(light: LineLight) -> None:
-    scene = PulsedScene(light, RATE, CLOCK_HZ, 6)
-    scene._block = RANGE // BLOCK_TICKS - 1
-    before = RANGE - BLOCK_TICKS
+    scene = PulsedSceneStream(light, RATE, CLOCK_HZ, 6)
+    scene._block = COUNTER_RANGE // BLOCK_TICKS - 1
+    before = COUNTER_RANGE - BLOCK_TICKS
     records = seen(scene, 40_000)
     assert records["time_ticks"][0] == before
     marks = records[records["flags"] == WRAP]
-    assert marks["time_ticks"].tolist() == [RANGE]
+    assert marks["time_ticks"].tolist() == [COUNTER_RANGE]
 
 
 def test_light_that_does_not_fit_is_refused(light: LineLight) -> None:
     with pytest.raises(InputError, match="rate"):
-        PulsedScene(light, 0, CLOCK_HZ, 1)
+        PulsedSceneStream(light, 0, CLOCK_HZ, 1)
     with pytest.raises(InputError, match="within the laser's period of 1e-06 s"):
-        PulsedScene(replace(light, row_times=light.row_times + 1e-8), RATE, CLOCK_HZ, 1)
+        PulsedSceneStream(replace(light, row_times=light.row_times + 1e-8), RATE, CLOCK_HZ, 1)
 
 
 def test_it_becomes_a_streak_image_of_three_columns(light: LineLight) -> None:
@@ -86,7 +96,7 @@ def test_it_becomes_a_streak_image_of_three_columns(light: LineLight) -> None:
     streak = read_transient(address, 1 / CLOCK_HZ)
     assert streak.counts.shape == (PERIOD_TICKS, 3)
     columns = light.photons[:, 256 * np.array([1, 3, 5]) // 6]
-    mean = ENLARGEMENT * (light.row_times[:, np.newaxis] * columns).sum(0) / columns.sum(0)
+    mean = SCENE_SCALE * (light.row_times[:, np.newaxis] * columns).sum(0) / columns.sum(0)
     measured = (streak.times[:, np.newaxis] * streak.counts).sum(0) / streak.counts.sum(0)
     # Within a tick: a record says only in which one a photon came.
     np.testing.assert_allclose(measured, mean, atol=1 / CLOCK_HZ)

@@ -15,7 +15,7 @@ from devices.emulation.faults import Fault
 from devices.loopback import HOST, Connection, LoopbackServer
 from devices.source import Source
 from devices.spad512.emulator import EmulatedSpadArray
-from devices.spad512.protocol import DEPTHS, END, ROWS, WIDTHS, Exposure
+from devices.spad512.protocol import BIT_DEPTHS, IMAGE_WIDTHS_PX, ROWS, TERMINATOR, ExposureRequest
 from tofclip.errors import (
     DeviceDisconnectedError,
     DeviceError,
@@ -28,52 +28,67 @@ from tofclip.errors import (
 LIGHT = np.random.default_rng(2).uniform(0, 2e5, (ROWS, ROWS))
 
 exposures = st.builds(
-    Exposure,
-    st.sampled_from(DEPTHS[1:]),
+    ExposureRequest,
+    st.sampled_from(BIT_DEPTHS[1:]),
     st.integers(1, 10**9).map(lambda nanoseconds: nanoseconds * 1e-9),
     st.integers(1, 1000),
-    st.sampled_from(WIDTHS),
+    st.sampled_from(IMAGE_WIDTHS_PX),
 )
 
 
 @given(exposures)
-def test_requests_come_back(exposure: Exposure) -> None:
-    found = Exposure.decode(exposure.encode().removesuffix(END))
+def test_requests_come_back(exposure: ExposureRequest) -> None:
+    found = ExposureRequest.decode(exposure.encode().removesuffix(TERMINATOR))
     assert found.seconds == pytest.approx(exposure.seconds, rel=1e-8)  # nine digits travel
-    assert (found.bits, found.images, found.width) == (exposure.bits, exposure.images, exposure.width)
+    assert (found.bits, found.images, found.width) == (
+        exposure.bits,
+        exposure.images,
+        exposure.width,
+    )
 
 
 def test_requests_as_the_makers_examples_write_them() -> None:
-    assert Exposure(8, 2e-3, 3, 128).encode() == b"I,8,2,3,0,1,0,1,128\n"  # milliseconds
-    assert Exposure(1, 2e-3, 3).encode() == b"I,1,2000,3,0,1,0,1,512\n"  # microseconds
-    assert Exposure(pile_up=True).encode_pile_up() == b"PU,1\n"
+    assert ExposureRequest(8, 2e-3, 3, 128).encode() == b"I,8,2,3,0,1,0,1,128\n"  # milliseconds
+    assert ExposureRequest(1, 2e-3, 3).encode() == b"I,1,2000,3,0,1,0,1,512\n"  # microseconds
+    assert ExposureRequest(pile_up=True).encode_pile_up() == b"PU,1\n"
 
 
-@pytest.mark.parametrize("line", [b"", b"I,8", b"I,x,1,1,0,1,0,1,8", b"I,8,1,1,0,1,0,1,9", b"I,8,nan,1,0,1,0,1,8"])
+@pytest.mark.parametrize(
+    "line", [b"", b"I,8", b"I,x,1,1,0,1,0,1,8", b"I,8,1,1,0,1,0,1,9", b"I,8,nan,1,0,1,0,1,8"]
+)
 def test_lines_that_request_nothing(line: bytes) -> None:
     with pytest.raises(ProtocolError):
-        Exposure.decode(line)
+        ExposureRequest.decode(line)
 
 
 @pytest.mark.parametrize(
     ("exposure", "bits", "frame_bytes"),
     [
-        (Exposure(1), 1, 32768),
-        (Exposure(8, width=4), 8, 2048),
-        (Exposure(9, width=4), 16, 4096),
-        (Exposure(8, width=4, pile_up=True), 16, 4096),
+        (ExposureRequest(1), 1, 32768),
+        (ExposureRequest(8, width=4), 8, 2048),
+        (ExposureRequest(9, width=4), 16, 4096),
+        (ExposureRequest(8, width=4, pile_up=True), 16, 4096),
     ],
 )
-def test_lengths_are_computed(exposure: Exposure, bits: int, frame_bytes: int) -> None:
+def test_lengths_are_computed(exposure: ExposureRequest, bits: int, frame_bytes: int) -> None:
     assert (exposure.codec.bits, exposure.codec.pixel_bytes) == (bits, frame_bytes)
 
 
 @pytest.mark.parametrize(
-    "values", [(5,), (8, 0.0), (8, 1e9), (8, 1e-3, 0), (8, 1e-3, 1, 5), (1, 1e-3, 1, 256), (1, 1e-3, 1, 512, True)]
+    "values",
+    [
+        (5,),
+        (8, 0.0),
+        (8, 1e9),
+        (8, 1e-3, 0),
+        (8, 1e-3, 1, 5),
+        (1, 1e-3, 1, 256),
+        (1, 1e-3, 1, 512, True),
+    ],
 )
 def test_impossible_exposures_are_refused(values: tuple[Any, ...]) -> None:
     with pytest.raises(InputError):
-        Exposure(*values)
+        ExposureRequest(*values)
 
 
 Array = Callable[..., EmulatedSpadArray]
@@ -130,16 +145,21 @@ def test_pictures_come_bit_for_bit(array: Array, values: dict[str, int]) -> None
         info = source.info.as_dict()
         finished(source)
     images = values.get("images", 1)
-    exposure = Exposure(
-        values["bits"], values.get("exposure_us", 1000) * 1e-6, images, values.get("width", 64), "pile_up" in values
+    exposure = ExposureRequest(
+        values["bits"],
+        values.get("exposure_us", 1000) * 1e-6,
+        images,
+        values.get("width", 64),
+        "pile_up" in values,
     )
     for place, frame in enumerate(frames):
-        sent = server.picture(place // images, place % images, exposure).tobytes()
-        assert exposure.codec.encode(frame.reshape(1)) == exposure.codec.numbered(place, sent)
+        sent = server.draw_frame(place // images, place % images, exposure).tobytes()
+        assert exposure.codec.encode(frame.reshape(1)) == exposure.codec.pack_frame(place, sent)
     assert info["greeting"] == "SPAD512S emulated server, ready"
     assert (info["rows"], info["columns"]) == (512, values.get("width", 64))
     if values["bits"] > 1:
-        # LIGHT has up to 200 photons in the millisecond: the picture is Poisson about it, and not turned.
+        # LIGHT has up to 200 photons in the millisecond: the picture is Poisson about it, and not
+        # turned.
         expected = LIGHT[:, : exposure.width] * 1e-3
         counts = np.mean([frame["counts"] for frame in frames], axis=0)
         assert np.corrcoef(counts.ravel(), expected.ravel())[0, 1] > 0.95
@@ -151,9 +171,9 @@ def test_pixels_that_spell_the_end_are_pixels() -> None:
 
     def serve(connection: Connection) -> None:
         connection.send(b"hello")
-        connection.request(END)
+        connection.read_request(TERMINATOR)
         connection.send(b"off")
-        while connection.request(END) is not None:
+        while connection.read_request(TERMINATOR) is not None:
             for start in range(0, pixels.size, 512):
                 connection.send(pixels[start : start + 512].tobytes())
             connection.send(b"DONE")
@@ -179,17 +199,23 @@ def test_after_an_unplugged_cable_the_pictures_go_on(array: Array) -> None:
             assert batch is not None
             gaps += [batch.after_gap]
         finished(source)
-    assert (source.stats.reconnects, source.stats.malformed, gaps.count(True)) == (1, 1, 1)
+    assert (source.stats.reconnects, source.stats.malformed, gaps.count_records(True)) == (1, 1, 1)
 
 
 def test_what_the_server_complains_of_is_passed_on(array: Array) -> None:
-    with opened(array(Fault(1, "stall"))) as source, pytest.raises(DeviceError, match=r"The FIFO is full\. ERROR"):
+    with (
+        opened(array(Fault(1, "stall"))) as source,
+        pytest.raises(DeviceError, match=r"The FIFO is full\. ERROR"),
+    ):
         taken(source, 5)
     assert source.stats.is_balanced
 
 
 def test_an_answer_of_another_length_is_noticed(array: Array) -> None:
-    with opened(array(Fault(1, "corrupt"))) as source, pytest.raises(ProtocolError, match="ended in b'GONE'"):
+    with (
+        opened(array(Fault(1, "corrupt"))) as source,
+        pytest.raises(ProtocolError, match="ended in b'GONE'"),
+    ):
         taken(source, 5)
     assert source.stats.is_balanced
 

@@ -1,6 +1,8 @@
-"""Streak cameras and SPAD arrays under random faults: accounts balance, nothing hangs, the exception is the right one.
+"""Streak cameras and SPAD arrays under random faults: accounts balance, nothing hangs, the
+exception is the right one.
 
-In the suite it is a sample; ``python tests/devices/test_tcp_fault_scripts.py 1000`` runs as many as it is told.
+In the suite it is a sample; ``python tests/devices/test_tcp_fault_scripts.py 1000`` runs as many as
+it is told.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import numpy as np
 import pytest
 
 import devices
-from devices.emulation.faults import Fault, Kind
+from devices.emulation.faults import Fault, FaultKind
 from devices.loopback import HOST
 from devices.remoteex.emulator import EmulatedLight, EmulatedStreakCamera
 from devices.source import Source
@@ -28,7 +30,7 @@ FRAMES = 25
 LONGEST = 60.0
 """Seconds; an undisturbed script takes less than one, each fault adds a few tenths."""
 
-STREAK_KINDS: dict[Kind, float] = {
+STREAK_KINDS: dict[FaultKind, float] = {
     "timeout": 0.3,
     "short": 0.2,
     "unplug": 0.2,
@@ -36,7 +38,13 @@ STREAK_KINDS: dict[Kind, float] = {
     "corrupt": 0.05,
     "overflow": 0.05,
 }
-ARRAY_KINDS: dict[Kind, float] = {"timeout": 0.3, "short": 0.25, "unplug": 0.25, "corrupt": 0.1, "stall": 0.1}
+ARRAY_KINDS: dict[FaultKind, float] = {
+    "timeout": 0.3,
+    "short": 0.25,
+    "unplug": 0.25,
+    "corrupt": 0.1,
+    "stall": 0.1,
+}
 FATAL = {"corrupt", "overflow", "stall"}
 """After these a stream cannot be trusted any more: reading ends with an exception."""
 
@@ -56,15 +64,21 @@ class Outcome:
 
     @property
     def is_right(self) -> bool:
-        """Whether nothing is unaccounted for, the tube is safe, and only a fatal fault has ended the stream."""
+        """Whether nothing is unaccounted for, the tube is safe, and only a fatal fault has ended
+        the stream.
+        """
         survived = self.exception is None
-        allowed = any(fault.kind in FATAL for fault in self.faults) and isinstance(self.exception, DeviceError)
+        allowed = any(fault.kind in FATAL for fault in self.faults) and isinstance(
+            self.exception, DeviceError
+        )
         balanced = self.stats.is_balanced and self.stats.unread == 0
         return balanced and self.gain == "0" and (survived or allowed) and self.seconds < LONGEST
 
 
-def script(seed: int, kinds: dict[Kind, float]) -> tuple[Fault, ...]:
-    """Draw up to five faults among the first requests; the very first one, with which a source opens, goes well."""
+def script(seed: int, kinds: dict[FaultKind, float]) -> tuple[Fault, ...]:
+    """Draw up to five faults among the first requests; the very first one, with which a source
+    opens, goes well.
+    """
     random = np.random.default_rng(seed)
     places = 1 + random.choice(15, random.integers(0, 6), replace=False)
     drawn = random.choice(len(kinds), len(places), p=list(kinds.values()))
@@ -80,13 +94,17 @@ def run(seed: int) -> Outcome:
         faults = script(seed, STREAK_KINDS)
         camera = EmulatedStreakCamera(SCREEN, 200, faults=faults)
         port, data_port = camera.ports
-        address = f"remoteex://{HOST}:{port}?data_port={data_port}&timeout_s=0.5&buffers=8&mcp_gain=9"
+        address = (
+            f"remoteex://{HOST}:{port}?data_port={data_port}&timeout_s=0.5&buffers=8&mcp_gain=9"
+        )
         outcome = _read(devices.open(address))
         camera.close()
         return Outcome(faults, *outcome[:2], camera.gain, outcome[2])
     faults = script(seed, ARRAY_KINDS)
     array = EmulatedSpadArray(ARRAY_LIGHT, seed, faults=faults)
-    outcome = _read(devices.open(f"spad512://{HOST}:{array.port}?width=4&timeout_s=1&images={1 + seed % 3}"))
+    outcome = _read(
+        devices.open(f"spad512://{HOST}:{array.port}?width=4&timeout_s=1&images={1 + seed % 3}")
+    )
     array.close()
     return Outcome(faults, *outcome[:2], "0", outcome[2])
 
@@ -122,8 +140,13 @@ def test_every_script_ends_as_it_should(outcomes: list[Outcome]) -> None:
 
 def test_the_scripts_are_worth_running(outcomes: list[Outcome]) -> None:
     """All kinds of faults came up, some streams went on after a cable was pulled, some ended."""
-    assert {fault.kind for outcome in outcomes for fault in outcome.faults} >= {*STREAK_KINDS, *ARRAY_KINDS}
-    assert sum(outcome.stats.reconnects > 0 and outcome.exception is None for outcome in outcomes) > 3
+    assert {fault.kind for outcome in outcomes for fault in outcome.faults} >= {
+        *STREAK_KINDS,
+        *ARRAY_KINDS,
+    }
+    assert (
+        sum(outcome.stats.reconnects > 0 and outcome.exception is None for outcome in outcomes) > 3
+    )
     assert sum(outcome.exception is not None for outcome in outcomes) > 3
     assert sum(outcome.stats.lost_device > 0 for outcome in outcomes) > 3
 
@@ -131,4 +154,7 @@ def test_the_scripts_are_worth_running(outcomes: list[Outcome]) -> None:
 if __name__ == "__main__":
     found = run_all(int(sys.argv[1]) if len(sys.argv) > 1 else 1000)
     wrong = [outcome for outcome in found if not outcome.is_right]
-    print(f"{len(found)} scripts, {len(wrong)} wrong, the slowest took {max(o.seconds for o in found):.1f} s", *wrong)
+    print(
+        f"{len(found)} scripts, {len(wrong)} wrong, the slowest took {max(o.seconds for o in found):.1f} s",
+        *wrong,
+    )

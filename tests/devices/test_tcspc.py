@@ -12,9 +12,15 @@ import pytest
 
 import devices
 from devices import tcspc
-from devices.tcspc import PHOTON
+from devices.tcspc import PHOTON_DTYPE
 from devices.transients import read_transient
-from tofclip.errors import FileFormatError, InputError, MissingDependencyError, StorageError, TofclipError
+from tofclip.errors import (
+    FileFormatError,
+    InputError,
+    MissingDependencyError,
+    StorageError,
+    TofclipError,
+)
 
 ptufile = pytest.importorskip("ptufile")
 sdtfile = pytest.importorskip("sdtfile")
@@ -96,7 +102,10 @@ def sdt(tmp_path: Path, decays: Any) -> Path:
     blocks = b""
     for curve in decays:
         one = np.zeros(1, block)
-        one["data_offs"], one["next_block_offs"] = at + block.itemsize, at + block.itemsize + bins * 2
+        one["data_offs"], one["next_block_offs"] = (
+            at + block.itemsize,
+            at + block.itemsize + bins * 2,
+        )
         one["block_length"] = bins * 2
         blocks += one.tobytes() + curve.astype("<u2").tobytes()
         at += block.itemsize + bins * 2
@@ -120,7 +129,7 @@ def test_photons_of_a_ptu(ptu: Path, decays: Any) -> None:
             source.seek(len(records) + 1)
     assert source.stats.is_balanced
     assert source.read() is None
-    assert records.dtype == PHOTON
+    assert records.dtype == PHOTON_DTYPE
     for channel, decay in enumerate(decays):
         counts = np.bincount(records["bin"][records["channel"] == channel], minlength=200)
         np.testing.assert_array_equal(counts, decay)
@@ -131,13 +140,16 @@ def test_photons_of_a_ptu(ptu: Path, decays: Any) -> None:
 
 def test_a_ptu_becomes_a_streak_image(ptu: Path, decays: Any) -> None:
     streak = read_transient(f"file://{ptu}?bins=200&start_ps=16", bin_width=RESOLUTION)
-    # Bins of the file's own width, the first one in the middle of its first: every photon stays in its bin.
+    # Bins of the file's own width, the first one in the middle of its first: every photon stays in
+    # its bin.
     np.testing.assert_allclose(streak.counts, decays.T, atol=1e-3)
     np.testing.assert_allclose(streak.times[:2], [16e-12, 48e-12], rtol=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["phu", "sdt"])
-def test_histograms_become_a_streak_image(request: pytest.FixtureRequest, kind: str, decays: Any) -> None:
+def test_histograms_become_a_streak_image(
+    request: pytest.FixtureRequest, kind: str, decays: Any
+) -> None:
     path = request.getfixturevalue(kind)
     streak = read_transient(f"file://{path}")
     np.testing.assert_array_equal(streak.counts, decays.T)
@@ -173,7 +185,7 @@ def test_what_cannot_be_read(tmp_path: Path, ptu: Path, monkeypatch: pytest.Monk
         devices.open(f"file://{tmp_path}/other.phu")
     with pytest.raises(InputError, match="'x' is unknown"):
         devices.open(f"file://{ptu}?x=1")
-    monkeypatch.setattr(tcspc, "MOST_BYTES", 100)
+    monkeypatch.setattr(tcspc, "MAX_FILE_BYTES", 100)
     with pytest.raises(FileFormatError, match="larger than 100 bytes"):
         devices.open(f"file://{ptu}")
     monkeypatch.undo()
@@ -192,4 +204,4 @@ def test_what_cannot_be_read(tmp_path: Path, ptu: Path, monkeypatch: pytest.Monk
 )
 def test_histograms_that_cannot_be(curves: list[Any], resolution: float, problem: str) -> None:
     with pytest.raises(FileFormatError, match=problem):
-        tcspc._histograms(curves, resolution, "", Path("run.sdt"))
+        tcspc._make_histogram_records(curves, resolution, "", Path("run.sdt"))

@@ -8,7 +8,15 @@ import pytest
 from hypothesis import given, settings
 
 from devices.codec import Records, as_bytes
-from devices.timetag.codec import DELTA, LOST, RANGE, RECORD, WRAP, TimeTagCodec, mark_wraps
+from devices.timetag.codec import (
+    COUNTER_RANGE,
+    DELTA,
+    LOST,
+    RECORD_DTYPE,
+    WRAP,
+    TimeTagCodec,
+    mark_wraps,
+)
 from tofclip.errors import InputError
 
 CODEC = TimeTagCodec()
@@ -16,17 +24,21 @@ unhurried = settings(deadline=None)  # the first call compiles
 
 
 def record(ticks: int, channels: int, flags: int = 0) -> Records:
-    return np.array([(ticks, channels, flags)], RECORD)
+    return np.array([(ticks, channels, flags)], RECORD_DTYPE)
 
 
 def records_of(rows: list[tuple[int, int, int]]) -> Records:
-    return np.array(rows, RECORD)
+    return np.array(rows, RECORD_DTYPE)
 
 
 @st.composite
 def streams(draw: st.DrawFn) -> Records:
     """Valid streams: steps from zero to several wraps, strobes and deltas, losses."""
-    steps = st.one_of(st.integers(0, 1000), st.integers(0, 3 * RANGE), st.sampled_from([RANGE, RANGE - 1, 1]))
+    steps = st.one_of(
+        st.integers(0, 1000),
+        st.integers(0, 3 * COUNTER_RANGE),
+        st.sampled_from([COUNTER_RANGE, COUNTER_RANGE - 1, 1]),
+    )
     kinds = st.one_of(
         st.tuples(st.integers(1, 15), st.sampled_from([0, LOST])),
         st.tuples(st.integers(0, 15), st.sampled_from([DELTA, DELTA | LOST])),
@@ -60,7 +72,7 @@ def test_decoding_undoes_encoding(records: Records) -> None:
 def test_a_stream_may_be_cut_anywhere(records: Records, data: st.DataObject) -> None:
     stream = as_bytes(CODEC.encode(records))
     cut = data.draw(st.integers(0, len(stream)))
-    front = CODEC.whole(stream[:cut])
+    front = CODEC.count_complete_bytes(stream[:cut])
     first = CODEC.decode(stream[:front], CODEC.start)
     second = CODEC.decode(stream[front:], first.state)
     np.testing.assert_array_equal(np.concatenate([first.records, second.records]), records)
@@ -69,10 +81,10 @@ def test_a_stream_may_be_cut_anywhere(records: Records, data: st.DataObject) -> 
 @unhurried
 @given(st.binary(max_size=600), st.booleans())
 def test_any_bytes_decode_to_valid_records(raw: bytes, after_loss: bool) -> None:
-    words = as_bytes(raw)[: CODEC.whole(as_bytes(raw))]
+    words = as_bytes(raw)[: CODEC.count_complete_bytes(as_bytes(raw))]
     found = CODEC.decode(words, CODEC.start, after_loss)
-    assert len(found.records) + found.malformed == CODEC.count(words)
-    epochs = found.records["time_ticks"] // RANGE
+    assert len(found.records) + found.malformed == CODEC.count_records(words)
+    epochs = found.records["time_ticks"] // COUNTER_RANGE
     marks = np.flatnonzero(found.records["flags"] & WRAP)
     assert np.all(np.diff(epochs) >= 0)
     assert np.all(np.diff(epochs, prepend=0)[marks] == 1)
@@ -80,39 +92,59 @@ def test_any_bytes_decode_to_valid_records(raw: bytes, after_loss: bool) -> None
 
 
 def test_the_counter_is_unwrapped_at_every_mark() -> None:
-    records = mark_wraps(records_of([(RANGE - 1, 1, 0), (RANGE + 5, 2, 0), (4 * RANGE, 4, 0)]))
+    records = mark_wraps(
+        records_of(
+            [(COUNTER_RANGE - 1, 1, 0), (COUNTER_RANGE + 5, 2, 0), (4 * COUNTER_RANGE, 4, 0)]
+        )
+    )
     assert records.tolist() == [
-        (RANGE - 1, 1, 0),
-        (RANGE, 0, WRAP),
-        (RANGE + 5, 2, 0),
-        (2 * RANGE, 0, WRAP),
-        (3 * RANGE, 0, WRAP),
-        (4 * RANGE, 4, WRAP),
+        (COUNTER_RANGE - 1, 1, 0),
+        (COUNTER_RANGE, 0, WRAP),
+        (COUNTER_RANGE + 5, 2, 0),
+        (2 * COUNTER_RANGE, 0, WRAP),
+        (3 * COUNTER_RANGE, 0, WRAP),
+        (4 * COUNTER_RANGE, 4, WRAP),
     ]
-    assert CODEC.decode(as_bytes(CODEC.encode(records)), CODEC.start).records.tolist() == records.tolist()
+    assert (
+        CODEC.decode(as_bytes(CODEC.encode(records)), CODEC.start).records.tolist()
+        == records.tolist()
+    )
     assert len(mark_wraps(records_of([]))) == 0
 
 
 def test_a_wrap_lost_with_others_is_noticed_by_the_counter_going_back() -> None:
-    before, after = record(RANGE - 10, 1), record(7, 1, LOST)
+    before, after = record(COUNTER_RANGE - 10, 1), record(7, 1, LOST)
     stream = as_bytes(CODEC.encode(before) + CODEC.encode(after))
-    assert CODEC.decode(stream, CODEC.start).records["time_ticks"].tolist() == [RANGE - 10, RANGE + 7]
+    assert CODEC.decode(stream, CODEC.start).records["time_ticks"].tolist() == [
+        COUNTER_RANGE - 10,
+        COUNTER_RANGE + 7,
+    ]
 
 
 def test_a_loss_on_the_way_is_noticed_alike() -> None:
-    before = CODEC.decode(as_bytes(CODEC.encode(record(RANGE - 10, 1))), CODEC.start)
+    before = CODEC.decode(as_bytes(CODEC.encode(record(COUNTER_RANGE - 10, 1))), CODEC.start)
     after = as_bytes(CODEC.encode(record(7, 1)))
-    assert CODEC.decode(after, before.state, after_loss=True).records["time_ticks"].tolist() == [RANGE + 7]
+    assert CODEC.decode(after, before.state, after_loss=True).records["time_ticks"].tolist() == [
+        COUNTER_RANGE + 7
+    ]
     assert CODEC.decode(after, before.state).malformed == 1
 
 
 def test_one_wrong_word_costs_at_most_itself_and_the_next() -> None:
     rows = [(1000 * n, 1, 0) for n in range(1, 9)]
     stream = bytearray(CODEC.encode(records_of(rows)))
-    stream[3 * 6 : 4 * 6] = CODEC.encode(record(RANGE - 3, 1))
+    stream[3 * 6 : 4 * 6] = CODEC.encode(record(COUNTER_RANGE - 3, 1))
     found = CODEC.decode(as_bytes(stream), CODEC.start)
     assert found.malformed == 1
-    assert found.records["time_ticks"].tolist() == [1000, 2000, 3000, RANGE - 3, 6000, 7000, 8000]
+    assert found.records["time_ticks"].tolist() == [
+        1000,
+        2000,
+        3000,
+        COUNTER_RANGE - 3,
+        6000,
+        7000,
+        8000,
+    ]
 
 
 @pytest.mark.parametrize("word", ["00 00 00 00 00 05", "1f 10 00 00 00 05", "01 10 00 00 00 05"])
@@ -129,12 +161,14 @@ def test_impossible_words_are_malformed(word: str) -> None:
         ([(5, 0, 0)], "needs a channel"),
         ([(5, 1, 0), (4, 1, 0)], "not go back"),
         ([(-5, 1, 0)], "not go back"),
-        ([(RANGE + 5, 1, 0)], "mark_wraps"),
-        ([(2 * RANGE + 5, 1, LOST)], "mark_wraps"),
+        ([(COUNTER_RANGE + 5, 1, 0)], "mark_wraps"),
+        ([(2 * COUNTER_RANGE + 5, 1, LOST)], "mark_wraps"),
         ([(5, 1, WRAP)], "mark_wraps"),
     ],
 )
-def test_records_that_no_instrument_sends_are_refused(rows: list[tuple[int, int, int]], said: str) -> None:
+def test_records_that_no_instrument_sends_are_refused(
+    rows: list[tuple[int, int, int]], said: str
+) -> None:
     with pytest.raises(InputError, match=said):
         CODEC.encode(records_of(rows))
 

@@ -1,4 +1,6 @@
-"""The time tagger's driver on the emulated instrument: what the address can set, policies, pace, odd answers."""
+"""The time tagger's driver on the emulated instrument: what the address can set, policies, pace,
+odd answers.
+"""
 
 from __future__ import annotations
 
@@ -12,25 +14,40 @@ import pytest
 import devices
 from devices.codec import as_bytes
 from devices.emulation.faults import Fault
-from devices.emulation.photons import FOREVER, Poisson
-from devices.emulation.timetag import CLOCK_HZ, EmulatedTimeTagger, Setting
-from devices.emulation.usb import VirtualUsb, usb_error
+from devices.emulation.photons import MAX_TICK, PoissonStream
+from devices.emulation.timetag import CLOCK_HZ, EmulatedTimeTagger, EmulatorSettings
+from devices.emulation.usb import VirtualUsb, make_usb_error
 from devices.ledger import Ledger
 from devices.source import Source
-from devices.timetag.codec import RANGE, WRAP, TimeTagCodec
-from devices.timetag.feed import Acquisition, TimeTaggerFeed
-from devices.timetag.registers import COMMANDS, IDENTITY, REPLIES, Capture, Register, TimeTagger
-from devices.timetag.source import opened
+from devices.timetag.codec import COUNTER_RANGE, WRAP, TimeTagCodec
+from devices.timetag.feed import AcquisitionSettings, TimeTaggerFeed
+from devices.timetag.registers import (
+    COMMAND_ENDPOINT,
+    REPLY_ENDPOINT,
+    USB_IDENTITY,
+    Capture,
+    Register,
+    TimeTagger,
+)
+from devices.timetag.source import open_on_backend
 from devices.uri import Uri
 from devices.usb import UsbLink
-from tofclip.errors import BufferOverflowError, DeviceStalledError, DeviceTimeoutError, InputError, ProtocolError
+from tofclip.errors import (
+    BufferOverflowError,
+    DeviceStalledError,
+    DeviceTimeoutError,
+    InputError,
+    ProtocolError,
+)
 
 RATE = 12_800_000.0
 SMALL = "sim+timetag://?seed=3&transfer_kib=8"
 
 
 def tagger(**options: object) -> tuple[EmulatedTimeTagger, VirtualUsb]:
-    instrument = EmulatedTimeTagger(lambda _: Poisson(RATE, CLOCK_HZ, 1), "T1", Setting(**options))  # type: ignore[arg-type]
+    instrument = EmulatedTimeTagger(
+        lambda _: PoissonStream(RATE, CLOCK_HZ, 1), "T1", EmulatorSettings(**options)
+    )  # type: ignore[arg-type]
     return instrument, VirtualUsb(instrument)
 
 
@@ -65,7 +82,9 @@ def test_what_it_says_of_itself() -> None:
 def test_packets_of_either_size_carry_the_same_records(packet: int) -> None:
     with devices.open(f"{SMALL}&records=5000&packet_bytes={packet}") as source:
         records = read_all(source)
-    known = TimeTagCodec().decode(as_bytes(Poisson(RATE, CLOCK_HZ, 3).words(5000, FOREVER)), TimeTagCodec.start)
+    known = TimeTagCodec().decode(
+        as_bytes(PoissonStream(RATE, CLOCK_HZ, 3).next_words(5000, MAX_TICK)), TimeTagCodec.start
+    )
     np.testing.assert_array_equal(records, known.records)
     assert source.stats.delivered == source.stats.acquired == 5000
 
@@ -73,7 +92,8 @@ def test_packets_of_either_size_carry_the_same_records(packet: int) -> None:
 def test_photons_are_poisson() -> None:
     codec = TimeTagCodec()
     records = codec.decode(
-        as_bytes(Poisson(RATE, CLOCK_HZ, 8, (1, 2, 3, 4)).words(200_000, FOREVER)), codec.start
+        as_bytes(PoissonStream(RATE, CLOCK_HZ, 8, (1, 2, 3, 4)).next_words(200_000, MAX_TICK)),
+        codec.start,
     ).records
     gaps = np.diff(records["time_ticks"])
     # Ten ticks per photon, geometrically distributed; five standard deviations of 200 000.
@@ -85,16 +105,19 @@ def test_photons_are_poisson() -> None:
 
 def test_wraps_are_in_the_stream_and_cuts_are_not() -> None:
     rare = 5.0  # photons per second: the counter wraps every 537 s
-    whole = Poisson(rare, CLOCK_HZ, 2).words(20_000, FOREVER)
-    light = Poisson(rare, CLOCK_HZ, 2)
-    pieces = [light.words(1, FOREVER) if number % 3 else light.words(7, RANGE) for number in range(500)]
+    whole = PoissonStream(rare, CLOCK_HZ, 2).next_words(20_000, MAX_TICK)
+    light = PoissonStream(rare, CLOCK_HZ, 2)
+    pieces = [
+        light.next_words(1, MAX_TICK) if number % 3 else light.next_words(7, COUNTER_RANGE)
+        for number in range(500)
+    ]
     cut = np.concatenate(pieces)
     np.testing.assert_array_equal(cut, whole[: len(cut)])
     records = TimeTagCodec().decode(as_bytes(whole), TimeTagCodec.start)
     assert records.malformed == 0
     marks = records.records[records.records["flags"] == WRAP]["time_ticks"]
-    np.testing.assert_array_equal(marks, RANGE * np.arange(1, len(marks) + 1))
-    assert len(marks) == records.records["time_ticks"][-1] // RANGE > 5
+    np.testing.assert_array_equal(marks, COUNTER_RANGE * np.arange(1, len(marks) + 1))
+    assert len(marks) == records.records["time_ticks"][-1] // COUNTER_RANGE > 5
 
 
 def test_a_slow_reader_loses_the_oldest() -> None:
@@ -147,22 +170,22 @@ def test_photons_come_when_they_are_due() -> None:
 
 def test_a_full_memory_loses_photons_and_says_so() -> None:
     instrument, bus = tagger(is_paced=True, memory_bytes=6000)
-    with opened(Uri.parse("timetag://?transfer_kib=64"), "", bus) as source:
+    with open_on_backend(Uri.parse("timetag://?transfer_kib=64"), "", bus) as source:
         first = source.read()
-        while instrument.truth.not_kept == 0:
+        while instrument.truth.lost_memory_full == 0:
             time.sleep(0.01)
             source.read()
         source.stop()
         while source.read() is not None:
             pass
     assert first is not None
-    assert source.stats.lost_device == instrument.truth.not_kept > 0
+    assert source.stats.lost_device == instrument.truth.lost_memory_full > 0
     assert source.stats.acquired == instrument.truth.registered
 
 
 def test_registers_answer_and_reset() -> None:
     _, bus = tagger()
-    registers = TimeTagger(UsbLink(IDENTITY, "", bus))
+    registers = TimeTagger(UsbLink(USB_IDENTITY, "", bus))
     assert registers.read(Register.CLOCK) == CLOCK_HZ
     registers.write(Register.CLOCK, 5)
     assert registers.read(Register.CLOCK) == CLOCK_HZ
@@ -176,12 +199,12 @@ def test_registers_answer_and_reset() -> None:
 @pytest.mark.parametrize("command", ["", "aa0002", "ab00020000000000", "aa00630000000000"])
 def test_a_wrong_command_stalls_the_instrument(command: str) -> None:
     _, bus = tagger()
-    link = UsbLink(IDENTITY, "", bus)
+    link = UsbLink(USB_IDENTITY, "", bus)
     with pytest.raises(DeviceStalledError):
-        link.write(COMMANDS, bytes.fromhex(command), 0.1)
+        link.write(COMMAND_ENDPOINT, bytes.fromhex(command), 0.1)
     buffer = array.array("B", bytes(8))
     with pytest.raises(DeviceTimeoutError):
-        link.read(REPLIES, buffer, 0.1)
+        link.read(REPLY_ENDPOINT, buffer, 0.1)
 
 
 @pytest.mark.parametrize(
@@ -209,17 +232,24 @@ def test_odd_answers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     _, bus = tagger()
     monkeypatch.setattr(EmulatedTimeTagger, "_reply", lambda *_: 3)
     with pytest.raises(ProtocolError, match="answered 3 bytes"):
-        opened(Uri.parse("timetag://"), "", bus)
+        open_on_backend(Uri.parse("timetag://"), "", bus)
     monkeypatch.setattr(EmulatedTimeTagger, "_reply", lambda *_: 4)
     with pytest.raises(ProtocolError, match="0 Hz"):
-        opened(Uri.parse("timetag://"), "", bus)
+        open_on_backend(Uri.parse("timetag://"), "", bus)
 
 
-@pytest.mark.parametrize("fault", [Fault(1, "unplug", 2), Fault(1, "powerloss", 2), Fault(1, "overflow")])
+@pytest.mark.parametrize(
+    "fault", [Fault(1, "unplug", 2), Fault(1, "powerloss", 2), Fault(1, "overflow")]
+)
 def test_one_that_was_stopped_stays_so_whatever_happens(fault: Fault) -> None:
-    instrument = EmulatedTimeTagger(lambda _: Poisson(RATE, CLOCK_HZ, 1), "T1", Setting(packet_bytes=510), [fault])
-    link = UsbLink(IDENTITY, "", VirtualUsb(instrument))
-    feed = TimeTaggerFeed(link, Ledger(), Acquisition(transfer_bytes=1024))
+    instrument = EmulatedTimeTagger(
+        lambda _: PoissonStream(RATE, CLOCK_HZ, 1),
+        "T1",
+        EmulatorSettings(packet_bytes=510),
+        [fault],
+    )
+    link = UsbLink(USB_IDENTITY, "", VirtualUsb(instrument))
+    feed = TimeTaggerFeed(link, Ledger(), AcquisitionSettings(transfer_bytes=1024))
     feed.start()
     assert feed.pull(0.1) is not None
     feed.stop()
@@ -230,7 +260,7 @@ def test_one_that_was_stopped_stays_so_whatever_happens(fault: Fault) -> None:
 
 def test_closing_does_not_wait_for_one_that_is_gone() -> None:
     instrument, bus = tagger()
-    source = opened(Uri.parse("timetag://?transfer_kib=0.5&reconnect_s=600"), "", bus)
+    source = open_on_backend(Uri.parse("timetag://?transfer_kib=0.5&reconnect_s=600"), "", bus)
     source.read()
     instrument.unplug(float("inf"))
     begin = time.monotonic()
@@ -242,7 +272,9 @@ def test_closing_does_not_wait_for_one_that_is_gone() -> None:
 def test_a_loose_plug_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     """It goes again while it is being set up after it came back."""
     instrument, bus = tagger()
-    with opened(Uri.parse("timetag://?transfer_kib=0.5&reconnect_s=10"), "", bus) as source:
+    with open_on_backend(
+        Uri.parse("timetag://?transfer_kib=0.5&reconnect_s=10"), "", bus
+    ) as source:
         source.read()
         answer, left = instrument.receive, [3]
 
@@ -250,7 +282,7 @@ def test_a_loose_plug_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
             if left[0]:
                 left[0] -= 1
                 instrument.unplug(1)
-                raise usb_error(errno.ENODEV)
+                raise make_usb_error(errno.ENODEV)
             answer(endpoint, data)
 
         monkeypatch.setattr(instrument, "receive", receive)

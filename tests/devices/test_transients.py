@@ -12,16 +12,16 @@ from devices.codec import Records
 from devices.histogram import BinAxis, StampHistogram
 from devices.linospad2.calibration import BoardCalibration, load_calibration
 from devices.linospad2.codec import LinoSpad2Codec
-from devices.linospad2.simulation import SimulatedBoard, uneven_board
-from devices.scenes import line_light
+from devices.linospad2.simulation import SimulatedBoard, draw_uneven_calibration
+from devices.scenes import simulate_line_light
 from devices.source import Batch, Info, Source
 from devices.statistics import Stats
-from devices.timetag.codec import RECORD, TimeTagCodec
+from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
 from devices.transients import read_transient
 from tofclip.errors import InputError, MissingTimeAxisError
 from tofclip.lidar import depth
 from tofclip.recovery import recover
-from tofclip.simulate import score
+from tofclip.simulate import score_returns
 from tofclip.storage import Field, Record
 
 
@@ -55,15 +55,20 @@ def canned(monkeypatch: pytest.MonkeyPatch) -> type[Canned]:
 
 
 def tags(rows: list[tuple[int, int, int]]) -> Records:
-    return np.array(rows, RECORD)
+    return np.array(rows, RECORD_DTYPE)
 
 
 def test_tags_of_two_channels(canned: type[Canned]) -> None:
     before, after = tags([(0, 1, 0), (3, 2, 0)]), tags([(9, 4, 0), (10, 1, 0), (12, 4, 0)])
-    canned([Batch(before), Batch(after, 2, after_gap=True)], Record("calibration", attributes={"tick_s": 1e-9}))
+    canned(
+        [Batch(before), Batch(after, 2, after_gap=True)],
+        Record("calibration", attributes={"tick_s": 1e-9}),
+    )
     streak = read_transient("canned://?bins=5&pixels=1,2&start_ps=500", bin_width=1e-9)
     expected = np.zeros((5, 2))
-    expected[3, 0] = expected[2, 1] = 1  # the photon at 9 came after a gap, and no pulse before it is known
+    expected[3, 0] = expected[2, 1] = (
+        1  # the photon at 9 came after a gap, and no pulse before it is known
+    )
     np.testing.assert_allclose(streak.counts, expected, atol=1e-6)
     np.testing.assert_allclose(streak.times, 0.5e-9 + np.arange(5) * 1e-9, rtol=1e-12)
     assert TimeTagCodec.dtype == before.dtype
@@ -92,7 +97,11 @@ def test_frames_are_added_up(canned: type[Canned]) -> None:
     with pytest.raises(MissingTimeAxisError):
         _ = read_transient("canned://").times
     canned([Batch(frames(1))])
-    assert read_transient("canned://?frames=9", bin_width=2e-12).times.tolist() == [0.0, 2e-12, 4e-12]
+    assert read_transient("canned://?frames=9", bin_width=2e-12).times.tolist() == [
+        0.0,
+        2e-12,
+        4e-12,
+    ]
 
 
 def test_where_it_came_from_is_told() -> None:
@@ -108,11 +117,13 @@ def test_where_it_came_from_is_told() -> None:
 
 
 def test_a_recording_becomes_the_same_scene(tmp_path: Path) -> None:
-    """Words in a file, a sidecar, a laser's period and a camera: everything that a real board would leave."""
-    light, codec, board = line_light(), LinoSpad2Codec(), uneven_board(9)
+    """Words in a file, a sidecar, a laser's period and a camera: everything that a real board would
+    leave.
+    """
+    light, codec, board = simulate_line_light(), LinoSpad2Codec(), draw_uneven_calibration(9)
     simulated = SimulatedBoard(light, board, codec, 8000, 9)
     path = tmp_path / "run.dat"
-    path.write_bytes(b"".join(simulated.cycle(number) for number in range(60)))
+    path.write_bytes(b"".join(simulated.encode_cycle(number) for number in range(60)))
     np.savetxt(
         tmp_path / "codes.csv",
         np.column_stack([np.arange(256), board.code_ends * 1e12]),
@@ -127,29 +138,36 @@ def test_a_recording_becomes_the_same_scene(tmp_path: Path) -> None:
         'code_table = "codes.csv"\noffset_table = "offsets.npy"\ncamera = "camera.h5"\n'
     )
     streak = read_transient(f"linospad2://{path}?bins=576")
-    figures = score(depth(recover(streak)), light.truth)
+    figures = score_returns(depth(recover(streak)), light.truth)
     # 0.4 mm with a million photons more; 6 ps or 1 mm is a third of a code.
     assert figures["median_depth_error_m"] < 1e-3
     assert figures["share_within_one_bin"] > 0.9
 
 
 @pytest.mark.parametrize("board", ["NL11_#33_2212b", "B7d_#28_2212s"])
-def test_recorded_boards_see_the_scene_with_their_own_tables_only(shared_data: Path, board: str) -> None:
-    """Measured unevenness of two boards: codes up to 112 ps wide, pixels out of step by 11 ns, ten of them hot."""
-    folder, light = shared_data / "devices" / "linospad2", line_light()
+def test_recorded_boards_see_the_scene_with_their_own_tables_only(
+    shared_data: Path, board: str
+) -> None:
+    """Measured unevenness of two boards: codes up to 112 ps wide, pixels out of step by 11 ns, ten
+    of them hot.
+    """
+    folder, light = shared_data / "devices" / "linospad2", simulate_line_light()
     name, firmware = board.rsplit("_", 1)
-    tables = load_calibration(folder / f"TDC_{board}.csv", folder / f"Offset_{board}.npy", folder / f"mask_{name}.txt")
+    tables = load_calibration(
+        folder / f"TDC_{board}.csv", folder / f"Offset_{board}.npy", folder / f"mask_{name}.txt"
+    )
     codec = LinoSpad2Codec(firmware)
     simulated = SimulatedBoard(light, tables, codec, 8000, 1)
     errors = []
     for known in (tables, BoardCalibration.ideal()):
         histogram = StampHistogram(BinAxis(20e-12, 576, 0.0, 25e-9), known)
         for number in range(100):
-            words = np.frombuffer(simulated.cycle(number), np.uint8)
+            words = np.frombuffer(simulated.encode_cycle(number), np.uint8)
             histogram.add(codec.decode(words, codec.start).records)
-        figures = score(depth(recover(histogram.streak(light.camera))), light.truth)
+        figures = score_returns(depth(recover(histogram.streak(light.camera))), light.truth)
         errors.append(figures["median_depth_error_m"])
-    # 0.8 mm with the tables and 315 mm without them, where the pixels' offsets are 11 ns or 1.6 m apart.
+    # 0.8 mm with the tables and 315 mm without them, where the pixels' offsets are 11 ns or 1.6 m
+    # apart.
     assert errors[0] < 1.5e-3
     assert errors[1] > 0.1
 
@@ -189,6 +207,6 @@ def test_bins_longer_than_the_lasers_period() -> None:
 
 
 def test_every_scheme_of_the_tables_can_be_imported() -> None:
-    for table in (registry.OPENERS, registry.FILES, registry.CODECS):
+    for table in (registry.OPENERS, registry.FILE_OPENERS, registry.CODECS):
         for entry in table.values():
-            assert callable(registry.named(entry))
+            assert callable(registry.import_entry(entry))

@@ -11,12 +11,12 @@ import pytest
 import usb.backend.libusb1
 import usb.core
 
-from devices.emulation.usb import VirtualDevice, VirtualUsb, usb_error
+from devices.emulation.usb import VirtualDevice, VirtualUsb, make_usb_error
 from devices.timetag import source as timetag
-from devices.timetag.registers import BARE_CHIP
+from devices.timetag.registers import BARE_CHIP_IDENTITY
 from devices.timetag.source import find_timetaggers, open_timetag
 from devices.uri import Uri
-from devices.usb import UsbIdentity, UsbLink, system_backend, translated
+from devices.usb import UsbIdentity, UsbLink, system_backend, translate_errors
 from tofclip.errors import (
     DeviceBusyError,
     DeviceDisconnectedError,
@@ -51,7 +51,7 @@ class Echo(VirtualDevice):
                 self.halted.add(endpoint)
             if number == errno.ENODEV:
                 self.unplug(2)
-            raise usb_error(number)
+            raise make_usb_error(number)
         length = min(len(buffer), len(self.got))
         buffer[:length] = self.got[:length]
         return length
@@ -78,7 +78,9 @@ def test_the_serial_number_chooses() -> None:
     assert linked(first, second, serial="B2").serial == "B2"
     with pytest.raises(DeviceNotFoundError, match=r"several.*say which: A1, B2"):
         linked(first, second)
-    with pytest.raises(DeviceNotFoundError, match="with serial number C3 is connected \\(connected: A1, B2\\)"):
+    with pytest.raises(
+        DeviceNotFoundError, match="with serial number C3 is connected \\(connected: A1, B2\\)"
+    ):
         linked(first, second, serial="C3")
     with pytest.raises(DeviceNotFoundError, match="connected: none"):
         linked()
@@ -87,7 +89,7 @@ def test_the_serial_number_chooses() -> None:
 
 def test_no_permission_shows_the_rule_to_add() -> None:
     instrument = Echo()
-    instrument.may_be_opened = False
+    instrument.is_accessible = False
     with pytest.raises(DevicePermissionError) as caught:
         linked(instrument)
     assert isinstance(caught.value.__cause__, ValueError)  # what pyusb makes of it
@@ -98,7 +100,7 @@ def test_no_permission_shows_the_rule_to_add() -> None:
 
 def test_another_program_holds_it() -> None:
     instrument = Echo()
-    instrument.held_by_other = True
+    instrument.is_claimed_elsewhere = True
     with pytest.raises(DeviceBusyError, match="another program"):
         linked(instrument)
 
@@ -167,7 +169,9 @@ def test_an_unconfigured_device_is_configured(monkeypatch: pytest.MonkeyPatch) -
 def test_a_kernel_driver_is_detached(monkeypatch: pytest.MonkeyPatch) -> None:
     detached: list[int] = []
     monkeypatch.setattr(VirtualUsb, "is_kernel_driver_active", lambda *_: True)
-    monkeypatch.setattr(VirtualUsb, "detach_kernel_driver", lambda _, __, interface: detached.append(interface))
+    monkeypatch.setattr(
+        VirtualUsb, "detach_kernel_driver", lambda _, __, interface: detached.append(interface)
+    )
     linked(Echo())
     assert detached == [0]
 
@@ -185,11 +189,11 @@ def test_no_usb_library(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_exceptions_that_pyusb_disguises() -> None:
-    with pytest.raises(UsbBackendError), translated(KIND):
+    with pytest.raises(UsbBackendError), translate_errors(KIND):
         raise usb.core.NoBackendError("No backend available")
-    with pytest.raises(DeviceError, match="cannot do that"), translated(KIND):
+    with pytest.raises(DeviceError, match="cannot do that"), translate_errors(KIND):
         raise NotImplementedError
-    with pytest.raises(ValueError, match=r"^a defect$"), translated(KIND):
+    with pytest.raises(ValueError, match=r"^a defect$"), translate_errors(KIND):
         raise ValueError("a defect")
 
 
@@ -199,8 +203,8 @@ def test_the_system_has_a_usb_library() -> None:
 
 def test_instruments_are_discovered(monkeypatch: pytest.MonkeyPatch) -> None:
     shut = Echo("S9")
-    shut.may_be_opened = False
-    bus = VirtualUsb(Echo("A1"), shut, Echo("", BARE_CHIP))
+    shut.is_accessible = False
+    bus = VirtualUsb(Echo("A1"), shut, Echo("", BARE_CHIP_IDENTITY))
     monkeypatch.setattr(timetag, "system_backend", lambda: bus)
     found = find_timetaggers()
     assert [(one.uri, bool(one.note)) for one in found] == [
@@ -216,7 +220,7 @@ def test_a_chip_without_firmware_is_told_from_nothing(monkeypatch: pytest.Monkey
     def behind(*instruments: VirtualDevice) -> Any:
         return lambda: VirtualUsb(*instruments)
 
-    monkeypatch.setattr(timetag, "system_backend", behind(Echo("", BARE_CHIP)))
+    monkeypatch.setattr(timetag, "system_backend", behind(Echo("", BARE_CHIP_IDENTITY)))
     with pytest.raises(DeviceNotFoundError, match="without firmware"):
         open_timetag(Uri.parse("timetag://"))
     monkeypatch.setattr(timetag, "system_backend", behind())

@@ -36,17 +36,27 @@ def write_hpdta(tmp_path: Path, pixels: NDArray[np.uint16]) -> Write:
     """Write an HPD-TA TIFF, its table of times (in `unit`) behind everything else."""
 
     def write(
-        table: NDArray[Any] | None = None, place: str = "", picture: NDArray[Any] = pixels, **text: object
+        table: NDArray[Any] | None = None,
+        place: str = "",
+        picture: NDArray[Any] = pixels,
+        **text: object,
     ) -> Path:
         path = tmp_path / "shot.tif"
         entries = {"bits": 16, "exposures": 1, "top": 0, "kind": 2, "scale": 1, "unit": "ns"} | text
 
         def save(place: str) -> None:
             description = HPDTA_TEXT.format(place=place, **entries)
-            tifffile.imwrite(path, picture, description=description, metadata=None, datetime="2021:05:02 20:49:12")
+            tifffile.imwrite(
+                path,
+                picture,
+                description=description,
+                metadata=None,
+                datetime="2021:05:02 20:49:12",
+            )
 
         if table is not None and not place:
-            # Two texts of the same length make files of the same size, behind which the table will lie.
+            # Two texts of the same length make files of the same size, behind which the table will
+            # lie.
             save(f"#{0:012d},{table.size:04d}")
             place = f"#{path.stat().st_size:012d},{table.size:04d}"
         save(place)
@@ -60,7 +70,9 @@ def write_hpdta(tmp_path: Path, pixels: NDArray[np.uint16]) -> Write:
 
 @pytest.fixture
 def lift_entries() -> dict[str, Any]:
-    """Entries of a non-line-of-sight archive with three views; the wall is seen by a pinhole of 250 px."""
+    """Entries of a non-line-of-sight archive with three views; the wall is seen by a pinhole of 250
+    px.
+    """
     columns, rows = np.meshgrid(np.arange(5) - 2.0, np.arange(5) - 2.0)
     sight = np.stack([columns * 10, rows * 10, np.full(columns.shape, 250.0)])
     return {
@@ -90,7 +102,9 @@ def write_lift(tmp_path: Path, lift_entries: dict[str, Any]) -> Write:
 
     def write(**changes: Any) -> Path:
         path = tmp_path / "shot.npz"
-        np.savez_compressed(path, **{k: v for k, v in (lift_entries | changes).items() if v is not None})
+        np.savez_compressed(
+            path, **{k: v for k, v in (lift_entries | changes).items() if v is not None}
+        )
         return path
 
     return write

@@ -1,4 +1,6 @@
-"""Light fields in every format: what was written comes back, view by view, and what is damaged is refused."""
+"""Light fields in every format: what was written comes back, view by view, and what is damaged is
+refused.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ def light_field() -> LightField:
 
 @pytest.mark.parametrize("name", ["field.h5", "field.exr"])
 def test_what_was_written_comes_back(tmp_path, name):
-    """Values are float32 in both formats, so they return exactly; views by their numbers, in whatever order."""
+    """Values are float32 in both formats, so they return exactly; views by their numbers, in
+    whatever order.
+    """
     known = light_field()
     write_light_field(known, tmp_path / name)
     found = read_light_field(tmp_path / name)
@@ -32,14 +36,19 @@ def test_a_transposed_light_field_is_written_with_its_own_pixels(tmp_path):
     """OpenEXR writes wrong pixels of arrays that are not contiguous."""
     turned = LightField(light_field().pictures.swapaxes(1, 2), VIEWS)
     write_light_field(turned, tmp_path / "turned.exr")
-    np.testing.assert_array_equal(read_light_field(tmp_path / "turned.exr").pictures[0], turned.pictures[0])
+    np.testing.assert_array_equal(
+        read_light_field(tmp_path / "turned.exr").pictures[0], turned.pictures[0]
+    )
 
 
 def test_colour_parts_become_luminance(tmp_path):
     import OpenEXR
 
     rgb = np.random.default_rng(0).random((5, 6, 3), np.float32)
-    parts = [OpenEXR.Part({"type": OpenEXR.scanlineimage}, {"RGB": rgb + n}, f"v=0,u={n}") for n in (0, 1)]
+    parts = [
+        OpenEXR.Part({"type": OpenEXR.scanlineimage}, {"RGB": rgb + n}, f"v=0,u={n}")
+        for n in (0, 1)
+    ]
     OpenEXR.File(parts).write(str(tmp_path / "rgb.exr"))
     found = read_light_field(tmp_path / "rgb.exr")
     np.testing.assert_allclose(found.pictures[0], rgb @ [0.2125, 0.7154, 0.0721], rtol=1e-5)
@@ -59,7 +68,9 @@ def test_a_folder_is_read_by_row_and_column(tmp_path):
         imwrite(tmp_path / f"scene7_{v + 1:02}_{u + 1:02}.tif", picture)
     found = read_light_field(tmp_path)
     np.testing.assert_array_equal(found.views, [(v, u) for v in (-1, 0) for u in (-1, 0, 1)])
-    np.testing.assert_array_equal(found.pictures, pictures(2, 3).reshape(6, 8, 10) / np.float32(255))
+    np.testing.assert_array_equal(
+        found.pictures, pictures(2, 3).reshape(6, 8, 10) / np.float32(255)
+    )
 
 
 def test_a_folder_in_raster_order_is_a_square_grid(tmp_path):
@@ -100,9 +111,15 @@ def test_views_of_unequal_size_are_refused(tmp_path):
     imwrite(tmp_path / "a_0_1.tif", np.eye(5, dtype=np.uint8))
     with pytest.raises(FileFormatError, match="first view is"):
         read_light_field(tmp_path)
-    window = (np.array([0, 0], np.int32), np.array([3, 3], np.int32))  # the display's; the data's may differ
+    window = (
+        np.array([0, 0], np.int32),
+        np.array([3, 3], np.int32),
+    )  # the display's; the data's may differ
     header = {"type": OpenEXR.scanlineimage, "displayWindow": window}
-    parts = [OpenEXR.Part(dict(header), {"Y": np.eye(4 + n, dtype=np.float32)}, f"v=0,u={n}") for n in (0, 1)]
+    parts = [
+        OpenEXR.Part(dict(header), {"Y": np.eye(4 + n, dtype=np.float32)}, f"v=0,u={n}")
+        for n in (0, 1)
+    ]
     OpenEXR.File(parts).write(str(tmp_path / "unequal.exr"))
     with pytest.raises(FileFormatError, match="differ in size"):
         read_light_field(tmp_path / "unequal.exr")
@@ -140,7 +157,9 @@ def test_damaged_and_unknown_files_are_refused(tmp_path):
 def test_nan_and_constant_pictures_are_refused(tmp_path, fault):
     import OpenEXR
 
-    part = OpenEXR.Part({"type": OpenEXR.scanlineimage}, {"Y": np.full((4, 4), fault, np.float32)}, "v=0,u=0")
+    part = OpenEXR.Part(
+        {"type": OpenEXR.scanlineimage}, {"Y": np.full((4, 4), fault, np.float32)}, "v=0,u=0"
+    )
     OpenEXR.File([part]).write(str(tmp_path / "field.exr"))
     with pytest.raises(TofclipError):
         read_light_field(tmp_path / "field.exr")

@@ -12,7 +12,13 @@ import tifffile
 from numpy.typing import NDArray
 
 from tofclip.camera import Camera, SkewSweep
-from tofclip.errors import FileFormatError, InputError, MissingTimeAxisError, StorageError, TofclipError
+from tofclip.errors import (
+    FileFormatError,
+    InputError,
+    MissingTimeAxisError,
+    StorageError,
+    TofclipError,
+)
 from tofclip.io import read_streak
 from tofclip.shots import Frames, Streak
 from tofclip.storage import Field, Record
@@ -46,12 +52,16 @@ def test_hpdta_counts_and_text(write_hpdta: Any, pixels: NDArray[np.uint16]) -> 
 
 def test_saturation_at_the_cameras_own_limit(write_hpdta: Any, pixels: NDArray[np.uint16]) -> None:
     pixels[3, 4], pixels[5, 6] = 4095, 4094
-    assert np.argwhere(read_streak(write_hpdta(place="Other", bits=12)).saturated).tolist() == [[3, 4]]
+    assert np.argwhere(read_streak(write_hpdta(place="Other", bits=12)).saturated).tolist() == [
+        [3, 4]
+    ]
     # Summed exposures pass 4095 unsaturated.
     assert not read_streak(write_hpdta(place="Other", bits=12, exposures=4)).saturated.any()
     assert not read_streak(write_hpdta(place="Other", bits=16)).saturated.any()
     pixels[7, 8] = 65535
-    assert np.argwhere(read_streak(write_hpdta(place="Other", bits=16)).saturated).tolist() == [[7, 8]]
+    assert np.argwhere(read_streak(write_hpdta(place="Other", bits=16)).saturated).tolist() == [
+        [7, 8]
+    ]
 
 
 def test_nothing_but_saturated_pixels_is_refused(plain: Any) -> None:
@@ -61,16 +71,22 @@ def test_nothing_but_saturated_pixels_is_refused(plain: Any) -> None:
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "uint32", "int16", "float32", "float64"])
 @pytest.mark.parametrize(
-    "options", [{}, {"byteorder": ">"}, {"rowsperstrip": 3}, {"compression": "zlib"}], ids=["", "big", "strips", "zip"]
+    "options",
+    [{}, {"byteorder": ">"}, {"rowsperstrip": 3}, {"compression": "zlib"}],
+    ids=["", "big", "strips", "zip"],
 )
-def test_plain_tiff_has_counts_and_no_time_axis(plain: Any, dtype: str, options: dict[str, Any]) -> None:
+def test_plain_tiff_has_counts_and_no_time_axis(
+    plain: Any, dtype: str, options: dict[str, Any]
+) -> None:
     picture = (np.arange(120).reshape(10, 12) + 1).astype(dtype)
     streak = read_streak(plain(picture, **options))
     np.testing.assert_array_equal(streak.counts, picture)
     with pytest.raises(MissingTimeAxisError):
         _ = streak.times
     assert (streak.saturated is None) == dtype.startswith("float")
-    np.testing.assert_allclose(read_streak(streak.source, bin_width=5e-12).times, np.arange(10) * 5e-12, rtol=1e-15)
+    np.testing.assert_allclose(
+        read_streak(streak.source, bin_width=5e-12).times, np.arange(10) * 5e-12, rtol=1e-15
+    )
 
 
 @pytest.mark.parametrize("bin_width", [0, -1e-12, np.nan, np.inf])
@@ -83,7 +99,11 @@ def test_an_impossible_bin_width_is_refused(plain: Any, bin_width: float) -> Non
     ("picture", "fault", "problem"),
     [
         (np.zeros((4, 5), np.uint16), InputError, "every pixel is zero"),
-        (np.array([[1.0, np.nan], [np.inf, 2.0]], np.float32), InputError, "2 pixels are NaN or infinite"),
+        (
+            np.array([[1.0, np.nan], [np.inf, 2.0]], np.float32),
+            InputError,
+            "2 pixels are NaN or infinite",
+        ),
         (np.full((4, 5), 1e300), InputError, "20 pixels are NaN or infinite"),
         (np.array([[1, -2], [-3, 4]], np.int16), InputError, "2 pixels are negative"),
         (np.ones((4, 5, 3), np.uint8), FileFormatError, "expected grey"),
@@ -112,7 +132,12 @@ def test_a_header_that_claims_too_much_is_refused_before_memory_is_taken(plain: 
 @pytest.mark.parametrize("keep", [4, 8, 100, 600, 1000])
 @pytest.mark.parametrize("kind", ["hpdta", "lift", "hdf5"])
 def test_truncated_files_are_refused(
-    write_hpdta: Any, write_lift: Any, tmp_path: Path, pixels: NDArray[np.uint16], kind: str, keep: int
+    write_hpdta: Any,
+    write_lift: Any,
+    tmp_path: Path,
+    pixels: NDArray[np.uint16],
+    kind: str,
+    keep: int,
 ) -> None:
     if kind == "hdf5":
         path = tmp_path / "shot.h5"
@@ -126,7 +151,9 @@ def test_truncated_files_are_refused(
         read_streak(path)
 
 
-def test_damaged_tiffs_raise_only_our_own_errors(write_hpdta: Any, capfd: pytest.CaptureFixture[str]) -> None:
+def test_damaged_tiffs_raise_only_our_own_errors(
+    write_hpdta: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
     path = write_hpdta(np.arange(20))
     whole, random = path.read_bytes(), np.random.default_rng(4)
     messages = []
@@ -144,9 +171,13 @@ def test_damaged_tiffs_raise_only_our_own_errors(write_hpdta: Any, capfd: pytest
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("content", [b"", b"hello, this is no picture", b"PK\x03\x04rest", b"II*\0", b"%PDF-1.4"])
+@pytest.mark.parametrize(
+    "content", [b"", b"hello, this is no picture", b"PK\x03\x04rest", b"II*\0", b"%PDF-1.4"]
+)
 @pytest.mark.parametrize("name", ["a.tif", "a.npz", "a.h5", "a"])
-def test_other_files_are_refused_whatever_they_are_called(tmp_path: Path, name: str, content: bytes) -> None:
+def test_other_files_are_refused_whatever_they_are_called(
+    tmp_path: Path, name: str, content: bytes
+) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(FileFormatError, match="is empty" if not content else "is "):
         read_streak(tmp_path / name)
@@ -160,14 +191,24 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
 
 
 def test_our_own_file_brings_everything_back(tmp_path: Path, pixels: NDArray[np.uint16]) -> None:
-    camera = Camera([8.0, 21.5], [0.1, -0.2], (9, 11), 30, sweep=SkewSweep([8.0, 21.5], [0.5, -1.0], [0.0, 0.01]))
+    camera = Camera(
+        [8.0, 21.5],
+        [0.1, -0.2],
+        (9, 11),
+        30,
+        sweep=SkewSweep([8.0, 21.5], [0.5, -1.0], [0.0, 0.01]),
+    )
     shot = Streak(
         counts=pixels,
         row_times=np.cumsum(np.linspace(18e-12, 20e-12, 20)),
         saturated=pixels > 3900,
         metadata={"Streak camera/Time Range": "20 ns", "Comment/UserComment": ""},
         camera=camera,
-        attachments={"relay_wall": Record("relay_wall", {"laser": Field(np.ones(3), "m")}, {"row_offset": 25})},
+        attachments={
+            "relay_wall": Record(
+                "relay_wall", {"laser": Field(np.ones(3), "m")}, {"row_offset": 25}
+            )
+        },
         provenance={"settings": {"a": 1}},
     )
     shot.save(tmp_path / "without_suffix")
@@ -185,7 +226,9 @@ def test_our_own_file_brings_everything_back(tmp_path: Path, pixels: NDArray[np.
 
 def test_another_kind_of_our_own_files_is_refused(tmp_path: Path) -> None:
     camera = Camera([5.0], [0.0], (3, 4), 10)
-    Frames(np.ones((2, 3, 4), np.float32), np.array([0.0, 1e-12]), camera).save(tmp_path / "frames.h5")
+    Frames(np.ones((2, 3, 4), np.float32), np.array([0.0, 1e-12]), camera).save(
+        tmp_path / "frames.h5"
+    )
     with pytest.raises(FileFormatError, match="holds a frames record, expected streak"):
         read_streak(tmp_path / "frames.h5")
 
@@ -194,11 +237,15 @@ def test_provenance_names_file_and_bin_width(plain: Any) -> None:
     path = plain(np.ones((4, 5), np.uint16))
     found = read_streak(path, bin_width=2e-11).provenance
     assert found["settings"] == {"bin_width_s": 2e-11}
-    assert found["inputs"] == [{"name": "plain.tif", "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}]
+    assert found["inputs"] == [
+        {"name": "plain.tif", "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    ]
 
 
 def test_recorded_flash_lidar_shot(shared_data: Path) -> None:
-    """Known of this shot: 1008 rows, from 18.78 ps each at the start to 20.49 ps at the end, 19.41 ps on average."""
+    """Known of this shot: 1008 rows, from 18.78 ps each at the start to 20.49 ps at the end, 19.41
+    ps on average.
+    """
     streak = read_streak(shared_data / "clip" / "scene5.tif")
     assert streak.counts.shape == (1008, 1344)
     steps = np.diff(streak.times)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
-from tofclip.lidar import PointCloud, Returns, export, point_cloud, ray_directions
+from tofclip.lidar import PointCloud, Returns, compute_ray_directions, export, point_cloud
 from tofclip.units import SPEED_OF_LIGHT
 
 SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".h5")
@@ -22,7 +22,9 @@ PROPERTIES = ("intensity", "confidence", "range", "return_number", "time")
 
 
 def camera(rows: int = 128, columns: int = 96, focal_length_px: float = 560.0) -> Camera:
-    return Camera(np.array([60.0]), np.array([0.0]), (rows, columns), 200, focal_length_px=focal_length_px)
+    return Camera(
+        np.array([60.0]), np.array([0.0]), (rows, columns), 200, focal_length_px=focal_length_px
+    )
 
 
 def returns_at(distance: np.ndarray, seen_by: Camera) -> Returns:
@@ -41,7 +43,13 @@ def random_cloud(points: int, seed: int) -> PointCloud:
     column = random.normal(size=(4, points)).astype(np.float32)
     numbers = random.integers(1, 5, points).astype(np.uint8)
     return PointCloud(
-        random.normal(size=(points, 3)), column[0], column[1], column[2], numbers, 1e-8 * column[3], {"seed": seed}
+        random.normal(size=(points, 3)),
+        column[0],
+        column[1],
+        column[2],
+        numbers,
+        1e-8 * column[3],
+        {"seed": seed},
     )
 
 
@@ -54,7 +62,9 @@ def open3d() -> ModuleType:
         ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
     except (ImportError, OSError):
         pass  # the system may have its own
-    return pytest.importorskip("open3d", reason="Open3D does not load on this machine", exc_type=ImportError)
+    return pytest.importorskip(
+        "open3d", reason="Open3D does not load on this machine", exc_type=ImportError
+    )
 
 
 def test_a_wall_across_the_axis_comes_out_flat():
@@ -71,16 +81,21 @@ def test_a_wall_across_the_axis_comes_out_flat():
 
 def test_x_is_right_y_is_down_and_the_axis_looks_forward():
     seen_by = camera(10, 20, focal_length_px=100.0)
-    axis, right, below = ray_directions(seen_by, [5, 5, 15], [10, 20, 10])
+    axis, right, below = compute_ray_directions(seen_by, [5, 5, 15], [10, 20, 10])
     np.testing.assert_allclose(axis, [0, 0, 1])
     np.testing.assert_allclose(right, np.array([0.1, 0, 1]) / np.sqrt(1.01))
     np.testing.assert_allclose(below, np.array([0, 0.1, 1]) / np.sqrt(1.01))
 
 
 @settings(max_examples=50, deadline=None)
-@given(row=st.floats(-500, 500), column=st.floats(-500, 500), focal=st.floats(10, 5000), distance=st.floats(0.1, 100))
+@given(
+    row=st.floats(-500, 500),
+    column=st.floats(-500, 500),
+    focal=st.floats(10, 5000),
+    distance=st.floats(0.1, 100),
+)
 def test_points_lie_at_their_range(row, column, focal, distance):
-    direction = ray_directions(camera(focal_length_px=focal), [row], [column])[0]
+    direction = compute_ray_directions(camera(focal_length_px=focal), [row], [column])[0]
     assert np.linalg.norm(distance * direction) == pytest.approx(distance, rel=1e-12)
 
 
@@ -133,7 +148,11 @@ def test_files_say_their_units(tmp_path):
     cloud = random_cloud(3, 0)
     for suffix in (".ply", ".pcd"):
         cloud.save(tmp_path / f"scene{suffix}")
-        header = (tmp_path / f"scene{suffix}").read_bytes().split(b"0 0 0 1" if suffix == ".pcd" else b"element")[0]
+        header = (
+            (tmp_path / f"scene{suffix}")
+            .read_bytes()
+            .split(b"0 0 0 1" if suffix == ".pcd" else b"element")[0]
+        )
         assert b"units: x m, y m, z m, intensity count, confidence m, range m, time s\n" in header
     cloud.save(tmp_path / "scene.csv")
     assert (tmp_path / "scene.csv").read_text().splitlines()[0] == (
@@ -148,7 +167,9 @@ def test_numpy_reads_the_same_numbers_from_text(tmp_path):
     cloud = random_cloud(50, 3)
     cloud.save(tmp_path / "scene.csv")
     table = np.genfromtxt(tmp_path / "scene.csv", delimiter=",", names=True, dtype=np.float64)
-    np.testing.assert_allclose(np.stack([table["x_m"], table["y_m"], table["z_m"]], axis=1), cloud.xyz, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.stack([table["x_m"], table["y_m"], table["z_m"]], axis=1), cloud.xyz, rtol=1e-6
+    )
     np.testing.assert_allclose(table["intensity_count"], cloud.intensity, rtol=1e-6)
     np.testing.assert_allclose(table["range_m"], cloud.range, rtol=1e-6)
 
@@ -172,7 +193,9 @@ def test_saving_is_all_or_nothing(tmp_path, monkeypatch):
 
 def test_unknown_formats_and_places_are_refused(tmp_path):
     cloud = random_cloud(2, 0)
-    with pytest.raises(InputError, match=r"'\.xyz'; use one of \.ply, \.pcd, \.csv, \.npz, \.las, \.laz, \.h5"):
+    with pytest.raises(
+        InputError, match=r"'\.xyz'; use one of \.ply, \.pcd, \.csv, \.npz, \.las, \.laz, \.h5"
+    ):
         cloud.save(tmp_path / "scene.xyz")
     with pytest.raises(InputError, match="use one of"):
         PointCloud.load(tmp_path / "scene")
@@ -189,7 +212,9 @@ def test_damaged_files_are_refused_in_one_line(tmp_path, suffix, damage):
     path = tmp_path / f"scene{suffix}"
     random_cloud(20, 0).save(path)
     content = path.read_bytes()
-    cut = content.rsplit(b",", 1)[0] if suffix == ".csv" else content[:-7]  # a CSV row without its last column
+    cut = (
+        content.rsplit(b",", 1)[0] if suffix == ".csv" else content[:-7]
+    )  # a CSV row without its last column
     path.write_bytes({"truncated": cut, "empty": b"", "foreign": b"\x00GIF89a" * 9}[damage])
     with pytest.raises(FileFormatError) as caught:
         PointCloud.load(path)
@@ -220,7 +245,9 @@ def test_tables_of_another_kind_are_refused(tmp_path, name):
 
 def test_columns_that_do_not_fit_are_refused():
     good = random_cloud(3, 0)
-    with pytest.raises(ShapeError, match=r"positions of a point cloud must have shape \(points, 3\)"):
+    with pytest.raises(
+        ShapeError, match=r"positions of a point cloud must have shape \(points, 3\)"
+    ):
         PointCloud(np.zeros((3, 2)), *(getattr(good, name) for name in PROPERTIES))
     with pytest.raises(ShapeError, match="intensity of a point cloud"):
         PointCloud(np.zeros((4, 3)), *(getattr(good, name) for name in PROPERTIES))

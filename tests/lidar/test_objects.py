@@ -13,7 +13,9 @@ from tofclip.lidar.objects import find_objects
 def cloud(xyz: np.ndarray) -> PointCloud:
     n = len(xyz)
     number = np.ones(n, np.uint8)
-    return PointCloud(xyz, np.full(n, 5.0), np.full(n, 2e-3), np.linalg.norm(xyz, axis=1), number, np.zeros(n))
+    return PointCloud(
+        xyz, np.full(n, 5.0), np.full(n, 2e-3), np.linalg.norm(xyz, axis=1), number, np.zeros(n)
+    )
 
 
 def test_objects_are_listed_from_the_nearest_with_their_size():
@@ -27,8 +29,14 @@ def test_objects_are_listed_from_the_nearest_with_their_size():
     assert first.centre == pytest.approx((0.0, 0.0, 1.5))
     assert second.centre == pytest.approx((0.4, 0.0, 3.0), abs=1e-6)
     # the inner nine tenths of 31 columns and 21 rows
-    assert (first.width, first.height) == (pytest.approx(0.54, abs=0.03), pytest.approx(0.09, abs=0.006))
-    assert (second.width, second.height) == (pytest.approx(0.27, abs=0.02), pytest.approx(0.18, abs=0.011))
+    assert (first.width, first.height) == (
+        pytest.approx(0.54, abs=0.03),
+        pytest.approx(0.09, abs=0.006),
+    )
+    assert (second.width, second.height) == (
+        pytest.approx(0.27, abs=0.02),
+        pytest.approx(0.18, abs=0.011),
+    )
     assert first.range == pytest.approx(1.51, abs=0.01)
     assert (first.confidence, first.intensity) == (pytest.approx(2e-3), 5.0)
     assert first.scatter < 0.02

@@ -1,4 +1,6 @@
-"""Counted photons: the bound, the detector that reaches it, pile-up, and pixels that need their neighbours."""
+"""Counted photons: the bound, the detector that reaches it, pile-up, and pixels that need their
+neighbours.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +15,10 @@ from tofclip.lidar import Pulse
 from tofclip.lidar.photons import (
     PhotonDetector,
     Smoothness,
-    locate_smoothly,
+    compute_range_bound,
+    correct_pile_up,
+    locate_with_smoothness,
     measure_accuracy,
-    range_bound,
-    undo_pile_up,
 )
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -32,11 +34,15 @@ def metres(time: np.ndarray | float) -> np.ndarray | float:
 
 
 def histograms(arrival, photons, background, seed, pulse=None) -> np.ndarray:
-    """Photons thrown one by one from the pulse and evenly over the bins: independent of the package's own drawing."""
+    """Photons thrown one by one from the pulse and evenly over the bins: independent of the
+    package's own drawing.
+    """
     noise = np.random.default_rng(seed)
     counts = noise.poisson(background, (arrival.size, BINS)).astype(float)
     for row, number in enumerate(noise.poisson(photons, arrival.size)):
-        time = arrival[row] + (noise.normal(0, SIGMA, number) if pulse is None else pulse(noise, number))
+        time = arrival[row] + (
+            noise.normal(0, SIGMA, number) if pulse is None else pulse(noise, number)
+        )
         counts[row] += np.histogram(time / BIN, np.arange(BINS + 1) - 0.5)[0]
     return counts
 
@@ -50,23 +56,32 @@ def detector() -> PhotonDetector:
 @given(photons=st.floats(1, 1e5), fwhm=st.floats(30e-12, 300e-12))
 def test_without_background_the_bound_is_sigma_over_root_photons(photons, fwhm):
     width = fwhm / 10
-    sigma = np.sqrt(fwhm**2 / (8 * np.log(2)) + width**2 / 12)  # a bin hides where in it a photon came
-    bound = range_bound(Pulse.gaussian(fwhm), width, photons, 0.0)
-    # the pulse is cut at two widths; without background the edge tells a little that a tail would not
+    sigma = np.sqrt(
+        fwhm**2 / (8 * np.log(2)) + width**2 / 12
+    )  # a bin hides where in it a photon came
+    bound = compute_range_bound(Pulse.gaussian(fwhm), width, photons, 0.0)
+    # the pulse is cut at two widths; without background the edge tells a little that a tail would
+    # not
     assert bound == pytest.approx(SPEED_OF_LIGHT / 2 * sigma / np.sqrt(photons), rel=2e-3)
 
 
 def test_background_and_wide_bins_raise_the_bound():
     pulse = Pulse.gaussian(FWHM)
-    bounds = [range_bound(pulse, BIN, 50, background) for background in (0, 0.01, 0.1, 1, 10)]
+    bounds = [
+        compute_range_bound(pulse, BIN, 50, background) for background in (0, 0.01, 0.1, 1, 10)
+    ]
     assert all(np.diff(bounds) > 0)
-    assert range_bound(pulse, 2 * FWHM, 50, 0.1) > 1.7 * range_bound(pulse, BIN, 50, 0.1)
+    assert compute_range_bound(pulse, 2 * FWHM, 50, 0.1) > 1.7 * compute_range_bound(
+        pulse, BIN, 50, 0.1
+    )
 
 
-@pytest.mark.parametrize(("width", "photons", "background"), [(0, 1, 1), (BIN, 0, 1), (BIN, 1, -1), (BIN, np.nan, 1)])
+@pytest.mark.parametrize(
+    ("width", "photons", "background"), [(0, 1, 1), (BIN, 0, 1), (BIN, 1, -1), (BIN, np.nan, 1)]
+)
 def test_a_bound_of_nothing_is_refused(width, photons, background):
     with pytest.raises(InputError, match="must be positive"):
-        range_bound(Pulse.gaussian(FWHM), width, photons, background)
+        compute_range_bound(Pulse.gaussian(FWHM), width, photons, background)
 
 
 @pytest.mark.parametrize(("photons", "background"), [(20, 0.01), (100, 0.1), (1000, 1.0)])
@@ -75,7 +90,7 @@ def test_errors_stay_within_a_tenth_of_the_bound(detector, photons, background):
     found = detector.locate(histograms(arrival, photons, background, seed=2))
     assert found.detected.all()
     error = found.range[:, 0] - metres(arrival)
-    bound = range_bound(detector.pulse, BIN, photons, background)
+    bound = compute_range_bound(detector.pulse, BIN, photons, background)
     # the root of 2000 squared errors is itself uncertain by 1.6 percent
     assert np.sqrt(np.mean(error**2)) < 1.1 * bound
     assert abs(error.mean()) < 4 * bound / np.sqrt(TRIALS)
@@ -90,39 +105,49 @@ def test_false_alarms_come_at_the_stated_rate_at_any_background(background, rate
     empty = np.random.default_rng(7).poisson(background, (TRIALS, BINS))
     alarms = int(quiet.locate(empty).detected.sum())
     silent = np.mean(empty.sum(axis=1) == 0)  # histograms without a photon raise no alarm
-    low, high = binom.interval(0.999, TRIALS, rate)  # eight cases: one in a hundred runs would fail one of them
+    low, high = binom.interval(
+        0.999, TRIALS, rate
+    )  # eight cases: one in a hundred runs would fail one of them
     assert low - rate * silent * TRIALS <= alarms <= high
 
 
 def test_an_exponentially_modified_pulse_has_its_shape_and_is_located():
     pulse = Pulse.exponentially_modified(FWHM, 100e-12)
-    drawn = np.random.default_rng(0).normal(0, SIGMA, 400_000) + np.random.default_rng(1).exponential(1e-10, 400_000)
+    drawn = np.random.default_rng(0).normal(0, SIGMA, 400_000) + np.random.default_rng(
+        1
+    ).exponential(1e-10, 400_000)
     counted, edges = np.histogram(drawn, np.arange(-10, 40) * BIN)
     middle = (edges[1:] + edges[:-1]) / 2
-    share = pulse.binned(BIN)(middle) / pulse.binned(BIN).area * BIN
+    share = pulse.integrate_bins(BIN)(middle) / pulse.integrate_bins(BIN).area * BIN
     assert counted / drawn.size == pytest.approx(share, abs=5 * np.sqrt(share.max() / drawn.size))
     arrival = np.random.default_rng(4).uniform(30, 70, TRIALS) * BIN
-    counts = histograms(arrival, 200, 0.1, 3, lambda noise, n: noise.normal(0, SIGMA, n) + noise.exponential(1e-10, n))
+    counts = histograms(
+        arrival,
+        200,
+        0.1,
+        3,
+        lambda noise, n: noise.normal(0, SIGMA, n) + noise.exponential(1e-10, n),
+    )
     error = PhotonDetector(pulse, BIN, BINS).locate(counts).range[:, 0] - metres(arrival)
-    assert np.sqrt(np.mean(error**2)) < 1.1 * range_bound(pulse, BIN, 200, 0.1)
+    assert np.sqrt(np.mean(error**2)) < 1.1 * compute_range_bound(pulse, BIN, 200, 0.1)
 
 
 def test_a_binned_pulse_sums_up_the_light():
     pulse = Pulse.gaussian(FWHM)
-    shape = pulse.binned(3 * BIN)
+    shape = pulse.integrate_bins(3 * BIN)
     middles = np.arange(-8, 9) * 3 * BIN + 0.3 * BIN
     assert np.sum(shape(middles)) * 3 * BIN == pytest.approx(shape.area, rel=1e-4)
     assert shape.area / shape(0.0) > pulse.area
     assert shape.slope_at(0.0) == pytest.approx(0, abs=1e-6 / BIN)
     with pytest.raises(InputError, match="width of a bin"):
-        pulse.binned(0.0)
+        pulse.integrate_bins(0.0)
     for fwhm, decay in ((0, 1e-12), (1e-12, np.inf)):
         with pytest.raises(InputError, match="width and decay"):
             Pulse.exponentially_modified(fwhm, decay)
 
 
 def test_two_returns_are_both_found_and_do_not_pull_each_other():
-    detector = PhotonDetector(Pulse.gaussian(FWHM), BIN, BINS, most_returns=3)
+    detector = PhotonDetector(Pulse.gaussian(FWHM), BIN, BINS, max_returns=3)
     noise = np.random.default_rng(5)
     near = noise.uniform(30, 50, 300) * BIN
     far = near + 2.2 * FWHM
@@ -132,7 +157,7 @@ def test_two_returns_are_both_found_and_do_not_pull_each_other():
     assert np.mean(found.detected[:, 2]) < 0.03  # a hundredth by chance
     for column, arrival, photons in ((0, near, 400), (1, far, 150)):
         error = found.range[:, column] - metres(arrival)
-        bound = range_bound(detector.pulse, BIN, photons, 0.1)
+        bound = compute_range_bound(detector.pulse, BIN, photons, 0.1)
         assert (
             np.sqrt(np.mean(error**2)) < 1.2 * bound
         )  # 300 trials: 4 percent; beside each other they know slightly less
@@ -150,9 +175,16 @@ def test_unusable_histograms_and_settings_are_refused(detector):
     for bad in (-1.0, np.nan):
         with pytest.raises(InputError, match="not negative"):
             detector.locate(np.full((1, BINS), bad))
-    for settings_ in ({"false_alarm_rate": 1e-5}, {"bins": 12}, {"most_returns": 0}, {"bin_width": 0.0}):
+    for settings_ in (
+        {"false_alarm_rate": 1e-5},
+        {"bins": 12},
+        {"most_returns": 0},
+        {"bin_width": 0.0},
+    ):
         with pytest.raises(InputError):
-            PhotonDetector(**{"pulse": Pulse.gaussian(FWHM), "bin_width": BIN, "bins": BINS, **settings_})
+            PhotonDetector(
+                **{"pulse": Pulse.gaussian(FWHM), "bin_width": BIN, "bins": BINS, **settings_}
+            )
 
 
 def test_accuracy_reports_what_was_asked(detector):
@@ -170,7 +202,9 @@ def test_accuracy_reports_what_was_asked(detector):
 
 
 def cycles_of_a_blinded_detector(rate: np.ndarray, cycles: int, dead: int, seed: int) -> np.ndarray:
-    """Photon by photon: counts of a detector that misses what comes within `dead` bins after a count."""
+    """Photon by photon: counts of a detector that misses what comes within `dead` bins after a
+    count.
+    """
     arrivals = np.random.default_rng(seed).random((cycles, rate.size)) < 1 - np.exp(-rate)
     ready, counts = np.zeros(cycles, int), np.zeros(rate.size)
     for bin_ in range(rate.size):
@@ -184,7 +218,7 @@ def cycles_of_a_blinded_detector(rate: np.ndarray, cycles: int, dead: int, seed:
 def test_pile_up_is_undone(dead):
     rate = 0.01 + 0.3 * np.exp(-(((np.arange(60) - 25) / 3) ** 2))
     counts = cycles_of_a_blinded_detector(rate, 100_000, 10_000 if dead is None else dead, 8)
-    arrived = undo_pile_up(counts, 100_000, dead) / 100_000
+    arrived = correct_pile_up(counts, 100_000, dead) / 100_000
     reached = slice(0, 32)  # beyond, few first photons are left
     assert abs(np.average(np.arange(32), weights=counts[reached]) - 25) > 0.5
     assert arrived[reached] == pytest.approx(rate[reached], rel=0.12, abs=0.003)
@@ -195,13 +229,19 @@ def test_pile_up_is_undone(dead):
 
 def test_pile_up_of_few_photons_changes_nothing_and_dead_bins_are_unknown():
     counts = np.array([0, 1, 0, 2, 0])
-    assert undo_pile_up(counts, 10**9) == pytest.approx(counts, rel=1e-6)
-    spent = undo_pile_up([5, 5, 0, 0], 10)
+    assert correct_pile_up(counts, 10**9) == pytest.approx(counts, rel=1e-6)
+    spent = correct_pile_up([5, 5, 0, 0], 10)
     assert spent[0] == pytest.approx(10 * np.log(2))
     assert np.isnan(spent[1:]).all()
-    for bad, cycles, dead in (([3], 2, None), ([-1], 2, None), ([1], 0, None), ([1], 2, 0), ([2, 2], 3, 1)):
+    for bad, cycles, dead in (
+        ([3], 2, None),
+        ([-1], 2, None),
+        ([1], 0, None),
+        ([1], 2, 0),
+        ([2, 2], 3, 1),
+    ):
         with pytest.raises(InputError):
-            undo_pile_up(bad, cycles, dead)
+            correct_pile_up(bad, cycles, dead)
 
 
 def test_neighbours_help_starved_pixels_and_borders_stay_sharp(detector):
@@ -210,13 +250,16 @@ def test_neighbours_help_starved_pixels_and_borders_stay_sharp(detector):
     arrival = np.where(front, 40.3, 80.2 + 0.3 * (x - 16)) * BIN
     counts = histograms(arrival.ravel(), 2.0, 0.05, seed=9)
     alone = detector.locate(counts).range.reshape(32, 32)
-    smooth = locate_smoothly(detector, counts.reshape(32, 32, -1))
+    smooth = locate_with_smoothness(detector, counts.reshape(32, 32, -1))
     error = np.abs(smooth.range.reshape(32, 32) - metres(arrival))
     bin_m = metres(BIN)
-    assert np.mean(np.abs(alone - metres(arrival)) < 2 * bin_m) < 0.6  # most pixels alone know too little
+    assert (
+        np.mean(np.abs(alone - metres(arrival)) < 2 * bin_m) < 0.6
+    )  # most pixels alone know too little
     assert np.mean(error < 2 * bin_m) > 0.98
     assert np.median(error) < 0.6 * bin_m
-    # Gaussian errors have their median at 0.67; pooled over a slope in whole bins they are somewhat larger
+    # Gaussian errors have their median at 0.67; pooled over a slope in whole bins they are somewhat
+    # larger
     assert 0.5 < np.median(error / smooth.confidence.reshape(32, 32)) < 1.5
     assert np.mean(smooth.photons) == pytest.approx(2.0, rel=0.15)
 
@@ -224,7 +267,7 @@ def test_neighbours_help_starved_pixels_and_borders_stay_sharp(detector):
 def test_without_costs_every_pixel_stands_alone(detector):
     arrival = np.random.default_rng(3).uniform(30, 90, 36) * BIN
     counts = histograms(arrival, 300, 0.05, 4)
-    free = locate_smoothly(detector, counts.reshape(6, 6, -1), Smoothness(0.0, 0.0, 0))
+    free = locate_with_smoothness(detector, counts.reshape(6, 6, -1), Smoothness(0.0, 0.0, 0))
     assert free.range == pytest.approx(detector.locate(counts).range, rel=1e-9)
 
 
@@ -233,4 +276,4 @@ def test_unusable_smoothness_is_refused(detector):
         with pytest.raises(InputError):
             Smoothness(*costs)
     with pytest.raises(ShapeError):
-        locate_smoothly(detector, np.zeros((4, BINS)))
+        locate_with_smoothness(detector, np.zeros((4, BINS)))

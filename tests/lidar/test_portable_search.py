@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from array_places import PLACES, place_called
+from array_places import DEVICE_NAMES, find_device
 
-from tofclip.arrays import Place, to_numpy
+from tofclip.arrays import ComputeDevice, to_numpy
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Detection, Pulse, Returns, depth
@@ -19,22 +19,25 @@ from tofclip.solvers import LinearInverse
 BIN = 20e-12
 FWHM = 60e-12
 START = 10e-9
-EVERYTHING = Detection(share_of_scene=0, share_of_instant=0, share_of_pixel=0)
-MANY = replace(EVERYTHING, most_returns=7, signal_to_noise=3.5)
+EVERYTHING = Detection(min_scene_fraction=0, min_time_bin_fraction=0, min_pixel_fraction=0)
+MANY = replace(EVERYTHING, max_returns=7, signal_to_noise=3.5)
 
-# The fits stop where the next step would be far below 5e-3 bins; rounding of float32 traces decides which of two rounds
-# is the last only for returns that overlap. Intensities and confidences follow the arrivals.
+# The fits stop where the next step would be far below 5e-3 bins; rounding of float32 traces decides
+# which of two rounds is the last only for returns that overlap. Intensities and confidences follow
+# the arrivals.
 ARRIVAL_BINS = 5e-3
 USUAL_BINS = 1e-6
 
 
-@pytest.fixture(params=PLACES)
-def place(request):
-    return place_called(request.param)
+@pytest.fixture(params=DEVICE_NAMES)
+def device(request):
+    return find_device(request.param)
 
 
 def scene(bins: int = 150, side: int = 14, unevenness: float = 0.0, seed: int = 0) -> Frames:
-    """Up to four returns in a pixel, some overlapping, some at the ends of the axis, on noise and a background."""
+    """Up to four returns in a pixel, some overlapping, some at the ends of the axis, on noise and a
+    background.
+    """
     rng = np.random.default_rng(seed)
     times = START + np.cumsum(BIN * (1 + unevenness * rng.uniform(-1, 1, bins)))
     shape = (side, side)
@@ -43,15 +46,17 @@ def scene(bins: int = 150, side: int = 14, unevenness: float = 0.0, seed: int = 
     number = rng.integers(0, 5, shape)
     for k in range(4):
         height = 10 ** rng.uniform(1, 3, shape) * (number > k)
-        values += height * np.exp(-4 * np.log(2) * ((times[:, np.newaxis, np.newaxis] - arrival) / FWHM) ** 2)
+        values += height * np.exp(
+            -4 * np.log(2) * ((times[:, np.newaxis, np.newaxis] - arrival) / FWHM) ** 2
+        )
         near = np.clip(arrival + rng.uniform(0.8, 3, shape) * FWHM, times[0], times[-1])
         arrival = np.where(rng.random(shape) < 0.3, near, rng.uniform(times[0], times[-1], shape))
     camera = Camera(np.array([20.0]), np.array([0.1]), shape, 41, pulse_fwhm=FWHM)
     return Frames(values.astype(np.float32), times, camera)
 
 
-def elsewhere(frames: Frames, place: Place) -> Frames:
-    return replace(frames, values=place.put(frames.values))
+def move_frames(frames: Frames, device: ComputeDevice) -> Frames:
+    return replace(frames, values=device.put(frames.values))
 
 
 def assert_alike(found: Returns, expected: Returns) -> None:
@@ -66,78 +71,100 @@ def assert_alike(found: Returns, expected: Returns) -> None:
     np.testing.assert_allclose(found.confidence, expected.confidence, rtol=2e-2)
     assert np.median(np.abs(found.intensity / expected.intensity - 1)) < 1e-5
     assert np.median(np.abs(found.confidence / expected.confidence - 1)) < 1e-4
-    assert {type(getattr(found, name)) for name in ("range", "intensity", "confidence")} == {np.ndarray}
+    assert {type(getattr(found, name)) for name in ("range", "intensity", "confidence")} == {
+        np.ndarray
+    }
 
 
-@pytest.mark.parametrize("detection", [Detection(), EVERYTHING, MANY], ids=["usual", "everything", "many"])
+@pytest.mark.parametrize(
+    "detection", [Detection(), EVERYTHING, MANY], ids=["usual", "everything", "many"]
+)
 @pytest.mark.parametrize("unevenness", [0.0, 0.1])
-def test_the_same_returns_as_by_the_compiled_search(place, detection, unevenness):
+def test_the_same_returns_as_by_the_compiled_search(device, detection, unevenness):
     frames = scene(unevenness=unevenness)
     expected = depth(frames, detection=detection)
     assert expected.return_number.max() >= 3
-    assert_alike(depth(elsewhere(frames, place), detection=detection), expected)
+    assert_alike(depth(move_frames(frames, device), detection=detection), expected)
 
 
-def test_a_measured_pulse_that_is_not_symmetric(place):
+def test_a_measured_pulse_that_is_not_symmetric(device):
     frames, pulse = scene(seed=1), Pulse.exponentially_modified(FWHM, 30e-12)
-    assert_alike(depth(elsewhere(frames, place), pulse=pulse), depth(frames, pulse=pulse))
+    assert_alike(depth(move_frames(frames, device), pulse=pulse), depth(frames, pulse=pulse))
 
 
-def test_pieces_make_no_difference(place, monkeypatch):
-    frames = elsewhere(scene(), place)
+def test_pieces_make_no_difference(device, monkeypatch):
+    frames = move_frames(scene(), device)
     whole = depth(frames, detection=EVERYTHING)
-    monkeypatch.setattr(search, "WORKING_BYTES", 50 * 150 * 4 * search.WORKING_TRACES)
+    monkeypatch.setattr(search, "WORKING_BYTES", 50 * 150 * 4 * search.WORKING_ARRAYS)
     pieces = depth(frames, detection=EVERYTHING)
     for name in ("y", "x", "time", "intensity", "confidence"):
         np.testing.assert_allclose(getattr(pieces, name), getattr(whole, name), rtol=1e-6)
 
 
-def test_nothing_in_darkness_nor_in_light_that_never_changes(place):
+def test_nothing_in_darkness_nor_in_light_that_never_changes(device):
     frames = scene()
     for level in (0.0, 20.0):
-        assert len(depth(elsewhere(replace(frames, values=np.full_like(frames.values, level)), place))) == 0
+        assert (
+            len(
+                depth(
+                    move_frames(replace(frames, values=np.full_like(frames.values, level)), device)
+                )
+            )
+            == 0
+        )
 
 
-def test_three_frames_are_enough_and_two_are_not(place):
+def test_three_frames_are_enough_and_two_are_not(device):
     values = np.array([0.0, 10.0, 0.0], np.float32)[:, np.newaxis, np.newaxis]
     camera = Camera(np.array([20.0]), np.array([0.1]), (1, 1), 41, pulse_fwhm=FWHM)
     frames = Frames(values, START + BIN * np.arange(3), camera)
-    expected, found = depth(frames, detection=EVERYTHING), depth(elsewhere(frames, place), detection=EVERYTHING)
+    expected, found = (
+        depth(frames, detection=EVERYTHING),
+        depth(move_frames(frames, device), detection=EVERYTHING),
+    )
     np.testing.assert_allclose(found.time, expected.time)
-    two = Frames(place.put(values[:2]), frames.times[:2], camera)
+    two = Frames(device.put(values[:2]), frames.times[:2], camera)
     with pytest.raises(InputError, match="at least three frames"):
         depth(two)
 
 
-def test_from_readings_to_returns_without_leaving_the_device(place):
-    """A wall at one range in the readings of five views, recovered and ranged where the readings are."""
+def test_from_readings_to_returns_without_leaving_the_device(device):
+    """A wall at one range in the readings of five views, recovered and ranged where the readings
+    are.
+    """
     camera = Camera(
-        np.linspace(20.0, 100.0, 5), np.deg2rad([-38.0, -20.0, 2.0, 21.0, 40.0]), (16, 16), 120, pulse_fwhm=FWHM
+        np.linspace(20.0, 100.0, 5),
+        np.deg2rad([-38.0, -20.0, 2.0, 21.0, 40.0]),
+        (16, 16),
+        120,
+        pulse_fwhm=FWHM,
     )
     times = START + BIN * np.arange(60)
     operator = camera.operator()
     wall = np.zeros((16, 16))
     wall[4:12, 5:11] = 100
     pulse = np.exp(-4 * np.log(2) * ((times - times[31] - 0.3 * BIN) / FWHM) ** 2)
-    readings = operator(wall)[:, np.newaxis] * pulse + np.random.default_rng(2).normal(0, 1, (120, 60))
-    readings = readings.astype(np.float32)
-    recovered = LinearInverse().recover(operator, place.put(readings))
+    measurements = operator(wall)[:, np.newaxis] * pulse + np.random.default_rng(2).normal(
+        0, 1, (120, 60)
+    )
+    measurements = measurements.astype(np.float32)
+    recovered = LinearInverse().recover(operator, device.put(measurements))
     found = depth(Frames(recovered.frames, times, camera))
-    expected = depth(Frames(LinearInverse().recover(operator, readings).frames, times, camera))
+    expected = depth(Frames(LinearInverse().recover(operator, measurements).frames, times, camera))
     np.testing.assert_array_equal([found.y, found.x], [expected.y, expected.x])
     # Recovery differs by 1e-6 of the brightest pixel.
     np.testing.assert_allclose(found.time, expected.time, atol=1e-3 * BIN)
     assert np.median(found.time) == pytest.approx(times[31] + 0.3 * BIN, abs=0.1 * BIN)
 
 
-def test_frames_of_other_libraries_are_checked_and_saved(place, tmp_path):
+def test_frames_of_other_libraries_are_checked_and_saved(device, tmp_path):
     frames = scene(bins=10)
-    there = elsewhere(frames, place)
+    there = move_frames(frames, device)
     there.save(tmp_path / "frames.h5")
     np.testing.assert_array_equal(Frames.load(tmp_path / "frames.h5").values, frames.values)
-    assert Place.of(there.values).library == place.library
+    assert ComputeDevice.of(there.values).library == device.library
     np.testing.assert_array_equal(to_numpy(there.values), frames.values)
     with pytest.raises(ShapeError):
-        replace(there, values=place.put(frames.values[1:]))
+        replace(there, values=device.put(frames.values[1:]))
     with pytest.raises(InputError, match="NaN"):
-        replace(there, values=place.put(np.full_like(frames.values, np.nan)))
+        replace(there, values=device.put(np.full_like(frames.values, np.nan)))

@@ -11,10 +11,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tofclip.camera import Camera
-from tofclip.errors import CalibrationError, FileFormatError, InputError, MissingDependencyError, ShapeError
-from tofclip.lidar import PointCloud, Returns, point_cloud, ray_directions, save_depth
-from tofclip.lidar.geometry import distorted
-from tofclip.lidar.processing import align, downsampled, fit_plane, moved, normals, selected, without_outliers
+from tofclip.errors import (
+    CalibrationError,
+    FileFormatError,
+    InputError,
+    MissingDependencyError,
+    ShapeError,
+)
+from tofclip.lidar import PointCloud, Returns, compute_ray_directions, point_cloud, save_depth
+from tofclip.lidar.geometry import distort_directions
+from tofclip.lidar.processing import (
+    align_clouds,
+    downsample_cloud,
+    estimate_normals,
+    fit_plane,
+    remove_outliers,
+    select_points,
+    transform_cloud,
+)
 
 NORMAL = np.array([0.2, -0.1, -1.0]) / np.linalg.norm([0.2, -0.1, -1.0])
 
@@ -25,14 +39,22 @@ def open3d():
     from tofclip.lidar import processing
 
     try:
-        return processing._open3d()
+        return processing._import_open3d()
     except MissingDependencyError as fault:
         pytest.skip(str(fault))
 
 
 def cloud_of(xyz: np.ndarray) -> PointCloud:
     n = np.arange(len(xyz))
-    return PointCloud(xyz, n + 1.0, 1e-3 + 0 * n, np.linalg.norm(xyz, axis=1), 1 + n % 3, 1e-9 * n, {"of": "a test"})
+    return PointCloud(
+        xyz,
+        n + 1.0,
+        1e-3 + 0 * n,
+        np.linalg.norm(xyz, axis=1),
+        1 + n % 3,
+        1e-9 * n,
+        {"of": "a test"},
+    )
 
 
 def plane_points(number: int, seed: int, noise: float = 1e-3) -> np.ndarray:
@@ -58,25 +80,25 @@ def test_a_plane_and_its_normals_are_found_among_strays():
     assert plane.offset == pytest.approx(-2.0, abs=3e-4)
     assert plane.rms == pytest.approx(1e-3, rel=0.15)
     assert plane.inliers[:600].mean() > 0.99
-    assert np.median(normals(selected(cloud, plane.inliers), 60) @ NORMAL) > 0.9998
+    assert np.median(estimate_normals(select_points(cloud, plane.inliers), 60) @ NORMAL) > 0.9998
 
 
 def test_strays_are_left_out_and_columns_stay_with_their_points():
     random = np.random.default_rng(2)
     cloud = cloud_of(np.concatenate([plane_points(800, 0), random.uniform(-3, 3, (20, 3))]))
-    kept = without_outliers(cloud)
+    kept = remove_outliers(cloud)
     assert (kept.intensity > 800).sum() <= 1
     assert len(kept) > 780
     assert np.array_equal(kept.xyz, cloud.xyz[(kept.intensity - 1).astype(int)])
     assert kept.provenance == cloud.provenance
-    assert len(without_outliers(selected(cloud, np.arange(5)))) == 5
+    assert len(remove_outliers(select_points(cloud, np.arange(5)))) == 5
 
 
 @settings(max_examples=20, deadline=None)
 @given(points=st.integers(0, 60), voxel=st.floats(0.05, 3.0), seed=st.integers(0, 99))
 def test_voxels_hold_one_point_each_and_keep_the_mean(points, voxel, seed):
     cloud = cloud_of(np.random.default_rng(seed).normal(size=(points, 3)))
-    thin = downsampled(cloud, voxel)
+    thin = downsample_cloud(cloud, voxel)
     cells = {tuple(cell) for cell in np.floor(cloud.xyz / voxel).astype(int)}
     assert len(thin) == len(cells)
     if points and len(cells) == 1:
@@ -90,37 +112,39 @@ def test_voxels_hold_one_point_each_and_keep_the_mean(points, voxel, seed):
 
 def test_a_cloud_is_laid_over_another_one():
     random = np.random.default_rng(5)
-    corner = np.concatenate([random.uniform(0, 1, (700, 3)) * side for side in ([1, 1, 0], [1, 0, 1], [0, 1, 1])])
+    corner = np.concatenate(
+        [random.uniform(0, 1, (700, 3)) * side for side in ([1, 1, 0], [1, 0, 1], [0, 1, 1])]
+    )
     target = cloud_of(corner + np.array([0, 0, 2.0]))
     pose = rotation(0.03)
     pose[:3, 3] = [0.02, -0.01, 0.015]
-    source = moved(target, np.linalg.inv(pose))
-    found = align(source, target, reach=0.1)
+    source = transform_cloud(target, np.linalg.inv(pose))
+    found = align_clouds(source, target, reach=0.1)
     assert found.overlap > 0.99
     assert found.rms < 1e-4
     np.testing.assert_allclose(found.pose, pose, atol=1e-4)
-    np.testing.assert_allclose(moved(source, found.pose).xyz, target.xyz, atol=3e-4)
+    np.testing.assert_allclose(transform_cloud(source, found.pose).xyz, target.xyz, atol=3e-4)
     np.testing.assert_array_equal(source.range, target.range)
 
 
 def test_unusable_requests_are_refused(monkeypatch):
     cloud = cloud_of(plane_points(10, 0))
-    few = selected(cloud, np.arange(2))
+    few = select_points(cloud, np.arange(2))
     for call in (
-        lambda: downsampled(cloud, 0.0),
-        lambda: without_outliers(cloud, 0),
-        lambda: normals(few),
+        lambda: downsample_cloud(cloud, 0.0),
+        lambda: remove_outliers(cloud, 0),
+        lambda: estimate_normals(few),
         lambda: fit_plane(few, 0.1),
-        lambda: align(few, cloud, 0.1),
-        lambda: moved(cloud, 2 * np.eye(4)),
+        lambda: align_clouds(few, cloud, 0.1),
+        lambda: transform_cloud(cloud, 2 * np.eye(4)),
     ):
         with pytest.raises(InputError):
             call()
     with pytest.raises(ShapeError):
-        moved(cloud, np.eye(3))
+        transform_cloud(cloud, np.eye(3))
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(MissingDependencyError, match="Open3D"):
-        normals(cloud)
+        estimate_normals(cloud)
     monkeypatch.setitem(sys.modules, "laspy", None)
     with pytest.raises(MissingDependencyError, match=r"tofclip\[las\]"):
         cloud.save("scene.las")
@@ -133,17 +157,26 @@ def test_unusable_requests_are_refused(monkeypatch):
     column=st.floats(0, 95),
 )
 def test_the_lens_is_undone(k, row, column):
-    camera = Camera(np.array([60.0]), np.array([0.0]), (128, 96), 200, focal_length_px=200.0, distortion=np.array(k))
-    x, y, z = ray_directions(camera, [row], [column])[0]
-    right, down = distorted(np.array([x / z]), np.array([y / z]), np.array(k))
+    camera = Camera(
+        np.array([60.0]),
+        np.array([0.0]),
+        (128, 96),
+        200,
+        focal_length_px=200.0,
+        distortion=np.array(k),
+    )
+    x, y, z = compute_ray_directions(camera, [row], [column])[0]
+    right, down = distort_directions(np.array([x / z]), np.array([y / z]), np.array(k))
     assert right[0] * 200 + 48 == pytest.approx(column, abs=1e-6)
     assert down[0] * 200 + 64 == pytest.approx(row, abs=1e-6)
 
 
 def test_impossible_lenses_are_refused(tmp_path):
-    camera = Camera(np.array([60.0]), np.array([0.0]), (128, 96), 200, distortion=np.array([-9.0, 0, 0, 0, 0]))
+    camera = Camera(
+        np.array([60.0]), np.array([0.0]), (128, 96), 200, distortion=np.array([-9.0, 0, 0, 0, 0])
+    )
     with pytest.raises(CalibrationError, match="too strong"):
-        ray_directions(camera, [0], [0])
+        compute_ray_directions(camera, [0], [0])
     camera.save(tmp_path / "camera.h5")
     assert Camera.load(tmp_path / "camera.h5").distortion.tolist() == [-9, 0, 0, 0, 0]
     for wrong in (np.zeros(4), np.full(5, np.nan)):
@@ -165,7 +198,9 @@ def las_points(path) -> tuple[np.ndarray, list[str], np.ndarray]:
         user, kind, length = struct.unpack_from("<16sHH", content, at + 2)
         if user.rstrip(b"\0") == b"LASF_Spec" and kind == 4:
             described = content[at + 54 : at + 54 + length]
-            names = [described[i + 4 : i + 36].rstrip(b"\0").decode() for i in range(0, length, 192)]
+            names = [
+                described[i + 4 : i + 36].rstrip(b"\0").decode() for i in range(0, length, 192)
+            ]
         at += 54 + length
     rows = np.frombuffer(content, np.uint8, number * size, start).reshape(number, size)
     return np.ascontiguousarray(rows[:, :12]).view("<i4") * scale + offset, names, rows[:, 30:]
@@ -176,9 +211,13 @@ def test_las_holds_micrometres_and_all_columns(tmp_path):
     cloud.save(tmp_path / "scene.las")
     xyz, names, extra = las_points(tmp_path / "scene.las")
     np.testing.assert_allclose(xyz, cloud.xyz, atol=0.51e-6)
-    assert names == [f"tofclip_{name}" for name in ("intensity", "confidence", "range", "return_number", "time")]
+    assert names == [
+        f"tofclip_{name}" for name in ("intensity", "confidence", "range", "return_number", "time")
+    ]
     raw = np.ascontiguousarray(extra)
-    np.testing.assert_array_equal(np.ascontiguousarray(raw[:, 0:4]).view("<f4")[:, 0], cloud.intensity)
+    np.testing.assert_array_equal(
+        np.ascontiguousarray(raw[:, 0:4]).view("<f4")[:, 0], cloud.intensity
+    )
     np.testing.assert_array_equal(np.ascontiguousarray(raw[:, 8:12]).view("<f4")[:, 0], cloud.range)
     np.testing.assert_array_equal(raw[:, 12], cloud.return_number)
 
@@ -191,7 +230,10 @@ def test_las_and_laz_are_read_by_laspy_and_by_us(tmp_path, suffix):
     cloud.save(path)
     seen, back = laspy.read(path), PointCloud.load(path)
     np.testing.assert_allclose(np.stack([seen.x, seen.y, seen.z], axis=-1), cloud.xyz, atol=0.51e-6)
-    units = {d.name: bytes(d.description.encode()).rstrip(b"\0") for d in seen.point_format.extra_dimensions}
+    units = {
+        d.name: bytes(d.description.encode()).rstrip(b"\0")
+        for d in seen.point_format.extra_dimensions
+    }
     assert (units["tofclip_range"], units["tofclip_time"]) == (b"m", b"s")
     assert seen.header.are_points_compressed == (suffix == ".laz")
     assert seen.intensity.max() == 65535
@@ -209,7 +251,9 @@ def test_las_and_laz_are_read_by_laspy_and_by_us(tmp_path, suffix):
 
 
 def exr_channels(path) -> dict[str, np.ndarray]:
-    """An uncompressed scan-line OpenEXR file of 32-bit channels, read by the format's specification alone."""
+    """An uncompressed scan-line OpenEXR file of 32-bit channels, read by the format's specification
+    alone.
+    """
     content = path.read_bytes()
     assert struct.unpack_from("<I", content)[0] == 20000630
     at, header = 8, {}
@@ -219,7 +263,10 @@ def exr_channels(path) -> dict[str, np.ndarray]:
         at += len(name) + len(kind) + 6
         header[name.decode()] = content[at : at + length]
         at += length
-    names = [entry.split(b"\0")[0].decode() for entry in (header["channels"][i : i + 18] for i in (0, 18))]
+    names = [
+        entry.split(b"\0")[0].decode()
+        for entry in (header["channels"][i : i + 18] for i in (0, 18))
+    ]
     left, top, right, bottom = struct.unpack("<4i", header["dataWindow"])
     rows, columns = bottom - top + 1, right - left + 1
     lines = struct.unpack_from(f"<{rows}Q", content, at + 1)
@@ -239,6 +286,8 @@ def test_depth_pictures_hold_metres_along_the_axis(tmp_path):
     assert sorted(seen) == ["Y", "Z"]
     xyz = point_cloud(returns).xyz
     assert seen["Z"][0, 8] == pytest.approx(xyz[0, 2])
-    assert seen["Z"][2, 4] == pytest.approx(3.0 * 10 / np.hypot(10, 1))  # one row above the axis; the brighter return
+    assert seen["Z"][2, 4] == pytest.approx(
+        3.0 * 10 / np.hypot(10, 1)
+    )  # one row above the axis; the brighter return
     assert (seen["Y"][2, 4], seen["Y"][5, 1], seen["Y"][3, 3]) == (7, 2, 0)
     assert np.isinf(seen["Z"]).sum() == 6 * 9 - 3

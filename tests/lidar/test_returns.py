@@ -19,7 +19,7 @@ BIN = 20e-12
 FWHM = 60e-12
 START = 10e-9
 BIN_M = SPEED_OF_LIGHT * BIN / 2
-EVERYTHING = Detection(share_of_scene=0, share_of_instant=0, share_of_pixel=0)
+EVERYTHING = Detection(min_scene_fraction=0, min_time_bin_fraction=0, min_pixel_fraction=0)
 
 
 def camera(rows: int = 1, columns: int = 1) -> Camera:
@@ -112,7 +112,9 @@ def test_two_returns_within_a_pulse_width_are_one():
 
 def test_a_faint_echo_505_rows_later_is_left_out_and_found_when_asked_for():
     times = even_times(700)
-    trace = gaussian(times, START + BIN * np.array([100.0, 605.0]), np.array([1000.0, 20.0])).sum(axis=1, keepdims=True)
+    trace = gaussian(times, START + BIN * np.array([100.0, 605.0]), np.array([1000.0, 20.0])).sum(
+        axis=1, keepdims=True
+    )
     assert depth(frames_of(trace, times)).return_number.tolist() == [1]
     both = depth(frames_of(trace, times), detection=EVERYTHING)
     assert both.return_number.tolist() == [1, 2]
@@ -145,8 +147,8 @@ def test_pixels_without_signal_have_no_return():
 def test_noise_alone_hardly_ever_makes_a_return():
     noise = np.random.default_rng(0).normal(20.0, 3.0, (500, 400))
     returns = depth(frames_of(noise, even_times(500)), detection=EVERYTHING)
-    # the best of about 170 independent bins exceeds 5 sigma once in 20 000 pixels; the noise level itself is
-    # uncertain by a few percent, so 1 % is asked for
+    # the best of about 170 independent bins exceeds 5 sigma once in 20 000 pixels; the noise level
+    # itself is uncertain by a few percent, so 1 % is asked for
     assert len(returns) <= 4
 
 
@@ -204,8 +206,10 @@ def test_light_from_before_time_zero_is_no_return():
 def test_only_the_strongest_returns_are_kept_nearest_first():
     times = even_times(400)
     arrivals = START + BIN * np.array([50.0, 120.0, 200.0, 300.0])
-    trace = gaussian(times, arrivals, np.array([100.0, 40.0, 300.0, 200.0])).sum(axis=1, keepdims=True)
-    returns = depth(frames_of(trace, times), detection=replace(EVERYTHING, most_returns=3))
+    trace = gaussian(times, arrivals, np.array([100.0, 40.0, 300.0, 200.0])).sum(
+        axis=1, keepdims=True
+    )
+    returns = depth(frames_of(trace, times), detection=replace(EVERYTHING, max_returns=3))
     np.testing.assert_allclose(returns.time, arrivals[[0, 2, 3]], atol=0.01 * BIN)
     assert returns.return_number.tolist() == [1, 2, 3]
 
@@ -217,14 +221,18 @@ def test_returns_come_in_raster_order_and_make_pictures():
     values[:, 1, 0] = gaussian(times, np.array(START + 60 * BIN), 90.0)
     values[:, 1, 0] += gaussian(times, np.array(START + 90 * BIN), 120.0)
     returns = depth(Frames(values.astype(np.float32), times, camera(2, 3)))
-    assert list(zip(returns.y.tolist(), returns.x.tolist(), returns.return_number.tolist(), strict=True)) == [
+    assert list(
+        zip(returns.y.tolist(), returns.x.tolist(), returns.return_number.tolist(), strict=True)
+    ) == [
         (0, 2, 1),
         (1, 0, 1),
         (1, 0, 2),
     ]
     picture = returns.image("time")
     assert np.isnan(picture).sum() == 4
-    assert picture[1, 0] == pytest.approx(START + 90 * BIN, abs=0.01 * BIN)  # the more intense of the two
+    assert picture[1, 0] == pytest.approx(
+        START + 90 * BIN, abs=0.01 * BIN
+    )  # the more intense of the two
     assert picture[0, 2] == pytest.approx(START + 40 * BIN, abs=0.01 * BIN)
 
 
@@ -237,7 +245,9 @@ def test_another_pulse_shape_finds_its_own_arrivals():
     arrival = START + 80.37 * BIN
     returns = depth(frames_of(50 * pulse(times - arrival)[:, np.newaxis], times), pulse=pulse)
     assert len(returns) == 1
-    assert returns.time[0] == pytest.approx(arrival, abs=0.05 * BIN)  # the kink at its start is 1 ps wide
+    assert returns.time[0] == pytest.approx(
+        arrival, abs=0.05 * BIN
+    )  # the kink at its start is 1 ps wide
 
 
 def test_a_pulse_shorter_than_a_bin_still_gives_a_range():
@@ -252,7 +262,10 @@ def test_a_pulse_shorter_than_a_bin_still_gives_a_range():
 def test_the_result_does_not_depend_on_the_number_of_threads(monkeypatch):
     random = np.random.default_rng(5)
     times = even_times(80)
-    frames = frames_of(random.poisson(gaussian(times, START + BIN * random.uniform(20, 60, 700), 50.0) + 1.0), times)
+    frames = frames_of(
+        random.poisson(gaussian(times, START + BIN * random.uniform(20, 60, 700), 50.0) + 1.0),
+        times,
+    )
     found: list[Returns] = []
     for threads in ("1", "2"):
         monkeypatch.setenv("TOFCLIP_THREADS", threads)

@@ -1,4 +1,6 @@
-"""Light fields: refocusing, reading, and the cameras that encode them, on scenes with a known answer."""
+"""Light fields: refocusing, reading, and the cameras that encode them, on scenes with a known
+answer.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +10,13 @@ import pytest
 from tofclip.errors import FileFormatError, InputError, ShapeError, TofclipError
 from tofclip.io.light_fields import read_light_field
 from tofclip.light_field import LightField
-from tofclip.light_field.measurement import Setup, measure, spoilt
+from tofclip.light_field.measurement import CameraSetup, corrupt_measurement, measure
 from tofclip.metrics import nmse
 from tofclip.recovery.light_field import ClipRecovery
 
-VIEWS = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij"), axis=-1).reshape(-1, 2)
+VIEWS = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij"), axis=-1).reshape(
+    -1, 2
+)
 SHEAR = -2.0
 SHAPE = (31, 34)
 
@@ -36,26 +40,28 @@ def test_refocusing_at_the_cards_depth_makes_it_sharp():
 
 
 def test_another_reference_sees_the_card_where_that_view_does():
-    np.testing.assert_allclose(light_field().refocus(SHEAR, (1.0, -1.0)), light_field().pictures[6], atol=1e-6)
+    np.testing.assert_allclose(
+        light_field().refocus(SHEAR, (1.0, -1.0)), light_field().pictures[6], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("encoder", ["line", "single-pixel"])
 def test_the_model_predicts_the_readings_of_the_true_views(encoder):
     """A whole-pixel shear is exact for codes; for lines the shifted detector splits pixels where a shifted picture
     does not, which on this scene of single pixels changes readings by up to a quarter."""
-    camera = Setup(encoder, 1.0, 3).camera(SHAPE, VIEWS)
-    readings = measure(light_field(), Setup(encoder, 1.0, 3)).readings
+    camera = CameraSetup(encoder, 1.0, 3).camera(SHAPE, VIEWS)
+    measurements = measure(light_field(), CameraSetup(encoder, 1.0, 3)).measurements
     predicted = camera.model(SHEAR)(scene())
     bound = 1e-5 if encoder == "single-pixel" else 0.25
-    assert np.linalg.norm(predicted - readings) < bound * np.linalg.norm(readings)
-    wrong = np.linalg.norm(camera.model(-SHEAR)(scene()) - readings)
-    assert np.linalg.norm(predicted - readings) < 0.5 * wrong
+    assert np.linalg.norm(predicted - measurements) < bound * np.linalg.norm(measurements)
+    wrong = np.linalg.norm(camera.model(-SHEAR)(scene()) - measurements)
+    assert np.linalg.norm(predicted - measurements) < 0.5 * wrong
 
 
 @pytest.mark.parametrize("encoder", ["line", "single-pixel"])
 def test_a_card_is_recovered_sharply_at_its_own_depth_only(encoder):
     """Trial seeds gave 1 to 6 % in focus; out of focus the wrong model cannot explain the readings."""
-    measurement = measure(light_field(), Setup(encoder, 0.8, 0))
+    measurement = measure(light_field(), CameraSetup(encoder, 0.8, 0))
 
     def error(shear: float) -> float:
         return nmse(ClipRecovery(weight=0.02).recover(measurement, shear).picture, scene())
@@ -65,8 +71,8 @@ def test_a_card_is_recovered_sharply_at_its_own_depth_only(encoder):
 
 
 def test_fewer_angles_than_views_leave_some_without():
-    camera = Setup("line", 5 / 31, 0).camera(SHAPE, VIEWS)
-    assert len(camera.used) == len(set(camera.used)) == 5
+    camera = CameraSetup("line", 5 / 31, 0).camera(SHAPE, VIEWS)
+    assert len(camera.used_views) == len(set(camera.used_views)) == 5
     assert camera.light_field_model().shape_in == (5, *SHAPE)
 
 
@@ -75,22 +81,23 @@ def test_a_measurement_survives_its_file(encoder, tmp_path):
     from tofclip.light_field.measurement import ClipMeasurement
     from tofclip.storage import Record
 
-    made = measure(light_field(), Setup(encoder, 0.5, 7))
+    made = measure(light_field(), CameraSetup(encoder, 0.5, 7))
     made.to_record({}).save(tmp_path / "m.h5")
     back = ClipMeasurement.from_record(Record.load(tmp_path / "m.h5", "clip_measurement"))
-    np.testing.assert_array_equal(back.readings, made.readings)
+    np.testing.assert_array_equal(back.measurements, made.measurements)
     assert (back.setup, back.image_shape) == (made.setup, made.image_shape)
 
 
 def test_bad_readings_and_photons_are_as_many_as_asked():
-    made = measure(light_field(), Setup("line", 1.0, 0))
-    largest = made.readings.max()
-    changed = spoilt(made, None, 0.1).readings != made.readings
-    assert 0 < changed.sum() <= round(0.1 * made.readings.size)
-    noisy = spoilt(made, 1000, 0.0).readings
-    # Poisson noise of the mean reading f: variance f * largest / photons; the bound is loose by a factor of 1.3.
-    expected = np.sqrt(made.readings.mean() * largest / 1000)
-    assert expected / 1.3 < np.std(noisy - made.readings) < 1.3 * expected
+    made = measure(light_field(), CameraSetup("line", 1.0, 0))
+    largest = made.measurements.max()
+    changed = corrupt_measurement(made, None, 0.1).measurements != made.measurements
+    assert 0 < changed.sum() <= round(0.1 * made.measurements.size)
+    noisy = corrupt_measurement(made, 1000, 0.0).measurements
+    # Poisson noise of the mean reading f: variance f * largest / photons; the bound is loose by a
+    # factor of 1.3.
+    expected = np.sqrt(made.measurements.mean() * largest / 1000)
+    assert expected / 1.3 < np.std(noisy - made.measurements) < 1.3 * expected
 
 
 @pytest.mark.parametrize(
@@ -99,14 +106,14 @@ def test_bad_readings_and_photons_are_as_many_as_asked():
         lambda: LightField(np.zeros((9, 4, 4)), VIEWS),
         lambda: LightField(np.full((9, 4, 4), np.nan), VIEWS),
         lambda: LightField(np.eye(9)[:, :, None], VIEWS[:4]),
-        lambda: Setup("nothing", 0.5, 0).camera(SHAPE, VIEWS),
-        lambda: Setup("line", 1e-3, 0).camera(SHAPE, VIEWS),
-        lambda: Setup("single-pixel", 1e-3, 0).camera(SHAPE, VIEWS),
-        lambda: Setup("line", -1.0, 0).camera(SHAPE, VIEWS),
-        lambda: Setup("line", 1.0, 0).camera(SHAPE, VIEWS).model(50.0),
-        lambda: Setup("single-pixel", 1.0, 0).camera(SHAPE, VIEWS).model(50.0),
-        lambda: spoilt(measure(light_field(), Setup("line", 1.0, 0)), None, 1.5),
-        lambda: spoilt(measure(light_field(), Setup("line", 1.0, 0)), -1.0, 0.0),
+        lambda: CameraSetup("nothing", 0.5, 0).camera(SHAPE, VIEWS),
+        lambda: CameraSetup("line", 1e-3, 0).camera(SHAPE, VIEWS),
+        lambda: CameraSetup("single-pixel", 1e-3, 0).camera(SHAPE, VIEWS),
+        lambda: CameraSetup("line", -1.0, 0).camera(SHAPE, VIEWS),
+        lambda: CameraSetup("line", 1.0, 0).camera(SHAPE, VIEWS).model(50.0),
+        lambda: CameraSetup("single-pixel", 1.0, 0).camera(SHAPE, VIEWS).model(50.0),
+        lambda: corrupt_measurement(measure(light_field(), CameraSetup("line", 1.0, 0)), None, 1.5),
+        lambda: corrupt_measurement(measure(light_field(), CameraSetup("line", 1.0, 0)), -1.0, 0.0),
     ],
 )
 def test_what_cannot_be_used_is_refused(fault):
@@ -117,9 +124,9 @@ def test_what_cannot_be_used_is_refused(fault):
 def test_readings_of_another_camera_are_refused():
     from dataclasses import replace
 
-    made = measure(light_field(), Setup("line", 1.0, 0))
+    made = measure(light_field(), CameraSetup("line", 1.0, 0))
     with pytest.raises(ShapeError):
-        replace(made, readings=made.readings[1:]).camera()
+        replace(made, measurements=made.measurements[1:]).camera()
 
 
 def test_a_light_field_file_is_read_and_a_wrong_one_refused(tmp_path):

@@ -1,6 +1,7 @@
 """Libraries other than NumPy that the tests of portable imaging put captures into.
 
-Where there is a graphics processor, ``TOFCLIP_TEST_DEVICES=cuda pytest tests/nlos -k portable`` tests it as well.
+Where there is a graphics processor, ``TOFCLIP_TEST_DEVICES=cuda pytest tests/nlos -k portable``
+tests it as well.
 """
 
 from __future__ import annotations
@@ -11,19 +12,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tofclip.arrays import Place, place_named, to_numpy
+from tofclip.arrays import ComputeDevice, parse_device, to_numpy
 
 LIBRARIES = ("torch", "array_api_strict", *os.environ.get("TOFCLIP_TEST_DEVICES", "").split())
 
 
-def place_of(library: str) -> Place:
-    """Return a library's processor, or the device of that name; skip the test where the library is not installed."""
+def find_device(library: str) -> ComputeDevice:
+    """Return a library's processor, or the device of that name; skip the test where the library is
+    not installed.
+    """
     if library == "array_api_strict":
-        return Place.of(pytest.importorskip(library).asarray([0.0]))
+        return ComputeDevice.of(pytest.importorskip(library).asarray([0.0]))
     if library != "torch":
-        return place_named(library)
-    pytest.importorskip(library).set_num_threads(1)  # waking others up takes longer than what there is to do
-    return place_named("torch:cpu")
+        return parse_device(library)
+    pytest.importorskip(library).set_num_threads(
+        1
+    )  # waking others up takes longer than what there is to do
+    return parse_device("torch:cpu")
 
 
 def relative_error(found: Any, expected: np.ndarray) -> float:

@@ -17,7 +17,9 @@ SHAPES = ("planar", "cylinder", "wavy", "relief", "plates")
 
 
 def shaped_wall(shape: str, count: int) -> NDArray[np.float64]:
-    """A wall of 2 m x 2 m: planar, a cylinder of radius 2.5 m, waves of 0.1 m, relief of 0.3 m, or two plates."""
+    """A wall of 2 m x 2 m: planar, a cylinder of radius 2.5 m, waves of 0.1 m, relief of 0.3 m, or
+    two plates.
+    """
     x, y = np.meshgrid(np.linspace(-1, 1, count), np.linspace(-1, 1, count))
     depths = {
         "planar": 0 * x,
@@ -35,4 +37,4 @@ def shaped_wall(shape: str, count: int) -> NDArray[np.float64]:
 def shaped_capture(shape: str, count: int, laser: NDArray[np.float64] | None = None) -> Capture:
     """Four hidden points seen from such a wall."""
     wall = shaped_wall(shape, count)
-    return PointScene(POINTS).seen_from(wall, SPOT if laser is None else laser, AXIS, JITTER)
+    return PointScene(POINTS).simulate_capture(wall, SPOT if laser is None else laser, AXIS, JITTER)

@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 
 import apps.studies.hidden_scene_adjoint as study_module
-from apps.studies.hidden_scene_adjoint import office, put_between_marks, study, table, tomography
+from apps.studies.hidden_scene_adjoint import (
+    build_office,
+    build_tomography,
+    format_table,
+    replace_between_marks,
+    run_study,
+)
 from nlos import Backprojection, Capture, Grid, PlanarRSD
 from nlos.adjoint import AdjointImaging, CompressedCapture
-from nlos.simulate import PointScene, relay_wall
+from nlos.simulate import PointScene, build_relay_wall
 from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import SparseMatrix
@@ -18,8 +24,8 @@ from tofclip.solvers import LinearInverse
 pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")
 
 HIDDEN = (0.15, -0.2, 0.65)
-WALL = relay_wall("planar", 24, 1.2)
-SCENE = PointScene([HIDDEN]).seen_from(WALL, [0.0, 0.0, 0.0], TimeAxis(256, 24e-12), 20e-12)
+WALL = build_relay_wall("planar", 24, 1.2)
+SCENE = PointScene([HIDDEN]).simulate_capture(WALL, [0.0, 0.0, 0.0], TimeAxis(256, 24e-12), 20e-12)
 GRID = Grid.box((-0.3, 0.45), (-0.4, 0.2), (0.45, 0.85), 0.05)
 SOLVER = Backprojection(0.15)
 
@@ -28,9 +34,11 @@ def test_with_every_point_read_for_itself_nothing_is_lost() -> None:
     """An identity matrix is unitary: its adjoint is its inverse (Eq. 22 and the sentence after it)."""
     import scipy.sparse
 
-    identity = SparseMatrix(scipy.sparse.eye_array(24 * 24, dtype=np.float32, format="csr"), (24, 24), (24 * 24,))
+    identity = SparseMatrix(
+        scipy.sparse.eye_array(24 * 24, dtype=np.float32, format="csr"), (24, 24), (24 * 24,)
+    )
     compressed = CompressedCapture.of(SCENE, identity)
-    assert compressed.recovered().signal == pytest.approx(SCENE.signal, rel=1e-5, abs=1e-7)
+    assert compressed.recover_transients().signal == pytest.approx(SCENE.signal, rel=1e-5, abs=1e-7)
     found = AdjointImaging(SOLVER, threshold=0.0).reconstruct(compressed, GRID)
     expected = SOLVER.reconstruct(SCENE, GRID).values
     assert found.values == pytest.approx(expected, rel=1e-4, abs=1e-4 * float(expected.max()))
@@ -38,11 +46,11 @@ def test_with_every_point_read_for_itself_nothing_is_lost() -> None:
 
 @pytest.mark.parametrize("method", [None, LinearInverse()])
 def test_few_projections_still_show_a_point(method: LinearInverse | None) -> None:
-    compressed = CompressedCapture.of(SCENE, tomography(24, 0.25))
-    assert compressed.readings.shape == (6 * 24, 256)
+    compressed = CompressedCapture.of(SCENE, build_tomography(24, 0.25))
+    assert compressed.measurements.shape == (6 * 24, 256)
     imaging = AdjointImaging(SOLVER) if method is None else AdjointImaging(SOLVER, method)
     volume = imaging.reconstruct(compressed, GRID)
-    assert volume.brightest() == pytest.approx(HIDDEN, abs=0.051)
+    assert volume.find_brightest() == pytest.approx(HIDDEN, abs=0.051)
     # The hard threshold of 0.3 leaves nothing between 0 and it.
     lit = volume.values[volume.values > 0]
     assert lit.min() >= 0.3 * volume.values.max()
@@ -54,26 +62,28 @@ def test_masked_wall_points_are_read_as_dark() -> None:
     wall, signal = SCENE.wall.copy(), SCENE.signal.copy()
     wall[3, 4] = np.nan
     signal[:, 3, 4] = np.nan
-    compressed = CompressedCapture.of(Capture(signal, wall, SCENE.laser, SCENE.bin_width), tomography(24, 0.25))
-    assert np.all(np.isfinite(compressed.readings))
-    assert not compressed.recovered().valid[3, 4]
+    compressed = CompressedCapture.of(
+        Capture(signal, wall, SCENE.laser, SCENE.bin_width), build_tomography(24, 0.25)
+    )
+    assert np.all(np.isfinite(compressed.measurements))
+    assert not compressed.recover_transients().valid[3, 4]
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    operator = tomography(24, 0.25)
+    operator = build_tomography(24, 0.25)
     fitting = CompressedCapture.of(SCENE, operator)
     with pytest.raises(ShapeError, match="readings"):
-        CompressedCapture(fitting.readings[:-1], operator, WALL, SCENE.laser, 1e-11)
+        CompressedCapture(fitting.measurements[:-1], operator, WALL, SCENE.laser, 1e-11)
     with pytest.raises(ShapeError, match="wall"):
-        CompressedCapture(fitting.readings, operator, WALL[:-1], SCENE.laser, 1e-11)
+        CompressedCapture(fitting.measurements, operator, WALL[:-1], SCENE.laser, 1e-11)
     with pytest.raises(InputError, match="NaN"):
-        CompressedCapture(fitting.readings * np.nan, operator, WALL, SCENE.laser, 1e-11)
+        CompressedCapture(fitting.measurements * np.nan, operator, WALL, SCENE.laser, 1e-11)
     with pytest.raises(ShapeError, match="signal"):
-        CompressedCapture.of(SCENE, tomography(20, 0.25))
+        CompressedCapture.of(SCENE, build_tomography(20, 0.25))
     with pytest.raises(InputError, match="threshold"):
         AdjointImaging(SOLVER, threshold=2)
     with pytest.raises(InputError, match="no projection"):
-        tomography(24, 0.01)
+        build_tomography(24, 0.01)
     behind = Grid(GRID.x, GRID.y, GRID.z - 2)
     assert "behind" in AdjointImaging(SOLVER).supports(fitting, behind).reason
     with pytest.raises(InputError, match="behind"):
@@ -84,9 +94,11 @@ def test_the_study_on_a_small_office_reaches_the_papers_finding(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(study_module, "EXPOSURES", {"20 ms": 19.0, "1 ms": 6.0})
-    wall = relay_wall("planar", 48)
-    capture = office(0.15).seen_from(wall, [0.0, 0.0, 0.0], TimeAxis(256, 64e-12), 60e-12)
-    rows = study(capture, Grid.box((-1, 1), (-1, 1), (0.9, 2.1), 0.06), PlanarRSD(0.24, 5.0))
+    wall = build_relay_wall("planar", 48)
+    capture = build_office(0.15).simulate_capture(
+        wall, [0.0, 0.0, 0.0], TimeAxis(256, 64e-12), 60e-12
+    )
+    rows = run_study(capture, Grid.box((-1, 1), (-1, 1), (0.9, 2.1), 0.06), PlanarRSD(0.24, 5.0))
     by_setting = {(row.exposure, row.sampling_ratio): row for row in rows}
     assert len(by_setting) == 4
     # Note 13: very close to the truth at 20 ms and SR 0.1.
@@ -96,8 +108,10 @@ def test_the_study_on_a_small_office_reaches_the_papers_finding(
         assert 0.8 < row.full <= 1
     assert by_setting["20 ms", 0.1].full > by_setting["1 ms", 0.1].full
     document = tmp_path / "notes.md"
-    document.write_text(f"before {study_module.MARK} old {study_module.MARK} after")
-    put_between_marks(table(rows), document)
+    document.write_text(
+        f"before {study_module.DOCUMENT_MARK} old {study_module.DOCUMENT_MARK} after"
+    )
+    replace_between_marks(format_table(rows), document)
     text = document.read_text()
     assert text.startswith("before ")
     assert text.endswith(" after")
@@ -105,15 +119,15 @@ def test_the_study_on_a_small_office_reaches_the_papers_finding(
     assert " old " not in text
     document.write_text("no marks")
     with pytest.raises(InputError, match="twice"):
-        put_between_marks("", document)
+        replace_between_marks("", document)
 
 
 def test_the_command_prints_and_writes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(study_module, "office_capture", lambda: SCENE)
-    monkeypatch.setattr(study_module, "office_grid", lambda: GRID)
-    monkeypatch.setattr(study_module, "WAVELENGTH", 0.2)
-    (tmp_path / "d.md").write_text(study_module.MARK * 2)
+    monkeypatch.setattr(study_module, "simulate_office", lambda: SCENE)
+    monkeypatch.setattr(study_module, "build_office_grid", lambda: GRID)
+    monkeypatch.setattr(study_module, "WAVELENGTH_M", 0.2)
+    (tmp_path / "d.md").write_text(study_module.DOCUMENT_MARK * 2)
     study_module.main(["--write", str(tmp_path / "d.md")])
     assert capsys.readouterr().out.strip() in (tmp_path / "d.md").read_text()

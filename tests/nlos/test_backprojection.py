@@ -12,7 +12,7 @@ import nlos.backprojection
 from nlos import Backprojection, Capture, Grid
 from nlos.backprojection import Weighting
 from nlos.band import Band
-from nlos.exact import exact_phasor_field
+from nlos.exact import compute_exact_phasor_field
 from nlos.method import Support
 from nlos.simulate import PointScene
 from nlos.time_axis import TimeAxis
@@ -33,7 +33,7 @@ def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
 @pytest.mark.parametrize("wall", [planar_wall(), curved_wall()], ids=["planar", "curved"])
 @pytest.mark.parametrize("laser", ["single", "confocal", "paired"])
 def test_a_hidden_point_comes_back_where_it_is(wall: np.ndarray, laser: str) -> None:
-    capture = PointScene([HIDDEN]).seen_from(wall, lasers_for(wall)[laser], AXIS, JITTER)
+    capture = PointScene([HIDDEN]).simulate_capture(wall, lasers_for(wall)[laser], AXIS, JITTER)
     volume = METHOD.reconstruct(capture, GRID)
     assert volume.values.dtype == np.float32
     assert volume.values.shape == (GRID.z.size, GRID.y.size, GRID.x.size)
@@ -48,13 +48,19 @@ def test_a_hidden_point_comes_back_where_it_is(wall: np.ndarray, laser: str) -> 
     z=st.floats(0.4, 0.9),
     confocal=st.booleans(),
 )
-def test_any_hidden_point_is_found_to_the_voxel(x: float, y: float, z: float, confocal: bool) -> None:
+def test_any_hidden_point_is_found_to_the_voxel(
+    x: float, y: float, z: float, confocal: bool
+) -> None:
     wall = curved_wall()
     axis = TimeAxis(500, AXIS.bin_width, 0.4)  # long enough for every path
-    capture = PointScene([[x, y, z]]).seen_from(wall, wall if confocal else [0.12, 0.05, 0.01], axis, JITTER)
-    around = Grid(x + 0.04 * np.arange(-3, 4), y + 0.04 * np.arange(-3, 4), z + 0.03 * np.arange(-3, 4))
+    capture = PointScene([[x, y, z]]).simulate_capture(
+        wall, wall if confocal else [0.12, 0.05, 0.01], axis, JITTER
+    )
+    around = Grid(
+        x + 0.04 * np.arange(-3, 4), y + 0.04 * np.arange(-3, 4), z + 0.03 * np.arange(-3, 4)
+    )
     # Voxels of a third and a quarter of a wavelength: neighbours are clearly weaker.
-    assert METHOD.reconstruct(capture, around).brightest() == pytest.approx((x, y, z))
+    assert METHOD.reconstruct(capture, around).find_brightest() == pytest.approx((x, y, z))
 
 
 @pytest.mark.parametrize("laser", ["single", "confocal", "paired"])
@@ -62,23 +68,23 @@ def test_any_hidden_point_is_found_to_the_voxel(x: float, y: float, z: float, co
 def test_it_equals_the_exact_sum_over_frequencies(laser: str, cycles: float) -> None:
     wall = curved_wall(9, 12)
     scene = PointScene([HIDDEN, (-0.2, 0.1, 0.75)], [1.0, 0.6])
-    capture = scene.seen_from(wall, lasers_for(wall)[laser], AXIS, JITTER)
+    capture = scene.simulate_capture(wall, lasers_for(wall)[laser], AXIS, JITTER)
     method = replace(METHOD, cycles=cycles)
     found = method.phasor_field(capture, GRID).values
-    exact = exact_phasor_field(capture, GRID, method.pulse).values
+    exact = compute_exact_phasor_field(capture, GRID, method.pulse).values
     assert found.dtype == np.complex64
     assert exact.dtype == np.complex128
-    # Linear interpolation of 64 samples per wavelength: phase step 0.1, error 0.1^2 * 0.09 at the carrier and some
-    # twice that over the band; measured 5e-4 to 7e-4. float32 phases add 1e-5.
+    # Linear interpolation of 64 samples per wavelength: phase step 0.1, error 0.1^2 * 0.09 at the
+    # carrier and some twice that over the band; measured 5e-4 to 7e-4. float32 phases add 1e-5.
     assert relative_error(found, exact) < 1.2e-3
 
 
 def test_the_exact_sum_is_its_own_definition() -> None:
     wall = curved_wall(3, 3)
-    capture = PointScene([HIDDEN]).seen_from(wall, [0.1, 0.0, 0.0], AXIS, JITTER)
+    capture = PointScene([HIDDEN]).simulate_capture(wall, [0.1, 0.0, 0.0], AXIS, JITTER)
     voxel = np.array([0.1, -0.1, 0.6])
     grid = Grid([voxel[0]], [voxel[1]], [voxel[2]])
-    found = exact_phasor_field(capture, grid, METHOD.pulse).values[0, 0, 0]
+    found = compute_exact_phasor_field(capture, grid, METHOD.pulse).values[0, 0, 0]
     band, expected = Band(METHOD.pulse, AXIS), 0.0j
     for point, trace in zip(capture.points, capture.traces().astype(np.float64), strict=True):
         last_leg = np.linalg.norm(point - voxel)
@@ -101,7 +107,9 @@ def test_it_is_linear_in_the_signal(capture: Capture) -> None:
 
 def test_signals_in_double_precision_give_the_same_picture(capture: Capture) -> None:
     double = replace(capture, signal=capture.signal.astype(np.float64))
-    assert np.array_equal(METHOD.reconstruct(double, GRID).values, METHOD.reconstruct(capture, GRID).values)
+    assert np.array_equal(
+        METHOD.reconstruct(double, GRID).values, METHOD.reconstruct(capture, GRID).values
+    )
 
 
 def test_masked_wall_points_do_not_matter(capture: Capture) -> None:
@@ -117,7 +125,9 @@ def test_masked_wall_points_do_not_matter(capture: Capture) -> None:
 
 def test_the_order_and_shape_of_wall_points_do_not_matter(capture: Capture) -> None:
     shuffled = np.random.default_rng(5).permutation(len(capture.points))
-    scattered = replace(capture, wall=capture.points[shuffled], signal=capture.traces().T[:, shuffled])
+    scattered = replace(
+        capture, wall=capture.points[shuffled], signal=capture.traces().T[:, shuffled]
+    )
     # Sums of float32 in another order.
     found = METHOD.phasor_field(scattered, GRID).values
     assert relative_error(found, METHOD.phasor_field(capture, GRID).values) < 1e-5
@@ -130,7 +140,9 @@ def test_the_volume_may_be_cut_into_pieces(capture: Capture) -> None:
         assert np.array_equal(plane[0], whole[z])
 
 
-def test_small_batches_of_wall_points_add_up(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_batches_of_wall_points_add_up(
+    capture: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whole = METHOD.phasor_field(capture, GRID).values
     monkeypatch.setattr(nlos.backprojection, "TABLE_BYTES", 1)
     for laser in (capture.laser, capture.wall):
@@ -165,8 +177,13 @@ def test_progress_counts_all_lookups_and_may_interrupt(capture: Capture) -> None
 
 
 def test_the_volume_remembers_how_it_was_made(capture: Capture) -> None:
-    made = METHOD.reconstruct(replace(capture, provenance={"shot": 7}), Grid([0], [0], [0.5])).provenance
-    assert made == {"shot": 7, "imaging": {"method": "backprojection", "wavelength_m": 0.125, "cycles": 3}}
+    made = METHOD.reconstruct(
+        replace(capture, provenance={"shot": 7}), Grid([0], [0], [0.5])
+    ).provenance
+    assert made == {
+        "shot": 7,
+        "imaging": {"method": "backprojection", "wavelength_m": 0.125, "cycles": 3},
+    }
 
 
 def test_support_is_true_or_says_why_not(capture: Capture) -> None:
@@ -178,13 +195,23 @@ def test_support_is_true_or_says_why_not(capture: Capture) -> None:
 @pytest.mark.parametrize(
     ("method", "grid", "reason"),
     [
-        (METHOD, Grid.box((-0.2, 0.2), (-0.2, 0.2), (-0.8, -0.4), 0.1), "behind the hindmost wall point"),
-        (METHOD, Grid.box((-0.2, 0.2), (-0.2, 0.2), (-0.1, 0.4), 0.1), "behind the hindmost wall point"),
+        (
+            METHOD,
+            Grid.box((-0.2, 0.2), (-0.2, 0.2), (-0.8, -0.4), 0.1),
+            "behind the hindmost wall point",
+        ),
+        (
+            METHOD,
+            Grid.box((-0.2, 0.2), (-0.2, 0.2), (-0.1, 0.4), 0.1),
+            "behind the hindmost wall point",
+        ),
         (METHOD, Grid.box((-1, 1), (-1, 1), (0.1, 2), 0.0015), "GiB allowed"),
         (Backprojection(0.001), GRID, "empty band"),
     ],
 )
-def test_what_cannot_be_imaged_is_refused(method: Backprojection, grid: Grid, reason: str, capture: Capture) -> None:
+def test_what_cannot_be_imaged_is_refused(
+    method: Backprojection, grid: Grid, reason: str, capture: Capture
+) -> None:
     support = method.supports(capture, grid)
     assert not support
     assert reason in support.reason
@@ -196,7 +223,7 @@ def test_one_wall_point_is_refused() -> None:
     lonely = Capture(np.ones(9), [0.0, 0.0, 0.0], [0.1, 0.0, 0.0], 16e-12)
     assert "one wall point" in METHOD.supports(lonely, GRID).reason
     with pytest.raises(InputError, match="one wall point"):
-        exact_phasor_field(lonely, GRID, METHOD.pulse)
+        compute_exact_phasor_field(lonely, GRID, METHOD.pulse)
 
 
 @pytest.mark.parametrize(("wavelength", "cycles"), [(0, 3), (0.1, -1), (np.nan, 3)])
@@ -206,15 +233,17 @@ def test_the_pulse_is_checked_at_once(wavelength: float, cycles: float) -> None:
 
 
 def test_a_long_path_keeps_its_phase_in_float32() -> None:
-    """A record that begins 300 m down the path: phases of 15 000 rad, of which float32 keeps less than 1e-3."""
+    """A record that begins 300 m down the path: phases of 15 000 rad, of which float32 keeps less
+    than 1e-3.
+    """
     wall = curved_wall(7, 8)
-    near = PointScene([HIDDEN]).seen_from(wall, [0.1, 0.0, 0.0], AXIS, JITTER)
+    near = PointScene([HIDDEN]).simulate_capture(wall, [0.1, 0.0, 0.0], AXIS, JITTER)
     shift = np.array([0.0, 0.0, 150.0])
     far_axis = TimeAxis(AXIS.bins, AXIS.bin_width, 300.0)
-    far = PointScene([HIDDEN + shift]).seen_from(wall, [0.1, 0.0, 0.0], far_axis, JITTER)
+    far = PointScene([HIDDEN + shift]).simulate_capture(wall, [0.1, 0.0, 0.0], far_axis, JITTER)
     grid = Grid(GRID.x, GRID.y, HIDDEN[2] + 150.0 + 0.05 * np.arange(-3, 4))
     found = METHOD.phasor_field(far, grid).values
-    exact = exact_phasor_field(far, grid, METHOD.pulse).values
+    exact = compute_exact_phasor_field(far, grid, METHOD.pulse).values
     assert near.signal.any()
     assert far.signal.any()
     # Distances of 150 m in float32 are good to 8e-6 m each way, 8e-4 rad at this wavelength.
@@ -222,7 +251,9 @@ def test_a_long_path_keeps_its_phase_in_float32() -> None:
 
 
 @pytest.mark.parametrize(("falloff", "obliquity"), [(0, 0), (1, 1), (2, 0.5)])
-def test_weights_are_powers_of_distance_and_direction(falloff: float, obliquity: float, capture: Capture) -> None:
+def test_weights_are_powers_of_distance_and_direction(
+    falloff: float, obliquity: float, capture: Capture
+) -> None:
     """One wall point at a time, so that the weight is a factor of the whole field."""
     weighted = replace(METHOD, weighting=Weighting(falloff, obliquity))
     signal = np.zeros_like(capture.signal)
@@ -247,10 +278,16 @@ def test_weights_are_checked() -> None:
 def test_all_lasers_of_a_grid_are_summed_as_if_each_were_alone() -> None:
     wall = curved_wall(7, 8)
     lasers = np.array([[[0.1, 0.0, 0.0], [-0.2, 0.1, 0.0]], [[0.0, -0.3, 0.0], [0.3, 0.3, 0.0]]])
-    alone = [PointScene([HIDDEN]).seen_from(wall, spot, AXIS, JITTER) for spot in lasers.reshape(-1, 3)]
+    alone = [
+        PointScene([HIDDEN]).simulate_capture(wall, spot, AXIS, JITTER)
+        for spot in lasers.reshape(-1, 3)
+    ]
     signal = np.stack([one.signal for one in alone], axis=1).reshape(AXIS.bins, 2, 2, 7, 8)
     together = Capture.exhaustive(signal, wall, lasers, AXIS.bin_width, AXIS.start)
     field = METHOD.phasor_field(together, GRID).values
     assert relative_error(field, sum(METHOD.phasor_field(one, GRID).values for one in alone)) < 1e-5
-    assert relative_error(field, exact_phasor_field(together, GRID, METHOD.pulse).values) < 1.2e-3
-    assert METHOD.reconstruct(together, GRID).brightest() == pytest.approx(HIDDEN)
+    assert (
+        relative_error(field, compute_exact_phasor_field(together, GRID, METHOD.pulse).values)
+        < 1.2e-3
+    )
+    assert METHOD.reconstruct(together, GRID).find_brightest() == pytest.approx(HIDDEN)

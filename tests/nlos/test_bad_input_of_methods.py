@@ -48,14 +48,18 @@ def seen(method: Any, wall: np.ndarray | None = None) -> Capture:
     wall = planar_wall(9, 11) if wall is None else wall
     confocal = isinstance(method, LightCone | FKMigration)
     return Capture(
-        np.zeros((AXIS.bins, *wall.shape[:-1])), wall, wall if confocal else SPOT, AXIS.bin_width, AXIS.start
+        np.zeros((AXIS.bins, *wall.shape[:-1])),
+        wall,
+        wall if confocal else SPOT,
+        AXIS.bin_width,
+        AXIS.start,
     )
 
 
 def imaging(method: Any) -> Callable[[Capture, Grid], Any]:
     """What a user calls to have an image."""
     if isinstance(method, TransientImaging):
-        return lambda capture, grid: method.gated(capture, grid, 1e-9, 2e-9)
+        return lambda capture, grid: method.image_gate(capture, grid, 1e-9, 2e-9)
     return lambda capture, grid: method.reconstruct(capture, grid)
 
 
@@ -72,7 +76,9 @@ def refusal(method: Any, capture: Capture, grid: Grid) -> str:
 
 @every_method
 def test_a_single_wall_point(method: Any) -> None:
-    assert "one wall point cannot locate anything" in refusal(method, seen(method, planar_wall(9, 11)[:1, :1]), GRID)
+    assert "one wall point cannot locate anything" in refusal(
+        method, seen(method, planar_wall(9, 11)[:1, :1]), GRID
+    )
 
 
 @every_method
@@ -85,7 +91,9 @@ def test_a_grid_behind_the_wall(method: Any) -> None:
 def test_ten_gigabytes(method: Any) -> None:
     # 10 GiB at 12 bytes a voxel, evenly spaced, within the record.
     side = round((10 * 2**30 / 12) ** (1 / 3))
-    large = Grid(np.linspace(-0.2, 0.2, side), np.linspace(-0.2, 0.2, side), np.linspace(0.4, 0.6, side))
+    large = Grid(
+        np.linspace(-0.2, 0.2, side), np.linspace(-0.2, 0.2, side), np.linspace(0.4, 0.6, side)
+    )
     reason = refusal(method, seen(method), large)
     assert "10.0 GiB" in reason
     assert "use larger voxels or a smaller box" in reason
@@ -100,10 +108,14 @@ def test_an_empty_band(make: Callable[[float], Any]) -> None:
 
 
 @pulsed_methods
-def test_a_wall_that_is_too_coarse_is_warned_of_at_the_callers_line(make: Callable[[float], Any]) -> None:
+def test_a_wall_that_is_too_coarse_is_warned_of_at_the_callers_line(
+    make: Callable[[float], Any],
+) -> None:
     method, grid = make(0.15), Grid.box((0, 0.05), (0, 0.05), (0.4, 0.45), 0.025)
     capture = seen(method)
-    lit = Capture(np.ones_like(capture.signal), capture.wall, capture.laser, AXIS.bin_width, AXIS.start)
+    lit = Capture(
+        np.ones_like(capture.signal), capture.wall, capture.laser, AXIS.bin_width, AXIS.start
+    )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         imaging(method)(lit, grid)
@@ -120,7 +132,9 @@ def test_a_wall_that_is_too_coarse_is_warned_of_at_the_callers_line(make: Callab
 def test_too_many_voxels_for_an_iteration() -> None:
     # A volume of 3 GiB is imaged at once, but not with the dozen volumes that a solver holds.
     side = round((3 * 2**30 / 12) ** (1 / 3))
-    large = Grid(np.linspace(-0.2, 0.2, side), np.linspace(-0.2, 0.2, side), np.linspace(0.4, 0.6, side))
+    large = Grid(
+        np.linspace(-0.2, 0.2, side), np.linspace(-0.2, 0.2, side), np.linspace(0.4, 0.6, side)
+    )
     method = EVERY["refinement"]
     assert Hybrid(0.4).supports(seen(method), large)
     assert "to refine" in refusal(method, seen(method), large)
@@ -130,7 +144,10 @@ def test_too_many_voxels_for_an_iteration() -> None:
     ("laser", "message"),
     [
         ([0.1, 0.05, -1.0], "the laser spot lies 1 m behind the hindmost wall point"),
-        (planar_wall(9, 11) - [0, 0, 1.0], "the laser spot lies 1 m behind the hindmost wall point"),
+        (
+            planar_wall(9, 11) - [0, 0, 1.0],
+            "the laser spot lies 1 m behind the hindmost wall point",
+        ),
         ([0.1, np.nan, 0.0], "the laser spot must be finite"),
     ],
 )
@@ -144,5 +161,7 @@ def test_a_laser_behind_the_wall(laser: Any, message: str) -> None:
 def test_samples_that_are_no_numbers() -> None:
     wall, signal = planar_wall(9, 11), np.zeros((AXIS.bins, 9, 11))
     signal[3, 2, 1] = np.nan
-    with pytest.raises(InputError, match="1 samples of the signal are NaN or infinite; set them to 0"):
+    with pytest.raises(
+        InputError, match="1 samples of the signal are NaN or infinite; set them to 0"
+    ):
         Capture(signal, wall, SPOT, AXIS.bin_width, AXIS.start)

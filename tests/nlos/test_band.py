@@ -14,7 +14,7 @@ PULSE = VirtualPulse(0.125, 3)
 
 
 def waveform_of(signal: np.ndarray, band: Band) -> tuple[np.ndarray, np.ndarray]:
-    waveforms = band.waveforms(band.phasors(signal[None]))
+    waveforms = band.waveforms(band.compute_phasors(signal[None]))
     paths = waveforms.start + waveforms.spacing * np.arange(waveforms.values.shape[1])
     return paths, waveforms.values[0]
 
@@ -32,9 +32,14 @@ def test_an_impulse_becomes_the_virtual_pulse(cycles: float) -> None:
     signal[120] = 1.0
     paths, found = waveform_of(signal, Band(pulse, AXIS))
     distance = paths - AXIS.paths[120]
-    # The inverse Fourier transform of G(k) over all positive and negative k, for samples `spacing` apart.
+    # The inverse Fourier transform of G(k) over all positive and negative k, for samples `spacing`
+    # apart.
     height = 2 * AXIS.spacing / (pulse.sigma * np.sqrt(2 * np.pi))
-    expected = height * np.exp(-(distance**2) / (2 * pulse.sigma**2)) * np.exp(2j * np.pi * distance / pulse.wavelength)
+    expected = (
+        height
+        * np.exp(-(distance**2) / (2 * pulse.sigma**2))
+        * np.exp(2j * np.pi * distance / pulse.wavelength)
+    )
     # The band is cut where G < 0.01: two Gaussian tails of 0.0024 of its area are missing.
     assert np.max(np.abs(found - expected)) < 0.01 * height
 
@@ -52,8 +57,8 @@ def test_phasors_are_the_weighted_fourier_sum_of_their_definition() -> None:
     signal = np.random.default_rng(3).normal(size=(2, AXIS.bins))
     kernel = np.exp(-1j * np.outer(AXIS.paths, band.wavenumbers))
     expected = band.weights * (signal @ kernel)
-    assert band.phasors(signal) == pytest.approx(expected, rel=1e-10, abs=1e-14)
-    single = band.phasors(signal.astype(np.float32))
+    assert band.compute_phasors(signal) == pytest.approx(expected, rel=1e-10, abs=1e-14)
+    single = band.compute_phasors(signal.astype(np.float32))
     assert single.dtype == np.complex64
     # float32 sums of 300 terms.
     assert np.linalg.norm(single - expected) < 1e-5 * np.linalg.norm(expected)
@@ -92,7 +97,7 @@ def test_nothing_wraps_around_the_end_of_the_record(
 
 def test_the_samples_are_fine_enough_for_linear_interpolation() -> None:
     band = Band(VirtualPulse(0.048, 3), TimeAxis(1016, 4.6e-12, 0.138))
-    spacing = band.waveforms(band.phasors(np.zeros((1, 1016), np.float32))).spacing
+    spacing = band.waveforms(band.compute_phasors(np.zeros((1, 1016), np.float32))).spacing
     assert spacing <= 0.048 / 64
     # Whole bins are still hit: no interpolation error where the record itself has a sample.
     assert (band.axis.spacing / spacing) % 1 == pytest.approx(0, abs=1e-9)
@@ -104,7 +109,9 @@ def test_bins_too_coarse_for_the_wavelength_are_an_empty_band(wavelength: float)
         Band(VirtualPulse(wavelength, 3), AXIS)
 
 
-@pytest.mark.parametrize(("wavelength", "cycles"), [(0, 3), (-1, 3), (np.nan, 3), (0.1, 0), (0.1, np.inf)])
+@pytest.mark.parametrize(
+    ("wavelength", "cycles"), [(0, 3), (-1, 3), (np.nan, 3), (0.1, 0), (0.1, np.inf)]
+)
 def test_a_pulse_needs_positive_numbers(wavelength: float, cycles: float) -> None:
     with pytest.raises(InputError, match="virtual pulse must be a positive"):
         VirtualPulse(wavelength, cycles)

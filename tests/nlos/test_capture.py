@@ -100,13 +100,19 @@ def test_files_give_back_what_was_saved(
     random = np.random.default_rng(0)
     wall = random.normal(size=(*wall_shape, 3))
     signal = random.normal(size=(bins, *wall_shape))
-    saved = Capture(signal, wall, wall if confocal else [1, 2, 3], bin_width, start, {"made": "here"})
+    saved = Capture(
+        signal, wall, wall if confocal else [1, 2, 3], bin_width, start, {"made": "here"}
+    )
     path = tmp_path_factory.mktemp("capture") / "wall.h5"
     saved.save(path)
     loaded = Capture.load(path)
     for name in ("signal", "wall", "laser"):
         assert np.array_equal(getattr(loaded, name), getattr(saved, name))
-    assert (loaded.bin_width, loaded.start, loaded.provenance) == (bin_width, start, {"made": "here"})
+    assert (loaded.bin_width, loaded.start, loaded.provenance) == (
+        bin_width,
+        start,
+        {"made": "here"},
+    )
 
 
 def test_a_file_without_a_wall_says_so(tmp_path: Path) -> None:

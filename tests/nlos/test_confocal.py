@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nlos import Capture, FKMigration, Grid, LightCone
-from nlos.confocal.light_cone import rebinning
-from nlos.preparation import binned, without_first_bounce
+from nlos.confocal.light_cone import build_rebinning_matrix
+from nlos.preparation import rebin_capture, remove_first_bounce
 from nlos.simulate import PointScene
 from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
@@ -30,7 +30,7 @@ def wall_at(depth: float = 0.0) -> np.ndarray:
 
 def confocal(positions: object, wall: np.ndarray | None = None, axis: TimeAxis = AXIS) -> Capture:
     wall = wall_at() if wall is None else wall
-    return PointScene(positions).seen_from(wall, wall, axis, 40e-12)
+    return PointScene(positions).simulate_capture(wall, wall, axis, 40e-12)
 
 
 def around(point: tuple[float, float, float], half: float = 0.12, voxel: float = 0.02) -> Grid:
@@ -41,11 +41,13 @@ def around(point: tuple[float, float, float], half: float = 0.12, voxel: float =
 @named
 @settings(max_examples=8, deadline=None)
 @given(x=st.floats(-0.35, 0.35), y=st.floats(-0.3, 0.3), z=st.floats(0.4, 0.9))
-def test_a_hidden_point_comes_back_where_it_is(method: LightCone | FKMigration, x: float, y: float, z: float) -> None:
+def test_a_hidden_point_comes_back_where_it_is(
+    method: LightCone | FKMigration, x: float, y: float, z: float
+) -> None:
     volume = method.reconstruct(confocal([[x, y, z]]), around((x, y, z)))
     assert volume.values.dtype == np.float32
     # The wall's step is 4 cm: lateral interpolation puts the maximum on the nearest lattice point.
-    assert volume.brightest() == pytest.approx((x, y, z), abs=0.021)
+    assert volume.find_brightest() == pytest.approx((x, y, z), abs=0.021)
 
 
 @named
@@ -71,7 +73,9 @@ def _voxels(grid: Grid) -> np.ndarray:
 
 @named
 def test_equal_points_at_two_depths_are_equally_bright(method: LightCone | FKMigration) -> None:
-    """Brightness falls by 4 powers of the distance: 0.5 m and 0.8 m differ 6.6-fold before the weights undo it."""
+    """Brightness falls by 4 powers of the distance: 0.5 m and 0.8 m differ 6.6-fold before the
+    weights undo it.
+    """
     peaks = []
     for depth in (0.5, 0.8):
         # On a lattice point, so that interpolation dims neither.
@@ -93,7 +97,9 @@ def test_the_order_of_wall_points_the_wall_plane_and_the_start_of_the_record_do_
     assert np.allclose(again, expected, atol=1e-4 * expected.max())
     capture = confocal([HIDDEN])
     order = np.random.default_rng(1).permutation(len(capture.points))
-    listed = Capture(capture.traces()[order].T, capture.points[order], capture.points[order], AXIS.bin_width)
+    listed = Capture(
+        capture.traces()[order].T, capture.points[order], capture.points[order], AXIS.bin_width
+    )
     assert np.array_equal(method.reconstruct(listed, grid).values, expected)
     transposed = Capture(
         np.swapaxes(capture.signal, 1, 2),
@@ -103,17 +109,19 @@ def test_the_order_of_wall_points_the_wall_plane_and_the_start_of_the_record_do_
     )
     assert np.array_equal(method.reconstruct(transposed, grid).values, expected)
     late = TimeAxis(AXIS.bins - 30, AXIS.bin_width, 30 * AXIS.spacing)
-    assert np.allclose(method.reconstruct(confocal([HIDDEN], axis=late), grid).values, expected, rtol=1e-3)
+    assert np.allclose(
+        method.reconstruct(confocal([HIDDEN], axis=late), grid).values, expected, rtol=1e-3
+    )
 
 
 @named
 def test_a_start_between_bins_is_interpolated(method: LightCone | FKMigration) -> None:
     axis = TimeAxis(AXIS.bins, AXIS.bin_width, 20.4 * AXIS.spacing)
     volume = method.reconstruct(confocal([HIDDEN], axis=axis), around(HIDDEN))
-    assert volume.brightest() == pytest.approx(HIDDEN, abs=0.021)
+    assert volume.find_brightest() == pytest.approx(HIDDEN, abs=0.021)
     before = TimeAxis(AXIS.bins, AXIS.bin_width, -10 * AXIS.spacing)
     volume = method.reconstruct(confocal([HIDDEN], axis=before), around(HIDDEN))
-    assert volume.brightest() == pytest.approx(HIDDEN, abs=0.021)
+    assert volume.find_brightest() == pytest.approx(HIDDEN, abs=0.021)
 
 
 @named
@@ -121,7 +129,7 @@ def test_half_a_wall_beyond_the_wall_is_seen_and_no_more(method: LightCone | FKM
     outside = (0.6, 0.0, 0.6)
     volume = method.reconstruct(confocal([outside]), around(outside))
     # Seen from one side only, the point is smeared along the ray.
-    assert volume.brightest() == pytest.approx(outside, abs=0.06)
+    assert volume.find_brightest() == pytest.approx(outside, abs=0.06)
     support = method.supports(confocal([HIDDEN]), Grid.box((-1.2, 0), (-0.4, 0.4), (0.4, 0.8), 0.1))
     assert "half a wall beyond" in support.reason
 
@@ -141,16 +149,24 @@ def test_what_is_no_confocal_lattice_is_refused(method: LightCone | FKMigration)
         assert "confocal scan is needed" in method.supports(other, grid).reason
         with pytest.raises(InputError, match="confocal"):
             method.reconstruct(other, grid)
-    assert "behind the hindmost" in method.supports(capture, Grid.box((0, 1), (0, 1), (-1, 1), 0.1)).reason
+    assert (
+        "behind the hindmost"
+        in method.supports(capture, Grid.box((0, 1), (0, 1), (-1, 1), 0.1)).reason
+    )
 
 
 @named
-def test_ten_gigabytes_are_refused_before_they_are_allocated(method: LightCone | FKMigration) -> None:
+def test_ten_gigabytes_are_refused_before_they_are_allocated(
+    method: LightCone | FKMigration,
+) -> None:
     x, y = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-1, 1, 80))
     wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
     # Broadcast in the test only; a record that starts 200 m late has as many empty bins before it.
     capture = Capture(np.zeros((2, 80, 80)), wall, wall, 32e-12, start=200.0)
-    assert "GiB allowed" in method.supports(capture, Grid.box((0, 0.1), (0, 0.1), (0.5, 0.6), 0.1)).reason
+    assert (
+        "GiB allowed"
+        in method.supports(capture, Grid.box((0, 0.1), (0, 0.1), (0.5, 0.6), 0.1)).reason
+    )
 
 
 @pytest.mark.parametrize("settings", [{"falloff": -1}, {"falloff": np.nan}])
@@ -165,7 +181,9 @@ def test_settings_are_checked(settings: dict[str, float]) -> None:
 @named
 def test_progress_and_provenance(method: LightCone | FKMigration) -> None:
     done: list[int] = []
-    volume = method.reconstruct(replace(confocal([HIDDEN]), provenance={"shot": 7}), around(HIDDEN), done.append)
+    volume = method.reconstruct(
+        replace(confocal([HIDDEN]), provenance={"shot": 7}), around(HIDDEN), done.append
+    )
     assert sum(done) == volume.grid.size
     assert volume.provenance["shot"] == 7
     assert volume.provenance["imaging"]["falloff"] == 4
@@ -177,35 +195,45 @@ def test_a_retroreflective_point_needs_the_smaller_power() -> None:
     distance = np.linalg.norm(wall_at() - point, axis=-1)
     bright = replace(capture, signal=capture.signal * distance**2)
     volume = LightCone(falloff=2).reconstruct(bright, around(point))
-    assert volume.brightest() == pytest.approx(point, abs=0.021)
+    assert volume.find_brightest() == pytest.approx(point, abs=0.021)
 
 
 def test_rebinning_keeps_the_integral_and_means() -> None:
     source, target = np.array([0.0, 0.0, 1.0, 4.0, 9.0]), np.linspace(0, 9, 7)
-    matrix = rebinning(source, target)
+    matrix = build_rebinning_matrix(source, target)
     values = np.array([5.0, 2.0, 3.0, 7.0])
     found = matrix @ values
     # An interval of length 0 holds nothing.
-    assert np.sum(found * np.diff(target)) == pytest.approx(np.sum(values * np.diff(source)), rel=1e-6)
+    assert np.sum(found * np.diff(target)) == pytest.approx(
+        np.sum(values * np.diff(source)), rel=1e-6
+    )
     assert found[0] == pytest.approx((2 * 1 + 3 * 0.5) / 1.5)
-    assert np.allclose(rebinning(np.array([0.0, 1.0]), np.array([2.0, 3.0])) @ np.ones(1), 0)
+    assert np.allclose(
+        build_rebinning_matrix(np.array([0.0, 1.0]), np.array([2.0, 3.0])) @ np.ones(1), 0
+    )
 
 
 @named
-def test_the_order_of_the_scan_a_little_noise_and_masked_points_do_not_matter(method: LightCone | FKMigration) -> None:
+def test_the_order_of_the_scan_a_little_noise_and_masked_points_do_not_matter(
+    method: LightCone | FKMigration,
+) -> None:
     capture, grid = confocal([HIDDEN]), around(HIDDEN)
     expected = method.reconstruct(capture, grid).values
     random = np.random.default_rng(2)
     order = random.permutation(X.size * Y.size)
     wall = (wall_at().reshape(-1, 3) + random.normal(0, 1e-4, (X.size * Y.size, 3)))[order]
-    shuffled = replace(capture, signal=capture.signal.reshape(AXIS.bins, -1)[:, order], wall=wall, laser=wall)
+    shuffled = replace(
+        capture, signal=capture.signal.reshape(AXIS.bins, -1)[:, order], wall=wall, laser=wall
+    )
     # Points are off by a 400th of their step, and so is the lattice that is found.
-    assert np.linalg.norm(method.reconstruct(shuffled, grid).values - expected) < 2e-2 * np.linalg.norm(expected)
+    assert np.linalg.norm(
+        method.reconstruct(shuffled, grid).values - expected
+    ) < 2e-2 * np.linalg.norm(expected)
     wall = wall_at()
     wall[3:5, 20:22] = np.nan
     masked = replace(capture, wall=wall, laser=wall)
     # Of 594 points 4 are dark.
-    assert method.reconstruct(masked, grid).brightest() == pytest.approx(HIDDEN, abs=0.021)
+    assert method.reconstruct(masked, grid).find_brightest() == pytest.approx(HIDDEN, abs=0.021)
 
 
 @named
@@ -219,20 +247,31 @@ def test_two_signals_of_one_place_are_refused(method: LightCone | FKMigration) -
 @pytest.fixture(scope="module")
 def letter(shared_data: Path) -> Capture:
     with np.load(shared_data / "nlos" / "otoole2018_diffuse_s.npz") as stored:
-        raw = Capture(stored["H"], stored["wall_xyz"], stored["laser_xyz"], float(stored["delta_t_s"]))
-    return binned(without_first_bounce(raw, 600 * raw.axis.spacing), 8)
+        raw = Capture(
+            stored["H"], stored["wall_xyz"], stored["laser_xyz"], float(stored["delta_t_s"])
+        )
+    return rebin_capture(remove_first_bounce(raw, 600 * raw.axis.spacing), 8)
 
 
 @named
-def test_the_recorded_letter_s_stands_at_half_a_metre(method: LightCone | FKMigration, letter: Capture) -> None:
+def test_the_recorded_letter_s_stands_at_half_a_metre(
+    method: LightCone | FKMigration, letter: Capture
+) -> None:
     axis = np.linspace(-0.35, 0.35, 64)
     volume = method.reconstruct(letter, Grid(axis, axis, np.arange(0.36, 0.64, 0.005)))
-    assert 0.49 <= volume.brightest()[2] <= 0.52
+    assert 0.49 <= volume.find_brightest()[2] <= 0.52
     assert 0.49 <= volume.grid.z[volume.values.sum(axis=(1, 2)).argmax()] <= 0.52
     picture = volume.maximum_projection().brightness
-    rows = {y: picture[np.abs(axis - y) < 0.02].mean(axis=0) for y in (-0.15, -0.06, 0.05, 0.15, 0.25)}
-    left, right, middle = (axis > -0.2) & (axis < -0.1), (axis > 0.06) & (axis < 0.16), np.abs(axis) < 0.05
-    # As back-projection shows it: bars at y = -0.15, 0.05 and 0.25, joined right above the middle and left below it.
+    rows = {
+        y: picture[np.abs(axis - y) < 0.02].mean(axis=0) for y in (-0.15, -0.06, 0.05, 0.15, 0.25)
+    }
+    left, right, middle = (
+        (axis > -0.2) & (axis < -0.1),
+        (axis > 0.06) & (axis < 0.16),
+        np.abs(axis) < 0.05,
+    )
+    # As back-projection shows it: bars at y = -0.15, 0.05 and 0.25, joined right above the middle
+    # and left below it.
     assert rows[-0.06][right].mean() > 1.3 * rows[-0.06][left].mean()
     assert rows[0.15][left].mean() > 1.3 * rows[0.15][right].mean()
     for bar, gap in ((-0.15, -0.06), (0.05, -0.06), (0.05, 0.15)):

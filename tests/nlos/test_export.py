@@ -15,9 +15,13 @@ GRID = Grid(0.1 + 0.02 * np.arange(7), -0.3 + 0.03 * np.arange(6), 0.5 + 0.01 * 
 
 
 def ball() -> Volume:
-    """A soft ball off the middle, brightest at one voxel, with a complex phase that must not matter."""
+    """A soft ball off the middle, brightest at one voxel, with a complex phase that must not
+    matter.
+    """
     z, y, x = np.meshgrid(GRID.z, GRID.y, GRID.x, indexing="ij")
-    values = np.exp(-(((x - 0.16) / 0.03) ** 2 + ((y + 0.24) / 0.04) ** 2 + ((z - 0.52) / 0.012) ** 2))
+    values = np.exp(
+        -(((x - 0.16) / 0.03) ** 2 + ((y + 0.24) / 0.04) ** 2 + ((z - 0.52) / 0.012) ** 2)
+    )
     return Volume((values * np.exp(1j * x)).astype(np.complex64), GRID)
 
 
@@ -31,7 +35,7 @@ def test_vti_opens_in_vtk(tmp_path: Path) -> None:
     assert image.spacing == pytest.approx((0.02, 0.03, 0.01))
     assert np.array_equal(image["brightness"].reshape(5, 6, 7), volume.magnitude)
     brightest = image.points[np.argmax(image["brightness"])]
-    assert brightest == pytest.approx(volume.brightest())
+    assert brightest == pytest.approx(volume.find_brightest())
 
 
 def test_a_flat_or_uneven_volume_as_vti(tmp_path: Path) -> None:
@@ -53,7 +57,7 @@ def test_ply_points_open_in_vtk(tmp_path: Path) -> None:
     assert len(xyz) == np.count_nonzero(ball().magnitude >= 0.5)
     assert brightness.min() >= 0.5
     strongest = xyz[np.argmax(brightness)]
-    assert strongest == pytest.approx(ball().brightest())
+    assert strongest == pytest.approx(ball().find_brightest())
 
 
 def test_exr_opens_in_opencv_or_openexr(tmp_path: Path) -> None:
@@ -78,7 +82,7 @@ def test_npz_opens_in_numpy(tmp_path: Path) -> None:
 def test_csv_has_a_row_per_bright_voxel(tmp_path: Path) -> None:
     ball().export(tmp_path / "a.csv", fraction=0.9)
     rows = np.genfromtxt(tmp_path / "a.csv", delimiter=",", names=True)
-    assert rows["x_m"] == pytest.approx(ball().brightest()[0])
+    assert rows["x_m"] == pytest.approx(ball().find_brightest()[0])
 
 
 def test_the_surface_encloses_the_ball(tmp_path: Path) -> None:
@@ -89,8 +93,11 @@ def test_the_surface_encloses_the_ball(tmp_path: Path) -> None:
     radius = np.linalg.norm(np.stack([x, y, z], axis=-1) - centre, axis=-1)
     mesh = Volume(np.clip(1 - radius / 0.2, 0, None), fine).surface(0.5)
     peak = 1 - radius.min() / 0.2
-    # Half of the brightest voxel lies at this radius; marching cubes interpolate a cone linearly along edges.
-    assert np.linalg.norm(mesh.vertices - centre, axis=1) == pytest.approx(0.2 * (1 - peak / 2), abs=2e-3)
+    # Half of the brightest voxel lies at this radius; marching cubes interpolate a cone linearly
+    # along edges.
+    assert np.linalg.norm(mesh.vertices - centre, axis=1) == pytest.approx(
+        0.2 * (1 - peak / 2), abs=2e-3
+    )
     mesh.save(tmp_path / "ball.ply")
     read = pyvista.read(tmp_path / "ball.ply")
     assert read.n_points == len(mesh.vertices)

@@ -5,9 +5,9 @@ import pytest
 from relay_walls import AXIS, HIDDEN, JITTER, curved_wall, lasers_for
 
 from nlos import Capture, FilteredBackprojection, Grid
-from nlos.backprojection import Weighting, smeared
+from nlos.backprojection import Weighting, backproject_signals
 from nlos.band import Waveforms
-from nlos.method import silent
+from nlos.method import ignore_progress
 from nlos.simulate import PointScene
 from tofclip.errors import InputError
 
@@ -18,12 +18,12 @@ METHOD = FilteredBackprojection(sigma=0.05)
 @pytest.mark.parametrize("laser", ["single", "confocal", "paired"])
 def test_a_hidden_point_comes_back_where_it_is(laser: str) -> None:
     wall = curved_wall()
-    capture = PointScene([HIDDEN]).seen_from(wall, lasers_for(wall)[laser], AXIS, JITTER)
+    capture = PointScene([HIDDEN]).simulate_capture(wall, lasers_for(wall)[laser], AXIS, JITTER)
     done: list[int] = []
     volume = METHOD.reconstruct(capture, GRID, done.append)
     assert volume.values.dtype == np.float32
     assert volume.values.min() == 0
-    assert volume.brightest() == pytest.approx(HIDDEN)
+    assert volume.find_brightest() == pytest.approx(HIDDEN)
     assert sum(done) == METHOD.lookups(capture, GRID)
     assert volume.provenance["imaging"]["sigma_m"] == 0.05
 
@@ -44,7 +44,9 @@ def test_unfiltered_signals_are_read_between_bins_and_nowhere_else() -> None:
         values = np.pad(traces, ((0, 0), (1, 2))).astype(np.complex64)
         return Waveforms(values, AXIS.start - AXIS.spacing, AXIS.spacing)
 
-    found = smeared(capture, grid, unfiltered, 10, Weighting(0.0), silent)[:, 0, 0].real
+    found = backproject_signals(capture, grid, unfiltered, 10, Weighting(0.0), ignore_progress)[
+        :, 0, 0
+    ].real
     # float32 paths are good to 1e-7 m of 5e-3.
     assert found[inside] == pytest.approx(expected[inside], abs=1e-3)
     far = (path < AXIS.start - AXIS.spacing) | (path > AXIS.paths[-1] + AXIS.spacing)
@@ -56,13 +58,13 @@ def test_the_laplacian_is_that_of_metres() -> None:
     grid = Grid(0.01 * np.arange(41), 0.008 * np.arange(51), 0.005 * np.arange(81))
     z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
     values = (3 * x**2 + 5 * y**2 + 7 * z**2).astype(np.float32)
-    found = FilteredBackprojection(0.02)._laplacian(values, grid)[40, 25, 20]
+    found = FilteredBackprojection(0.02)._apply_laplacian(values, grid)[40, 25, 20]
     # A Gaussian of two to four voxels, sampled: errs by less than a percent.
     assert found == pytest.approx(-(0.02**2) * 2 * (3 + 5 + 7), rel=0.01)
     single = Grid([0.0], grid.y, grid.z)
-    assert FilteredBackprojection(0.02)._laplacian(values[..., :1], single)[40, 25, 0] == pytest.approx(
-        -(0.02**2) * 2 * 12, rel=0.01
-    )
+    assert FilteredBackprojection(0.02)._apply_laplacian(values[..., :1], single)[
+        40, 25, 0
+    ] == pytest.approx(-(0.02**2) * 2 * 12, rel=0.01)
 
 
 def test_uneven_voxels_and_nonsense_are_refused(capture: Capture) -> None:

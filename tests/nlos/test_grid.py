@@ -17,7 +17,7 @@ def test_shape_follows_z_y_x() -> None:
     grid = Grid(x=[0, 1, 2], y=[0, 1], z=[1, 2, 3, 4])
     assert grid.shape == (4, 2, 3)
     assert grid.size == 24
-    assert grid.nearest((1.9, 0.2, 3.4)) == (2, 0, 2)
+    assert grid.find_nearest((1.9, 0.2, 3.4)) == (2, 0, 2)
 
 
 @given(
@@ -30,7 +30,8 @@ def test_a_box_holds_evenly_spaced_voxels_of_the_size_asked_for(
     sides = [tuple(sorted(pair)) for pair in ends]
     grid = Grid.box(*sides, voxel)
     for axis, (first, last) in zip((grid.x, grid.y, grid.z), sides, strict=True):
-        # 1e-6 of a voxel is the slack that lets a side of a whole number of voxels keep its last one.
+        # 1e-6 of a voxel is the slack that lets a side of a whole number of voxels keep its last
+        # one.
         slack = 1e-5 * voxel
         assert axis[0] >= first - slack
         assert axis[-1] <= last + slack
@@ -70,17 +71,23 @@ def test_a_box_runs_upwards(side: tuple[float, float]) -> None:
         Grid.box((0, 1), side, (0, 1), 0.1)
 
 
-def test_the_space_in_front_of_a_wall_is_as_wide_as_the_wall_and_as_deep_as_light_reaches(capture: Capture) -> None:
+def test_the_space_in_front_of_a_wall_is_as_wide_as_the_wall_and_as_deep_as_light_reaches(
+    capture: Capture,
+) -> None:
     grid = Grid.in_front_of(capture, 0.05)
     assert grid.x[[0, -1]] == pytest.approx([-0.6, 0.6])
     assert grid.y[[0, -1]] == pytest.approx([-0.5, 0.5])
     assert grid.z[0] >= 0.05 - 1e-9
     reach = capture.axis.paths[-1] / 2
     assert reach - 0.05 <= grid.z[-1] <= reach
-    assert Grid.in_front_of(capture, 0.05, near=0.3, far=0.5).z[[0, -1]] == pytest.approx([0.3, 0.5])
+    assert Grid.in_front_of(capture, 0.05, near=0.3, far=0.5).z[[0, -1]] == pytest.approx(
+        [0.3, 0.5]
+    )
 
 
-def test_a_long_record_does_not_make_the_space_deeper_than_two_wall_widths(capture: Capture) -> None:
+def test_a_long_record_does_not_make_the_space_deeper_than_two_wall_widths(
+    capture: Capture,
+) -> None:
     later = Capture(capture.signal, capture.wall, capture.laser, capture.bin_width, start=100.0)
     assert Grid.in_front_of(later, 0.05).z[-1] == pytest.approx(2.4, abs=0.05)
 

@@ -8,7 +8,7 @@ import pytest
 from scene_shapes import JITTER, POINTS, SHAPES, SPOT, shaped_capture, shaped_wall
 
 from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD
-from nlos.exact import exact_phasor_field
+from nlos.exact import compute_exact_phasor_field
 from nlos.simulate import PointScene
 from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
@@ -28,7 +28,7 @@ def scaled_error(found: np.ndarray, expected: np.ndarray) -> float:
 @cache
 def truth(shape: str) -> tuple[Capture, np.ndarray]:
     capture = shaped_capture(shape, COUNT)
-    return capture, exact_phasor_field(capture, GRID, METHOD.pulse).values
+    return capture, compute_exact_phasor_field(capture, GRID, METHOD.pulse).values
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -54,20 +54,20 @@ def test_other_scans_of_a_curved_wall(laser: str) -> None:
     wall = shaped_wall("wavy", 17)
     scene, axis = PointScene(POINTS), TimeAxis(640, 32e-12)
     if laser == "confocal":
-        capture = scene.seen_from(wall, wall, axis, JITTER)
+        capture = scene.simulate_capture(wall, wall, axis, JITTER)
     else:
         walls = np.stack([wall, wall])
         spots = np.broadcast_to(np.array([SPOT, [-0.4, 0.3, 0.0]])[:, None, None], walls.shape)
-        capture = scene.seen_from(walls, spots, axis, JITTER)
-    exact = exact_phasor_field(capture, GRID, METHOD.pulse).values
+        capture = scene.simulate_capture(walls, spots, axis, JITTER)
+    exact = compute_exact_phasor_field(capture, GRID, METHOD.pulse).values
     assert scaled_error(METHOD.phasor_field(capture, GRID).values, exact) < 1e-2
 
 
 def test_a_scattered_list_of_wall_points_is_as_good() -> None:
     random = np.random.default_rng(3)
     wall = random.uniform([-1, -1, 0], [1, 1, 0.2], (400, 3))
-    capture = PointScene(POINTS).seen_from(wall, SPOT, TimeAxis(512, 32e-12), JITTER)
-    exact = exact_phasor_field(capture, GRID, METHOD.pulse).values
+    capture = PointScene(POINTS).simulate_capture(wall, SPOT, TimeAxis(512, 32e-12), JITTER)
+    exact = compute_exact_phasor_field(capture, GRID, METHOD.pulse).values
     assert scaled_error(METHOD.phasor_field(capture, GRID).values, exact) < 1e-2
 
 
@@ -85,10 +85,10 @@ def test_the_hidden_points_stand_out() -> None:
 
 def test_the_way_in_time_shows_the_same_points() -> None:
     wall = shaped_wall("relief", 11)
-    capture = PointScene(POINTS[:1]).seen_from(wall, SPOT, TimeAxis(1024, 16e-12), JITTER)
+    capture = PointScene(POINTS[:1]).simulate_capture(wall, SPOT, TimeAxis(1024, 16e-12), JITTER)
     grid = Grid(np.linspace(0.1, 0.5, 5), np.linspace(-0.4, 0.0, 5), [0.9, 1.0, 1.1])
     in_time = replace(METHOD, propagation="time").reconstruct(capture, grid)
-    assert in_time.brightest() == pytest.approx(tuple(POINTS[0]))
+    assert in_time.find_brightest() == pytest.approx(tuple(POINTS[0]))
     assert scaled_error(in_time.values, METHOD.reconstruct(capture, grid).values) < 3e-2
     assert in_time.provenance["imaging"]["propagation"] == "time"
 
@@ -105,7 +105,7 @@ def test_the_plane_may_stand_elsewhere_and_before_it_voxels_stay_sensible() -> N
 
 def test_backprojection_agrees_at_the_acceptance_geometry() -> None:
     wall = shaped_wall("cylinder", 64)
-    capture = PointScene(POINTS).seen_from(wall, SPOT, TimeAxis(512, 32e-12), JITTER)
+    capture = PointScene(POINTS).simulate_capture(wall, SPOT, TimeAxis(512, 32e-12), JITTER)
     grid = Grid(np.linspace(0.18, 0.42, 9), np.linspace(-0.32, -0.08, 9), np.linspace(0.9, 1.1, 5))
     found = Hybrid(0.125, 4.24).reconstruct(capture, grid).values
     assert scaled_error(found, Backprojection(0.125, 4.24).reconstruct(capture, grid).values) < 1e-2

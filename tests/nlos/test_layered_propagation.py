@@ -10,17 +10,17 @@ from scene_shapes import SHAPES, shaped_wall
 
 from nlos.band import Band, VirtualPulse
 from nlos.plane import Plane
-from nlos.propagation.direct import direct_sum
-from nlos.propagation.layered import layered_sum
-from nlos.propagation.passage import Passage, common_period
-from nlos.propagation.propagate import strength
-from nlos.rsd.transfer import Waves
-from nlos.rsd.window import convenient
+from nlos.propagation.direct import propagate_direct
+from nlos.propagation.low_rank_propagation import propagate_low_rank
+from nlos.propagation.propagate import estimate_strength
+from nlos.propagation.wall_to_plane_plan import WallToPlanePlan, find_common_period
+from nlos.rsd.transfer import SphericalWaves
+from nlos.rsd.window import find_fast_length
 from nlos.time_axis import TimeAxis
 
 BAND = Band(VirtualPulse(0.25, 4.24), TimeAxis(512, 32e-12))
 K = BAND.wavenumbers
-WAVES = Waves(float(K[0]), float(K[1] - K[0]), K.size, continued=False)
+WAVES = SphericalWaves(float(K[0]), float(K[1] - K[0]), K.size, continued=False)
 STEP = 2 / 31  # of walls with 32 points along a side
 FITTING = Plane(STEP * np.arange(-20, 24), STEP * np.arange(-21, 18), 0.4)
 OTHER = Plane(np.linspace(-1.3, 1.1, 37), np.linspace(-0.8, 1.5, 29), 0.42)
@@ -38,8 +38,8 @@ def phasors(count: int) -> np.ndarray:
     return (values * BAND.weights / BAND.weights.max()).astype(np.complex64)
 
 
-def passage(points: np.ndarray, plane: Plane, tolerance: float) -> Passage:
-    found = Passage.of(points, plane, WAVES, BAND.weights, tolerance)
+def make_plan(points: np.ndarray, plane: Plane, tolerance: float) -> WallToPlanePlan:
+    found = WallToPlanePlan.of(points, plane, WAVES, BAND.weights, tolerance)
     assert found is not None
     return found
 
@@ -52,27 +52,34 @@ def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
 @pytest.mark.parametrize("shape", SHAPES)
 def test_it_is_the_direct_sum_within_the_tolerance(shape: str, plane: Plane) -> None:
     points = points_of(shaped_wall(shape, 32))
-    exact = direct_sum(points, phasors(len(points)), plane, K)
+    exact = propagate_direct(points, phasors(len(points)), plane, K)
     for tolerance in (1e-2, 1e-3):
-        found = layered_sum(passage(points, plane, tolerance), phasors(len(points)))
+        found = propagate_low_rank(make_plan(points, plane, tolerance), phasors(len(points)))
         assert found.dtype == np.complex64
         assert relative_error(found, exact) < tolerance
 
 
 def test_few_depths_take_few_terms() -> None:
     """One for a planar wall, two for two plates, whatever their distance; more for a smooth relief."""
-    counts = {shape: passage(points_of(shaped_wall(shape, 32)), FITTING, 1e-2).relief.counts for shape in SHAPES}
+    counts = {
+        shape: make_plan(
+            points_of(shaped_wall(shape, 32)), FITTING, 1e-2
+        ).low_rank_transfer.term_counts
+        for shape in SHAPES
+    }
     assert set(counts["planar"]) == {1}
     assert max(counts["plates"]) == 2
-    strict = passage(points_of(shaped_wall("relief", 32)), FITTING, 1e-3).relief.counts
+    strict = make_plan(
+        points_of(shaped_wall("relief", 32)), FITTING, 1e-3
+    ).low_rank_transfer.term_counts
     assert sum(counts["cylinder"]) < sum(counts["relief"]) < sum(strict)
 
 
 def test_any_order_and_missing_points() -> None:
     random = np.random.default_rng(7)
     points = random.permutation(shaped_wall("relief", 32).reshape(-1, 3))[:900]
-    found = layered_sum(passage(points, FITTING, 1e-2), phasors(900))
-    assert relative_error(found, direct_sum(points, phasors(900), FITTING, K)) < 1e-2
+    found = propagate_low_rank(make_plan(points, FITTING, 1e-2), phasors(900))
+    assert relative_error(found, propagate_direct(points, phasors(900), FITTING, K)) < 1e-2
 
 
 def test_coarse_walls_and_coarse_planes_repeat_their_spectra() -> None:
@@ -82,28 +89,41 @@ def test_coarse_walls_and_coarse_planes_repeat_their_spectra() -> None:
     fine = shaped_wall("wavy", 32).reshape(-1, 3)
     for points, plane in ((coarse, FITTING), (coarse, sparse), (fine, sparse)):
         values = phasors(len(points))
-        found = layered_sum(passage(points, plane, 1e-2), values)
-        assert relative_error(found, direct_sum(points, values, plane, K)) < 1e-2
+        found = propagate_low_rank(make_plan(points, plane, 1e-2), values)
+        assert relative_error(found, propagate_direct(points, values, plane, K)) < 1e-2
 
 
 def test_it_is_linear() -> None:
     points = points_of(shaped_wall("cylinder", 32))
-    way, random = passage(points, FITTING, 1e-2), np.random.default_rng(1)
-    first, second = phasors(len(points)), random.normal(size=(len(points), K.size)).astype(np.complex64)
-    both = layered_sum(way, 2 * first - 3j * second)
-    assert relative_error(2 * layered_sum(way, first) - 3j * layered_sum(way, second), both) < 1e-5
+    plan, random = make_plan(points, FITTING, 1e-2), np.random.default_rng(1)
+    first, second = (
+        phasors(len(points)),
+        random.normal(size=(len(points), K.size)).astype(np.complex64),
+    )
+    both = propagate_low_rank(plan, 2 * first - 3j * second)
+    assert (
+        relative_error(
+            2 * propagate_low_rank(plan, first) - 3j * propagate_low_rank(plan, second), both
+        )
+        < 1e-5
+    )
 
 
 def test_silence_and_a_single_frequency_pass() -> None:
     points = points_of(shaped_wall("relief", 32))
     values = np.zeros_like(phasors(len(points)))
-    assert strength(values).tolist() == [1.0] * K.size
-    assert not layered_sum(passage(points, FITTING, 1e-2), values).any()
+    assert estimate_strength(values).tolist() == [1.0] * K.size
+    assert not propagate_low_rank(make_plan(points, FITTING, 1e-2), values).any()
     values[:, 9] = phasors(len(points))[:, 9]
-    assert np.flatnonzero(strength(values)).tolist() == [9]
-    way = Passage.of(points, FITTING, WAVES, strength(values), 1e-2)
-    assert way is not None
-    assert relative_error(layered_sum(way, values), direct_sum(points, values, FITTING, K)) < 1e-2
+    assert np.flatnonzero(estimate_strength(values)).tolist() == [9]
+    plan = WallToPlanePlan.of(points, FITTING, WAVES, estimate_strength(values), 1e-2)
+    assert plan is not None
+    assert (
+        relative_error(
+            propagate_low_rank(plan, values), propagate_direct(points, values, FITTING, K)
+        )
+        < 1e-2
+    )
 
 
 def test_scattered_points_stand_above_no_lattice() -> None:
@@ -111,25 +131,25 @@ def test_scattered_points_stand_above_no_lattice() -> None:
     scattered = random.uniform([-1, -1, 0], [1, 1, 0.2], (100, 3))
     twice = np.concatenate([shaped_wall("wavy", 5).reshape(-1, 3)] * 2)
     for points in (scattered, twice):
-        assert Passage.of(points, FITTING, WAVES, BAND.weights, 1e-2) is None
+        assert WallToPlanePlan.of(points, FITTING, WAVES, BAND.weights, 1e-2) is None
 
 
 def test_large_problems_take_it_and_small_or_strict_ones_do_not() -> None:
     large, small = (shaped_wall("relief", count).reshape(-1, 3) for count in (64, 9))
     plane = Plane(np.linspace(-1, 1, 64), np.linspace(-1, 1, 64), 0.4)
-    assert passage(large, plane, 1e-2).quicker
-    assert not passage(small, plane, 1e-2).quicker
-    assert not passage(large, plane, 1e-4).quicker
+    assert make_plan(large, plane, 1e-2).is_faster_than_direct
+    assert not make_plan(small, plane, 1e-2).is_faster_than_direct
+    assert not make_plan(large, plane, 1e-4).is_faster_than_direct
 
 
 def test_periods_suit_wall_and_plane() -> None:
-    assert [convenient(count) for count in (3, 17, 100, 129, 161, 300, 321, 385, 481)] == [
+    assert [find_fast_length(count) for count in (3, 17, 100, 129, 161, 300, 321, 385, 481)] == [
         16, 32, 128, 160, 192, 320, 384, 400, 512,
     ]  # fmt: skip
-    assert common_period(4.9, 0.1, 0.1, 30) == (64, 64.0)
-    assert common_period(4.9, 0.1, 0.2, 30) == (64, 32.0)
-    assert common_period(4.9, 0.1, 0.12, 30) == (64, pytest.approx(64 / 1.2))
-    assert common_period(3.9, 0.1, 0.12, 30) == (48, 40.0)
-    length, places = common_period(4.9, 0.1, 0.0777, 30)
+    assert find_common_period(4.9, 0.1, 0.1, 30) == (64, 64.0)
+    assert find_common_period(4.9, 0.1, 0.2, 30) == (64, 32.0)
+    assert find_common_period(4.9, 0.1, 0.12, 30) == (64, pytest.approx(64 / 1.2))
+    assert find_common_period(3.9, 0.1, 0.12, 30) == (48, 40.0)
+    length, places = find_common_period(4.9, 0.1, 0.0777, 30)
     assert length == 64
     assert places == pytest.approx(6.4 / 0.0777)

@@ -2,13 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from portable_libraries import LIBRARIES, place_of
+from portable_libraries import LIBRARIES, find_device
 
 from nlos import Capture
 from nlos.adjoint import CompressedCapture
-from nlos.preparation import binned, cropped, without_first_bounce
-from nlos.simulate import counted
-from nlos.unwarp import without_device_legs
+from nlos.preparation import crop_capture, rebin_capture, remove_first_bounce
+from nlos.simulate import add_poisson_noise
+from nlos.unwarp import remove_device_legs
 from tofclip.arrays import to_numpy
 from tofclip.errors import InputError
 from tofclip.units import SPEED_OF_LIGHT
@@ -20,28 +20,28 @@ CAPTURE = Capture(SIGNAL, WALL, [0.0, 0, 0], SPACING / SPEED_OF_LIGHT, 0.2, {"sh
 
 
 def test_cropping_keeps_every_bin_at_its_path() -> None:
-    kept = cropped(CAPTURE, 0.395, 0.605)
+    kept = crop_capture(CAPTURE, 0.395, 0.605)
     assert kept.axis.paths == pytest.approx(np.arange(0.40, 0.606, 0.01))
     assert np.array_equal(kept.signal, CAPTURE.signal[20:41])
     assert kept.provenance == {"shot": 7}
     with pytest.raises(InputError, match=r"record runs from 0\.2 to 1\.19 m"):
-        cropped(CAPTURE, 2, 3)
+        crop_capture(CAPTURE, 2, 3)
 
 
 def test_bins_put_together_stand_for_their_middle() -> None:
-    few = binned(CAPTURE, 8)
+    few = rebin_capture(CAPTURE, 8)
     assert few.signal.shape == (12, 3)
     assert few.signal[2] == pytest.approx(CAPTURE.signal[16:24].sum(axis=0), rel=1e-5)
     assert few.bin_width == pytest.approx(8 * CAPTURE.bin_width)
     assert few.axis.paths[2] == pytest.approx(CAPTURE.axis.paths[16:24].mean())
-    assert np.array_equal(binned(CAPTURE, 1).signal, CAPTURE.signal)
+    assert np.array_equal(rebin_capture(CAPTURE, 1).signal, CAPTURE.signal)
     for factor in (0, -2, 51):
         with pytest.raises(InputError, match="put together"):
-            binned(CAPTURE, factor)
+            rebin_capture(CAPTURE, factor)
 
 
 def test_the_first_bounce_comes_later_far_from_the_laser() -> None:
-    gated = without_first_bounce(CAPTURE, 0.25)
+    gated = remove_first_bounce(CAPTURE, 0.25)
     assert np.all(gated.signal[CAPTURE.axis.paths < 0.2501, 0] == 0)
     assert np.array_equal(gated.signal[6:, 0], CAPTURE.signal[6:, 0])
     assert np.all(gated.signal[:36, 1] == 0)
@@ -49,28 +49,28 @@ def test_the_first_bounce_comes_later_far_from_the_laser() -> None:
     # Where the wall point is not known the signal is not used either.
     assert np.array_equal(gated.signal[:, 2], CAPTURE.signal[:, 2])
     with pytest.raises(InputError, match="margin"):
-        without_first_bounce(CAPTURE, -1)
+        remove_first_bounce(CAPTURE, -1)
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
 def test_a_capture_is_prepared_where_it_lives(library: str) -> None:
-    moved = CAPTURE.on(place_of(library))
+    moved = CAPTURE.on(find_device(library))
     for prepared in (
-        lambda one: cropped(one, 0.395, 0.605),
-        lambda one: binned(one, 8),
-        lambda one: without_first_bounce(one, 0.25),
+        lambda one: crop_capture(one, 0.395, 0.605),
+        lambda one: rebin_capture(one, 8),
+        lambda one: remove_first_bounce(one, 0.25),
     ):
         found, expected = prepared(moved), prepared(CAPTURE)
-        assert found.place == moved.place
+        assert found.device == moved.device
         assert found.axis == expected.axis
         np.testing.assert_allclose(to_numpy(found.signal), expected.signal, rtol=1e-6, atol=1e-6)
 
 
 def test_what_has_compiled_loops_refuses_other_arrays() -> None:
-    moved = CAPTURE.on(place_of("torch"))
+    moved = CAPTURE.on(find_device("torch"))
     with pytest.raises(InputError, match="unwarping works on NumPy arrays"):
-        without_device_legs(moved, np.zeros(3), np.zeros(3))
+        remove_device_legs(moved, np.zeros(3), np.zeros(3))
     with pytest.raises(InputError, match="drawing photons works on NumPy arrays"):
-        counted(moved, 10)
+        add_poisson_noise(moved, 10)
     with pytest.raises(InputError, match="compressed readings works on NumPy arrays"):
         CompressedCapture(moved.signal, None, WALL, np.zeros(3), 1e-11)  # type: ignore[arg-type]

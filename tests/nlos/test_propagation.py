@@ -9,8 +9,8 @@ from scene_shapes import SHAPES, SPOT, shaped_capture, shaped_wall
 from nlos import Capture, Grid, propagate
 from nlos.band import Band, VirtualPulse
 from nlos.plane import Plane
-from nlos.propagation.plane_field import virtual_plane
-from nlos.rsd.transfer import Waves
+from nlos.propagation.plane_field import choose_virtual_plane
+from nlos.rsd.transfer import SphericalWaves
 from nlos.simulate import PointScene
 from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
@@ -23,9 +23,12 @@ def definition(capture: Capture, plane: Plane, pulse: VirtualPulse) -> np.ndarra
     """The field on the plane, summed term by term in float64."""
     band = Band(pulse, capture.axis)
     passes = 2 if len(capture.lasers) > 1 else 1
-    phasors = band.phasors(capture.traces().astype(np.float64))
+    phasors = band.compute_phasors(capture.traces().astype(np.float64))
     distance = np.linalg.norm(plane.points[..., np.newaxis, :] - capture.points, axis=-1)
-    waves = np.exp(1j * passes * distance[..., np.newaxis] * band.wavenumbers) / distance[..., np.newaxis]
+    waves = (
+        np.exp(1j * passes * distance[..., np.newaxis] * band.wavenumbers)
+        / distance[..., np.newaxis]
+    )
     return np.einsum("yxpk,pk->yxk", waves, phasors)
 
 
@@ -55,10 +58,13 @@ def test_confocal_waves_run_at_doubled_wavenumbers() -> None:
 def test_the_way_in_time_arrives_at_the_same_field(confocal: bool) -> None:
     wall = shaped_wall("relief", 13)
     fine = TimeAxis(1024, 16e-12)
-    capture = PointScene([[0.2, 0.1, 1.0]]).seen_from(wall, wall if confocal else SPOT, fine, 60e-12)
+    capture = PointScene([[0.2, 0.1, 1.0]]).simulate_capture(
+        wall, wall if confocal else SPOT, fine, 60e-12
+    )
     exact = definition(capture, PLANE, PULSE)
     error = relative_error(propagate(capture, PLANE, PULSE, "time").values, exact)
-    # Linear interpolation loses (k * bin)^2 / 12 in the mean: 1.2 % at the carrier, 4 % at the shortest wave.
+    # Linear interpolation loses (k * bin)^2 / 12 in the mean: 1.2 % at the carrier, 4 % at the
+    # shortest wave.
     assert 1e-3 < error < 2e-2
 
 
@@ -67,7 +73,7 @@ def test_the_way_in_time_grows_exact_with_finer_bins() -> None:
     errors = []
     for bin_width in (32e-12, 16e-12, 8e-12):
         axis = TimeAxis(round(512 * 32e-12 / bin_width), bin_width)
-        capture = PointScene([[0.2, 0.1, 1.0]]).seen_from(wall, SPOT, axis, 60e-12)
+        capture = PointScene([[0.2, 0.1, 1.0]]).simulate_capture(wall, SPOT, axis, 60e-12)
         field = propagate(capture, PLANE, PULSE, "time")
         errors.append(relative_error(field.values, definition(capture, PLANE, PULSE)))
     # Errors of linear interpolation fall with the square of the bins' width.
@@ -82,7 +88,9 @@ def test_pieces_of_a_wall_add_up(propagation: str) -> None:
         replace(capture, wall=np.where((capture.wall[..., :1] < 0) == side, capture.wall, np.nan))
         for side in (True, False)
     )
-    whole, *parts = (propagate(some, PLANE, PULSE, propagation).values for some in (capture, left, right))
+    whole, *parts = (
+        propagate(some, PLANE, PULSE, propagation).values for some in (capture, left, right)
+    )
     assert relative_error(parts[0] + parts[1], whole) < 1e-5
 
 
@@ -91,25 +99,29 @@ def test_the_number_of_points_on_the_plane_does_not_matter() -> None:
     capture = shaped_capture("relief", 7)
     whole = propagate(capture, PLANE, PULSE).values
     corner = Plane(PLANE.x[:2], PLANE.y[:2], PLANE.z)
-    assert relative_error(propagate(capture, corner, PULSE).values, whole[:2, :2]) < 4e-5  # float32 distances
+    assert (
+        relative_error(propagate(capture, corner, PULSE).values, whole[:2, :2]) < 4e-5
+    )  # float32 distances
 
 
 def test_the_virtual_plane_keeps_its_distance_and_samples_the_shortest_wave() -> None:
     points = shaped_wall("relief", 9).reshape(-1, 3)
     small = Grid([-0.5, 0.5], [-0.5, 0.5], [1.0])
     for shortest, gap in ((0.01, 0.05), (0.07, 0.07), (0.5, 0.1)):
-        plane = virtual_plane(points, small, Waves(2 * np.pi / shortest, 0.0, 1, True), 0.0)
+        plane = choose_virtual_plane(
+            points, small, SphericalWaves(2 * np.pi / shortest, 0.0, 1, True), 0.0
+        )
         assert plane.z == pytest.approx(points[:, 2].max() + gap)
         assert max(plane.steps) <= shortest / 2
         # All straight ways to voxels within the wall's outline pass within it too.
         assert (plane.x[0], plane.x[-1], plane.y[-1]) == pytest.approx((-1, 1, 1))
-    waves = Waves(2 * np.pi / 0.07, 0.0, 1, True)
-    assert virtual_plane(points, small, waves, 1.0, 0.9).z == 0.9
+    waves = SphericalWaves(2 * np.pi / 0.07, 0.0, 1, True)
+    assert choose_virtual_plane(points, small, waves, 1.0, 0.9).z == 0.9
     gap = 0.07 + np.ptp(points[:, 2])
-    roomy = virtual_plane(points, small, waves, 2.0)
+    roomy = choose_virtual_plane(points, small, waves, 2.0)
     assert roomy.x[-1] == pytest.approx(1 + 2 * np.sqrt(0.07 * gap))
     plane_z = points[:, 2].max() + 0.07
-    wide = virtual_plane(points, Grid([-3, 3], [-0.5, 0.5], [plane_z + gap]), waves, 0.0)
+    wide = choose_virtual_plane(points, Grid([-3, 3], [-0.5, 0.5], [plane_z + gap]), waves, 0.0)
     assert wide.x[-1] == pytest.approx(2)  # half way to a voxel at 3 m
 
 
@@ -121,7 +133,9 @@ def test_what_cannot_be_propagated_is_refused() -> None:
         propagate(capture, PLANE, PULSE, "magic")  # type: ignore[arg-type]
     walls = np.stack([capture.wall, capture.wall])
     spots = np.broadcast_to(np.array([[0.1, 0, 0], [0.3, 0, 0]])[:, None, None], walls.shape)
-    several = replace(capture, wall=walls, laser=spots, signal=np.stack([capture.signal] * 2, axis=1))
+    several = replace(
+        capture, wall=walls, laser=spots, signal=np.stack([capture.signal] * 2, axis=1)
+    )
     with pytest.raises(InputError, match="2 laser spots"):
         propagate(several, PLANE, PULSE)
     with pytest.raises(InputError, match="empty band"):

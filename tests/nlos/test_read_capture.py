@@ -1,4 +1,6 @@
-"""Every format that `nlos.io.read_capture` knows, in files that these tests write, and the ways such files can fail."""
+"""Every format that `nlos.io.read_capture` knows, in files that these tests write, and the ways
+such files can fail.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from relay_walls import HIDDEN, JITTER, planar_wall
 
 from nlos import Backprojection, Capture, Grid
 from nlos.io import read_capture
-from nlos.io.turning import turned_to_scene
+from nlos.io.orientation import rotate_to_scene
 from nlos.simulate import PointScene
 from nlos.time_axis import TimeAxis
 from tofclip.errors import FileFormatError, InputError, StorageError
@@ -28,13 +30,19 @@ SOURCE, EYE = np.array([0.3, -0.4, 1.5]), np.array([-0.6, 0.2, 1.8])
 
 
 def simulated(laser: Any = SPOT, wall: np.ndarray = WALL, axis: TimeAxis = AXIS) -> Capture:
-    return PointScene([HIDDEN]).seen_from(wall, laser, axis, JITTER)
+    return PointScene([HIDDEN]).simulate_capture(wall, laser, axis, JITTER)
 
 
 def with_legs(capture: Capture, start: float) -> tuple[np.ndarray, float]:
     """The same light as a device records it, drawn without any shifting."""
-    legs = np.linalg.norm(capture.laser - SOURCE, axis=-1) + np.linalg.norm(capture.wall - EYE, axis=-1)
-    path = np.linalg.norm(capture.laser - HIDDEN, axis=-1) + np.linalg.norm(capture.wall - HIDDEN, axis=-1) + legs
+    legs = np.linalg.norm(capture.laser - SOURCE, axis=-1) + np.linalg.norm(
+        capture.wall - EYE, axis=-1
+    )
+    path = (
+        np.linalg.norm(capture.laser - HIDDEN, axis=-1)
+        + np.linalg.norm(capture.wall - HIDDEN, axis=-1)
+        + legs
+    )
     paths = start + AXIS.spacing * np.arange(400)
     return np.exp(-0.5 * ((paths.reshape(-1, *[1] * path.ndim) - path) / 0.012) ** 2), start
 
@@ -50,10 +58,11 @@ def same(found: Capture, expected: Capture) -> None:
 def shows_the_point(capture: Capture, point: Any = HIDDEN) -> None:
     steps = 0.04 * np.arange(-3, 4)
     volume = Backprojection(0.2).reconstruct(capture, Grid(*(c + steps for c in point)))
-    assert volume.brightest() == pytest.approx(tuple(point))
+    assert volume.find_brightest() == pytest.approx(tuple(point))
 
 
-# --- our own ---------------------------------------------------------------------------------------------------------
+# --- our own
+# ---------------------------------------------------------------------------------------------------------
 
 
 def test_our_own_captures_keep_their_history(tmp_path: Path) -> None:
@@ -82,14 +91,21 @@ def test_another_record_of_ours_is_no_capture(tmp_path: Path) -> None:
         read_capture(tmp_path / "camera.h5")
 
 
-# --- NumPy archives --------------------------------------------------------------------------------------------------
+# --- NumPy archives
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("laser", [SPOT, WALL], ids=["single", "confocal"])
 def test_a_numpy_archive(laser: np.ndarray, tmp_path: Path) -> None:
     expected = simulated(laser)
-    arrays = {"H": expected.signal, "wall_xyz": WALL.astype(np.float32), "laser_xyz": laser.astype(np.float32)}
-    np.savez(tmp_path / "a.npz", **arrays, delta_t_s=AXIS.bin_width, t_start_m=AXIS.start, confocal=1)
+    arrays = {
+        "H": expected.signal,
+        "wall_xyz": WALL.astype(np.float32),
+        "laser_xyz": laser.astype(np.float32),
+    }
+    np.savez(
+        tmp_path / "a.npz", **arrays, delta_t_s=AXIS.bin_width, t_start_m=AXIS.start, confocal=1
+    )
     found = read_capture(tmp_path / "a.npz")
     same(found, expected)
     assert found.provenance["inputs"][0]["name"] == "a.npz"
@@ -110,10 +126,13 @@ def test_the_recorded_archives(shared_data: Path) -> None:
     assert letter.bin_width == pytest.approx(4.6e-12)
 
 
-# --- y-tal -----------------------------------------------------------------------------------------------------------
+# --- y-tal
+# -----------------------------------------------------------------------------------------------------------
 
 
-def write_tal(path: Path, capture: Capture, laser: np.ndarray, signal: np.ndarray | None = None, **more: Any) -> None:
+def write_tal(
+    path: Path, capture: Capture, laser: np.ndarray, signal: np.ndarray | None = None, **more: Any
+) -> None:
     with h5py.File(path, "w") as file:
         file["H"] = capture.signal if signal is None else signal
         file["H_format"] = np.array([1], "i4")
@@ -153,13 +172,16 @@ def test_tal_with_shapes_that_disagree(tmp_path: Path) -> None:
         read_capture(tmp_path / "odd.hdf5")
 
 
-# --- Zaragoza --------------------------------------------------------------------------------------------------------
+# --- Zaragoza
+# --------------------------------------------------------------------------------------------------------
 
 # In that data set the wall is upright in x and z, and the scene lies at smaller y.
 TO_ZARAGOZA = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
 
 
-def write_zaragoza(path: Path, signal: np.ndarray, laser: np.ndarray, start: float, columns_first: bool) -> None:
+def write_zaragoza(
+    path: Path, signal: np.ndarray, laser: np.ndarray, start: float, columns_first: bool
+) -> None:
     """Split the signal over 2 colours and 3 bounces; `signal` is (t, [lasers...,] points...)."""
     parts = np.array([0.5, 0.3, 0.2])[:, None] * np.array([0.25, 0.75])
     split = np.multiply.outer(parts, signal)  # (bounce, colour, t, ...)
@@ -191,7 +213,9 @@ def test_zaragoza(kind: str, columns_first: bool, tmp_path: Path) -> None:
         laser = SPOT.reshape(1, 1, 3) if kind == "single" else WALL[::4, ::5]
         each = [with_legs(simulated(spot), 3.6) for spot in laser.reshape(-1, 3)]
         start = each[0][1]
-        signal = np.stack([one for one, _ in each], axis=1).reshape(400, *laser.shape[:2], *WALL.shape[:2])
+        signal = np.stack([one for one, _ in each], axis=1).reshape(
+            400, *laser.shape[:2], *WALL.shape[:2]
+        )
     write_zaragoza(tmp_path / "z.hdf5", signal, laser, start, columns_first)
     found = read_capture(tmp_path / "z.hdf5")
     assert found.points[:, 2] == pytest.approx(np.zeros(len(found.points)), abs=1e-12)
@@ -207,24 +231,33 @@ def test_zaragoza_with_odd_axes(tmp_path: Path) -> None:
         read_capture(tmp_path / "z.hdf5")
 
 
-@pytest.mark.parametrize("direction", [(0, 0, 2.0), (0, 0, -1), (0, -1, 0), (1, 0, 0), (0.6, 0, 0.8)])
-def test_turning_makes_a_direction_z_and_keeps_distances(direction: tuple[float, float, float]) -> None:
+@pytest.mark.parametrize(
+    "direction", [(0, 0, 2.0), (0, 0, -1), (0, -1, 0), (1, 0, 0), (0.6, 0, 0.8)]
+)
+def test_turning_makes_a_direction_z_and_keeps_distances(
+    direction: tuple[float, float, float],
+) -> None:
     towards = np.array(direction) / np.linalg.norm(direction)
     # The scene stays in front: a hidden point at 0.5 along the direction has z = 0.5 afterwards.
-    turned = turned_to_scene(Capture(np.ones((3, 2)), [0.5 * towards, [0, 0, 0]], 0.5 * towards, 1e-11), towards)
+    turned = rotate_to_scene(
+        Capture(np.ones((3, 2)), [0.5 * towards, [0, 0, 0]], 0.5 * towards, 1e-11), towards
+    )
     assert turned.wall[0] == pytest.approx([0, 0, 0.5])
-    basis = turned_to_scene(Capture(np.ones((3, 3)), np.eye(3), np.eye(3), 1e-11), towards).wall
+    basis = rotate_to_scene(Capture(np.ones((3, 3)), np.eye(3), np.eye(3), 1e-11), towards).wall
     assert basis.T @ basis == pytest.approx(np.eye(3))
     assert np.linalg.det(basis) == pytest.approx(1)
     with pytest.raises(InputError, match="direction"):
-        turned_to_scene(turned, np.zeros(3))
+        rotate_to_scene(turned, np.zeros(3))
 
 
-# --- MATLAB ----------------------------------------------------------------------------------------------------------
+# --- MATLAB
+# ----------------------------------------------------------------------------------------------------------
 
 
 def write_matlab(path: Path, version: str, **variables: Any) -> None:
-    """Write MATLAB's own layout: version 5 by SciPy, 7.3 as HDF5 with reversed axes behind a header of 512 bytes."""
+    """Write MATLAB's own layout: version 5 by SciPy, 7.3 as HDF5 with reversed axes behind a header
+    of 512 bytes.
+    """
     if version == "5":
         scipy.io.savemat(path, variables)
         return
@@ -257,11 +290,11 @@ def test_migration_data(version: str, beside: bool, tmp_path: Path) -> None:
     x, y = np.meshgrid(np.linspace(-1, 1, 14), np.linspace(-1, 1, 13))
     wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
     expected = simulated(wall, wall, TimeAxis(300, 32e-12))
-    late_bins = np.random.default_rng(1).integers(3, 20, wall.shape[:2])
+    delay_bins = np.random.default_rng(1).integers(3, 20, wall.shape[:2])
     meas = np.zeros((13, 14, 330), np.float32)
     for i, j in np.ndindex(13, 14):
-        meas[i, j, late_bins[i, j] : late_bins[i, j] + 300] = expected.signal[:, i, j]
-    tofgrid = late_bins * 32.0
+        meas[i, j, delay_bins[i, j] : delay_bins[i, j] + 300] = expected.signal[:, i, j]
+    tofgrid = delay_bins * 32.0
     if beside:
         write_matlab(tmp_path / "meas_10min.mat", version, meas=meas)
         write_matlab(tmp_path / "tof.mat", version, tofgrid=tofgrid)
@@ -314,7 +347,11 @@ def test_rectified_data(version: str, tmp_path: Path) -> None:
     x, y = np.meshgrid((np.arange(12) - 6) * 0.1, (np.arange(10) - 5) * 0.1)
     wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
     expected = simulated(wall[4, 7], wall, TimeAxis(300, 16e-12))
-    arrays = {"rect_data": np.moveaxis(expected.signal, 0, 2), "ts": 16e-12, "sampling_spacing": 0.1}
+    arrays = {
+        "rect_data": np.moveaxis(expected.signal, 0, 2),
+        "ts": 16e-12,
+        "sampling_spacing": 0.1,
+    }
     write_matlab(tmp_path / "four.mat", version, **arrays, SPAD_index=[7, 4])
     same(read_capture(tmp_path / "four.mat"), expected)
     write_matlab(tmp_path / "off.mat", version, **arrays, SPAD_index=[12, 4])
@@ -329,7 +366,8 @@ def test_a_foreign_matlab_file(version: str, tmp_path: Path) -> None:
         read_capture(tmp_path / "other.mat")
 
 
-# --- EXR -------------------------------------------------------------------------------------------------------------
+# --- EXR
+# -------------------------------------------------------------------------------------------------------------
 
 GEOMETRY = """
 bin_width_ps = 16.0
@@ -343,14 +381,19 @@ def write_exr(path: Path, channels: dict[str, np.ndarray]) -> None:
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(header, {name: np.ascontiguousarray(v, np.float32) for name, v in channels.items()}).write(str(path))
+    OpenEXR.File(
+        header, {name: np.ascontiguousarray(v, np.float32) for name, v in channels.items()}
+    ).write(str(path))
 
 
 def write_streaks(folder: Path, capture: Capture, geometry: str = GEOMETRY) -> None:
     for row in range(capture.signal.shape[1]):
         brightness = capture.signal[:, row].T  # (column, t)
         # No leading zeros, as renderers number them: 10 comes after 9.
-        write_exr(folder / f"streak_{row}.exr", {"R": 0.5 * brightness, "G": brightness, "B": 1.5 * brightness})
+        write_exr(
+            folder / f"streak_{row}.exr",
+            {"R": 0.5 * brightness, "G": brightness, "B": 1.5 * brightness},
+        )
     (folder / "geometry.toml").write_text(geometry)
 
 
@@ -401,7 +444,8 @@ def test_exr_folders_that_are_no_capture(tmp_path: Path) -> None:
         read_capture(tmp_path)
 
 
-# --- damage ----------------------------------------------------------------------------------------------------------
+# --- damage
+# ----------------------------------------------------------------------------------------------------------
 
 
 def test_what_is_no_file_or_no_capture_says_so(tmp_path: Path) -> None:
@@ -426,7 +470,9 @@ def test_truncated_files_are_refused(name: str, tmp_path: Path) -> None:
     if name == "own.h5":
         capture.save(path)
     elif name == "a.npz":
-        np.savez(path, H=capture.signal, wall_xyz=WALL, laser_xyz=SPOT, delta_t_s=1e-11, t_start_m=0)
+        np.savez(
+            path, H=capture.signal, wall_xyz=WALL, laser_xyz=SPOT, delta_t_s=1e-11, t_start_m=0
+        )
     elif name == "tal.hdf5":
         write_tal(path, capture, SPOT)
     else:

@@ -23,7 +23,8 @@ def test_the_recorded_letter_looks_as_by_backprojection(shared_data: Path) -> No
     expected = Backprojection(0.05, 4).reconstruct(capture, grid)
     for method in (PlanarRSD(0.05, 4), Hybrid(0.05, 4)):
         found = method.reconstruct(capture, grid)
-        assert 0.48 <= found.brightest()[2] <= 0.52
+        assert 0.48 <= found.find_brightest()[2] <= 0.52
         pictures = (volume.maximum_projection().brightness.ravel() for volume in (found, expected))
-        # Beyond the band that both share, only tolerance, interpolation and the record's ends differ.
+        # Beyond the band that both share, only tolerance, interpolation and the record's ends
+        # differ.
         assert np.corrcoef(*pictures)[0, 1] > 0.99

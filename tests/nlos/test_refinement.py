@@ -8,16 +8,18 @@ import pytest
 from relay_walls import curved_wall, planar_wall
 
 from nlos import Capture, Grid, Hybrid, Refinement, Volume
-from nlos.exposure import unfolded_band
+from nlos.illumination_groups import choose_unaliased_band
 from nlos.refinement.model import WallModel
-from nlos.refinement.refine import variation
-from nlos.refinement.spherical import spherical_sum
-from nlos.simulate import HiddenScene, PointScene, Surface, counted
+from nlos.refinement.refine import build_total_variation
+from nlos.refinement.spherical import propagate_spherical_waves
+from nlos.simulate import HiddenScene, PointScene, Surface, add_poisson_noise
 from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
 from tofclip.solvers import Sparse
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")  # small walls are coarse ones
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::nlos.sampling.AliasingWarning"
+)  # small walls are coarse ones
 HYBRID = Hybrid(0.2, 4.0)
 SPOT = np.array([0.12, 0.05, 0.02])
 SPOTS = np.array([SPOT, [-0.3, 0.2, 0.03]])
@@ -34,10 +36,12 @@ def seen(laser: str) -> Capture:
     scene = PointScene(HIDDEN, [1.0, 0.7, 1.0])
     if laser == "two spots":
         walls = np.stack([wall, wall])
-        capture = scene.seen_from(walls, np.broadcast_to(SPOTS[:, None, None], walls.shape), AXIS, 60e-12)
+        capture = scene.simulate_capture(
+            walls, np.broadcast_to(SPOTS[:, None, None], walls.shape), AXIS, 60e-12
+        )
     else:
-        capture = scene.seen_from(wall, wall if laser == "confocal" else SPOT, AXIS, 60e-12)
-    return counted(capture, 200.0, 0.0, seed=1)
+        capture = scene.simulate_capture(wall, wall if laser == "confocal" else SPOT, AXIS, 60e-12)
+    return add_poisson_noise(capture, 200.0, 0.0, seed=1)
 
 
 def distances(grid: Grid) -> np.ndarray:
@@ -53,7 +57,9 @@ def share_near(volume: Volume, radius: float) -> float:
 
 
 def likeness(volume: Volume) -> float:
-    """Correlation with the hidden points, as wide as linear interpolation between voxels makes them."""
+    """Correlation with the hidden points, as wide as linear interpolation between voxels makes
+    them.
+    """
     truth = np.maximum(1 - distances(volume.grid) / 0.06, 0)
     return float(np.corrcoef(volume.values.ravel(), truth.ravel())[0, 1])
 
@@ -64,12 +70,13 @@ def test_refinement_beats_the_single_shot(laser: str) -> None:
     refined = Refinement(HYBRID, Sparse(weight=2e-2, iterations=30)).reconstruct(seen(laser), GRID)
     assert refined.values.dtype == np.float32
     assert refined.values.min() >= 0
-    # 8 cm is a voxel's diagonal, which a point between voxels spreads over; the single shot reaches 0.39 to 0.74.
+    # 8 cm is a voxel's diagonal, which a point between voxels spreads over; the single shot reaches
+    # 0.39 to 0.74.
     assert share_near(refined, 0.08) > 0.9 > share_near(shot, 0.08)
     assert share_near(refined, 0.04) > 4 * share_near(shot, 0.04)
     assert likeness(refined) > likeness(shot) + 0.25
     for point in HIDDEN:
-        z, y, x = GRID.nearest(point)
+        z, y, x = GRID.find_nearest(point)
         around = refined.values[z - 1 : z + 2, y - 1 : y + 2, x - 1 : x + 2]
         assert around.max() > 0.2 * refined.values.max()
     assert refined.provenance["imaging"]["prior"] == "l1"
@@ -79,11 +86,17 @@ def test_refinement_beats_the_single_shot(laser: str) -> None:
 def test_an_even_surface_is_smooth_with_sharp_borders_under_total_variation() -> None:
     """A square of 36 cm, parallel to the wall, against the voxels that it fills."""
     scene = HiddenScene([Surface.rectangle([-0.05, 0.0, 0.7], (0.36, 0.36), 0.03)])
-    capture = counted(scene.seen_from(planar_wall(ROWS, COLUMNS), [0.1, 0.0, 0.0], AXIS, 60e-12), 200.0, seed=2)
+    capture = add_poisson_noise(
+        scene.simulate_capture(planar_wall(ROWS, COLUMNS), [0.1, 0.0, 0.0], AXIS, 60e-12),
+        200.0,
+        seed=2,
+    )
     front = (np.abs(GRID.y)[:, None] <= 0.18) & (np.abs(GRID.x + 0.05) <= 0.18)
     truth = front * (np.abs(GRID.z - 0.7) < 0.03)[:, None, None]
     shot = HYBRID.reconstruct(capture, GRID).values
-    refined = Refinement(HYBRID, variation(GRID, 3e-3, 60)).reconstruct(capture, GRID).values
+    refined = (
+        Refinement(HYBRID, build_total_variation(GRID, 3e-3, 60)).reconstruct(capture, GRID).values
+    )
     found, before = (float(np.corrcoef(v.ravel(), truth.ravel())[0, 1]) for v in (refined, shot))
     assert found > before + 0.1
 
@@ -95,7 +108,7 @@ def test_the_adjoint_of_the_readings_is_the_real_part_of_the_hybrids_field(laser
     gain = capture.axis.paths ** (3 if laser == "confocal" else 2)
     brightened = replace(capture, signal=capture.signal * gain[:, None, None])
     expected = HYBRID.phasor_field(brightened, GRID).values.real
-    found = model.operator().adjoint(model.readings())[..., 0]
+    found = model.operator().adjoint(model.measurements())[..., 0]
     # Half of the hybrid's tolerance: what its illumination is split to differs in the two.
     assert np.linalg.norm(found - expected) < 5e-3 * np.linalg.norm(expected)
 
@@ -103,7 +116,7 @@ def test_the_adjoint_of_the_readings_is_the_real_part_of_the_hybrids_field(laser
 def test_a_voxels_phasors_are_those_of_the_formula() -> None:
     capture = seen("single")
     hybrid = replace(HYBRID, plane_z=0.3, tolerance=1e-3)
-    band = unfolded_band(capture, GRID, hybrid.pulse)
+    band = choose_unaliased_band(capture, GRID, hybrid.pulse)
     volume, expected = np.zeros(GRID.shape), 0
     for z, y, x in ((2, 4, 9), (7, 9, 3), (9, 2, 12)):
         volume[z, y, x] = 1
@@ -112,7 +125,8 @@ def test_a_voxels_phasors_are_those_of_the_formula() -> None:
         phases = np.exp(-1j * np.outer(outward + back, band.wavenumbers))
         expected = expected + np.sqrt(band.weights) * phases / back[:, None]
     found = WallModel(hybrid, capture, GRID).operator(np.float64)(volume).view(np.complex128)
-    # Cutting the virtual plane off costs single phasors, most at the band's weak edges, a few per cent.
+    # Cutting the virtual plane off costs single phasors, most at the band's weak edges, a few per
+    # cent.
     assert np.linalg.norm(found - expected.ravel()) < 5e-2 * np.linalg.norm(expected)
 
 
@@ -121,19 +135,21 @@ def test_spherical_waves_agree_in_both_precisions_and_both_directions() -> None:
     one, other = random.uniform(-1, 1, (70, 3)), random.uniform([-1, -1, 2], [1, 1, 4], (131, 3))
     wavenumbers = np.linspace(20, 60, 11)
     values = random.normal(size=(70, 11)) + 1j * random.normal(size=(70, 11))
-    exact = spherical_sum(one, values, other, wavenumbers)
-    quick = spherical_sum(one, values.astype(np.complex64), other, wavenumbers)
+    exact = propagate_spherical_waves(one, values, other, wavenumbers)
+    quick = propagate_spherical_waves(one, values.astype(np.complex64), other, wavenumbers)
     assert quick.dtype == np.complex64
     assert np.linalg.norm(quick - exact) < 3e-5 * np.linalg.norm(exact)
     weights = random.normal(size=(131, 11)) + 0j
-    turned = spherical_sum(other, weights, one, wavenumbers)
+    turned = propagate_spherical_waves(other, weights, one, wavenumbers)
     assert np.sum(exact * weights) == pytest.approx(np.sum(values * turned), rel=1e-12)
 
 
 def test_progress_counts_every_voxel_in_every_iteration() -> None:
     small = Grid.box((-0.1, 0.1), (-0.1, 0.1), (0.6, 0.7), (0.05, 0.05, 0.04))
     done: list[int] = []
-    volume = Refinement(HYBRID, Sparse(iterations=3)).reconstruct(seen("single"), small, done.append)
+    volume = Refinement(HYBRID, Sparse(iterations=3)).reconstruct(
+        seen("single"), small, done.append
+    )
     assert sum(done) == 3 * small.size
     assert volume.provenance["imaging"]["stopped_because"] == "iteration limit"
 

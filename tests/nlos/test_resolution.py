@@ -1,4 +1,6 @@
-"""How sharp a hidden point becomes, against the diffraction limit of the wall and the length of the pulse."""
+"""How sharp a hidden point becomes, against the diffraction limit of the wall and the length of the
+pulse.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +28,15 @@ def full_width_at_half_maximum(axis: np.ndarray, values: np.ndarray) -> float:
 def test_a_point_is_as_wide_as_diffraction_and_the_pulse_make_it(depth: float) -> None:
     wall = planar_wall(51, 51)
     wall[..., :2] *= SIDE / 2 / np.array([0.6, 0.5])
-    capture = PointScene([[0.0, 0.0, depth]]).seen_from(wall, [0.0, 0.0, 0.0], TimeAxis(900, 16e-12), 20e-12)
+    capture = PointScene([[0.0, 0.0, depth]]).simulate_capture(
+        wall, [0.0, 0.0, 0.0], TimeAxis(900, 16e-12), 20e-12
+    )
     across = np.linspace(-0.25, 0.25, 51)
     along = depth + np.linspace(-0.25, 0.25, 51)
     lateral = METHOD.reconstruct(capture, Grid(across, [0.0], [depth])).values[0, 0]
     axial = METHOD.reconstruct(capture, Grid([0.0], [0.0], along)).values[:, 0, 0]
-    # Of a square aperture seen under the half angle theta the amplitude is sinc(2 x sin(theta) / wavelength).
+    # Of a square aperture seen under the half angle theta the amplitude is sinc(2 x sin(theta) /
+    # wavelength).
     sine = SIDE / 2 / np.hypot(SIDE / 2, depth)
     limit = SINC_HALF * WAVELENGTH / sine
     assert full_width_at_half_maximum(across, lateral) == pytest.approx(limit, rel=0.1)

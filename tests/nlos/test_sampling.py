@@ -32,7 +32,12 @@ def test_the_spacing_is_that_of_neighbours_however_they_are_listed() -> None:
 def test_a_coarse_wall_is_warned_of_and_a_fine_one_is_not() -> None:
     grid = Grid([0.0], [0.0], [0.5])
     shortest = 2 * np.pi / Band(METHOD.pulse, capture_of(planar_wall()).axis).wavenumbers[-1]
-    for share, confocal, warned in ((0.45, False, False), (0.55, False, True), (0.3, True, True), (0.2, True, False)):
+    for share, confocal, warned in (
+        (0.45, False, False),
+        (0.55, False, True),
+        (0.3, True, True),
+        (0.2, True, False),
+    ):
         wall = planar_wall() * (share * shortest / 0.06)
         wall[..., 1] *= 0.96  # rows are 6.25 cm apart, columns 6 cm
         capture = capture_of(wall, wall if confocal else [0.0, 0, 0])

@@ -1,4 +1,6 @@
-"""From scattered wall points to a plane by transforms that ask for no lattice, against the direct sum."""
+"""From scattered wall points to a plane by transforms that ask for no lattice, against the direct
+sum.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +14,10 @@ import nlos.propagation.propagate
 from nlos import propagate
 from nlos.band import Band, VirtualPulse
 from nlos.plane import Plane
-from nlos.propagation.direct import direct_sum
-from nlos.propagation.layered import layered_sum
-from nlos.propagation.scattered import ScatteredPassage
-from nlos.rsd.transfer import Waves
+from nlos.propagation.direct import propagate_direct
+from nlos.propagation.low_rank_propagation import propagate_low_rank
+from nlos.propagation.scattered import ScatteredWallToPlanePlan
+from nlos.rsd.transfer import SphericalWaves
 from nlos.simulate import PointScene
 from nlos.time_axis import TimeAxis
 
@@ -23,7 +25,7 @@ pytest.importorskip("finufft", reason="finufft is optional")
 
 BAND = Band(VirtualPulse(0.25, 4.24), TimeAxis(512, 32e-12))
 K = BAND.wavenumbers
-WAVES = Waves(float(K[0]), float(K[1] - K[0]), K.size, continued=False)
+WAVES = SphericalWaves(float(K[0]), float(K[1] - K[0]), K.size, continued=False)
 FINE = Plane(np.linspace(-1.2, 1.3, 40), np.linspace(-1.1, 1.0, 33), 0.4)
 COARSE = Plane(FINE.x[::3], FINE.y[::4], 0.42)
 CLOUD = np.random.default_rng(5).uniform([-1, -0.7, 0], [1, 0.9, 0.3], (900, 3))
@@ -39,8 +41,10 @@ def phasors(count: int) -> np.ndarray:
 
 def error_of(points: np.ndarray, plane: Plane, tolerance: float) -> float:
     values = phasors(len(points))
-    found = layered_sum(ScatteredPassage.of(points, plane, WAVES, BAND.weights, tolerance), values)
-    exact = direct_sum(points, values, plane, K)
+    found = propagate_low_rank(
+        ScatteredWallToPlanePlan.of(points, plane, WAVES, BAND.weights, tolerance), values
+    )
+    exact = propagate_direct(points, values, plane, K)
     assert found.shape == exact.shape
     assert found.dtype == np.complex64
     return float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
@@ -53,25 +57,33 @@ def test_it_is_the_direct_sum_within_the_tolerance(plane: Plane, tolerance: floa
 
 
 def test_points_on_a_line_and_points_that_coincide() -> None:
-    line = np.stack([np.linspace(-1, 1, 60) ** 3, np.full(60, 0.2), np.linspace(0, 0.3, 60)], axis=1)
+    line = np.stack(
+        [np.linspace(-1, 1, 60) ** 3, np.full(60, 0.2), np.linspace(0, 0.3, 60)], axis=1
+    )
     assert error_of(line, FINE, 1e-2) < 1e-2
     assert error_of(np.concatenate([CLOUD[:80], CLOUD[:80]]), FINE, 1e-2) < 1e-2
 
 
 def test_a_flat_cloud_takes_one_term() -> None:
     flat = CLOUD * [1, 1, 0]
-    assert set(ScatteredPassage.of(flat, FINE, WAVES, BAND.weights, 1e-2).relief.counts) == {1}
+    assert set(
+        ScatteredWallToPlanePlan.of(
+            flat, FINE, WAVES, BAND.weights, 1e-2
+        ).low_rank_transfer.term_counts
+    ) == {1}
     assert error_of(flat, FINE, 1e-2) < 1e-2
 
 
 def test_it_is_taken_where_it_is_quicker_and_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Else the direct sum is, which the field shows by its accuracy."""
-    capture = PointScene(POINTS).seen_from(CLOUD, SPOT, TimeAxis(512, 32e-12), 60e-12)
+    capture = PointScene(POINTS).simulate_capture(CLOUD, SPOT, TimeAxis(512, 32e-12), 60e-12)
     errors = {}
     exact = propagate(capture, FINE, BAND.pulse, tolerance=1e-4).values
     for quicker, installed in ((True, True), (True, False), (False, True)):
-        monkeypatch.setattr(ScatteredPassage, "quicker", quicker)
-        monkeypatch.setattr(nlos.propagation.propagate, "scattered_transforms", lambda there=installed: there)
+        monkeypatch.setattr(ScatteredWallToPlanePlan, "is_faster_than_direct", quicker)
+        monkeypatch.setattr(
+            nlos.propagation.propagate, "has_finufft", lambda there=installed: there
+        )
         found = propagate(capture, FINE, BAND.pulse).values
         errors[quicker, installed] = np.linalg.norm(found - exact) / np.linalg.norm(exact)
     assert 1e-5 < errors[True, True] < 1e-2
@@ -81,9 +93,16 @@ def test_it_is_taken_where_it_is_quicker_and_installed(monkeypatch: pytest.Monke
 def test_large_clouds_take_it_and_small_ones_do_not() -> None:
     random = np.random.default_rng(1)
     plane = Plane(np.linspace(-1, 1, 128), np.linspace(-1, 1, 128), 0.4)
-    waves = Waves(40.0, 1.0, 100, continued=False)
+    waves = SphericalWaves(40.0, 1.0, 100, continued=False)
     for count, expected in ((300, False), (20000, True)):
         points = random.uniform([-1, -1, 0], [1, 1, 0.3], (count, 3))
-        assert ScatteredPassage.of(points, plane, waves, np.ones(100), 1e-2).quicker == expected
+        assert (
+            ScatteredWallToPlanePlan.of(
+                points, plane, waves, np.ones(100), 1e-2
+            ).is_faster_than_direct
+            == expected
+        )
     points = random.uniform([-1, -1, 0], [1, 1, 0.3], (20000, 3))
-    assert not ScatteredPassage.of(points, plane, waves, np.ones(100), 1e-4).quicker
+    assert not ScatteredWallToPlanePlan.of(
+        points, plane, waves, np.ones(100), 1e-4
+    ).is_faster_than_direct

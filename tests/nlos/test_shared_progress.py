@@ -10,9 +10,9 @@ from scene_shapes import shaped_capture
 
 import nlos.hybrid
 from nlos import Grid, Hybrid
-from nlos.method import Portion
-from nlos.propagation.passage import Passage
-from nlos.rsd.diffraction import Diffraction
+from nlos.method import SubProgress
+from nlos.propagation.wall_to_plane_plan import WallToPlanePlan
+from nlos.rsd.diffraction import DiffractionPlan
 
 GRID = Grid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.5, 0.5, 7), [0.7, 0.9, 1.0])
 pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")
 def test_pieces_of_a_portion_make_up_the_portion(pieces: list[int], portion: int) -> None:
     pieces = [*pieces, 1]
     reported: list[int] = []
-    report = Portion(reported.append, sum(pieces), portion)
+    report = SubProgress(reported.append, sum(pieces), portion)
     for piece in pieces:
         report(piece)
     assert sum(reported) == portion
@@ -30,22 +30,25 @@ def test_pieces_of_a_portion_make_up_the_portion(pieces: list[int], portion: int
 
 
 @pytest.mark.parametrize(
-    ("propagation", "quicker", "share"), [("spectral", False, 0.4), ("spectral", True, 0.4), ("time", False, 0.95)]
+    ("propagation", "quicker", "share"),
+    [("spectral", False, 0.4), ("spectral", True, 0.4), ("time", False, 0.95)],
 )
 def test_the_way_to_the_plane_has_its_share(
     propagation: str, quicker: bool, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whether by direct sums, Fourier transforms or in time; all steps together count every voxel once."""
+    """Whether by direct sums, Fourier transforms or in time; all steps together count every voxel
+    once.
+    """
     done: list[int] = []
     before: list[tuple[int, int]] = []
-    diffract = nlos.hybrid.diffract
+    diffract = nlos.hybrid.diffract_to_grid
 
-    def noticed(way: Diffraction, values: np.ndarray, *rest: object) -> None:
+    def noticed(plan: DiffractionPlan, values: np.ndarray, *rest: object) -> None:
         before.append((len(done), sum(done)))
-        diffract(way, values, *rest)  # type: ignore[arg-type]
+        diffract(plan, values, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(nlos.hybrid, "diffract", noticed)
-    monkeypatch.setattr(Passage, "quicker", quicker)
+    monkeypatch.setattr(nlos.hybrid, "diffract_to_grid", noticed)
+    monkeypatch.setattr(WallToPlanePlan, "is_faster_than_direct", quicker)
     Hybrid(0.25, 4.24, propagation).reconstruct(shaped_capture("wavy", 17), GRID, done.append)
     ((reports, voxels),) = before
     assert reports > 1
@@ -53,8 +56,10 @@ def test_the_way_to_the_plane_has_its_share(
     assert sum(done) == GRID.size
 
 
-def test_an_interruption_comes_through_on_the_way_to_the_plane(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(nlos.hybrid, "diffract", None)  # is not reached
+def test_an_interruption_comes_through_on_the_way_to_the_plane(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(nlos.hybrid, "diffract_to_grid", None)  # is not reached
 
     def stop(_: int) -> None:
         raise KeyboardInterrupt

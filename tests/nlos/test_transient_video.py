@@ -17,7 +17,9 @@ from nlos.video import TransientVideo
 from tofclip.errors import InputError, ShapeError
 from tofclip.units import SPEED_OF_LIGHT
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")  # small walls are coarse ones
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::nlos.sampling.AliasingWarning"
+)  # small walls are coarse ones
 LASER = np.array([0.12, 0.05, 0.0])
 POINTS = np.array([[0.15, -0.2, 0.6], [-0.2, 0.15, 0.95]])
 ARRIVALS = np.linalg.norm(POINTS - LASER, axis=1) / SPEED_OF_LIGHT
@@ -28,7 +30,7 @@ METHODS = {"rsd": PlanarRSD(0.15, 4), "hybrid": Hybrid(0.15, 4)}
 
 def seen(method: str, points: np.ndarray = POINTS) -> Capture:
     wall = planar_wall(19, 21) if method == "rsd" else curved_wall(19, 21)
-    return PointScene(points).seen_from(wall, LASER, AXIS, 40e-12)
+    return PointScene(points).simulate_capture(wall, LASER, AXIS, 40e-12)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -42,13 +44,16 @@ def test_a_hidden_point_lights_up_when_the_flash_reaches_it(method: str) -> None
     assert sum(done) == GRID.size
     # The brightest of all voxels and instants is the point when the flash passes.
     instant, *voxel = np.unravel_index(video.values.argmax(), video.values.shape)
-    assert (instant, *voxel) == (16, *GRID.nearest(POINTS[0]))
-    # The wave is a pulse: 3.5 standard deviations of its envelope earlier and later the point is dark.
+    assert (instant, *voxel) == (16, *GRID.find_nearest(POINTS[0]))
+    # The wave is a pulse: 3.5 standard deviations of its envelope earlier and later the point is
+    # dark.
     there = video.values[(slice(None), *voxel)]
     away = np.abs(times - ARRIVALS[0]) * SPEED_OF_LIGHT > 3.5 * METHODS[method].pulse.sigma
     assert there[away].max() < 0.05 * there.max()
     # Its width is that of the envelope; jitter adds to it in squares.
-    width = np.sqrt(np.sum((times - ARRIVALS[0]) ** 2 * there**2) / np.sum(there**2)) * SPEED_OF_LIGHT
+    width = (
+        np.sqrt(np.sum((times - ARRIVALS[0]) ** 2 * there**2) / np.sum(there**2)) * SPEED_OF_LIGHT
+    )
     assert width == pytest.approx(METHODS[method].pulse.sigma / np.sqrt(2), rel=0.1)
 
 
@@ -65,14 +70,14 @@ def test_every_voxel_at_its_own_time_is_the_image_of_the_method(method: str) -> 
 
 
 def test_front_views_are_the_brightest_along_z(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(nlos.video, "INSTANTS_AT_A_TIME", 3)  # 7 instants in three pieces
+    monkeypatch.setattr(nlos.video, "INSTANTS_PER_BLOCK", 3)  # 7 instants in three pieces
     imaging, capture = TransientImaging(METHODS["hybrid"]), seen("hybrid")
     times = np.linspace(ARRIVALS[0], ARRIVALS[1], 7)
     front, whole = imaging.front_views(capture, GRID, times), imaging.video(capture, GRID, times)
     assert front.values.shape == (7, 17, 17)
     np.testing.assert_allclose(front.values, whole.values.max(axis=1), rtol=1e-5)
     for i, point in ((0, POINTS[0]), (6, POINTS[1])):
-        _, y, x = GRID.nearest(point)
+        _, y, x = GRID.find_nearest(point)
         assert np.unravel_index(front.values[i].argmax(), front.values[i].shape) == (y, x)
 
 
@@ -82,11 +87,11 @@ def test_a_gate_shows_what_lights_up_while_it_is_open(method: str) -> None:
     around = 1.5 * METHODS[method].pulse.sigma / SPEED_OF_LIGHT
     image = METHODS[method].reconstruct(capture, GRID).values
     for arrival, bright, dark in ((ARRIVALS[0], *POINTS), (ARRIVALS[1], *POINTS[::-1])):
-        gated = imaging.gated(capture, GRID, arrival - around, arrival + around)
-        peak = gated.values[GRID.nearest(bright)]
+        gated = imaging.image_gate(capture, GRID, arrival - around, arrival + around)
+        peak = gated.values[GRID.find_nearest(bright)]
         # erf(1.5) = 0.966 of the flash passes, of which this is the square root.
-        assert peak == pytest.approx(image[GRID.nearest(bright)], rel=0.05)
-        assert gated.values[GRID.nearest(dark)] < 0.2 * image[GRID.nearest(dark)]
+        assert peak == pytest.approx(image[GRID.find_nearest(bright)], rel=0.05)
+        assert gated.values[GRID.find_nearest(dark)] < 0.2 * image[GRID.find_nearest(dark)]
         assert gated.provenance["imaging"]["gate_opens_s"] == arrival - around
 
 
@@ -124,7 +129,8 @@ def test_the_film_shows_the_point_where_it_is(tmp_path: Path) -> None:
         # Only the title, in the uppermost rows, and the voxel change: nothing jumps.
         rows, columns = np.nonzero(np.abs(lit - dark).max(axis=-1)[60:] > 60)
         assert np.ptp(rows) == pytest.approx(np.ptp(columns), abs=2)  # square
-        # The axes fill the left 70 % of the width and most of the height; the voxel is a quarter of the way down.
+        # The axes fill the left 70 % of the width and most of the height; the voxel is a quarter of
+        # the way down.
         assert rows.mean() + 60 < lit.shape[0] / 3
         assert 0.4 * lit.shape[1] < columns.mean() < 0.65 * lit.shape[1]
     with pytest.raises(InputError, match=r"must end in \.gif"):
@@ -145,6 +151,6 @@ def test_what_cannot_be_filmed_is_refused() -> None:
     with pytest.raises(InputError, match="must be finite"):
         imaging.video(capture, GRID, [np.nan])
     with pytest.raises(InputError, match="open before it closes"):
-        imaging.gated(capture, GRID, 2e-9, 1e-9)
+        imaging.image_gate(capture, GRID, 2e-9, 1e-9)
     with pytest.raises(ShapeError, match="transient video"):
         TransientVideo(np.zeros((2, 3, 3), np.float32), np.zeros(2), GRID)

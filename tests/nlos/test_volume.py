@@ -24,7 +24,7 @@ def volume_with(value: complex = 3 - 4j, dtype: type = np.complex64) -> Volume:
 def test_magnitude_and_brightest_voxel() -> None:
     volume = volume_with()
     assert volume.magnitude[1, 0, 3] == pytest.approx(5)
-    assert volume.brightest() == pytest.approx((0.3, -0.2, 0.6))
+    assert volume.find_brightest() == pytest.approx((0.3, -0.2, 0.6))
 
 
 def test_the_maximum_projection_keeps_the_depth() -> None:
@@ -87,10 +87,15 @@ def test_a_picture_is_written(name: str, tmp_path: Path) -> None:
 
 def test_the_picture_has_x_to_the_right_and_y_down_in_metres(tmp_path: Path) -> None:
     figure = _draw_figure(volume_with())
-    panels = {axes.get_title().split(":")[0].split(" ")[0]: axes for axes in figure.axes if axes.get_title()}
+    panels = {
+        axes.get_title().split(":")[0].split(" ")[0]: axes
+        for axes in figure.axes
+        if axes.get_title()
+    }
     assert set(panels) == {"front", "side", "top", "depth"}
     front, side, top = (panels[name].images[0] for name in ("front", "side", "top"))
-    # Pixel edges: half a voxel beyond the outer centres; rows run down the picture with y, or with z from above.
+    # Pixel edges: half a voxel beyond the outer centres; rows run down the picture with y, or with
+    # z from above.
     assert front.get_extent() == pytest.approx([-0.05, 0.35, 0.05, -0.25])
     assert side.get_extent() == pytest.approx([0.45, 0.65, 0.05, -0.25])
     assert top.get_extent() == pytest.approx([-0.05, 0.35, 0.65, 0.45])

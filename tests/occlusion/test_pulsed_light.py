@@ -12,25 +12,27 @@ from tofclip.occlusion import InactiveRegion
 from tofclip.simulate.light_fields import (
     Body,
     CameraArray,
-    Clock,
     Lambertian,
     PulsedScene,
     Rectangle,
-    flash,
-    flash_view,
+    TimeAxis,
+    render_flash,
+    render_flash_view,
 )
-from tofclip.simulate.light_fields.pulsed import irradiance
-from tofclip.simulate.light_fields.render import look
-from tofclip.simulate.shapes import plain
+from tofclip.simulate.light_fields.pulsed import compute_irradiance
+from tofclip.simulate.light_fields.render import cast_rays
+from tofclip.simulate.shapes import make_plain_pattern
 from tofclip.units import SPEED_OF_LIGHT
 
-ARRAY = CameraArray((21, 21), 3, focal_length_px=60.0, view_step=5e-3, focus=0.1, samples=1, view_rows=1)
+ARRAY = CameraArray(
+    (21, 21), 3, focal_length_px=60.0, view_step=5e-3, focus=0.1, samples=1, view_rows=1
+)
 AT_HOME = np.zeros((1, 3))
-CLOCK = Clock.covering(0.02, 0.2, 20e-12, 60e-12)
+CLOCK = TimeAxis.for_ranges(0.02, 0.2, 20e-12, 60e-12)
 
 
 def plate(side: float, z: float, x: float = 0.0) -> Body:
-    return Body(Rectangle(side, side), Lambertian(plain(0.5)), np.array([x, 0.0, z]))
+    return Body(Rectangle(side, side), Lambertian(make_plain_pattern(0.5)), np.array([x, 0.0, z]))
 
 
 def test_a_row_of_cameras_has_views_to_both_sides():
@@ -40,9 +42,10 @@ def test_a_row_of_cameras_has_views_to_both_sides():
 
 @pytest.mark.parametrize("z", [0.06, 0.15])
 def test_light_from_a_plate_arrives_after_the_way_there_and_back_and_fades_with_distance(z):
-    seen = flash_view(PulsedScene((plate(0.4, z),), AT_HOME), ARRAY, CLOCK, (0.0, 0.0))
+    seen = render_flash_view(PulsedScene((plate(0.4, z),), AT_HOME), ARRAY, CLOCK, (0.0, 0.0))
     middle = seen[10, 10]
-    # half the field is 1/6 of the distance: its corners lie 2.7 % further, and half a bin at most cut off
+    # half the field is 1/6 of the distance: its corners lie 2.7 % further, and half a bin at most
+    # cut off
     assert middle @ CLOCK.times / middle.sum() == pytest.approx(2 * z / SPEED_OF_LIGHT, abs=1e-13)
     assert middle.sum() == pytest.approx(0.5 * (ARRAY.focus / z) ** 2, rel=1e-5)
     corner = seen[0, 0]
@@ -53,9 +56,12 @@ def test_light_from_a_plate_arrives_after_the_way_there_and_back_and_fades_with_
 
 def test_a_lamp_to_the_side_throws_the_shadow_to_the_other_side():
     lamp = np.array([[-0.05, 0.0, 0.0]])
-    seen = flash_view(PulsedScene((plate(0.01, 0.05), plate(0.4, 0.1)), lamp), ARRAY, CLOCK, (0.0, 0.0))
+    seen = render_flash_view(
+        PulsedScene((plate(0.01, 0.05), plate(0.4, 0.1)), lamp), ARRAY, CLOCK, (0.0, 0.0)
+    )
     total = seen[10].sum(axis=-1)
-    # the plate's edges at -5 and 5 mm throw shadows to 40 and 60 mm; a pixel of the wall is 1/600 m wide
+    # the plate's edges at -5 and 5 mm throw shadows to 40 and 60 mm; a pixel of the wall is 1/600 m
+    # wide
     wall = (np.arange(21) - 10) * 0.1 / 60
     assert not total[(wall > 0.041) & (wall < 0.059)].any()
     assert (total[wall < -0.011] > 0).all()
@@ -63,24 +69,42 @@ def test_a_lamp_to_the_side_throws_the_shadow_to_the_other_side():
 
 def test_a_lamp_beside_the_only_view_shows_it_no_shadow():
     bodies = (plate(0.01, 0.05), plate(0.4, 0.1))
-    assert flash_view(PulsedScene(bodies, AT_HOME), ARRAY, CLOCK, (0.0, 0.0)).sum(axis=-1).min() > 0
+    assert (
+        render_flash_view(PulsedScene(bodies, AT_HOME), ARRAY, CLOCK, (0.0, 0.0)).sum(axis=-1).min()
+        > 0
+    )
 
 
-@given(width=st.floats(1, 14), distance=st.floats(30, 60), factor=st.floats(0.3, 4), across=st.floats(-0.4, 0.4))
+@given(
+    width=st.floats(1, 14),
+    distance=st.floats(30, 60),
+    factor=st.floats(0.3, 4),
+    across=st.floats(-0.4, 0.4),
+)
 @settings(max_examples=40, deadline=None)
 def test_lamps_at_the_views_light_a_point_as_often_as_views_see_it(width, distance, factor, across):
-    """With a lamp at each view, light gets there and back by the same lines of sight, or not at all."""
+    """With a lamp at each view, light gets there and back by the same lines of sight, or not at
+    all.
+    """
     region = InactiveRegion(15e-3, width * 1e-3, distance * 1e-3)
     behind, x = factor * region.length, across * region.width
     lamps = np.stack([2.5e-3 * np.arange(-3, 4), np.zeros(7), np.zeros(7)], axis=-1)
     passed = (x * region.distance + lamps[:, 0] * behind) / (region.distance + behind)
     if np.any(abs(abs(passed) - region.width / 2) < 1e-7):
         return  # along the very edge
-    speck = Body(Rectangle(1e-7, 1e-7), Lambertian(plain(1.0)), np.array([x, 0.0, region.distance + behind]))
-    bar = Body(Rectangle(region.width, 1.0), Lambertian(plain(0.5)), np.array([0.0, 0.0, region.distance]))
-    sights = [look((speck, bar), lamp, (speck.centre - lamp)[np.newaxis]) for lamp in lamps]
+    speck = Body(
+        Rectangle(1e-7, 1e-7),
+        Lambertian(make_plain_pattern(1.0)),
+        np.array([x, 0.0, region.distance + behind]),
+    )
+    bar = Body(
+        Rectangle(region.width, 1.0),
+        Lambertian(make_plain_pattern(0.5)),
+        np.array([0.0, 0.0, region.distance]),
+    )
+    sights = [cast_rays((speck, bar), lamp, (speck.centre - lamp)[np.newaxis]) for lamp in lamps]
     facing, point = np.array([[0.0, 0.0, -1.0]]), speck.centre[np.newaxis]
-    lit = [irradiance((speck, bar), lamp, point, facing)[0] > 0 for lamp in lamps]
+    lit = [compute_irradiance((speck, bar), lamp, point, facing)[0] > 0 for lamp in lamps]
     views = region.sees(lamps[:, 0], x, behind)
     np.testing.assert_array_equal([sight.body[0] == 0 for sight in sights], views)
     np.testing.assert_array_equal(lit, views)
@@ -89,9 +113,9 @@ def test_lamps_at_the_views_light_a_point_as_often_as_views_see_it(width, distan
 
 def test_every_view_is_rendered_on_its_own():
     scene = PulsedScene((plate(0.01, 0.05), plate(0.4, 0.1)), AT_HOME)
-    all_views = flash(scene, ARRAY, CLOCK)
+    all_views = render_flash(scene, ARRAY, CLOCK)
     assert all_views.shape == (3, 21, 21, CLOCK.bins)
-    np.testing.assert_array_equal(all_views[2], flash_view(scene, ARRAY, CLOCK, (0.0, 1.0)))
+    np.testing.assert_array_equal(all_views[2], render_flash_view(scene, ARRAY, CLOCK, (0.0, 1.0)))
 
 
 @pytest.mark.parametrize(
@@ -99,8 +123,8 @@ def test_every_view_is_rendered_on_its_own():
     [
         (lambda: PulsedScene((), AT_HOME), InputError),
         (lambda: PulsedScene((plate(0.1, 0.1),), np.zeros(3)), ShapeError),
-        (lambda: Clock(0.0, 0.0, 5, 1e-12), InputError),
-        (lambda: Clock(np.nan, 1e-12, 5, 1e-12), InputError),
+        (lambda: TimeAxis(0.0, 0.0, 5, 1e-12), InputError),
+        (lambda: TimeAxis(np.nan, 1e-12, 5, 1e-12), InputError),
         (lambda: CameraArray(view_rows=0), InputError),
     ],
 )

@@ -7,15 +7,19 @@ import pytest
 
 from tofclip.errors import InputError
 from tofclip.operators import PointSpreadConvolution, SliceConvolution
-from tofclip.operators.coded_lines import coded_line
+from tofclip.operators.coded_lines import make_coded_line
 
 
 @pytest.mark.parametrize("sensor", [5, 14, 31])
-@pytest.mark.parametrize(("rows", "columns", "spread"), [(12, 9, (12, 9)), (11, 14, (11, 14)), (12, 14, (5, 6))])
+@pytest.mark.parametrize(
+    ("rows", "columns", "spread"), [(12, 9, (12, 9)), (11, 14, (11, 14)), (12, 14, (5, 6))]
+)
 def test_a_1d_sensor_reads_the_middle_row_of_the_convolution(rows, columns, spread, sensor):
     random = np.random.default_rng(0)
     picture, spreads = random.random((rows, columns)), random.random((3, *spread))
-    seen = SliceConvolution((rows, columns), spreads, sensor, np.float64)(picture).reshape(3, sensor)
+    seen = SliceConvolution((rows, columns), spreads, sensor, np.float64)(picture).reshape(
+        3, sensor
+    )
     for line, each in zip(seen, spreads, strict=True):
         whole = PointSpreadConvolution((rows, columns), each, (rows, sensor), np.float64)(picture)
         np.testing.assert_allclose(line, whole[(rows - 1) // 2], atol=1e-12)
@@ -43,7 +47,7 @@ def test_a_point_falls_where_the_line_s_angle_says():
 
 @pytest.mark.parametrize("angle", [0.0, -np.pi / 4, 0.6])
 def test_a_coded_line_runs_along_its_angle_and_about_half_of_it_is_open(angle):
-    line = coded_line((64, 128), 1, angle, np.random.default_rng(1))
+    line = make_coded_line((64, 128), 1, angle, np.random.default_rng(1))
     rows, columns = np.nonzero(line > 1e-12)
     # Each row's light lies on the two columns nearest to the line.
     assert np.abs(columns - 64 - np.tan(angle) * (rows - 32)).max() < 1
@@ -53,13 +57,13 @@ def test_a_coded_line_runs_along_its_angle_and_about_half_of_it_is_open(angle):
 
 
 def test_a_wide_code_fills_its_width_and_is_cut_at_the_border():
-    line = coded_line((32, 40), 40, 0.5, np.random.default_rng(2))
+    line = make_coded_line((32, 40), 40, 0.5, np.random.default_rng(2))
     assert np.count_nonzero(line.sum(axis=0)) == 40
-    narrow = coded_line((32, 40), 5, 0.0, np.random.default_rng(2))
+    narrow = make_coded_line((32, 40), 5, 0.0, np.random.default_rng(2))
     np.testing.assert_array_equal(np.flatnonzero(narrow.any(axis=0)), np.arange(18, 23))
 
 
 @pytest.mark.parametrize(("width", "angle"), [(0, 0.0), (9, 0.0), (1, np.pi / 2)])
 def test_lines_that_cannot_be_are_refused(width, angle):
     with pytest.raises(InputError):
-        coded_line((8, 8), width, angle, np.random.default_rng(0))
+        make_coded_line((8, 8), width, angle, np.random.default_rng(0))

@@ -1,4 +1,6 @@
-"""Cameras of compressive light-field photography against the sums that they stand for (supplement Eq. 17 and 18)."""
+"""Cameras of compressive light-field photography against the sums that they stand for (supplement
+Eq. 17 and 18).
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,12 @@ import pytest
 
 from tofclip.errors import InputError
 from tofclip.operators import Integration
-from tofclip.operators.light_field_camera import COMPRESSIVE_CAMERAS, AshokCamera, BabacanCamera, MarwahCamera
+from tofclip.operators.light_field_camera import (
+    COMPRESSIVE_CAMERAS,
+    AshokCamera,
+    BabacanCamera,
+    MarwahCamera,
+)
 
 VIEWS = [(float(v), float(u)) for v in range(-1, 2) for u in range(-2, 2)]
 SHAPE = (9, 11)
@@ -22,8 +29,8 @@ def light_field() -> np.ndarray:
 @every_camera
 def test_the_whole_model_is_the_sum_of_the_views_encoders(name):
     camera = COMPRESSIVE_CAMERAS[name](SHAPE, VIEWS, 1, 3)
-    assert camera.readings == 99
-    assert camera.used == tuple(range(12))
+    assert camera.measurements == 99
+    assert camera.used_views == tuple(range(12))
     summed = Integration(camera.encoders)(light_field())
     np.testing.assert_allclose(camera.light_field_model()(light_field()), summed, rtol=1e-5)
     np.testing.assert_array_equal(camera.weighting()(summed), summed)
@@ -36,7 +43,9 @@ def test_each_exposure_weighs_whole_views(kind):
     assert weights.shape == (5, 12)
     assert 0 <= weights.min() < weights.max() <= 1
     exposures = camera.light_field_model()(light_field()).reshape(5, *SHAPE)
-    np.testing.assert_allclose(exposures, np.einsum("jk,kyx->jyx", weights, light_field()), rtol=1e-5)
+    np.testing.assert_allclose(
+        exposures, np.einsum("jk,kyx->jyx", weights, light_field()), rtol=1e-5
+    )
     assert np.linalg.matrix_rank(weights) == 5
 
 
@@ -61,7 +70,9 @@ def test_a_picture_is_seen_as_its_sheared_views(name):
     camera = COMPRESSIVE_CAMERAS[name](SHAPE, VIEWS, 1, 3)
     picture = light_field()[0]
     views = ShearedViews(SHAPE, VIEWS, 0.6, (0.5, 0.0))(picture)
-    np.testing.assert_allclose(camera.model(0.6, (0.5, 0.0))(picture), camera.light_field_model()(views), rtol=1e-6)
+    np.testing.assert_allclose(
+        camera.model(0.6, (0.5, 0.0))(picture), camera.light_field_model()(views), rtol=1e-6
+    )
 
 
 @every_camera

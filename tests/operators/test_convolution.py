@@ -15,16 +15,25 @@ sizes = st.integers(1, 9)
 
 @settings(max_examples=60, deadline=None)
 @given(rows=sizes, columns=sizes, down=sizes, right=sizes, sensor_rows=sizes, sensor_columns=sizes)
-def test_every_point_puts_the_point_spread_about_its_own_place(rows, columns, down, right, sensor_rows, sensor_columns):
-    """Every size of picture, PSF and sensor: no light wraps around, none is lost but beside the sensor."""
+def test_every_point_puts_the_point_spread_about_its_own_place(
+    rows, columns, down, right, sensor_rows, sensor_columns
+):
+    """Every size of picture, PSF and sensor: no light wraps around, none is lost but beside the
+    sensor.
+    """
     spread = np.random.default_rng(0).random((min(down, rows), min(right, columns)))
     picture = np.random.default_rng(1).random((rows, columns))
-    seen = PointSpreadConvolution((rows, columns), spread, (sensor_rows, sensor_columns), np.float64)(picture)
+    seen = PointSpreadConvolution(
+        (rows, columns), spread, (sensor_rows, sensor_columns), np.float64
+    )(picture)
     expected = np.zeros((sensor_rows, sensor_columns))
     first = rows // 2 - sensor_rows // 2, columns // 2 - sensor_columns // 2
     for (y, x), light in np.ndenumerate(picture):
         for (j, i), share in np.ndenumerate(spread):
-            row, column = y + j - spread.shape[0] // 2 - first[0], x + i - spread.shape[1] // 2 - first[1]
+            row, column = (
+                y + j - spread.shape[0] // 2 - first[0],
+                x + i - spread.shape[1] // 2 - first[1],
+            )
             if 0 <= row < sensor_rows and 0 <= column < sensor_columns:
                 expected[row, column] += light * share
     np.testing.assert_allclose(seen, expected, atol=1e-12)

@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofclip.operators import HadamardCodes, LinearShear, MeanWeighting, RadonProjection, RandomCodes
+from tofclip.operators import (
+    HadamardCodes,
+    LinearShear,
+    MeanWeighting,
+    RadonProjection,
+    RandomCodes,
+)
 
 
 def blob(shape: tuple[int, int], x: float, y: float) -> np.ndarray:
@@ -15,13 +21,15 @@ def blob(shape: tuple[int, int], x: float, y: float) -> np.ndarray:
 
 def test_at_right_angles_a_projection_sums_columns_and_rows():
     picture = np.random.default_rng(0).random((8, 8))
-    readings = RadonProjection((8, 8), 8, [0.0, np.pi / 2], [0.0, 0.0], np.float64)(picture)
-    np.testing.assert_allclose(readings[:8], picture.sum(axis=0), rtol=1e-12)
-    np.testing.assert_allclose(readings[8:], picture.sum(axis=1), rtol=1e-12)
+    measurements = RadonProjection((8, 8), 8, [0.0, np.pi / 2], [0.0, 0.0], np.float64)(picture)
+    np.testing.assert_allclose(measurements[:8], picture.sum(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(measurements[8:], picture.sum(axis=1), rtol=1e-12)
 
 
 def test_offsetting_the_detector_shears_the_picture():
-    """A_k B_k by offset is A_k after the shear; linear interpolation twice or once on a blob of 3 px differs by 1 %."""
+    """A_k B_k by offset is A_k after the shear; linear interpolation twice or once on a blob of 3
+    px differs by 1 %.
+    """
     shear, view = -0.6, (-3, 2)
     angles = np.deg2rad([0, 23, 77, 140])
     picture = blob((61, 67), 4, -3)
@@ -35,13 +43,17 @@ def test_offsetting_the_detector_shears_the_picture():
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_a_lone_picture_is_projected_as_by_the_matrix(count):
-    """Without a matrix and with it; detectors so short and so far off that light is lost on both sides."""
+    """Without a matrix and with it; detectors so short and so far off that light is lost on both
+    sides.
+    """
     random = np.random.default_rng(count)
     offsets = random.uniform(-9, 9, count)
     operator = RadonProjection((12, 17), 9, random.uniform(0, np.pi, count), offsets, np.float64)
-    picture, readings = random.random((12, 17)), random.random(9 * count)
+    picture, measurements = random.random((12, 17)), random.random(9 * count)
     np.testing.assert_allclose(operator(picture), operator.matrix @ picture.ravel(), atol=1e-13)
-    np.testing.assert_allclose(operator.adjoint(readings).ravel(), operator.matrix.T @ readings, atol=1e-13)
+    np.testing.assert_allclose(
+        operator.adjoint(measurements).ravel(), operator.matrix.T @ measurements, atol=1e-13
+    )
     assert operator(picture).sum() < count * picture.sum()
 
 
@@ -69,6 +81,8 @@ def test_the_seed_decides_the_codes(kind):
 
 
 def test_every_view_keeps_its_own_share_of_its_mean():
-    readings = np.array([1.0, 3.0, 10.0, 20.0, 60.0])
-    weighted = MeanWeighting([2, 3], 0.1, np.float64)(readings)
-    np.testing.assert_allclose(weighted, readings - 0.9 * np.array([2, 2, 30, 30, 30]), rtol=1e-14)
+    measurements = np.array([1.0, 3.0, 10.0, 20.0, 60.0])
+    weighted = MeanWeighting([2, 3], 0.1, np.float64)(measurements)
+    np.testing.assert_allclose(
+        weighted, measurements - 0.9 * np.array([2, 2, 30, 30, 30]), rtol=1e-14
+    )

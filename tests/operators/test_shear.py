@@ -14,7 +14,9 @@ both = pytest.mark.parametrize("kind", [LinearShear, FourierShear])
 
 @both
 def test_near_objects_move_against_the_view(kind):
-    """Negative shear: a view to the right and below sees the object further left and up, by whole pixels."""
+    """Negative shear: a view to the right and below sees the object further left and up, by whole
+    pixels.
+    """
     picture = np.zeros((9, 12))
     picture[6, 8] = 1
     seen = kind((9, 12), -2.0, (1, 3), (0, 1), np.float64)(picture)
@@ -45,6 +47,7 @@ def test_the_centroid_moves_by_the_shear_times_the_distance_from_the_reference(s
 def test_a_band_limited_picture_is_shifted(kind):
     x = 2 * np.pi * np.arange(32) / 32
     seen = kind((7, 32), 0.3, (0, 1), dtype=np.float64)(np.tile(np.cos(x), (7, 1)))
-    # Linear interpolation of a sine with 32 pixels a period is off by at most (2 pi / 32)^2 / 8 = 0.5 %.
+    # Linear interpolation of a sine with 32 pixels a period is off by at most (2 pi / 32)^2 / 8 =
+    # 0.5 %.
     bound = 5e-3 if kind is LinearShear else 1e-12
     assert np.abs(seen - np.cos(x - 0.3 * 2 * np.pi / 32))[:, 1:].max() < bound

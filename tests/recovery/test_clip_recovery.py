@@ -9,7 +9,12 @@ import pytest
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.light_field import LightField
-from tofclip.light_field.measurement import ClipMeasurement, Setup, measure, spoilt
+from tofclip.light_field.measurement import (
+    CameraSetup,
+    ClipMeasurement,
+    corrupt_measurement,
+    measure,
+)
 from tofclip.metrics import nmse
 from tofclip.recovery.light_field import ClipRecovery, recover_light_field
 
@@ -34,57 +39,65 @@ def truth(scene) -> np.ndarray:
     return scene.refocus(SHEAR)
 
 
-def readings(scene: LightField, encoder: str = "line", ratio: float = 1.0) -> ClipMeasurement:
-    return measure(scene, Setup(encoder, ratio, 0))
+def measurements(scene: LightField, encoder: str = "line", ratio: float = 1.0) -> ClipMeasurement:
+    return measure(scene, CameraSetup(encoder, ratio, 0))
 
 
 @pytest.mark.parametrize("prior", ["tv", "wavelet", "l1", "collaborative", "nlm"])
 def test_every_prior_recovers_the_picture(prior, scene, truth):
-    found = ClipRecovery(prior).recover(readings(scene), SHEAR)
+    found = ClipRecovery(prior).recover(measurements(scene), SHEAR)
     # l1 has nothing to do with a lit ground; it only fits the data
     assert nmse(found.picture, truth, 4) < (0.25 if prior == "l1" else 0.08)
     assert found.weight > 0
     assert found.iterations > 0
 
 
-@pytest.mark.parametrize("encoder", ["line", "single-pixel", "coded-line", "diffuser", "cubic-phase"])
+@pytest.mark.parametrize(
+    "encoder", ["line", "single-pixel", "coded-line", "diffuser", "cubic-phase"]
+)
 def test_every_encoder_is_recovered_without_a_weight_of_its_own(encoder, scene, truth):
-    found = ClipRecovery().recover(readings(scene, encoder, 0.6), SHEAR)
+    found = ClipRecovery().recover(measurements(scene, encoder, 0.6), SHEAR)
     assert nmse(found.picture, truth, 4) < 0.15
 
 
 def test_quality_is_better_than_fast(scene, truth):
-    measurement = readings(scene, ratio=0.4)
-    fast, quality = (ClipRecovery(preset=name).recover(measurement, SHEAR) for name in ("fast", "quality"))
+    measurement = measurements(scene, ratio=0.4)
+    fast, quality = (
+        ClipRecovery(preset=name).recover(measurement, SHEAR) for name in ("fast", "quality")
+    )
     assert nmse(quality.picture, truth, 4) < 0.9 * nmse(fast.picture, truth, 4)
-    assert quality.stopped_because.startswith("10 calls")
+    assert quality.stop_reason.startswith("10 calls")
 
 
 def test_huber_s_term_needs_no_one_to_say_which_readings_are_bad(scene, truth):
-    bad = spoilt(readings(scene), None, 0.08)
+    bad = corrupt_measurement(measurements(scene), None, 0.08)
     squares = ClipRecovery().recover(bad, SHEAR)
     robust = ClipRecovery(data_term="huber").recover(bad, SHEAR)
     assert nmse(robust.picture, truth, 4) < 0.4 * nmse(squares.picture, truth, 4)
 
 
 def test_the_likelihood_of_photons_does_about_as_well_as_squares(scene, truth):
-    """Mean over three seeds. The bound is loose: both are near what this many photons allow, each at times better."""
+    """Mean over three seeds. The bound is loose: both are near what this many photons allow, each
+    at times better.
+    """
     errors = {"squares": 0.0, "poisson": 0.0}
     for seed in range(3):
-        counted = spoilt(measure(scene, Setup("line", 2.0, seed)), 60, 0)
+        counted = corrupt_measurement(measure(scene, CameraSetup("line", 2.0, seed)), 60, 0)
         for name in errors:
-            errors[name] += nmse(ClipRecovery(data_term=name).recover(counted, SHEAR).picture, truth, 4) / 3
+            errors[name] += (
+                nmse(ClipRecovery(data_term=name).recover(counted, SHEAR).picture, truth, 4) / 3
+            )
     assert errors["poisson"] < 1.3 * errors["squares"]
     assert errors["poisson"] < 0.08
 
 
 def test_a_weight_that_is_given_is_taken(scene):
-    found = ClipRecovery(weight=0.03).recover(readings(scene), SHEAR)
+    found = ClipRecovery(weight=0.03).recover(measurements(scene), SHEAR)
     assert found.weight == 0.03
 
 
 def test_the_same_settings_give_the_same_picture(scene):
-    one, other = (ClipRecovery().recover(readings(scene), SHEAR) for _ in range(2))
+    one, other = (ClipRecovery().recover(measurements(scene), SHEAR) for _ in range(2))
     np.testing.assert_array_equal(one.picture, other.picture)
 
 
@@ -105,40 +118,45 @@ def test_names_and_numbers_without_sense_are_refused(settings, message):
 
 def test_photons_must_be_known_for_their_likelihood(scene):
     with pytest.raises(InputError, match="how many photons"):
-        ClipRecovery(data_term="poisson").recover(readings(scene), SHEAR)
+        ClipRecovery(data_term="poisson").recover(measurements(scene), SHEAR)
 
 
 def test_single_pixel_readings_have_no_use_for_it(scene):
-    counted = spoilt(readings(scene, "single-pixel"), 1000, 0)
+    counted = corrupt_measurement(measurements(scene, "single-pixel"), 1000, 0)
     with pytest.raises(InputError, match="take squares"):
         ClipRecovery(data_term="poisson").recover(counted, SHEAR)
 
 
 def test_readings_that_are_none_are_refused(scene):
-    measurement = readings(scene)
+    measurement = measurements(scene)
     with pytest.raises(InputError, match="NaN"):
-        replace(measurement, readings=np.full_like(measurement.readings, np.nan))
+        replace(measurement, measurements=np.full_like(measurement.measurements, np.nan))
     with pytest.raises(InputError, match="every reading is zero"):
-        replace(measurement, readings=np.zeros_like(measurement.readings))
+        replace(measurement, measurements=np.zeros_like(measurement.measurements))
     with pytest.raises(ShapeError):
-        ClipRecovery().recover(replace(measurement, readings=measurement.readings[:-1]), SHEAR)
+        ClipRecovery().recover(
+            replace(measurement, measurements=measurement.measurements[:-1]), SHEAR
+        )
 
 
 def test_a_light_field_comes_back_view_by_view(scene):
-    """With four times as many readings as pixels: each view gets a quarter of what its picture would need."""
-    found = recover_light_field(readings(scene, ratio=4.0))
+    """With four times as many readings as pixels: each view gets a quarter of what its picture
+    would need.
+    """
+    found = recover_light_field(measurements(scene, ratio=4.0))
     np.testing.assert_array_equal(found.views, scene.views)
     middle = 10
     assert nmse(found.pictures[middle], scene.pictures[middle], 4) < 0.1
-    # the plate stands at SHEAR: seen from another view it is somewhere else, and the recovered views know
+    # the plate stands at SHEAR: seen from another view it is somewhere else, and the recovered
+    # views know
     for view in (0, 15):
         own = nmse(found.pictures[view], scene.pictures[view], 4)
         assert own < 0.5 * nmse(found.pictures[view], scene.pictures[middle], 4)
 
 
 def test_views_without_readings_are_filled_in(scene):
-    few = readings(scene, ratio=0.25)
-    assert len(few.camera().used) < 16
+    few = measurements(scene, ratio=0.25)
+    assert len(few.camera().used_views) < 16
     found = recover_light_field(few)
     assert np.all(found.pictures.max(axis=(1, 2)) > 0.1)
 
@@ -146,4 +164,4 @@ def test_views_without_readings_are_filled_in(scene):
 def test_an_incomplete_grid_of_views_is_refused(scene):
     some = LightField(scene.pictures[:-1], scene.views[:-1])
     with pytest.raises(InputError, match="complete grid"):
-        recover_light_field(readings(some))
+        recover_light_field(measurements(some))

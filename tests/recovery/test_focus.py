@@ -1,4 +1,6 @@
-"""Depth-locked refocus: one shot of targets from 0.5 to 5 m, each recovered at the shear of its own range."""
+"""Depth-locked refocus: one shot of targets from 0.5 to 5 m, each recovered at the shear of its own
+range.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +14,23 @@ from tofclip import Frames, depth, nmse, point_cloud
 from tofclip.camera import Camera, SkewSweep, measure
 from tofclip.errors import CalibrationError, InputError, ShapeError
 from tofclip.recovery import (
-    DepthLocked,
+    DepthLockedFocus,
     FixedFocus,
     SharpestFocus,
-    focus_named,
-    parallax_from_shot,
+    fit_parallax_to_shot,
+    parse_focus,
     recover,
 )
-from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate, true_frames
-from tofclip.simulate.shapes import cut_out, letter, plain
-from tofclip.solvers import Adjoint, Sparse
+from tofclip.simulate import (
+    Instrument,
+    Plate,
+    Scene,
+    StreakDetector,
+    render_true_frames,
+    simulate_shot,
+)
+from tofclip.simulate.shapes import cut_pattern, make_letter, make_plain_pattern
+from tofclip.solvers import Backprojection, Sparse
 from tofclip.units import SPEED_OF_LIGHT
 
 BIN = 20e-12
@@ -50,7 +59,7 @@ def camera(order: tuple[int, ...] = (3, 0, 5, 1, 6, 2, 4)) -> Camera:
 
 def plate(name: str, place: tuple[int, int], distance: float) -> Plate:
     pixel = distance / FOCAL
-    pattern = cut_out(letter(name), plain(0.8))
+    pattern = cut_pattern(make_letter(name), make_plain_pattern(0.8))
     return Plate((place[0] * pixel, place[1] * pixel, distance), (18 * pixel, 18 * pixel), pattern)
 
 
@@ -68,25 +77,25 @@ def gate(distance: float, made: Camera) -> slice:
 
 @pytest.fixture(scope="module")
 def shot():
-    return simulate(SCENE, instrument(camera()), seed=0)
+    return simulate_shot(SCENE, instrument(camera()), seed=0)
 
 
 @pytest.fixture(scope="module")
 def locked(shot) -> Frames:
-    return recover(shot.streak, shot.camera, METHOD, focus=DepthLocked())
+    return recover(shot.streak, shot.camera, METHOD, focus=DepthLockedFocus())
 
 
 def test_every_range_is_as_good_as_alone_and_the_ends_are_better_than_any_fixed_shear(shot, locked):
     made = shot.camera
-    truth = true_frames(SCENE, instrument(made), shot.exposure).values
-    readings = measure(shot.streak.counts, None, made).readings
+    truth = render_true_frames(SCENE, instrument(made), shot.exposure).values
+    measurements = measure(shot.streak.counts, None, made).measurements
     shears = np.linspace(-2.0, 0.5, 11)
 
     def error(frames: np.ndarray, distance: float) -> float:
         return nmse(frames.sum(axis=0), truth[gate(distance, made)].sum(axis=0))
 
     def alone(distance: float, shear: float) -> float:
-        part = np.ascontiguousarray(readings[:, gate(distance, made)])
+        part = np.ascontiguousarray(measurements[:, gate(distance, made)])
         return error(METHOD.recover(made.operator(shear), part).frames, distance)
 
     found = {d: error(locked.values[gate(d, made)], d) for d in RANGES}
@@ -102,13 +111,19 @@ def test_pieces_cover_all_frames_within_the_tolerance(shot):
     made = shot.camera
     times = shot.streak.times - made.time_zero
     for tolerance in (0.1, 0.5):
-        pieces = DepthLocked(tolerance).pieces(made, times, measure(shot.streak.counts, None, made))
+        pieces = DepthLockedFocus(tolerance).plan_segments(
+            made, times, measure(shot.streak.counts, None, made)
+        )
         assert pieces[0].frames.start == 0
         assert pieces[-1].frames.stop == times.size
         assert all(a.frames.stop == b.frames.start for a, b in pairwise(pieces))
         used = np.repeat([p.shear for p in pieces], [p.size for p in pieces])
-        wrong = np.abs(used - made.shear_at(SPEED_OF_LIGHT * times / 2)) * 3  # three steps to the outermost view
-        assert wrong.max() < 2 * tolerance  # a piece spans twice the tolerance; its mean may lie off its middle
+        wrong = (
+            np.abs(used - made.shear_at(SPEED_OF_LIGHT * times / 2)) * 3
+        )  # three steps to the outermost view
+        assert (
+            wrong.max() < 2 * tolerance
+        )  # a piece spans twice the tolerance; its mean may lie off its middle
         assert np.median(wrong) < tolerance
     assert np.all(np.diff([piece.brightness for piece in pieces]) < 0)
 
@@ -125,24 +140,33 @@ def test_frames_remember_their_shears(locked, shot, tmp_path):
         replace(locked, shears=np.zeros(3))
 
 
-@pytest.mark.parametrize("focus", [FixedFocus(), DepthLocked()])
+@pytest.mark.parametrize("focus", [FixedFocus(), DepthLockedFocus()])
 def test_heights_come_out_true_in_the_depth_of_field_arrangement(focus):
-    shot = simulate(SCENE, instrument(camera(order=(0, 1, 2, 3, 4, 5, 6))), seed=0)
+    shot = simulate_shot(SCENE, instrument(camera(order=(0, 1, 2, 3, 4, 5, 6))), seed=0)
     frames = recover(shot.streak, shot.camera, METHOD, focus=focus)
     returns = depth(frames)
-    cloud, as_seen = point_cloud(returns), point_cloud(depth(frames, shot.camera.replace(lenslet_pitch=0.0)))
+    cloud, as_seen = (
+        point_cloud(returns),
+        point_cloud(depth(frames, shot.camera.replace(lenslet_pitch=0.0))),
+    )
     nearest = np.abs(cloud.range - 0.5) < 0.05
     height = np.median(cloud.xyz[nearest, 1]) * FOCAL / 0.5
     seen = np.median(as_seen.xyz[nearest, 1]) * FOCAL / 0.5
-    # the median height of the letter U's surface lies 1 px below its middle; noise and defocus cost a pixel
+    # the median height of the letter U's surface lies 1 px below its middle; noise and defocus cost
+    # a pixel
     assert height == pytest.approx(-17, abs=2)
     assert np.abs(seen - height) > 4 if focus == FixedFocus() else np.abs(seen - height) < 0.5
 
 
 def test_a_stack_finds_the_shears_that_the_ranges_ask_for(shot):
     made = shot.camera.replace(lenslet_pitch=0.0)
-    part = replace(shot.streak, counts=shot.streak.counts[:128], row_times=shot.streak.row_times[:128], saturated=None)
-    frames = recover(part, made, Adjoint(), focus=SharpestFocus(-2.5, 0.5, 7))
+    part = replace(
+        shot.streak,
+        counts=shot.streak.counts[:128],
+        row_times=shot.streak.row_times[:128],
+        saturated=None,
+    )
+    frames = recover(part, made, Backprojection(), focus=SharpestFocus(-2.5, 0.5, 7))
     assert frames.figures["focus"] == "stack:-2.5:0.5:7"
     # the target at 0.5 m lies in the first gate; light of the one at 0.9 m arrives later than both
     assert frames.shears[33] == pytest.approx(float(shot.camera.shear_at(0.5)), abs=0.2)
@@ -151,29 +175,40 @@ def test_a_stack_finds_the_shears_that_the_ranges_ask_for(shot):
 def test_the_parallax_is_found_from_the_shot(shot):
     unknown = shot.camera.replace(lenslet_pitch=0.0, focus_distance=np.inf)
     done = []
-    found = parallax_from_shot(shot.streak, unknown, 5, (-2.4, 0.9, 6), done.append)
+    found = fit_parallax_to_shot(shot.streak, unknown, 5, (-2.4, 0.9, 6), done.append)
     strength = FOCAL * 5e-3
     assert found.parallax.strength == pytest.approx(strength, rel=0.1)
     for distance in (0.5, 5.0):
-        assert float(found.camera.shear_at(distance)) == pytest.approx(float(shot.camera.shear_at(distance)), abs=0.2)
+        assert float(found.camera.shear_at(distance)) == pytest.approx(
+            float(shot.camera.shear_at(distance)), abs=0.2
+        )
     assert sum(done) == 6 * 30 * shot.streak.counts.shape[0]
 
 
 def test_names_of_foci():
-    assert focus_named("depth-locked") == DepthLocked()
-    assert focus_named("fixed:-0.5") == FixedFocus(-0.5)
-    assert focus_named("stack:-2:1:7") == SharpestFocus(-2.0, 1.0, 7)
-    for text in ("", "fixed", "fixed:a", "fixed:nan", "stack:0:1", "stack:1:0:3", "stack:0:1:1", "depth-locked:1"):
+    assert parse_focus("depth-locked") == DepthLockedFocus()
+    assert parse_focus("fixed:-0.5") == FixedFocus(-0.5)
+    assert parse_focus("stack:-2:1:7") == SharpestFocus(-2.0, 1.0, 7)
+    for text in (
+        "",
+        "fixed",
+        "fixed:a",
+        "fixed:nan",
+        "stack:0:1",
+        "stack:1:0:3",
+        "stack:0:1:1",
+        "depth-locked:1",
+    ):
         with pytest.raises(InputError, match=r"focus|shear"):
-            focus_named(text)
+            parse_focus(text)
     with pytest.raises(InputError, match="tolerance"):
-        DepthLocked(0.0)
+        DepthLockedFocus(0.0)
 
 
 def test_what_the_camera_does_not_know_is_said(shot):
     with pytest.raises(CalibrationError, match="lenslet pitch"):
-        recover(shot.streak, shot.camera.replace(lenslet_pitch=0.0), focus=DepthLocked())
+        recover(shot.streak, shot.camera.replace(lenslet_pitch=0.0), focus=DepthLockedFocus())
     with pytest.raises(CalibrationError, match="time zero"):
-        parallax_from_shot(shot.streak, shot.camera.replace(time_zero=1e-9), 5, (-1.0, 1.0, 3))
+        fit_parallax_to_shot(shot.streak, shot.camera.replace(time_zero=1e-9), 5, (-1.0, 1.0, 3))
     with pytest.raises(InputError, match="gates"):
-        parallax_from_shot(shot.streak, shot.camera, 2, (-1.0, 1.0, 3))
+        fit_parallax_to_shot(shot.streak, shot.camera, 2, (-1.0, 1.0, 3))

@@ -10,16 +10,22 @@ import pytest
 
 from tofclip import Frames, Streak, depth, recover
 from tofclip.camera import Camera, ProjectiveSweep, measure
-from tofclip.camera.calibration import estimate_skew, register
+from tofclip.camera.calibration import estimate_skew, register_views
 from tofclip.errors import CalibrationError, InputError, MissingTimeAxisError
-from tofclip.recovery import method_named, prepare, time_shift_bins
-from tofclip.simulate import SimulatedShot, default_instrument, default_scene, score, simulate
+from tofclip.recovery import compute_view_delays_bins, make_method, prepare_recovery
+from tofclip.simulate import (
+    SimulatedShot,
+    make_default_instrument,
+    make_default_scene,
+    score_returns,
+    simulate_shot,
+)
 from tofclip.solvers import LinearInverse, Sparse, TotalVariation
 
 
 @pytest.fixture(scope="module")
 def shot() -> SimulatedShot:
-    return simulate(default_scene(), default_instrument(), seed=0)
+    return simulate_shot(make_default_scene(), make_default_instrument(), seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +42,12 @@ def frames(shot, uncalibrated) -> Frames:
 def test_skew_and_gains_are_found_from_the_shot(shot, frames):
     true, found = shot.camera, frames.camera
     # A quarter of a row and two percent: small beside the pulse (3 rows) and the photon noise.
-    np.testing.assert_allclose(time_shift_bins(found), time_shift_bins(true), atol=0.25)
-    np.testing.assert_allclose(found.gains / found.gains.mean(), true.gains / true.gains.mean(), rtol=0.02)
+    np.testing.assert_allclose(
+        compute_view_delays_bins(found), compute_view_delays_bins(true), atol=0.25
+    )
+    np.testing.assert_allclose(
+        found.gains / found.gains.mean(), true.gains / true.gains.mean(), rtol=0.02
+    )
     # Objects nearer or farther than the focus are displaced by up to a pixel in the outer views.
     np.testing.assert_allclose(found.centres_px, true.centres_px, atol=0.5)
 
@@ -50,12 +60,12 @@ def test_energy_curves_give_the_skew_to_a_row(shot, uncalibrated):
 
 def test_registration_lowers_the_residual(shot, uncalibrated):
     coarse = uncalibrated.replace(sweep=estimate_skew(shot.streak.counts, uncalibrated).sweep)
-    found = register(shot.streak.counts, shot.streak.saturated, coarse)
+    found = register_views(shot.streak.counts, shot.streak.saturated, coarse)
     assert found.residuals.min() < 0.7 * found.residuals[0]
 
 
 def test_ranges_are_true(shot, frames):
-    figures = score(depth(frames), shot.truth)
+    figures = score_returns(depth(frames), shot.truth)
     assert figures["median_depth_error_m"] < figures["bin_m"] / 2
     assert figures["share_within_one_bin"] > 0.95
 
@@ -79,26 +89,31 @@ def test_frames_say_what_they_are(shot, frames):
 
 
 def test_progress_adds_up(shot, uncalibrated):
-    few_rows = replace(shot.streak, counts=shot.streak.counts[:330], row_times=shot.streak.times[:330], saturated=None)
+    few_rows = replace(
+        shot.streak,
+        counts=shot.streak.counts[:330],
+        row_times=shot.streak.times[:330],
+        saturated=None,
+    )
     for camera in (shot.camera, uncalibrated):
         done: list[int] = []
-        task = prepare(few_rows, camera, LinearInverse())
+        task = prepare_recovery(few_rows, camera, LinearInverse())
         task.run(done.append)
         assert 0 < sum(done) <= task.work
 
 
 def test_a_method_can_be_named():
-    assert method_named("l1", iterations=7) == Sparse(iterations=7)
-    assert method_named("tv") == TotalVariation()
+    assert make_method("l1", iterations=7) == Sparse(iterations=7)
+    assert make_method("tv") == TotalVariation()
     with pytest.raises(InputError, match="choose one of tv, l1, linear, adjoint"):
-        method_named("magic")
+        make_method("magic")
     with pytest.raises(InputError, match="does not take iterations"):
-        method_named("linear", iterations=7)
+        make_method("linear", iterations=7)
 
 
 def test_a_camera_without_a_sweep_is_not_late():
     camera = Camera([20.0, 40.0], [0.0, 0.1], (9, 9), 61)
-    assert time_shift_bins(camera) == [0, 0]
+    assert compute_view_delays_bins(camera) == [0, 0]
 
 
 def test_what_is_missing_is_asked_for(shot):
@@ -120,13 +135,19 @@ def test_views_that_do_not_belong_together_are_refused(uncalibrated):
 
 def test_only_a_skew_can_be_refined(shot):
     with pytest.raises(CalibrationError, match="only a skew"):
-        register(shot.streak.counts, None, shot.camera.replace(sweep=ProjectiveSweep(np.eye(3))))
+        register_views(
+            shot.streak.counts, None, shot.camera.replace(sweep=ProjectiveSweep(np.eye(3)))
+        )
 
 
 def test_the_measurement_of_the_true_frames_is_what_was_simulated(shot):
-    """Rendering goes ray by ray and never through the projection; both must agree on where the light goes."""
+    """Rendering goes ray by ray and never through the projection; both must agree on where the
+    light goes.
+    """
     measured = measure(shot.signal, None, shot.camera, dark=0.0)
-    by_view = measured.readings.sum(axis=1)
+    by_view = measured.measurements.sum(axis=1)
     edges = ((shot.camera.centres_px[1:] + shot.camera.centres_px[:-1]) / 2).astype(int)
     energy = np.array([part.sum() for part in np.split(by_view, edges)])
-    np.testing.assert_allclose(energy / energy.mean(), shot.camera.gains / shot.camera.gains.mean(), rtol=0.1)
+    np.testing.assert_allclose(
+        energy / energy.mean(), shot.camera.gains / shot.camera.gains.mean(), rtol=0.1
+    )

@@ -12,8 +12,8 @@ import pytest
 from tofclip import Streak
 from tofclip.camera import Camera, SkewSweep
 from tofclip.shots.stack import save_stack
-from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate
-from tofclip.simulate.shapes import checkerboard
+from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate_shot
+from tofclip.simulate.shapes import make_checkerboard
 
 CENTRES = 40.0 + 60 * np.arange(5)
 SHOTS = 6
@@ -44,7 +44,9 @@ def camera() -> Camera:
     sweep = SkewSweep(CENTRES, np.array([-2.0, 1.0, 0.0, 0.5, 3.0]), np.zeros(5))
     angles = np.arctan([0.5, -0.8, 0.9, -0.4, 0.1])
     optics = {"focal_length_px": 100.0, "lenslet_pitch": 5e-3, "focus_distance": 1.3}
-    return Camera(CENTRES, angles, (32, 32), 320, sweep=sweep, time_zero=-6e-9, pulse_fwhm=150e-12, **optics)
+    return Camera(
+        CENTRES, angles, (32, 32), 320, sweep=sweep, time_zero=-6e-9, pulse_fwhm=150e-12, **optics
+    )
 
 
 @pytest.fixture(scope="package")
@@ -53,15 +55,26 @@ def streaks(camera: Camera) -> list[Streak]:
 
     def plate(distance: float, place_px: float) -> Plate:
         pixel = distance / 100.0
-        return Plate((place_px * pixel, place_px * pixel, distance), (9 * pixel, 9 * pixel), checkerboard(3, 0.3, 0.9))
+        return Plate(
+            (place_px * pixel, place_px * pixel, distance),
+            (9 * pixel, 9 * pixel),
+            make_checkerboard(3, 0.3, 0.9),
+        )
 
     made = Instrument(camera, StreakDetector(128, 50e-12, peak_photons=5e4))
-    return [simulate(Scene((plate(1.1, -8), plate(1.5, 8))), made, seed).streak for seed in range(SHOTS)]
+    return [
+        simulate_shot(Scene((plate(1.1, -8), plate(1.5, 8))), made, seed).streak
+        for seed in range(SHOTS)
+    ]
 
 
 @pytest.fixture(scope="package")
-def recorded(tmp_path_factory: pytest.TempPathFactory, camera: Camera, streaks: list[Streak]) -> Path:
-    """A folder with ``camera.h5``, ``shots.h5`` (a stack) and ``shots`` (a folder with a file for each)."""
+def recorded(
+    tmp_path_factory: pytest.TempPathFactory, camera: Camera, streaks: list[Streak]
+) -> Path:
+    """A folder with ``camera.h5``, ``shots.h5`` (a stack) and ``shots`` (a folder with a file for
+    each).
+    """
     folder = tmp_path_factory.mktemp("recorded")
     camera.save(folder / "camera.h5")
     save_stack(streaks, folder / "shots.h5")

@@ -1,4 +1,6 @@
-"""Jobs that a test can ask for: well-behaved, failing, deadly. Workers import this module by its name."""
+"""Jobs that a test can ask for: well-behaved, failing, deadly. Workers import this module by its
+name.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def die(result: Path, *, every_time: bool) -> None:
 
 
 def on_a_full_disk(work: Callable[[], Any]) -> Any:
-    """Do a job while no file may grow beyond a kilobyte: the system refuses to write on, as a full disk does."""
+    """Do a job while no file may grow beyond a kilobyte: the system refuses to write on, as a full
+    disk does.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1024, hard))
     try:
@@ -53,4 +57,6 @@ def on_a_full_disk(work: Callable[[], Any]) -> Any:
 
 def squares(folder: Path, count: int) -> list[Job]:
     paths = [folder / f"{number:03d}.txt" for number in range(count)]
-    return [Job(path.stem, path, partial(square, number, path)) for number, path in enumerate(paths)]
+    return [
+        Job(path.stem, path, partial(square, number, path)) for number, path in enumerate(paths)
+    ]

@@ -8,7 +8,7 @@ from time import sleep
 import pytest
 
 from tofclip.errors import InputError
-from tofclip.sequences.streaming.channel import Channel, ClosedError
+from tofclip.sequences.streaming.channel import Channel, ChannelClosedError
 
 
 def test_entries_come_in_order_and_then_the_end():
@@ -57,7 +57,7 @@ def test_closing_frees_whoever_waits():
     ended = []
 
     def put() -> None:
-        with pytest.raises(ClosedError):
+        with pytest.raises(ChannelClosedError):
             full.put(1)
         ended.append("put")
 

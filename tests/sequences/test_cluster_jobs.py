@@ -11,8 +11,15 @@ import pytest
 from odd_jobs import die, refuse, squares, stumble
 
 from tofclip.errors import FileFormatError, InputError, MissingDependencyError, StorageError
-from tofclip.sequences.jobs import Failure, Job, Report, claim, run, unfinished
-from tofclip.sequences.jobs.workers import local_workers, workers
+from tofclip.sequences.jobs import (
+    Failure,
+    Job,
+    Report,
+    lock_output_folder,
+    run_jobs,
+    select_unfinished,
+)
+from tofclip.sequences.jobs.workers import connect_workers, count_local_workers
 
 MANY = 60  # many times what two workers are given at once
 
@@ -26,7 +33,7 @@ def test_a_failure_is_told_and_stops_nothing(tmp_path):
     refused = Job("refused", tmp_path / "refused.txt", partial(refuse, tmp_path / "refused.txt"))
     stumbling = Job("broken", tmp_path / "broken.txt", stumble)
     seen: list[Report] = []
-    summary = run([refused, *jobs, stumbling], watch=seen.append)
+    summary = run_jobs([refused, *jobs, stumbling], on_report=seen.append)
     assert summary.done == 3
     assert summary.failures == (
         Failure("broken", "unforeseen ZeroDivisionError: a defect"),
@@ -37,19 +44,19 @@ def test_a_failure_is_told_and_stops_nothing(tmp_path):
     assert summary.processes == 1
     assert summary.peak_bytes > 10e6  # no Python is smaller
     (tmp_path / "001.txt").unlink()
-    assert unfinished([refused, *jobs]) == [refused, jobs[1]]
+    assert select_unfinished([refused, *jobs]) == [refused, jobs[1]]
 
 
 def test_workers_do_what_is_done_here_however_many_jobs_there_are(scheduler, tmp_path):
     here, there = tmp_path / "here", tmp_path / "there"
     here.mkdir()
     there.mkdir()
-    run(squares(here, MANY))
-    summary = run(squares(there, MANY), scheduler)
+    run_jobs(squares(here, MANY))
+    summary = run_jobs(squares(there, MANY), scheduler)
     assert (summary.done, summary.failures) == (MANY, ())
     assert summary.processes == 2
     assert contents(there) == contents(here)
-    assert run([], scheduler).done == 0
+    assert run_jobs([], scheduler).done == 0
 
 
 def test_a_killed_worker_costs_at_most_the_job_that_kills_every_one(scheduler, tmp_path):
@@ -57,14 +64,17 @@ def test_a_killed_worker_costs_at_most_the_job_that_kills_every_one(scheduler, t
     for name, every_time in (("once", False), ("always", True)):
         path = tmp_path / f"{name}.txt"
         jobs.insert(10, Job(name, path, partial(die, path, every_time=every_time)))
-    summary = run(jobs, scheduler)
+    summary = run_jobs(jobs, scheduler)
     assert [failure.name for failure in summary.failures] == ["always"]
     assert "died" in summary.failures[0].problem
     assert summary.done == 31
     found = contents(tmp_path)
     assert found.pop("once.died") == found.pop("always.died") == ""
-    assert found == {**{f"{n:03d}.txt": str(n**2) for n in range(30)}, "once.txt": "49"}  # and no temporary file
-    assert [job.name for job in unfinished(jobs)] == ["always"]
+    assert found == {
+        **{f"{n:03d}.txt": str(n**2) for n in range(30)},
+        "once.txt": "49",
+    }  # and no temporary file
+    assert [job.name for job in select_unfinished(jobs)] == ["always"]
 
 
 def test_leftovers_of_killed_writers_go_and_other_hidden_files_stay(tmp_path):
@@ -73,43 +83,49 @@ def test_leftovers_of_killed_writers_go_and_other_hidden_files_stay(tmp_path):
     (tmp_path / ".profile").write_text("a user's")
     (tmp_path / ".000.png.abcd_123.png").write_text("half a picture")
     (job,) = squares(tmp_path, 1)
-    run([replace(job, beside=(tmp_path / "000.png",))])
+    run_jobs([replace(job, extra_outputs=(tmp_path / "000.png",))])
     assert sorted(contents(tmp_path)) == [".999.txt.abcd_123.txt", ".profile", "000.txt"]
 
 
-@pytest.mark.parametrize(("where", "number"), [("local:3", 3), ("tcp://host:8786", 0), ("tls://host:1", 0)])
+@pytest.mark.parametrize(
+    ("where", "number"), [("local:3", 3), ("tcp://host:8786", 0), ("tls://host:1", 0)]
+)
 def test_names_of_clusters(where, number):
-    assert local_workers(where) == number
+    assert count_local_workers(where) == number
 
 
 def test_local_alone_means_the_cores(monkeypatch):
     monkeypatch.setenv("TOFCLIP_THREADS", "5")
-    assert local_workers("local") == 5
+    assert count_local_workers("local") == 5
 
 
 @pytest.mark.parametrize(
-    "where", ["", "local:", "local:0", "local:-1", "local:two", "host:8786", "http://host", "tcp://"]
+    "where",
+    ["", "local:", "local:0", "local:-1", "local:two", "host:8786", "http://host", "tcp://"],
 )
 def test_other_names_are_refused(where):
     with pytest.raises(InputError, match="local:N"):
-        local_workers(where)
+        count_local_workers(where)
 
 
 def test_a_cluster_that_is_not_there(monkeypatch):
     monkeypatch.setattr("tofclip.sequences.jobs.workers.WAIT_SECONDS", 0.3)
-    with pytest.raises(InputError, match="no scheduler answers"), workers("tcp://127.0.0.1:9"):
+    with (
+        pytest.raises(InputError, match="no scheduler answers"),
+        connect_workers("tcp://127.0.0.1:9"),
+    ):
         pass
 
 
 def test_without_the_library_it_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingDependencyError, match=r"tofclip\[cluster\]"):
-        run(squares(tmp_path, 1), "local:1")
+        run_jobs(squares(tmp_path, 1), "local:1")
 
 
 def test_workers_of_another_version_are_refused(scheduler, monkeypatch):
     monkeypatch.setattr("tofclip.sequences.jobs.workers.__version__", "0.0.0-of-the-test")
-    with pytest.raises(InputError, match="install the same"), workers(scheduler):
+    with pytest.raises(InputError, match="install the same"), connect_workers(scheduler):
         pass
 
 
@@ -118,7 +134,7 @@ def test_workers_without_this_program_are_refused(scheduler, monkeypatch):
         raise ModuleNotFoundError("No module named 'tofclip'")
 
     monkeypatch.setattr("tofclip.sequences.jobs.workers._version", missing)
-    with pytest.raises(InputError, match="have no tofclip"), workers(scheduler):
+    with pytest.raises(InputError, match="have no tofclip"), connect_workers(scheduler):
         pass
 
 
@@ -126,20 +142,24 @@ def test_a_scheduler_without_workers_is_refused(monkeypatch):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is an extra")
     monkeypatch.setattr("tofclip.sequences.jobs.workers.WAIT_SECONDS", 0.3)
     nobody = distributed.LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0", silence_logs=50)
-    with nobody, pytest.raises(InputError, match="has no worker"), workers(nobody.scheduler_address):
+    with (
+        nobody,
+        pytest.raises(InputError, match="has no worker"),
+        connect_workers(nobody.scheduler_address),
+    ):
         pass
 
 
 def test_a_folder_belongs_to_its_settings(tmp_path):
     folder = tmp_path / "new" / "results"
-    claim(folder, {"method": "tv", "camera": Path("camera.h5"), "weight": None})
-    claim(folder, {"method": "tv", "camera": Path("camera.h5"), "weight": None})
+    lock_output_folder(folder, {"method": "tv", "camera": Path("camera.h5"), "weight": None})
+    lock_output_folder(folder, {"method": "tv", "camera": Path("camera.h5"), "weight": None})
     with pytest.raises(InputError, match="method tv instead of l1"):
-        claim(folder, {"method": "l1", "camera": Path("camera.h5"), "weight": None})
+        lock_output_folder(folder, {"method": "l1", "camera": Path("camera.h5"), "weight": None})
     for text in ("{", "[]"):
         (folder / "settings.json").write_text(text)
         with pytest.raises(FileFormatError):
-            claim(folder, {})
+            lock_output_folder(folder, {})
     (tmp_path / "file").touch()
     with pytest.raises(StorageError):
-        claim(tmp_path / "file" / "results", {})
+        lock_output_folder(tmp_path / "file" / "results", {})

@@ -59,9 +59,13 @@ def test_shots_to_frames_to_clouds_on_a_cluster(run, scheduler, few, tmp_path):
     assert status == 0
     assert (told["results"], told["kept_from_before"], told["failures"]) == (1, 2, [])
     assert told["peak_memory_mib_per_process"] > 10
-    status, out, _ = run("cloud", frames / "*.h5", "--out", clouds, "--cluster", scheduler, "--json")
+    status, out, _ = run(
+        "cloud", frames / "*.h5", "--out", clouds, "--cluster", scheduler, "--json"
+    )
     assert status == 0
-    assert json.loads(out)["points"] > 300  # two plates of 9 x 9 pixels, three times, thinned by their dark fields
+    assert (
+        json.loads(out)["points"] > 300
+    )  # two plates of 9 x 9 pixels, three times, thinned by their dark fields
     assert len(list(clouds.glob("*.ply"))) == 3
 
 
@@ -76,7 +80,14 @@ def test_a_sequence_here_is_that_of_single_shots(run, few, tmp_path):
 
 
 def test_a_sweep_has_a_folder_for_each_combination(run, recorded, tmp_path):
-    words = ("recover", recorded / "shots" / "shot[0].h5", "--out", tmp_path / "out", "--method", "l1")
+    words = (
+        "recover",
+        recorded / "shots" / "shot[0].h5",
+        "--out",
+        tmp_path / "out",
+        "--method",
+        "l1",
+    )
     assert run(*words, "--sweep", "iterations=1,2", "--sweep", "weight=1e-3")[0] == 0
     found = {path.parent.name for path in (tmp_path / "out").rglob("shot0.h5")}
     assert found == {"iterations=1,weight=1e-3", "iterations=2,weight=1e-3"}
@@ -120,7 +131,15 @@ def test_unusable_wishes_end_in_one_line(run, recorded, tmp_path, words):
 
 
 def test_ranging_on_a_cluster(run, scheduler, recorded, tmp_path):
-    words = ("lidar", "sequence", recorded / "shots.h5", "--out", tmp_path / "out", "--camera", recorded / "camera.h5")
+    words = (
+        "lidar",
+        "sequence",
+        recorded / "shots.h5",
+        "--out",
+        tmp_path / "out",
+        "--camera",
+        recorded / "camera.h5",
+    )
     status, out, err = run(*words, "--cluster", scheduler, "--json")
     assert (status, err) == (0, "")
     told = json.loads(out)
@@ -129,13 +148,25 @@ def test_ranging_on_a_cluster(run, scheduler, recorded, tmp_path):
 
 
 def test_studies_on_a_cluster(run, scheduler, tmp_path):
-    words = ("reproduce", "table1", "--out", tmp_path / "made", "--seeds", "1", "--cluster", scheduler, "--json")
+    words = (
+        "reproduce",
+        "table1",
+        "--out",
+        tmp_path / "made",
+        "--seeds",
+        "1",
+        "--cluster",
+        scheduler,
+        "--json",
+    )
     folder = tmp_path / "made" / "reproduction"
     folder.mkdir(parents=True)
     (folder / "table1.json").write_text("{")  # damaged: made again
     status, out, err = run(*words)
     assert (status, json.loads(out)["results"]) == (0, 1), err
-    assert {path.name for path in folder.iterdir()} == {f"table1.{ending}" for ending in ("md", "csv", "png", "json")}
+    assert {path.name for path in folder.iterdir()} == {
+        f"table1.{ending}" for ending in ("md", "csv", "png", "json")
+    }
     assert "tofclip reproduce table1" in (tmp_path / "made" / "reproduction.md").read_text()
     made = (folder / "table1.json").stat().st_mtime_ns
     told = json.loads(run(*words)[1])
@@ -147,7 +178,16 @@ def test_a_study_that_fails_on_a_cluster(run, scheduler, tmp_path):
     recording = tmp_path / "data" / "diffusercam" / "psf_hand_300x400.npz"
     recording.parent.mkdir(parents=True)
     recording.write_text("no archive")
-    words = ("reproduce", "fig4d", "--data", tmp_path / "data", "--out", tmp_path / "made", "--cluster", scheduler)
+    words = (
+        "reproduce",
+        "fig4d",
+        "--data",
+        tmp_path / "data",
+        "--out",
+        tmp_path / "made",
+        "--cluster",
+        scheduler,
+    )
     status, out, _ = run(*words, "--json")
     assert status == 1
     (failure,) = json.loads(out)["failures"]
@@ -162,20 +202,47 @@ def test_captures_on_a_cluster_are_imaged_as_here(run, scheduler, tmp_path):
     wall = np.stack([x, y, 0.1 * x**2], axis=-1)
     for number in range(3):
         scene = PointScene([[0.1 * number, 0.0, 0.6]])
-        scene.seen_from(wall, [0.1, 0.0, 0.0], TimeAxis(256, 32e-12), 150e-12).save(captures / f"{number}.h5")
+        scene.simulate_capture(wall, [0.1, 0.0, 0.0], TimeAxis(256, 32e-12), 150e-12).save(
+            captures / f"{number}.h5"
+        )
     (captures / "broken.h5").write_text("no capture")
-    words = ("nlos", "reconstruct", captures, "--method", "hybrid", "--wavelength-mm", "300", "--voxel-mm", "60")
+    words = (
+        "nlos",
+        "reconstruct",
+        captures,
+        "--method",
+        "hybrid",
+        "--wavelength-mm",
+        "300",
+        "--voxel-mm",
+        "60",
+    )
     here, there = tmp_path / "here", tmp_path / "there"
     assert run(*words, "--out", here)[0] == 1
     status, out, err = run(*words, "--out", there, "--cluster", scheduler, "--json")
     told = json.loads(out)
-    assert (status, told["imaged"][0]["capture"], list(told["failed"])) == (1, "0.h5", ["broken.h5"]), err
+    assert (status, told["imaged"][0]["capture"], list(told["failed"])) == (
+        1,
+        "0.h5",
+        ["broken.h5"],
+    ), err
     for number in range(3):
         one, other = (Volume.load(folder / f"{number}.h5") for folder in (here, there))
-        # Sums of some hundred float32 numbers, each rounded to 6e-8: processes that have done other things before may
-        # add in another order.
+        # Sums of some hundred float32 numbers, each rounded to 6e-8: processes that have done other
+        # things before may add in another order.
         np.testing.assert_allclose(other.values, one.values, rtol=0, atol=1e-5 * one.values.max())
-    assert run("nlos", "reconstruct", captures / "0.h5", "--out", tmp_path / "v.h5", "--cluster", scheduler)[0] == 2
+    assert (
+        run(
+            "nlos",
+            "reconstruct",
+            captures / "0.h5",
+            "--out",
+            tmp_path / "v.h5",
+            "--cluster",
+            scheduler,
+        )[0]
+        == 2
+    )
 
 
 def test_ctrl_c_ends_the_workers_and_leaves_whole_results(recorded, tmp_path):
@@ -183,13 +250,26 @@ def test_ctrl_c_ends_the_workers_and_leaves_whole_results(recorded, tmp_path):
     shots.mkdir()
     for number in range(40):
         (shots / f"{number:02d}.h5").symlink_to(recorded / "shots" / "shot0.h5")
-    slow = ("--method", "tv", "--iterations", "3000", "--focus", "depth-locked", "--cluster", "local:1")
+    slow = (
+        "--method",
+        "tv",
+        "--iterations",
+        "3000",
+        "--focus",
+        "depth-locked",
+        "--cluster",
+        "local:1",
+    )
     words = ("recover", shots, "--out", out, "--camera", recorded / "camera.h5", *slow)
     command = [sys.executable, "-m", "apps", *map(str, words)]
     # A terminal sends Ctrl-C to a whole group of processes.
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True, cwd=ROOT)
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True, cwd=ROOT
+    )
     try:
-        while process.poll() is None and len(psutil.Process(process.pid).children()) < 2:  # a worker and a tracker
+        while (
+            process.poll() is None and len(psutil.Process(process.pid).children()) < 2
+        ):  # a worker and a tracker
             time.sleep(0.05)
         time.sleep(1)
         workers = psutil.Process(process.pid).children(recursive=True)
@@ -197,6 +277,11 @@ def test_ctrl_c_ends_the_workers_and_leaves_whole_results(recorded, tmp_path):
         _, err = process.communicate(timeout=60)
     finally:
         process.kill()
-    assert (process.returncode, err) == (130, "tofclip: interrupted; no unfinished file was left behind\n")
+    assert (process.returncode, err) == (
+        130,
+        "tofclip: interrupted; no unfinished file was left behind\n",
+    )
     assert psutil.wait_procs(workers, timeout=10)[1] == []
-    assert all(path.name == "settings.json" or len(Frames.load(path).times) for path in out.iterdir())
+    assert all(
+        path.name == "settings.json" or len(Frames.load(path).times) for path in out.iterdir()
+    )

@@ -16,9 +16,17 @@ from tofclip import Frames
 from tofclip.camera import Camera, measure
 from tofclip.errors import InputError, StorageError
 from tofclip.lidar import PointCloud
-from tofclip.sequences import Clouds, Ranging, Recovery, files_in, is_sequence, shots_in, variants
-from tofclip.sequences.jobs import run, unfinished
-from tofclip.sequences.kept import KeepingCamera, KeptInverse, kept
+from tofclip.sequences import (
+    CloudSettings,
+    RangingSettings,
+    RecoverySettings,
+    expand_sweep,
+    is_sequence,
+    list_files,
+    list_shots,
+)
+from tofclip.sequences.cache import CachedInverse, CachingCamera, get_cached_camera
+from tofclip.sequences.jobs import run_jobs, select_unfinished
 from tofclip.solvers import LinearInverse
 from tofclip.storage import Record
 
@@ -26,21 +34,24 @@ SHOTS = 6
 
 
 @pytest.fixture
-def linear(recorded: Path) -> Recovery:
-    return Recovery("linear", camera=recorded / "camera.h5")
+def linear(recorded: Path) -> RecoverySettings:
+    return RecoverySettings("linear", camera=recorded / "camera.h5")
 
 
-def test_recovery_on_workers_is_bit_for_bit_recovery_here_and_of_single_shots(scheduler, recorded, linear, tmp_path):
-    shots = shots_in(recorded / "shots.h5")
+def test_recovery_on_workers_is_bit_for_bit_recovery_here_and_of_single_shots(
+    scheduler, recorded, linear, tmp_path
+):
+    shots = list_shots(recorded / "shots.h5")
     assert next(iter(shots)) == "shots_000000"
     here, there = (linear.jobs(shots, tmp_path / place) for place in ("here", "there"))
-    assert run(here).done == SHOTS
-    assert run(there, scheduler).done == SHOTS
+    assert run_jobs(here).done == SHOTS
+    assert run_jobs(there, scheduler).done == SHOTS
     for one, other, shot in zip(here, there, shots.values(), strict=True):
         frames = Frames.load(one.result)
         np.testing.assert_array_equal(Frames.load(other.result).values, frames.values)
-        alone = linear.task(shot()).run().values
-        # the linear algebra of a single shot may use several threads, which round differently: float32
+        alone = linear.prepare_task(shot()).run().values
+        # the linear algebra of a single shot may use several threads, which round differently:
+        # float32
         np.testing.assert_allclose(frames.values, alone, atol=1e-5 * alone.max())
         assert frames.provenance["settings"]["verb"] == "recover"
 
@@ -48,22 +59,28 @@ def test_recovery_on_workers_is_bit_for_bit_recovery_here_and_of_single_shots(sc
 @pytest.mark.parametrize("method", ["l1", "tv", "adjoint"])
 def test_kept_operators_change_nothing(recorded, method, tmp_path):
     settings = {} if method == "adjoint" else {"iterations": 3}
-    recovery = Recovery(method, camera=recorded / "camera.h5", focus="depth-locked", **settings)
-    shots = dict(list(shots_in(recorded / "shots.h5").items())[:2])
+    recovery = RecoverySettings(
+        method, camera=recorded / "camera.h5", focus="depth-locked", **settings
+    )
+    shots = dict(list(list_shots(recorded / "shots.h5").items())[:2])
     jobs = recovery.jobs(shots, tmp_path / "out")
-    assert run(jobs).failures == ()
+    assert run_jobs(jobs).failures == ()
     for job, shot in zip(jobs, shots.values(), strict=True):
-        np.testing.assert_array_equal(Frames.load(job.result).values, recovery.task(shot()).run().values)
+        np.testing.assert_array_equal(
+            Frames.load(job.result).values, recovery.prepare_task(shot()).run().values
+        )
 
 
-def test_a_corrupt_shot_and_a_full_disk_spoil_only_their_own_result(scheduler, recorded, linear, tmp_path):
+def test_a_corrupt_shot_and_a_full_disk_spoil_only_their_own_result(
+    scheduler, recorded, linear, tmp_path
+):
     shots = tmp_path / "shots"
     shutil.copytree(recorded / "shots", shots)
     whole = (shots / "shot2.h5").read_bytes()
     (shots / "shot2.h5").write_bytes(whole[: len(whole) // 2])
-    jobs = linear.jobs(shots_in(shots), tmp_path / "out")
+    jobs = linear.jobs(list_shots(shots), tmp_path / "out")
     jobs[4] = replace(jobs[4], work=partial(on_a_full_disk, jobs[4].work))
-    summary = run(jobs, scheduler)
+    summary = run_jobs(jobs, scheduler)
     assert summary.done == SHOTS - 2
     corrupt, full = summary.failures
     assert "shot2.h5: is damaged" in corrupt.problem
@@ -72,39 +89,43 @@ def test_a_corrupt_shot_and_a_full_disk_spoil_only_their_own_result(scheduler, r
     assert present == {"settings.json", "shot0.h5", "shot1.h5", "shot3.h5", "shot5.h5"}
     (shots / "shot2.h5").write_bytes(whole)
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("shot*")}
-    missing = unfinished(linear.jobs(shots_in(shots), tmp_path / "out"))
+    missing = select_unfinished(linear.jobs(list_shots(shots), tmp_path / "out"))
     assert [job.name for job in missing] == ["shot2", "shot4"]
-    assert run(missing, scheduler).done == 2
+    assert run_jobs(missing, scheduler).done == 2
     assert all(path.stat().st_mtime_ns == time for path, time in before.items())
 
 
 def test_ranging_on_workers_is_bit_for_bit_ranging_here(scheduler, recorded, tmp_path):
-    ranging = Ranging(recorded / "camera.h5", focus="depth-locked", average=2)
-    shots = shots_in(recorded / "shots.h5")
+    ranging = RangingSettings(recorded / "camera.h5", focus="depth-locked", average=2)
+    shots = list_shots(recorded / "shots.h5")
     here, there = (ranging.jobs(shots, tmp_path / place, ".npz") for place in ("here", "there"))
     figures = []
-    assert run(here, watch=lambda report: figures.append(report.figures)).done == SHOTS // 2
-    assert run(there, scheduler).done == SHOTS // 2
+    assert (
+        run_jobs(here, on_report=lambda report: figures.append(report.figures)).done == SHOTS // 2
+    )
+    assert run_jobs(there, scheduler).done == SHOTS // 2
     for one, other, (points, late) in zip(here, there, figures, strict=True):
         cloud = PointCloud.load(one.result)
         np.testing.assert_array_equal(PointCloud.load(other.result).xyz, cloud.xyz)
         assert len(cloud) == points > 0
-        assert np.abs(late).max() < 0.15  # the shots are not late; see the tests of jitter for the tolerance
+        assert (
+            np.abs(late).max() < 0.15
+        )  # the shots are not late; see the tests of jitter for the tolerance
     plan = (tmp_path / "here" / "plan.h5").stat().st_mtime_ns
-    assert unfinished(ranging.jobs(shots, tmp_path / "here", ".npz")) == []
+    assert select_unfinished(ranging.jobs(shots, tmp_path / "here", ".npz")) == []
     assert (tmp_path / "here" / "plan.h5").stat().st_mtime_ns == plan
     with pytest.raises(InputError, match="average 2 instead of 3"):
         replace(ranging, average=3).jobs(shots, tmp_path / "here", ".npz")
     for unusable in ({"focus": "stack:0:1:3"}, {"average": 0}):
         with pytest.raises(InputError):
-            Ranging(**unusable)
+            RangingSettings(**unusable)
 
 
 def test_a_sweep_that_is_not_known_is_found_from_the_first_shot(recorded, camera, tmp_path):
     camera.replace(sweep=None, time_zero=0.0).save(tmp_path / "camera.h5")
-    ranging = Ranging(tmp_path / "camera.h5", time_zero=-6e-9)
-    (job, *_) = ranging.jobs(shots_in(recorded / "shots"), tmp_path / "out", ".ply")
-    assert run([job]).failures == ()
+    ranging = RangingSettings(tmp_path / "camera.h5", time_zero=-6e-9)
+    (job, *_) = ranging.jobs(list_shots(recorded / "shots"), tmp_path / "out", ".ply")
+    assert run_jobs([job]).failures == ()
     plan = Record.load(tmp_path / "out" / "plan.h5", "ranging")
     found = Camera.from_record(plan.child("camera", "camera"))
     assert found.time_zero == -6e-9
@@ -114,23 +135,35 @@ def test_a_sweep_that_is_not_known_is_found_from_the_first_shot(recorded, camera
 
 
 def test_clouds_of_many_frames(scheduler, recorded, linear, tmp_path):
-    run(linear.jobs(shots_in(str(recorded / "shots" / "shot[01].h5")), tmp_path / "frames"))
-    frames = files_in(tmp_path / "frames" / "*.h5")
-    here, there = (Clouds(voxel=0.01).jobs(frames, tmp_path / place, ".npz") for place in ("here", "there"))
-    assert run(here).failures == run(there, scheduler).failures == ()
+    run_jobs(linear.jobs(list_shots(str(recorded / "shots" / "shot[01].h5")), tmp_path / "frames"))
+    frames = list_files(tmp_path / "frames" / "*.h5")
+    here, there = (
+        CloudSettings(voxel=0.01).jobs(frames, tmp_path / place, ".npz")
+        for place in ("here", "there")
+    )
+    assert run_jobs(here).failures == run_jobs(there, scheduler).failures == ()
     for one, other in zip(here, there, strict=True):
-        np.testing.assert_array_equal(PointCloud.load(one.result).xyz, PointCloud.load(other.result).xyz)
-    assert run(Clouds().jobs(frames, tmp_path / "depth", ".exr")).done == 2
+        np.testing.assert_array_equal(
+            PointCloud.load(one.result).xyz, PointCloud.load(other.result).xyz
+        )
+    assert run_jobs(CloudSettings().jobs(frames, tmp_path / "depth", ".exr")).done == 2
 
 
 def test_every_combination_of_a_sweep(linear):
-    swept = variants(replace(linear, method="tv"), {"method": ["l1", "tv"], "iterations": ["2", "4"]})
+    swept = expand_sweep(
+        replace(linear, method="tv"), {"method": ["l1", "tv"], "iterations": ["2", "4"]}
+    )
     assert list(swept) == [f"method={name},iterations={n}" for name in ("l1", "tv") for n in (2, 4)]
     assert swept["method=l1,iterations=4"] == replace(linear, method="l1", iterations=4)
-    assert variants(linear, {}) == {"": linear}
-    for unusable in ({"colour": ["red"]}, {"iterations": ["many"]}, {"method": ["magic"]}, {"weight": ["1e-3"]}):
+    assert expand_sweep(linear, {}) == {"": linear}
+    for unusable in (
+        {"colour": ["red"]},
+        {"iterations": ["many"]},
+        {"method": ["magic"]},
+        {"weight": ["1e-3"]},
+    ):
         with pytest.raises(InputError):
-            variants(linear, unusable)
+            expand_sweep(linear, unusable)
 
 
 def test_names_of_inputs(recorded, tmp_path):
@@ -139,19 +172,19 @@ def test_names_of_inputs(recorded, tmp_path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     pattern = str(tmp_path / "days" / "**" / "*.*")
-    assert list(files_in(pattern)) == ["a/one", "b/one", "b/two"]
-    assert list(files_in(tmp_path / "days" / "b")) == ["one", "two"]
+    assert list(list_files(pattern)) == ["a/one", "b/one", "b/two"]
+    assert list(list_files(tmp_path / "days" / "b")) == ["one", "two"]
     (tmp_path / "days" / "link.h5").symlink_to(tmp_path / "days" / "b" / "one.h5")
-    assert list(files_in(tmp_path / "days")) == ["link"]
+    assert list(list_files(tmp_path / "days")) == ["link"]
     (tmp_path / "days" / "link.h5").unlink()
     (tmp_path / "days" / "b" / "two.h5").touch()
     with pytest.raises(InputError, match="have one name"):
-        files_in(pattern)
+        list_files(pattern)
     for empty in (tmp_path / "days", str(tmp_path / "*.png")):
         with pytest.raises(InputError, match="no file"):
-            files_in(empty)
+            list_files(empty)
     with pytest.raises(StorageError):
-        files_in(tmp_path / "absent")
+        list_files(tmp_path / "absent")
     for sequence in (recorded / "shots", recorded / "shots.h5", "*.h5"):
         assert is_sequence(sequence)
     for single in (
@@ -168,33 +201,40 @@ def test_results_keep_the_folders_of_their_inputs(recorded, linear, tmp_path):
     for day in ("a", "b"):
         (tmp_path / "days" / day).mkdir(parents=True)
         shutil.copy(recorded / "shots" / "shot0.h5", tmp_path / "days" / day)
-    shots = shots_in(str(tmp_path / "days" / "*" / "*.h5"), bin_width=50e-12)
-    assert run(linear.jobs(shots, tmp_path / "out")).done == 2
+    shots = list_shots(str(tmp_path / "days" / "*" / "*.h5"), bin_width=50e-12)
+    assert run_jobs(linear.jobs(shots, tmp_path / "out")).done == 2
     assert (tmp_path / "out" / "b" / "shot0.h5").exists()
 
 
 def test_operators_are_kept_by_content(camera):
-    one, other = kept(camera), kept(Camera.from_record(camera.to_record()))
+    one, other = (
+        get_cached_camera(camera),
+        get_cached_camera(Camera.from_record(camera.to_record())),
+    )
     assert one is other
     assert one.operator(0.5) is other.operator(0.5)
     assert one.operator(0.5) is not one.operator(0.25)
-    assert kept(camera.replace(time_zero=1e-9)) is not one
-    kept(camera.replace(time_zero=2e-9))  # the third: the first has to go
-    assert kept(camera) is not one
-    many = KeepingCamera(camera.centres_px, camera.angles, camera.image_shape, camera.slit_width_px)
+    assert get_cached_camera(camera.replace(time_zero=1e-9)) is not one
+    get_cached_camera(camera.replace(time_zero=2e-9))  # the third: the first has to go
+    assert get_cached_camera(camera) is not one
+    many = CachingCamera(camera.centres_px, camera.angles, camera.image_shape, camera.slit_width_px)
     shears = np.linspace(0, 1, 20)
     made = [many.operator(shear) for shear in shears]
-    assert sum(many.operator(shear) is first for shear, first in zip(shears, made, strict=True)) == 16
+    assert (
+        sum(many.operator(shear) is first for shear, first in zip(shears, made, strict=True)) == 16
+    )
 
 
 def test_kept_inverses_are_those_of_the_method(camera, streaks):
     measured = measure(streaks[0].counts, streaks[0].saturated, camera)
     method, operator = LinearInverse(), camera.operator()
-    keeping = KeptInverse(method)
-    expected = method.recover(operator, measured.readings, measured.good).frames
+    keeping = CachedInverse(method)
+    expected = method.recover(operator, measured.measurements, measured.valid).frames
     for _ in range(2):
-        np.testing.assert_array_equal(keeping.recover(operator, measured.readings, measured.good).frames, expected)
-    assert keeping.recover(operator, measured.readings).setup_seconds == 0
+        np.testing.assert_array_equal(
+            keeping.recover(operator, measured.measurements, measured.valid).frames, expected
+        )
+    assert keeping.recover(operator, measured.measurements).setup_seconds == 0
     assert keeping.work(7) == 7
 
 

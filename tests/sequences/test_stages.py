@@ -8,7 +8,7 @@ from time import perf_counter, sleep
 
 import pytest
 
-from tofclip.sequences.streaming import Stage, in_stages
+from tofclip.sequences.streaming import Stage, run_stages
 
 STEP = 0.05
 
@@ -20,20 +20,22 @@ def slow(value: int) -> int:
 
 def test_values_pass_all_stages_in_order():
     stages = [Stage("double", lambda value: 2 * value), Stage("text", str)]
-    passages = list(in_stages(range(20), stages))
+    passages = list(run_stages(range(20), stages))
     assert [passage.value for passage in passages] == [str(2 * number) for number in range(20)]
     assert [passage.number for passage in passages] == list(range(20))
 
 
 def test_stages_overlap_and_their_times_are_told():
     started = perf_counter()
-    passages = list(in_stages(range(8), [Stage("first", slow), Stage("second", slow)]))
+    passages = list(run_stages(range(8), [Stage("first", slow), Stage("second", slow)]))
     # one after the other they would take 16 steps, side by side 9
     assert perf_counter() - started < 13 * STEP
     for passage in passages:
         assert set(passage.seconds) == {"read", "wait", "first", "second"}
         assert passage.seconds["first"] >= STEP
-        assert passage.latency == pytest.approx(sum(passage.seconds.values()) - passage.seconds["read"])
+        assert passage.latency == pytest.approx(
+            sum(passage.seconds.values()) - passage.seconds["read"]
+        )
     assert passages[0].latency < 3.5 * STEP
 
 
@@ -45,10 +47,11 @@ def test_a_slow_consumer_holds_the_source_back():
             brought.append(number)
             yield number
 
-    stream = in_stages(source(), [Stage("same", lambda value: value)], held=2)
+    stream = run_stages(source(), [Stage("same", lambda value: value)], queue_size=2)
     next(stream)
     sleep(4 * STEP)
-    # two before and two behind the stage, one in it, the one handed out, and the one that the reader holds
+    # two before and two behind the stage, one in it, the one handed out, and the one that the
+    # reader holds
     assert len(brought) <= 7
     assert [passage.number for passage in stream] == list(range(1, 50))
 
@@ -59,7 +62,7 @@ def test_a_slow_stage_drops_the_oldest_where_that_is_wanted():
             sleep(STEP / 5)
             yield number
 
-    passages = list(in_stages(source(), [Stage("slow", slow)], policy="drop_oldest"))
+    passages = list(run_stages(source(), [Stage("slow", slow)], policy="drop_oldest"))
     numbers = [passage.number for passage in passages]
     assert numbers[-1] == 19  # the newest is never dropped
     assert numbers == sorted(numbers)
@@ -80,7 +83,7 @@ def test_a_fault_is_raised_behind_what_was_done(place):
             raise OSError("unplugged")
         return value
 
-    stream = in_stages(source(), [Stage("work", work), Stage("same", lambda value: value)])
+    stream = run_stages(source(), [Stage("work", work), Stage("same", lambda value: value)])
     assert [next(stream).number for _ in range(3)] == [0, 1, 2]
     with pytest.raises(OSError, match="unplugged"):
         next(stream)
@@ -97,7 +100,7 @@ def test_leaving_early_ends_the_threads_and_closes_the_source():
         finally:
             closed.set()
 
-    stream = in_stages(source(), [Stage("same", lambda value: value)])
+    stream = run_stages(source(), [Stage("same", lambda value: value)])
     next(stream)
     stream.close()
     assert closed.wait(5)

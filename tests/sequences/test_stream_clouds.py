@@ -9,11 +9,11 @@ from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.lidar import depth, point_cloud
 from tofclip.recovery import recover
-from tofclip.sequences.ranger import Ranger
+from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Streak
-from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate
-from tofclip.simulate.shapes import plain
+from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate_shot
+from tofclip.simulate.shapes import make_plain_pattern
 
 CENTRES = 30.0 + 45 * np.arange(4)
 
@@ -21,13 +21,21 @@ CENTRES = 30.0 + 45 * np.arange(4)
 def shots(number: int) -> list[Streak]:
     """Plates that come nearer from shot to shot."""
     camera = Camera(
-        CENTRES, np.arctan([0.6, -0.7, 0.3, -0.1]), (24, 24), 200, time_zero=-6e-9, pulse_fwhm=150e-12, sweep=None
+        CENTRES,
+        np.arctan([0.6, -0.7, 0.3, -0.1]),
+        (24, 24),
+        200,
+        time_zero=-6e-9,
+        pulse_fwhm=150e-12,
+        sweep=None,
     )
     detector = StreakDetector(96, 50e-12, peak_photons=5e4)
     made = []
     for shot in range(number):
-        scene = Scene((Plate((0.0, 0.0, 1.4 - 0.05 * shot), (0.05, 0.05), plain(0.8)),))
-        made.append(simulate(scene, Instrument(still(camera), detector), shot).streak)
+        scene = Scene(
+            (Plate((0.0, 0.0, 1.4 - 0.05 * shot), (0.05, 0.05), make_plain_pattern(0.8)),)
+        )
+        made.append(simulate_shot(scene, Instrument(still(camera), detector), shot).streak)
     return made
 
 
@@ -55,8 +63,8 @@ def test_a_stream_gives_the_clouds_of_its_shots():
 
 def test_a_ranger_of_ones_own_is_used():
     made = shots(2)
-    ranger = Ranger(made[0].camera, made[0].times)
-    (first, second) = stream_clouds(iter(made), ranger, held=2)
+    pipeline = RangingPipeline(made[0].camera, made[0].times)
+    (first, second) = stream_clouds(iter(made), pipeline, queue_size=2)
     np.testing.assert_array_equal(first.cloud.xyz, next(stream_clouds(made)).cloud.xyz)
     assert second.shot == 1
 
@@ -65,4 +73,9 @@ def test_no_shot_is_no_cloud_and_faults_come_through():
     assert list(stream_clouds([])) == []
     made = shots(1)
     with pytest.raises(InputError, match="above the dark level"):
-        list(stream_clouds([made[0], Streak(np.full((96, 200), 3.0), made[0].times)], Ranger.for_shot(made[0])))
+        list(
+            stream_clouds(
+                [made[0], Streak(np.full((96, 200), 3.0), made[0].times)],
+                RangingPipeline.for_shot(made[0]),
+            )
+        )

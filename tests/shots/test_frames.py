@@ -13,7 +13,9 @@ from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.shots import Frames
 from tofclip.storage import Field, Record
 
-CAMERA = Camera([8.0, 21.5], [0.1, -0.2], (5, 6), 30, gains=[0.9, 1.1], sweep=SkewSweep([8.0], [0.5], [0.01]))
+CAMERA = Camera(
+    [8.0, 21.5], [0.1, -0.2], (5, 6), 30, gains=[0.9, 1.1], sweep=SkewSweep([8.0], [0.5], [0.01])
+)
 VALUES = np.random.default_rng(2).normal(size=(4, 5, 6)).astype(np.float32)
 # Steps of 1, 2 and 3 ps: a real sweep is not even.
 TIMES = np.array([10.0, 11.0, 13.0, 16.0]) * 1e-12
@@ -25,7 +27,9 @@ def test_frames_survive_their_file(tmp_path: Path) -> None:
         TIMES,
         CAMERA,
         figures={"relative_residual": 0.08, "method": "tv", "iterations": 60},
-        attachments={"relay_wall": Record("relay_wall", {"laser": Field(np.ones(3), "m", ("xyz",))})},
+        attachments={
+            "relay_wall": Record("relay_wall", {"laser": Field(np.ones(3), "m", ("xyz",))})
+        },
         provenance={"settings": {"seed": 1}},
     )
     expected.save(tmp_path / "frames.h5")
@@ -36,7 +40,9 @@ def test_frames_survive_their_file(tmp_path: Path) -> None:
     assert got.figures == expected.figures
     np.testing.assert_array_equal(got.camera.gains, [0.9, 1.1])
     assert got.camera.image_shape == (5, 6)
-    np.testing.assert_array_equal(got.attachments["relay_wall"].array("laser", np.float64, 1, "m"), np.ones(3))
+    np.testing.assert_array_equal(
+        got.attachments["relay_wall"].array("laser", np.float64, 1, "m"), np.ones(3)
+    )
     assert list(got.attachments) == ["relay_wall"]
     assert got.provenance == {"settings": {"seed": 1}}
     np.testing.assert_array_equal(Camera.load(tmp_path / "frames.h5").centres_px, CAMERA.centres_px)
@@ -67,7 +73,9 @@ def test_the_mean_bin_width() -> None:
         ({"values": np.where(VALUES > 1, np.nan, VALUES)}, InputError, "NaN or infinity"),
     ],
 )
-def test_frames_that_disagree_are_refused(changes: dict[str, Any], fault: type[InputError], problem: str) -> None:
+def test_frames_that_disagree_are_refused(
+    changes: dict[str, Any], fault: type[InputError], problem: str
+) -> None:
     with pytest.raises(fault, match=problem):
         Frames(**({"values": VALUES, "times": TIMES, "camera": CAMERA} | changes))
 

@@ -20,12 +20,16 @@ texts = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"
 shapes = hnp.array_shapes(min_dims=2, max_dims=2, max_side=6)
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(shape=shapes, metadata=st.dictionaries(texts, texts, max_size=4), data=st.data())
 def test_a_streak_survives_its_file(
     shape: tuple[int, int], metadata: dict[str, str], data: st.DataObject, tmp_path: Path
 ) -> None:
-    counts = data.draw(hnp.arrays(np.float32, shape, elements=st.floats(-1000, 70000, width=32)).filter(np.any))
+    counts = data.draw(
+        hnp.arrays(np.float32, shape, elements=st.floats(-1000, 70000, width=32)).filter(np.any)
+    )
     steps = data.draw(st.none() | hnp.arrays(np.float64, shape[0], elements=st.floats(1e-12, 1e-9)))
     saturated = data.draw(st.none() | hnp.arrays(bool, shape))
     expected = Streak(counts, None if steps is None else np.cumsum(steps), saturated, metadata)
@@ -49,24 +53,34 @@ def test_a_streak_survives_its_file(
         ({"counts": np.full((3, 4), np.nan)}, InputError, "12 pixels are NaN or infinite"),
         ({"counts": np.full((3, 4), 1e300)}, InputError, "12 pixels are NaN or infinite"),
         ({"saturated": np.zeros((4, 3), bool)}, ShapeError, r"saturated must have shape \(3, 4\)"),
-        ({"row_times": np.arange(4.0)}, ShapeError, r"time axis must have shape \(3,\), got \(4,\)"),
+        (
+            {"row_times": np.arange(4.0)},
+            ShapeError,
+            r"time axis must have shape \(3,\), got \(4,\)",
+        ),
         ({"row_times": np.array([0.0, 2.0, 2.0])}, InputError, "must be finite and increase"),
         ({"row_times": np.array([0.0, np.nan, 2.0])}, InputError, "must be finite and increase"),
     ],
 )
-def test_unusable_streaks_are_refused(changes: dict[str, Any], fault: type[InputError], problem: str) -> None:
+def test_unusable_streaks_are_refused(
+    changes: dict[str, Any], fault: type[InputError], problem: str
+) -> None:
     with pytest.raises(fault, match=problem):
         Streak(**({"counts": COUNTS} | changes))
 
 
 def test_negative_readings_are_kept() -> None:
-    """A background taken off leaves noise on both sides of zero; clipping it would bias the picture."""
+    """A background taken off leaves noise on both sides of zero; clipping it would bias the
+    picture.
+    """
     np.testing.assert_array_equal(Streak(COUNTS - 5).counts, COUNTS - 5)
 
 
 def test_the_time_axis_is_asked_for_by_name() -> None:
     streak = Streak(COUNTS, source="shot.tif")
-    with pytest.raises(MissingTimeAxisError, match=r"shot\.tif has no time axis: give .*--bin-width-ps"):
+    with pytest.raises(
+        MissingTimeAxisError, match=r"shot\.tif has no time axis: give .*--bin-width-ps"
+    ):
         _ = streak.times
     np.testing.assert_allclose(streak.with_bin_width(2e-12).times, [0, 2e-12, 4e-12], rtol=1e-15)
 

@@ -10,8 +10,15 @@ import pytest
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import depth, point_cloud
 from tofclip.shots import Frames
-from tofclip.simulate import Truth, default_instrument, default_scene, score, simulate, true_frames
-from tofclip.simulate.shapes import cut_out, letter, plain
+from tofclip.simulate import (
+    GroundTruth,
+    make_default_instrument,
+    make_default_scene,
+    render_true_frames,
+    score_returns,
+    simulate_shot,
+)
+from tofclip.simulate.shapes import cut_pattern, make_letter, make_plain_pattern
 from tofclip.units import SPEED_OF_LIGHT
 
 BIN_M = SPEED_OF_LIGHT * 20e-12 / 2
@@ -19,12 +26,12 @@ BIN_M = SPEED_OF_LIGHT * 20e-12 / 2
 
 @pytest.fixture(scope="module")
 def shot():
-    return simulate(default_scene(), default_instrument(), 0)
+    return simulate_shot(make_default_scene(), make_default_instrument(), 0)
 
 
 @pytest.fixture(scope="module")
 def frames(shot):
-    return true_frames(default_scene(), default_instrument(), shot.exposure)
+    return render_true_frames(make_default_scene(), make_default_instrument(), shot.exposure)
 
 
 def test_the_scene_is_where_the_instrument_looks(shot):
@@ -35,13 +42,16 @@ def test_the_scene_is_where_the_instrument_looks(shot):
     assert truth.reflectance.max() <= 1
     assert np.all(np.isfinite(truth.range[truth.target]))
     assert not shot.signal[[0, -1]].any()  # the sweep sees all of it
-    assert shot.streak.counts.max() == pytest.approx(default_instrument().detector.full_scale_photons)
+    assert shot.streak.counts.max() == pytest.approx(
+        make_default_instrument().detector.full_scale_photons
+    )
 
 
 def test_the_letters_are_upright_and_not_mirrored(shot):
-    # the U, 34 pixels wide around (-25, -24) from the optical axis, is the nearest plate; compare with its drawing
+    # the U, 34 pixels wide around (-25, -24) from the optical axis, is the nearest plate; compare
+    # with its drawing
     seen = shot.truth.range[64 - 24 - 17 : 64 - 24 + 17, 64 - 25 - 17 : 64 - 25 + 17] < 1.9
-    drawn = np.isfinite(cut_out(letter("U"), plain(0.5)))
+    drawn = np.isfinite(cut_pattern(make_letter("U"), make_plain_pattern(0.5)))
     step = (np.arange(34) + 0.5) / 34 * drawn.shape[0]
     picture = drawn[np.ix_(step.astype(int), step.astype(int))]
     assert np.mean(seen == picture) > 0.93  # the borders lie half a pixel aside
@@ -55,7 +65,7 @@ def test_the_letters_are_upright_and_not_mirrored(shot):
 
 def test_true_frames_give_the_true_depth(shot, frames):
     returns = depth(frames)
-    figures = score(returns, shot.truth)
+    figures = score_returns(returns, shot.truth)
     assert figures["bin_m"] == pytest.approx(BIN_M)
     assert figures["median_depth_error_m"] < 0.01 * BIN_M  # measured: 0.0003 bin
     assert figures["share_within_one_bin"] == 1.0
@@ -66,23 +76,28 @@ def test_true_frames_give_the_true_depth(shot, frames):
 def test_true_frames_give_the_reflectance(shot, frames):
     intensity = depth(frames).image("intensity")[shot.truth.target]
     reflectance = shot.exposure * shot.truth.reflectance[shot.truth.target]
-    # the tails beyond 1 % of the pulse's peak, 0.2 %, and the rows' own width, which spreads the pulse by 2.5 %
+    # the tails beyond 1 % of the pulse's peak, 0.2 %, and the rows' own width, which spreads the
+    # pulse by 2.5 %
     np.testing.assert_allclose(intensity, reflectance, rtol=0.03)
 
 
 def test_photon_noise_leaves_the_depth_far_below_half_a_bin(shot, frames):
     noisy = np.random.default_rng(0).poisson(frames.values + 0.05).astype(np.float32)
-    figures = score(depth(replace(frames, values=noisy)), shot.truth)
-    # some 60 photons a pixel: 26 ps / sqrt(60) * c / 2 is 0.5 mm as a standard deviation; half a bin is 1.5 mm
+    figures = score_returns(depth(replace(frames, values=noisy)), shot.truth)
+    # some 60 photons a pixel: 26 ps / sqrt(60) * c / 2 is 0.5 mm as a standard deviation; half a
+    # bin is 1.5 mm
     assert figures["median_depth_error_m"] < 0.5 * BIN_M / 2
     assert figures["share_within_one_bin"] > 0.95
 
 
 def test_the_wall_of_the_scene_comes_out_flat(shot, frames):
     returns = depth(frames)
-    wall = point_cloud(returns).xyz[(shot.truth.target & (shot.truth.range > 3.15))[returns.y, returns.x]]
+    wall = point_cloud(returns).xyz[
+        (shot.truth.target & (shot.truth.range > 3.15))[returns.y, returns.x]
+    ]
     assert len(wall) > 2000
-    # range changes by up to 0.5 mm across a pixel at the rim, and the stripes' slope weighs its sides unequally
+    # range changes by up to 0.5 mm across a pixel at the rim, and the stripes' slope weighs its
+    # sides unequally
     assert np.max(np.abs(wall[:, 2] - 3.18)) < 5e-5
 
 
@@ -90,7 +105,8 @@ def test_a_flat_plate_s_truth_is_analytic(shot):
     rows, columns = np.indices((128, 128)) - 64
     wall = 3.18 * np.sqrt(1 + (rows**2 + columns**2) / 560.0**2)
     behind = shot.truth.target & (shot.truth.range > 3.15)
-    # the mean over a pixel differs from its middle by the curvature only: 3.18 / (24 * 560^2), below a micrometre
+    # the mean over a pixel differs from its middle by the curvature only: 3.18 / (24 * 560^2),
+    # below a micrometre
     np.testing.assert_allclose(shot.truth.range[behind], wall[behind], atol=2e-6)
 
 
@@ -99,34 +115,38 @@ def test_targets_keep_a_pixel_s_distance_from_every_border(shot):
     jump = np.zeros((128, 128), bool)
     for axis in (0, 1):
         step = np.abs(np.diff(np.nan_to_num(truth.range), axis=axis)) > 0.05
-        jump |= np.insert(step, 0, False, axis=axis) | np.insert(step, step.shape[axis], False, axis=axis)
+        jump |= np.insert(step, 0, False, axis=axis) | np.insert(
+            step, step.shape[axis], False, axis=axis
+        )
     assert jump.any()
     assert not np.any(jump & truth.target)
 
 
-def blank(truth: Truth, shot_frames: Frames) -> Frames:
+def blank(truth: GroundTruth, shot_frames: Frames) -> Frames:
     return replace(shot_frames, values=np.zeros_like(shot_frames.values))
 
 
 def test_the_score_tells_right_from_wrong(shot, frames):
     returns = depth(frames)
     shifted = replace(returns, range=returns.range + 1.2 * BIN_M)
-    figures = score(shifted, shot.truth)
+    figures = score_returns(shifted, shot.truth)
     assert figures["median_depth_error_m"] == pytest.approx(1.2 * BIN_M, rel=1e-3)
     assert figures["share_within_one_bin"] == 0.0
     half = frames.values.copy()
     half[:, :64] = 0
-    figures = score(depth(replace(frames, values=half)), shot.truth)
-    assert figures["share_with_return"] == pytest.approx(shot.truth.target[64:].sum() / shot.truth.target.sum())
+    figures = score_returns(depth(replace(frames, values=half)), shot.truth)
+    assert figures["share_with_return"] == pytest.approx(
+        shot.truth.target[64:].sum() / shot.truth.target.sum()
+    )
     assert figures["share_within_one_bin"] == figures["share_with_return"]
     stray = frames.values.copy()
     stray[:, :2] = stray[:, 64:66]  # nothing of the scene reaches the uppermost rows
-    figures = score(depth(replace(frames, values=stray)), shot.truth)
+    figures = score_returns(depth(replace(frames, values=stray)), shot.truth)
     assert figures["false_return_share"] > 0.01
 
 
 def test_a_score_needs_something_to_compare(shot, frames):
     with pytest.raises(InputError, match="no target pixel"):
-        score(depth(blank(shot.truth, frames)), shot.truth)
+        score_returns(depth(blank(shot.truth, frames)), shot.truth)
     with pytest.raises(ShapeError, match="the returns' picture"):
-        score(depth(frames), replace(shot.truth, range=np.zeros((3, 3), np.float32)))
+        score_returns(depth(frames), replace(shot.truth, range=np.zeros((3, 3), np.float32)))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tofclip.errors import InputError, ShapeError
 from tofclip.simulate import Plate, Scene
 from tofclip.simulate.scene import NO_PLATE
-from tofclip.simulate.shapes import cut_out, letter, plain, rings
+from tofclip.simulate.shapes import cut_pattern, make_letter, make_plain_pattern, make_rings
 
 ORIGIN = np.zeros(3)
 AHEAD = np.array([[0.0, 0.0, 1.0]])
@@ -27,7 +27,7 @@ def wall(depth: float, side: float = 10.0, reflectance: float = 0.5, **turned: f
 )  # fmt: skip
 def test_a_turned_plate_is_met_in_its_plane(yaw, pitch, depth, right, down):
     plate = wall(depth, 100.0, yaw=yaw, pitch=pitch)
-    distance, _ = plate.meet(ORIGIN, np.array([[right, down, 1.0]]))
+    distance, _ = plate.intersect(ORIGIN, np.array([[right, down, 1.0]]))
     across, along, normal = plate.axes
     np.testing.assert_allclose([across @ along, across @ normal, along @ normal], 0, atol=1e-12)
     point = distance[0] * np.array([right, down, 1.0])
@@ -36,15 +36,15 @@ def test_a_turned_plate_is_met_in_its_plane(yaw, pitch, depth, right, down):
 
 def test_positive_yaw_turns_the_right_side_back_and_positive_pitch_the_upper_side():
     beside, above = np.array([[0.1, 0.0, 1.0]]), np.array([[0.0, -0.1, 1.0]])
-    assert wall(2.0, yaw=0.3).meet(ORIGIN, beside)[0][0] > 2.0
-    assert wall(2.0, pitch=0.3).meet(ORIGIN, above)[0][0] > 2.0
+    assert wall(2.0, yaw=0.3).intersect(ORIGIN, beside)[0][0] > 2.0
+    assert wall(2.0, pitch=0.3).intersect(ORIGIN, above)[0][0] > 2.0
 
 
 def test_the_pattern_is_upright_and_not_mirrored():
     pattern = np.array([[0.1, 0.2], [0.3, np.nan]])
     plate = Plate((0, 0, 1), (0.2, 0.2), pattern)
     corners = np.array([[-0.05, -0.05, 1], [0.05, -0.05, 1], [-0.05, 0.05, 1], [0.05, 0.05, 1]])
-    distance, reflectance = plate.meet(ORIGIN, corners)
+    distance, reflectance = plate.intersect(ORIGIN, corners)
     np.testing.assert_allclose(reflectance[:3], [0.1, 0.2, 0.3], rtol=1e-6)
     assert distance.tolist() == [1.0, 1.0, 1.0, np.inf]
 
@@ -52,53 +52,77 @@ def test_the_pattern_is_upright_and_not_mirrored():
 def test_the_nearest_plate_is_seen_through_the_holes_of_none():
     hole = Plate((0, 0, 1), (1, 1), np.array([[np.nan, 0.9]]))
     scene = Scene((wall(3.0), hole, wall(2.0)))
-    hits = scene.look(ORIGIN, np.array([[0.1, 0, 1], [-0.1, 0, 1], [9.0, 0, 1]]))
+    hits = scene.cast_rays(ORIGIN, np.array([[0.1, 0, 1], [-0.1, 0, 1], [9.0, 0, 1]]))
     assert hits.plate.tolist() == [1, 2, NO_PLATE]
     np.testing.assert_allclose(hits.path[:2], np.hypot(1, 0.1) * np.array([1, 2]))
     assert hits.reflectance[2] == 0
 
 
 def test_what_is_behind_the_camera_is_not_seen():
-    assert Scene((wall(-1.0),)).look(ORIGIN, AHEAD).plate.tolist() == [NO_PLATE]
+    assert Scene((wall(-1.0),)).cast_rays(ORIGIN, AHEAD).plate.tolist() == [NO_PLATE]
 
 
 def test_path_is_half_of_there_and_back_from_different_places():
     viewpoint = np.array([3.0, 0.0, 0.0])
-    hits = Scene((wall(4.0),)).look(viewpoint, np.array([[-0.75, 0.0, 1.0]]))  # hits (0, 0, 4): 4 m from the lamp
+    hits = Scene((wall(4.0),)).cast_rays(
+        viewpoint, np.array([[-0.75, 0.0, 1.0]])
+    )  # hits (0, 0, 4): 4 m from the lamp
     assert hits.path[0] == pytest.approx((4.0 + 5.0) / 2)
     assert hits.distance[0] == pytest.approx(4.0)
 
 
 def test_a_slanted_surface_is_lit_by_the_cosine():
-    hits = Scene((wall(2.0, yaw=np.pi / 3),)).look(ORIGIN, AHEAD)
+    hits = Scene((wall(2.0, yaw=np.pi / 3),)).cast_rays(ORIGIN, AHEAD)
     assert hits.reflectance[0] == pytest.approx(0.5 * np.cos(np.pi / 3))
 
 
 def test_a_plate_casts_a_shadow_that_a_distant_lamp_moves_aside():
-    card = Plate((0, 0, 1.0), (0.1, 0.1), plain(0.9))
-    behind = np.array([[0.2, 0.0, 2.0], [0.0, 0.0, 2.0]])  # points on the wall, as directions from the origin
-    beside = Scene((card, wall(2.0)), lamp=(-0.2, 0.0, 0.0)).look(ORIGIN, behind)
+    card = Plate((0, 0, 1.0), (0.1, 0.1), make_plain_pattern(0.9))
+    behind = np.array(
+        [[0.2, 0.0, 2.0], [0.0, 0.0, 2.0]]
+    )  # points on the wall, as directions from the origin
+    beside = Scene((card, wall(2.0)), lamp=(-0.2, 0.0, 0.0)).cast_rays(ORIGIN, behind)
     assert beside.plate.tolist() == [1, 0]
-    assert beside.reflectance[0] == 0  # the line from the lamp to (0.2, 0, 2) passes the card's middle
-    colocated = Scene((card, wall(2.0))).look(ORIGIN, behind)
+    assert (
+        beside.reflectance[0] == 0
+    )  # the line from the lamp to (0.2, 0, 2) passes the card's middle
+    colocated = Scene((card, wall(2.0))).cast_rays(ORIGIN, behind)
     assert np.all(colocated.reflectance > 0)
 
 
 def test_letters_have_their_shape():
     def at(name: str, x: float, y: float) -> bool:
-        pattern = cut_out(letter(name), plain(0.8))
+        pattern = cut_pattern(make_letter(name), make_plain_pattern(0.8))
         return bool(np.isfinite(pattern[int(y * pattern.shape[0]), int(x * pattern.shape[1])]))
 
-    assert (at("U", 0.1, 0.1), at("U", 0.9, 0.1), at("U", 0.5, 0.1), at("U", 0.5, 0.95)) == (True, True, False, True)
-    assert (at("C", 0.1, 0.5), at("C", 0.9, 0.5), at("C", 0.5, 0.5), at("C", 0.5, 0.1)) == (True, False, False, True)
+    assert (at("U", 0.1, 0.1), at("U", 0.9, 0.1), at("U", 0.5, 0.1), at("U", 0.5, 0.95)) == (
+        True,
+        True,
+        False,
+        True,
+    )
+    assert (at("C", 0.1, 0.5), at("C", 0.9, 0.5), at("C", 0.5, 0.5), at("C", 0.5, 0.1)) == (
+        True,
+        False,
+        False,
+        True,
+    )
     assert (at("L", 0.2, 0.1), at("L", 0.9, 0.9), at("L", 0.9, 0.1)) == (True, True, False)
-    assert (at("A", 0.5, 0.1), at("A", 0.5, 0.4), at("A", 0.5, 0.7), at("A", 0.5, 0.95)) == (True, False, True, False)
+    assert (at("A", 0.5, 0.1), at("A", 0.5, 0.4), at("A", 0.5, 0.7), at("A", 0.5, 0.95)) == (
+        True,
+        False,
+        True,
+        False,
+    )
 
 
 def test_a_disc_of_rings_is_round():
-    pattern = rings(3, 0.2, 0.8)
+    pattern = make_rings(3, 0.2, 0.8)
     assert np.mean(np.isfinite(pattern)) == pytest.approx(np.pi / 4, abs=0.02)
-    assert (np.nanmin(pattern), np.nanmax(pattern)) == (pytest.approx(0.2, abs=0.01), pytest.approx(0.8, abs=0.01))
+    assert (np.nanmin(pattern), np.nanmax(pattern)) == (
+        pytest.approx(0.2, abs=0.01),
+        pytest.approx(0.8, abs=0.01),
+    )
 
 
 def test_unusable_scenes_are_refused():
@@ -109,10 +133,10 @@ def test_unusable_scenes_are_refused():
     with pytest.raises(InputError, match=r"within 0\.\.1"):
         Plate((0, 0, 1), (1, 1), np.full((2, 2), np.nan))
     with pytest.raises(InputError, match="positive size"):
-        Plate((0, 0, 1), (0, 1), plain(0.5))
+        Plate((0, 0, 1), (0, 1), make_plain_pattern(0.5))
     with pytest.raises(InputError, match="finite position"):
-        Plate((0, 0, np.inf), (1, 1), plain(0.5))
+        Plate((0, 0, np.inf), (1, 1), make_plain_pattern(0.5))
     with pytest.raises(InputError, match="at least one plate"):
         Scene(())
     with pytest.raises(InputError, match="no outline is known for 'Q'"):
-        letter("Q")
+        make_letter("Q")

@@ -11,9 +11,16 @@ from hypothesis import strategies as st
 
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
-from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate, true_frames
-from tofclip.simulate.render import streak_of_rays, view_rays
-from tofclip.simulate.shapes import cut_out, letter, plain, stripes
+from tofclip.simulate import (
+    Instrument,
+    Plate,
+    Scene,
+    StreakDetector,
+    render_true_frames,
+    simulate_shot,
+)
+from tofclip.simulate.render import cast_view_rays, render_streak
+from tofclip.simulate.shapes import cut_pattern, make_letter, make_plain_pattern, make_stripes
 from tofclip.units import SPEED_OF_LIGHT
 
 CENTRES = np.array([60.0, 170.3, 280.8])
@@ -30,7 +37,13 @@ def instrument(rows: int = 200, around: float = 2.0, **camera: object) -> Instru
     """Three views of 48 x 64 pixels; light from range `around` arrives in row 60."""
     time_zero = 60 * BIN - 2 * around / SPEED_OF_LIGHT
     optics = {"focal_length_px": FOCAL, "lenslet_pitch": WIDE_PITCH, "focus_distance": FOCUS}
-    made = Camera(CENTRES, ANGLES, (48, 64), 340, **({"gains": GAINS, "time_zero": time_zero} | optics | camera))
+    made = Camera(
+        CENTRES,
+        ANGLES,
+        (48, 64),
+        340,
+        **({"gains": GAINS, "time_zero": time_zero} | optics | camera),
+    )
     return Instrument(made, StreakDetector(rows=rows), rays_per_pixel_side=6)
 
 
@@ -46,11 +59,13 @@ def centroid(amounts: np.ndarray) -> float:
 
 def view_image(scene: Scene, made: Instrument, view: int) -> np.ndarray:
     position = float(made.camera.view_positions[view])
-    return streak_of_rays(view_rays(scene, made, position), view, made)
+    return render_streak(cast_view_rays(scene, made, position), view, made)
 
 
 @settings(max_examples=40, deadline=None)
-@given(x=st.floats(-15, 15), y=st.floats(-15, 15), depth=st.floats(1.2, 3.0), view=st.integers(0, 2))
+@given(
+    x=st.floats(-15, 15), y=st.floats(-15, 15), depth=st.floats(1.2, 3.0), view=st.integers(0, 2)
+)
 def test_a_point_falls_on_the_column_and_row_of_the_camera_s_formula(x, y, depth, view):
     made = instrument(around=depth)
     image = view_image(Scene((spot(x, y, depth),)), made, view)
@@ -58,12 +73,16 @@ def test_a_point_falls_on_the_column_and_row_of_the_camera_s_formula(x, y, depth
     shear = -FOCAL * WIDE_PITCH * (1 / depth - 1 / FOCUS)
     assert made.camera.shear_at(depth) == pytest.approx(shear)
     column = CENTRES[view] + x - y * np.tan(ANGLES[view]) + shear * u
-    # a spot of one pixel is sampled by 6 rays a side, so its centre is known to a twelfth of a pixel a direction
-    assert centroid(image.sum(axis=0)) == pytest.approx(column, abs=(1 + abs(np.tan(ANGLES[view]))) / 12 + 0.01)
+    # a spot of one pixel is sampled by 6 rays a side, so its centre is known to a twelfth of a
+    # pixel a direction
+    assert centroid(image.sum(axis=0)) == pytest.approx(
+        column, abs=(1 + abs(np.tan(ANGLES[view]))) / 12 + 0.01
+    )
     point = depth * np.array([x / FOCAL, y / FOCAL, 1.0])
     path = np.linalg.norm(point) + np.linalg.norm(point - [WIDE_PITCH * u, 0, 0])
     row = path / SPEED_OF_LIGHT / BIN + made.camera.time_zero / BIN
-    # half a pixel beside the middle the way there and back differs by up to 2 * 2 mm * (15 + 2)/200, 0.1 bin
+    # half a pixel beside the middle the way there and back differs by up to 2 * 2 mm * (15 +
+    # 2)/200, 0.1 bin
     assert centroid(image.sum(axis=1)) == pytest.approx(row, abs=0.1)
 
 
@@ -77,30 +96,39 @@ def test_views_agree_at_the_focus_and_move_apart_in_front_of_it():
     columns = {}
     for depth in (FOCUS, 1.4):
         made, scene = instrument(around=depth), Scene((spot(0.2, 0.1, depth),))
-        columns[depth] = [centroid(view_image(scene, made, k).sum(axis=0)) - CENTRES[k] for k in range(3)]
+        columns[depth] = [
+            centroid(view_image(scene, made, k).sum(axis=0)) - CENTRES[k] for k in range(3)
+        ]
     np.testing.assert_allclose(columns[FOCUS], 0.2 - 0.1 * np.tan(ANGLES), atol=0.2)
-    assert columns[1.4][0] > 0.5 > -0.5 > columns[1.4][2]  # view 0 stands to the left: near things move to the right
+    assert (
+        columns[1.4][0] > 0.5 > -0.5 > columns[1.4][2]
+    )  # view 0 stands to the left: near things move to the right
 
 
 def test_the_pulse_has_its_width_and_a_sub_bin_delay():
     made = instrument()
     profile = view_image(Scene((spot(0.0, 0.0, 2.0),)), made, 1).sum(axis=1)
-    # beside the middle of the spot its range is longer, by 2 m / (12 * 200^2) = 4 um or 1.4e-3 bin on average
+    # beside the middle of the spot its range is longer, by 2 m / (12 * 200^2) = 4 um or 1.4e-3 bin
+    # on average
     assert centroid(profile) == pytest.approx(60.0 + 1.4e-3, abs=1e-4)
     spread = np.sum(profile * (np.arange(200) - 60.0) ** 2) / profile.sum()
-    assert spread == pytest.approx(SIGMA_BIN**2 + 1 / 12, rel=1e-3)  # a row integrates over its width
-    later = view_image(Scene((spot(0.0, 0.0, 2.0 + 0.3 * SPEED_OF_LIGHT * BIN / 2),)), made, 1).sum(axis=1)
+    assert spread == pytest.approx(
+        SIGMA_BIN**2 + 1 / 12, rel=1e-3
+    )  # a row integrates over its width
+    later = view_image(Scene((spot(0.0, 0.0, 2.0 + 0.3 * SPEED_OF_LIGHT * BIN / 2),)), made, 1).sum(
+        axis=1
+    )
     assert centroid(later) == pytest.approx(60.3 + 1.4e-3, abs=1e-4)
 
 
 def test_no_light_is_lost_between_the_rays_and_the_slit():
     made = instrument()
-    scene = Scene((Plate((0.02, -0.01, 2.1), (0.25, 0.2), stripes(3, 0.2, 0.9), yaw=0.2),))
+    scene = Scene((Plate((0.02, -0.01, 2.1), (0.25, 0.2), make_stripes(3, 0.2, 0.9), yaw=0.2),))
     for view in range(3):
-        rays = view_rays(scene, made, float(made.camera.view_positions[view]))
+        rays = cast_view_rays(scene, made, float(made.camera.view_positions[view]))
         # the pulse is cut at 5 standard deviations, 6e-7 of its energy
         expected = GAINS[view] * rays.brightness.sum()
-        assert streak_of_rays(rays, view, made).sum() == pytest.approx(expected, rel=1e-6)
+        assert render_streak(rays, view, made).sum() == pytest.approx(expected, rel=1e-6)
 
 
 def test_light_beyond_the_screen_is_lost_quietly():
@@ -109,18 +137,36 @@ def test_light_beyond_the_screen_is_lost_quietly():
     whole = view_image(Scene((spot(0.0, 0.0, 2.0),)), instrument(), 1)
     np.testing.assert_allclose(late, whole[:61])
     aside = made.camera.replace(centres_px=np.array([1.0, 170.3, 338.0]))
-    edge = view_image(Scene((Plate((0, 0, 2), (0.5, 0.4), plain(0.8)),)), replace(made, camera=aside), 0)
-    assert 0 < edge.sum() < 0.7 * view_image(Scene((Plate((0, 0, 2), (0.5, 0.4), plain(0.8)),)), made, 0).sum()
+    edge = view_image(
+        Scene((Plate((0, 0, 2), (0.5, 0.4), make_plain_pattern(0.8)),)),
+        replace(made, camera=aside),
+        0,
+    )
+    assert (
+        0
+        < edge.sum()
+        < 0.7
+        * view_image(Scene((Plate((0, 0, 2), (0.5, 0.4), make_plain_pattern(0.8)),)), made, 0).sum()
+    )
 
 
 @pytest.mark.parametrize("depth", [1.7, 2.0, 2.6])
 def test_recovery_s_operator_agrees_with_the_ray_caster(depth):
-    # Two independent ways to the same picture; they differ by what a pixel's finite height spreads on the slit.
+    # Two independent ways to the same picture; they differ by what a pixel's finite height spreads
+    # on the slit.
     made = instrument(around=depth)
     pixel = depth / FOCAL
-    scene = Scene((Plate((0, 0, depth), (30 * pixel, 30 * pixel), cut_out(letter("A"), plain(0.9))),))
-    shot = simulate(scene, made, 0)
-    frames = np.moveaxis(true_frames(scene, made, shot.exposure).values, 0, -1)
+    scene = Scene(
+        (
+            Plate(
+                (0, 0, depth),
+                (30 * pixel, 30 * pixel),
+                cut_pattern(make_letter("A"), make_plain_pattern(0.9)),
+            ),
+        )
+    )
+    shot = simulate_shot(scene, made, 0)
+    frames = np.moveaxis(render_true_frames(scene, made, shot.exposure).values, 0, -1)
 
     def mismatch(shear: float) -> float:
         predicted = made.camera.operator(shear)(np.ascontiguousarray(frames)).T
@@ -128,7 +174,9 @@ def test_recovery_s_operator_agrees_with_the_ray_caster(depth):
 
     assert mismatch(made.camera.shear_at(depth)) < 0.05
     for other in (-1.0, 1.0):
-        assert mismatch(made.camera.shear_at(depth) + other) > 2 * mismatch(made.camera.shear_at(depth))
+        assert mismatch(made.camera.shear_at(depth) + other) > 2 * mismatch(
+            made.camera.shear_at(depth)
+        )
 
 
 def test_a_side_view_looks_behind_the_occluder():
@@ -144,8 +192,13 @@ def test_a_side_view_looks_behind_the_occluder():
 
 
 def test_brightness_falls_with_the_square_of_the_range():
-    flux = [view_image(Scene((spot(0.0, 0.0, depth),)), instrument(around=depth), 1).sum() for depth in (1.8, 3.6)]
-    assert flux[0] / flux[1] == pytest.approx(4.0, rel=1e-3)  # the spot fills the same pixel at both ranges
+    flux = [
+        view_image(Scene((spot(0.0, 0.0, depth),)), instrument(around=depth), 1).sum()
+        for depth in (1.8, 3.6)
+    ]
+    assert flux[0] / flux[1] == pytest.approx(
+        4.0, rel=1e-3
+    )  # the spot fills the same pixel at both ranges
 
 
 def test_a_sweep_that_is_skewed_moves_and_stretches_the_rows():
@@ -154,18 +207,27 @@ def test_a_sweep_that_is_skewed_moves_and_stretches_the_rows():
     for view, (offset, stretch) in enumerate([(-7.5, 0.02), (0.0, 0.0), (6.25, -0.05)]):
         straight = view_image(Scene((spot(0.0, 0.0, 2.0),)), instrument(), view).sum(axis=1)
         skewed = view_image(Scene((spot(0.0, 0.0, 2.0),)), made, view).sum(axis=1)
-        # the spot lies within a pixel of the view's centre, where the skew changes by 0.07 rows a column
-        assert centroid(skewed) == pytest.approx(offset + (1 + stretch) * centroid(straight), abs=0.04)
+        # the spot lies within a pixel of the view's centre, where the skew changes by 0.07 rows a
+        # column
+        assert centroid(skewed) == pytest.approx(
+            offset + (1 + stretch) * centroid(straight), abs=0.04
+        )
         width = np.sum(skewed * (np.arange(200) - centroid(skewed)) ** 2) / skewed.sum()
         assert width == pytest.approx(((1 + stretch) * SIGMA_BIN) ** 2 + 1 / 12, rel=5e-3)
 
 
 @pytest.fixture(scope="module")
 def flat_shot():
-    scene = Scene((Plate((0, 0, 2), (0.6, 0.5), plain(0.8)),))
+    scene = Scene((Plate((0, 0, 2), (0.6, 0.5), make_plain_pattern(0.8)),))
     made = instrument()
-    detector = StreakDetector(rows=200, peak_photons=500, background_photons=3.0, full_scale_photons=480)
-    return simulate(scene, replace(made, detector=detector), 7), scene, replace(made, detector=detector)
+    detector = StreakDetector(
+        rows=200, peak_photons=500, background_photons=3.0, full_scale_photons=480
+    )
+    return (
+        simulate_shot(scene, replace(made, detector=detector), 7),
+        scene,
+        replace(made, detector=detector),
+    )
 
 
 def test_noise_is_poisson_on_signal_and_background(flat_shot):
@@ -192,7 +254,7 @@ def test_saturated_pixels_are_clipped_and_marked(flat_shot):
 
 def test_a_seed_gives_the_same_shot_again(flat_shot):
     shot, scene, made = flat_shot
-    again, other = simulate(scene, made, 7), simulate(scene, made, 8)
+    again, other = simulate_shot(scene, made, 7), simulate_shot(scene, made, 8)
     np.testing.assert_array_equal(shot.streak.counts, again.streak.counts)
     assert np.any(shot.streak.counts != other.streak.counts)
     np.testing.assert_array_equal(shot.signal, other.signal)
@@ -207,13 +269,19 @@ def test_a_shot_says_when_each_row_was_and_carries_its_camera(flat_shot):
 
 def test_unusable_instruments_and_empty_shots_are_refused():
     with pytest.raises(InputError, match="no light of the scene"):
-        simulate(Scene((Plate((0, 0, -2.0), (1, 1), plain(0.5)),)), instrument(), 0)
+        simulate_shot(
+            Scene((Plate((0, 0, -2.0), (1, 1), make_plain_pattern(0.5)),)), instrument(), 0
+        )
     with pytest.raises(InputError, match="no light of the scene"):
-        simulate(Scene((spot(0, 0, 20.0),)), instrument(), 0)  # arrives after the last row
+        simulate_shot(Scene((spot(0, 0, 20.0),)), instrument(), 0)  # arrives after the last row
     for wrong in ({"rows": 0}, {"bin_width": 0.0}, {"bin_width": float("nan")}):
         with pytest.raises(InputError, match="rows and a positive bin width"):
             StreakDetector(**wrong)
-    for wrong in ({"peak_photons": 0.0}, {"background_photons": -1.0}, {"full_scale_photons": float("nan")}):
+    for wrong in (
+        {"peak_photons": 0.0},
+        {"background_photons": -1.0},
+        {"full_scale_photons": float("nan")},
+    ):
         with pytest.raises(InputError, match="photons"):
             StreakDetector(**wrong)
     with pytest.raises(InputError, match="must be positive"):

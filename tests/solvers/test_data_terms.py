@@ -1,4 +1,6 @@
-"""Data terms against their definitions: gradients by differences, curvature at most 1, bad readings left out."""
+"""Data terms against their definitions: gradients by differences, curvature at most 1, bad readings
+left out.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ from hypothesis import strategies as st
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.solvers import Huber, LeastSquares, Poisson
-from tofclip.solvers.data_terms import DataTermMaker, robust_deviation
+from tofclip.solvers.data_terms import DataTermMaker, estimate_robust_deviation
 
 COUNTS = np.array([0.0, 1, 3, 20, 400, 1e4])
 DEVIATION = np.sqrt(COUNTS + 1)
@@ -32,7 +34,8 @@ def test_the_gradient_is_the_derivative_of_the_value(make, shift, seed):
         aside = np.zeros_like(at)
         aside[reading] = step
         slope = (term.value(at + aside)[0] - term.value(at - aside)[0]) / (2 * step)
-        # central differences in float64: rounding 1e-16 * value / step, curvature changes within the step
+        # central differences in float64: rounding 1e-16 * value / step, curvature changes within
+        # the step
         assert slope == pytest.approx(term.gradient(at)[reading, 0], rel=1e-4, abs=1e-4)
 
 
@@ -54,12 +57,12 @@ def test_the_readings_themselves_fit_best(make):
 
 @pytest.mark.parametrize("make", makers(), ids=["squares", "huber", "poisson"])
 def test_readings_that_are_not_good_do_not_count(make):
-    good = np.ones(SCALED.shape, bool)
-    good[2] = False
+    valid = np.ones(SCALED.shape, bool)
+    valid[2] = False
     far = SCALED.copy()
     far[2] += 9
-    assert make(SCALED, good).value(far)[0] == pytest.approx(0, abs=1e-9)
-    assert make(SCALED, good).gradient(far)[2, 0] == 0
+    assert make(SCALED, valid).value(far)[0] == pytest.approx(0, abs=1e-9)
+    assert make(SCALED, valid).gradient(far)[2, 0] == 0
 
 
 def test_huber_is_squares_within_and_straight_beyond_its_threshold():
@@ -69,19 +72,25 @@ def test_huber_is_squares_within_and_straight_beyond_its_threshold():
 
 
 def test_poisson_is_the_likelihood_up_to_its_scale():
-    """Above half a count and a half the term is counts - n log(counts), less its least value, over the curvature."""
+    """Above half a count and a half the term is counts - n log(counts), less its least value, over
+    the curvature.
+    """
     expected = np.array([1.0, 2, 5, 30, 300, 12000])
     term = Poisson(SCALED, deviation=DEVIATION)
     # n log(n) is 0 where n is
     log_counts = np.log(np.maximum(COUNTS, 1))
     likelihood = np.sum(expected - COUNTS * np.log(expected) - (COUNTS - COUNTS * log_counts))
-    assert term.value((expected / DEVIATION)[:, np.newaxis])[0] == pytest.approx(likelihood / Poisson.CURVATURE)
+    assert term.value((expected / DEVIATION)[:, np.newaxis])[0] == pytest.approx(
+        likelihood / Poisson.CURVATURE
+    )
 
 
 def test_the_robust_deviation_is_that_of_gaussian_errors():
     errors = np.random.default_rng(0).normal(0, 3, 20001)
     errors[:1000] = 1e6
-    assert robust_deviation(errors) == pytest.approx(3, rel=0.1)  # 5 % of outliers raise the median size by 6 %
+    assert estimate_robust_deviation(errors) == pytest.approx(
+        3, rel=0.1
+    )  # 5 % of outliers raise the median size by 6 %
 
 
 def test_what_cannot_be_is_refused():
@@ -92,4 +101,4 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(ShapeError):
         LeastSquares(SCALED, np.ones((2, 1), bool))
     with pytest.raises(InputError, match="met exactly"):
-        robust_deviation(np.zeros(5))
+        estimate_robust_deviation(np.zeros(5))

@@ -42,7 +42,9 @@ def test_non_local_means_remove_most_of_the_noise(clean):
 
 
 def test_the_collaborative_filter_gets_better_with_its_pilot(clean):
-    """From a blurred pilot onwards, each result the pilot of the next; the truth as pilot is the bound."""
+    """From a blurred pilot onwards, each result the pilot of the next; the truth as pilot is the
+    bound.
+    """
     noisy = clean + noise(clean.shape)
     denoiser = CollaborativeWiener()
     found = [gaussian_filter(noisy, 1)]
@@ -50,7 +52,13 @@ def test_the_collaborative_filter_gets_better_with_its_pilot(clean):
         found.append(denoiser(noisy, found[-1], DEVIATION))
     shares = [left_over(picture, clean) for picture in found]
     assert found[-1].dtype == noisy.dtype
-    assert shares[1] > shares[2] > shares[3] > shares[4] > left_over(denoiser(noisy, clean, DEVIATION), clean)
+    assert (
+        shares[1]
+        > shares[2]
+        > shares[3]
+        > shares[4]
+        > left_over(denoiser(noisy, clean, DEVIATION), clean)
+    )
     assert shares[4] < 0.25
 
 
@@ -65,7 +73,9 @@ def test_without_noise_nothing_changes(clean):
 
 def test_the_filter_turns_with_the_picture(clean):
     noisy = (clean + noise(clean.shape))[:27, :30]
-    everyone = CollaborativeWiener(group=10_000)  # with every patch in the group, ties do not matter
+    everyone = CollaborativeWiener(
+        group=10_000
+    )  # with every patch in the group, ties do not matter
     turned = everyone(noisy.T, noisy.T, DEVIATION)
     np.testing.assert_allclose(turned.T, everyone(noisy, noisy, DEVIATION), atol=2e-5)
 

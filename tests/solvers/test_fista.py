@@ -7,17 +7,17 @@ import pytest
 import scipy.optimize
 import scipy.sparse
 
-from tofclip.operators import LineProjection, SparseMatrix, squared_norm
+from tofclip.operators import LineProjection, SparseMatrix, estimate_squared_norm
 from tofclip.solvers import (
     Fista,
     LeastSquares,
     NonnegativeSparsity,
     NonnegativeTotalVariation,
     Sparse,
-    Stopping,
+    StoppingRule,
     TotalVariation,
+    ignore_progress,
     iterate,
-    silent,
 )
 from tofclip.threads import LANES
 
@@ -28,14 +28,16 @@ def identity(shape: tuple[int, int], dtype: type = np.float64) -> SparseMatrix:
 
 
 def projection() -> LineProjection:
-    return LineProjection((12, 11), 40, [8.2, 20.0, 31.5], [-0.7, 0.05, 0.6], [1.0, 0.8, 1.1], np.float64)
+    return LineProjection(
+        (12, 11), 40, [8.2, 20.0, 31.5], [-0.7, 0.05, 0.6], [1.0, 0.8, 1.1], np.float64
+    )
 
 
 def test_sparsity_on_the_identity_is_soft_thresholding():
-    readings = np.random.default_rng(0).standard_normal((35, 5))
-    weight = 0.3 * readings.max()
-    result = Sparse(weight=0.3, iterations=40).recover(identity((5, 7)), readings)
-    expected = np.maximum(readings - weight, 0).T.reshape(5, 5, 7)
+    measurements = np.random.default_rng(0).standard_normal((35, 5))
+    weight = 0.3 * measurements.max()
+    result = Sparse(weight=0.3, iterations=40).recover(identity((5, 7)), measurements)
+    expected = np.maximum(measurements - weight, 0).T.reshape(5, 5, 7)
     # The step is 2 % below the exact one, so an error shrinks geometrically and fast.
     np.testing.assert_allclose(result.frames, expected, atol=1e-9)
 
@@ -43,12 +45,16 @@ def test_sparsity_on_the_identity_is_soft_thresholding():
 def test_without_a_weight_it_solves_nonnegative_least_squares():
     operator = projection()
     truth = np.maximum(np.random.default_rng(1).standard_normal((12, 11)), 0)
-    readings = operator(truth) + 0.1 * np.random.default_rng(2).standard_normal(40)
-    _, expected = scipy.optimize.nnls(operator.matrix.toarray(), readings)
+    measurements = operator(truth) + 0.1 * np.random.default_rng(2).standard_normal(40)
+    _, expected = scipy.optimize.nnls(operator.matrix.toarray(), measurements)
     solver = Fista(
-        operator, LeastSquares(_lanes(readings)), NonnegativeSparsity(0), 1 / squared_norm(operator, 99), LANES
+        operator,
+        LeastSquares(_lanes(measurements)),
+        NonnegativeSparsity(0),
+        1 / estimate_squared_norm(operator, 99),
+        LANES,
     )
-    iterate(solver, Stopping(4000), silent, LANES)
+    iterate(solver, StoppingRule(4000), ignore_progress, LANES)
     assert np.sqrt(2 * solver.objective[0]) == pytest.approx(expected, rel=1e-6)
 
 
@@ -57,63 +63,81 @@ def test_optimality_of_sparse_solutions():
     operator = projection()
     truth = np.zeros((12, 11))
     truth[3:5, 4:8] = [[1, 2, 1, 3], [2, 2, 1, 1]]
-    readings = operator(truth)
+    measurements = operator(truth)
     weight = 0.02
     solver = Fista(
-        operator, LeastSquares(_lanes(readings)), NonnegativeSparsity(weight), 1 / squared_norm(operator, 99), LANES
+        operator,
+        LeastSquares(_lanes(measurements)),
+        NonnegativeSparsity(weight),
+        1 / estimate_squared_norm(operator, 99),
+        LANES,
     )
-    iterate(solver, Stopping(6000), silent, LANES)
+    iterate(solver, StoppingRule(6000), ignore_progress, LANES)
     picture = solver.current[..., 0]
-    pull = operator.adjoint(readings - operator(picture))
+    pull = operator.adjoint(measurements - operator(picture))
     assert np.abs(pull[picture > 1e-3] - weight).max() < 1e-3 * weight
     assert pull.max() <= weight * (1 + 1e-3)
 
 
 def test_the_objective_never_rises():
     operator = projection()
-    readings = np.abs(np.random.default_rng(3).standard_normal((40, LANES)))
+    measurements = np.abs(np.random.default_rng(3).standard_normal((40, LANES)))
     for prior in (NonnegativeSparsity(0.01), NonnegativeTotalVariation(0.05)):
-        solver = Fista(operator, LeastSquares(readings), prior, 1 / squared_norm(operator, 99), LANES)
+        solver = Fista(
+            operator,
+            LeastSquares(measurements),
+            prior,
+            1 / estimate_squared_norm(operator, 99),
+            LANES,
+        )
         before = solver.objective
-        refused = 0
+        rejected = 0
         for _ in range(150):
             solver.step()
             assert np.all(solver.objective <= before)
-            refused += int(solver.refused.sum())
+            rejected += int(solver.rejected.sum())
             before = solver.objective
-        assert refused > 0  # or the monotone restart was never put to the test
+        assert rejected > 0  # or the monotone restart was never put to the test
 
 
 def test_what_a_refused_frame_reports_belongs_to_its_picture():
     operator = projection()
-    readings = np.abs(np.random.default_rng(4).standard_normal((40, LANES)))
-    solver = Fista(operator, LeastSquares(readings), NonnegativeSparsity(0.01), 1 / squared_norm(operator, 99), LANES)
+    measurements = np.abs(np.random.default_rng(4).standard_normal((40, LANES)))
+    solver = Fista(
+        operator,
+        LeastSquares(measurements),
+        NonnegativeSparsity(0.01),
+        1 / estimate_squared_norm(operator, 99),
+        LANES,
+    )
     for _ in range(60):
         solver.step()
-        if solver.refused.any():
+        if solver.rejected.any():
             break
-    assert solver.refused.any()
-    expected = 0.5 * ((operator(solver.current) - readings) ** 2).sum(0) + 0.01 * solver.current.sum((0, 1))
+    assert solver.rejected.any()
+    expected = 0.5 * ((operator(solver.current) - measurements) ** 2).sum(
+        0
+    ) + 0.01 * solver.current.sum((0, 1))
     np.testing.assert_allclose(solver.objective, expected, rtol=1e-12)
 
 
 def test_a_frame_does_not_depend_on_its_neighbours():
     operator = projection()
-    readings = np.abs(np.random.default_rng(5).standard_normal((40, 50)))
-    readings[:, 17] *= 3  # the brightest: it sets the scale of the weight in both runs
-    whole = Sparse(1e-2, 40).recover(operator, readings)
-    part = Sparse(1e-2, 40).recover(operator, readings[:, 15:20])
+    measurements = np.abs(np.random.default_rng(5).standard_normal((40, 50)))
+    measurements[:, 17] *= 3  # the brightest: it sets the scale of the weight in both runs
+    whole = Sparse(1e-2, 40).recover(operator, measurements)
+    part = Sparse(1e-2, 40).recover(operator, measurements[:, 15:20])
     np.testing.assert_allclose(part.frames, whole.frames[15:20], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("method", [Sparse(2e-3, 25), TotalVariation(2e-3, 25)], ids=["l1", "tv"])
 def test_runs_repeat_to_the_last_bit_and_on_any_number_of_threads(method, monkeypatch):
     operator = LineProjection((12, 11), 40, [8.2, 20.0, 31.5], [-0.7, 0.05, 0.6], [1.0, 0.8, 1.1])
-    readings = np.abs(np.random.default_rng(6).standard_normal((40, 100))).astype(np.float32)
+    measurements = np.abs(np.random.default_rng(6).standard_normal((40, 100))).astype(np.float32)
     monkeypatch.setenv("TOFCLIP_THREADS", "1")
-    first = method.recover(operator, readings)
+    first = method.recover(operator, measurements)
     monkeypatch.setenv("TOFCLIP_THREADS", "3")
-    second = method.recover(operator, readings)
+    second = method.recover(operator, measurements)
     np.testing.assert_array_equal(first.frames, second.frames)
     np.testing.assert_array_equal(first.objective, second.objective)
 
@@ -122,14 +146,14 @@ def test_bad_readings_have_no_influence():
     operator = projection()
     truth = np.zeros((12, 11))
     truth[4:8, 3:9] = 1
-    readings = np.tile(operator(truth)[:, np.newaxis], (1, 3))
-    good = np.ones(readings.shape, bool)
-    good[10:14, 1] = False
-    spoilt = readings.copy()
+    measurements = np.tile(operator(truth)[:, np.newaxis], (1, 3))
+    valid = np.ones(measurements.shape, bool)
+    valid[10:14, 1] = False
+    spoilt = measurements.copy()
     spoilt[10:14, 1] = 1e6
     method = Sparse(1e-3, 50)
-    expected = method.recover(operator, readings, good)
-    np.testing.assert_array_equal(method.recover(operator, spoilt, good).frames, expected.frames)
+    expected = method.recover(operator, measurements, valid)
+    np.testing.assert_array_equal(method.recover(operator, spoilt, valid).frames, expected.frames)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -140,15 +164,15 @@ def test_results_have_the_operator_s_type(dtype):
 
 def test_tolerance_stops_and_says_so():
     operator = projection()
-    readings = np.abs(np.random.default_rng(7).standard_normal((40, 5)))
-    limited = Sparse(1e-2, 5).recover(operator, readings)
-    assert (limited.iterations, limited.stopped_because) == (5, "iteration limit")
+    measurements = np.abs(np.random.default_rng(7).standard_normal((40, 5)))
+    limited = Sparse(1e-2, 5).recover(operator, measurements)
+    assert (limited.iterations, limited.stop_reason) == (5, "iteration limit")
     assert limited.objective.size == 6
-    done = Sparse(1e-2, 3000, 1e-7).recover(operator, readings)
-    assert done.stopped_because == "converged"
+    done = Sparse(1e-2, 3000, 1e-7).recover(operator, measurements)
+    assert done.stop_reason == "converged"
     assert 5 < done.iterations < 3000
     assert done.objective[-1] < limited.objective[-1]
 
 
-def _lanes(readings: np.ndarray) -> np.ndarray:
-    return np.tile(readings[:, np.newaxis], (1, LANES))
+def _lanes(measurements: np.ndarray) -> np.ndarray:
+    return np.tile(measurements[:, np.newaxis], (1, LANES))

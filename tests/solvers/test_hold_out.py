@@ -13,12 +13,20 @@ from tofclip.errors import InputError
 from tofclip.metrics import nmse
 from tofclip.operators import RadonProjection
 from tofclip.solvers import TotalVariation
-from tofclip.solvers.hold_out import FIRST, FOLDS, MANY, RATIO, _downhill, choose_weight, folds
+from tofclip.solvers.cross_validation import (
+    FOLD_COUNT,
+    INITIAL_WEIGHT,
+    SINGLE_FOLD_RUNS,
+    WEIGHT_RATIO,
+    _search_downhill,
+    assign_folds,
+    choose_weight,
+)
 
 
 @given(count=st.integers(2, 3000), run=st.integers(1, 200), seed=st.integers(0, 9))
 def test_every_reading_is_left_out_once(count, run, seed):
-    out = folds(count, run, seed)
+    out = assign_folds(count, run, seed)
     assert out.shape[0] == count
     assert out.any(axis=0).all()
     if out.shape[1] > 1:
@@ -28,31 +36,33 @@ def test_every_reading_is_left_out_once(count, run, seed):
 
 
 def test_neighbours_are_left_out_together():
-    out = folds(16 * 20, 20, 3).reshape(16, 20, FOLDS)
+    out = assign_folds(16 * 20, 20, 3).reshape(16, 20, FOLD_COUNT)
     np.testing.assert_array_equal(out.all(axis=1), out.any(axis=1))
 
 
 def test_many_runs_need_one_fold_only():
-    assert folds(MANY, 1, 0).shape[1] == 1
-    assert folds(MANY - 1, 1, 0).shape[1] == FOLDS
+    assert assign_folds(SINGLE_FOLD_RUNS, 1, 0).shape[1] == 1
+    assert assign_folds(SINGLE_FOLD_RUNS - 1, 1, 0).shape[1] == FOLD_COUNT
 
 
 def test_one_reading_alone_is_refused():
     with pytest.raises(InputError, match="as a number"):
-        folds(1, 1, 0)
+        assign_folds(1, 1, 0)
 
 
 @pytest.mark.parametrize("lowest", [-3.4, -0.7, 0.0, 0.4, 4.2])
 def test_the_search_finds_the_lowest_point_of_a_parabola(lowest):
-    choice = _downhill(lambda weight: 3 + (np.log(weight / FIRST) / np.log(RATIO) - lowest) ** 2)
-    assert choice.weight == pytest.approx(FIRST * RATIO**lowest, rel=1e-6)
-    assert np.all(np.diff(choice.tried) > 0)
+    choice = _search_downhill(
+        lambda weight: 3 + (np.log(weight / INITIAL_WEIGHT) / np.log(WEIGHT_RATIO) - lowest) ** 2
+    )
+    assert choice.weight == pytest.approx(INITIAL_WEIGHT * WEIGHT_RATIO**lowest, rel=1e-6)
+    assert np.all(np.diff(choice.trial_weights) > 0)
 
 
 def test_an_error_that_only_falls_ends_the_search():
-    choice = _downhill(lambda weight: weight)
-    assert choice.tried.size == 10
-    assert choice.weight == choice.tried[0]
+    choice = _search_downhill(lambda weight: weight)
+    assert choice.trial_weights.size == 10
+    assert choice.weight == choice.trial_weights[0]
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.1])
@@ -62,12 +72,17 @@ def test_the_picture_is_nearly_as_good_as_with_the_best_weight(noise):
     truth[8:30, 10:18], truth[12:20, 10:34] = 1, 0.5
     clean = operator(truth)
     random = np.random.default_rng(0)
-    readings = (clean + noise * clean.max() * random.standard_normal(clean.shape)).astype(np.float32)
+    measurements = (clean + noise * clean.max() * random.standard_normal(clean.shape)).astype(
+        np.float32
+    )
     method = TotalVariation(1.0, 200, 1e-4)
 
     def error(weight: float) -> float:
-        return nmse(replace(method, weight=weight).recover(operator, readings[:, np.newaxis]).frames[0], truth)
+        return nmse(
+            replace(method, weight=weight).recover(operator, measurements[:, np.newaxis]).frames[0],
+            truth,
+        )
 
     best = min(error(weight) for weight in 10.0 ** np.arange(-3, -0.5, 0.25))
     # 20 % is the project's acceptance for a weight chosen without the truth
-    assert error(choose_weight(method, operator, readings, 40).weight) < 1.2 * best
+    assert error(choose_weight(method, operator, measurements, 40).weight) < 1.2 * best

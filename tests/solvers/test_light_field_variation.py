@@ -1,4 +1,6 @@
-"""Total variation over a light field, against the two-dimensional one and against pictures with known answers."""
+"""Total variation over a light field, against the two-dimensional one and against pictures with
+known answers.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +13,15 @@ from tofclip.solvers.light_field_variation import NonnegativeLightFieldVariation
 from tofclip.solvers.proximal import Regulariser
 
 
-def denoised(prior: Regulariser, noisy: np.ndarray, calls: int = 300) -> tuple[np.ndarray, np.ndarray]:
+def denoised(
+    prior: Regulariser, noisy: np.ndarray, calls: int = 300
+) -> tuple[np.ndarray, np.ndarray]:
     """Run the warm-started proximal step on the same point until it has converged."""
     still = np.zeros(noisy.shape[-1], noisy.dtype)
     for _ in range(calls):
-        result, penalty = prior.descend(noisy, np.zeros_like(noisy), still, np.zeros_like(noisy), 1.0)
+        result, penalty = prior.proximal_step(
+            noisy, np.zeros_like(noisy), still, np.zeros_like(noisy), 1.0
+        )
     return result, penalty
 
 
@@ -32,7 +38,9 @@ def test_views_on_their_own_are_ordinary_pictures():
 
 @pytest.mark.parametrize(("grid", "axis"), [((2, 3), 0), ((3, 2), 1)])
 def test_a_step_between_views_shrinks_from_both_sides(grid, axis):
-    """Two even halves of `n` views along an axis approach by weight * angular / n, as steps between columns do."""
+    """Two even halves of `n` views along an axis approach by weight * angular / n, as steps between
+    columns do.
+    """
     halves = np.ones((4, 4, 3, 3))
     index = [slice(None)] * 4
     index[axis] = slice(2, None)

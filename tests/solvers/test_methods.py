@@ -7,45 +7,59 @@ import pytest
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import Diagonal, LineProjection
-from tofclip.solvers import Adjoint, LinearInverse, Sparse, Stopping, TotalVariation, relative_residual
+from tofclip.solvers import (
+    Backprojection,
+    LinearInverse,
+    Sparse,
+    StoppingRule,
+    TotalVariation,
+    relative_residual,
+)
 
-METHODS = [Sparse(2e-3, 10), TotalVariation(2e-3, 10), LinearInverse(), Adjoint()]
+METHODS = [Sparse(2e-3, 10), TotalVariation(2e-3, 10), LinearInverse(), Backprojection()]
 every_method = pytest.mark.parametrize("method", METHODS, ids=lambda method: method.name)
 
 
 @pytest.fixture
 def operator() -> LineProjection:
-    return LineProjection((12, 11), 40, [8.2, 20.0, 31.5], [-0.7, 0.05, 0.6], [1.0, 0.8, 1.1], np.float64)
+    return LineProjection(
+        (12, 11), 40, [8.2, 20.0, 31.5], [-0.7, 0.05, 0.6], [1.0, 0.8, 1.1], np.float64
+    )
 
 
 def test_linear_inverse_is_the_damped_normal_equations(operator):
-    readings = np.random.default_rng(0).random((40, 5))
+    measurements = np.random.default_rng(0).random((40, 5))
     dense = operator.matrix.toarray()
     mu = 0.05 * np.linalg.norm(dense, 2) ** 2
-    expected = np.linalg.solve(dense.T @ dense + mu * np.eye(132), dense.T @ readings)
-    result = LinearInverse(0.05).recover(operator, readings)
+    expected = np.linalg.solve(dense.T @ dense + mu * np.eye(132), dense.T @ measurements)
+    result = LinearInverse(0.05).recover(operator, measurements)
     # The largest eigenvalue comes from 15 power iterations, within 1 %.
     scale = np.abs(expected).max()
     np.testing.assert_allclose(result.frames, expected.T.reshape(5, 12, 11), atol=0.01 * scale)
-    assert result.stopped_because == "direct method"
+    assert result.stop_reason == "direct method"
 
 
 def test_linear_inverse_leaves_dead_readings_out(operator):
-    readings = np.random.default_rng(1).random((40, 4))
+    measurements = np.random.default_rng(1).random((40, 4))
     alive = np.ones((40, 4), bool)
     alive[[3, 17]] = False
-    spoilt = readings.copy()
+    spoilt = measurements.copy()
     spoilt[[3, 17]] = 1e5
     method = LinearInverse()
     np.testing.assert_allclose(
-        method.recover(operator, spoilt, alive).frames, method.recover(operator, readings, alive).frames, rtol=1e-10
+        method.recover(operator, spoilt, alive).frames,
+        method.recover(operator, measurements, alive).frames,
+        rtol=1e-10,
     )
 
 
 def test_a_prepared_inverse_serves_many_shots(operator):
-    readings = np.random.default_rng(2).random((40, 40))
+    measurements = np.random.default_rng(2).random((40, 40))
     prepared = LinearInverse().prepare(operator)
-    np.testing.assert_array_equal(prepared.recover(readings).frames, LinearInverse().recover(operator, readings).frames)
+    np.testing.assert_array_equal(
+        prepared.recover(measurements).frames,
+        LinearInverse().recover(operator, measurements).frames,
+    )
 
 
 def test_setting_up_is_told_apart_from_recovering(operator):
@@ -54,28 +68,28 @@ def test_setting_up_is_told_apart_from_recovering(operator):
 
 
 def test_adjoint_is_the_adjoint_up_to_one_factor(operator):
-    readings = np.random.default_rng(3).random((40, 37))
-    expected = np.moveaxis(operator.adjoint(readings), -1, 0)
-    frames = Adjoint().recover(operator, readings).frames
+    measurements = np.random.default_rng(3).random((40, 37))
+    expected = np.moveaxis(operator.adjoint(measurements), -1, 0)
+    frames = Backprojection().recover(operator, measurements).frames
     np.testing.assert_allclose(frames * expected.max() / frames.max(), expected, rtol=1e-12)
 
 
 def test_adjoint_has_the_scale_that_fits_best(operator):
-    readings = np.random.default_rng(5).random((40, 9))
-    frames = Adjoint().recover(operator, readings).frames
-    best = relative_residual(operator, frames, readings)
+    measurements = np.random.default_rng(5).random((40, 9))
+    frames = Backprojection().recover(operator, measurements).frames
+    best = relative_residual(operator, frames, measurements)
     assert best < 1
     for factor in (0.99, 1.01):
-        assert relative_residual(operator, factor * frames, readings) > best
+        assert relative_residual(operator, factor * frames, measurements) > best
 
 
 @every_method
 def test_frames_come_in_the_order_of_the_readings(operator, method):
-    readings = np.zeros((40, 70))
+    measurements = np.zeros((40, 70))
     bright = [0, 33, 69]
     for frame in bright:
-        readings[:, frame] = operator(np.ones((12, 11)))
-    result = method.recover(operator, readings)
+        measurements[:, frame] = operator(np.ones((12, 11)))
+    result = method.recover(operator, measurements)
     assert result.frames.shape == (70, 12, 11)
     energy = result.frames.sum(axis=(1, 2))
     assert set(np.nonzero(energy > 1e-6 * energy.max())[0]) == set(bright)
@@ -123,29 +137,31 @@ def test_linear_inverse_needs_a_matrix(operator):
 @pytest.mark.parametrize("settings", [(0,), (5, -1.0), (5, np.nan)])
 def test_nonsensical_stopping_is_refused(settings):
     with pytest.raises(InputError):
-        Stopping(*settings)
+        StoppingRule(*settings)
 
 
 def test_relative_residual_by_hand(operator):
     frames = np.random.default_rng(4).random((35, 12, 11))
-    readings = operator(np.moveaxis(frames, 0, -1))
-    assert relative_residual(operator, frames, readings) < 1e-14
-    assert relative_residual(operator, 0 * frames, readings) == 1
-    good = np.ones(readings.shape, bool)
-    good[5] = False
-    readings[5] = 1e9
-    assert relative_residual(operator, frames, readings, good) < 1e-14
+    measurements = operator(np.moveaxis(frames, 0, -1))
+    assert relative_residual(operator, frames, measurements) < 1e-14
+    assert relative_residual(operator, 0 * frames, measurements) == 1
+    valid = np.ones(measurements.shape, bool)
+    valid[5] = False
+    measurements[5] = 1e9
+    assert relative_residual(operator, frames, measurements, valid) < 1e-14
     with pytest.raises(InputError, match="zero"):
-        relative_residual(operator, frames, 0 * readings)
+        relative_residual(operator, frames, 0 * measurements)
 
 
 @pytest.mark.parametrize("method", [Sparse(), TotalVariation()], ids=lambda method: method.name)
 def test_a_lone_picture_is_recovered_as_in_a_block(method):
-    """One picture takes loops of one lane, many take blocks; float32 rounding is all that may differ."""
+    """One picture takes loops of one lane, many take blocks; float32 rounding is all that may
+    differ.
+    """
     random = np.random.default_rng(4)
     operator = LineProjection((15, 17), 90, [14.0, 44.0, 74.0], [0.5, 0.0, -0.5], [1.0, 1.0, 1.0])
     picture = (random.random((15, 17)) > 0.8).astype(np.float32)
-    readings = operator(picture)[:, np.newaxis]
-    alone = method.recover(operator, readings).frames[0]
-    many = method.recover(operator, np.tile(readings, 3)).frames
+    measurements = operator(picture)[:, np.newaxis]
+    alone = method.recover(operator, measurements).frames[0]
+    many = method.recover(operator, np.tile(measurements, 3)).frames
     np.testing.assert_allclose(alone, many[1], atol=1e-3 * alone.max())

@@ -1,4 +1,6 @@
-"""Plug-and-play recovery: its quadratic step against a dense solve, its fixed points, its gain over the start."""
+"""Plug-and-play recovery: its quadratic step against a dense solve, its fixed points, its gain over
+the start.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +12,15 @@ from scipy.ndimage import gaussian_filter
 
 from tofclip.errors import InputError
 from tofclip.metrics import nmse
-from tofclip.operators import RadonProjection, squared_norm
-from tofclip.solvers import Huber, LeastSquares, PlugAndPlay, RegularisationByDenoising, TotalVariation
-from tofclip.solvers.plug_and_play import nearest_fit
+from tofclip.operators import RadonProjection, estimate_squared_norm
+from tofclip.solvers import (
+    Huber,
+    LeastSquares,
+    PlugAndPlay,
+    RegularisationByDenoising,
+    TotalVariation,
+)
+from tofclip.solvers.plug_and_play import solve_data_step
 
 SHAPE = (48, 45)
 
@@ -36,16 +44,22 @@ def unchanged(noisy: np.ndarray, pilot: np.ndarray, deviation: float) -> np.ndar
 
 def readings_with_noise(operator: RadonProjection, truth: np.ndarray) -> np.ndarray:
     clean = operator(truth)
-    return (clean + 0.04 * clean.max() * np.random.default_rng(0).standard_normal(clean.shape))[:, np.newaxis]
+    return (clean + 0.04 * clean.max() * np.random.default_rng(0).standard_normal(clean.shape))[
+        :, np.newaxis
+    ]
 
 
 def test_the_quadratic_step_is_the_dense_solution():
     operator = RadonProjection((7, 6), 7, np.arange(5) * np.pi / 5, np.zeros(5), dtype=np.float64)
     dense = np.stack([operator(row.reshape(7, 6)) for row in np.eye(42)], axis=1)
     rng = np.random.default_rng(1)
-    readings, anchor = rng.random(operator.shape_out), rng.random((7, 6))
-    found = nearest_fit(operator, LeastSquares(readings[:, np.newaxis]), anchor, 0.7, iterations=60)
-    known = np.linalg.solve(dense.T @ dense + 0.7 * np.eye(42), dense.T @ readings + 0.7 * anchor.ravel())
+    measurements, anchor = rng.random(operator.shape_out), rng.random((7, 6))
+    found = solve_data_step(
+        operator, LeastSquares(measurements[:, np.newaxis]), anchor, 0.7, iterations=60
+    )
+    known = np.linalg.solve(
+        dense.T @ dense + 0.7 * np.eye(42), dense.T @ measurements + 0.7 * anchor.ravel()
+    )
     np.testing.assert_allclose(found.ravel(), known, atol=1e-8)
 
 
@@ -54,28 +68,32 @@ def test_bad_readings_hardly_pull_with_huber_s_weights():
     anchor = np.random.default_rng(2).random((7, 6))
     spoilt = operator(anchor)[:, np.newaxis]
     spoilt[3] += 1e4
-    pulled = nearest_fit(operator, Huber(spoilt, threshold=0.01), anchor, 1.0)
+    pulled = solve_data_step(operator, Huber(spoilt, threshold=0.01), anchor, 1.0)
     assert np.abs(pulled - anchor).max() < 0.01  # at most threshold / coupling
-    assert np.abs(nearest_fit(operator, LeastSquares(spoilt), anchor, 1.0) - anchor).max() > 100
+    assert np.abs(solve_data_step(operator, LeastSquares(spoilt), anchor, 1.0) - anchor).max() > 100
 
 
 def test_without_a_denoiser_the_data_are_met(projections, truth):
-    """A denoiser that changes nothing leaves the iterations of proximal points: they end at the least residual."""
-    readings = projections(truth)[:, np.newaxis]
+    """A denoiser that changes nothing leaves the iterations of proximal points: they end at the
+    least residual.
+    """
+    measurements = projections(truth)[:, np.newaxis]
     start = TotalVariation(0.05, 20)
-    found = PlugAndPlay(start, unchanged, calls=40).recover(projections, readings)
-    before = np.linalg.norm(projections(start.recover(projections, readings).frames[0]) - readings[:, 0])
-    assert np.linalg.norm(projections(found.frames[0]) - readings[:, 0]) < 0.1 * before
+    found = PlugAndPlay(start, unchanged, calls=40).recover(projections, measurements)
+    before = np.linalg.norm(
+        projections(start.recover(projections, measurements).frames[0]) - measurements[:, 0]
+    )
+    assert np.linalg.norm(projections(found.frames[0]) - measurements[:, 0]) < 0.1 * before
 
 
 def test_it_improves_on_its_start(projections, truth):
-    readings = readings_with_noise(projections, truth)
+    measurements = readings_with_noise(projections, truth)
     start = TotalVariation(0.004, 200, 1e-4)  # too small a weight: the start is noisy
-    before = nmse(start.recover(projections, readings).frames[0], truth)
-    result = PlugAndPlay(start).recover(projections, readings)
+    before = nmse(start.recover(projections, measurements).frames[0], truth)
+    result = PlugAndPlay(start).recover(projections, measurements)
     assert nmse(result.frames[0], truth) < 0.8 * before
     assert result.frames.min() >= 0
-    assert result.stopped_because == "8 calls of the denoiser done"
+    assert result.stop_reason == "8 calls of the denoiser done"
 
 
 def blurred(noisy: np.ndarray, pilot: np.ndarray, deviation: float) -> np.ndarray:
@@ -83,12 +101,16 @@ def blurred(noisy: np.ndarray, pilot: np.ndarray, deviation: float) -> np.ndarra
 
 
 def test_regularisation_by_denoising_ends_at_its_equation(projections, truth):
-    """``A'(A h - f) + coupling (h - denoise(h)) = 0`` holds at the end; the iteration contracts for a blur."""
-    readings = projections(gaussian_filter(truth, 2) + 0.5)[:, np.newaxis]  # so that nothing is cut at 0
+    """``A'(A h - f) + coupling (h - denoise(h)) = 0`` holds at the end; the iteration contracts for
+    a blur.
+    """
+    measurements = projections(gaussian_filter(truth, 2) + 0.5)[
+        :, np.newaxis
+    ]  # so that nothing is cut at 0
     method = RegularisationByDenoising(TotalVariation(0.02, 20), blurred, calls=80)
-    picture = method.recover(projections, readings).frames[0]
-    coupling = method.coupling * squared_norm(projections)
-    pull = projections.adjoint(readings[:, 0] - projections(picture))
+    picture = method.recover(projections, measurements).frames[0]
+    coupling = method.coupling * estimate_squared_norm(projections)
+    pull = projections.adjoint(measurements[:, 0] - projections(picture))
     push = coupling * (picture - gaussian_filter(picture, 1.0))
     assert picture.min() > 0
     # ten steps of conjugate gradients a call leave a hundredth
@@ -96,27 +118,37 @@ def test_regularisation_by_denoising_ends_at_its_equation(projections, truth):
 
 
 def test_many_frames_are_recovered_one_by_one(projections, truth):
-    readings = np.concatenate([projections(truth)[:, np.newaxis], projections(truth[::-1].copy())[:, np.newaxis]], 1)
+    measurements = np.concatenate(
+        [projections(truth)[:, np.newaxis], projections(truth[::-1].copy())[:, np.newaxis]], 1
+    )
     method = PlugAndPlay(TotalVariation(0.02, 30), calls=2)
-    both = method.recover(projections, readings).frames
-    alone = method.recover(projections, readings[:, :1].copy()).frames
-    np.testing.assert_allclose(both[0], alone[0], atol=5e-3)  # a batch sets one weight for all its frames
+    both = method.recover(projections, measurements).frames
+    alone = method.recover(projections, measurements[:, :1].copy()).frames
+    np.testing.assert_allclose(
+        both[0], alone[0], atol=5e-3
+    )  # a batch sets one weight for all its frames
 
 
 def test_a_frame_without_light_stays_dark(projections, truth):
-    readings = np.stack([projections(truth), np.zeros(projections.shape_out)], axis=1)
-    frames = PlugAndPlay(TotalVariation(0.02, 10), calls=2).recover(projections, readings).frames
+    measurements = np.stack([projections(truth), np.zeros(projections.shape_out)], axis=1)
+    frames = (
+        PlugAndPlay(TotalVariation(0.02, 10), calls=2).recover(projections, measurements).frames
+    )
     assert frames[1].max() == 0
 
 
 def test_huber_s_term_reaches_the_denoiser_s_loop(projections, truth):
-    readings = projections(truth)[:, np.newaxis].copy()
-    bad = np.random.default_rng(3).permutation(readings.size)[: readings.size // 20]
-    clean_peak = readings.max()
-    readings[bad] = clean_peak
-    squares = PlugAndPlay(TotalVariation(0.02, 200)).recover(projections, readings).frames[0]
+    measurements = projections(truth)[:, np.newaxis].copy()
+    bad = np.random.default_rng(3).permutation(measurements.size)[: measurements.size // 20]
+    clean_peak = measurements.max()
+    measurements[bad] = clean_peak
+    squares = PlugAndPlay(TotalVariation(0.02, 200)).recover(projections, measurements).frames[0]
     term = partial(Huber, threshold=0.02 * clean_peak)
-    robust = PlugAndPlay(TotalVariation(0.005, 200, 0.0, term)).recover(projections, readings).frames[0]
+    robust = (
+        PlugAndPlay(TotalVariation(0.005, 200, 0.0, term))
+        .recover(projections, measurements)
+        .frames[0]
+    )
     assert nmse(robust, truth) < 0.5 * nmse(squares, truth)
 
 

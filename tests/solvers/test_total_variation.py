@@ -9,19 +9,25 @@ from tofclip.solvers import NonnegativeTotalVariation
 from tofclip.threads import LANES
 
 
-def denoise(picture: np.ndarray, weight: float, calls: int = 400, dtype: type = np.float64) -> tuple[np.ndarray, float]:
+def denoise(
+    picture: np.ndarray, weight: float, calls: int = 400, dtype: type = np.float64
+) -> tuple[np.ndarray, float]:
     """Run the warm-started proximal step on the same point until it has converged."""
     block = np.tile(picture.astype(dtype)[..., np.newaxis], (1, 1, LANES))
     prior = NonnegativeTotalVariation(weight)
     still = np.zeros(LANES, dtype)
     for _ in range(calls):
-        result, penalty = prior.descend(block, np.zeros_like(block), still, np.zeros_like(block), 1.0)
+        result, penalty = prior.proximal_step(
+            block, np.zeros_like(block), still, np.zeros_like(block), 1.0
+        )
     assert np.ptp(result, axis=-1).max() == 0  # every lane the same
     return result[..., 0], float(penalty[0])
 
 
 def test_two_plateaus_approach_each_other():
-    """A step between halves of `n` columns moves each by weight / n (Strong and Chan 2003), until they meet."""
+    """A step between halves of `n` columns moves each by weight / n (Strong and Chan 2003), until
+    they meet.
+    """
     picture = np.ones((6, 8))
     picture[:, 4:] = 3
     result, penalty = denoise(picture, 0.4)

@@ -9,7 +9,7 @@ from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.operators import Identity
 from tofclip.solvers import LinearInverse, PreparedInverse
-from tofclip.solvers.traces import PATCH_COLUMNS, PATCH_ROWS, InverseTraces, patch_order
+from tofclip.solvers.traces import PATCH_COLUMNS, PATCH_ROWS, InverseTraces, order_by_patch
 from tofclip.threads import LANES
 
 
@@ -19,15 +19,15 @@ def camera() -> Camera:
 
 @pytest.mark.parametrize("frames", [1, 31, 64, 150])
 def test_traces_are_the_pictures_seen_pixel_by_pixel(frames):
-    readings = np.random.default_rng(frames).random((170, frames)).astype(np.float32)
+    measurements = np.random.default_rng(frames).random((170, frames)).astype(np.float32)
     prepared = LinearInverse().prepare(camera().operator())
-    pixels = patch_order((21, 37))
+    pixels = order_by_patch((21, 37))
     traces = InverseTraces(prepared, pixels)
-    weights = prepared.weights(readings)
+    weights = prepared.weights(measurements)
     found = np.full((pixels.size, frames + 2), -1.0, np.float32)
     for piece in (slice(0, 100), slice(100, 101), slice(101, pixels.size)):
         traces.fill(weights, piece, found[piece], slice(1, frames + 1))
-    expected = prepared.recover(readings).frames.reshape(frames, -1)[:, pixels].T
+    expected = prepared.recover(measurements).frames.reshape(frames, -1)[:, pixels].T
     # the same sums in the same order: only a lone frame goes another way
     np.testing.assert_allclose(found[:, 1:-1], expected, atol=1e-5 * np.abs(expected).max())
     assert np.all(found[:, [0, -1]] == -1)
@@ -35,17 +35,19 @@ def test_traces_are_the_pictures_seen_pixel_by_pixel(frames):
 
 def test_the_brightest_pixel_stands_out_as_its_matched_filter_says():
     operator = camera().operator()
-    traces = InverseTraces(LinearInverse().prepare(operator), patch_order((21, 37)))
+    traces = InverseTraces(LinearInverse().prepare(operator), order_by_patch((21, 37)))
     block = np.random.default_rng(2).standard_normal((170, LANES)).astype(np.float32)
     block[:, 0] = -np.abs(block[:, 0])
     matrix = operator.matrix.toarray()
-    expected = np.maximum((matrix.T @ block / np.linalg.norm(matrix, axis=0)[:, np.newaxis]).max(axis=0), 0)
+    expected = np.maximum(
+        (matrix.T @ block / np.linalg.norm(matrix, axis=0)[:, np.newaxis]).max(axis=0), 0
+    )
     assert expected[0] == 0
-    np.testing.assert_allclose(traces.brightest(block), expected, rtol=1e-5)
+    np.testing.assert_allclose(traces.peak_response(block), expected, rtol=1e-5)
 
 
 def test_patches_hold_every_pixel_once_and_neighbours_together():
-    order = patch_order((21, 37))
+    order = order_by_patch((21, 37))
     np.testing.assert_array_equal(np.sort(order), np.arange(21 * 37))
     row, column = np.divmod(order[: PATCH_ROWS * PATCH_COLUMNS], 37)
     assert (row.max(), column.max()) == (PATCH_ROWS - 1, PATCH_COLUMNS - 1)
@@ -54,4 +56,4 @@ def test_patches_hold_every_pixel_once_and_neighbours_together():
 def test_operators_without_a_matrix_are_refused():
     inverse = PreparedInverse(Identity((4, 4)), np.eye(16, dtype=np.float32))
     with pytest.raises(InputError, match="sparse matrix"):
-        InverseTraces(inverse, patch_order((4, 4)))
+        InverseTraces(inverse, order_by_patch((4, 4)))

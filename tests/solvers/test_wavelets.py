@@ -12,7 +12,9 @@ from tofclip.solvers.wavelets import NonnegativeWavelets
 
 def step(picture: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray]:
     before, still = np.zeros_like(picture), np.zeros(picture.shape[-1], picture.dtype)
-    return NonnegativeWavelets(weight).descend(picture, before, still, np.zeros_like(picture), 1.0)
+    return NonnegativeWavelets(weight).proximal_step(
+        picture, before, still, np.zeros_like(picture), 1.0
+    )
 
 
 @pytest.mark.parametrize("shape", [(32, 32, 1), (37, 45, 3)])
@@ -49,7 +51,9 @@ def test_the_objective_falls_and_the_data_are_met():
     operator = RadonProjection((32, 32), 32, np.arange(24) * np.pi / 24, np.zeros(24))
     y, x = np.mgrid[:32, :32] - 15.5
     truth = np.exp(-(x**2 + y**2) / 40).astype(np.float32)
-    readings = operator(truth)[:, np.newaxis]
-    result = Wavelets(1e-3, 80).recover(operator, readings)
+    measurements = operator(truth)[:, np.newaxis]
+    result = Wavelets(1e-3, 80).recover(operator, measurements)
     assert np.all(np.diff(result.objective) <= 0)
-    assert np.linalg.norm(operator(result.frames[0]) - readings[:, 0]) < 0.02 * np.linalg.norm(readings)
+    assert np.linalg.norm(operator(result.frames[0]) - measurements[:, 0]) < 0.02 * np.linalg.norm(
+        measurements
+    )

@@ -15,7 +15,7 @@ from viewer_scenes import frames, plane
 import tofclip
 from apps.cli import main
 from apps.viewer import render
-from apps.viewer.desktop import Window, open_window
+from apps.viewer.desktop import DesktopWindow, open_window
 from apps.viewer.session import Session
 from apps.viewer.transient import TransientSource
 from tofclip.errors import MissingDependencyError
@@ -34,7 +34,7 @@ def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_picture_and_its_figures(
     cloud: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(render, "graphics_work", lambda: False)
+    monkeypatch.setattr(render, "has_working_graphics", lambda: False)
     assert main(["view", str(cloud), "--png", str(tmp_path / "cloud.png"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["points"], found["backend"]) == (500, "matplotlib")
@@ -52,7 +52,11 @@ def test_a_picture_and_its_figures(
     ],
 )
 def test_what_cannot_be_is_said_in_a_line(
-    words: list[str], cloud: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    words: list[str],
+    cloud: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["view", str(cloud), *words]) == 2
@@ -69,18 +73,18 @@ def test_a_window_without_a_display_says_what_is_missing(
     assert main(["view", str(cloud), "--desktop"]) == 2
     assert "DISPLAY" in capsys.readouterr().err
     monkeypatch.setenv("DISPLAY", ":99")
-    monkeypatch.setattr("apps.viewer.desktop.graphics_work", lambda: False)
+    monkeypatch.setattr("apps.viewer.desktop.has_working_graphics", lambda: False)
     with pytest.raises(MissingDependencyError, match="OpenGL"):
         open_window(Session(TransientSource("frames", frames())))
 
 
 def test_the_window_follows_its_keys() -> None:
-    if not render.graphics_work():
+    if not render.has_working_graphics():
         pytest.skip("no working graphics library here")
     import pyvista
 
     session = Session(TransientSource("frames", frames()))
-    window = Window(session, pyvista.Plotter(off_screen=True, window_size=(320, 240)))
+    window = DesktopWindow(session, pyvista.Plotter(off_screen=True, window_size=(320, 240)))
     assert window.plotter.screenshot(return_img=True).std() > 1
     keys = window.keys()
     keys["Home"]()
@@ -103,10 +107,16 @@ def test_the_page_is_served_without_graphics_display_or_open3d(cloud: Path, tmp_
         (tmp_path / f"{name}.py").write_text("raise ImportError('not on this machine')\n")
     environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{ROOT}", "DISPLAY": ""}
     picture = [*PROGRAM, str(cloud), "--png", str(tmp_path / "cloud.png"), "--json"]
-    done = subprocess.run(picture, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        picture, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
     assert (done.returncode, json.loads(done.stdout)["backend"]) == (0, "matplotlib")
     page = subprocess.Popen(
-        [*PROGRAM, str(cloud), "--no-browser", "--json"], cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True
+        [*PROGRAM, str(cloud), "--no-browser", "--json"],
+        cwd=ROOT,
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
     )
     try:
         assert page.stdout is not None

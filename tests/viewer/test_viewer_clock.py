@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apps.viewer.clock import FASTEST, SLOWEST, Clock
+from apps.viewer.clock import MAX_SPEED, MIN_SPEED, PlaybackClock
 from tofclip.errors import InputError
 
 
 def test_frames_follow_the_time_and_the_speed() -> None:
-    clock = Clock(8.0, loop=False)
+    clock = PlaybackClock(8.0, loop=False)
     clock.play(0, 100)
     assert [clock.tick(now, 0, 100) for now in (5.0, 5.0625, 5.125, 6.0)] == [0, 0, 1, 8]
     clock.set_speed(4.0)
@@ -23,7 +23,7 @@ def test_frames_follow_the_time_and_the_speed() -> None:
 
 
 def test_the_end_stops_it_or_begins_anew() -> None:
-    clock = Clock(10.0, loop=False)
+    clock = PlaybackClock(10.0, loop=False)
     clock.play(0, 4)
     clock.tick(0.0, 0, 4)
     assert (clock.tick(9.0, 0, 4), clock.playing) == (3, False)
@@ -35,7 +35,7 @@ def test_the_end_stops_it_or_begins_anew() -> None:
 
 
 def test_steps_and_jumps_stay_among_the_frames() -> None:
-    clock = Clock(10.0)
+    clock = PlaybackClock(10.0)
     clock.jump(3, 0, 5)
     assert clock.frame == 3
     clock.play(0, 5)
@@ -48,20 +48,24 @@ def test_steps_and_jumps_stay_among_the_frames() -> None:
 
 
 def test_frames_that_are_forgotten_are_left() -> None:
-    clock = Clock(10.0)
+    clock = PlaybackClock(10.0)
     clock.jump(1, 0, 10)
     assert clock.tick(0.0, 6, 20) == 6
 
 
-@given(st.floats(-1e3, 1e3), st.integers(1, 50), st.lists(st.floats(0, 1e4), min_size=2, max_size=6))
-def test_there_is_no_other_frame_than_those_that_exist(speed: float, count: int, times: list[float]) -> None:
-    clock = Clock(25.0)
+@given(
+    st.floats(-1e3, 1e3), st.integers(1, 50), st.lists(st.floats(0, 1e4), min_size=2, max_size=6)
+)
+def test_there_is_no_other_frame_than_those_that_exist(
+    speed: float, count: int, times: list[float]
+) -> None:
+    clock = PlaybackClock(25.0)
     clock.set_speed(speed)
-    assert SLOWEST <= clock.speed <= FASTEST
+    assert MIN_SPEED <= clock.speed <= MAX_SPEED
     clock.play(0, count)
     assert all(0 <= clock.tick(now, 0, count) < count for now in sorted(times))
 
 
 def test_a_clock_that_stands_still_is_refused() -> None:
     with pytest.raises(InputError, match="positive"):
-        Clock(0.0)
+        PlaybackClock(0.0)

@@ -8,71 +8,84 @@ from hypothesis import given
 from hypothesis import strategies as st
 from viewer_scenes import plane
 
-from apps.viewer.clouds import cloud_of
-from apps.viewer.colouring import PALETTES, QUANTITIES, Colouring, colours_of, full_light, palette, scale_for
+from apps.viewer.clouds import make_cloud
+from apps.viewer.colouring import (
+    PALETTES,
+    QUANTITIES,
+    Colouring,
+    colour_points,
+    find_full_light,
+    load_palette,
+    make_scale,
+)
 from apps.viewer.filters import Filters
-from apps.viewer.picking import distance, picked, point_on_ray
-from apps.viewer.source import nothing
+from apps.viewer.picking import find_point_on_ray, make_pick, measure_distance
+from apps.viewer.source import make_empty_cloud
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
 
 
 def column(ranges: list[float]) -> PointCloud:
     """Points along the z axis at these ranges."""
-    return cloud_of(np.column_stack([np.zeros((len(ranges), 2)), ranges]))
+    return make_cloud(np.column_stack([np.zeros((len(ranges), 2)), ranges]))
 
 
 def test_limits_get_the_outermost_colours_and_the_middle_the_middle_one() -> None:
     cloud = column([0.5, 1.0, 2.0, 3.0, 9.0])
-    scale = scale_for(cloud, Colouring("range", "grey", (1.0, 3.0), equalised=False))
+    scale = make_scale(cloud, Colouring("range", "grey", (1.0, 3.0), equalised=False))
     assert scale.limits == (1.0, 3.0)
-    assert colours_of(cloud, scale)[:, 0].tolist() == [0, 0, 128, 255, 255]
+    assert colour_points(cloud, scale)[:, 0].tolist() == [0, 0, 128, 255, 255]
 
 
 def test_an_equalised_scale_gives_every_colour_equally_many_points() -> None:
     random = np.random.default_rng(1)
     cloud = column(np.exp(random.normal(size=20_000)).tolist())
-    scale = scale_for(cloud, Colouring("range", "grey", equalised=True))
+    scale = make_scale(cloud, Colouring("range", "grey", equalised=True))
     inside = (cloud.range >= scale.limits[0]) & (cloud.range <= scale.limits[1])
-    share = np.histogram(colours_of(cloud, scale)[inside, 0], 8, (0, 256))[0] / inside.sum()
-    assert np.allclose(share, 1 / 8, atol=0.01)  # 20 000 points in 255 steps: 1/255 at either edge, and rounding
+    share = np.histogram(colour_points(cloud, scale)[inside, 0], 8, (0, 256))[0] / inside.sum()
+    assert np.allclose(
+        share, 1 / 8, atol=0.01
+    )  # 20 000 points in 255 steps: 1/255 at either edge, and rounding
     assert np.all(np.diff(scale.values) >= 0)
 
 
 def test_height_counts_upwards_and_time_is_in_nanoseconds() -> None:
-    cloud = cloud_of(np.array([[0.0, -0.3, 1.0]]))
-    assert QUANTITIES["height"].of(cloud) == pytest.approx([0.3])
+    cloud = make_cloud(np.array([[0.0, -0.3, 1.0]]))
+    assert QUANTITIES["height"].extract(cloud) == pytest.approx([0.3])
     # There and back at the speed of light: 6.67 ns for each metre.
-    assert QUANTITIES["time"].of(cloud) == pytest.approx([6.671 * np.hypot(0.3, 1.0)], rel=1e-3)
+    assert QUANTITIES["time"].extract(cloud) == pytest.approx(
+        [6.671 * np.hypot(0.3, 1.0)], rel=1e-3
+    )
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("equalised", [False, True])
 def test_clouds_of_one_value_or_none_have_colours_too(quantity: str, equalised: bool) -> None:
-    for cloud in (nothing(), column([2.0, 2.0])):
-        scale = scale_for(cloud, Colouring(quantity, equalised=equalised))
+    for cloud in (make_empty_cloud(), column([2.0, 2.0])):
+        scale = make_scale(cloud, Colouring(quantity, equalised=equalised))
         assert scale.limits[0] < scale.limits[1]
-        assert colours_of(cloud, scale, full_light(cloud)).shape == (len(cloud), 3)
+        assert colour_points(cloud, scale, find_full_light(cloud)).shape == (len(cloud), 3)
 
 
 def test_palettes_grow_lighter_evenly() -> None:
     """Perceptually uniform ones rise in lightness; turbo and the two ends of others need not."""
     for name in set(PALETTES) - {"turbo"}:
-        light = palette(name) @ np.array([0.2126, 0.7152, 0.0722])
+        light = load_palette(name) @ np.array([0.2126, 0.7152, 0.0722])
         assert np.all(np.diff(light[::16]) > 0), name
 
 
 def test_dim_points_are_darker_where_asked_for() -> None:
-    cloud = cloud_of(np.ones((100, 3)), {"intensity": np.linspace(0, 99, 100)})
-    scale = scale_for(cloud, Colouring("range", "grey", (0.0, 1.0), equalised=False))
-    shaded = colours_of(cloud, scale, full_light(cloud))[:, 0]
+    cloud = make_cloud(np.ones((100, 3)), {"intensity": np.linspace(0, 99, 100)})
+    scale = make_scale(cloud, Colouring("range", "grey", (0.0, 1.0), equalised=False))
+    shaded = colour_points(cloud, scale, find_full_light(cloud))[:, 0]
     assert np.all(np.diff(shaded.astype(int)) >= 0)
     assert (shaded[0], shaded[-1]) == (38, 255)  # 15 % of the light stays
-    assert colours_of(cloud, scale).min() == 255
+    assert colour_points(cloud, scale).min() == 255
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"quantity": "weight"}, {"palette": "jet"}, {"limits": (2.0, 1.0)}, {"limits": (0.0, np.nan)}]
+    "wrong",
+    [{"quantity": "weight"}, {"palette": "jet"}, {"limits": (2.0, 1.0)}, {"limits": (0.0, np.nan)}],
 )
 def test_wrong_colourings(wrong: dict[str, object]) -> None:
     with pytest.raises(InputError):
@@ -80,12 +93,15 @@ def test_wrong_colourings(wrong: dict[str, object]) -> None:
 
 
 def test_filters_keep_what_lies_within_all_limits() -> None:
-    cloud = cloud_of(np.array([[0.0, 0, 1], [0, 0, 2], [1, 0, 2], [0, 0, 3]]), {"intensity": np.array([1, 2, 3, 4])})
-    assert Filters().kept(cloud).all()
-    assert Filters(range=(1.5, 2.1)).kept(cloud).tolist() == [False, True, False, False]
-    assert Filters(intensity=(2, 3)).kept(cloud).tolist() == [False, True, True, False]
-    assert Filters(z=(2, 3), x=(-0.5, 0.5)).kept(cloud).tolist() == [False, True, False, True]
-    assert Filters(time=(0, 7e-9)).kept(cloud).tolist() == [True, False, False, False]
+    cloud = make_cloud(
+        np.array([[0.0, 0, 1], [0, 0, 2], [1, 0, 2], [0, 0, 3]]),
+        {"intensity": np.array([1, 2, 3, 4])},
+    )
+    assert Filters().select(cloud).all()
+    assert Filters(range=(1.5, 2.1)).select(cloud).tolist() == [False, True, False, False]
+    assert Filters(intensity=(2, 3)).select(cloud).tolist() == [False, True, True, False]
+    assert Filters(z=(2, 3), x=(-0.5, 0.5)).select(cloud).tolist() == [False, True, False, True]
+    assert Filters(time=(0, 7e-9)).select(cloud).tolist() == [True, False, False, False]
     with pytest.raises(InputError, match="limits of y"):
         Filters(y=(1, 0))
 
@@ -94,28 +110,34 @@ def test_filters_keep_what_lies_within_all_limits() -> None:
 def test_a_ray_at_a_point_finds_it(number: int, aside: tuple[float, float], back: float) -> None:
     cloud = plane(400)
     eye = np.array([*aside, back])
-    found = point_on_ray(cloud.xyz, eye, cloud.xyz[number] - eye)
+    found = find_point_on_ray(cloud.xyz, eye, cloud.xyz[number] - eye)
     assert found is not None
     seen = cloud.xyz[found] - eye
     aimed = cloud.xyz[number] - eye
-    # Another point may lie within the reach of a click and nearer; it is never further off than that.
+    # Another point may lie within the reach of a click and nearer; it is never further off than
+    # that.
     angle = np.linalg.norm(np.cross(seen, aimed)) / (np.linalg.norm(seen) * np.linalg.norm(aimed))
     assert angle < 0.0041
 
 
 def test_the_point_in_front_is_meant_and_a_miss_means_none() -> None:
     cloud = column([2.0, 1.0, 3.0])
-    assert point_on_ray(cloud.xyz, (0, 0, 0), (0, 0, 5)) == 1
-    assert point_on_ray(cloud.xyz, (0, 0, 1.5), (0, 0, 1)) == 0
-    assert point_on_ray(cloud.xyz, (0, 0, 4), (0, 0, 1)) is None  # all are behind the eye
-    assert point_on_ray(cloud.xyz, (0, 0, 0), (0.2, 0, 1)) is None
-    assert point_on_ray(nothing().xyz, (0, 0, 0), (0, 0, 1)) is None
+    assert find_point_on_ray(cloud.xyz, (0, 0, 0), (0, 0, 5)) == 1
+    assert find_point_on_ray(cloud.xyz, (0, 0, 1.5), (0, 0, 1)) == 0
+    assert find_point_on_ray(cloud.xyz, (0, 0, 4), (0, 0, 1)) is None  # all are behind the eye
+    assert find_point_on_ray(cloud.xyz, (0, 0, 0), (0.2, 0, 1)) is None
+    assert find_point_on_ray(make_empty_cloud().xyz, (0, 0, 0), (0, 0, 1)) is None
 
 
 def test_what_is_known_about_a_pick() -> None:
-    cloud = cloud_of(np.array([[0.3, 0.4, 1.2], [0.0, 0, 0]]), {"confidence": np.array([0.002, 0.0])})
-    first, second = picked(cloud, 0, (3, 4)), picked(cloud, 1)
-    assert distance(first, second) == pytest.approx(1.3)
-    assert first.in_words.splitlines()[:2] == ["x 0.3000 m, y 0.4000 m, z 1.2000 m", "range 1.3000 m ± 2.00 mm"]
-    assert first.in_words.endswith("pixel row 3, column 4")
-    assert "pixel" not in second.in_words
+    cloud = make_cloud(
+        np.array([[0.3, 0.4, 1.2], [0.0, 0, 0]]), {"confidence": np.array([0.002, 0.0])}
+    )
+    first, second = make_pick(cloud, 0, (3, 4)), make_pick(cloud, 1)
+    assert measure_distance(first, second) == pytest.approx(1.3)
+    assert first.description.splitlines()[:2] == [
+        "x 0.3000 m, y 0.4000 m, z 1.2000 m",
+        "range 1.3000 m ± 2.00 mm",
+    ]
+    assert first.description.endswith("pixel row 3, column 4")
+    assert "pixel" not in second.description

@@ -15,17 +15,19 @@ import pytest
 from matplotlib.image import imread
 from viewer_scenes import frames, volume
 
-from apps.viewer.door import Door
+from apps.viewer.access_control import AccessControl
 from apps.viewer.page import Page
-from apps.viewer.session import AROUND, Session
+from apps.viewer.session import GATE_AROUND_FRAME, Session
 from apps.viewer.transient import TransientSource
-from apps.viewer.volume import SURFACE, VolumeSource
+from apps.viewer.volume import SURFACE_MODE, VolumeSource
 from tofclip.lidar import PointCloud
 
 playwright = pytest.importorskip(
     "playwright.sync_api", reason="the page is driven by playwright: pip install playwright"
 )
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
 FLAGS = (
     "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run "
     "--disable-background-networking --disable-component-update --disable-sync"
@@ -49,7 +51,7 @@ class Seen:
     """A served session and the tab that looks at it."""
 
     def __init__(self, browser: Any, session: Session) -> None:
-        self.page, self.complaints = Page(session, Door()), []
+        self.page, self.complaints = Page(session, AccessControl()), []
         self._thread = threading.Thread(target=self.page.run, daemon=True)
         self._thread.start()
         self.tab = browser.new_page(viewport={"width": 1100, "height": 640})
@@ -58,7 +60,9 @@ class Seen:
         self.tab.on("pageerror", lambda fault: self.complaints.append(str(fault)))
         self.tab.goto(self.page.address)
         self.tab.locator("#frame-number").wait_for()
-        notice = self.tab.locator("[class*=Notification-closeButton]")  # that the renderer is a slow one
+        notice = self.tab.locator(
+            "[class*=Notification-closeButton]"
+        )  # that the renderer is a slow one
         notice.first.wait_for()
         notice.first.click()
 
@@ -144,7 +148,9 @@ def test_play_pause_and_step(seen: Seen) -> None:
 def test_recolour(seen: Seen) -> None:
     before = picture(seen)
     seen.choose("colour", "intensity")
-    until(lambda: "intensity (counts)" in seen.tab.locator("#scale").inner_text(), "the scale says so")
+    until(
+        lambda: "intensity (counts)" in seen.tab.locator("#scale").inner_text(), "the scale says so"
+    )
     seen.choose("palette", "inferno")
     until(lambda: bool(np.abs(picture(seen) - before).max() > 0.2), "the colours are others")
     seen.choose("colour", "range")
@@ -165,14 +171,18 @@ def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
     canvas = seen.tab.locator(SCENE).bounding_box()
     assert canvas is not None
     near = shown.cloud.xyz[shown.cloud.range < 1.63].mean(axis=0, keepdims=True)
-    row, column, _ = seen.page.viewpoint.project(near, (round(canvas["height"]), round(canvas["width"])))
+    row, column, _ = seen.page.viewpoint.project(
+        near, (round(canvas["height"]), round(canvas["width"]))
+    )
     seen.tab.mouse.click(canvas["x"] + column[0], canvas["y"] + row[0])
     words = seen.tab.locator("#picked")
     until(lambda: "range 1.58" in words.inner_text(), "the point is described")
     assert "pixel row 1" in words.inner_text()
     until(lambda: seen.tab.locator(".uplot canvas").count() == 1, "its waveform is drawn")
     far = shown.cloud.xyz[shown.cloud.range > 1.63].mean(axis=0, keepdims=True)
-    row, column, _ = seen.page.viewpoint.project(far, (round(canvas["height"]), round(canvas["width"])))
+    row, column, _ = seen.page.viewpoint.project(
+        far, (round(canvas["height"]), round(canvas["width"]))
+    )
     seen.tab.mouse.click(canvas["x"] + column[0], canvas["y"] + row[0])
     until(lambda: "distance 0." in words.inner_text(), "the distance of both is told")
     until(lambda: bool(np.abs(picture(seen) - before).max() > 0.3), "both are marked")
@@ -180,12 +190,15 @@ def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
 
 
 def test_refocus(seen: Seen) -> None:
-    seen.choose("time gate", AROUND)
+    seen.choose("time gate", GATE_AROUND_FRAME)
     seen.type("frame", "30")
     until(lambda: seen.number("#points") == 36, "the gate is shown")
     before = seen.page.session.latest
     seen.type("refocus", "1")
-    until(lambda: seen.page.session.shear == 1.0 and seen.page.session.latest is not before, "it is recovered anew")
+    until(
+        lambda: seen.page.session.shear == 1.0 and seen.page.session.latest is not before,
+        "it is recovered anew",
+    )
     after = seen.page.session.latest
     assert before is not None
     assert after is not None
@@ -207,7 +220,10 @@ def test_screenshot_export_and_bookmark(seen: Seen, tmp_path: Path) -> None:
     download.value.save_as(tmp_path / "shown.ply")
     assert len(PointCloud.load(tmp_path / "shown.ply")) == seen.number("#points")
     seen.press("bookmark")
-    until(lambda: seen.row("view from").locator("input").first.input_value() == "view 1", "the view is remembered")
+    until(
+        lambda: seen.row("view from").locator("input").first.input_value() == "view 1",
+        "the view is remembered",
+    )
     seen.choose("view from", "start")
 
 
@@ -226,9 +242,11 @@ def test_a_volume_as_a_surface(browser: Any) -> None:
     seen = Seen(browser, Session(VolumeSource("ball", volume())))
     try:
         until(lambda: seen.number("#points") > 10, "voxels are shown")
-        seen.choose("show as", SURFACE)
+        seen.choose("show as", SURFACE_MODE)
         seen.type("threshold", "0.6")
-        until(lambda: seen.page.session.source.ways.threshold == 0.6, "the threshold is set")
+        until(
+            lambda: seen.page.session.source.display_modes.threshold == 0.6, "the threshold is set"
+        )
         until(lambda: picture(seen).std() > 0.02, "the surface is drawn")
         assert seen.complaints == []
     finally:

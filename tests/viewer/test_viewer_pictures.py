@@ -12,15 +12,15 @@ from matplotlib.image import imread
 from viewer_scenes import PlaneSource, plane, volume
 
 from apps.viewer import render
-from apps.viewer.clouds import cloud_of
+from apps.viewer.clouds import make_cloud
 from apps.viewer.film import save_film
-from apps.viewer.picture import SHAPE, Still, save_picture
-from apps.viewer.raster import BACKGROUND, rastered
-from apps.viewer.render import PyvistaRenderer, RasterRenderer, graphics_work
+from apps.viewer.raster import BACKGROUND, rasterise_points
+from apps.viewer.render import PyvistaRenderer, RasterRenderer, has_working_graphics
+from apps.viewer.scene_figure import PICTURE_SHAPE_PX, SceneFigure, save_picture
 from apps.viewer.session import Session
-from apps.viewer.source import nothing
-from apps.viewer.viewpoint import WIDEST, Viewpoint, in_front_of
-from apps.viewer.volume import SURFACE, VolumeSource
+from apps.viewer.source import make_empty_cloud
+from apps.viewer.viewpoint import MAX_FIELD_OF_VIEW_RAD, Viewpoint, place_viewpoint
+from apps.viewer.volume import SURFACE_MODE, VolumeSource
 from tofclip.errors import InputError, MissingDependencyError
 
 AHEAD = Viewpoint(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.deg2rad(90.0))
@@ -28,7 +28,9 @@ AHEAD = Viewpoint(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.deg2rad(90.0))
 
 
 def test_right_is_right_and_down_is_down() -> None:
-    row, column, depth = AHEAD.project(np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [0, 0, -1]]), (101, 201))
+    row, column, depth = AHEAD.project(
+        np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2], [0, 0, -1]]), (101, 201)
+    )
     assert row[:3] == pytest.approx([50, 50, 75.25])
     assert column[:3] == pytest.approx([100, 125.25, 100])
     assert depth[:3] == pytest.approx([2, 2, 2])
@@ -37,56 +39,69 @@ def test_right_is_right_and_down_is_down() -> None:
         _ = Viewpoint(np.ones(3), np.ones(3)).axes
 
 
-@given(st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-0.5, 8)), st.floats(0.05, 3), st.floats(1.0, 2.0))
-def test_a_cloud_is_seen_whole(middle: tuple[float, float, float], size: float, aspect: float) -> None:
+@given(
+    st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-0.5, 8)),
+    st.floats(0.05, 3),
+    st.floats(1.0, 2.0),
+)
+def test_a_cloud_is_seen_whole(
+    middle: tuple[float, float, float], size: float, aspect: float
+) -> None:
     xyz = (size * np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3)) + middle).astype(np.float32)
-    viewpoint = in_front_of(xyz, aspect)
+    viewpoint = place_viewpoint(xyz, aspect)
     shape = (200, round(200 * aspect))
     row, column, _ = viewpoint.project(xyz, shape)
     with np.errstate(invalid="ignore"):
         seen = (row > 0) & (row < shape[0]) & (column > 0) & (column < shape[1])
     assert seen.mean() > 0.97  # a hundredth at either end is let go
-    assert viewpoint.field_of_view <= WIDEST
+    assert viewpoint.field_of_view <= MAX_FIELD_OF_VIEW_RAD
 
 
 def test_near_points_hide_far_ones() -> None:
     xyz = np.array([[0.0, 0, 1], [0, 0, 2], [0.5, 0.5, 2]], np.float32)
     colours = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]], np.uint8)
     for order in ([0, 1, 2], [2, 1, 0]):
-        picture = rastered(xyz[order], colours[order], AHEAD, (101, 101), 3)
+        picture = rasterise_points(xyz[order], colours[order], AHEAD, (101, 101), 3)
         assert picture[50, 50].tolist() == [255, 0, 0]
         assert picture[62:65, 62:65].reshape(-1, 3).tolist() == [[0, 0, 255]] * 9
         assert (picture == BACKGROUND).all(axis=-1).sum() == 101 * 101 - 18
-    assert (rastered(nothing().xyz, colours[:0], AHEAD, (11, 11), 3) == BACKGROUND).all()
+    assert (
+        rasterise_points(make_empty_cloud().xyz, colours[:0], AHEAD, (11, 11), 3) == BACKGROUND
+    ).all()
 
 
 def test_both_renderers_put_points_in_the_same_places() -> None:
-    if not graphics_work():
+    if not has_working_graphics():
         pytest.skip("no working graphics library here")
     random = np.random.default_rng(2)
     xyz = np.column_stack([random.uniform(-0.3, 0.3, (300, 2)), random.uniform(1.5, 3, 300)])
     source = PlaneSource()
-    source.view = lambda _: type(PlaneSource().view(0))(cloud_of(xyz.astype(np.float32)))  # type: ignore[method-assign]
-    shown, viewpoint = Session(source).shown(0.0), in_front_of(xyz.astype(np.float32))
-    pictures = [one.draw(shown, viewpoint, (200, 300), 5) for one in (PyvistaRenderer(), RasterRenderer())]
+    source.view = lambda _: type(PlaneSource().view(0))(make_cloud(xyz.astype(np.float32)))  # type: ignore[method-assign]
+    shown, viewpoint = Session(source).frame_at(0.0), place_viewpoint(xyz.astype(np.float32))
+    pictures = [
+        one.draw(shown, viewpoint, (200, 300), 5) for one in (PyvistaRenderer(), RasterRenderer())
+    ]
     first, second = ((picture != BACKGROUND).any(axis=-1) for picture in pictures)
     # The two round a square's corner differently, by at most a pixel on each side.
     assert (first & second).sum() / (first | second).sum() > 0.6
 
 
 @pytest.mark.parametrize(
-    ("probe", "works"), [("", True), ("import os; os.abort()", False), ("raise SystemExit(1)", False)]
+    ("probe", "works"),
+    [("", True), ("import os; os.abort()", False), ("raise SystemExit(1)", False)],
 )
 def test_a_graphics_library_that_ends_its_process_is_found_out(probe: str, works: bool) -> None:
-    assert graphics_work(probe) is works
+    assert has_working_graphics(probe) is works
 
 
-def test_without_graphics_the_picture_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(render, "graphics_work", lambda: False)
-    renderer = render.best_renderer()
+def test_without_graphics_the_picture_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(render, "has_working_graphics", lambda: False)
+    renderer = render.choose_renderer()
     assert renderer.name == "matplotlib"
-    shown = Session(PlaneSource()).shown(0.0)
-    still = Still("planes", shown, renderer)
+    shown = Session(PlaneSource()).frame_at(0.0)
+    still = SceneFigure("planes", shown, renderer)
     assert "drawn by matplotlib" in still.draw(shown).axes[0].get_title(loc="left")
     save_picture("planes", shown, renderer, tmp_path / "planes.png")
     assert np.std(imread(tmp_path / "planes.png")[..., :3]) > 0.05
@@ -95,12 +110,17 @@ def test_without_graphics_the_picture_says_so(tmp_path: Path, monkeypatch: pytes
 
 def test_a_picture_of_nothing_and_of_a_surface() -> None:
     empty = PlaneSource(points=0)
-    assert Still("empty", Session(empty).shown(0.0), RasterRenderer()).pixels(Session(empty).shown(0.0)).std() > 0
-    if graphics_work():
+    assert (
+        SceneFigure("empty", Session(empty).frame_at(0.0), RasterRenderer())
+        .pixels(Session(empty).frame_at(0.0))
+        .std()
+        > 0
+    )
+    if has_working_graphics():
         source = VolumeSource("ball", volume())
-        source.ways.chosen = SURFACE
-        shown = Session(source).shown(0.0)
-        drawn = PyvistaRenderer().draw(shown, in_front_of(shown.cloud.xyz), SHAPE, 3)
+        source.display_modes.current = SURFACE_MODE
+        shown = Session(source).frame_at(0.0)
+        drawn = PyvistaRenderer().draw(shown, place_viewpoint(shown.cloud.xyz), PICTURE_SHAPE_PX, 3)
         assert (drawn != BACKGROUND).any(axis=-1).mean() > 0.1
 
 
@@ -126,5 +146,11 @@ def test_films_need_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_million_points_are_drawn_at_once() -> None:
     cloud = plane(1_000_000)
-    picture = rastered(cloud.xyz, np.full((len(cloud), 3), 200, np.uint8), in_front_of(cloud.xyz), SHAPE, 2)
+    picture = rasterise_points(
+        cloud.xyz,
+        np.full((len(cloud), 3), 200, np.uint8),
+        place_viewpoint(cloud.xyz),
+        PICTURE_SHAPE_PX,
+        2,
+    )
     assert (picture == 200).all(axis=-1).mean() > 0.3

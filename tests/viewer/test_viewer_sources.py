@@ -27,12 +27,12 @@ from viewer_scenes import (
     volume,
 )
 
-from apps.viewer.live import LiveShots
-from apps.viewer.panes import front_pictures, panes
-from apps.viewer.session import ALL, AROUND, UP_TO, Session
+from apps.viewer.live import LiveShotSource
+from apps.viewer.session import GATE_ALL_TIMES, GATE_AROUND_FRAME, GATE_UP_TO_FRAME, Session
+from apps.viewer.side_pictures import project_front, render_pictures
 from apps.viewer.source import Gate, Source
-from apps.viewer.sources import Extras, open_source
-from apps.viewer.volume import PROJECTION, SLICE, SURFACE
+from apps.viewer.source_factory import ShotOptions, open_source
+from apps.viewer.volume import PROJECTION_MODE, SLICE_MODE, SURFACE_MODE
 from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError, StorageError
 from tofclip.shots import Streak
 from tofclip.shots.stack import save_stack
@@ -73,18 +73,18 @@ def test_frames_become_a_cloud_at_the_ranges_of_the_squares(transient: Source) -
 
 def test_time_walks_through_a_transient(transient: Source) -> None:
     session = Session(transient)
-    assert session.gate == UP_TO
-    whole = len(session.shown(0.0).cloud)
+    assert session.gate == GATE_UP_TO_FRAME
+    whole = len(session.frame_at(0.0).cloud)
     assert whole == 36 + 49  # the pixels of both squares: at its end a transient is complete
     session.jump(NEAR_FRAME + 3)
-    assert len(session.shown(0.0).cloud) == 36
+    assert len(session.frame_at(0.0).cloud) == 36
     session.jump(NEAR_FRAME - 9)
-    assert len(session.shown(0.0).cloud) == 0
-    session.gate = ALL
-    assert len(session.shown(0.0).cloud) == whole
-    session.gate = AROUND
+    assert len(session.frame_at(0.0).cloud) == 0
+    session.gate = GATE_ALL_TIMES
+    assert len(session.frame_at(0.0).cloud) == whole
+    session.gate = GATE_AROUND_FRAME
     session.jump(FAR_FRAME)
-    shown = session.shown(0.0)
+    shown = session.frame_at(0.0)
     assert len(shown.cloud) == 49
     assert shown.pixels is not None
     assert len(shown.pixels) == 49
@@ -97,25 +97,29 @@ def test_time_walks_through_a_transient(transient: Source) -> None:
 def test_playing_begins_anew_and_ends_at_the_last_frame(transient: Source) -> None:
     session = Session(transient)
     session.play()
-    assert session.shown(10.0).frame == 0
-    assert 0 < session.shown(11.0).frame < FRAMES - 1
-    assert session.shown(1000.0).frame == FRAMES - 1
+    assert session.frame_at(10.0).frame == 0
+    assert 0 < session.frame_at(11.0).frame < FRAMES - 1
+    assert session.frame_at(1000.0).frame == FRAMES - 1
     assert not session.clock.playing
     assert session.label == "REPLAY"
 
 
 def test_a_pick_brings_the_pixels_whole_waveform(transient: Source) -> None:
     session = Session(transient)
-    shown = session.shown(0.0)
+    shown = session.frame_at(0.0)
     number = int(np.argmax(shown.cloud.range))
     pick = session.pick((0, 0, 0), shown.cloud.xyz[number])
     assert pick is not None
     assert pick.waveform is not None
-    assert pick.waveform.times[pick.waveform.counts.argmax()] == pytest.approx(pick.time, abs=BIN_WIDTH)
+    assert pick.waveform.times[pick.waveform.counts.argmax()] == pytest.approx(
+        pick.time, abs=BIN_WIDTH
+    )
     assert pick.waveform.counts.size == FRAMES
     assert session.distance is None
     other = session.pick_point(int(np.argmin(shown.cloud.range)))
-    assert session.distance == pytest.approx(np.linalg.norm(np.subtract(pick.position, other.position)))
+    assert session.distance == pytest.approx(
+        np.linalg.norm(np.subtract(pick.position, other.position))
+    )
     assert session.pick((0, 0, 0), (0, -1, 0.1)) is None  # a miss forgets them
     assert session.picks == []
     with pytest.raises(InputError, match="no point"):
@@ -123,15 +127,17 @@ def test_a_pick_brings_the_pixels_whole_waveform(transient: Source) -> None:
 
 
 def test_refocusing_moves_the_squares_along_the_slit_and_back(transient: Source) -> None:
-    """A refocus by one shear of light seen at shear 0 displaces the picture by the camera's own figure."""
+    """A refocus by one shear of light seen at shear 0 displaces the picture by the camera's own
+    figure.
+    """
     session = Session(transient)
-    session.gate = AROUND
+    session.gate = GATE_AROUND_FRAME
     session.jump(NEAR_FRAME)
-    sharp = session.shown(0.0)
+    sharp = session.frame_at(0.0)
     session.shear = 0.0
-    again = session.shown(0.0)
+    again = session.frame_at(0.0)
     session.shear = 1.0
-    moved = session.shown(0.0)
+    moved = session.frame_at(0.0)
     assert sharp.pixels is not None
     assert again.pixels is not None
     assert moved.pixels is not None
@@ -140,10 +146,11 @@ def test_refocusing_moves_the_squares_along_the_slit_and_back(transient: Source)
     shift = np.average(moved.pixels, axis=0, weights=moved.cloud.intensity) - np.average(
         again.pixels, axis=0, weights=again.cloud.intensity
     )
-    # Only a part of a shear displaces, 3 rows; the rest defocuses, which pulls the mean by some of a pixel.
+    # Only a part of a shear displaces, 3 rows; the rest defocuses, which pulls the mean by some of
+    # a pixel.
     assert np.allclose(shift, -np.array(camera().displacement_per_shear), atol=0.7)
     session.jump(45)  # between the squares there is no light, and none is invented
-    assert len(session.shown(0.0).cloud) == 0
+    assert len(session.frame_at(0.0).cloud) == 0
 
 
 def test_clouds_follow_one_another(folder: Path) -> None:
@@ -151,11 +158,11 @@ def test_clouds_follow_one_another(folder: Path) -> None:
     session = Session(source)
     assert len(source) == 4
     assert [float(np.median(source.view(n).cloud.xyz[:, 2])) for n in range(4)] == [1, 2, 3, 4]
-    assert set(session.pictures(session.shown(0.0))) == {"intensity", "depth"}
+    assert set(session.pictures(session.frame_at(0.0))) == {"intensity", "depth"}
     session.step(1)
-    assert session.shown(0.0).frame == 1
+    assert session.frame_at(0.0).frame == 1
     with pytest.raises(InputError, match="focused"):
-        source.refocused(0, 1.0, Gate(0, 1))
+        source.refocus(0, 1.0, Gate(0, 1))
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".csv", ".npz", ".h5"])
@@ -176,7 +183,7 @@ def test_a_cloud_of_another_program_needs_positions_only(tmp_path: Path) -> None
 
 def test_a_single_shot_is_recovered_as_a_transient(folder: Path) -> None:
     source = open_source(str(folder / "shot.h5"))
-    assert source.abilities.times is not None
+    assert source.capabilities.times is not None
     ranges = source.view(0).cloud.range
     for frame in (NEAR_FRAME, FAR_FRAME):
         close = np.abs(ranges - range_of(frame)) < 3e-3  # a bin
@@ -184,11 +191,15 @@ def test_a_single_shot_is_recovered_as_a_transient(folder: Path) -> None:
 
 
 def test_a_stack_of_shots_is_recovered_shot_by_shot(folder: Path) -> None:
-    source = open_source(str(folder / "stack.h5"), Extras(camera=folder / "camera.h5", time_zero=-20e-9))
+    source = open_source(
+        str(folder / "stack.h5"), ShotOptions(camera=folder / "camera.h5", time_zero=-20e-9)
+    )
     assert len(source) == 3
     session = Session(source)
-    shown = session.shown(0.0)
-    nearest = range_of(NEAR_FRAME) + 10e-9 * 0.149896  # the other time zero moves everything by 1.5 m
+    shown = session.frame_at(0.0)
+    nearest = (
+        range_of(NEAR_FRAME) + 10e-9 * 0.149896
+    )  # the other time zero moves everything by 1.5 m
     later = shown.cloud.range.min()
     assert later == pytest.approx(nearest + 1.498, abs=0.02)
     assert set(session.pictures(shown)) == {"streak", "intensity", "depth"}
@@ -196,32 +207,37 @@ def test_a_stack_of_shots_is_recovered_shot_by_shot(folder: Path) -> None:
     assert waveform is not None
     assert waveform.counts.size == FRAMES
     session.shear = 0.5
-    assert len(session.shown(0.0).cloud) > 0
+    assert len(session.frame_at(0.0).cloud) > 0
 
 
 def test_a_volume_as_voxels_surface_projection_and_slices(folder: Path) -> None:
     source = open_source(str(folder / "volume.h5"))
     session = Session(source)
-    voxels = session.shown(0.0).cloud
+    voxels = session.frame_at(0.0).cloud
     assert np.allclose(voxels.xyz.mean(axis=0), (0.05, -0.05, 0.5), atol=0.01)
-    assert np.all(np.linalg.norm(voxels.xyz - [0.05, -0.05, 0.5], axis=1) < 0.04 * np.sqrt(2 * np.log(1 / 0.3)) + 1e-3)
-    source.ways.threshold = 0.8
-    assert 0 < len(session.shown(0.0).cloud) < len(voxels)
-    source.ways.chosen = PROJECTION
-    columns = session.shown(0.0).cloud.xyz[:, :2].round(3).tolist()
+    assert np.all(
+        np.linalg.norm(voxels.xyz - [0.05, -0.05, 0.5], axis=1)
+        < 0.04 * np.sqrt(2 * np.log(1 / 0.3)) + 1e-3
+    )
+    source.display_modes.threshold = 0.8
+    assert 0 < len(session.frame_at(0.0).cloud) < len(voxels)
+    source.display_modes.current = PROJECTION_MODE
+    columns = session.frame_at(0.0).cloud.xyz[:, :2].round(3).tolist()
     assert len({tuple(column) for column in columns}) == len(columns)
-    source.ways.chosen = SLICE
+    source.display_modes.current = SLICE_MODE
     session.jump(3)
-    assert np.unique(session.shown(0.0).cloud.xyz[:, 2]).size == 1
-    assert session.pictures(session.shown(0.0))["intensity"].shape == volume().grid.shape[1:]
-    source.ways.chosen, source.ways.threshold = SURFACE, np.exp(-0.5)
-    shown = session.shown(0.0)
+    assert np.unique(session.frame_at(0.0).cloud.xyz[:, 2]).size == 1
+    assert session.pictures(session.frame_at(0.0))["intensity"].shape == volume().grid.shape[1:]
+    source.display_modes.current, source.display_modes.threshold = SURFACE_MODE, np.exp(-0.5)
+    shown = session.frame_at(0.0)
     assert shown.surface is not None
     radius = np.linalg.norm(shown.surface.vertices - [0.05, -0.05, 0.5], axis=1)
-    assert np.allclose(radius, 0.04, atol=0.004)  # one standard deviation, by linear interpolation over 2 cm voxels
-    source.ways.chosen = "hologram"
+    assert np.allclose(
+        radius, 0.04, atol=0.004
+    )  # one standard deviation, by linear interpolation over 2 cm voxels
+    source.display_modes.current = "hologram"
     with pytest.raises(InputError, match="hologram"):
-        session.shown(0.0)
+        session.frame_at(0.0)
 
 
 def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
@@ -230,17 +246,17 @@ def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
         yield streak(2)
         raise DeviceTimeoutError("nothing came")
 
-    source = LiveShots("test", shots(), camera(), streak(0))
+    source = LiveShotSource("test", shots(), camera(), streak(0))
     session = Session(source)
     deadline = time.monotonic() + 20
     while source.is_live and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert (len(source), source.oldest, source.trouble) == (3, 0, "nothing came")
-    assert session.shown(0.0).frame == 2
+    assert (len(source), source.oldest, source.failure_text) == (3, 0, "nothing came")
+    assert session.frame_at(0.0).frame == 2
     session.step(-1)
-    assert (session.shown(0.0).frame, session.following) == (1, False)
+    assert (session.frame_at(0.0).frame, session.following) == (1, False)
     session.follow()
-    assert session.shown(0.0).frame == 2
+    assert session.frame_at(0.0).frame == 2
     assert session.label == "REPLAY"  # nothing comes any more
     source.close()
 
@@ -254,15 +270,15 @@ def test_live_shots_that_come_too_fast_are_dropped(monkeypatch: pytest.MonkeyPat
             busy.wait(20)
         came.set()
 
-    def slowly(self: LiveShots, shot: Streak) -> NDArray[np.float32]:
+    def slowly(self: LiveShotSource, shot: Streak) -> NDArray[np.float32]:
         if threading.current_thread() is not threading.main_thread():
             busy.set()
             go_on.wait(20)
         return rectified(self, shot)
 
-    rectified = LiveShots.rectified
-    monkeypatch.setattr(LiveShots, "rectified", slowly)
-    source = LiveShots("test", shots(), camera(), streak(0))
+    rectified = LiveShotSource.rectify
+    monkeypatch.setattr(LiveShotSource, "rectify", slowly)
+    source = LiveShotSource("test", shots(), camera(), streak(0))
     assert came.wait(20)
     go_on.set()
     deadline = time.monotonic() + 20
@@ -302,11 +318,16 @@ def test_what_cannot_be_looked_at(tmp_path: Path, folder: Path) -> None:
 
 
 def test_panes_have_a_handy_size_and_dark_holes() -> None:
-    scale = Session(PlaneSource()).shown(0.0).scale
-    made = panes(front_pictures(plane(4000)), scale)
+    scale = Session(PlaneSource()).frame_at(0.0).scale
+    made = render_pictures(project_front(plane(4000)), scale)
     assert made["depth"].dtype == np.uint8
-    assert all(200 <= max(image.shape) <= 420 for image in made.values()) or made["depth"].shape[0] == 128
-    empty = panes(front_pictures(PlaneSource().view(0).cloud), replace(scale, quantity="height"))["depth"]
+    assert (
+        all(200 <= max(image.shape) <= 420 for image in made.values())
+        or made["depth"].shape[0] == 128
+    )
+    empty = render_pictures(
+        project_front(PlaneSource().view(0).cloud), replace(scale, quantity="height")
+    )["depth"]
     assert (empty == (32, 36, 44)).all(axis=-1).mean() > 0.9
-    tall = panes({"streak": np.ones((1016, 1344), np.float32)}, scale)["streak"]
+    tall = render_pictures({"streak": np.ones((1016, 1344), np.float32)}, scale)["streak"]
     assert max(tall.shape) <= 420

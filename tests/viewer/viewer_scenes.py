@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from apps.viewer.clouds import cloud_of
+from apps.viewer.clouds import make_cloud
 from apps.viewer.source import Gate, Source, View
 from nlos import Grid, Volume
 from tofclip.camera import Camera, SkewSweep
@@ -25,7 +25,13 @@ def camera() -> Camera:
     """Seven views whose light of range 0 would arrive 10 ns before the first row."""
     at_rest = SkewSweep(CENTRES_PX, np.zeros(7), np.zeros(7))
     return Camera(
-        CENTRES_PX, ANGLES, IMAGE_SHAPE, slit_width_px=300, sweep=at_rest, focal_length_px=140.0, time_zero=-10e-9
+        CENTRES_PX,
+        ANGLES,
+        IMAGE_SHAPE,
+        slit_width_px=300,
+        sweep=at_rest,
+        focal_length_px=140.0,
+        time_zero=-10e-9,
     )
 
 
@@ -55,7 +61,9 @@ def plane(points: int, distance: float = 2.0, seed: int = 0) -> PointCloud:
     """Points scattered over a plane across the line of sight, 1 m wide."""
     random = np.random.default_rng(seed)
     xyz = np.column_stack([random.uniform(-0.5, 0.5, (points, 2)), np.full(points, distance)])
-    return cloud_of(xyz.astype(np.float32), {"intensity": random.uniform(1, 9, points).astype(np.float32)})
+    return make_cloud(
+        xyz.astype(np.float32), {"intensity": random.uniform(1, 9, points).astype(np.float32)}
+    )
 
 
 def volume() -> Volume:
@@ -79,5 +87,5 @@ class PlaneSource(Source):
     def view(self, number: int) -> View:
         return View(plane(self._points, 2 + number / 100))
 
-    def refocused(self, number: int, shear: float, gate: Gate) -> View:
+    def refocus(self, number: int, shear: float, gate: Gate) -> View:
         return View(plane(self._points, 2 + shear))

@@ -1,6 +1,12 @@
 """The camera: where each view lies on the slit, how its lenslet projects, how the sweep bends time."""
 
-from tofclip.camera.measurement import Measurement, Rectifier, dark_level, measure, require_width
+from tofclip.camera.measurement import (
+    Measurement,
+    Rectifier,
+    estimate_dark_level,
+    measure,
+    require_width,
+)
 from tofclip.camera.model import Camera
 from tofclip.camera.sweep import PolynomialSweep, ProjectiveSweep, SkewSweep, Sweep
 
@@ -12,7 +18,7 @@ __all__ = [
     "Rectifier",
     "SkewSweep",
     "Sweep",
-    "dark_level",
+    "estimate_dark_level",
     "measure",
     "require_width",
 ]

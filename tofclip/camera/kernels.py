@@ -1,7 +1,7 @@
 """The compiled resampling of streak images.
 
-Pictures are (columns, rows) here: a view's sweep moves along the rows of the sensor, so that successive readings of one
-column lie side by side, before and after.
+Pictures are (columns, rows) here: a view's sweep moves along the rows of the sensor, so that
+successive readings of one column lie side by side, before and after.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+fast_njit = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 
 
-@vectorised
-def sample_in_time(counts, dark, raw_row, late, readings):
+@fast_njit
+def sample_in_time(counts, dark, raw_row, delay, measurements):
     """Sample every column linearly between two of its rows, and take off the dark level.
 
     Parameters
@@ -22,41 +22,49 @@ def sample_in_time(counts, dark, raw_row, late, readings):
     dark : float32
     raw_row : (columns, rows) float32 array
         Where each rectified pixel lies in the raw image.
-    late : float32
+    delay : float32
         Rows to add to all raw rows.
-    readings : (columns, rows) float32 array, overwritten
+    measurements : (columns, rows) float32 array, overwritten
         0 beyond the raw image.
     """
     rows, zero = counts.shape[1], np.int32(0)
-    last, lowest, below = np.float32(rows - 1), np.int32(max(rows - 2, 0)), np.int32(min(1, rows - 1))
+    last, lowest, below = (
+        np.float32(rows - 1),
+        np.int32(max(rows - 2, 0)),
+        np.int32(min(1, rows - 1)),
+    )
     for column in range(counts.shape[0]):
-        raw, position, reading = counts[column], raw_row[column], readings[column]
+        raw, position, reading = counts[column], raw_row[column], measurements[column]
         for row in range(position.size):
-            y = position[row] + late
+            y = position[row] + delay
             top = min(max(np.int32(y), zero), lowest)
             upper, lower = raw[top], raw[top + below]
             value = upper + (y - np.float32(top)) * (lower - upper) - dark
             reading[row] = value if y >= 0 and y <= last else np.float32(0)
 
 
-@vectorised
-def sample(counts, dark, raw_row, raw_column, late, readings):
+@fast_njit
+def sample_bilinear(counts, dark, raw_row, raw_column, delay, measurements):
     """Sample bilinearly; see `sample_in_time`.
 
     Parameters
     ----------
     counts : (raw columns, rows) float32 array
-    raw_row, raw_column, readings : (some columns, rows) float32 array
+    raw_row, raw_column, measurements : (some columns, rows) float32 array
     """
     columns, rows = counts.shape
     flat, zero, length = counts.reshape(counts.size), np.int32(0), np.int32(rows)
-    last_row, lowest, below = np.float32(rows - 1), np.int32(max(rows - 2, 0)), np.int32(min(1, rows - 1))
+    last_row, lowest, below = (
+        np.float32(rows - 1),
+        np.int32(max(rows - 2, 0)),
+        np.int32(min(1, rows - 1)),
+    )
     last_column, rightmost = np.float32(columns - 1), np.int32(max(columns - 2, 0))
     beside = np.int32(min(1, columns - 1)) * length
     for column in range(raw_row.shape[0]):
-        down, across, reading = raw_row[column], raw_column[column], readings[column]
+        down, across, reading = raw_row[column], raw_column[column], measurements[column]
         for row in range(down.size):
-            y, x = down[row] + late, across[row]
+            y, x = down[row] + delay, across[row]
             top, left = min(max(np.int32(y), zero), lowest), min(max(np.int32(x), zero), rightmost)
             right, here = x - np.float32(left), left * length + top
             upper = flat[here] + right * (flat[here + beside] - flat[here])
@@ -67,24 +75,27 @@ def sample(counts, dark, raw_row, raw_column, late, readings):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def trust(bad, raw_row, raw_column, late, good):
+def mark_valid(bad, raw_row, raw_column, delay, valid):
     """Tell the readings that lie within the raw image and to which no bad pixel contributes.
 
     Parameters
     ----------
     bad : (rows, raw columns) bool array
     raw_row, raw_column, late
-        As for `sample`.
-    good : (some columns, rows) bool array, overwritten
+        As for `sample_bilinear`.
+    valid : (some columns, rows) bool array, overwritten
     """
     rows, columns = bad.shape
-    for column in range(good.shape[0]):
-        for row in range(good.shape[1]):
-            y, x = raw_row[column, row] + late, raw_column[column, row]
-            good[column, row] = 0 <= y <= rows - 1 and 0 <= x <= columns - 1
-            if good[column, row]:
+    for column in range(valid.shape[0]):
+        for row in range(valid.shape[1]):
+            y, x = raw_row[column, row] + delay, raw_column[column, row]
+            valid[column, row] = 0 <= y <= rows - 1 and 0 <= x <= columns - 1
+            if valid[column, row]:
                 top, left = np.uintp(y), np.uintp(x)
                 # a pixel right on another one has nothing of the next
-                below, beside = top + np.uintp(y > np.float32(top)), left + np.uintp(x > np.float32(left))
+                below, beside = (
+                    top + np.uintp(y > np.float32(top)),
+                    left + np.uintp(x > np.float32(left)),
+                )
                 if bad[top, left] or bad[top, beside] or bad[below, left] or bad[below, beside]:
-                    good[column, row] = False
+                    valid[column, row] = False

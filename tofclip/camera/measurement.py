@@ -14,9 +14,9 @@ from tofclip.threads import run_blocks
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-QUIET_SHARE = 0.05
+DARK_ROW_FRACTION = 0.05
 COLUMNS_PER_BLOCK = 168
-DARK = "nothing rises above the dark level; was there any light?"
+NO_LIGHT_MESSAGE = "nothing rises above the dark level; was there any light?"
 
 
 @dataclass(frozen=True)
@@ -25,17 +25,20 @@ class Measurement:
 
     Parameters
     ----------
-    readings : (columns, frames) float32 array
-        Slit readings, one column of the array for each instant. May be negative: noise about a dark level is.
-    good : (columns, frames) bool array
+    measurements : (columns, frames) float32 array
+        Slit readings, one column of the array for each instant. May be negative: noise about a dark
+        level is.
+    valid : (columns, frames) bool array
         False where a sensor pixel was saturated or dead, or where the raw image ends.
     """
 
-    readings: FloatImage
-    good: Mask
+    measurements: FloatImage
+    valid: Mask
 
 
-def measure(counts: FloatImage, saturated: Mask | None, camera: Camera, dark: float | None = None) -> Measurement:
+def measure(
+    counts: FloatImage, saturated: Mask | None, camera: Camera, dark: float | None = None
+) -> Measurement:
     """Subtract the dark level and rectify the sweep.
 
     Parameters
@@ -46,7 +49,7 @@ def measure(counts: FloatImage, saturated: Mask | None, camera: Camera, dark: fl
     camera : Camera
         Its sweep says where each rectified pixel lies; without one the rows are taken as they are.
     dark : float, optional
-        Dark level in counts; by default `dark_level` of the picture.
+        Dark level in counts; by default `estimate_dark_level` of the picture.
 
     Raises
     ------
@@ -67,19 +70,20 @@ def require_width(counts: FloatImage, camera: Camera) -> None:
         )
 
 
-def dark_level(counts: FloatImage) -> float:
+def estimate_dark_level(counts: FloatImage) -> float:
     """Median of the quietest rows, in counts.
 
-    Taken from whole rows, before or after the light came, so that it stays where the readings scatter about it: the
-    least value of a picture would turn noise into an offset.
+    Taken from whole rows, before or after the light came, so that it stays where the readings
+    scatter about it: the least value of a picture would turn noise into an offset.
     """
     row_sums = counts.sum(axis=1, dtype=np.float64)
-    quiet = np.argsort(row_sums)[: max(1, round(QUIET_SHARE * row_sums.size))]
+    quiet = np.argsort(row_sums)[: max(1, round(DARK_ROW_FRACTION * row_sums.size))]
     return float(np.median(counts[quiet]))
 
 
 class Rectifier:
-    """Turns raw streak images of one camera into readings; holding one saves working out the sweep for every shot.
+    """Turns raw streak images of one camera into readings; holding one saves working out the sweep
+    for every shot.
 
     Parameters
     ----------
@@ -98,15 +102,22 @@ class Rectifier:
         position = (row.astype(np.float64), column.astype(np.float64))
         raw = position if camera.sweep is None else camera.sweep.raw_position(*position)
         shape = (rows, camera.slit_width_px)
-        # An exact row must not become one that lies beyond the picture by a rounding error of float32.
+        # An exact row must not become one that lies beyond the picture by a rounding error of
+        # float32.
         self._raw_row = np.ascontiguousarray(np.broadcast_to(raw[0], shape).T, dtype=np.float32)
         raw_column = np.broadcast_to(raw[1], shape).T
         own = np.broadcast_to(column.T.astype(np.float32), shape[::-1])
         self._stays_in_column = bool(np.all(raw_column == own))
-        self._raw_column = own if self._stays_in_column else np.ascontiguousarray(raw_column, dtype=np.float32)
+        self._raw_column = (
+            own if self._stays_in_column else np.ascontiguousarray(raw_column, dtype=np.float32)
+        )
 
     def measure(
-        self, counts: FloatImage, saturated: Mask | None = None, dark: float | None = None, late: float = 0.0
+        self,
+        counts: FloatImage,
+        saturated: Mask | None = None,
+        dark: float | None = None,
+        delay: float = 0.0,
     ) -> Measurement:
         """Subtract the dark level and rectify the sweep (bilinear).
 
@@ -116,8 +127,8 @@ class Rectifier:
         saturated : (rows, columns) bool array, optional
             A reading is bad if any raw pixel that contributes to it is.
         dark : float, optional
-            Counts; by default `dark_level` of the picture.
-        late : float
+            Counts; by default `estimate_dark_level` of the picture.
+        delay : float
             Rows by which this shot's light comes later than the camera's calibration says.
 
         Raises
@@ -126,15 +137,21 @@ class Rectifier:
             As for `measure`, or another number of rows.
         """
         self._require_shape(counts)
-        good = self._good(np.zeros(counts.shape, bool) if saturated is None else saturated, late)
-        if not good.any():
-            raise InputError("no reading can be trusted: every pixel is saturated, dead or outside the sweep")
-        readings = self.readings(counts, dark, late)
-        if not np.any((readings > 0) & good):
-            raise InputError(DARK)
-        return Measurement(readings, good)
+        valid = self._find_valid(
+            np.zeros(counts.shape, bool) if saturated is None else saturated, delay
+        )
+        if not valid.any():
+            raise InputError(
+                "no reading can be trusted: every pixel is saturated, dead or outside the sweep"
+            )
+        measurements = self.measurements(counts, dark, delay)
+        if not np.any((measurements > 0) & valid):
+            raise InputError(NO_LIGHT_MESSAGE)
+        return Measurement(measurements, valid)
 
-    def readings(self, counts: FloatImage, dark: float | None = None, late: float = 0.0) -> FloatImage:
+    def measurements(
+        self, counts: FloatImage, dark: float | None = None, delay: float = 0.0
+    ) -> FloatImage:
         """Return the readings alone, for methods that cannot leave out single ones.
 
         Parameters
@@ -152,39 +169,53 @@ class Rectifier:
         CalibrationError, InputError
             As for `measure`, but for readings that cannot be trusted.
         """
-        from tofclip.camera.kernels import sample, sample_in_time
+        from tofclip.camera.kernels import sample_bilinear, sample_in_time
 
         self._require_shape(counts)
-        level, shift = np.float32(dark_level(counts) if dark is None else dark), np.float32(late)
-        readings = np.empty(self._raw_row.shape, np.float32)
+        level, shift = (
+            np.float32(estimate_dark_level(counts) if dark is None else dark),
+            np.float32(delay),
+        )
+        measurements = np.empty(self._raw_row.shape, np.float32)
         turned = None if self._stays_in_column else np.ascontiguousarray(counts.T)
 
         def work(piece: slice) -> None:
             if turned is None:
                 raw = np.ascontiguousarray(counts[:, piece].T)
-                sample_in_time(raw, level, self._raw_row[piece], shift, readings[piece])
+                sample_in_time(raw, level, self._raw_row[piece], shift, measurements[piece])
             else:
-                sample(turned, level, self._raw_row[piece], self._raw_column[piece], shift, readings[piece])
+                sample_bilinear(
+                    turned,
+                    level,
+                    self._raw_row[piece],
+                    self._raw_column[piece],
+                    shift,
+                    measurements[piece],
+                )
 
-        run_blocks(work, len(readings), COLUMNS_PER_BLOCK)
-        readings[self.camera.dead_columns] = 0
-        if not readings.max() > 0:
-            raise InputError(DARK)
-        return readings
+        run_blocks(work, len(measurements), COLUMNS_PER_BLOCK)
+        measurements[self.camera.dead_columns] = 0
+        if not measurements.max() > 0:
+            raise InputError(NO_LIGHT_MESSAGE)
+        return measurements
 
-    def _good(self, bad: Mask, late: float) -> Mask:
-        from tofclip.camera.kernels import trust
+    def _find_valid(self, bad: Mask, delay: float) -> Mask:
+        from tofclip.camera.kernels import mark_valid
 
-        good, raw = np.empty(self._raw_row.shape, bool), np.ascontiguousarray(bad)
+        valid, raw = np.empty(self._raw_row.shape, bool), np.ascontiguousarray(bad)
 
         def work(piece: slice) -> None:
-            trust(raw, self._raw_row[piece], self._raw_column[piece], np.float32(late), good[piece])
+            mark_valid(
+                raw, self._raw_row[piece], self._raw_column[piece], np.float32(delay), valid[piece]
+            )
 
-        run_blocks(work, len(good), COLUMNS_PER_BLOCK)
-        good &= ~self.camera.dead_columns[:, np.newaxis]
-        return good
+        run_blocks(work, len(valid), COLUMNS_PER_BLOCK)
+        valid &= ~self.camera.dead_columns[:, np.newaxis]
+        return valid
 
     def _require_shape(self, counts: FloatImage) -> None:
         require_width(counts, self.camera)
         if counts.shape != self._raw_row.shape[::-1]:
-            raise ShapeError("a streak image of this camera", self._raw_row.shape[::-1], counts.shape)
+            raise ShapeError(
+                "a streak image of this camera", self._raw_row.shape[::-1], counts.shape
+            )

@@ -24,24 +24,26 @@ class Camera:
     """A row of cylindrical lenslets in front of a line sensor.
 
     Scene point (X, Y), in pixels from the optical axis of view k, falls on slit column
-    ``centres_px[k] + X - Y * tan(angles[k]) + s * view_positions[k]`` where s is the shear in pixels per view step.
+    ``centres_px[k] + X - Y * tan(angles[k]) + s * view_positions[k]`` where s is the shear in
+    pixels per view step.
 
     Parameters
     ----------
     centres_px : (views,) array
         0-based slit column of each view's optical axis; real numbers.
     angles : (views,) array
-        Angle of each view's line response from the vertical, rad. Its sign mirrors the picture: images cannot settle
-        it, the calibration has to say it.
+        Angle of each view's line response from the vertical, rad. Its sign mirrors the picture:
+        images cannot settle it, the calibration has to say it.
     image_shape : (int, int)
-        Rows and columns of the recovered picture. Its optical axis is pixel ``(rows // 2, columns // 2)``.
+        Rows and columns of the recovered picture. Its optical axis is pixel ``(rows // 2, columns
+        // 2)``.
     slit_width_px : int
         Number of columns of the streak image.
     gains : (views,) array, optional
         Relative brightness of the views.
     view_positions : (views,) array, optional
-        Position u_k of each view in view steps, relative to the reference view; defaults to whole steps with 0 at
-        the middle view.
+        Position u_k of each view in view steps, relative to the reference view; defaults to whole
+        steps with 0 at the middle view.
     sweep : Sweep, optional
         How the raw streak image has to be rectified. None: it has to be estimated from the data.
     dead_columns : (slit_width_px,) bool array, optional
@@ -51,21 +53,24 @@ class Camera:
     pulse_fwhm : float
         Full width at half maximum of the instrument's response to a short pulse, s.
     focal_length_px : float
-        Distance from the lenslet to the picture in image pixels, which turns pixels into directions.
+        Distance from the lenslet to the picture in image pixels, which turns pixels into
+        directions.
     lenslet_pitch : float
-        Distance between the viewpoints of neighbouring view steps, m; 0 where the parallax is not known or none.
+        Distance between the viewpoints of neighbouring view steps, m; 0 where the parallax is not
+        known or none.
     focus_distance : float
         Depth at which the views coincide (shear 0), m; may be infinite.
     distortion : (5,) array, optional
-        Lens distortion k1, k2, p1, p2, k3 (Brown and Conrady, in OpenCV's order), of directions x/z and y/z; none by
-        default.
+        Lens distortion k1, k2, p1, p2, k3 (Brown and Conrady, in OpenCV's order), of directions x/z
+        and y/z; none by default.
     centre_uncertainty_px, angle_uncertainty : (views,) array, optional
         One standard deviation of the calibration.
 
     Raises
     ------
     CalibrationError
-        Arrays disagree in length, a number is not finite, a centre lies off the slit, or a gain is not positive.
+        Arrays disagree in length, a number is not finite, a centre lies off the slit, or a gain is
+        not positive.
     """
 
     centres_px: FloatArray
@@ -88,22 +93,26 @@ class Camera:
     def __post_init__(self) -> None:
         views = np.size(self.centres_px)
         steps = np.arange(views, dtype=np.float64) - views // 2
-        self._set("centres_px", self.centres_px)
-        self._set("distortion", self.distortion)
-        self._set("angles", self.angles)
-        self._set("gains", self.gains if np.size(self.gains) else np.ones(views))
-        self._set("view_positions", self.view_positions if np.size(self.view_positions) else steps)
+        self._set_field("centres_px", self.centres_px)
+        self._set_field("distortion", self.distortion)
+        self._set_field("angles", self.angles)
+        self._set_field("gains", self.gains if np.size(self.gains) else np.ones(views))
+        self._set_field(
+            "view_positions", self.view_positions if np.size(self.view_positions) else steps
+        )
         for name in ("centre_uncertainty_px", "angle_uncertainty"):
             known = getattr(self, name)
-            self._set(name, known if np.size(known) else np.full(views, np.nan))
+            self._set_field(name, known if np.size(known) else np.full(views, np.nan))
         dead = np.asarray(self.dead_columns, dtype=bool)
         if dead.size == 0:
             dead = np.zeros(self.slit_width_px, dtype=bool)
         object.__setattr__(self, "dead_columns", dead)
-        object.__setattr__(self, "image_shape", (int(self.image_shape[0]), int(self.image_shape[1])))
+        object.__setattr__(
+            self, "image_shape", (int(self.image_shape[0]), int(self.image_shape[1]))
+        )
         self._validate()
 
-    def _set(self, name: str, value: Any) -> None:
+    def _set_field(self, name: str, value: Any) -> None:
         array = np.array(value, dtype=np.float64)
         array.flags.writeable = False
         object.__setattr__(self, name, array)
@@ -117,7 +126,9 @@ class Camera:
             if values.shape != (views,) or not np.all(np.isfinite(values)):
                 raise CalibrationError(f"{name} must be {views} finite numbers, got {values}")
         if min(self.image_shape) < 1 or self.slit_width_px < 1:
-            raise CalibrationError(f"picture {self.image_shape} and slit {self.slit_width_px} must not be empty")
+            raise CalibrationError(
+                f"picture {self.image_shape} and slit {self.slit_width_px} must not be empty"
+            )
         off = self.centres_px[(self.centres_px < 0) | (self.centres_px > self.slit_width_px - 1)]
         if off.size:
             raise CalibrationError(
@@ -135,11 +146,19 @@ class Camera:
         if np.any(np.abs(self.angles) >= np.pi / 2):
             raise CalibrationError("line angles must lie within 90 degrees of the vertical")
         if not (self.pulse_fwhm > 0 and self.focal_length_px > 0 and np.isfinite(self.time_zero)):
-            raise CalibrationError("pulse width and focal length must be positive, time zero finite")
-        if not (np.isfinite(self.lenslet_pitch) and self.lenslet_pitch >= 0 and self.focus_distance > 0):
-            raise CalibrationError("the lenslet pitch must not be negative, the focus distance must be positive")
+            raise CalibrationError(
+                "pulse width and focal length must be positive, time zero finite"
+            )
+        if not (
+            np.isfinite(self.lenslet_pitch) and self.lenslet_pitch >= 0 and self.focus_distance > 0
+        ):
+            raise CalibrationError(
+                "the lenslet pitch must not be negative, the focus distance must be positive"
+            )
         if self.distortion.shape != (5,) or not np.all(np.isfinite(self.distortion)):
-            raise CalibrationError(f"lens distortion must be 5 finite numbers, got {self.distortion}")
+            raise CalibrationError(
+                f"lens distortion must be 5 finite numbers, got {self.distortion}"
+            )
 
     @property
     def views(self) -> int:
@@ -154,12 +173,14 @@ class Camera:
     def operator(self, shear: float = 0.0, dtype: DTypeLike = np.float32) -> LineProjection:
         """Return F(d), which maps a picture refocused at `shear` onto the slit (supplement Eq. 21).
 
-        Because a line integral turns a 2D shift into a 1D one, refocusing only moves the views on the slit.
+        Because a line integral turns a 2D shift into a 1D one, refocusing only moves the views on
+        the slit.
 
         Parameters
         ----------
         shear : float
-            Pixels per view step; negative for objects nearer than the calibrated depth (SPEC: ``s = -a/d``).
+            Pixels per view step; negative for objects nearer than the calibrated depth (SPEC: ``s =
+            -a/d``).
         dtype : dtype
             float32 or float64.
         """
@@ -175,13 +196,15 @@ class Camera:
     def shear_at(self, distance: ArrayLike) -> FloatArray:
         """Shear of a surface at `distance`, m: ``s(d) = -f * pitch * (1/d - 1/focus_distance)``.
 
-        The distance is the depth z. A range along the line of sight does in its place as long as the field of view is
-        narrow: at an angle a from the axis it is longer by 1/cos(a), 2 % at 11 degrees.
+        The distance is the depth z. A range along the line of sight does in its place as long as
+        the field of view is narrow: at an angle a from the axis it is longer by 1/cos(a), 2 % at 11
+        degrees.
 
         Returns
         -------
         float64 array, as `distance`
-            Pixels per view step; negative nearer than the focus; 0 everywhere where no lenslet pitch is known.
+            Pixels per view step; negative nearer than the focus; 0 everywhere where no lenslet
+            pitch is known.
         """
         nearness = 1 / np.asarray(distance, dtype=np.float64) - 1 / self.focus_distance
         shear: FloatArray = -self.focal_length_px * self.lenslet_pitch * nearness
@@ -191,9 +214,10 @@ class Camera:
     def displacement_per_shear(self) -> tuple[float, float]:
         """(rows, columns) by which a picture moves if it is recovered at a shear of one too little.
 
-        Parallax adds ``s * u_k`` to a view's slit position, ``X - Y * tan(angle_k)``. The part of u_k that is a
-        constant plus a multiple of tan(angle_k) is a translation of the picture, found here by least squares; only the
-        rest defocuses. Where tan(angle) grows evenly along the views (the depth-of-field arrangement) hardly any does.
+        Parallax adds ``s * u_k`` to a view's slit position, ``X - Y * tan(angle_k)``. The part of
+        u_k that is a constant plus a multiple of tan(angle_k) is a translation of the picture,
+        found here by least squares; only the rest defocuses. Where tan(angle) grows evenly along
+        the views (the depth-of-field arrangement) hardly any does.
         """
         if self.views == 1:
             return 0.0, float(self.view_positions[0])
@@ -241,12 +265,16 @@ class Camera:
             slit_width_px=int(record.attribute("slit_width_px")),
             gains=record.array("gains", np.float64, 1),
             view_positions=record.array("view_positions", np.float64, 1, "view step"),
-            sweep=sweep_from_record(record.children["sweep"]) if "sweep" in record.children else None,
+            sweep=sweep_from_record(record.children["sweep"])
+            if "sweep" in record.children
+            else None,
             dead_columns=record.array("dead_columns", np.uint8, 1).astype(bool),
             time_zero=float(record.attribute("time_zero_s")),
             pulse_fwhm=float(record.attribute("pulse_fwhm_s")),
             focal_length_px=float(record.attribute("focal_length_px")),
-            distortion=record.array("distortion", np.float64, 1) if "distortion" in record.fields else np.zeros(5),
+            distortion=record.array("distortion", np.float64, 1)
+            if "distortion" in record.fields
+            else np.zeros(5),
             lenslet_pitch=float(record.attribute("lenslet_pitch_m", 0.0)),
             focus_distance=float(record.attribute("focus_distance_m", np.inf)),
             centre_uncertainty_px=record.array("centre_uncertainty", np.float64, 1, "px"),

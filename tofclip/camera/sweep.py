@@ -1,8 +1,9 @@
 """How the streak tube's sweep distorts the picture, as maps from rectified pixels to raw ones.
 
-A *rectified* streak image has one row per instant, the same for all columns; its columns are the slit's. A sweep says
-where in the *raw* image each rectified pixel lies, so that the raw image is sampled there. Pixel coordinates are
-0-based, pixel centres are whole numbers, row = time, column = slit.
+A *rectified* streak image has one row per instant, the same for all columns; its columns are the
+slit's. A sweep says where in the *raw* image each rectified pixel lies, so that the raw image is
+sampled there. Pixel coordinates are 0-based, pixel centres are whole numbers, row = time, column =
+slit.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ class Sweep(Protocol):
     """Anything that says where a rectified pixel lies in the raw streak image."""
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the raw (row, column) of rectified positions; arguments broadcast against each other."""
+        """Return the raw (row, column) of rectified positions; arguments broadcast against each
+        other.
+        """
         ...
 
     def to_record(self) -> Record:
@@ -35,8 +38,8 @@ class Sweep(Protocol):
 class SkewSweep:
     """A time skew per view: ``raw row = offset_k + (1 + stretch_k) * row`` at each view's centre.
 
-    Between two centres offset and stretch are interpolated linearly, beyond the outer ones they go on linearly: the
-    sweep's distortion is a smooth function of the slit column.
+    Between two centres offset and stretch are interpolated linearly, beyond the outer ones they go
+    on linearly: the sweep's distortion is a smooth function of the slit column.
 
     Parameters
     ----------
@@ -63,8 +66,8 @@ class SkewSweep:
             raise CalibrationError(f"sweep centres must increase, got {self.centres_px}")
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
-        offset = _interpolate_and_extend(column, self.centres_px, self.offsets_bin)
-        stretch = _interpolate_and_extend(column, self.centres_px, self.stretches)
+        offset = _interpolate_linearly(column, self.centres_px, self.offsets_bin)
+        stretch = _interpolate_linearly(column, self.centres_px, self.stretches)
         raw_row, raw_column = np.broadcast_arrays(offset + (1.0 + stretch) * row, column)
         return raw_row, raw_column
 
@@ -91,7 +94,8 @@ class SkewSweep:
 class PolynomialSweep:
     """A bivariate quadratic map, as MATLAB's ``fitgeotrans(..., 'polynomial', 2)`` makes it.
 
-    ``u = c . [1, x, y, x*y, x^2, y^2]`` in normalised 0-based coordinates, x = column, y = row, alike for v = raw row.
+    ``u = c . [1, x, y, x*y, x^2, y^2]`` in normalised 0-based coordinates, x = column, y = row,
+    alike for v = raw row.
 
     Parameters
     ----------
@@ -120,8 +124,8 @@ class PolynomialSweep:
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
         x = (np.asarray(column) - self.rectified_origin[0]) / self.rectified_scale[0]
         y = (np.asarray(row) - self.rectified_origin[1]) / self.rectified_scale[1]
-        u = _quadratic(self.column_coefficients, x, y)
-        v = _quadratic(self.row_coefficients, x, y)
+        u = _evaluate_quadratic(self.column_coefficients, x, y)
+        v = _evaluate_quadratic(self.row_coefficients, x, y)
         return (
             v * self.raw_scale[1] + self.raw_origin[1],
             u * self.raw_scale[0] + self.raw_origin[0],
@@ -195,12 +199,14 @@ def sweep_from_record(record: Record) -> Sweep:
     return kinds[record.kind].from_record(record)
 
 
-def _quadratic(c: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+def _evaluate_quadratic(c: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
     value: FloatArray = c[0] + c[1] * x + c[2] * y + c[3] * x * y + c[4] * x**2 + c[5] * y**2
     return value
 
 
-def _interpolate_and_extend(position: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:
+def _interpolate_linearly(
+    position: FloatArray, knots: FloatArray, values: FloatArray
+) -> FloatArray:
     """Piecewise linear interpolation whose end pieces go on beyond the outer knots."""
     if knots.size == 1:
         return np.full(np.shape(position), values[0])

@@ -1,4 +1,6 @@
-"""Files of the instruments, turned once, at this border, into the objects that the other rooms work with."""
+"""Files of the instruments, turned once, at this border, into the objects that the other rooms work
+with.
+"""
 
 from tofclip.io.streaks import read_streak
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError
-from tofclip.storage import one_line, reading
+from tofclip.storage import format_error_line, translate_read_errors
 
 
 class Archive:
@@ -31,13 +31,17 @@ class Archive:
         self._entries = self._load()
 
     def _load(self) -> Mapping[str, Any]:
-        with reading(self.path):
+        with translate_read_errors(self.path):
             self.path.stat()
         try:
             with np.load(self.path, allow_pickle=False) as archive:
                 return dict(archive)
-        except Exception as fault:  # whatever the decoder stumbles over, it is the file that is damaged
-            raise FileFormatError(self.path, f"is a truncated or damaged NumPy archive ({one_line(fault)})") from fault
+        except (
+            Exception
+        ) as fault:  # whatever the decoder stumbles over, it is the file that is damaged
+            raise FileFormatError(
+                self.path, f"is a truncated or damaged NumPy archive ({format_error_line(fault)})"
+            ) from fault
 
     def __contains__(self, name: str) -> bool:
         return name in self._entries
@@ -53,11 +57,12 @@ class Archive:
         if not fits or found.dtype.kind not in "uif":
             wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
             raise FileFormatError(
-                self.path, f"field '{name}' must be numbers of shape {wanted}, found {found.dtype} of {found.shape}"
+                self.path,
+                f"field '{name}' must be numbers of shape {wanted}, found {found.dtype} of {found.shape}",
             )
         return found
 
-    def finite(self, name: str, *shape: int | None) -> NDArray[np.float64]:
+    def finite_array(self, name: str, *shape: int | None) -> NDArray[np.float64]:
         """Return entry `name` in float64, refusing NaN and infinity; arguments as in `array`."""
         found = self.array(name, *shape).astype(np.float64)
         if not np.all(np.isfinite(found)):
@@ -68,7 +73,9 @@ class Archive:
         """Return entry `name`, a single string."""
         found = np.asarray(self._entries.get(name, 0))
         if found.ndim != 0 or found.dtype.kind != "U":
-            raise FileFormatError(self.path, f"field '{name}' must be a string, found {found.dtype} of {found.shape}")
+            raise FileFormatError(
+                self.path, f"field '{name}' must be a string, found {found.dtype} of {found.shape}"
+            )
         return str(found)
 
     def scalars(self) -> dict[str, str]:

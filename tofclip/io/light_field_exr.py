@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError
-from tofclip.io.light_field_folder import luminance
+from tofclip.io.light_field_folder import compute_luminance
 from tofclip.light_field import LightField
-from tofclip.storage import atomic_path, one_line, reading
+from tofclip.storage import atomic_path, format_error_line, translate_read_errors
 
-NUMBER = r"([-+]?\d+(?:\.\d+)?)"
-PART_NAME = re.compile(rf"v={NUMBER},u={NUMBER}")
+NUMBER_PATTERN = r"([-+]?\d+(?:\.\d+)?)"
+PART_NAME_PATTERN = re.compile(rf"v={NUMBER_PATTERN},u={NUMBER_PATTERN}")
 
 
 def read_exr(path: Path) -> LightField:
@@ -28,17 +28,22 @@ def read_exr(path: Path) -> LightField:
     """
     import OpenEXR
 
-    with reading(path):
+    with translate_read_errors(path):
         path.stat()
     try:
         parts = OpenEXR.File(str(path), separate_channels=True).parts
-        named = [(part.name(), {name: channel.pixels for name, channel in part.channels.items()}) for part in parts]
+        named = [
+            (part.name(), {name: channel.pixels for name, channel in part.channels.items()})
+            for part in parts
+        ]
     except Exception as fault:  # whatever the decoder stumbles over, it is the file that is damaged
-        raise FileFormatError(path, f"is a truncated or damaged OpenEXR file ({one_line(fault)})") from fault
-    pictures = [_picture(path, name, channels) for name, channels in named]
+        raise FileFormatError(
+            path, f"is a truncated or damaged OpenEXR file ({format_error_line(fault)})"
+        ) from fault
+    pictures = [_read_luminance(path, name, channels) for name, channels in named]
     if len({picture.shape for picture in pictures}) != 1:
         raise FileFormatError(path, "its parts differ in size; every view must have as many pixels")
-    return LightField(np.stack(pictures), np.array([_view(path, name) for name, _ in named]))
+    return LightField(np.stack(pictures), np.array([_parse_view(path, name) for name, _ in named]))
 
 
 def write_exr(light_field: LightField, path: Path) -> None:
@@ -47,24 +52,31 @@ def write_exr(light_field: LightField, path: Path) -> None:
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     parts = [
-        # The library writes wrong pixels of arrays that are not contiguous, and the part's name into the header.
-        OpenEXR.Part(dict(header), {"Y": np.ascontiguousarray(picture, np.float32)}, f"v={v:g},u={u:g}")
+        # The library writes wrong pixels of arrays that are not contiguous, and the part's name
+        # into the header.
+        OpenEXR.Part(
+            dict(header), {"Y": np.ascontiguousarray(picture, np.float32)}, f"v={v:g},u={u:g}"
+        )
         for picture, (v, u) in zip(light_field.pictures, light_field.views.tolist(), strict=True)
     ]
     with atomic_path(path) as temporary:
         OpenEXR.File(parts).write(str(temporary))
 
 
-def _view(path: Path, name: str) -> tuple[float, float]:
-    found = PART_NAME.fullmatch(name)
+def _parse_view(path: Path, name: str) -> tuple[float, float]:
+    found = PART_NAME_PATTERN.fullmatch(name)
     if found is None:
-        raise FileFormatError(path, f"part '{name}' does not say which view it is; name it like 'v=0,u=-1'")
+        raise FileFormatError(
+            path, f"part '{name}' does not say which view it is; name it like 'v=0,u=-1'"
+        )
     return float(found[1]), float(found[2])
 
 
-def _picture(path: Path, name: str, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
+def _read_luminance(path: Path, name: str, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
     if "Y" in channels:
         return channels["Y"].astype(np.float32)
     if not {"R", "G", "B"} <= channels.keys():
-        raise FileFormatError(path, f"part '{name}' needs a channel Y or R, G and B, found {', '.join(channels)}")
-    return luminance(np.stack([channels[colour] for colour in "RGB"], axis=-1))
+        raise FileFormatError(
+            path, f"part '{name}' needs a channel Y or R, G and B, found {', '.join(channels)}"
+        )
+    return compute_luminance(np.stack([channels[colour] for colour in "RGB"], axis=-1))

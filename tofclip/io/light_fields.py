@@ -12,7 +12,7 @@ from tofclip.io.archive import Archive
 from tofclip.io.light_field_exr import read_exr, write_exr
 from tofclip.io.light_field_folder import read_folder
 from tofclip.light_field import LightField
-from tofclip.storage import Field, Record, provenance
+from tofclip.storage import Field, Record, collect_provenance
 
 
 def read_light_field(path: str | Path) -> LightField:
@@ -21,9 +21,9 @@ def read_light_field(path: str | Path) -> LightField:
     Parameters
     ----------
     path : path-like
-        ``.npz``: `lf` (v, u, y, x), `scale`, a factor for it, and the view numbers `v` and `u`. ``.h5``, ``.hdf5``:
-        written by `write_light_field`. ``.exr``: one part for each view, named ``v=0,u=-1``. A folder: one picture
-        for each view, see `tofclip.io.light_field_folder`.
+        ``.npz``: `lf` (v, u, y, x), `scale`, a factor for it, and the view numbers `v` and `u`.
+        ``.h5``, ``.hdf5``: written by `write_light_field`. ``.exr``: one part for each view, named
+        ``v=0,u=-1``. A folder: one picture for each view, see `tofclip.io.light_field_folder`.
 
     Raises
     ------
@@ -39,12 +39,15 @@ def read_light_field(path: str | Path) -> LightField:
         raise StorageError(f"{source}: no such file or folder")
     reader = _READERS.get(source.suffix.lower())
     if reader is None:
-        raise FileFormatError(source, f"is no light field; take a folder of pictures or {', '.join(_READERS)}")
+        raise FileFormatError(
+            source, f"is no light field; take a folder of pictures or {', '.join(_READERS)}"
+        )
     return reader(source)
 
 
 def write_light_field(light_field: LightField, path: str | Path) -> None:
-    """Write a light field, whole or not at all, as ``.h5``, ``.hdf5`` or ``.exr`` (float32 values, ZIP compression).
+    """Write a light field, whole or not at all, as ``.h5``, ``.hdf5`` or ``.exr`` (float32 values,
+    ZIP compression).
 
     Raises
     ------
@@ -63,8 +66,11 @@ def write_light_field(light_field: LightField, path: str | Path) -> None:
 def _read_archive(path: Path) -> LightField:
     archive = Archive(path)
     pictures = archive.array("lf", None, None, None, None)
-    v, u = archive.finite("v", pictures.shape[0]), archive.finite("u", pictures.shape[1])
-    scaled = pictures.astype(np.float32) * np.float32(archive.finite("scale"))
+    v, u = (
+        archive.finite_array("v", pictures.shape[0]),
+        archive.finite_array("u", pictures.shape[1]),
+    )
+    scaled = pictures.astype(np.float32) * np.float32(archive.finite_array("scale"))
     grid = np.stack(np.meshgrid(v, u, indexing="ij"), axis=-1)
     return LightField(scaled.reshape(-1, *pictures.shape[2:]), grid.reshape(-1, 2))
 
@@ -79,7 +85,7 @@ def _write_record(light_field: LightField, path: Path) -> None:
         "pictures": Field(light_field.pictures.astype(np.float32), "", ("view", "y", "x")),
         "views": Field(light_field.views, "", ("view", "vu")),
     }
-    Record("light_field", fields, provenance=provenance({})).save(path)
+    Record("light_field", fields, provenance=collect_provenance({})).save(path)
 
 
 _READERS: dict[str, Callable[[Path], LightField]] = {

@@ -13,14 +13,14 @@ from tofclip.io.itex import read_itex
 from tofclip.io.lift import read_lift
 from tofclip.io.tiff import read_tiff
 from tofclip.shots import Streak
-from tofclip.storage import SIGNATURE, provenance, reading
+from tofclip.storage import HDF5_SIGNATURE, collect_provenance, translate_read_errors
 
 # A file is known by its first bytes: suffixes get lost and lie.
 READERS: dict[bytes, Callable[[str | Path], Streak]] = {
     b"II*\0": read_tiff,
     b"MM\0*": read_tiff,
     b"PK\x03\x04": read_lift,
-    SIGNATURE: Streak.load,
+    HDF5_SIGNATURE: Streak.load,
     ITEX_SIGNATURE: read_itex,
 }
 
@@ -28,15 +28,16 @@ READERS: dict[bytes, Callable[[str | Path], Streak]] = {
 def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
     """Read a streak image: rows are instants, columns are slit pixels.
 
-    The format is recognised by content: a TIFF of Hamamatsu's HPD-TA with its text and time axis, the same program's
-    ITEX (``.img``), any other grey TIFF (no time axis), a LIFT archive (``.npz``) with its camera, or a streak image of
-    our own (HDF5).
+    The format is recognised by content: a TIFF of Hamamatsu's HPD-TA with its text and time axis,
+    the same program's ITEX (``.img``), any other grey TIFF (no time axis), a LIFT archive
+    (``.npz``) with its camera, or a streak image of our own (HDF5).
 
     Parameters
     ----------
     path : path-like
     bin_width : float, optional
-        Duration of a row, s. Overrides the file's own time axis: rows are then evenly spaced, the first at 0.
+        Duration of a row, s. Overrides the file's own time axis: rows are then evenly spaced, the
+        first at 0.
 
     Returns
     -------
@@ -53,17 +54,17 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
     InputError
         Its pixels hold NaN, are all zero, all saturated, or negative where counts cannot be.
     """
-    streak = _reader_of(path)(path)
+    streak = _select_reader(path)(path)
     if bin_width is not None:
         streak = streak.with_bin_width(bin_width)
-    history = provenance({"bin_width_s": bin_width}, path)
+    history = collect_provenance({"bin_width_s": bin_width}, path)
     if streak.provenance:
         history["earlier"] = dict(streak.provenance)
     return replace(streak, provenance=history)
 
 
-def _reader_of(path: str | Path) -> Callable[[str | Path], Streak]:
-    with reading(path), open(path, "rb") as file:
+def _select_reader(path: str | Path) -> Callable[[str | Path], Streak]:
+    with translate_read_errors(path), open(path, "rb") as file:
         start = file.read(8)
     if not start:
         raise FileFormatError(path, "is empty")
@@ -72,5 +73,6 @@ def _reader_of(path: str | Path) -> Callable[[str | Path], Streak]:
             return reader
     size = os.path.getsize(path)
     raise FileFormatError(
-        path, f"is no TIFF, ITEX (.img), LIFT archive (.npz) or HDF5 streak image ({size} bytes of something else)"
+        path,
+        f"is no TIFF, ITEX (.img), LIFT archive (.npz) or HDF5 streak image ({size} bytes of something else)",
     )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io import hpdta
 from tofclip.shots import Streak
-from tofclip.storage import one_line, reading
+from tofclip.storage import format_error_line, translate_read_errors
 
 if TYPE_CHECKING:
     import tifffile
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
 MAX_PIXELS = 1 << 28
 """A damaged header may claim any size; no streak camera has a sensor larger than this."""
 
-QUIET = logging.NullHandler()
+NULL_LOG_HANDLER = logging.NullHandler()
 
 
 def read_tiff(path: str | Path) -> Streak:
     """Read a streak image from a TIFF with one grey picture; see `tofclip.io.read_streak`.
 
-    HPD-TA's text and time axis are used where present (`tofclip.io.hpdta`). Integer pixels at the sensor's limit are
-    marked in ``Streak.saturated``; floating-point pictures have no such limit.
+    HPD-TA's text and time axis are used where present (`tofclip.io.hpdta`). Integer pixels at the
+    sensor's limit are marked in ``Streak.saturated``; floating-point pictures have no such limit.
     """
-    pixels, text, date = _decode(path)
+    pixels, text, date = _decode_page(path)
     metadata: dict[str, str] = {"DateTime": date} if date else {}
     times = None
     if hpdta.is_hpdta(text):
         metadata |= hpdta.parse_text(text)
-        times = hpdta.row_times(metadata, path, pixels.shape[0])
+        times = hpdta.read_row_times(metadata, path, pixels.shape[0])
     negative = int(np.count_nonzero(pixels < 0))
     if negative:
         raise InputError(
@@ -44,40 +44,48 @@ def read_tiff(path: str | Path) -> Streak:
     return Streak(
         counts=pixels,
         row_times=times,
-        saturated=hpdta.saturated_pixels(pixels, metadata, path),
+        saturated=hpdta.find_saturated_pixels(pixels, metadata, path),
         metadata=metadata,
         source=str(path),
     )
 
 
-def _decode(path: str | Path) -> tuple[NDArray[Any], str, str]:
+def _decode_page(path: str | Path) -> tuple[NDArray[Any], str, str]:
     """Return pixels, image description and date of the only picture in the file."""
     import tifffile
 
     # Without a handler its complaints go to standard error, ahead of the one line that we raise.
-    logging.getLogger("tifffile").addHandler(QUIET)
-    with reading(path), open(path, "rb") as file:
+    logging.getLogger("tifffile").addHandler(NULL_LOG_HANDLER)
+    with translate_read_errors(path), open(path, "rb") as file:
         try:
             with tifffile.TiffFile(file) as tiff:
-                page = _only_page(tiff, path)
+                page = _check_only_page(tiff, path)
                 date = page.tags.get("DateTime")
                 return page.asarray(), page.description, "" if date is None else str(date.value)
         except FileFormatError:
             raise
-        except Exception as fault:  # whatever the decoder stumbles over, it is the file that is damaged
-            raise FileFormatError(path, f"is a damaged or unsupported TIFF ({one_line(fault)})") from fault
+        except (
+            Exception
+        ) as fault:  # whatever the decoder stumbles over, it is the file that is damaged
+            raise FileFormatError(
+                path, f"is a damaged or unsupported TIFF ({format_error_line(fault)})"
+            ) from fault
 
 
-def _only_page(tiff: tifffile.TiffFile, path: str | Path) -> tifffile.TiffPage:
+def _check_only_page(tiff: tifffile.TiffFile, path: str | Path) -> tifffile.TiffPage:
     """Hold what the header claims against the file before any memory is taken for it."""
     page, size = tiff.pages.first, tiff.filehandle.size
     if len(tiff.pages) != 1:
         raise FileFormatError(path, f"holds {len(tiff.pages)} pictures, expected one streak image")
     if page.ndim != 2 or page.dtype is None or page.dtype.kind not in "uif":
-        raise FileFormatError(path, f"holds a picture of shape {page.shape}, expected grey (rows, columns)")
+        raise FileFormatError(
+            path, f"holds a picture of shape {page.shape}, expected grey (rows, columns)"
+        )
     if not 0 < page.size <= MAX_PIXELS:
         raise FileFormatError(path, f"claims an impossible size of {page.shape} pixels")
     end = max(map(sum, zip(page.dataoffsets, page.databytecounts, strict=True)), default=0)
     if end > size or (page.compression == 1 and sum(page.databytecounts) < page.nbytes):
-        raise FileFormatError(path, f"is truncated: {page.shape} pixels of {page.dtype} do not fit into {size} bytes")
+        raise FileFormatError(
+            path, f"is truncated: {page.shape} pixels of {page.dtype} do not fit into {size} bytes"
+        )
     return page

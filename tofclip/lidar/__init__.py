@@ -3,9 +3,18 @@
 from tofclip.lidar.cloud import PointCloud, point_cloud
 from tofclip.lidar.depth_exr import save_depth
 from tofclip.lidar.detection import Detection
-from tofclip.lidar.geometry import ray_directions
+from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.returns import Returns
 from tofclip.lidar.search import depth
 
-__all__ = ["Detection", "PointCloud", "Pulse", "Returns", "depth", "point_cloud", "ray_directions", "save_depth"]
+__all__ = [
+    "Detection",
+    "PointCloud",
+    "Pulse",
+    "Returns",
+    "compute_ray_directions",
+    "depth",
+    "point_cloud",
+    "save_depth",
+]

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.lidar import export
 from tofclip.lidar.column import Column
-from tofclip.lidar.geometry import ray_directions
+from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.returns import Returns
 from tofclip.storage import Field, Record
 
-UNITS = {
+COLUMN_UNITS = {
     "x": "m",
     "y": "m",
     "z": "m",
@@ -32,7 +32,8 @@ UNITS = {
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points in the reference view's frame: x right, y down, z forward, origin at the reference lenslet.
+    """Points in the reference view's frame: x right, y down, z forward, origin at the reference
+    lenslet.
 
     Parameters
     ----------
@@ -88,8 +89,8 @@ class PointCloud:
         Parameters
         ----------
         path : path-like
-            ``.ply`` and ``.pcd`` (binary, little endian), ``.csv``, ``.npz``, ``.las``, ``.laz`` (both need
-            laspy), or ``.h5`` (with provenance).
+            ``.ply`` and ``.pcd`` (binary, little endian), ``.csv``, ``.npz``, ``.las``, ``.laz``
+            (both need laspy), or ``.h5`` (with provenance).
 
         Raises
         ------
@@ -101,7 +102,7 @@ class PointCloud:
         if Path(path).suffix.lower() == ".h5":
             self.to_record().save(path)
         else:
-            export.write(path, self._columns())
+            export.write_table(path, self._columns())
 
     @classmethod
     def load(cls, path: str | Path) -> PointCloud:
@@ -110,55 +111,65 @@ class PointCloud:
         Raises
         ------
         InputError, StorageError, FileFormatError
-            A suffix of no known format, a file that cannot be read, or one that is damaged or lacks a column.
+            A suffix of no known format, a file that cannot be read, or one that is damaged or lacks
+            a column.
         """
         if Path(path).suffix.lower() == ".h5":
             return cls.from_record(Record.load(path, "cloud"))
-        values = export.read(path)
-        missing = [name for name in UNITS if name not in values]
+        values = export.read_table(path)
+        missing = [name for name in COLUMN_UNITS if name not in values]
         if missing:
-            raise FileFormatError(path, f"has no column '{missing[0]}': it was not written by tofclip")
+            raise FileFormatError(
+                path, f"has no column '{missing[0]}': it was not written by tofclip"
+            )
         positions = np.stack([values.pop(axis) for axis in "xyz"], axis=-1)
-        properties: dict[str, Any] = {name: values[name] for name in UNITS if name not in "xyz"}
+        properties: dict[str, Any] = {
+            name: values[name] for name in COLUMN_UNITS if name not in "xyz"
+        }
         return cls(xyz=positions, **properties)
 
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
         fields = {"xyz": Field(self.xyz, "m", ("point", "xyz"))}
-        for name in UNITS:
+        for name in COLUMN_UNITS:
             if name not in "xyz":
-                fields[name] = Field(getattr(self, name), UNITS[name], ("point",))
+                fields[name] = Field(getattr(self, name), COLUMN_UNITS[name], ("point",))
         return Record("cloud", fields, provenance=self.provenance)
 
     @classmethod
     def from_record(cls, record: Record) -> PointCloud:
         """Rebuild a point cloud from what was stored."""
         columns: dict[str, Any] = {
-            name: record.array(name, np.uint8 if name == "return_number" else np.float32, 1, UNITS[name])
-            for name in UNITS
+            name: record.array(
+                name, np.uint8 if name == "return_number" else np.float32, 1, COLUMN_UNITS[name]
+            )
+            for name in COLUMN_UNITS
             if name not in "xyz"
         }
-        return cls(xyz=record.array("xyz", np.float32, 2, "m"), provenance=record.provenance, **columns)
+        return cls(
+            xyz=record.array("xyz", np.float32, 2, "m"), provenance=record.provenance, **columns
+        )
 
     def _columns(self) -> list[Column]:
         values = dict(zip("xyz", self.xyz.T, strict=True))
         return [
-            Column(name, unit, values[name] if name in values else getattr(self, name)) for name, unit in UNITS.items()
+            Column(name, unit, values[name] if name in values else getattr(self, name))
+            for name, unit in COLUMN_UNITS.items()
         ]
 
 
 def point_cloud(returns: Returns) -> PointCloud:
     """Place every return in space: its range along the direction in which its pixel looks.
 
-    Heights that parallax displaced, because the picture was recovered at another shear than that of its range, are put
-    right where the camera knows its lenslet pitch.
+    Heights that parallax displaced, because the picture was recovered at another shear than that of
+    its range, are put right where the camera knows its lenslet pitch.
 
     Parameters
     ----------
-    returns : Returns
+    find_returns : Returns
         Radial distances with their camera.
     """
-    directions = ray_directions(returns.camera, *returns.line_of_sight_px)
+    directions = compute_ray_directions(returns.camera, *returns.line_of_sight_px)
     return PointCloud(
         xyz=(directions * returns.range[:, np.newaxis]).astype(np.float32),
         intensity=returns.intensity,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tofclip.lidar.geometry import ray_directions
+from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.returns import Returns
 from tofclip.storage import atomic_path
 
@@ -14,12 +14,13 @@ from tofclip.storage import atomic_path
 def save_depth(returns: Returns, path: str | Path) -> None:
     """Write each pixel's most intense return to an OpenEXR file, whole or not at all.
 
-    Channel ``Z`` is the depth along the optical axis in metres, infinite where nothing came back, as renderers have it;
-    ``Y`` the intensity in counts referred to 1 m, 0 there. Both are 32-bit floats, uncompressed.
+    Channel ``Z`` is the depth along the optical axis in metres, infinite where nothing came back,
+    as renderers have it; ``Y`` the intensity in counts referred to 1 m, 0 there. Both are 32-bit
+    floats, uncompressed.
 
     Parameters
     ----------
-    returns : Returns
+    find_returns : Returns
     path : path-like
         Ends in ``.exr``.
     """
@@ -29,7 +30,7 @@ def save_depth(returns: Returns, path: str | Path) -> None:
     seen = np.isfinite(distance)
     rows, columns = np.nonzero(seen)
     depth = np.full(distance.shape, np.inf, dtype=np.float32)
-    depth[seen] = distance[seen] * ray_directions(returns.camera, rows, columns)[:, 2]
+    depth[seen] = distance[seen] * compute_ray_directions(returns.camera, rows, columns)[:, 2]
     brightness = np.where(seen, intensity, 0).astype(np.float32)
     header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
     channels = {"Z": np.ascontiguousarray(depth), "Y": np.ascontiguousarray(brightness)}

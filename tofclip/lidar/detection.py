@@ -13,7 +13,9 @@ from tofclip.errors import InputError
 FloatArray = NDArray[np.float64]
 
 SLOTS_PER_WIDTH = 4
-BRIGHT_QUANTILE = 0.999  # the scene's brightness is that of its brightest pixels, but not of a single glint
+SCENE_BRIGHTNESS_QUANTILE = (
+    0.999  # the scene's brightness is that of its brightest pixels, but not of a single glint
+)
 
 
 @dataclass(frozen=True)
@@ -24,14 +26,16 @@ class Detection:
     ----------
     signal_to_noise : float
         Least response of the matched filter, in standard deviations of the pixel's background.
-    share_of_scene : float
+    min_scene_fraction : float
         Least intensity relative to the brightest returns of the scene.
-    share_of_instant : float
-        Least intensity relative to the brightest return of any pixel at the same instant, within a pulse width:
-        leaves out the streaks that recovery from few views draws across a frame around its bright objects.
-    share_of_pixel : float
-        Least intensity relative to the pixel's strongest return: leaves out echoes inside the instrument.
-    most_returns : int
+    min_time_bin_fraction : float
+        Least intensity relative to the brightest return of any pixel at the same instant, within a
+        pulse width: leaves out the streaks that recovery from few views draws across a frame around
+        its bright objects.
+    min_pixel_fraction : float
+        Least intensity relative to the pixel's strongest return: leaves out echoes inside the
+        instrument.
+    max_returns : int
         At most so many returns in a pixel, the strongest.
 
     Raises
@@ -41,21 +45,23 @@ class Detection:
     """
 
     signal_to_noise: float = 5.0
-    share_of_scene: float = 0.05
-    share_of_instant: float = 0.12
-    share_of_pixel: float = 0.2
-    most_returns: int = 4
+    min_scene_fraction: float = 0.05
+    min_time_bin_fraction: float = 0.12
+    min_pixel_fraction: float = 0.2
+    max_returns: int = 4
 
     def __post_init__(self) -> None:
         if not self.signal_to_noise >= 0:
-            raise InputError(f"the signal-to-noise limit must not be negative, got {self.signal_to_noise}")
-        for share in (self.share_of_scene, self.share_of_instant, self.share_of_pixel):
+            raise InputError(
+                f"the signal-to-noise limit must not be negative, got {self.signal_to_noise}"
+            )
+        for share in (self.min_scene_fraction, self.min_time_bin_fraction, self.min_pixel_fraction):
             if not 0 <= share <= 1:
                 raise InputError(f"a share must lie between 0 and 1, got {share}")
-        if not 1 <= self.most_returns <= 255:
-            raise InputError(f"a pixel can have 1 to 255 returns, got {self.most_returns}")
+        if not 1 <= self.max_returns <= 255:
+            raise InputError(f"a pixel can have 1 to 255 returns, got {self.max_returns}")
 
-    def significant(
+    def find_significant(
         self, pixel: NDArray[np.int64], time: FloatArray, intensity: FloatArray, pulse_width: float
     ) -> NDArray[np.bool_]:
         """Say which candidates are strong enough.
@@ -75,15 +81,23 @@ class Detection:
             return np.zeros(0, dtype=bool)
         strongest = np.zeros(int(pixel.max()) + 1)
         np.maximum.at(strongest, pixel, intensity)
-        scene = np.quantile(strongest[strongest > 0], BRIGHT_QUANTILE)
-        needed = np.maximum(self.share_of_scene * scene, self.share_of_pixel * strongest[pixel])
-        np.maximum(needed, self.share_of_instant * _brightest_around(time, intensity, pulse_width), out=needed)
+        scene = np.quantile(strongest[strongest > 0], SCENE_BRIGHTNESS_QUANTILE)
+        needed = np.maximum(
+            self.min_scene_fraction * scene, self.min_pixel_fraction * strongest[pixel]
+        )
+        np.maximum(
+            needed,
+            self.min_time_bin_fraction * _find_local_maximum(time, intensity, pulse_width),
+            out=needed,
+        )
         strong: NDArray[np.bool_] = intensity >= needed
         return strong
 
 
-def _brightest_around(time: FloatArray, intensity: FloatArray, width: float) -> FloatArray:
-    """Largest intensity among the candidates within `width` of each instant, to a quarter of a width."""
+def _find_local_maximum(time: FloatArray, intensity: FloatArray, width: float) -> FloatArray:
+    """Largest intensity among the candidates within `width` of each instant, to a quarter of a
+    width.
+    """
     slot = np.round((time - time.min()) / (width / SLOTS_PER_WIDTH)).astype(np.intp)
     brightest = np.zeros(int(slot.max()) + 1)
     np.maximum.at(brightest, slot, intensity)

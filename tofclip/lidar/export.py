@@ -1,6 +1,7 @@
 """Tables of points in the formats that other programs read: PLY, PCD, CSV, NPZ, LAS and LAZ.
 
-Every file says the units of its columns: PLY and PCD in a comment, CSV and NPZ in the columns' names (``x_m``).
+Every file says the units of its columns: PLY and PCD in a comment, CSV and NPZ in the columns'
+names (``x_m``).
 """
 
 from __future__ import annotations
@@ -15,28 +16,30 @@ import numpy as np
 from tofclip.errors import FileFormatError, InputError
 from tofclip.lidar.column import Columns, Table
 from tofclip.lidar.las import read_las, write_las
-from tofclip.storage import atomic_path, reading
+from tofclip.storage import atomic_path, translate_read_errors
 
 PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1"}
 PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8", ("U", "1"): "u1"}
-LONGEST_HEADER = 1 << 16
+MAX_HEADER_BYTES = 1 << 16
 
 
-def write(path: str | Path, columns: Columns) -> None:
+def write_table(path: str | Path, columns: Columns) -> None:
     """Write columns to the format that the suffix of `path` names, whole or not at all."""
-    writer = _format_of(path)[0]
+    writer = _look_up_format(path)[0]
     with atomic_path(path) as temporary:
         writer(temporary, columns)
 
 
-def read(path: str | Path) -> Table:
-    """Read a table that `write` wrote: its columns by their names, without units."""
-    reader = _format_of(path)[1]
-    with reading(path):
+def read_table(path: str | Path) -> Table:
+    """Read a table that `write_table` wrote: its columns by their names, without units."""
+    reader = _look_up_format(path)[1]
+    with translate_read_errors(path):
         return reader(Path(path))
 
 
-def _format_of(path: str | Path) -> tuple[Callable[[Path, Columns], None], Callable[[Path], Table]]:
+def _look_up_format(
+    path: str | Path,
+) -> tuple[Callable[[Path, Columns], None], Callable[[Path], Table]]:
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
         known = ", ".join([*FORMATS, ".h5"])
@@ -46,7 +49,7 @@ def _format_of(path: str | Path) -> tuple[Callable[[Path, Columns], None], Calla
 
 def _write_ply(path: Path, columns: Columns) -> None:
     names = {np.dtype(code): name for name, code in PLY_TYPES.items()}
-    lines = ["ply", "format binary_little_endian 1.0", f"comment units: {_units(columns)}"]
+    lines = ["ply", "format binary_little_endian 1.0", f"comment units: {_format_units(columns)}"]
     lines += [f"element vertex {columns[0].values.size}"]
     lines += [f"property {names[column.values.dtype]} {column.name}" for column in columns]
     _write_binary(path, [*lines, "end_header"], columns)
@@ -58,7 +61,7 @@ def _write_pcd(path: Path, columns: Columns) -> None:
     types, sizes = zip(*(kinds[column.values.dtype] for column in columns), strict=True)
     lines = [
         "# .PCD v0.7 - Point Cloud Data file format",
-        f"# units: {_units(columns)}",
+        f"# units: {_format_units(columns)}",
         "VERSION 0.7",
         "FIELDS " + " ".join(column.name for column in columns),
         "SIZE " + " ".join(sizes),
@@ -85,7 +88,7 @@ def _write_npz(path: Path, columns: Columns) -> None:
     np.savez_compressed(path, **arrays)
 
 
-def _units(columns: Columns) -> str:
+def _format_units(columns: Columns) -> str:
     return ", ".join(f"{column.name} {column.unit}" for column in columns if column.unit)
 
 
@@ -101,19 +104,19 @@ def _write_binary(path: Path, header: list[str], columns: Columns) -> None:
 
 def _read_ply(path: Path) -> Table:
     with open(path, "rb") as file:
-        lines = _header(file, path, "ply", "end_header")
+        lines = _read_header(file, path, "ply", "end_header")
         if ["format", "binary_little_endian", "1.0"] not in lines:
             raise FileFormatError(path, "is no binary little-endian PLY file")
         elements = [line for line in lines if line[0] == "element"]
         if len(elements) != 1 or elements[0][1] != "vertex":
             raise FileFormatError(path, "must hold vertices and nothing else")
         properties = [(line[-1], PLY_TYPES.get(line[1])) for line in lines if line[0] == "property"]
-        return _rows(file, path, properties, elements[0][2])
+        return _read_rows(file, path, properties, elements[0][2])
 
 
 def _read_pcd(path: Path) -> Table:
     with open(path, "rb") as file:
-        entries = {line[0]: line[1:] for line in _header(file, path, "#", "DATA")}
+        entries = {line[0]: line[1:] for line in _read_header(file, path, "#", "DATA")}
         if entries["DATA"] != ["binary"]:
             raise FileFormatError(path, "is no binary PCD file")
         try:
@@ -122,7 +125,7 @@ def _read_pcd(path: Path) -> Table:
             points = entries["POINTS"][0]
         except (KeyError, ValueError, IndexError) as fault:
             raise FileFormatError(path, "has an incomplete PCD header") from fault
-        return _rows(file, path, properties, points)
+        return _read_rows(file, path, properties, points)
 
 
 def _read_csv(path: Path) -> Table:
@@ -135,35 +138,39 @@ def _read_csv(path: Path) -> Table:
         raise FileFormatError(path, f"holds something that is no number ({fault})") from fault
     if table.shape[1] != len(labels):
         raise FileFormatError(path, f"names {len(labels)} columns, holds {table.shape[1]}")
-    return {_without_unit(label): column for label, column in zip(labels, table.T, strict=True)}
+    return {_strip_unit(label): column for label, column in zip(labels, table.T, strict=True)}
 
 
 def _read_npz(path: Path) -> Table:
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            return {_without_unit(label): arrays[label] for label in arrays.files}
+            return {_strip_unit(label): arrays[label] for label in arrays.files}
     except (ValueError, EOFError, zipfile.BadZipFile, AttributeError) as fault:
         raise FileFormatError(path, "is no NumPy archive, or a damaged one") from fault
 
 
-def _without_unit(label: str) -> str:
+def _strip_unit(label: str) -> str:
     name, _, unit = label.rpartition("_")
     return name if unit in ("m", "s", "count") else label
 
 
-def _header(file: BinaryIO, path: Path, first: str, last: str) -> list[list[str]]:
+def _read_header(file: BinaryIO, path: Path, first: str, last: str) -> list[list[str]]:
     """Words of each header line, up to and including the one that begins with `last`."""
     lines: list[list[str]] = []
     while not lines or lines[-1][0] != last:
-        line = file.readline(LONGEST_HEADER)
+        line = file.readline(MAX_HEADER_BYTES)
         words = line.decode("ascii", errors="replace").split()
-        if not words or (not lines and words[0] != first) or file.tell() > LONGEST_HEADER:
-            raise FileFormatError(path, f"is no {path.suffix[1:].upper()} file, or its header is damaged")
+        if not words or (not lines and words[0] != first) or file.tell() > MAX_HEADER_BYTES:
+            raise FileFormatError(
+                path, f"is no {path.suffix[1:].upper()} file, or its header is damaged"
+            )
         lines.append(words)
     return lines
 
 
-def _rows(file: BinaryIO, path: Path, properties: list[tuple[str, str | None]], points: str) -> Table:
+def _read_rows(
+    file: BinaryIO, path: Path, properties: list[tuple[str, str | None]], points: str
+) -> Table:
     """Read the binary rows behind a header."""
     if any(code is None for _, code in properties) or not points.isdecimal():
         raise FileFormatError(path, "has columns of a type that tofclip does not write")
@@ -171,7 +178,8 @@ def _rows(file: BinaryIO, path: Path, properties: list[tuple[str, str | None]], 
     content = file.read()
     if len(content) != int(points) * layout.itemsize:
         raise FileFormatError(
-            path, f"should hold {points} points of {layout.itemsize} bytes, found {len(content)} bytes"
+            path,
+            f"should hold {points} points of {layout.itemsize} bytes, found {len(content)} bytes",
         )
     rows = np.frombuffer(content, layout)
     return {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names or ()}

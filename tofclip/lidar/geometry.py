@@ -8,14 +8,17 @@ from numpy.typing import ArrayLike, NDArray
 from tofclip.camera import Camera
 from tofclip.errors import CalibrationError
 
-ROUNDS = 50
-CONVERGED = 1e-10  # in units of the focal length; far below a thousandth of a pixel
+MAX_ITERATIONS = 50
+CONVERGENCE_TOLERANCE = 1e-10  # in units of the focal length; far below a thousandth of a pixel
 
 
-def ray_directions(camera: Camera, rows: ArrayLike, columns: ArrayLike) -> NDArray[np.float64]:
+def compute_ray_directions(
+    camera: Camera, rows: ArrayLike, columns: ArrayLike
+) -> NDArray[np.float64]:
     """Direction in which each pixel of the reference view looks.
 
-    A pinhole ``((column - column_0) / f, (row - row_0) / f, 1)``, normalised, with the camera's lens distortion undone.
+    A pinhole ``((column - column_0) / f, (row - row_0) / f, 1)``, normalised, with the camera's
+    lens distortion undone.
 
     Parameters
     ----------
@@ -38,13 +41,13 @@ def ray_directions(camera: Camera, rows: ArrayLike, columns: ArrayLike) -> NDArr
     right = (np.asarray(columns, dtype=np.float64) - axis_column) / camera.focal_length_px
     down = (np.asarray(rows, dtype=np.float64) - axis_row) / camera.focal_length_px
     if camera.distortion.any():
-        right, down = undistorted(right, down, camera.distortion)
+        right, down = undistort_directions(right, down, camera.distortion)
     directions = np.stack([right, down, np.ones_like(right)], axis=-1)
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     return directions
 
 
-def distorted(
+def distort_directions(
     right: NDArray[np.float64], down: NDArray[np.float64], coefficients: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where a lens puts the direction (right, down, 1), in units of the focal length.
@@ -53,7 +56,8 @@ def distorted(
     ----------
     right, down : (n,) array
     coefficients : (5,) array
-        k1, k2, p1, p2, k3 of D. C. Brown, "Close-range camera calibration", Photogramm. Eng. 37, 855 (1971).
+        k1, k2, p1, p2, k3 of D. C. Brown, "Close-range camera calibration", Photogramm. Eng. 37,
+        855 (1971).
     """
     k1, k2, p1, p2, k3 = coefficients
     square = right**2 + down**2
@@ -64,17 +68,19 @@ def distorted(
     )
 
 
-def undistorted(
+def undistort_directions(
     right: NDArray[np.float64], down: NDArray[np.float64], coefficients: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Undo `distorted`, by a fixed-point iteration."""
+    """Undo `distort_directions`, by a fixed-point iteration."""
     x, y = right.copy(), down.copy()
     with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(ROUNDS):
-            seen_x, seen_y = distorted(x, y, coefficients)
+        for _ in range(MAX_ITERATIONS):
+            seen_x, seen_y = distort_directions(x, y, coefficients)
             x += right - seen_x
             y += down - seen_y
         left = np.hypot(right - seen_x, down - seen_y).max(initial=0.0)
-    if not left < CONVERGED:
-        raise CalibrationError("the camera's lens distortion is too strong to be undone within the picture")
+    if not left < CONVERGENCE_TOLERANCE:
+        raise CalibrationError(
+            "the camera's lens distortion is too strong to be undone within the picture"
+        )
     return x, y

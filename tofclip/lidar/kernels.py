@@ -1,6 +1,7 @@
 """The compiled search for returns in one pixel's trace after another.
 
-Every function is serial and holds no interpreter lock; `tofclip.lidar.search` shares the pixels between threads.
+Every function is serial and holds no interpreter lock; `tofclip.lidar.search` shares the pixels
+between threads.
 """
 
 from __future__ import annotations
@@ -8,22 +9,33 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tofclip.lidar.fit.kernels import EVEN, compiled, describe, refine, sort_rows, window
+from tofclip.lidar.fit.kernels import (
+    EVEN_VARIANCE,
+    compiled,
+    find_pulse_window,
+    measure_returns,
+    refine_returns,
+    sort_rows,
+)
 
-ROUNDS = 8  # Gauss-Newton from near the top has converged after two; more for returns that overlap
-HOPELESS = 0.7  # of the share of the strongest return that a candidate needs: the fit does not make up for so much
-GROUP = 32  # bins of which the highest peak is kept
-TOGETHER = 4  # weights of a filter that are applied in one pass
+MAX_ITERATIONS = (
+    8  # Gauss-Newton from near the top has converged after two; more for returns that overlap
+)
+# of the share of the strongest return that a candidate needs: the fit does not make up for so much
+PREFIT_THRESHOLD_FACTOR = 0.7
+BINS_PER_GROUP = 32  # bins of which the highest peak is kept
+WEIGHTS_PER_PASS = 4  # weights of a filter that are applied in one pass
 
 vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy", _nrt=False)
 
 
 @njit(nogil=True, cache=True)
-def find_returns(traces, pixels, times, standing, filters, pulse, limits, found, counts):
+def find_returns(traces, pixels, times, bin_weights, filters, pulse, limits, found, counts):
     """Find the returns of each trace.
 
-    Candidates are the peaks of the trace under a sharp filter, which still shows two returns where the matched filter
-    would merge them; whether one counts, the matched filter decides, and once more the fit.
+    Candidates are the peaks of the trace under a sharp filter, which still shows two returns where
+    the matched filter would merge them; whether one counts, the matched filter decides, and once
+    more the fit.
 
     Parameters
     ----------
@@ -32,82 +44,102 @@ def find_returns(traces, pixels, times, standing, filters, pulse, limits, found,
         Number of the pixel to which each trace belongs.
     times : (bins,) float64 array
         Instant of each bin, increasing.
-    standing : (bins,) float32 array
+    bin_weights : (bins,) float32 array
         For how many bins each one stands where background and noise are concerned.
     filters : tuple
-        A sharp filter, (width, bins), and the matched one, (bins, width + 1), float32 arrays of unit energy, nowhere
-        negative: entry w holds the weight of bin ``j + w - width // 2`` for a return at bin j, and the width of the
-        sharp one is a multiple of four. The last column holds the sum over the others. Then the largest sum of either.
+        A sharp filter, (width, bins), and the matched one, (bins, width + 1), float32 arrays of
+        unit energy, nowhere negative: entry w holds the weight of bin ``j + w - width // 2`` for a
+        return at bin j, and the width of the sharp one is a multiple of four. The last column holds
+        the sum over the others. Then the largest sum of either.
     pulse : tuple
-        See `Pulse.table`.
+        See `Pulse.kernel_table`.
     limits : (float, float, float)
-        Smallest distance between two returns, s, smallest signal-to-noise, and smallest share of the strongest return,
-        with the fall-off with range undone.
+        Smallest distance between two returns, s, smallest signal-to-noise, and smallest share of
+        the strongest return, with the fall-off with range undone.
     found : (all pixels, most returns, 3) float64 array, overwritten where `pixels` says
-        Instant, sum of the fitted pulse over the bins, standard deviation of the instant; nearest first.
+        Instant, sum of the fitted pulse over the bins, standard deviation of the instant; nearest
+        first.
     counts : (all pixels,) int64 array, overwritten where `pixels` says
         Number of returns of each pixel.
     """
-    groups = -(-times.size // GROUP)
+    groups = -(-times.size // BINS_PER_GROUP)
     memory = (
         np.empty(times.size, np.float32),
-        np.zeros(groups * GROUP, np.float32),
+        np.zeros(groups * BINS_PER_GROUP, np.float32),
         np.empty(groups, np.float32),
-        standing.copy(),
+        bin_weights.copy(),
         np.empty((found.shape[1], 4)),
         np.empty((found.shape[1], 5)),
         np.empty((times.size, 3)),
     )
     for place in range(traces.shape[0]):
         pixel = pixels[place]
-        counts[pixel] = returns_of(traces[place], times, standing, filters, pulse, limits, memory, found[pixel])
+        counts[pixel] = find_trace_returns(
+            traces[place], times, bin_weights, filters, pulse, limits, memory, found[pixel]
+        )
 
 
 @compiled
-def returns_of(trace, times, standing, filters, pulse, limits, memory, found):
+def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, memory, found):
     """Find the returns of one trace and return their number; `memory` is overwritten."""
     (sharp, matched, gains), (curve, scale) = filters, pulse
     score, maxima, bounds, free, peaks, estimate, profile = memory
-    correlate(trace, sharp, score)
-    keep_maxima(score, maxima)
-    number, background, noise = strongest_peaks(
-        trace, times, standing, matched, gains, scale, limits, maxima, bounds, free, peaks
+    correlate_trace(trace, sharp, score)
+    copy_local_maxima(score, maxima)
+    number, background, noise = find_strongest_peaks(
+        trace, times, bin_weights, matched, gains, scale, limits, maxima, bounds, free, peaks
     )
     needed, least, kept = 0.0, limits[1] * noise, 0
     for k in range(number):
         j = int(peaks[k, 0])
         peaks[k, 1] = max(peaks[k, 1] - background * matched[j, -1], 0.0)
-        needed = max(needed, HOPELESS * limits[2] * peaks[k, 1] * times[j] ** 2)
+        needed = max(needed, PREFIT_THRESHOLD_FACTOR * limits[2] * peaks[k, 1] * times[j] ** 2)
     for k in range(number):
         j, strength = int(peaks[k, 0]), peaks[k, 1]
         if strength > least and strength * times[j] ** 2 >= needed:
-            estimate[kept, 0] = top(trace, times, matched, background, j, strength)
+            estimate[kept, 0] = interpolate_peak_time(
+                trace, times, matched, background, j, strength
+            )
             estimate[kept, 1] = max(trace[j] - background, 0.0)
             estimate[kept, 2], estimate[kept, 3] = peaks[k, 2], peaks[k, 3]
             kept += 1
-    refine(trace, times, background, curve, scale, estimate[:kept], EVEN, ROUNDS)
-    number = describe(trace, times, background, noise, curve, scale, estimate[:kept], least, profile, found)
+    refine_returns(
+        trace, times, background, curve, scale, estimate[:kept], EVEN_VARIANCE, MAX_ITERATIONS
+    )
+    number = measure_returns(
+        trace, times, background, noise, curve, scale, estimate[:kept], least, profile, found
+    )
     sort_rows(found[:number])
     return number
 
 
 @vectorised
-def correlate(trace, filters, score):
+def correlate_trace(trace, filters, score):
     """Filter a trace: ``score[j] = sum_w filters[w, j] * trace[j + w - width // 2]``."""
     width, bins = filters.shape
     half = width // 2
     first, last = min(half, bins), max(bins - half + 1, min(half, bins))
     here = score[first:last]
-    for w in range(0, width, TOGETHER):
+    for w in range(0, width, WEIGHTS_PER_PASS):
         one, two = filters[w, first:last], filters[w + 1, first:last]
         three, four = filters[w + 2, first:last], filters[w + 3, first:last]
-        there = trace[first + w - half : last + w - half + TOGETHER - 1]
+        there = trace[first + w - half : last + w - half + WEIGHTS_PER_PASS - 1]
         if w == 0:
             for j in range(here.size):
-                here[j] = one[j] * there[j] + two[j] * there[j + 1] + three[j] * there[j + 2] + four[j] * there[j + 3]
+                here[j] = (
+                    one[j] * there[j]
+                    + two[j] * there[j + 1]
+                    + three[j] * there[j + 2]
+                    + four[j] * there[j + 3]
+                )
         else:
             for j in range(here.size):
-                here[j] += one[j] * there[j] + two[j] * there[j + 1] + three[j] * there[j + 2] + four[j] * there[j + 3]
+                here[j] += (
+                    one[j] * there[j]
+                    + two[j] * there[j + 1]
+                    + three[j] * there[j + 2]
+                    + four[j] * there[j + 3]
+                )
     for edge in (range(first), range(last, bins)):
         for j in edge:
             score[j] = 0
@@ -116,7 +148,7 @@ def correlate(trace, filters, score):
 
 
 @vectorised
-def response(trace, matched, j):
+def compute_response(trace, matched, j):
     """Response of the matched filter at bin j."""
     width = matched.shape[1] - 1
     start = j - width // 2
@@ -127,10 +159,12 @@ def response(trace, matched, j):
 
 
 @compiled
-def top(trace, times, matched, background, j, here):
-    """Instant near bin j at which the response, `here` at the bin, is highest: by a parabola in its logarithm."""
-    before = response(trace, matched, j - 1) - background * matched[j - 1, -1]
-    after = response(trace, matched, j + 1) - background * matched[j + 1, -1]
+def interpolate_peak_time(trace, times, matched, background, j, here):
+    """Instant near bin j at which the response, `here` at the bin, is highest: by a parabola in its
+    logarithm.
+    """
+    before = compute_response(trace, matched, j - 1) - background * matched[j - 1, -1]
+    after = compute_response(trace, matched, j + 1) - background * matched[j + 1, -1]
     if before <= 0 or after <= 0 or here < before or here < after:
         return times[j]
     rise, fall = np.log(here / before), np.log(here / after)
@@ -139,81 +173,106 @@ def top(trace, times, matched, background, j, here):
 
 
 @compiled
-def strongest_peaks(trace, times, standing, matched, gains, scale, limits, maxima, bounds, free, peaks):
-    """Fill `peaks` with the highest maxima that might count, in the order of time: bin, response, and bins they claim.
+def find_strongest_peaks(
+    trace, times, bin_weights, matched, gains, scale, limits, maxima, bounds, free, peaks
+):
+    """Fill `peaks` with the highest maxima that might count, in the order of time: bin, response,
+    and bins they claim.
 
-    Returns their number, the background and the noise. Peaks keep ``limits[0]`` from each other. They are taken from
-    the highest down, until not even bins all as bright as the next one says could count: because of the noise, or
-    beside the strongest return. The response is still that to peak and background together.
+    Returns their number, the background and the noise. Peaks keep ``limits[0]`` from each other.
+    They are taken from the highest down, until not even bins all as bright as the next one says
+    could count: because of the noise, or beside the strongest return. The response is still that to
+    peak and background together.
 
-    Background and noise are those of the bins that no peak claims. Peaks claim their surroundings from the strongest
-    down, for as long as half of the bins stay free. `free` is equal to `standing`, and again afterwards.
+    Background and noise are those of the bins that no peak claims. Peaks claim their surroundings
+    from the strongest down, for as long as half of the bins stay free. `free` is equal to
+    `bin_weights`, and again afterwards.
     """
-    total, square, bins = sums(trace, standing)
+    total, square, bins = sum_moments(trace, bin_weights)
     left, number, needed, claiming = bins, 0, 0.0, True
-    background, noise = level(total, square, left)
-    bound_groups(maxima, 0, bounds.size, bounds)
+    background, noise = compute_mean_and_deviation(total, square, left)
+    update_group_maxima(maxima, 0, bounds.size, bounds)
     while number < peaks.shape[0]:
-        group = highest_place(bounds)
+        group = find_highest(bounds)
         brightest = gains[1] * (bounds[group] / gains[0] - background)
-        if bounds[group] <= 0 or brightest <= limits[1] * noise or brightest * times[-1] ** 2 < needed:
+        if (
+            bounds[group] <= 0
+            or brightest <= limits[1] * noise
+            or brightest * times[-1] ** 2 < needed
+        ):
             break
-        best = place_in_group(maxima, group, bounds[group])
-        first, last = window(times, (best, best), times[best], scale)
-        strength = response(trace, matched, best)
-        peaks[number, 0], peaks[number, 1], peaks[number, 2], peaks[number, 3] = best, strength, first, last
+        best = find_bin_in_group(maxima, group, bounds[group])
+        first, last = find_pulse_window(times, (best, best), times[best], scale)
+        strength = compute_response(trace, matched, best)
+        peaks[number, 0], peaks[number, 1], peaks[number, 2], peaks[number, 3] = (
+            best,
+            strength,
+            first,
+            last,
+        )
         number += 1
-        forget_around(best, times, limits[0], maxima, bounds)
+        clear_maxima_around(best, times, limits[0], maxima, bounds)
         claiming = claiming and 2 * (left - (last - first)) >= bins
         if claiming:
             for i in range(first, last):
                 value = free[i] * float(trace[i])
                 total, square, left = total - value, square - value * trace[i], left - free[i]
                 free[i] = 0
-            background, noise = level(total, square, left)
-        needed = max(needed, HOPELESS * limits[2] * (strength - background * matched[best, -1]) * times[best] ** 2)
+            background, noise = compute_mean_and_deviation(total, square, left)
+        needed = max(
+            needed,
+            PREFIT_THRESHOLD_FACTOR
+            * limits[2]
+            * (strength - background * matched[best, -1])
+            * times[best] ** 2,
+        )
     for k in range(number):
         for i in range(int(peaks[k, 2]), int(peaks[k, 3])):
-            free[i] = standing[i]
+            free[i] = bin_weights[i]
     sort_rows(peaks[:number])
     return number, background, noise
 
 
 @vectorised
-def keep_maxima(score, maxima):
-    """Copy the inner local maxima above zero, and zero for all other scores; of a level top the last bin."""
+def copy_local_maxima(score, maxima):
+    """Copy the inner local maxima above zero, and zero for all other scores; of a level top the
+    last bin.
+    """
     zero = np.float32(0)
     maxima[0] = maxima[score.size - 1] = zero
     before, here, after, kept = score[:-2], score[1:-1], score[2:], maxima[1 : score.size - 1]
     for j in range(here.size):
-        kept[j] = here[j] if here[j] > zero and here[j] >= before[j] and here[j] > after[j] else zero
+        kept[j] = (
+            here[j] if here[j] > zero and here[j] >= before[j] and here[j] > after[j] else zero
+        )
 
 
 @vectorised
-def bound_groups(maxima, first, last, bounds):
+def update_group_maxima(maxima, first, last, bounds):
     """Largest maximum of each group of bins from `first` to before `last`, or 0.
 
-    Numbers from zero up keep their order when their bits are read as whole numbers, whose maximum is found in vectors.
+    Numbers from zero up keep their order when their bits are read as whole numbers, whose maximum
+    is found in vectors.
     """
     bits, highest_bits = maxima.view(np.int32), bounds.view(np.int32)
     for group in range(first, last):
         highest = np.int32(0)
-        for j in range(group * GROUP, (group + 1) * GROUP):
+        for j in range(group * BINS_PER_GROUP, (group + 1) * BINS_PER_GROUP):
             highest = max(highest, bits[j])
         highest_bits[group] = highest
 
 
 @vectorised
-def place_in_group(maxima, group, value):
+def find_bin_in_group(maxima, group, value):
     """Bin of the last maximum of a group that is as high as `value`, which has to be there."""
-    place, here = 0, maxima[group * GROUP : (group + 1) * GROUP]
-    for j in range(GROUP):
+    place, here = 0, maxima[group * BINS_PER_GROUP : (group + 1) * BINS_PER_GROUP]
+    for j in range(BINS_PER_GROUP):
         place = max(place, j if here[j] == value else 0)
-    return group * GROUP + place
+    return group * BINS_PER_GROUP + place
 
 
 @compiled
-def forget_around(best, times, distance, maxima, bounds):
+def clear_maxima_around(best, times, distance, maxima, bounds):
     """Take away the maxima nearer than `distance` to a bin, and that at the bin itself."""
     first = last = best
     while first > 0 and times[best] - times[first - 1] < distance:
@@ -221,15 +280,17 @@ def forget_around(best, times, distance, maxima, bounds):
     while last < times.size - 1 and times[last + 1] - times[best] < distance:
         last += 1
     maxima[first : last + 1] = 0
-    bound_groups(maxima, first // GROUP, last // GROUP + 1, bounds)
+    update_group_maxima(maxima, first // BINS_PER_GROUP, last // BINS_PER_GROUP + 1, bounds)
 
 
 @vectorised
-def sums(trace, standing):
-    """Sum, sum of squares and number of bins; float32 squares would drown a small noise on a high background."""
+def sum_moments(trace, bin_weights):
+    """Sum, sum of squares and number of bins; float32 squares would drown a small noise on a high
+    background.
+    """
     total = square = bins = 0.0
     for i in range(trace.size):
-        value, share = float(trace[i]), float(standing[i])
+        value, share = float(trace[i]), float(bin_weights[i])
         total += share * value
         square += share * value * value
         bins += share
@@ -237,14 +298,14 @@ def sums(trace, standing):
 
 
 @compiled
-def level(total, square, bins):
+def compute_mean_and_deviation(total, square, bins):
     """Mean and standard deviation from sum, sum of squares and number."""
     mean = total / bins
     return mean, np.sqrt(max(square / bins - mean * mean, 0.0))
 
 
 @compiled
-def highest_place(values):
+def find_highest(values):
     """Return where the first of the highest values stands."""
     place, highest = 0, values[0]
     for other in range(1, values.size):  # without a branch, whose way nobody could foretell

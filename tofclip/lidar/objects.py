@@ -13,11 +13,14 @@ from scipy.spatial import cKDTree
 from tofclip.errors import InputError
 from tofclip.lidar.cloud import PointCloud
 
-INNER = (5.0, 95.0)  # percent of an object's points that count for its size: a few strays do not widen it
+SIZE_PERCENTILES = (
+    5.0,
+    95.0,
+)  # percent of an object's points that count for its size: a few strays do not widen it
 
 
 @dataclass(frozen=True)
-class SeenObject:
+class DetectedObject:
     """One object.
 
     Parameters
@@ -48,17 +51,18 @@ class SeenObject:
     intensity: float
 
 
-def find_objects(cloud: PointCloud, reach: float, fewest: int = 40) -> list[SeenObject]:
-    """Group points that lie within `reach`, m, of each other, directly or through others; the nearest object first.
+def find_objects(cloud: PointCloud, reach: float, min_points: int = 40) -> list[DetectedObject]:
+    """Group points that lie within `reach`, m, of each other, directly or through others; the
+    nearest object first.
 
     Parameters
     ----------
     cloud : PointCloud
     reach : float
-    fewest : int
+    min_points : int
         Smaller groups are left out.
     """
-    if not (np.isfinite(reach) and reach > 0) or fewest < 1:
+    if not (np.isfinite(reach) and reach > 0) or min_points < 1:
         raise InputError("objects need a positive reach, and at least one point")
     if len(cloud) == 0:
         return []
@@ -66,15 +70,18 @@ def find_objects(cloud: PointCloud, reach: float, fewest: int = 40) -> list[Seen
     links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(cloud), len(cloud)))
     groups, label = connected_components(links, directed=False)
     members = (np.flatnonzero(label == group) for group in range(groups))
-    return sorted((_described(cloud, one) for one in members if one.size >= fewest), key=lambda seen: seen.range)
+    return sorted(
+        (_measure_object(cloud, one) for one in members if one.size >= min_points),
+        key=lambda seen: seen.range,
+    )
 
 
-def _described(cloud: PointCloud, points: NDArray[np.intp]) -> SeenObject:
+def _measure_object(cloud: PointCloud, points: NDArray[np.intp]) -> DetectedObject:
     xyz, distance = cloud.xyz[points], cloud.range[points]
-    low, high = np.percentile(xyz, INNER, axis=0)
+    low, high = np.percentile(xyz, SIZE_PERCENTILES, axis=0)
     middle = float(np.median(distance))
     x, y, z = (float(one) for one in np.median(xyz, axis=0))
-    return SeenObject(
+    return DetectedObject(
         points=points,
         range=middle,
         confidence=float(np.median(cloud.confidence[points])),

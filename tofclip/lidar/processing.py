@@ -17,7 +17,7 @@ from tofclip.lidar.cloud import PointCloud
 
 FloatArray = NDArray[np.float64]
 
-COLUMNS = ("intensity", "confidence", "range", "return_number", "time")
+PROPERTY_COLUMNS = ("intensity", "confidence", "range", "return_number", "time")
 
 
 @dataclass(frozen=True)
@@ -61,14 +61,15 @@ class Alignment:
     rms: float
 
 
-def selected(cloud: PointCloud, chosen: NDArray[Any]) -> PointCloud:
+def select_points(cloud: PointCloud, chosen: NDArray[Any]) -> PointCloud:
     """Return some points of a cloud, by mask or by numbers."""
-    columns: dict[str, Any] = {name: getattr(cloud, name)[chosen] for name in COLUMNS}
+    columns: dict[str, Any] = {name: getattr(cloud, name)[chosen] for name in PROPERTY_COLUMNS}
     return replace(cloud, xyz=cloud.xyz[chosen], **columns)
 
 
-def moved(cloud: PointCloud, pose: ArrayLike) -> PointCloud:
-    """Return a cloud in another frame, such as that of a mount or of a map; ranges stay those from the camera.
+def transform_cloud(cloud: PointCloud, pose: ArrayLike) -> PointCloud:
+    """Return a cloud in another frame, such as that of a mount or of a map; ranges stay those from
+    the camera.
 
     Parameters
     ----------
@@ -85,7 +86,7 @@ def moved(cloud: PointCloud, pose: ArrayLike) -> PointCloud:
     return replace(cloud, xyz=(cloud.xyz @ turn.T + matrix[:3, 3]).astype(np.float32))
 
 
-def downsampled(cloud: PointCloud, voxel: float) -> PointCloud:
+def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     """Return one point for each occupied cube of side `voxel`, m: means of its points.
 
     Confidences of independent points shrink with their number; the return number is the least.
@@ -104,13 +105,15 @@ def downsampled(cloud: PointCloud, voxel: float) -> PointCloud:
 
     first = np.full(number.size, 255, np.uint8)
     np.minimum.at(first, group, cloud.return_number)
-    columns: dict[str, Any] = {name: mean(getattr(cloud, name)) for name in ("intensity", "range", "time")}
+    columns: dict[str, Any] = {
+        name: mean(getattr(cloud, name)) for name in ("intensity", "range", "time")
+    }
     columns["confidence"] = np.sqrt(mean(cloud.confidence.astype(np.float64) ** 2) / number)
     positions = np.stack([mean(axis) for axis in cloud.xyz.T], axis=-1).astype(np.float32)
     return replace(cloud, xyz=positions, return_number=first, **columns)
 
 
-def without_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 2.0) -> PointCloud:
+def remove_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 2.0) -> PointCloud:
     """Leave out points whose mean distance to their neighbours stands out from that of all points.
 
     Parameters
@@ -124,16 +127,18 @@ def without_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float 
         raise InputError("outliers need at least one neighbour and a positive number of deviations")
     if len(cloud) <= neighbours:
         return cloud
-    _, kept = _open3d_cloud(cloud).remove_statistical_outlier(neighbours, deviations)
-    return selected(cloud, np.asarray(kept, dtype=np.int64))
+    _, kept = _to_open3d(cloud).remove_statistical_outlier(neighbours, deviations)
+    return select_points(cloud, np.asarray(kept, dtype=np.int64))
 
 
-def normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:
-    """Return each point's surface normal, (n, 3), towards the camera, from a plane through its neighbours."""
+def estimate_normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:
+    """Return each point's surface normal, (n, 3), towards the camera, from a plane through its
+    neighbours.
+    """
     if len(cloud) < 3 or neighbours < 3:
         raise InputError("a normal needs at least three points and three neighbours")
-    open3d = _open3d()
-    shape = _open3d_cloud(cloud)
+    open3d = _import_open3d()
+    shape = _to_open3d(cloud)
     shape.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(neighbours))
     shape.orient_normals_towards_camera_location(np.zeros(3))
     return np.asarray(shape.normals)
@@ -151,9 +156,9 @@ def fit_plane(cloud: PointCloud, reach: float, seed: int = 0) -> Plane:
     """
     if len(cloud) < 3 or not reach > 0:
         raise InputError("a plane needs at least three points and a positive reach")
-    open3d = _open3d()
+    open3d = _import_open3d()
     open3d.utility.random.seed(seed)
-    _, found = _open3d_cloud(cloud).segment_plane(reach, 3, 1000)
+    _, found = _to_open3d(cloud).segment_plane(reach, 3, 1000)
     inliers = np.zeros(len(cloud), dtype=bool)
     inliers[np.asarray(found, dtype=np.int64)] = True
     points = cloud.xyz[inliers].astype(np.float64)
@@ -164,8 +169,11 @@ def fit_plane(cloud: PointCloud, reach: float, seed: int = 0) -> Plane:
     return Plane(normal, float(normal @ middle), inliers, rms)
 
 
-def align(source: PointCloud, target: PointCloud, reach: float, start: ArrayLike | None = None) -> Alignment:
-    """Lay a cloud over another one, such as the next of a sequence (point-to-plane iterated closest points).
+def align_clouds(
+    source: PointCloud, target: PointCloud, reach: float, start: ArrayLike | None = None
+) -> Alignment:
+    """Lay a cloud over another one, such as the next of a sequence (point-to-plane iterated closest
+    points).
 
     Parameters
     ----------
@@ -176,26 +184,30 @@ def align(source: PointCloud, target: PointCloud, reach: float, start: ArrayLike
         First guess of the pose.
     """
     if min(len(source), len(target)) < 3 or not reach > 0:
-        raise InputError("registration needs at least three points in each cloud and a positive reach")
-    registration = _open3d().pipelines.registration
-    surface = _open3d_cloud(target)
-    surface.normals = _open3d().utility.Vector3dVector(normals(target))
+        raise InputError(
+            "registration needs at least three points in each cloud and a positive reach"
+        )
+    registration = _import_open3d().pipelines.registration
+    surface = _to_open3d(target)
+    surface.normals = _import_open3d().utility.Vector3dVector(estimate_normals(target))
     found = registration.registration_icp(
-        _open3d_cloud(source),
+        _to_open3d(source),
         surface,
         reach,
         np.eye(4) if start is None else np.asarray(start, dtype=np.float64),
         registration.TransformationEstimationPointToPlane(),
     )
-    return Alignment(np.asarray(found.transformation), float(found.fitness), float(found.inlier_rmse))
+    return Alignment(
+        np.asarray(found.transformation), float(found.fitness), float(found.inlier_rmse)
+    )
 
 
-def _open3d_cloud(cloud: PointCloud) -> Any:
-    open3d = _open3d()
+def _to_open3d(cloud: PointCloud) -> Any:
+    open3d = _import_open3d()
     return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud.xyz.astype(np.float64)))
 
 
-def _open3d() -> Any:
+def _import_open3d() -> Any:
     """Open3D; it wants a libusb, which libusb-package brings where the system has none."""
     try:
         import libusb_package

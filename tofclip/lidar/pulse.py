@@ -9,12 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofclip.errors import InputError
 
-SAMPLES_PER_WIDTH = 128  # linear interpolation then errs by less than 2e-5 of the peak
-REACH_IN_WIDTHS = 2.0  # a Gaussian is 1.5e-5 of its peak there
-REACH_IN_DECAYS = 11.0  # an exponential is 1.7e-5 of its start there
+SAMPLES_PER_FWHM = 128  # linear interpolation then errs by less than 2e-5 of the peak
+EXTENT_FWHM = 2.0  # a Gaussian is 1.5e-5 of its peak there
+EXTENT_DECAYS = 11.0  # an exponential is 1.7e-5 of its start there
 FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
 SAMPLES_PER_BIN = 64  # of a pulse that was summed over bins
-SIGNIFICANT = 0.01  # below this share of its peak a pulse says nothing about where it is
+SUPPORT_THRESHOLD = 0.01  # below this share of its peak a pulse says nothing about where it is
 
 Table = tuple[NDArray[np.float64], tuple[float, float, float, float]]
 
@@ -35,7 +35,8 @@ class Pulse:
     Raises
     ------
     InputError
-        Fewer than three samples, nothing positive, a spacing that is not positive, or an origin outside.
+        Fewer than three samples, nothing positive, a spacing that is not positive, or an origin
+        outside.
     """
 
     samples: NDArray[np.float64]
@@ -44,12 +45,21 @@ class Pulse:
 
     def __post_init__(self) -> None:
         samples = np.array(self.samples, dtype=np.float64)
-        if samples.ndim != 1 or samples.size < 3 or not np.all(np.isfinite(samples)) or samples.max() <= 0:
+        if (
+            samples.ndim != 1
+            or samples.size < 3
+            or not np.all(np.isfinite(samples))
+            or samples.max() <= 0
+        ):
             raise InputError("a pulse needs at least three finite samples, one of them positive")
         if not (np.isfinite(self.spacing) and self.spacing > 0):
-            raise InputError(f"the spacing of a pulse's samples must be a positive time, got {self.spacing}")
+            raise InputError(
+                f"the spacing of a pulse's samples must be a positive time, got {self.spacing}"
+            )
         if not 0 <= self.origin <= samples.size - 1:
-            raise InputError(f"the origin of a pulse must lie within its samples, got {self.origin}")
+            raise InputError(
+                f"the origin of a pulse must lie within its samples, got {self.origin}"
+            )
         samples /= samples.max()
         samples.flags.writeable = False
         object.__setattr__(self, "samples", samples)
@@ -59,18 +69,20 @@ class Pulse:
         """Return a Gaussian of full width at half maximum `fwhm`, s, whose arrival is its peak."""
         if not (np.isfinite(fwhm) and fwhm > 0):
             raise InputError(f"the width of a pulse must be a positive time, got {fwhm}")
-        half = int(REACH_IN_WIDTHS * SAMPLES_PER_WIDTH)
-        widths = np.arange(-half, half + 1) / SAMPLES_PER_WIDTH
-        return cls(np.exp2(-((2 * widths) ** 2)), fwhm / SAMPLES_PER_WIDTH, float(half))
+        half = int(EXTENT_FWHM * SAMPLES_PER_FWHM)
+        widths = np.arange(-half, half + 1) / SAMPLES_PER_FWHM
+        return cls(np.exp2(-((2 * widths) ** 2)), fwhm / SAMPLES_PER_FWHM, float(half))
 
     @classmethod
     def exponentially_modified(cls, fwhm: float, decay: float) -> Pulse:
-        """Return a Gaussian convolved with an exponential decay, as photon-counting diodes answer a short pulse.
+        """Return a Gaussian convolved with an exponential decay, as photon-counting diodes answer a
+        short pulse.
 
         Parameters
         ----------
         fwhm : float
-            Full width at half maximum of the Gaussian, s. Its middle, before the decay, is the arrival.
+            Full width at half maximum of the Gaussian, s. Its middle, before the decay, is the
+            arrival.
         decay : float
             Time constant of the exponential, s.
 
@@ -82,15 +94,18 @@ class Pulse:
         from scipy.stats import exponnorm
 
         if not (np.isfinite(fwhm) and fwhm > 0 and np.isfinite(decay) and decay > 0):
-            raise InputError(f"width and decay of a pulse must be positive times, got {fwhm} and {decay}")
-        before = int(REACH_IN_WIDTHS * SAMPLES_PER_WIDTH)
-        after = before + int(REACH_IN_DECAYS * decay / fwhm * SAMPLES_PER_WIDTH)
-        spacing, sigma = fwhm / SAMPLES_PER_WIDTH, fwhm / FWHM_PER_SIGMA
+            raise InputError(
+                f"width and decay of a pulse must be positive times, got {fwhm} and {decay}"
+            )
+        before = int(EXTENT_FWHM * SAMPLES_PER_FWHM)
+        after = before + int(EXTENT_DECAYS * decay / fwhm * SAMPLES_PER_FWHM)
+        spacing, sigma = fwhm / SAMPLES_PER_FWHM, fwhm / FWHM_PER_SIGMA
         time = np.arange(-before, after + 1) * spacing
         return cls(exponnorm.pdf(time, decay / sigma, scale=sigma), spacing, float(before))
 
-    def binned(self, bin_width: float) -> Pulse:
-        """Return the shape that bins of `bin_width`, s, show: its light summed from half a bin before to half after.
+    def integrate_bins(self, bin_width: float) -> Pulse:
+        """Return the shape that bins of `bin_width`, s, show: its light summed from half a bin
+        before to half after.
 
         Sampled at the middles of bins it is, up to one factor, each bin's share of the light.
         """
@@ -98,14 +113,20 @@ class Pulse:
             raise InputError(f"the width of a bin must be a positive time, got {bin_width}")
         spacing = min(self.spacing, bin_width / SAMPLES_PER_BIN)
         before = int(np.ceil((self.origin * self.spacing + bin_width / 2) / spacing))
-        after = int(np.ceil(((self.samples.size - 1 - self.origin) * self.spacing + bin_width / 2) / spacing))
+        after = int(
+            np.ceil(
+                ((self.samples.size - 1 - self.origin) * self.spacing + bin_width / 2) / spacing
+            )
+        )
         time = np.arange(-before, after + 1) * spacing
         arrived = np.concatenate([[0.0], np.cumsum((self.samples[1:] + self.samples[:-1]) / 2)])
-        position = (time[:, np.newaxis] + np.array([-0.5, 0.5]) * bin_width) / self.spacing + self.origin
+        position = (
+            time[:, np.newaxis] + np.array([-0.5, 0.5]) * bin_width
+        ) / self.spacing + self.origin
         start, end = np.interp(position, np.arange(self.samples.size), arrived).T
         return Pulse(end - start, spacing, float(before))
 
-    def compressed(self, factor: float) -> Pulse:
+    def compress(self, factor: float) -> Pulse:
         """Return the same shape, `factor` times shorter."""
         return Pulse(self.samples, self.spacing / factor, self.origin)
 
@@ -138,9 +159,9 @@ class Pulse:
     @property
     def support(self) -> tuple[float, float]:
         """First and last instant, s after the arrival, at which the pulse matters."""
-        return self.extent(SIGNIFICANT)
+        return self.extent(SUPPORT_THRESHOLD)
 
-    def table(self, level: float = SIGNIFICANT) -> Table:
+    def kernel_table(self, level: float = SUPPORT_THRESHOLD) -> Table:
         """Return what the compiled loops take.
 
         Returns
@@ -150,10 +171,16 @@ class Pulse:
         scale : tuple
             Samples per second, origin, and `extent` of `level`.
         """
-        return np.stack([self.samples, self.slope], axis=1), (1 / self.spacing, self.origin, *self.extent(level))
+        return np.stack([self.samples, self.slope], axis=1), (
+            1 / self.spacing,
+            self.origin,
+            *self.extent(level),
+        )
 
     def extent(self, level: float) -> tuple[float, float]:
-        """Return when the curve first rises through `level` of its peak and last falls through it, s after arrival."""
+        """Return when the curve first rises through `level` of its peak and last falls through it,
+        s after arrival.
+        """
         above = np.flatnonzero(self.samples >= level)
         first, last = float(above[0]), float(above[-1])
         if above[0] > 0:

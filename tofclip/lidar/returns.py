@@ -64,7 +64,8 @@ class Returns:
     def line_of_sight_px(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(rows, columns) of the reference view's pixels in which the returns lie.
 
-        A picture that was not recovered at the shear of its range is displaced by the parallax; here that is undone.
+        A picture that was not recovered at the shear of its range is displaced by the parallax;
+        here that is undone.
         """
         missing = self.camera.shear_at(self.range) - self.shear
         rows, columns = self.camera.displacement_per_shear
@@ -72,7 +73,8 @@ class Returns:
         return self.y - known * rows * missing, self.x - known * columns * missing
 
     def image(self, name: str) -> NDArray[np.float32]:
-        """Picture (y, x) of one property of each pixel's most intense return; NaN where nothing came back.
+        """Picture (y, x) of one property of each pixel's most intense return; NaN where nothing
+        came back.
 
         Parameters
         ----------

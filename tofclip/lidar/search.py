@@ -1,9 +1,11 @@
-"""The search for returns: from each pixel's brightness over time to when light came back, how much, and how surely.
+"""The search for returns: from each pixel's brightness over time to when light came back, how much,
+and how surely.
 
-A recovered frame is no photon count: it went through an inverse problem, whose errors are spread over pixels and bins
-and are nearly even in time. For such errors the least-squares fit of the pulse is the maximum-likelihood estimate, so
-candidates are judged by the matched filter and refined by Gauss-Newton steps of that fit, below a bin. Histograms of
-counted photons are for `tofclip.lidar.photons`, whose estimator is the maximum-likelihood one there.
+A recovered frame is no photon count: it went through an inverse problem, whose errors are spread
+over pixels and bins and are nearly even in time. For such errors the least-squares fit of the pulse
+is the maximum-likelihood estimate, so candidates are judged by the matched filter and refined by
+Gauss-Newton steps of that fit, below a bin. Histograms of counted photons are for
+`tofclip.lidar.photons`, whose estimator is the maximum-likelihood one there.
 """
 
 from __future__ import annotations
@@ -24,16 +26,17 @@ from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.returns import Returns
 from tofclip.lidar.traces import FrameTraces, Traces
 from tofclip.shots import Frames
-from tofclip.threads import blocks, run_blocks
+from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float64]
 
-REFERENCE_RANGE = 1.0  # m; an intensity is what the same surface would send back from here
-PIXELS_AT_ONCE = 128  # their traces fit the second-level cache
-PIXELS_PER_BLOCK = 4 * PIXELS_AT_ONCE
-SHARPENING = 2.0  # of the filter that looks for candidates; it costs a tenth of the matched filter's sensitivity
-SHORTEST_PULSE_BINS = 2.0  # anything shorter falls between the samples
+REFERENCE_RANGE_M = 1.0  # m; an intensity is what the same surface would send back from here
+PIXELS_PER_BATCH = 128  # their traces fit the second-level cache
+PIXELS_PER_BLOCK = 4 * PIXELS_PER_BATCH
+# of the filter that looks for candidates; it costs a tenth of the matched filter's sensitivity
+SHARPENING_FACTOR = 2.0
+MIN_PULSE_BINS = 2.0  # anything shorter falls between the samples
 
 
 class ReturnSearch:
@@ -47,8 +50,8 @@ class ReturnSearch:
     detection : Detection, optional
         What counts as a return.
     pulse : Pulse, optional
-        Shape of a single return; by default a Gaussian as wide as ``camera.pulse_fwhm``. Two returns of similar
-        strength are told apart from 1.3 widths on.
+        Shape of a single return; by default a Gaussian as wide as ``camera.pulse_fwhm``. Two
+        returns of similar strength are told apart from 1.3 widths on.
     shears : (time,) array, optional
         Shear at which each frame is recovered, pixels per view step; 0 by default.
 
@@ -67,14 +70,18 @@ class ReturnSearch:
         shears: FloatArray | None = None,
     ) -> None:
         if times.size < 3:
-            raise InputError(f"a return needs at least three frames to be found in, got {times.size}")
-        shortest = SHORTEST_PULSE_BINS * float(times[-1] - times[0]) / (times.size - 1)
+            raise InputError(
+                f"a return needs at least three frames to be found in, got {times.size}"
+            )
+        shortest = MIN_PULSE_BINS * float(times[-1] - times[0]) / (times.size - 1)
         self.camera, self.times = camera, times
         self.detection = Detection() if detection is None else detection
         self.pulse = Pulse.gaussian(max(camera.pulse_fwhm, shortest)) if pulse is None else pulse
         self.shears = np.zeros(times.size) if shears is None else shears
 
-    def returns(self, traces: Traces | PortableTraces, provenance: Mapping[str, Any] | None = None) -> Returns:
+    def find_returns(
+        self, traces: Traces | PortableTraces, provenance: Mapping[str, Any] | None = None
+    ) -> Returns:
         """Find the returns in the traces of all pixels.
 
         Parameters
@@ -87,10 +94,10 @@ class ReturnSearch:
         -----
         Memory: 128 traces a thread, and 100 bytes a pixel.
         """
-        pixel, time, signal, deviation = self._candidates(traces)
+        pixel, time, signal, deviation = self._find_candidates(traces)
         distance = SPEED_OF_LIGHT * time / 2
-        intensity = signal * (distance / REFERENCE_RANGE) ** 2
-        kept = (time > 0) & self.detection.significant(pixel, time, intensity, self.pulse.fwhm)
+        intensity = signal * (distance / REFERENCE_RANGE_M) ** 2
+        kept = (time > 0) & self.detection.find_significant(pixel, time, intensity, self.pulse.fwhm)
         y, x = np.divmod(pixel[kept], self.camera.image_shape[1])
         return Returns(
             y=y.astype(np.int32),
@@ -98,7 +105,7 @@ class ReturnSearch:
             range=distance[kept],
             intensity=intensity[kept].astype(np.float32),
             confidence=(SPEED_OF_LIGHT * deviation[kept] / 2).astype(np.float32),
-            return_number=_rank_within(pixel[kept]),
+            return_number=_rank_within_pixel(pixel[kept]),
             time=time[kept],
             camera=self.camera,
             shear=self._shear_at(time[kept]),
@@ -106,35 +113,47 @@ class ReturnSearch:
         )
 
     def _shear_at(self, time: FloatArray) -> FloatArray:
-        if np.ptp(self.shears) == 0:  # looking up every instant takes longer than placing it in space
+        if (
+            np.ptp(self.shears) == 0
+        ):  # looking up every instant takes longer than placing it in space
             return np.full(time.size, self.shears[0])
         return np.interp(time, self.times, self.shears)
 
     @property
     def reach_bins(self) -> int:
         """How many bins on either side of a return its search and its fit look at."""
-        return int(self._filters[1].shape[1]) // 2 + 1  # the responses of a peak's neighbours tell where its top is
+        return (
+            int(self._filters[1].shape[1]) // 2 + 1
+        )  # the responses of a peak's neighbours tell where its top is
 
-    def _candidates(
+    def _find_candidates(
         self, traces: Traces | PortableTraces
     ) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
         """Pixel number, instant, counts and deviation of every candidate, in raster and time order."""
         if isinstance(traces, PortableTraces):
-            return self._portable.candidates(traces.values)
+            return self._portable.find_candidates(traces.values)
         from tofclip.lidar.kernels import find_returns
 
         total, bins = traces.pixels.size, traces.bins
         sharp, matched, gains = self._filters
         # Beyond the bins that are searched the filters reach into what lies elsewhere on the axis.
-        filters = np.take(sharp, bins.numbers, axis=1) * bins.searched, matched[bins.numbers], gains
-        fixed = self.times[bins.numbers], bins.standing, filters, self.pulse.table()
-        found = np.empty((total, self.detection.most_returns, 3))
+        filters = (
+            np.take(sharp, bins.numbers, axis=1) * bins.search_mask,
+            matched[bins.numbers],
+            gains,
+        )
+        fixed = self.times[bins.numbers], bins.bin_weights, filters, self.pulse.kernel_table()
+        found = np.empty((total, self.detection.max_returns, 3))
         counts = np.zeros(total, np.int64)
-        limits = self.pulse.fwhm, float(self.detection.signal_to_noise), float(self.detection.share_of_pixel)
+        limits = (
+            self.pulse.fwhm,
+            float(self.detection.signal_to_noise),
+            float(self.detection.min_pixel_fraction),
+        )
 
         def work(piece: slice) -> None:
-            memory = np.empty((PIXELS_AT_ONCE, bins.numbers.size), np.float32)
-            for part in blocks(piece.stop - piece.start, PIXELS_AT_ONCE):
+            memory = np.empty((PIXELS_PER_BATCH, bins.numbers.size), np.float32)
+            for part in split_blocks(piece.stop - piece.start, PIXELS_PER_BATCH):
                 some = slice(piece.start + part.start, piece.start + part.stop)
                 block = memory[: some.stop - some.start]
                 traces.fill(some, block)
@@ -147,20 +166,24 @@ class ReturnSearch:
 
     @cached_property
     def _filters(self) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float]]:
-        """The sharp filter that shows candidates, the matched one that judges them, and their gains."""
-        sharp, matched = self._bare_filters
+        """The sharp filter that shows candidates, the matched one that judges them, and their
+        gains.
+        """
+        sharp, matched = self._raw_filters
         sums = matched.sum(axis=0)
         with_sums = np.ascontiguousarray(np.concatenate([matched, sums[np.newaxis]]).T)
         return sharp, with_sums, (float(sharp.sum(axis=0).max()), float(sums.max()))
 
     @cached_property
-    def _bare_filters(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _raw_filters(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         # The compiled loop takes four weights of the sharp filter at a time.
-        return _filter(self.times, self.pulse.compressed(SHARPENING), 4), _filter(self.times, self.pulse, 2)
+        return _build_filter(self.times, self.pulse.compress(SHARPENING_FACTOR), 4), _build_filter(
+            self.times, self.pulse, 2
+        )
 
     @cached_property
     def _portable(self) -> PortableSearch:
-        return PortableSearch(self.times, self._bare_filters, self.pulse, self.detection)
+        return PortableSearch(self.times, self._raw_filters, self.pulse, self.detection)
 
 
 def depth(
@@ -174,8 +197,9 @@ def depth(
     Parameters
     ----------
     frames : Frames
-        Brightness (time, y, x) on any increasing time axis, searched in whatever library and on whatever device its
-        array is; the returns are NumPy's. The source is co-located: range is ``c * time / 2``.
+        Brightness (time, y, x) on any increasing time axis, searched in whatever library and on
+        whatever device its array is; the returns are NumPy's. The source is co-located: range is
+        ``c * time / 2``.
     camera : Camera, optional
         Takes the place of the camera inside `frames`.
     detection, pulse
@@ -188,17 +212,20 @@ def depth(
     """
     camera = frames.camera if camera is None else camera
     if camera.image_shape != frames.values.shape[1:]:
-        raise ShapeError("frames", f"(time, y, x) with (y, x) = {camera.image_shape}", frames.values.shape)
+        raise ShapeError(
+            "frames", f"(time, y, x) with (y, x) = {camera.image_shape}", frames.values.shape
+        )
     search = ReturnSearch(camera, frames.times, detection, pulse, frames.shears)
     traces = FrameTraces(frames) if is_numpy(frames.values) else PortableTraces(frames)
-    return search.returns(traces, frames.provenance)
+    return search.find_returns(traces, frames.provenance)
 
 
-def _filter(times: FloatArray, pulse: Pulse, multiple: int) -> NDArray[np.float32]:
-    """Unit-energy filter for a return at each bin, (width, bins), its width a `multiple`; the time axis may be uneven.
+def _build_filter(times: FloatArray, pulse: Pulse, multiple: int) -> NDArray[np.float32]:
+    """Unit-energy filter for a return at each bin, (width, bins), its width a `multiple`; the time
+    axis may be uneven.
 
-    What a measured pulse has below zero is noise and left out. Where the axis cuts off most of the pulse the energy
-    stays below one: little would be known of such a return.
+    What a measured pulse has below zero is noise and left out. Where the axis cuts off most of the
+    pulse the energy stays below one: little would be known of such a return.
     """
     before, after = pulse.support
     reach = int(np.ceil(max(-before, after) / np.diff(times).min()))
@@ -212,7 +239,7 @@ def _filter(times: FloatArray, pulse: Pulse, multiple: int) -> NDArray[np.float3
     return filters.astype(np.float32)
 
 
-def _rank_within(pixel: NDArray[np.int64]) -> NDArray[np.uint8]:
+def _rank_within_pixel(pixel: NDArray[np.int64]) -> NDArray[np.uint8]:
     """Number the entries of each pixel from 1; equal pixels lie side by side."""
     position = np.arange(pixel.size)
     starts_here = np.r_[True, pixel[1:] != pixel[:-1]][: pixel.size]

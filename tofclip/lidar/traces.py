@@ -1,4 +1,6 @@
-"""Where the search for returns takes its traces from: the brightness of each pixel over time, some pixels at once."""
+"""Where the search for returns takes its traces from: the brightness of each pixel over time, some
+pixels at once.
+"""
 
 from __future__ import annotations
 
@@ -12,25 +14,26 @@ from tofclip.shots import Frames
 
 
 @dataclass(frozen=True)
-class Bins:
+class TraceBins:
     """Which bins of a time axis traces hold.
 
     Parameters
     ----------
     numbers : (n,) int array
         Increasing.
-    searched : (n,) bool array
-        Whether a return may lie there. Wherever one may, all bins that its search and its fit look at are held.
-    standing : (n,) float32 array
+    search_mask : (n,) bool array
+        Whether a return may lie there. Wherever one may, all bins that its search and its fit look
+        at are held.
+    bin_weights : (n,) float32 array
         For how many bins of the axis each one stands where background and noise are concerned.
     """
 
     numbers: NDArray[np.int64]
-    searched: NDArray[np.bool_]
-    standing: NDArray[np.float32]
+    search_mask: NDArray[np.bool_]
+    bin_weights: NDArray[np.float32]
 
     @classmethod
-    def whole(cls, bins: int) -> Bins:
+    def all_bins(cls, bins: int) -> TraceBins:
         """Return all bins of an axis, every one for itself."""
         return cls(np.arange(bins), np.ones(bins, bool), np.ones(bins, np.float32))
 
@@ -39,9 +42,11 @@ class Traces(Protocol):
     """Anything that hands out pixels' traces."""
 
     pixels: NDArray[np.int64]
-    """Numbers of the pixels, counted in raster order, in the order in which their traces are cheapest to have."""
+    """Numbers of the pixels, counted in raster order, in the order in which their traces are
+    cheapest to have.
+    """
 
-    bins: Bins
+    bins: TraceBins
     """The bins that they hold."""
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
@@ -60,10 +65,10 @@ class FrameTraces:
     def __init__(self, frames: Frames) -> None:
         self._pictures = frames.values.reshape(frames.times.size, -1).astype(np.float32, copy=False)
         self.pixels = np.arange(self._pictures.shape[1])
-        self.bins = Bins.whole(frames.times.size)
+        self.bins = TraceBins.all_bins(frames.times.size)
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
         """Write traces of neighbours in raster order."""
-        from tofclip.solvers.kernels import lanes_to_frames
+        from tofclip.solvers.kernels import copy_lanes_to_frames
 
-        lanes_to_frames(self._pictures[:, piece], traces)
+        copy_lanes_to_frames(self._pictures[:, piece], traces)

@@ -1,4 +1,6 @@
-"""Depth from focus: refocus on many depths and find, for each pixel, the one where it is sharp (supplement Note 2)."""
+"""Depth from focus: refocus on many depths and find, for each pixel, the one where it is sharp
+(supplement Note 2).
+"""
 
 from __future__ import annotations
 
@@ -10,13 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofclip.errors import InputError, ShapeError
-from tofclip.light_field.labels import smoothest_labels
+from tofclip.light_field.belief_propagation import find_smooth_labels
 from tofclip.light_field.views import LightField
 
 Array = NDArray[Any]
 FocusMeasure = Callable[[Array], Array]
 
-TYPICAL = 0.9  # quantile of the best sharpness: what a textured pixel has
+TYPICAL_QUANTILE = 0.9  # quantile of the best sharpness: what a textured pixel has
 SMOOTHNESS = 0.1
 WINDOW_PX = 1.5
 
@@ -42,30 +44,39 @@ class FocalStack:
 
     def __post_init__(self) -> None:
         if self.pictures.ndim != 3 or self.shears.shape != (len(self.pictures),):
-            raise ShapeError("the pictures of a focal stack", "(shears, rows, columns)", self.pictures.shape)
+            raise ShapeError(
+                "the pictures of a focal stack", "(shears, rows, columns)", self.pictures.shape
+            )
         if not (np.all(np.isfinite(self.pictures)) and np.all(np.diff(self.shears) > 0)):
             raise InputError("a focal stack needs finite pictures and ascending shears")
 
-    def sharpest(self, depths: NDArray[np.int64]) -> Array:
-        """Return the all-in-focus picture: each pixel from the picture whose number is in (rows, columns) `depths`."""
+    def all_in_focus(self, depths: NDArray[np.int64]) -> Array:
+        """Return the all-in-focus picture: each pixel from the picture whose number is in (rows,
+        columns) `depths`.
+        """
         if depths.shape != self.pictures.shape[1:]:
             raise ShapeError("the map of depths", self.pictures.shape[1:], depths.shape)
         found: Array = np.take_along_axis(self.pictures, depths[np.newaxis], axis=0)[0]
         return found
 
 
-def focal_stack(light_field: LightField, shears: ArrayLike, reference: tuple[float, float] = (0.0, 0.0)) -> FocalStack:
-    """Refocus a light field at several shears, as seen from `reference`, any (v, u), fractions included.
+def make_focal_stack(
+    light_field: LightField, shears: ArrayLike, reference: tuple[float, float] = (0.0, 0.0)
+) -> FocalStack:
+    """Refocus a light field at several shears, as seen from `reference`, any (v, u), fractions
+    included.
 
-    Depth from focus and `FocalStack.sharpest` on a stack from another reference synthesise that viewpoint.
+    Depth from focus and `FocalStack.all_in_focus` on a stack from another reference synthesise that
+    viewpoint.
     """
     depths = np.asarray(shears, np.float64)
     pictures = [light_field.refocus(float(shear), reference) for shear in depths]
     return FocalStack(np.stack(pictures), depths)
 
 
-def sum_modified_laplacian(pictures: Array) -> Array:
-    """Second differences along rows and columns, their sizes added (S. K. Nayar, Y. Nakagawa, TPAMI 16, 824, 1994).
+def compute_modified_laplacian(pictures: Array) -> Array:
+    """Second differences along rows and columns, their sizes added (S. K. Nayar, Y. Nakagawa, TPAMI
+    16, 824, 1994).
 
     Parameters
     ----------
@@ -82,39 +93,46 @@ def sum_modified_laplacian(pictures: Array) -> Array:
     return down + across
 
 
-def image_energy(pictures: Array) -> Array:
-    """Squared slopes along rows and columns, added; shapes as in `sum_modified_laplacian`."""
+def compute_image_energy(pictures: Array) -> Array:
+    """Squared slopes along rows and columns, added; shapes as in `compute_modified_laplacian`."""
     down, across = np.gradient(pictures, axis=(-2, -1))
     energy: Array = down**2 + across**2
     return energy
 
 
-def depth_from_focus(
+def estimate_depth_from_focus(
     stack: FocalStack,
-    measure: FocusMeasure = image_energy,
+    measure: FocusMeasure = compute_image_energy,
     window_px: float = WINDOW_PX,
     smoothness: float = SMOOTHNESS,
 ) -> NDArray[np.int64]:
-    """Return for each pixel the number of the picture of the stack in which it is sharp, (rows, columns).
+    """Return for each pixel the number of the picture of the stack in which it is sharp, (rows,
+    columns).
 
-    Sharpness is averaged over a Gaussian window, which keeps noise from winning; labels are then chosen so that
-    neighbours differ little, which lets pixels without texture follow those that have some.
+    Sharpness is averaged over a Gaussian window, which keeps noise from winning; labels are then
+    chosen so that neighbours differ little, which lets pixels without texture follow those that
+    have some.
 
     Parameters
     ----------
     stack : FocalStack
     measure : callable
-        `sum_modified_laplacian` or `image_energy`, or another one.
+        `compute_modified_laplacian` or `compute_image_energy`, or another one.
     window_px : float
         Standard deviation of the window.
     smoothness : float
-        Price of two neighbours being one picture apart, relative to a textured pixel being out of focus.
+        Price of two neighbours being one picture apart, relative to a textured pixel being out of
+        focus.
     """
     from scipy.ndimage import gaussian_filter
 
-    sharpness = gaussian_filter(measure(stack.pictures.astype(np.float32)), (0, window_px, window_px))
+    sharpness = gaussian_filter(
+        measure(stack.pictures.astype(np.float32)), (0, window_px, window_px)
+    )
     best = sharpness.max(axis=0)
-    typical = float(np.quantile(best, TYPICAL))
+    typical = float(np.quantile(best, TYPICAL_QUANTILE))
     if typical == 0:
-        raise InputError("these pictures are even nearly everywhere; depth from focus needs texture")
-    return smoothest_labels((best - sharpness) / typical, smoothness)
+        raise InputError(
+            "these pictures are even nearly everywhere; depth from focus needs texture"
+        )
+    return find_smooth_labels((best - sharpness) / typical, smoothness)

@@ -1,4 +1,6 @@
-"""Readings of a light-field camera: how they were made, how they are kept, and the problem that they pose."""
+"""Readings of a light-field camera: how they were made, how they are kept, and the problem that
+they pose.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,7 @@ from tofclip.storage import Field, Record
 
 
 @dataclass(frozen=True)
-class Setup:
+class CameraSetup:
     """Which camera measures.
 
     Parameters
@@ -36,7 +38,9 @@ class Setup:
         """Build the camera; the same setup builds the same one again."""
         if self.encoder not in CAMERAS:
             raise InputError(f"unknown encoder '{self.encoder}'; take one of {', '.join(CAMERAS)}")
-        return CAMERAS[self.encoder](image_shape, [(v, u) for v, u in views.tolist()], self.sampling_ratio, self.seed)
+        return CAMERAS[self.encoder](
+            image_shape, [(v, u) for v, u in views.tolist()], self.sampling_ratio, self.seed
+        )
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ class ClipMeasurement:
 
     Parameters
     ----------
-    readings : (readings,) float32 array
+    measurements : (readings,) float32 array
     views : (views, 2) array
         (v, u) of every view.
     image_shape : (int, int)
@@ -54,16 +58,16 @@ class ClipMeasurement:
         What a reading of 1 means in counted photons; 0: not known.
     """
 
-    readings: NDArray[Any]
+    measurements: NDArray[Any]
     views: NDArray[np.float64]
     image_shape: tuple[int, int]
-    setup: Setup
+    setup: CameraSetup
     photons_per_unit: float = 0.0
 
     def __post_init__(self) -> None:
-        if not np.all(np.isfinite(self.readings)):
+        if not np.all(np.isfinite(self.measurements)):
             raise InputError("the readings hold NaN or infinity")
-        if not self.readings.any():
+        if not self.measurements.any():
             raise InputError("every reading is zero; there is nothing to recover")
 
     def camera(self) -> LightFieldCamera:
@@ -75,8 +79,10 @@ class ClipMeasurement:
             It makes another number of readings: the file is not from this setup.
         """
         camera = self.setup.camera(self.image_shape, self.views)
-        if self.readings.shape != (camera.readings,):
-            raise ShapeError("the readings of this camera", (camera.readings,), self.readings.shape)
+        if self.measurements.shape != (camera.measurements,):
+            raise ShapeError(
+                "the readings of this camera", (camera.measurements,), self.measurements.shape
+            )
         return camera
 
     def counts(self) -> NDArray[Any]:
@@ -88,8 +94,10 @@ class ClipMeasurement:
             Nobody knows how many photons a reading stands for.
         """
         if self.photons_per_unit <= 0:
-            raise InputError("these readings do not say how many photons they stand for; take squares or huber")
-        counted: NDArray[Any] = self.readings * np.float32(self.photons_per_unit)
+            raise InputError(
+                "these readings do not say how many photons they stand for; take squares or huber"
+            )
+        counted: NDArray[Any] = self.measurements * np.float32(self.photons_per_unit)
         return counted
 
     def to_record(self, provenance: Mapping[str, Any]) -> Record:
@@ -97,7 +105,7 @@ class ClipMeasurement:
         return Record(
             "clip_measurement",
             {
-                "readings": Field(self.readings, "", ("reading",)),
+                "readings": Field(self.measurements, "", ("reading",)),
                 "views": Field(self.views, "", ("view", "vu")),
             },
             {
@@ -114,25 +122,30 @@ class ClipMeasurement:
     @classmethod
     def from_record(cls, record: Record) -> ClipMeasurement:
         """Rebuild a measurement from its record."""
-        setup = Setup(
+        setup = CameraSetup(
             str(record.attribute("encoder")),
             float(record.attribute("sampling_ratio")),
             int(record.attribute("seed")),
         )
         shape = (int(record.attribute("rows")), int(record.attribute("columns")))
-        views, photons = record.array("views", np.float64, 2), float(record.attribute("photons_per_unit"))
+        views, photons = (
+            record.array("views", np.float64, 2),
+            float(record.attribute("photons_per_unit")),
+        )
         return cls(record.array("readings", np.float32, 1), views, shape, setup, photons)
 
 
-def measure(light_field: LightField, setup: Setup) -> ClipMeasurement:
+def measure(light_field: LightField, setup: CameraSetup) -> ClipMeasurement:
     """Encode the true views, each by its own A_k: no model of refocusing takes part."""
     shape = (light_field.pictures.shape[1], light_field.pictures.shape[2])
     camera = setup.camera(shape, light_field.views)
-    readings = camera.light_field_model()(light_field.pictures[list(camera.used)])
-    return ClipMeasurement(readings, light_field.views, shape, setup)
+    measurements = camera.light_field_model()(light_field.pictures[list(camera.used_views)])
+    return ClipMeasurement(measurements, light_field.views, shape, setup)
 
 
-def spoilt(measurement: ClipMeasurement, photons: float | None, bad_fraction: float) -> ClipMeasurement:
+def corrupt_measurement(
+    measurement: ClipMeasurement, photons: float | None, bad_fraction: float
+) -> ClipMeasurement:
     """Add photon noise, then set a share of all readings to 0 or to the largest, at random.
 
     Parameters
@@ -148,11 +161,13 @@ def spoilt(measurement: ClipMeasurement, photons: float | None, bad_fraction: fl
     if photons is not None and not (np.isfinite(photons) and photons > 0):
         raise InputError(f"the number of photons must be positive, got {photons}")
     random = np.random.default_rng([measurement.setup.seed, 1])
-    readings = measurement.readings.copy()
-    largest = readings.max()
+    measurements = measurement.measurements.copy()
+    largest = measurements.max()
     per_unit = 0.0 if photons is None else float(photons / largest)
     if photons is not None:
-        readings = (random.poisson(np.maximum(readings, 0) * per_unit) / per_unit).astype(np.float32)
-    bad = random.permutation(readings.size)[: round(bad_fraction * readings.size)]
-    readings[bad] = random.choice(np.array([0, largest], np.float32), bad.size)
-    return replace(measurement, readings=readings, photons_per_unit=per_unit)
+        measurements = (random.poisson(np.maximum(measurements, 0) * per_unit) / per_unit).astype(
+            np.float32
+        )
+    bad = random.permutation(measurements.size)[: round(bad_fraction * measurements.size)]
+    measurements[bad] = random.choice(np.array([0, largest], np.float32), bad.size)
+    return replace(measurement, measurements=measurements, photons_per_unit=per_unit)

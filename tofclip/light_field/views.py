@@ -33,13 +33,19 @@ class LightField:
 
     def __post_init__(self) -> None:
         if self.pictures.ndim != 3:
-            raise ShapeError("the pictures of a light field", "(views, rows, columns)", self.pictures.shape)
+            raise ShapeError(
+                "the pictures of a light field", "(views, rows, columns)", self.pictures.shape
+            )
         if self.views.shape != (len(self.pictures), 2):
-            raise ShapeError("the views of a light field", (len(self.pictures), 2), self.views.shape)
+            raise ShapeError(
+                "the views of a light field", (len(self.pictures), 2), self.views.shape
+            )
         if not np.all(np.isfinite(self.pictures)):
             raise InputError("a light field must not hold NaN or infinity")
         if np.ptp(self.pictures) == 0:
-            raise InputError("a light field whose pictures are all one even tone shows nothing to recover")
+            raise InputError(
+                "a light field whose pictures are all one even tone shows nothing to recover"
+            )
 
     def refocus(self, shear: float, reference: tuple[float, float] = (0.0, 0.0)) -> NDArray[Any]:
         """Shift and add: each view is shifted back and the mean taken of those that see the pixel.

@@ -1,4 +1,6 @@
-"""The inactive region: what lies so close behind a solid occluder that no view can see it (supplement Note 10)."""
+"""The inactive region: what lies so close behind a solid occluder that no view can see it
+(supplement Note 10).
+"""
 
 from __future__ import annotations
 
@@ -13,11 +15,12 @@ from tofclip.errors import InputError
 
 @dataclass(frozen=True)
 class InactiveRegion:
-    """The shadow that a solid occluder on the axis throws, were the whole aperture one lamp: its umbra.
+    """The shadow that a solid occluder on the axis throws, were the whole aperture one lamp: its
+    umbra.
 
-    Everything happens in the plane of the axis and the aperture's width. A point is seen from somewhere on the
-    aperture exactly if it is seen from one of its ends; hence views that stand at both ends and anywhere between see
-    as far as a lens that fills the aperture would.
+    Everything happens in the plane of the axis and the aperture's width. A point is seen from
+    somewhere on the aperture exactly if it is seen from one of its ends; hence views that stand at
+    both ends and anywhere between see as far as a lens that fills the aperture would.
 
     Parameters
     ----------
@@ -41,17 +44,21 @@ class InactiveRegion:
     def __post_init__(self) -> None:
         for name in ("baseline", "width", "distance"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise InputError(f"the {name} must be a positive length, got {getattr(self, name)} m")
+                raise InputError(
+                    f"the {name} must be a positive length, got {getattr(self, name)} m"
+                )
 
     @property
-    def ends(self) -> bool:
+    def is_bounded(self) -> bool:
         """Whether anything behind the occluder's middle is promised to be seen: D < L."""
         return self.width < self.baseline
 
     @property
     def length(self) -> float:
-        """How far the region reaches behind the occluder, m: ``l_d = d D / (L - D)``; infinite where D >= L."""
-        if not self.ends:
+        """How far the region reaches behind the occluder, m: ``l_d = d D / (L - D)``; infinite
+        where D >= L.
+        """
+        if not self.is_bounded:
             return float("inf")
         return self.distance * self.width / (self.baseline - self.width)
 
@@ -60,7 +67,7 @@ class InactiveRegion:
 
         Parameters
         ----------
-        place : array
+        position : array
             Of a view on the aperture, m from the axis.
         across, behind : arrays
             A point: m from the axis, and m behind the occluder. All three are broadcast.

@@ -1,4 +1,6 @@
-"""Linear operators: the base with its adjoint, composition and stacking, and the encoders of a camera."""
+"""Linear operators: the base with its adjoint, composition and stacking, and the encoders of a
+camera.
+"""
 
 from tofclip.operators.base import (
     Adjoint,
@@ -7,12 +9,11 @@ from tofclip.operators.base import (
     Identity,
     LinearOperator,
     Reshape,
-    squared_norm,
+    estimate_squared_norm,
 )
 from tofclip.operators.coded_lines import SliceConvolution
 from tofclip.operators.coded_views import MaskedViews, ShearedViews, WeightedViews
 from tofclip.operators.convolution import PointSpreadConvolution
-from tofclip.operators.joined import BlockDiagonal, Integration, Stack
 from tofclip.operators.projection import LineProjection
 from tofclip.operators.radon import RadonProjection
 from tofclip.operators.selection import ViewSelection
@@ -20,6 +21,7 @@ from tofclip.operators.sensors import DenseSensor, MaskedSensor, PitchedSensor
 from tofclip.operators.shear import FourierShear, LinearShear
 from tofclip.operators.single_pixel import HadamardCodes, RandomCodes
 from tofclip.operators.sparse import SparseMatrix
+from tofclip.operators.stacking import BlockDiagonal, Integration, Stack
 from tofclip.operators.weighting import MeanWeighting
 
 __all__ = [
@@ -49,5 +51,5 @@ __all__ = [
     "Stack",
     "ViewSelection",
     "WeightedViews",
-    "squared_norm",
+    "estimate_squared_norm",
 ]

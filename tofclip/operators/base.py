@@ -1,10 +1,11 @@
 """Linear operators: exact shapes, an adjoint beside every forward, composition with ``@``.
 
-An operator maps arrays of `shape_in` to arrays of `shape_out`. A batch is one explicit last axis more; nothing is
-flattened or broadcast behind the caller's back.
+An operator maps arrays of `shape_in` to arrays of `shape_out`. A batch is one explicit last axis
+more; nothing is flattened or broadcast behind the caller's back.
 
-Every operator takes NumPy arrays. Those that are `portable` take the arrays of any library that follows the array API
-standard as well, such as CuPy's and PyTorch's on a graphics processor, and answer in kind; the others refuse them.
+Every operator takes NumPy arrays. Those that are `portable` take the arrays of any library that
+follows the array API standard as well, such as CuPy's and PyTorch's on a graphics processor, and
+answer in kind; the others refuse them.
 """
 
 from __future__ import annotations
@@ -16,7 +17,15 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from tofclip.arrays import Array as Array
-from tofclip.arrays import InEachPlace, Place, as_type, is_complex, is_numpy, namespace, require_numpy
+from tofclip.arrays import (
+    ComputeDevice,
+    PerDevice,
+    as_type,
+    is_complex,
+    is_numpy,
+    namespace,
+    require_numpy,
+)
 from tofclip.errors import InputError, ShapeError
 
 Shape = tuple[int, ...]
@@ -27,8 +36,9 @@ REAL_TYPES = (np.dtype(np.float32), np.dtype(np.float64))
 class LinearOperator(ABC):
     """A linear map between real arrays of fixed shapes.
 
-    Subclasses write `_forward` and `_adjoint`, which get a block of the operator's own type with the batch as last
-    axis, and return one: of NumPy's arrays a contiguous one, and of other libraries' only what says it is `portable`.
+    Subclasses write `_forward` and `_adjoint`, which get a block of the operator's own type with
+    the batch as last axis, and return one: of NumPy's arrays a contiguous one, and of other
+    libraries' only what says it is `portable`.
 
     Parameters
     ----------
@@ -55,7 +65,9 @@ class LinearOperator(ABC):
         if self.dtype not in REAL_TYPES:
             raise InputError(f"operators work in float32 or float64, not {self.dtype}")
         if min((*self.shape_in, *self.shape_out)) < 1:
-            raise ShapeError("an operator", "at least one element on both sides", (shape_in, shape_out))
+            raise ShapeError(
+                "an operator", "at least one element on both sides", (shape_in, shape_out)
+            )
 
     @abstractmethod
     def _forward(self, block: Array) -> Array:
@@ -67,19 +79,19 @@ class LinearOperator(ABC):
 
     def __call__(self, x: Array) -> Array:
         """Apply the operator to an array of shape `shape_in`, or `shape_in` and a batch axis."""
-        block, single = self._as_block(x, self.shape_in, "the operand")
+        block, single = self._to_block(x, self.shape_in, "the operand")
         result = self._forward(block)
         return result[..., 0] if single else result
 
     def adjoint(self, y: Array) -> Array:
         """Apply the adjoint to an array of shape `shape_out`, or `shape_out` and a batch axis."""
-        block, single = self._as_block(y, self.shape_out, "the adjoint's operand")
+        block, single = self._to_block(y, self.shape_out, "the adjoint's operand")
         result = self._adjoint(block)
         return result[..., 0] if single else result
 
-    def _as_block(self, values: Array, shape: Shape, what: str) -> tuple[Array, bool]:
+    def _to_block(self, values: Array, shape: Shape, what: str) -> tuple[Array, bool]:
         if not self.portable:
-            require_numpy(f"the operator {type(self._bound_to_numpy).__name__}", values)
+            require_numpy(f"the operator {type(self._numpy_only_part).__name__}", values)
         array = np.asarray(values) if is_numpy(values) else values
         single = array.shape == shape
         if not single and array.shape[:-1] != shape:
@@ -88,14 +100,14 @@ class LinearOperator(ABC):
             raise InputError(f"{what} must be real, got {array.dtype}")
         return as_type(array[..., None] if single else array, self.dtype), single
 
-    def _made_of(self, *parts: LinearOperator) -> None:
+    def _set_parts(self, *parts: LinearOperator) -> None:
         """Remember the parts; what is made of several takes the arrays that all of them take."""
         self.parts, self.portable = parts, all(part.portable for part in parts)
 
     @property
-    def _bound_to_numpy(self) -> LinearOperator:
+    def _numpy_only_part(self) -> LinearOperator:
         """The innermost part because of which other libraries' arrays cannot be taken."""
-        return next((part._bound_to_numpy for part in self.parts if not part.portable), self)
+        return next((part._numpy_only_part for part in self.parts if not part.portable), self)
 
     @property
     def H(self) -> LinearOperator:  # noqa: N802 - the field's own symbol
@@ -116,7 +128,7 @@ class Adjoint(LinearOperator):
     def __init__(self, operator: LinearOperator) -> None:
         super().__init__(operator.shape_out, operator.shape_in, operator.dtype)
         self.operator = operator
-        self._made_of(operator)
+        self._set_parts(operator)
 
     def _forward(self, block: Array) -> Array:
         return self.operator._adjoint(block)
@@ -137,10 +149,12 @@ class Composition(LinearOperator):
         if outer.shape_in != inner.shape_out:
             raise ShapeError("the inner operator's result", outer.shape_in, inner.shape_out)
         if outer.dtype != inner.dtype:
-            raise InputError(f"cannot compose {outer.dtype} with {inner.dtype}; build both in one type")
+            raise InputError(
+                f"cannot compose {outer.dtype} with {inner.dtype}; build both in one type"
+            )
         super().__init__(inner.shape_in, outer.shape_out, outer.dtype)
         self.outer, self.inner = outer, inner
-        self._made_of(outer, inner)
+        self._set_parts(outer, inner)
 
     def _forward(self, block: Array) -> Array:
         return self.outer._forward(self.inner._forward(block))
@@ -170,7 +184,9 @@ class Identity(LinearOperator):
 
 
 class Reshape(LinearOperator):
-    """The same values in another shape, such as the views of a light field one below the other as one tall picture."""
+    """The same values in another shape, such as the views of a light field one below the other as
+    one tall picture.
+    """
 
     portable = True
 
@@ -197,16 +213,16 @@ class Diagonal(LinearOperator):
             raise InputError("weights must be finite")
         super().__init__(array.shape, array.shape, dtype)
         self.weights = array
-        self._weights = InEachPlace(partial(Place.put, values=array[..., np.newaxis]))
+        self._weights = PerDevice(partial(ComputeDevice.put, values=array[..., np.newaxis]))
 
     def _forward(self, block: Array) -> Array:
-        return self._weights.beside(block) * block
+        return self._weights.get(block) * block
 
     def _adjoint(self, block: Array) -> Array:
         return self._forward(block)
 
 
-def squared_norm(operator: LinearOperator, iterations: int = 30, seed: int = 0) -> float:
+def estimate_squared_norm(operator: LinearOperator, iterations: int = 30, seed: int = 0) -> float:
     """Estimate the largest eigenvalue of A'A from below by power iteration.
 
     For a solver's step this is used with a margin; the iteration converges from below.

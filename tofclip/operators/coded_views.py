@@ -1,4 +1,6 @@
-"""Operators of compressive light-field photography (supplement Note 5): whole light fields on dense area sensors."""
+"""Operators of compressive light-field photography (supplement Note 5): whole light fields on dense
+area sensors.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +30,18 @@ class WeightedViews(LinearOperator):
     Light fields are (views, rows, columns); readings are (exposures * rows * columns,).
     """
 
-    def __init__(self, image_shape: tuple[int, int], weights: ArrayLike, dtype: DTypeLike = np.float32) -> None:
+    def __init__(
+        self, image_shape: tuple[int, int], weights: ArrayLike, dtype: DTypeLike = np.float32
+    ) -> None:
         self.weights = np.asarray(weights, dtype=dtype)
         if self.weights.ndim != 2:
             raise ShapeError("mask weights", "(exposures, views)", self.weights.shape)
         if not np.all(np.isfinite(self.weights)):
             raise InputError("mask weights must be finite")
         exposures, views = self.weights.shape
-        super().__init__((views, *image_shape), (exposures * image_shape[0] * image_shape[1],), dtype)
+        super().__init__(
+            (views, *image_shape), (exposures * image_shape[0] * image_shape[1],), dtype
+        )
 
     def _forward(self, block: Array) -> Array:
         seen: Array = self.weights @ block.reshape(len(block), -1)
@@ -47,7 +53,8 @@ class WeightedViews(LinearOperator):
 
 
 class MaskedViews(LinearOperator):
-    """One exposure through a mask near the sensor: ``y = sum_k C_k P_k``, C_k the mask as view k sees it (Eq. 18).
+    """One exposure through a mask near the sensor: ``y = sum_k C_k P_k``, C_k the mask as view k
+    sees it (Eq. 18).
 
     Parameters
     ----------
@@ -80,9 +87,11 @@ class MaskedViews(LinearOperator):
 
 
 class ShearedViews(LinearOperator):
-    """All views that a picture at one depth has: ``[B_1; B_2; ...]``, (rows, columns) to (views, rows, columns).
+    """All views that a picture at one depth has: ``[B_1; B_2; ...]``, (rows, columns) to (views,
+    rows, columns).
 
-    Composed with a model of the whole light field it makes that of the picture refocused at one depth (Eq. 21).
+    Composed with a model of the whole light field it makes that of the picture refocused at one
+    depth (Eq. 21).
 
     Parameters
     ----------
@@ -116,8 +125,11 @@ class ShearedViews(LinearOperator):
         return total
 
 
-def sheared_mask(
-    image_shape: tuple[int, int], views: Sequence[View], mask_shear: float, random: np.random.Generator
+def make_sheared_mask(
+    image_shape: tuple[int, int],
+    views: Sequence[View],
+    mask_shear: float,
+    random: np.random.Generator,
 ) -> NDArray[np.float64]:
     """Make the codes of a random mask at some distance in front of the sensor.
 
@@ -126,7 +138,8 @@ def sheared_mask(
     image_shape : (int, int)
     views : sequence of (float, float)
     mask_shear : float
-        Pixels by which the mask appears moved from view to view: 0 on the sensor, where all views see it alike.
+        Pixels by which the mask appears moved from view to view: 0 on the sensor, where all views
+        see it alike.
     random : numpy Generator
         Of the mask's transmissions, evenly from 0 to 1.
 
@@ -138,4 +151,6 @@ def sheared_mask(
     large = (image_shape[0] + 2 * margin, image_shape[1] + 2 * margin)
     mask = random.random(large)
     inner = (slice(margin, -margin), slice(margin, -margin))
-    return np.stack([LinearShear(large, mask_shear, view, dtype=np.float64)(mask)[inner] for view in views])
+    return np.stack(
+        [LinearShear(large, mask_shear, view, dtype=np.float64)(mask)[inner] for view in views]
+    )

@@ -1,4 +1,6 @@
-"""Convolution of a picture with a point-spread function: what a lens, a mask or a diffuser puts on a sensor."""
+"""Convolution of a picture with a point-spread function: what a lens, a mask or a diffuser puts on
+a sensor.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +14,24 @@ from tofclip.operators.base import Array, LinearOperator
 
 
 class PointSpreadConvolution(LinearOperator):
-    """A picture convolved with a point-spread function (PSF), on the plane of the sensor (supplement Eq. 4).
+    """A picture convolved with a point-spread function (PSF), on the plane of the sensor
+    (supplement Eq. 4).
 
-    A point in the picture's middle puts the PSF, as it is, about the sensor's middle. The convolution is linear: the
-    picture is dark beyond its border, and light that falls beside the sensor is lost. It runs over Fourier space,
-    padded by just as much as keeps periodic images of the picture off the sensor.
+    A point in the picture's middle puts the PSF, as it is, about the sensor's middle. The
+    convolution is linear: the picture is dark beyond its border, and light that falls beside the
+    sensor is lost. It runs over Fourier space, padded by just as much as keeps periodic images of
+    the picture off the sensor.
 
     Parameters
     ----------
     image_shape : (int, int)
         Rows and columns of the picture.
     point_spread : (rows, columns) array
-        Light on the sensor from a point of brightness 1; its origin is pixel ``(rows // 2, columns // 2)``.
+        Light on the sensor from a point of brightness 1; its origin is pixel ``(rows // 2, columns
+        // 2)``.
     sensor_shape : (int, int), optional
-        Rows and columns of the sensor, about the picture's middle; the default is the picture's shape. A lensless
-        camera sees more than its sensor covers: then the picture is the larger.
+        Rows and columns of the sensor, about the picture's middle; the default is the picture's
+        shape. A lensless camera sees more than its sensor covers: then the picture is the larger.
     dtype : dtype
         float32 or float64.
 
@@ -37,8 +42,10 @@ class PointSpreadConvolution(LinearOperator):
 
     Notes
     -----
-    ``scipy.fft`` is used: 0.18 ms for both transforms of a 128 x 128 picture padded to 192 x 192. A pyFFTW plan takes
-    0.16 ms unmeasured and 0.12 ms measured, but owns its memory, so that threads would have to wait for each other.
+    ``scipy.fft`` is used: 0.18 ms for both transforms of a 128 x 128 picture padded to 192 x 192. A
+    pyFFTW plan takes
+    0.16 ms unmeasured and 0.12 ms measured, but owns its memory, so that threads would have to wait
+      for each other.
     """
 
     def __init__(
@@ -52,10 +59,13 @@ class PointSpreadConvolution(LinearOperator):
 
         sensor_shape = image_shape if sensor_shape is None else sensor_shape
         super().__init__(image_shape, sensor_shape, dtype)
-        spread, centre = _without_dark_border(checked_point_spread(point_spread, image_shape))
-        first = [image // 2 - sensor // 2 for image, sensor in zip(image_shape, sensor_shape, strict=True)]
+        spread, centre = _crop_to_support(validate_point_spread(point_spread, image_shape))
+        first = [
+            image // 2 - sensor // 2
+            for image, sensor in zip(image_shape, sensor_shape, strict=True)
+        ]
         self._padded = tuple(
-            scipy.fft.next_fast_len(unmixed_length(*sizes), real=True)
+            scipy.fft.next_fast_len(alias_free_length(*sizes), real=True)
             for sizes in zip(image_shape, sensor_shape, spread.shape, first, centre, strict=True)
         )
         placed = np.zeros(self._padded, self.dtype)
@@ -64,12 +74,14 @@ class PointSpreadConvolution(LinearOperator):
         self._spectrum = scipy.fft.rfft2(np.roll(placed, shift, (0, 1)))[..., np.newaxis]
 
     def _forward(self, block: Array) -> Array:
-        return self._filtered(block, self._spectrum, self.shape_out)
+        return self._apply_spectrum(block, self._spectrum, self.shape_out)
 
     def _adjoint(self, block: Array) -> Array:
-        return self._filtered(block, self._spectrum.conj(), self.shape_in)
+        return self._apply_spectrum(block, self._spectrum.conj(), self.shape_in)
 
-    def _filtered(self, block: Array, spectrum: NDArray[Any], shape: tuple[int, ...]) -> Array:
+    def _apply_spectrum(
+        self, block: Array, spectrum: NDArray[Any], shape: tuple[int, ...]
+    ) -> Array:
         import scipy.fft
 
         transformed = scipy.fft.rfft2(block, s=self._padded, axes=(0, 1))
@@ -78,7 +90,9 @@ class PointSpreadConvolution(LinearOperator):
         return np.ascontiguousarray(filtered[: shape[0], : shape[1]])
 
 
-def checked_point_spread(point_spread: ArrayLike, image_shape: tuple[int, int]) -> NDArray[np.float64]:
+def validate_point_spread(
+    point_spread: ArrayLike, image_shape: tuple[int, int]
+) -> NDArray[np.float64]:
     """Return a PSF as float64, refusing what cannot be one for pictures of `image_shape`."""
     spread = np.asarray(point_spread, dtype=np.float64)
     if spread.ndim != 2 or 0 in spread.shape:
@@ -91,21 +105,24 @@ def checked_point_spread(point_spread: ArrayLike, image_shape: tuple[int, int]) 
     if not np.all(np.isfinite(spread)):
         raise InputError("a point-spread function must not hold NaN or infinity")
     if not spread.any():
-        raise InputError("a point-spread function that is dark everywhere shows nothing; check its background")
+        raise InputError(
+            "a point-spread function that is dark everywhere shows nothing; check its background"
+        )
     return spread
 
 
-def _without_dark_border(spread: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[int]]:
+def _crop_to_support(spread: NDArray[np.float64]) -> tuple[NDArray[np.float64], list[int]]:
     """Cut a PSF down to where it is not zero; return it and where its origin lies then."""
     lit = [np.flatnonzero(spread.any(axis=other)) for other in (1, 0)]
     cut = spread[lit[0][0] : lit[0][-1] + 1, lit[1][0] : lit[1][-1] + 1]
     return cut, [size // 2 - int(axis[0]) for size, axis in zip(spread.shape, lit, strict=True)]
 
 
-def unmixed_length(image: int, sensor: int, spread: int, first: int, centre: int) -> int:
+def alias_free_length(image: int, sensor: int, spread: int, first: int, centre: int) -> int:
     """Least period for which no sensor pixel gets light from a periodic image of the picture.
 
-    Sensor pixels lie at first ... first + sensor - 1 of the picture's own pixels 0 ... image - 1; the PSF reaches from
+    Sensor pixels lie at first ... first + sensor - 1 of the picture's own pixels 0 ... image - 1;
+    the PSF reaches from
     -centre to spread - 1 - centre.
     """
     return max(image, sensor, spread, first + sensor + centre, image - first + spread - 1 - centre)

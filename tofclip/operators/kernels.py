@@ -1,12 +1,13 @@
 """Compiled inner loops of the operators.
 
-The sparse product: a plain numba loop over the lanes of a block re-reads and re-writes the accumulator for every
-nonzero, because the compiler cannot know that the arrays do not overlap. Here the accumulator is a vector value that
-lives in registers: it makes the product two to three times faster than scipy's on the sizes of a streak image.
+The sparse product: a plain numba loop over the lanes of a block re-reads and re-writes the
+accumulator for every nonzero, because the compiler cannot know that the arrays do not overlap. Here
+the accumulator is a vector value that lives in registers: it makes the product two to three times
+faster than scipy's on the sizes of a streak image.
 
-Line projections of a lone picture need no matrix at all: where a pixel falls is computed in less time than it would
-take to read it from memory. Positions are whole numbers of 2^-32 pixels, so that both directions share every pixel
-alike to the last bit.
+Line projections of a lone picture need no matrix at all: where a pixel falls is computed in less
+time than it would take to read it from memory. Positions are whole numbers of 2^-32 pixels, so that
+both directions share every pixel alike to the last bit.
 """
 
 from __future__ import annotations
@@ -25,13 +26,13 @@ from numba.extending import intrinsic
 from tofclip.operators.radon import FRACTION_BITS
 from tofclip.threads import LANES
 
-UNROLL = 2  # independent accumulators, which hide the latency of the fused multiply-add
-INDEX = ir.IntType(64)
+UNROLL_COUNT = 2  # independent accumulators, which hide the latency of the fused multiply-add
+INDEX_TYPE = ir.IntType(64)
 LANE_SELECTOR = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
 
 
 @intrinsic
-def _row_times_block(
+def _emit_row_product(
     typing_context: Any,
     result: Any,
     row: Any,
@@ -43,10 +44,11 @@ def _row_times_block(
     last: Any,
     onto: Any,
 ) -> Any:
-    """``result[row, :LANES] = start + sum_q values[q] * block[columns[q], :LANES]`` for q in [first, last).
+    """``result[row, :LANES] = start + sum_q values[q] * block[columns[q], :LANES]`` for q in
+    [first, last).
 
-    `start` is 0, or what stands there already where the boolean `onto` says so. `stride` is the length of a row of
-    both blocks, which must be C-contiguous.
+    `start` is 0, or what stands there already where the boolean `onto` says so. `stride` is the
+    length of a row of both blocks, which must be C-contiguous.
     """
     signature = types.void(result, row, stride, block, columns, values, first, last, onto)
 
@@ -64,25 +66,29 @@ def _row_times_block(
             return builder.bitcast(start, vector.as_pointer())
 
         def accumulate(position: Any, accumulator: Any) -> None:
-            column = builder.zext(builder.load(builder.gep(index, [position])), INDEX)
+            column = builder.zext(builder.load(builder.gep(index, [position])), INDEX_TYPE)
             scalar = builder.load(builder.gep(weight, [position]))
             lone = builder.insert_element(undefined, scalar, ir.Constant(ir.IntType(32), 0))
             broadcast = builder.shuffle_vector(lone, undefined, LANE_SELECTOR)
-            product = builder.fmul(broadcast, builder.load(lanes_at(source, column), align=4), flags=("contract",))
-            builder.store(builder.fadd(product, builder.load(accumulator), flags=("contract",)), accumulator)
+            product = builder.fmul(
+                broadcast, builder.load(lanes_at(source, column), align=4), flags=("contract",)
+            )
+            builder.store(
+                builder.fadd(product, builder.load(accumulator), flags=("contract",)), accumulator
+            )
 
         destination = lanes_at(target, row_number)
         zero = ir.Constant(vector, [0.0] * LANES)
         present = builder.select(arguments[8], builder.load(destination, align=4), zero)
-        starts = [present] + [zero] * (UNROLL - 1)
+        starts = [present] + [zero] * (UNROLL_COUNT - 1)
         accumulators = [cgutils.alloca_once_value(builder, start) for start in starts]
         position = cgutils.alloca_once_value(builder, begin)
-        for step in (UNROLL, 1):
-            with _loop_while(builder, partial(_fits, builder, position, step, end)):
+        for step in (UNROLL_COUNT, 1):
+            with _emit_while(builder, partial(_emit_fits, builder, position, step, end)):
                 here = builder.load(position)
                 for lane_set in range(step):
-                    accumulate(builder.add(here, INDEX(lane_set)), accumulators[lane_set])
-                builder.store(builder.add(here, INDEX(step)), position)
+                    accumulate(builder.add(here, INDEX_TYPE(lane_set)), accumulators[lane_set])
+                builder.store(builder.add(here, INDEX_TYPE(step)), position)
         total = builder.load(accumulators[0])
         for accumulator in accumulators[1:]:
             total = builder.fadd(total, builder.load(accumulator))
@@ -92,12 +98,12 @@ def _row_times_block(
     return signature, generate
 
 
-def _fits(builder: Any, position: Any, step: int, end: Any) -> Any:
-    return builder.icmp_signed("<=", builder.add(builder.load(position), INDEX(step)), end)
+def _emit_fits(builder: Any, position: Any, step: int, end: Any) -> Any:
+    return builder.icmp_signed("<=", builder.add(builder.load(position), INDEX_TYPE(step)), end)
 
 
 @contextlib.contextmanager
-def _loop_while(builder: Any, condition: Callable[[], Any]) -> Iterator[None]:
+def _emit_while(builder: Any, condition: Callable[[], Any]) -> Iterator[None]:
     head, body, after = (builder.append_basic_block(name) for name in ("head", "body", "after"))
     builder.branch(head)
     builder.position_at_end(head)
@@ -109,8 +115,9 @@ def _loop_while(builder: Any, condition: Callable[[], Any]) -> Iterator[None]:
 
 
 @njit(nogil=True, cache=True)
-def sparse_times_block(tile_starts, columns, values, block, result):
-    """``result = M @ block`` for a sparse matrix M in column tiles; see `tofclip.operators.sparse.Tiles`.
+def multiply_sparse_block(tile_starts, columns, values, block, result):
+    """``result = M @ block`` for a sparse matrix M in column tiles; see
+    `tofclip.operators.sparse.Tiles`.
 
     Parameters
     ----------
@@ -126,31 +133,36 @@ def sparse_times_block(tile_starts, columns, values, block, result):
         for row in range(tile_starts.shape[1] - 1):
             first, last = tile_starts[tile, row], tile_starts[tile, row + 1]
             if first < last or not onto:
-                _row_times_block(result, row, LANES, block, columns, values, first, last, onto)
+                _emit_row_product(result, row, LANES, block, columns, values, first, last, onto)
 
 
-compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy")
-inlined = njit(inline="always")
+fast_njit = njit(
+    nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy"
+)
+inline_njit = njit(inline="always")
 
-FRACTION = (1 << FRACTION_BITS) - 1
+FRACTION_MASK = (1 << FRACTION_BITS) - 1
 
 
-@inlined
-def _deposit(line, position, light, light_step):
-    """Share light between the bin of `position`, in column 0, and the next one, in column 1 of the same row."""
+@inline_njit
+def _deposit_light(line, position, light, light_step):
+    """Share light between the bin of `position`, in column 0, and the next one, in column 1 of the
+    same row.
+    """
     first = np.uint64(position >> FRACTION_BITS)
-    beyond = line.dtype.type(position & FRACTION) * light_step
+    beyond = line.dtype.type(position & FRACTION_MASK) * light_step
     line[first, 0] += light - beyond
     line[first, 1] += beyond
 
 
-@compiled
+@fast_njit
 def project_onto_lines(picture, starts, rightward, downward, lines):
-    """Project a (rows, columns) picture onto lines; adds to `lines`, (lines, bins, 2), which `_deposit` explains.
+    """Project a (rows, columns) picture onto lines; adds to `lines`, (lines, bins, 2), which
+    `_deposit_light` explains.
 
-    `starts`, `rightward` and `downward`, (lines,) int64, are the position of the first pixel and the steps from pixel
-    to pixel in units of 2^-32 bins; every position and the next bin must lie on the line. Two lines at a time keep the
-    processor busy while a sum is on its way to memory.
+    `starts`, `rightward` and `downward`, (lines,) int64, are the position of the first pixel and
+    the steps from pixel to pixel in units of 2^-32 bins; every position and the next bin must lie
+    on the line. Two lines at a time keep the processor busy while a sum is on its way to memory.
     """
     step = picture.dtype.type(1 / (1 << FRACTION_BITS))
     pairs = starts.size // 2
@@ -163,20 +175,22 @@ def project_onto_lines(picture, starts, rightward, downward, lines):
             there = starts[other] + row * downward[other]
             for column in range(picture.shape[1]):
                 light = picture[row, column]
-                _deposit(line, here + column * right, light, light * step)
-                _deposit(next_line, there + column * next_right, light, light * step)
+                _deposit_light(line, here + column * right, light, light * step)
+                _deposit_light(next_line, there + column * next_right, light, light * step)
     for last in range(2 * pairs, starts.size):
         line, right = lines[last], rightward[last]
         for row in range(picture.shape[0]):
             here = starts[last] + row * downward[last]
             for column in range(picture.shape[1]):
                 light = picture[row, column]
-                _deposit(line, here + column * right, light, light * step)
+                _deposit_light(line, here + column * right, light, light * step)
 
 
-@compiled
+@fast_njit
 def back_project_lines(lines, starts, rightward, downward, picture):
-    """The adjoint of `project_onto_lines` for lines (lines, bins) of one value a bin; overwrites `picture`."""
+    """The adjoint of `project_onto_lines` for lines (lines, bins) of one value a bin; overwrites
+    `picture`.
+    """
     step = picture.dtype.type(1 / (1 << FRACTION_BITS))
     for row in range(picture.shape[0]):
         picture[row] = 0
@@ -186,15 +200,18 @@ def back_project_lines(lines, starts, rightward, downward, picture):
             for column in range(picture.shape[1]):
                 position = start + column * right
                 first = np.uint64(position >> FRACTION_BITS)
-                share = line.dtype.type(position & FRACTION) * step
-                picture[row, column] += line[first] + share * (line[first + np.uint64(1)] - line[first])
+                share = line.dtype.type(position & FRACTION_MASK) * step
+                picture[row, column] += line[first] + share * (
+                    line[first + np.uint64(1)] - line[first]
+                )
 
 
-@compiled
-def count_on_lines(starts, rightward, downward, before, shape, counts):
+@fast_njit
+def count_line_nonzeros(starts, rightward, downward, before, shape, counts):
     """Count the nonzeros in each row of the matrix that `project_onto_lines` stands for.
 
-    `counts` is (lines, detector pixels), zeros; the detector's first pixel is bin `before`, `shape` the picture's.
+    `counts` is (lines, detector pixels), zeros; the detector's first pixel is bin `before`, `shape`
+    the picture's.
     """
     for number in range(starts.size):
         for row in range(shape[0]):
@@ -204,16 +221,16 @@ def count_on_lines(starts, rightward, downward, before, shape, counts):
                 reading = (position >> FRACTION_BITS) - before
                 if 0 <= reading < counts.shape[1]:
                     counts[number, reading] += 1
-                if 0 <= reading + 1 < counts.shape[1] and position & FRACTION:
+                if 0 <= reading + 1 < counts.shape[1] and position & FRACTION_MASK:
                     counts[number, reading + 1] += 1
 
 
-@compiled
-def enter_on_lines(starts, rightward, downward, before, shape, places, columns, values):
-    """Write the nonzeros that `count_on_lines` counted.
+@fast_njit
+def fill_line_nonzeros(starts, rightward, downward, before, shape, places, columns, values):
+    """Write the nonzeros that `count_line_nonzeros` counted.
 
-    `places`, (lines, detector pixels), says where each row of the matrix begins in `columns` and `values`, and says
-    afterwards where it ends.
+    `places`, (lines, detector pixels), says where each row of the matrix begins in `columns` and
+    `values`, and says afterwards where it ends.
     """
     whole, step = values.dtype.type(1), values.dtype.type(1 / (1 << FRACTION_BITS))
     for number in range(starts.size):
@@ -221,7 +238,10 @@ def enter_on_lines(starts, rightward, downward, before, shape, places, columns, 
             start = starts[number] + row * downward[number]
             for column in range(shape[1]):
                 position = start + column * rightward[number]
-                reading, share = (position >> FRACTION_BITS) - before, values.dtype.type(position & FRACTION) * step
+                reading, share = (
+                    (position >> FRACTION_BITS) - before,
+                    values.dtype.type(position & FRACTION_MASK) * step,
+                )
                 for bin_number, weight in ((reading, whole - share), (reading + 1, share)):
                     if 0 <= bin_number < places.shape[1] and (bin_number == reading or share != 0):
                         place = places[number, bin_number]
@@ -229,17 +249,19 @@ def enter_on_lines(starts, rightward, downward, before, shape, places, columns, 
                         places[number, bin_number] = place + 1
 
 
-@compiled
-def count_in_tiles(row_starts, indices, width, counts):
+@fast_njit
+def count_tile_nonzeros(row_starts, indices, width, counts):
     """Count a CSR matrix's nonzeros in each tile of `width` columns and row, (tiles, rows) zeros."""
     for row in range(row_starts.size - 1):
         for entry in range(row_starts[row], row_starts[row + 1]):
             counts[indices[entry] // width, row] += 1
 
 
-@compiled
+@fast_njit
 def sort_into_tiles(row_starts, indices, data, width, places, columns, values):
-    """Write a CSR matrix's nonzeros in the order of tile, row and column; `places` as in `enter_on_lines`."""
+    """Write a CSR matrix's nonzeros in the order of tile, row and column; `places` as in
+    `fill_line_nonzeros`.
+    """
     for row in range(row_starts.size - 1):
         for entry in range(row_starts[row], row_starts[row + 1]):
             tile = indices[entry] // width
@@ -248,9 +270,11 @@ def sort_into_tiles(row_starts, indices, data, width, places, columns, values):
             places[tile, row] = place + 1
 
 
-@compiled
-def walsh_hadamard(values):
-    """Multiply (n, columns) values by Sylvester's Hadamard matrix of n = 2^k rows, in place; two stages at a time."""
+@fast_njit
+def transform_walsh_hadamard(values):
+    """Multiply (n, columns) values by Sylvester's Hadamard matrix of n = 2^k rows, in place; two
+    stages at a time.
+    """
     count, columns = values.shape
     half = 1
     while 2 * half < count:
@@ -272,11 +296,13 @@ def walsh_hadamard(values):
                 values[row + half, column] = a - b
 
 
-@compiled
+@fast_njit
 def shift_linearly(block, down, right, below, beside, shifted):
-    """Shift a (rows, columns, lanes) block by ``down + below`` rows and ``right + beside`` columns; dark beyond.
+    """Shift a (rows, columns, lanes) block by ``down + below`` rows and ``right + beside`` columns;
+    dark beyond.
 
-    `down` and `right` are whole numbers, `below` and `beside` the shares of the next row and column, from 0 to 1.
+    `down` and `right` are whole numbers, `below` and `beside` the shares of the next row and
+    column, from 0 to 1.
     """
     rows, columns, lanes = block.shape
     length, whole = columns * lanes, block.dtype.type(1)

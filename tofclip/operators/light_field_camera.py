@@ -1,11 +1,18 @@
-"""The cameras of compact light-field photography by name: which nonlocal readings each view of a light field gets."""
+"""The cameras of compact light-field photography by name: which nonlocal readings each view of a
+light field gets.
+"""
 
 from __future__ import annotations
 
 from tofclip.operators.cameras.base import LightFieldCamera
 from tofclip.operators.cameras.coded_line import CodedLineCamera
-from tofclip.operators.cameras.compressive import AshokCamera, BabacanCamera, CompressiveCamera, MarwahCamera
-from tofclip.operators.cameras.line import LineCamera, SpreadLineCamera
+from tofclip.operators.cameras.compressive import (
+    AshokCamera,
+    BabacanCamera,
+    CompressiveCamera,
+    MarwahCamera,
+)
+from tofclip.operators.cameras.line import EvenAngleLineCamera, LineCamera
 from tofclip.operators.cameras.point_spread import (
     CodedApertureCamera,
     CubicPhaseCamera,
@@ -25,20 +32,20 @@ __all__ = [
     "CompressiveCamera",
     "CubicPhaseCamera",
     "DiffuserCamera",
+    "EvenAngleLineCamera",
     "LightFieldCamera",
     "LineCamera",
     "MarwahCamera",
     "MeasuredCamera",
     "PointSpreadCamera",
     "SinglePixelCamera",
-    "SpreadLineCamera",
 ]
 
 CAMERAS: dict[str, type[LightFieldCamera]] = {
     kind.name: kind
     for kind in (
         LineCamera,
-        SpreadLineCamera,
+        EvenAngleLineCamera,
         SinglePixelCamera,
         CodedLineCamera,
         CodedApertureCamera,
@@ -50,4 +57,6 @@ CAMERAS: dict[str, type[LightFieldCamera]] = {
 COMPRESSIVE_CAMERAS: dict[str, type[CompressiveCamera]] = {
     kind.name: kind for kind in (AshokCamera, BabacanCamera, MarwahCamera)
 }
-"""Cameras that are made to recover whole light fields from dense sensors, for comparison (supplement Note 5)."""
+"""Cameras that are made to recover whole light fields from dense sensors, for comparison
+(supplement Note 5).
+"""

@@ -1,8 +1,10 @@
-"""Point-spread functions: of masks and phase plates in the aperture, traced with rays, and measured ones.
+"""Point-spread functions: of masks and phase plates in the aperture, traced with rays, and measured
+ones.
 
-A ray through view (v, u) from a point at shear s meets the sensor at ``s (v, u)`` plus what the element in the
-aperture deflects it by. The rays of one view make that view's PSF ``r(x, -u)``; all of them, each view's moved by
-``s u``, make the camera's depth-dependent PSF ``g(x, s)`` (supplement Eq. 4 and 5).
+A ray through view (v, u) from a point at shear s meets the sensor at ``s (v, u)`` plus what the
+element in the aperture deflects it by. The rays of one view make that view's PSF ``r(x, -u)``; all
+of them, each view's moved by ``s u``, make the camera's depth-dependent PSF ``g(x, s)`` (supplement
+Eq. 4 and 5).
 """
 
 from __future__ import annotations
@@ -23,15 +25,20 @@ if TYPE_CHECKING:
 
 Coordinates = NDArray[np.float64]
 
-RAYS = 48
+RAYS_PER_SIDE = 48
 """Rays along each side of a view's patch of the aperture: 0.15 million for 8 x 8 views."""
 
 
 class ApertureElement(Protocol):
-    """A mask or a thin phase plate in the aperture, on pupil coordinates from -1 to 1, v down and u right."""
+    """A mask or a thin phase plate in the aperture, on pupil coordinates from -1 to 1, v down and u
+    right.
+    """
 
-    def rays(self, v: Coordinates, u: Coordinates) -> tuple[Coordinates, Coordinates, Coordinates]:
-        """Return what share of each ray passes, and by how many pixels it is deflected down and to the right.
+    def trace_rays(
+        self, v: Coordinates, u: Coordinates
+    ) -> tuple[Coordinates, Coordinates, Coordinates]:
+        """Return what share of each ray passes, and by how many pixels it is deflected down and to
+        the right.
 
         Parameters
         ----------
@@ -49,7 +56,8 @@ class ApertureElement(Protocol):
 class CodedAperture:
     """An amplitude mask: ``g(x, s)`` is the code f, mirrored and scaled by s (supplement Eq. 6).
 
-    ``g(x, s) = f(-x / s)`` up to the factor that keeps the light the same at every depth; at s = 0 it is a point.
+    ``g(x, s) = f(-x / s)`` up to the factor that keeps the light the same at every depth; at s = 0
+    it is a point.
 
     Parameters
     ----------
@@ -59,7 +67,9 @@ class CodedAperture:
 
     code: NDArray[Any]
 
-    def rays(self, v: Coordinates, u: Coordinates) -> tuple[Coordinates, Coordinates, Coordinates]:
+    def trace_rays(
+        self, v: Coordinates, u: Coordinates
+    ) -> tuple[Coordinates, Coordinates, Coordinates]:
         """Return the rays; see `ApertureElement`. View u looks through the mask at -u, as in Eq. 6."""
         cells = [
             np.clip(((1 - place) / 2 * size).astype(int), 0, size - 1)
@@ -72,9 +82,11 @@ class CodedAperture:
 
 @dataclass(frozen=True)
 class CubicPhasePlate:
-    """A cubic phase plate (E. R. Dowski, W. T. Cathey, Appl. Opt. 34, 1859 (1995)): its PSF hardly changes with depth.
+    """A cubic phase plate (E. R. Dowski, W. T. Cathey, Appl. Opt. 34, 1859 (1995)): its PSF hardly
+    changes with depth.
 
-    The phase ``u^3 + v^3`` deflects by its gradient, so rays land at ``strength * (v^2, u^2)``, the middle taken off.
+    The phase ``u^3 + v^3`` deflects by its gradient, so rays land at ``strength * (v^2, u^2)``, the
+    middle taken off.
 
     Parameters
     ----------
@@ -84,9 +96,13 @@ class CubicPhasePlate:
 
     strength_px: float
 
-    def rays(self, v: Coordinates, u: Coordinates) -> tuple[Coordinates, Coordinates, Coordinates]:
+    def trace_rays(
+        self, v: Coordinates, u: Coordinates
+    ) -> tuple[Coordinates, Coordinates, Coordinates]:
         """Return the rays; see `ApertureElement`."""
-        down, right = np.broadcast_arrays(self.strength_px * (v**2 - 0.5), self.strength_px * (u**2 - 0.5))
+        down, right = np.broadcast_arrays(
+            self.strength_px * (v**2 - 0.5), self.strength_px * (u**2 - 0.5)
+        )
         return np.ones(down.shape), down, right
 
 
@@ -107,7 +123,9 @@ class Diffuser:
     grain: float
     seed: int
 
-    def rays(self, v: Coordinates, u: Coordinates) -> tuple[Coordinates, Coordinates, Coordinates]:
+    def trace_rays(
+        self, v: Coordinates, u: Coordinates
+    ) -> tuple[Coordinates, Coordinates, Coordinates]:
         """Return the rays; see `ApertureElement`."""
         phase = self._phase
         down, right = phase(v.ravel(), u.ravel(), dx=1), phase(v.ravel(), u.ravel(), dy=1)
@@ -120,8 +138,12 @@ class Diffuser:
         from scipy.ndimage import gaussian_filter
 
         if not (self.grain > 0 and np.isfinite(self.spread_px)):
-            raise InputError(f"a diffuser's grain must be positive and its spread finite, got {self}")
-        cells = max(16, round(8 / self.grain))  # four cells a grain, so that the spline adds no wiggles
+            raise InputError(
+                f"a diffuser's grain must be positive and its spread finite, got {self}"
+            )
+        cells = max(
+            16, round(8 / self.grain)
+        )  # four cells a grain, so that the spline adds no wiggles
         noise = np.random.default_rng(self.seed).standard_normal((cells, cells))
         places = np.linspace(-1, 1, cells)
         phase = gaussian_filter(noise, self.grain / (places[1] - places[0]), mode="wrap")
@@ -131,19 +153,24 @@ class Diffuser:
         return RectBivariateSpline(places, places, phase * (self.spread_px / slopes))
 
 
-def view_point_spreads(
-    element: ApertureElement, views: Sequence[View], shape: tuple[int, int], rays: int = RAYS
+def trace_view_point_spreads(
+    element: ApertureElement,
+    views: Sequence[View],
+    shape: tuple[int, int],
+    rays: int = RAYS_PER_SIDE,
 ) -> NDArray[np.float64]:
-    """Trace each view's PSF ``r(x, -u_k)``: the light that passes its patch of the aperture from a point at infinity.
+    """Trace each view's PSF ``r(x, -u_k)``: the light that passes its patch of the aperture from a
+    point at infinity.
 
     Parameters
     ----------
     element : ApertureElement
     views : sequence of (float, float)
-        (v, u) of every view; a view's patch is one view step wide, and the patches fill the aperture.
+        (v, u) of every view; a view's patch is one view step wide, and the patches fill the
+        aperture.
     shape : (int, int)
         Rows and columns of the PSFs; rays that land beyond are lost.
-    rays : int
+    trace_rays : int
         Along each side of a patch.
 
     Returns
@@ -157,16 +184,20 @@ def view_point_spreads(
     within = (np.arange(rays) + 0.5) / rays - 0.5
     spreads = np.empty((len(grid), *shape))
     for spread, view in zip(spreads, grid, strict=True):
-        v, u = ((place - centre + within) / size for place, centre, size in zip(view, middle, half, strict=True))
-        transmission, down, right = element.rays(v[:, np.newaxis], u[np.newaxis, :])
-        spread[:] = _landed(transmission / (rays**2 * len(grid)), down, right, shape)
+        v, u = (
+            (place - centre + within) / size
+            for place, centre, size in zip(view, middle, half, strict=True)
+        )
+        transmission, down, right = element.trace_rays(v[:, np.newaxis], u[np.newaxis, :])
+        spread[:] = _accumulate_rays(transmission / (rays**2 * len(grid)), down, right, shape)
     return spreads
 
 
-def sheared_point_spreads(
+def shear_point_spreads(
     spreads: NDArray[Any], views: Sequence[View], shear: float, reference: View = (0.0, 0.0)
 ) -> NDArray[np.float64]:
-    """Move each view's PSF by ``s (u - u_ref)``: convolving with it is shearing the picture and convolving then.
+    """Move each view's PSF by ``s (u - u_ref)``: convolving with it is shearing the picture and
+    convolving then.
 
     Parameters
     ----------
@@ -183,42 +214,53 @@ def sheared_point_spreads(
     """
     shape = (spreads.shape[1], spreads.shape[2])
     pairs = zip(spreads, views, strict=True)
-    return np.stack([LinearShear(shape, shear, view, reference, np.float64)(spread) for spread, view in pairs])
+    return np.stack(
+        [LinearShear(shape, shear, view, reference, np.float64)(spread) for spread, view in pairs]
+    )
 
 
 class MeasuredPointSpreads:
-    """PSFs measured once with a point source at several depths (supplement Note 4), and those in between.
+    """PSFs measured once with a point source at several depths (supplement Note 4), and those in
+    between.
 
     Parameters
     ----------
     stack : (depths, rows, columns) array
-        Background taken off. Each PSF is brought to the sum 1: a point source looks brighter when it is near.
+        Background taken off. Each PSF is brought to the sum 1: a point source looks brighter when
+        it is near.
     shears : (depths,) array
         s of each depth, in pixels per view step; any order.
 
     Raises
     ------
     ShapeError, InputError
-        There is not one shear for each PSF, a shear repeats, or a PSF is not finite or holds no light.
+        There is not one shear for each PSF, a shear repeats, or a PSF is not finite or holds no
+        light.
     """
 
     def __init__(self, stack: ArrayLike, shears: ArrayLike) -> None:
         spreads, depths = np.asarray(stack, np.float64), np.asarray(shears, np.float64)
         if spreads.ndim != 3 or depths.shape != spreads.shape[:1] or depths.size == 0:
             raise ShapeError(
-                "PSFs and their shears", "(depths, rows, columns) and (depths,)", (spreads.shape, depths.shape)
+                "PSFs and their shears",
+                "(depths, rows, columns) and (depths,)",
+                (spreads.shape, depths.shape),
             )
         light = spreads.sum(axis=(1, 2))
         if not (np.all(np.isfinite(depths)) and np.all(np.isfinite(light)) and np.all(light > 0)):
-            raise InputError("every measured PSF must be finite and hold light; check its background")
+            raise InputError(
+                "every measured PSF must be finite and hold light; check its background"
+            )
         if np.unique(depths).size != depths.size:
             raise InputError("two measured PSFs belong to the same shear; take the mean of both")
         order = np.argsort(depths)
         self.shears = depths[order]
         self.stack = (spreads / light[:, np.newaxis, np.newaxis])[order]
 
-    def at(self, shear: float) -> NDArray[np.float64]:
-        """Return the PSF at one depth, (rows, columns), linearly between the two nearest that were measured."""
+    def interpolate(self, shear: float) -> NDArray[np.float64]:
+        """Return the PSF at one depth, (rows, columns), linearly between the two nearest that were
+        measured.
+        """
         if not self.shears[0] <= shear <= self.shears[-1]:
             raise InputError(
                 f"shear {shear} lies beyond the measured {self.shears[0]:g} ... {self.shears[-1]:g}; "
@@ -227,11 +269,15 @@ class MeasuredPointSpreads:
         place = float(np.interp(shear, self.shears, np.arange(self.shears.size)))
         below = min(int(place), max(self.shears.size - 2, 0))
         above = min(below + 1, self.shears.size - 1)
-        mixed: NDArray[np.float64] = (1 - place + below) * self.stack[below] + (place - below) * self.stack[above]
+        mixed: NDArray[np.float64] = (1 - place + below) * self.stack[below] + (
+            place - below
+        ) * self.stack[above]
         return mixed
 
 
-def _landed(light: Coordinates, down: Coordinates, right: Coordinates, shape: tuple[int, int]) -> NDArray[np.float64]:
+def _accumulate_rays(
+    light: Coordinates, down: Coordinates, right: Coordinates, shape: tuple[int, int]
+) -> NDArray[np.float64]:
     """Gather rays on pixels; each is shared between the four nearest."""
     total = np.zeros(shape[0] * shape[1])
     row, column = down + shape[0] // 2, right + shape[1] // 2

@@ -1,7 +1,9 @@
-"""Products with a sparse matrix on arrays of other libraries than NumPy, on whatever device they are.
+"""Products with a sparse matrix on arrays of other libraries than NumPy, on whatever device they
+are.
 
-PyTorch and CuPy have such products, by the maker of the device (cuSPARSE, MKL). For any other library that follows the
-array API standard the entries are gathered and summed, which every library can.
+PyTorch and CuPy have such products, by the maker of the device (cuSPARSE, MKL). For any other
+library that follows the array API standard the entries are gathered and summed, which every library
+can.
 """
 
 from __future__ import annotations
@@ -12,8 +14,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from tofclip.arrays import Array, Place, namespace
-from tofclip.threads import blocks
+from tofclip.arrays import Array, ComputeDevice, namespace
+from tofclip.threads import split_blocks
 
 if TYPE_CHECKING:
     import scipy.sparse
@@ -30,10 +32,10 @@ class Product(Protocol):
         ...
 
 
-def portable_product(matrix: scipy.sparse.csr_array, place: Place) -> Product:
-    """Bring a CSR matrix to `place` and return the product with it there."""
+def make_portable_product(matrix: scipy.sparse.csr_array, device: ComputeDevice) -> Product:
+    """Bring a CSR matrix to `device` and return the product with it there."""
     kinds: dict[str, Callable[..., Product]] = {"torch": TorchProduct, "cupy": CupyProduct}
-    return kinds.get(place.library, GatheredProduct)(matrix, place)
+    return kinds.get(device.library, GatheredProduct)(matrix, device)
 
 
 class TorchProduct:
@@ -42,19 +44,23 @@ class TorchProduct:
     Parameters
     ----------
     matrix : CSR matrix
-    place : Place
+    device : Place
     """
 
-    def __init__(self, matrix: scipy.sparse.csr_array, place: Place) -> None:
+    def __init__(self, matrix: scipy.sparse.csr_array, device: ComputeDevice) -> None:
         import torch
 
-        if not matrix.has_canonical_format:  # PyTorch wants every entry once and in order, and does not look
+        if (
+            not matrix.has_canonical_format
+        ):  # PyTorch wants every entry once and in order, and does not look
             matrix = matrix.copy()
             matrix.sum_duplicates()
-        parts = (place.put(part) for part in (matrix.indptr, matrix.indices, matrix.data))
+        parts = (device.put(part) for part in (matrix.indptr, matrix.indices, matrix.data))
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta", UserWarning)
-            self._matrix = torch.sparse_csr_tensor(*parts, size=matrix.shape, check_invariants=False)
+            self._matrix = torch.sparse_csr_tensor(
+                *parts, size=matrix.shape, check_invariants=False
+            )
 
     def __call__(self, block: Array) -> Array:
         """Multiply a (columns, frames) block."""
@@ -67,13 +73,13 @@ class CupyProduct:
     Parameters
     ----------
     matrix : CSR matrix
-    place : Place
+    device : Place
     """
 
-    def __init__(self, matrix: scipy.sparse.csr_array, place: Place) -> None:
+    def __init__(self, matrix: scipy.sparse.csr_array, device: ComputeDevice) -> None:
         from cupyx.scipy.sparse import csr_matrix
 
-        parts = tuple(place.put(part) for part in (matrix.data, matrix.indices, matrix.indptr))
+        parts = tuple(device.put(part) for part in (matrix.data, matrix.indices, matrix.indptr))
         self._matrix = csr_matrix(parts, shape=matrix.shape)
 
     def __call__(self, block: Array) -> Array:
@@ -84,21 +90,22 @@ class CupyProduct:
 class GatheredProduct:
     """The sum of what a row's entries gather, by functions of the array API standard alone.
 
-    Every row is filled up with zeros to the longest, so rows of much the same length cost least memory.
+    Every row is filled up with zeros to the longest, so rows of much the same length cost least
+    memory.
 
     Parameters
     ----------
     matrix : CSR matrix
-    place : Place
+    device : Place
     """
 
-    def __init__(self, matrix: scipy.sparse.csr_array, place: Place) -> None:
+    def __init__(self, matrix: scipy.sparse.csr_array, device: ComputeDevice) -> None:
         lengths = np.diff(matrix.indptr)
         shape = (matrix.shape[0], max(1, int(lengths.max(initial=0))))
         columns, values = np.zeros(shape, np.int64), np.zeros(shape, matrix.dtype)
         filled = np.arange(shape[1]) < lengths[:, np.newaxis]
         columns[filled], values[filled] = matrix.indices, matrix.data
-        self._columns, self._values = place.put(columns), place.put(values[..., np.newaxis])
+        self._columns, self._values = device.put(columns), device.put(values[..., np.newaxis])
         self._itemsize = matrix.dtype.itemsize
 
     def __call__(self, block: Array) -> Array:
@@ -107,9 +114,11 @@ class GatheredProduct:
         rows, width = self._columns.shape
         at_once = max(1, GATHERED_BYTES // max(1, width * block.shape[1] * self._itemsize))
         parts = []
-        for piece in blocks(rows, at_once):
+        for piece in split_blocks(rows, at_once):
             columns = self._columns[piece, :]
             gathered = xp.take(block, xp.reshape(columns, (-1,)), axis=0)
-            terms = xp.reshape(gathered, (*columns.shape, block.shape[1])) * self._values[piece, ...]
+            terms = (
+                xp.reshape(gathered, (*columns.shape, block.shape[1])) * self._values[piece, ...]
+            )
             parts.append(xp.sum(terms, axis=1))
         return xp.concat(parts)

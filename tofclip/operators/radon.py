@@ -16,16 +16,19 @@ if TYPE_CHECKING:
     import scipy.sparse
 
 FRACTION_BITS = 32
-"""Positions on a detector are whole multiples of 2^-32 pixels, in the matrix and in the compiled loops alike."""
+"""Positions on a detector are whole multiples of 2^-32 pixels, in the matrix and in the compiled
+loops alike.
+"""
 
 
 class RadonProjection(SparseMatrix):
     """Line projections in Radon coordinates (supplement Note 6).
 
-    Pixel (row, column), at ``X = column - columns // 2`` and ``Y = row - rows // 2``, falls on position
-    ``detector_px // 2 + X cos(angle) + Y sin(angle) + offset`` of the angle's detector and is shared between the two
-    nearest detector pixels. An offset of ``s (du cos(angle) + dv sin(angle))`` makes it A_k B_k for the view (dv, du)
-    from the reference, because a line integral turns a 2D shift into a 1D one (Eq. 21).
+    Pixel (row, column), at ``X = column - columns // 2`` and ``Y = row - rows // 2``, falls on
+    position ``detector_px // 2 + X cos(angle) + Y sin(angle) + offset`` of the angle's detector and
+    is shared between the two nearest detector pixels. An offset of ``s (du cos(angle) + dv
+    sin(angle))`` makes it A_k B_k for the view (dv, du) from the reference, because a line integral
+    turns a 2D shift into a 1D one (Eq. 21).
 
     Parameters
     ----------
@@ -42,7 +45,8 @@ class RadonProjection(SparseMatrix):
 
     Notes
     -----
-    Readings are (angles * detector_px,), angle by angle. A lone picture is projected without a matrix.
+    Readings are (angles * detector_px,), angle by angle. A lone picture is projected without a
+    matrix.
     """
 
     def __init__(
@@ -56,11 +60,14 @@ class RadonProjection(SparseMatrix):
         self.angles = np.asarray(angles, dtype=np.float64)
         self.offsets_px = np.asarray(offsets_px, dtype=np.float64)
         if self.angles.ndim != 1 or self.angles.shape != self.offsets_px.shape:
-            raise ShapeError("angles and offsets", "(angles,) each", (self.angles.shape, self.offsets_px.shape))
+            raise ShapeError(
+                "angles and offsets", "(angles,) each", (self.angles.shape, self.offsets_px.shape)
+            )
         if not np.all(np.isfinite([self.angles, self.offsets_px])):
             raise InputError("angles and offsets must be finite")
         self.detector_px = detector_px
-        # Not by way of SparseMatrix: the matrix is made if a block of frames or a caller asks for it.
+        # Not by way of SparseMatrix: the matrix is made if a block of frames or a caller asks for
+        # it.
         LinearOperator.__init__(self, image_shape, (self.angles.size * detector_px,), dtype)
 
     @cached_property
@@ -68,24 +75,32 @@ class RadonProjection(SparseMatrix):
         """The CSR matrix, (angles * detector_px, rows * columns); made on first use."""
         import scipy.sparse
 
-        from tofclip.operators.kernels import count_on_lines, enter_on_lines
+        from tofclip.operators.kernels import count_line_nonzeros, fill_line_nonzeros
 
-        before, _, paths = self._paths
+        before, _, paths = self._line_paths
         counts = np.zeros((self.angles.size, self.detector_px), np.int64)
-        count_on_lines(*paths, before, self.shape_in, counts)
+        count_line_nonzeros(*paths, before, self.shape_in, counts)
         ends = np.cumsum(counts)
         columns, values = np.empty(ends[-1], np.int32), np.empty(ends[-1], self.dtype)
-        enter_on_lines(*paths, before, self.shape_in, (ends - counts.ravel()).reshape(counts.shape), columns, values)
+        fill_line_nonzeros(
+            *paths,
+            before,
+            self.shape_in,
+            (ends - counts.ravel()).reshape(counts.shape),
+            columns,
+            values,
+        )
         shape = (self.shape_out[0], self.shape_in[0] * self.shape_in[1])
         made = scipy.sparse.csr_array((values, columns, np.append(0, ends)), shape=shape)
         return SparseMatrix(made, self.shape_in, self.shape_out).matrix
 
     @cached_property
-    def _paths(self) -> tuple[int, int, list[NDArray[np.int64]]]:
+    def _line_paths(self) -> tuple[int, int, list[NDArray[np.int64]]]:
         """Bins before the detector's first, bins in all, and positions on lines extended so.
 
-        The positions are those of each line's first pixel and the steps to its right and lower neighbour, in units of
-        2^-32 bins. The lines are long enough for every pixel to fall on them, so that compiled loops need not ask.
+        The positions are those of each line's first pixel and the steps to its right and lower
+        neighbour, in units of 2^-32 bins. The lines are long enough for every pixel to fall on
+        them, so that compiled loops need not ask.
         """
         rows, columns = self.shape_in
         right, down = np.cos(self.angles), np.sin(self.angles)
@@ -95,25 +110,28 @@ class RadonProjection(SparseMatrix):
         highest = first + np.maximum(across, 0) + np.maximum(along, 0)
         before = max(0, -int(np.floor(lowest.min()))) + 1
         bins = before + max(self.detector_px, int(np.ceil(highest.max())) + 2)
-        fixed = [np.rint(values * 2.0**FRACTION_BITS).astype(np.int64) for values in (first + before, right, down)]
+        fixed = [
+            np.rint(values * 2.0**FRACTION_BITS).astype(np.int64)
+            for values in (first + before, right, down)
+        ]
         return before, bins, fixed
 
-    def _lone_forward(self, picture: Array) -> Array:
+    def _forward_single(self, picture: Array) -> Array:
         from tofclip.operators.kernels import project_onto_lines
 
-        before, bins, paths = self._paths
+        before, bins, paths = self._line_paths
         lines = np.zeros((self.angles.size, bins, 2), self.dtype)
         project_onto_lines(picture, *paths, lines)
         seen = slice(before, before + self.detector_px)
         shared = slice(before - 1, before + self.detector_px - 1)
         return (lines[:, seen, 0] + lines[:, shared, 1]).reshape(self.shape_out)
 
-    def _lone_adjoint(self, readings: Array) -> Array:
+    def _adjoint_single(self, measurements: Array) -> Array:
         from tofclip.operators.kernels import back_project_lines
 
-        before, bins, paths = self._paths
+        before, bins, paths = self._line_paths
         lines = np.zeros((self.angles.size, bins), self.dtype)
-        lines[:, before : before + self.detector_px] = readings.reshape(-1, self.detector_px)
+        lines[:, before : before + self.detector_px] = measurements.reshape(-1, self.detector_px)
         picture = np.empty(self.shape_in, self.dtype)
         back_project_lines(lines, *paths, picture)
         return picture

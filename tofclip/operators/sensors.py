@@ -21,9 +21,13 @@ class _Sensor(LinearOperator):
     dtype : dtype
     """
 
-    def __init__(self, plane_shape: tuple[int, int], pixels: NDArray[np.intp], dtype: DTypeLike) -> None:
+    def __init__(
+        self, plane_shape: tuple[int, int], pixels: NDArray[np.intp], dtype: DTypeLike
+    ) -> None:
         if pixels.size == 0:
-            raise InputError(f"no pixel of the {tuple(plane_shape)} plane is read; check the sensor's mask and offset")
+            raise InputError(
+                f"no pixel of the {tuple(plane_shape)} plane is read; check the sensor's mask and offset"
+            )
         super().__init__(plane_shape, (pixels.size,), dtype)
         self.pixels = pixels
 
@@ -52,14 +56,15 @@ class DenseSensor(_Sensor):
 
 
 class PitchedSensor(_Sensor):
-    """Small pixels far apart: every n-th pixel of the plane is read (supplement Note 3, sparse 2D sensors).
+    """Small pixels far apart: every n-th pixel of the plane is read (supplement Note 3, sparse 2D
+    sensors).
 
     Parameters
     ----------
     plane_shape : (int, int)
     pitch_px : (float, float)
-        Distance from row to row and from column to column, at least 1. A pitch that is no whole number reads the
-        pixels nearest below the true places.
+        Distance from row to row and from column to column, at least 1. A pitch that is no whole
+        number reads the pixels nearest below the true places.
     offset_px : (float, float)
         First row and column that are read.
     dtype : dtype
@@ -73,14 +78,19 @@ class PitchedSensor(_Sensor):
         offset_px: tuple[float, float] = (0, 0),
         dtype: DTypeLike = np.float32,
     ) -> None:
-        rows, columns = (_places(*axis) for axis in zip(plane_shape, pitch_px, offset_px, strict=True))
-        super().__init__(plane_shape, (rows[:, np.newaxis] * plane_shape[1] + columns).ravel(), dtype)
+        rows, columns = (
+            _pixel_positions(*axis) for axis in zip(plane_shape, pitch_px, offset_px, strict=True)
+        )
+        super().__init__(
+            plane_shape, (rows[:, np.newaxis] * plane_shape[1] + columns).ravel(), dtype
+        )
         self.grid_shape = (rows.size, columns.size)
         """Rows and columns of the sensor: readings reshaped to it are a picture."""
 
 
 class MaskedSensor(_Sensor):
-    """Only live pixels are read: defective ones are left out, or the sensor has any layout whatever.
+    """Only live pixels are read: defective ones are left out, or the sensor has any layout
+    whatever.
 
     Parameters
     ----------
@@ -96,7 +106,7 @@ class MaskedSensor(_Sensor):
         super().__init__((mask.shape[0], mask.shape[1]), np.flatnonzero(mask), dtype)
 
 
-def _places(size: int, pitch_px: float, offset_px: float) -> NDArray[np.intp]:
+def _pixel_positions(size: int, pitch_px: float, offset_px: float) -> NDArray[np.intp]:
     if not (np.isfinite(pitch_px) and pitch_px >= 1):
         raise InputError(f"a sensor's pitch must be at least one pixel, got {pitch_px}")
     if not 0 <= offset_px < size:

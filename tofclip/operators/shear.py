@@ -1,4 +1,6 @@
-"""The shear B_k: from the refocused reference picture to the picture that a view sees (supplement Eq. 3)."""
+"""The shear B_k: from the refocused reference picture to the picture that a view sees (supplement
+Eq. 3).
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ View = tuple[float, float]
 class _Shear(LinearOperator):
     """A shift of the whole picture by s times the view's distance from the reference view.
 
-    View (v, u) sees ``p(x, y) = h(x - s (u - u_ref), y - s (v - v_ref))``. The adjoint is the opposite shift, exactly.
+    View (v, u) sees ``p(x, y) = h(x - s (u - u_ref), y - s (v - v_ref))``. The adjoint is the
+    opposite shift, exactly.
 
     Parameters
     ----------
@@ -45,27 +48,29 @@ class _Shear(LinearOperator):
     ) -> None:
         super().__init__(image_shape, image_shape, dtype)
         self.shift_px = tuple(float(shear * (a - b)) for a, b in zip(view, reference, strict=True))
-        if not all(abs(shift) < size for shift, size in zip(self.shift_px, image_shape, strict=True)):
+        if not all(
+            abs(shift) < size for shift, size in zip(self.shift_px, image_shape, strict=True)
+        ):
             raise InputError(
                 f"shear {shear} moves view {view} by {self.shift_px} px, out of a {image_shape} picture; "
                 "take a shear nearer to zero"
             )
 
     def _forward(self, block: Array) -> Array:
-        return self._shifted(block, self.shift_px[0], self.shift_px[1])
+        return self._shift(block, self.shift_px[0], self.shift_px[1])
 
     def _adjoint(self, block: Array) -> Array:
-        return self._shifted(block, -self.shift_px[0], -self.shift_px[1])
+        return self._shift(block, -self.shift_px[0], -self.shift_px[1])
 
     @abstractmethod
-    def _shifted(self, block: Array, down: float, right: float) -> Array:
+    def _shift(self, block: Array, down: float, right: float) -> Array:
         """Shift a (rows, columns, batch) block."""
 
 
 class LinearShear(_Shear):
     """The shear with linear interpolation between neighbouring pixels; dark beyond the border."""
 
-    def _shifted(self, block: Array, down: float, right: float) -> Array:
+    def _shift(self, block: Array, down: float, right: float) -> Array:
         from tofclip.operators.kernels import shift_linearly
 
         rows, columns = (int(np.floor(shift)) for shift in (down, right))
@@ -76,20 +81,22 @@ class LinearShear(_Shear):
 
 
 class FourierShear(_Shear):
-    """The shear with Fourier interpolation: no blur, but periodic: what leaves on one side enters on the other."""
+    """The shear with Fourier interpolation: no blur, but periodic: what leaves on one side enters
+    on the other.
+    """
 
-    def _shifted(self, block: Array, down: float, right: float) -> Array:
+    def _shift(self, block: Array, down: float, right: float) -> Array:
         import scipy.fft
 
         rows, columns = self.shape_in
         spectrum = scipy.fft.rfft2(block, axes=(0, 1))
-        spectrum *= _delay(np.fft.fftfreq(rows), down)[:, np.newaxis, np.newaxis]
-        spectrum *= _delay(np.fft.rfftfreq(columns), right)[:, np.newaxis]
+        spectrum *= _shift_spectrum(np.fft.fftfreq(rows), down)[:, np.newaxis, np.newaxis]
+        spectrum *= _shift_spectrum(np.fft.rfftfreq(columns), right)[:, np.newaxis]
         shifted = scipy.fft.irfft2(spectrum, s=(rows, columns), axes=(0, 1))
         return np.ascontiguousarray(shifted, dtype=self.dtype)
 
 
-def _delay(cycles_per_px: Array, shift_px: float) -> Array:
+def _shift_spectrum(cycles_per_px: Array, shift_px: float) -> Array:
     """Spectrum of a shift. At the Nyquist frequency only its real part keeps a real picture real."""
     delay = np.exp(-2j * np.pi * cycles_per_px * shift_px)
     return np.where(np.abs(cycles_per_px) == 0.5, delay.real, delay)

@@ -10,12 +10,14 @@ from tofclip.operators.base import Array, LinearOperator
 
 
 class HadamardCodes(LinearOperator):
-    """Random 0/1 codes with a fast product: rows of a Hadamard matrix whose columns have random signs.
+    """Random 0/1 codes with a fast product: rows of a Hadamard matrix whose columns have random
+    signs.
 
-    A code is ``(1 + H D) / 2``: D holds a random sign for each pixel, and the rows of H are drawn without
-    replacement (structurally random matrices, T. T. Do et al., IEEE Trans. Signal Process. 60, 139 (2012)). H is the
-    Kronecker product of one Hadamard matrix for each side, the picture padded to powers of two, so that all of it
-    is a fast Walsh-Hadamard transform along either side of the picture.
+    A code is ``(1 + H D) / 2``: D holds a random sign for each pixel, and the rows of H are drawn
+    without replacement (structurally random matrices, T. T. Do et al., IEEE Trans. Signal Process.
+    60, 139 (2012)). H is the Kronecker product of one Hadamard matrix for each side, the picture
+    padded to powers of two, so that all of it is a fast Walsh-Hadamard transform along either side
+    of the picture.
 
     Parameters
     ----------
@@ -28,7 +30,9 @@ class HadamardCodes(LinearOperator):
         float32 or float64.
     """
 
-    def __init__(self, image_shape: tuple[int, int], codes: int, seed: int, dtype: DTypeLike = np.float32) -> None:
+    def __init__(
+        self, image_shape: tuple[int, int], codes: int, seed: int, dtype: DTypeLike = np.float32
+    ) -> None:
         super().__init__(image_shape, (codes,), dtype)
         self._padded = tuple(1 << (size - 1).bit_length() for size in image_shape)
         cells = self._padded[0] * self._padded[1]
@@ -40,30 +44,38 @@ class HadamardCodes(LinearOperator):
         self._chosen = columns * self._padded[0] + rows  # the spectrum comes out transposed
 
     def _forward(self, block: Array) -> Array:
-        from tofclip.operators.kernels import walsh_hadamard
+        from tofclip.operators.kernels import transform_walsh_hadamard
 
-        (rows, columns), (padded_rows, padded_columns), batch = self.shape_in, self._padded, block.shape[-1]
+        (rows, columns), (padded_rows, padded_columns), batch = (
+            self.shape_in,
+            self._padded,
+            block.shape[-1],
+        )
         signed = np.zeros((padded_rows, columns, batch), self.dtype)
         np.multiply(block, self._signs, out=signed[:rows])
-        walsh_hadamard(signed.reshape(padded_rows, -1))
+        transform_walsh_hadamard(signed.reshape(padded_rows, -1))
         spectrum = np.zeros((padded_columns, padded_rows, batch), self.dtype)
         spectrum[:columns] = signed.swapaxes(0, 1)
-        walsh_hadamard(spectrum.reshape(padded_columns, -1))
+        transform_walsh_hadamard(spectrum.reshape(padded_columns, -1))
         coded: Array = spectrum.reshape(-1, batch)[self._chosen]
         coded += block.sum(axis=0).sum(axis=0)
         coded /= 2
         return coded
 
     def _adjoint(self, block: Array) -> Array:
-        from tofclip.operators.kernels import walsh_hadamard
+        from tofclip.operators.kernels import transform_walsh_hadamard
 
-        (rows, columns), (padded_rows, padded_columns), batch = self.shape_in, self._padded, block.shape[-1]
+        (rows, columns), (padded_rows, padded_columns), batch = (
+            self.shape_in,
+            self._padded,
+            block.shape[-1],
+        )
         spectrum = np.zeros((padded_columns * padded_rows, batch), self.dtype)
         spectrum[self._chosen] = block
-        walsh_hadamard(spectrum.reshape(padded_columns, -1))
+        transform_walsh_hadamard(spectrum.reshape(padded_columns, -1))
         half_way = spectrum.reshape(padded_columns, padded_rows, batch)[:columns]
         signed = np.ascontiguousarray(half_way.swapaxes(0, 1))
-        walsh_hadamard(signed.reshape(padded_rows, -1))
+        transform_walsh_hadamard(signed.reshape(padded_rows, -1))
         pictures: Array = signed[:rows] * self._signs
         pictures += block.sum(axis=0)
         pictures /= 2
@@ -83,7 +95,9 @@ class RandomCodes(LinearOperator):
         float32 or float64.
     """
 
-    def __init__(self, image_shape: tuple[int, int], codes: int, seed: int, dtype: DTypeLike = np.float32) -> None:
+    def __init__(
+        self, image_shape: tuple[int, int], codes: int, seed: int, dtype: DTypeLike = np.float32
+    ) -> None:
         super().__init__(image_shape, (codes,), dtype)
         drawn = np.random.default_rng(seed).integers(0, 2, (codes, image_shape[0] * image_shape[1]))
         self._codes = drawn.astype(self.dtype)

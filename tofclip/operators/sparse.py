@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import Array, InEachPlace, Place, is_numpy, namespace
+from tofclip.arrays import Array, ComputeDevice, PerDevice, is_numpy, namespace
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators.base import LinearOperator, Shape
-from tofclip.operators.portable import Product, portable_product
+from tofclip.operators.portable import Product, make_portable_product
 from tofclip.threads import LANES, run_blocks
 
 if TYPE_CHECKING:
@@ -24,9 +24,9 @@ TILE_BYTES = 1 << 19  # half of a present-day core's second-level cache
 class SparseMatrix(LinearOperator):
     """A CSR matrix and its transpose, applied to blocks of frames.
 
-    Matrix and transpose are set up on first use, for each library and device whose arrays come in, so that forward and
-    adjoint are one gathering product on blocks. Memory is 8 bytes per nonzero and side in float32, in each place. A
-    lone NumPy picture goes through scipy's own product.
+    Matrix and transpose are set up on first use, for each library and device whose arrays come in,
+    so that forward and adjoint are one gathering product on blocks. Memory is 8 bytes per nonzero
+    and side in float32, in each place. A lone NumPy picture goes through scipy's own product.
 
     Parameters
     ----------
@@ -46,54 +46,61 @@ class SparseMatrix(LinearOperator):
         if not np.all(np.isfinite(matrix.data)):
             raise InputError("the sparse matrix must be finite")
         # Products wait for memory: half as long an index is a third less to read.
-        short = matrix.indices.astype(np.int32), matrix.indptr.astype(np.int32 if matrix.nnz < 1 << 31 else np.int64)
-        self._given = type(matrix)((matrix.data, *short), shape=matrix.shape)
+        short = (
+            matrix.indices.astype(np.int32),
+            matrix.indptr.astype(np.int32 if matrix.nnz < 1 << 31 else np.int64),
+        )
+        self._matrix = type(matrix)((matrix.data, *short), shape=matrix.shape)
 
     @cached_property
     def matrix(self) -> scipy.sparse.csr_array:
         """The CSR matrix, (all of `shape_out`, all of `shape_in`)."""
-        return self._given
+        return self._matrix
 
     @cached_property
-    def _rows(self) -> InEachPlace[Product]:
-        return InEachPlace(self._product_in)
+    def _forward_products(self) -> PerDevice[Product]:
+        return PerDevice(self._make_forward_product)
 
     @cached_property
-    def _columns(self) -> InEachPlace[Product]:
-        return InEachPlace(self._transposed_product_in)
+    def _adjoint_products(self) -> PerDevice[Product]:
+        return PerDevice(self._make_adjoint_product)
 
-    def _product_in(self, place: Place) -> Product:
-        return product_in(place, self.matrix)
+    def _make_forward_product(self, device: ComputeDevice) -> Product:
+        return make_product(device, self.matrix)
 
-    def _transposed_product_in(self, place: Place) -> Product:
-        return product_in(place, self.matrix.T.tocsr())
+    def _make_adjoint_product(self, device: ComputeDevice) -> Product:
+        return make_product(device, self.matrix.T.tocsr())
 
     def _forward(self, block: Array) -> Array:
         if block.shape[-1] == 1 and is_numpy(block):
-            return self._lone_forward(block[..., 0])[..., np.newaxis]
-        return _applied(self._rows.beside(block), block, self.shape_out)
+            return self._forward_single(block[..., 0])[..., np.newaxis]
+        return _apply_product(self._forward_products.get(block), block, self.shape_out)
 
     def _adjoint(self, block: Array) -> Array:
         if block.shape[-1] == 1 and is_numpy(block):
-            return self._lone_adjoint(block[..., 0])[..., np.newaxis]
-        return _applied(self._columns.beside(block), block, self.shape_in)
+            return self._adjoint_single(block[..., 0])[..., np.newaxis]
+        return _apply_product(self._adjoint_products.get(block), block, self.shape_in)
 
-    def _lone_forward(self, picture: Array) -> Array:
-        """Apply to a lone array: there are no neighbouring frames to share a vector instruction with."""
+    def _forward_single(self, picture: Array) -> Array:
+        """Apply to a lone array: there are no neighbouring frames to share a vector instruction
+        with.
+        """
         product: Array = self.matrix @ picture.reshape(-1)
         return product.reshape(self.shape_out)
 
-    def _lone_adjoint(self, readings: Array) -> Array:
-        product: Array = self.matrix.T @ readings.reshape(-1)
+    def _adjoint_single(self, measurements: Array) -> Array:
+        product: Array = self.matrix.T @ measurements.reshape(-1)
         return product.reshape(self.shape_in)
 
 
-def product_in(place: Place, matrix: scipy.sparse.csr_array) -> Product:
+def make_product(device: ComputeDevice, matrix: scipy.sparse.csr_array) -> Product:
     """Set up the product with `matrix` for the arrays of a place."""
-    return TiledProduct(matrix) if place.has_compiled_loops else portable_product(matrix, place)
+    return (
+        TiledProduct(matrix) if device.has_compiled_loops else make_portable_product(matrix, device)
+    )
 
 
-def _applied(product: Product, block: Array, target: Shape) -> Array:
+def _apply_product(product: Product, block: Array, target: Shape) -> Array:
     xp = namespace(block)
     return xp.reshape(product(xp.reshape(block, (-1, block.shape[-1]))), (*target, -1))
 
@@ -107,16 +114,16 @@ class TiledProduct:
     """
 
     def __init__(self, matrix: scipy.sparse.csr_array) -> None:
-        self._tiles, self._count = Tiles.of(matrix), matrix.shape[0]
+        self._tiles, self._count = Tiles.from_csr(matrix), matrix.shape[0]
 
     def __call__(self, block: NDArray[Any]) -> NDArray[Any]:
         """Multiply a (columns, frames) block."""
-        from tofclip.operators.kernels import sparse_times_block
+        from tofclip.operators.kernels import multiply_sparse_block
 
         rows, batch = self._count, block.shape[-1]
         result = np.empty((rows, batch), block.dtype)
         if batch == LANES:
-            sparse_times_block(*self._tiles, block, result)
+            multiply_sparse_block(*self._tiles, block, result)
             return result
 
         def work(piece: slice) -> None:
@@ -124,7 +131,7 @@ class TiledProduct:
             padded = np.zeros((block.shape[0], LANES), block.dtype)
             padded[:, :lanes] = block[:, piece]
             product = np.empty((rows, LANES), block.dtype)
-            sparse_times_block(*self._tiles, padded, product)
+            multiply_sparse_block(*self._tiles, padded, product)
             result[:, piece] = product[:, :lanes]
 
         run_blocks(work, batch)
@@ -132,7 +139,8 @@ class TiledProduct:
 
 
 class Tiles(NamedTuple):
-    """A CSR matrix cut into groups of neighbouring columns, so that a group's part of the operand stays in cache.
+    """A CSR matrix cut into groups of neighbouring columns, so that a group's part of the operand
+    stays in cache.
 
     Parameters
     ----------
@@ -147,24 +155,33 @@ class Tiles(NamedTuple):
     values: NDArray[Any]
 
     @classmethod
-    def of(cls, matrix: scipy.sparse.csr_array) -> Tiles:
+    def from_csr(cls, matrix: scipy.sparse.csr_array) -> Tiles:
         """Sort the nonzeros of `matrix` by tile, then row, then as they stand in the row."""
-        from tofclip.operators.kernels import count_in_tiles, sort_into_tiles
+        from tofclip.operators.kernels import count_tile_nonzeros, sort_into_tiles
 
         width = max(1, TILE_BYTES // (LANES * matrix.dtype.itemsize))
         per_row = np.zeros((-(-matrix.shape[1] // width), matrix.shape[0]), np.int64)
-        count_in_tiles(matrix.indptr, matrix.indices, width, per_row)
+        count_tile_nonzeros(matrix.indptr, matrix.indices, width, per_row)
         ends = np.cumsum(per_row).reshape(per_row.shape)
         starts = np.concatenate([ends - per_row, ends[:, -1:]], axis=1)
         columns, values = np.empty(matrix.nnz, np.uint32), np.empty(matrix.nnz, matrix.dtype)
-        sort_into_tiles(matrix.indptr, matrix.indices, matrix.data, width, starts[:, :-1].copy(), columns, values)
+        sort_into_tiles(
+            matrix.indptr,
+            matrix.indices,
+            matrix.data,
+            width,
+            starts[:, :-1].copy(),
+            columns,
+            values,
+        )
         return cls(starts, columns, values)
 
 
 def split_between_bins(
     position: NDArray[np.float64], bins: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Share every pixel's light between the two bins nearest to where it falls, by linear interpolation.
+    """Share every pixel's light between the two bins nearest to where it falls, by linear
+    interpolation.
 
     Parameters
     ----------

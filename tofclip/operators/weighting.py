@@ -12,10 +12,11 @@ from tofclip.operators.base import Array, LinearOperator
 
 
 class MeanWeighting(LinearOperator):
-    """``W = I - (1 - w) 11' / m_k`` for each view's m_k readings: their mean counts w times; self-adjoint.
+    """``W = I - (1 - w) 11' / m_k`` for each view's m_k readings: their mean counts w times;
+    self-adjoint.
 
-    Codes of 0 and 1 all measure half the picture's sum, which swamps what tells them apart; apply W to the readings
-    and to the operator alike.
+    Codes of 0 and 1 all measure half the picture's sum, which swamps what tells them apart; apply W
+    to the readings and to the operator alike.
 
     Parameters
     ----------
@@ -27,7 +28,9 @@ class MeanWeighting(LinearOperator):
         float32 or float64.
     """
 
-    def __init__(self, counts: Sequence[int], weight: float = 0.02, dtype: DTypeLike = np.float32) -> None:
+    def __init__(
+        self, counts: Sequence[int], weight: float = 0.02, dtype: DTypeLike = np.float32
+    ) -> None:
         if not counts or min(counts) < 1:
             raise InputError("every view needs at least one reading")
         if not 0 <= weight <= 1:

@@ -1,22 +1,36 @@
 """From a streak image and a camera to transient frames."""
 
-from tofclip.recovery.focus import DepthLocked, FixedFocus, Focus, Piece, SharpestFocus, focus_named
-from tofclip.recovery.parallax import ShotParallax, parallax_from_shot
-from tofclip.recovery.plan import Task, fitted_to_shot, method_named, prepare, recover, time_shift_bins
+from tofclip.recovery.focus import (
+    DepthLockedFocus,
+    FixedFocus,
+    Focus,
+    FrameSegment,
+    SharpestFocus,
+    parse_focus,
+)
+from tofclip.recovery.parallax import ShotParallax, fit_parallax_to_shot
+from tofclip.recovery.plan import (
+    RecoveryTask,
+    compute_view_delays_bins,
+    fit_camera_to_shot,
+    make_method,
+    prepare_recovery,
+    recover,
+)
 
 __all__ = [
-    "DepthLocked",
+    "DepthLockedFocus",
     "FixedFocus",
     "Focus",
-    "Piece",
+    "FrameSegment",
+    "RecoveryTask",
     "SharpestFocus",
     "ShotParallax",
-    "Task",
-    "fitted_to_shot",
-    "focus_named",
-    "method_named",
-    "parallax_from_shot",
-    "prepare",
+    "compute_view_delays_bins",
+    "fit_camera_to_shot",
+    "fit_parallax_to_shot",
+    "make_method",
+    "parse_focus",
+    "prepare_recovery",
     "recover",
-    "time_shift_bins",
 ]

@@ -1,4 +1,6 @@
-"""At which shear each frame is recovered: one for all, the one that its time of flight tells, or the sharpest."""
+"""At which shear each frame is recovered: one for all, the one that its time of flight tells, or
+the sharpest.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.camera import Camera, Measurement
-from tofclip.camera.calibration.parallax import sharpest_shears
+from tofclip.camera.calibration.parallax import find_sharpest_shears
 from tofclip.errors import CalibrationError, InputError
-from tofclip.solvers import Progress, silent
+from tofclip.solvers import Progress, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float64]
 
-NEAREST = 0.2  # m; in front of it the shear would change from bin to bin, and light of such ranges is stray
-FARTHER = 1.25  # light from there is weaker by a third
+# m; in front of it the shear would change from bin to bin, and light of such ranges is stray
+MIN_RANGE_M = 0.2
+SEGMENT_RANGE_RATIO = 1.25  # light from there is weaker by a third
 GATE_BINS = 64
 
 
 @dataclass(frozen=True)
-class Piece:
+class FrameSegment:
     """Successive frames that share an operator.
 
     Parameters
@@ -32,7 +35,8 @@ class Piece:
     shear : float
         Pixels per view step.
     brightness : float
-        How bright a surface appears there, relative to the other pieces: a prior weighs in proportion.
+        How bright a surface appears there, relative to the other pieces: a prior weighs in
+        proportion.
     """
 
     frames: slice
@@ -48,18 +52,22 @@ class Piece:
 class Focus(Protocol):
     """Anything that says at which shear each frame is recovered."""
 
-    def require(self, camera: Camera) -> None:
+    def check_camera(self, camera: Camera) -> None:
         """Raise `CalibrationError` if the camera does not know enough."""
         ...
 
-    def pieces(
-        self, camera: Camera, times: FloatArray, measurement: Measurement, progress: Progress = silent
-    ) -> list[Piece]:
+    def plan_segments(
+        self,
+        camera: Camera,
+        times: FloatArray,
+        measurement: Measurement,
+        progress: Progress = ignore_progress,
+    ) -> list[FrameSegment]:
         """Cut the frames at `times` (s of flight) into pieces, in order and without gaps."""
         ...
 
     def work(self, frames: int) -> int:
-        """Frame iterations that `pieces` reports."""
+        """Frame iterations that `plan_segments` reports."""
         ...
 
 
@@ -76,14 +84,18 @@ class FixedFocus:
     def __str__(self) -> str:
         return f"fixed:{self.shear:g}"
 
-    def require(self, camera: Camera) -> None:
+    def check_camera(self, camera: Camera) -> None:
         """Ask for nothing."""
 
-    def pieces(
-        self, camera: Camera, times: FloatArray, measurement: Measurement, progress: Progress = silent
-    ) -> list[Piece]:
+    def plan_segments(
+        self,
+        camera: Camera,
+        times: FloatArray,
+        measurement: Measurement,
+        progress: Progress = ignore_progress,
+    ) -> list[FrameSegment]:
         """Return a single piece."""
-        return [Piece(slice(0, times.size), self.shear)]
+        return [FrameSegment(slice(0, times.size), self.shear)]
 
     def work(self, frames: int) -> int:
         """Nothing has to be tried."""
@@ -91,11 +103,11 @@ class FixedFocus:
 
 
 @dataclass(frozen=True)
-class DepthLocked:
+class DepthLockedFocus:
     """Every frame at the shear of the range that its time of flight tells, s(c t / 2).
 
-    Frames whose shears put no view further off the slit than the tolerance share an operator. The light of a frame
-    is expected to fall off as 1/range^2, and the prior's weight with it.
+    Frames whose shears put no view further off the slit than the tolerance share an operator. The
+    light of a frame is expected to fall off as 1/range^2, and the prior's weight with it.
 
     Parameters
     ----------
@@ -107,12 +119,14 @@ class DepthLocked:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.tolerance_px) and self.tolerance_px > 0):
-            raise InputError(f"the tolerance must be a positive number of pixels, got {self.tolerance_px}")
+            raise InputError(
+                f"the tolerance must be a positive number of pixels, got {self.tolerance_px}"
+            )
 
     def __str__(self) -> str:
         return "depth-locked"
 
-    def require(self, camera: Camera) -> None:
+    def check_camera(self, camera: Camera) -> None:
         """Ask for a known parallax."""
         if camera.lenslet_pitch <= 0:
             raise CalibrationError(
@@ -120,19 +134,28 @@ class DepthLocked:
                 "(tofclip.camera.calibration.parallax) or choose --focus fixed:S or stack:S0:S1:N"
             )
 
-    def pieces(
-        self, camera: Camera, times: FloatArray, measurement: Measurement, progress: Progress = silent
-    ) -> list[Piece]:
-        """Cut where the shear has changed by twice the tolerance, or the light has become a third weaker."""
-        distance = np.maximum(SPEED_OF_LIGHT * times / 2, NEAREST)
+    def plan_segments(
+        self,
+        camera: Camera,
+        times: FloatArray,
+        measurement: Measurement,
+        progress: Progress = ignore_progress,
+    ) -> list[FrameSegment]:
+        """Cut where the shear has changed by twice the tolerance, or the light has become a third
+        weaker.
+        """
+        distance = np.maximum(SPEED_OF_LIGHT * times / 2, MIN_RANGE_M)
         shears = camera.shear_at(distance)
         step = 2 * self.tolerance_px / np.abs(camera.view_positions).max(initial=1.0)
         number = np.floor((shears - shears[0]) / step).astype(np.int64)
-        octave = np.floor(np.log(distance / distance[0]) / np.log(FARTHER))
+        octave = np.floor(np.log(distance / distance[0]) / np.log(SEGMENT_RANGE_RATIO))
         changed = (np.diff(number) != 0) | (np.diff(octave) != 0)
         cuts = np.flatnonzero(np.concatenate([[True], changed, [True]]))
         parts = [slice(int(first), int(last)) for first, last in pairwise(cuts)]
-        return [Piece(part, float(shears[part].mean()), float(np.mean(distance[part] ** -2.0))) for part in parts]
+        return [
+            FrameSegment(part, float(shears[part].mean()), float(np.mean(distance[part] ** -2.0)))
+            for part in parts
+        ]
 
     def work(self, frames: int) -> int:
         """Nothing has to be tried."""
@@ -156,36 +179,45 @@ class SharpestFocus:
     number: int
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.first) and np.isfinite(self.last) and self.first < self.last and self.number >= 2):
+        if not (
+            np.isfinite(self.first)
+            and np.isfinite(self.last)
+            and self.first < self.last
+            and self.number >= 2
+        ):
             raise InputError(f"a focus stack needs two or more rising shears, got {self}")
 
     def __str__(self) -> str:
         return f"stack:{self.first:g}:{self.last:g}:{self.number}"
 
-    def require(self, camera: Camera) -> None:
+    def check_camera(self, camera: Camera) -> None:
         """Ask for nothing."""
 
-    def pieces(
-        self, camera: Camera, times: FloatArray, measurement: Measurement, progress: Progress = silent
-    ) -> list[Piece]:
+    def plan_segments(
+        self,
+        camera: Camera,
+        times: FloatArray,
+        measurement: Measurement,
+        progress: Progress = ignore_progress,
+    ) -> list[FrameSegment]:
         """Try all shears on each gate."""
         starts = range(0, times.size, GATE_BINS)
         gates = [slice(start, min(start + GATE_BINS, times.size)) for start in starts]
         shears = np.linspace(self.first, self.last, self.number)
-        found = sharpest_shears(measurement, camera, gates, shears, progress).shears
-        return [Piece(gate, float(shear)) for gate, shear in zip(gates, found, strict=True)]
+        found = find_sharpest_shears(measurement, camera, gates, shears, progress).shears
+        return [FrameSegment(gate, float(shear)) for gate, shear in zip(gates, found, strict=True)]
 
     def work(self, frames: int) -> int:
         """Each frame is recovered once for each shear."""
-        from tofclip.camera.calibration.parallax import LOOK
+        from tofclip.camera.calibration.parallax import GATE_METHOD
 
-        return self.number * LOOK.work(frames)
-
-
-AT_THE_CALIBRATED_DEPTH = FixedFocus()
+        return self.number * GATE_METHOD.work(frames)
 
 
-def focus_named(text: str) -> Focus:
+DEFAULT_FOCUS = FixedFocus()
+
+
+def parse_focus(text: str) -> Focus:
     """Read ``depth-locked``, ``fixed:S`` or ``stack:S0:S1:N``.
 
     Raises
@@ -196,7 +228,7 @@ def focus_named(text: str) -> Focus:
     name, *numbers = text.split(":")
     try:
         if name == "depth-locked" and not numbers:
-            return DepthLocked()
+            return DepthLockedFocus()
         if name == "fixed" and len(numbers) == 1:
             return FixedFocus(float(numbers[0]))
         if name == "stack" and len(numbers) == 3:

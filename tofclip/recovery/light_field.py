@@ -1,4 +1,6 @@
-"""From the readings of a light-field camera to the picture at one depth, by names that a user can type."""
+"""From the readings of a light-field camera to the picture at one depth, by names that a user can
+type.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +18,22 @@ from tofclip.light_field import LightField
 from tofclip.light_field.measurement import ClipMeasurement
 from tofclip.operators import Diagonal, Identity, LinearOperator, ViewSelection
 from tofclip.solvers import Sparse, TotalVariation, Wavelets
-from tofclip.solvers.data_terms import DataTermMaker, Huber, LeastSquares, Poisson, robust_deviation
+from tofclip.solvers.cross_validation import INITIAL_WEIGHT, choose_weight
+from tofclip.solvers.data_terms import (
+    DataTermMaker,
+    Huber,
+    LeastSquares,
+    Poisson,
+    estimate_robust_deviation,
+)
 from tofclip.solvers.denoisers import BlockMatching, CollaborativeWiener, Denoiser, NonlocalMeans
-from tofclip.solvers.hold_out import FIRST, choose_weight
 from tofclip.solvers.iterative import ProximalMethod
 from tofclip.solvers.light_field_variation import LightFieldVariation
 from tofclip.solvers.plug_and_play import PlugAndPlay
 
-VARIATIONAL: dict[str, type[ProximalMethod]] = {kind.name: kind for kind in (TotalVariation, Wavelets, Sparse)}
+VARIATIONAL_PRIORS: dict[str, type[ProximalMethod]] = {
+    kind.name: kind for kind in (TotalVariation, Wavelets, Sparse)
+}
 DENOISERS: dict[str, Callable[[], Denoiser]] = {
     "collaborative": CollaborativeWiener,
     "bm3d": BlockMatching,
@@ -34,14 +44,19 @@ PRESETS = {"fast": 2, "quality": 10}
 
 DATA_TERMS = ("squares", "huber", "poisson")
 
-ITERATIONS = 400
-LIGHT_FIELD_WEIGHT = 1e-3  # of the weights tried on rendered planes the best at sampling ratios from 0.5 to 2
-RELATIVE_CHANGE = 1e-4  # of the objective in an iteration: then the recovery has converged
+MAX_ITERATIONS = 400
+LIGHT_FIELD_WEIGHT = (
+    1e-3  # of the weights tried on rendered planes the best at sampling ratios from 0.5 to 2
+)
+OBJECTIVE_TOLERANCE = 1e-4  # of the objective in an iteration: then the recovery has converged
 
-LOOKS = 3  # at the errors, after which Huber's threshold stays within a few percent
-NARROW = 1.345  # robust deviations: 95 % of the efficiency of squares, and safe from what is still unknown
-WIDE = 3.0  # robust deviations, once they are known: most of what is out of focus counts in full
-SMOOTHER = 2.0
+THRESHOLD_PASSES = 3  # at the errors, after which Huber's threshold stays within a few percent
+# robust deviations: 95 % of the efficiency of squares, and safe from what is still unknown
+INITIAL_THRESHOLD_DEVIATIONS = 1.345
+FINAL_THRESHOLD_DEVIATIONS = (
+    3.0  # robust deviations, once they are known: most of what is out of focus counts in full
+)
+HUBER_WEIGHT_FACTOR = 2.0
 """How much the weight is raised with Huber's term.
 
 Its prediction error is a sum of many small errors on the dark ground, which any weight predicts, and of edges cut off;
@@ -49,7 +64,7 @@ on letters with 0 to 10 % bad readings the best weight is 1.5 to 2 times the one
 
 
 @dataclass(frozen=True)
-class Recovered:
+class ClipResult:
     """A picture and how it came about.
 
     Parameters
@@ -58,7 +73,7 @@ class Recovered:
     weight : float
         Of the variational prior, relative to the largest value of A'f.
     iterations : int
-    stopped_because : str
+    stop_reason : str
     seconds : float
         Of the recovery at its final weight.
     seconds_setup : float
@@ -70,7 +85,7 @@ class Recovered:
     picture: NDArray[Any]
     weight: float
     iterations: int
-    stopped_because: str
+    stop_reason: str
     seconds: float
     seconds_setup: float
     seconds_weight: float
@@ -83,15 +98,17 @@ class ClipRecovery:
     Parameters
     ----------
     prior : str
-        ``tv``, ``wavelet`` or ``l1``: minimised with the data term. ``collaborative``, ``bm3d`` or ``nlm``: a
-        denoiser, plugged into the recovery after total variation.
+        ``tv``, ``wavelet`` or ``l1``: minimised with the data term. ``collaborative``, ``bm3d`` or
+        ``nlm``: a denoiser, plugged into the recovery after total variation.
     preset : str
-        ``fast`` stops where the prior's own problem has converged (denoisers: 2 calls). ``quality`` goes on with
-        ten calls of the denoiser, the collaborative one if the prior is none.
+        ``fast`` stops where the prior's own problem has converged (denoisers: 2 calls). ``quality``
+        goes on with ten calls of the denoiser, the collaborative one if the prior is none.
     weight : float, optional
-        Of the variational prior, relative to the largest value of A'f; chosen by cross-validation if not given.
+        Of the variational prior, relative to the largest value of A'f; chosen by cross-validation
+        if not given.
     data_term : str
-        ``squares``; ``huber`` where some readings are wildly wrong; ``poisson`` the likelihood of photon counts.
+        ``squares``; ``huber`` where some readings are wildly wrong; ``poisson`` the likelihood of
+        photon counts.
 
     Raises
     ------
@@ -105,68 +122,84 @@ class ClipRecovery:
     data_term: str = "squares"
 
     def __post_init__(self) -> None:
-        _require("prior", self.prior, [*VARIATIONAL, *DENOISERS])
-        _require("preset", self.preset, list(PRESETS))
-        _require("data term", self.data_term, list(DATA_TERMS))
+        _require_known("prior", self.prior, [*VARIATIONAL_PRIORS, *DENOISERS])
+        _require_known("preset", self.preset, list(PRESETS))
+        _require_known("data term", self.data_term, list(DATA_TERMS))
         if self.weight is not None and not (np.isfinite(self.weight) and self.weight > 0):
             raise InputError(f"the prior's weight must be positive, got {self.weight}")
 
-    def recover(self, measurement: ClipMeasurement, shear: float) -> Recovered:
+    def recover(self, measurement: ClipMeasurement, shear: float) -> ClipResult:
         """Recover the picture refocused at `shear`, pixels per view step."""
         begin = perf_counter()
-        problem = self._problem(measurement, shear)
+        problem = self._make_problem(measurement, shear)
         ready = perf_counter()
-        method = self._variational(problem)
+        method = self._choose_method(problem)
         chosen = perf_counter()
-        result = self._finished(method).recover(problem.model, problem.readings)
-        return Recovered(
+        result = self._add_denoiser(method).recover(problem.model, problem.measurements)
+        return ClipResult(
             result.frames[0],
             method.weight,
             result.iterations,
-            result.stopped_because,
+            result.stop_reason,
             perf_counter() - chosen - result.setup_seconds,
             ready - begin + result.setup_seconds,
             chosen - ready,
         )
 
-    def _problem(self, measurement: ClipMeasurement, shear: float) -> _Problem:
+    def _make_problem(self, measurement: ClipMeasurement, shear: float) -> _InverseProblem:
         camera = measurement.camera()
         model, weighting = camera.model(shear), camera.weighting()
         if self.data_term != "poisson":
-            readings = weighting(measurement.readings)[:, np.newaxis]
-            return _Problem(weighting @ model, readings, camera.row_length, LeastSquares)
+            measurements = weighting(measurement.measurements)[:, np.newaxis]
+            return _InverseProblem(
+                weighting @ model, measurements, camera.correlation_length, LeastSquares
+            )
         if not isinstance(weighting, Identity):
-            raise InputError(f"readings of a {camera.name} camera all have about the same photon noise; take squares")
+            raise InputError(
+                f"readings of a {camera.name} camera all have about the same photon noise; take squares"
+            )
         counts = measurement.counts()
-        # dark readings count no more than a quarter of the mean: they would hold up the convergence of all others
+        # dark readings count no more than a quarter of the mean: they would hold up the convergence
+        # of all others
         deviation = np.sqrt(np.maximum(counts, counts.mean() / 4) + 1)
         model = Diagonal(measurement.photons_per_unit / deviation) @ model
-        readings = (counts / deviation)[:, np.newaxis]
-        return _Problem(model, readings, camera.row_length, partial(Poisson, deviation=deviation))
+        measurements = (counts / deviation)[:, np.newaxis]
+        return _InverseProblem(
+            model, measurements, camera.correlation_length, partial(Poisson, deviation=deviation)
+        )
 
-    def _variational(self, problem: _Problem) -> ProximalMethod:
+    def _choose_method(self, problem: _InverseProblem) -> ProximalMethod:
         """Return the prior's method with its data term and weight."""
-        first = FIRST if self.weight is None else self.weight
-        method = VARIATIONAL.get(self.prior, TotalVariation)(first, ITERATIONS, RELATIVE_CHANGE, problem.data_term)
+        first = INITIAL_WEIGHT if self.weight is None else self.weight
+        method = VARIATIONAL_PRIORS.get(self.prior, TotalVariation)(
+            first, MAX_ITERATIONS, OBJECTIVE_TOLERANCE, problem.data_term
+        )
         if self.data_term == "huber":
-            method = _robust(method, problem)
+            method = _make_robust(method, problem)
         if self.weight is not None:
             return method
-        weight = choose_weight(method, problem.model, problem.readings[:, 0], problem.row_length).weight
-        return replace(method, weight=weight * SMOOTHER if self.data_term == "huber" else weight)
+        weight = choose_weight(
+            method, problem.model, problem.measurements[:, 0], problem.correlation_length
+        ).weight
+        return replace(
+            method, weight=weight * HUBER_WEIGHT_FACTOR if self.data_term == "huber" else weight
+        )
 
-    def _finished(self, method: ProximalMethod) -> ProximalMethod | PlugAndPlay:
-        if self.preset == "fast" and self.prior in VARIATIONAL:
+    def _add_denoiser(self, method: ProximalMethod) -> ProximalMethod | PlugAndPlay:
+        if self.preset == "fast" and self.prior in VARIATIONAL_PRIORS:
             return method
         denoiser = DENOISERS.get(self.prior, CollaborativeWiener)()
         return PlugAndPlay(method, denoiser, PRESETS[self.preset])
 
 
-def recover_light_field(measurement: ClipMeasurement, weight: float = LIGHT_FIELD_WEIGHT) -> LightField:
+def recover_light_field(
+    measurement: ClipMeasurement, weight: float = LIGHT_FIELD_WEIGHT
+) -> LightField:
     """Recover every view instead of one picture (Eq. 20), by total variation over pixels and views.
 
-    Far more unknowns than readings: expect less than of the refocused picture, whose views agree. Views without
-    readings are filled in from their neighbours. Memory: about ten times the light field.
+    Far more unknowns than readings: expect less than of the refocused picture, whose views agree.
+    Views without readings are filled in from their neighbours. Memory: about ten times the light
+    field.
 
     Parameters
     ----------
@@ -186,43 +219,55 @@ def recover_light_field(measurement: ClipMeasurement, weight: float = LIGHT_FIEL
         The views are no complete grid, row by row.
     """
     camera = measurement.camera()
-    grid = _grid(measurement.views)
+    grid = _view_grid_shape(measurement.views)
     shape = (len(measurement.views), *measurement.image_shape)
-    model = camera.weighting() @ camera.light_field_model() @ ViewSelection(shape, camera.used)
-    method = LightFieldVariation(weight, ITERATIONS, RELATIVE_CHANGE, grid=grid)
-    pictures = method.recover(model, camera.weighting()(measurement.readings)[:, np.newaxis]).frames[0]
+    model = (
+        camera.weighting() @ camera.light_field_model() @ ViewSelection(shape, camera.used_views)
+    )
+    method = LightFieldVariation(weight, MAX_ITERATIONS, OBJECTIVE_TOLERANCE, grid=grid)
+    pictures = method.recover(
+        model, camera.weighting()(measurement.measurements)[:, np.newaxis]
+    ).frames[0]
     return LightField(pictures, measurement.views)
 
 
-def _grid(views: NDArray[np.float64]) -> tuple[int, int]:
+def _view_grid_shape(views: NDArray[np.float64]) -> tuple[int, int]:
     """Return how many views there are down and across."""
     down, across = (np.unique(views[:, axis]) for axis in (0, 1))
     complete = np.stack(np.meshgrid(down, across, indexing="ij"), axis=-1).reshape(-1, 2)
     if complete.shape != views.shape or not np.array_equal(complete, views):
-        raise InputError("a light field is recovered from a complete grid of views, row by row; some are missing")
+        raise InputError(
+            "a light field is recovered from a complete grid of views, row by row; some are missing"
+        )
     return down.size, across.size
 
 
 @dataclass(frozen=True)
-class _Problem:
+class _InverseProblem:
     """Model and readings (readings, 1) weighted as the data term wants them."""
 
     model: LinearOperator
-    readings: NDArray[Any]
-    row_length: int
+    measurements: NDArray[Any]
+    correlation_length: int
     data_term: DataTermMaker
 
 
-def _robust(method: ProximalMethod, problem: _Problem) -> ProximalMethod:
+def _make_robust(method: ProximalMethod, problem: _InverseProblem) -> ProximalMethod:
     """Return the method with Huber's term, its threshold from the errors that a narrow one leaves."""
     looking = method
-    for _ in range(LOOKS):
-        seen = looking.recover(problem.model, problem.readings).frames[0]
-        deviation = robust_deviation(problem.model(seen) - problem.readings[:, 0])
-        looking = replace(looking, data_term=partial(Huber, threshold=NARROW * deviation), weight=FIRST / 4)
-    return replace(method, data_term=partial(Huber, threshold=WIDE * deviation))
+    for _ in range(THRESHOLD_PASSES):
+        seen = looking.recover(problem.model, problem.measurements).frames[0]
+        deviation = estimate_robust_deviation(problem.model(seen) - problem.measurements[:, 0])
+        looking = replace(
+            looking,
+            data_term=partial(Huber, threshold=INITIAL_THRESHOLD_DEVIATIONS * deviation),
+            weight=INITIAL_WEIGHT / 4,
+        )
+    return replace(
+        method, data_term=partial(Huber, threshold=FINAL_THRESHOLD_DEVIATIONS * deviation)
+    )
 
 
-def _require(what: str, name: str, known: list[str]) -> None:
+def _require_known(what: str, name: str, known: list[str]) -> None:
     if name not in known:
         raise InputError(f"unknown {what} '{name}'; take one of {', '.join(known)}")

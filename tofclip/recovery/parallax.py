@@ -1,4 +1,6 @@
-"""The camera's parallax from an ordinary shot: time tells the range of each gate, agreement of the views its shear."""
+"""The camera's parallax from an ordinary shot: time tells the range of each gate, agreement of the
+views its shear.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.camera import Camera, Measurement, measure
-from tofclip.camera.calibration.parallax import FocusCurve, Parallax, parallax_from_shears, sharpest_shears
+from tofclip.camera.calibration.parallax import (
+    FocusCurve,
+    Parallax,
+    find_sharpest_shears,
+    fit_parallax_to_shears,
+)
 from tofclip.errors import CalibrationError, InputError
-from tofclip.recovery.plan import fitted_to_shot
+from tofclip.recovery.plan import fit_camera_to_shot
 from tofclip.shots import Streak
-from tofclip.solvers import Progress, silent
+from tofclip.solvers import Progress, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float64]
 
-FEWEST_GATES = 3
+MIN_GATES = 3
 
 
 @dataclass(frozen=True)
@@ -41,8 +48,12 @@ class ShotParallax:
     curve: FocusCurve
 
 
-def parallax_from_shot(
-    streak: Streak, camera: Camera, gates: int, shears: tuple[float, float, int], progress: Progress = silent
+def fit_parallax_to_shot(
+    streak: Streak,
+    camera: Camera,
+    gates: int,
+    shears: tuple[float, float, int],
+    progress: Progress = ignore_progress,
 ) -> ShotParallax:
     """Fit lenslet pitch and focus distance to the shears at which a shot's gates are in focus.
 
@@ -66,26 +77,36 @@ def parallax_from_shot(
     InputError
         Fewer than three gates.
     """
-    if gates < FEWEST_GATES:
-        raise InputError(f"a parallax needs {FEWEST_GATES} gates or more, got {gates}")
+    if gates < MIN_GATES:
+        raise InputError(f"a parallax needs {MIN_GATES} gates or more, got {gates}")
     if camera.sweep is None:
-        camera = fitted_to_shot(streak, camera, progress)
+        camera = fit_camera_to_shot(streak, camera, progress)
     measurement = measure(streak.counts, streak.saturated, camera)
     times = streak.times - camera.time_zero
     if times[0] <= 0:
-        raise CalibrationError("light cannot come before time zero: give the camera's (--time-zero-ns)")
-    cut, distances = bright_gates(measurement, times, gates)
-    curve = sharpest_shears(measurement, camera, cut, np.linspace(*shears), progress)
-    found = parallax_from_shears(curve.shears, distances, curve.weight)
-    return ShotParallax(found.applied(camera), found, distances, curve)
+        raise CalibrationError(
+            "light cannot come before time zero: give the camera's (--time-zero-ns)"
+        )
+    cut, distances = split_gates_by_brightness(measurement, times, gates)
+    curve = find_sharpest_shears(measurement, camera, cut, np.linspace(*shears), progress)
+    found = fit_parallax_to_shears(curve.shears, distances, curve.weight)
+    return ShotParallax(found.apply_to(camera), found, distances, curve)
 
 
-def bright_gates(measurement: Measurement, times: FloatArray, number: int) -> tuple[list[slice], FloatArray]:
-    """Cut the frames into gates of equal brightness (root of the light); also their light's mean range, m."""
-    light = np.maximum((measurement.readings * measurement.good).sum(axis=0, dtype=np.float64), 0)
+def split_gates_by_brightness(
+    measurement: Measurement, times: FloatArray, number: int
+) -> tuple[list[slice], FloatArray]:
+    """Cut the frames into gates of equal brightness (root of the light); also their light's mean
+    range, m.
+    """
+    light = np.maximum(
+        (measurement.measurements * measurement.valid).sum(axis=0, dtype=np.float64), 0
+    )
     share = np.cumsum(np.sqrt(light)) / np.sqrt(light).sum()
     edges = np.searchsorted(share, np.arange(1, number) / number) + 1
     cuts = np.unique(np.concatenate([[0], edges, [light.size]])).tolist()
     gates = [slice(first, last) for first, last in pairwise(cuts)]
-    instants = [np.average(times[gate], weights=light[gate] + np.finfo(np.float64).tiny) for gate in gates]
+    instants = [
+        np.average(times[gate], weights=light[gate] + np.finfo(np.float64).tiny) for gate in gates
+    ]
     return gates, SPEED_OF_LIGHT * np.array(instants) / 2

@@ -9,22 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from tofclip.arrays import HERE, Place, place_named, to_numpy
+from tofclip.arrays import CPU, ComputeDevice, parse_device, to_numpy
 from tofclip.camera import Camera, Measurement, measure
-from tofclip.camera.calibration.registration import register, registration_work
+from tofclip.camera.calibration.registration import count_registration_iterations, register_views
 from tofclip.camera.calibration.skew import estimate_skew
 from tofclip.errors import InputError
-from tofclip.recovery.focus import AT_THE_CALIBRATED_DEPTH, Focus
-from tofclip.recovery.pieces import recover_pieces, residual_of_pieces
+from tofclip.recovery.focus import DEFAULT_FOCUS, Focus
+from tofclip.recovery.segments import compute_segments_residual, recover_segments
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import (
-    Adjoint,
+    Backprojection,
     LinearInverse,
     Method,
     Progress,
     Sparse,
     TotalVariation,
-    silent,
+    ignore_progress,
 )
 from tofclip.storage import Scalar
 
@@ -32,11 +32,11 @@ METHODS: dict[str, Callable[..., Method]] = {
     "tv": TotalVariation,
     "l1": Sparse,
     "linear": LinearInverse,
-    "adjoint": Adjoint,
+    "adjoint": Backprojection,
 }
 
 
-def method_named(name: str, **settings: Any) -> Method:
+def make_method(name: str, **settings: Any) -> Method:
     """Make a recovery method by its short name, with settings of its own where given.
 
     Parameters
@@ -55,7 +55,7 @@ def method_named(name: str, **settings: Any) -> Method:
 
 
 @dataclass(frozen=True)
-class Task:
+class RecoveryTask:
     """A recovery that is about to run, so that a progress bar can know its length.
 
     Parameters
@@ -65,49 +65,52 @@ class Task:
     method : Method
     focus : Focus
         At which shear each frame is recovered.
-    place : Place
-        Where: readings are put there, and frames fetched from there. What precedes the recovery is done in NumPy.
+    device : Place
+        Where: readings are put there, and frames fetched from there. What precedes the recovery is
+        done in NumPy.
     """
 
     streak: Streak
     camera: Camera
     method: Method
-    focus: Focus = AT_THE_CALIBRATED_DEPTH
-    place: Place = HERE
+    focus: Focus = DEFAULT_FOCUS
+    device: ComputeDevice = CPU
 
     @property
     def work(self) -> int:
         """Frame iterations that will be reported at most."""
         frames = self.streak.counts.shape[0]
         own = self.method.work(frames) + self.focus.work(frames)
-        return own + (registration_work() if self.camera.sweep is None else 0)
+        return own + (count_registration_iterations() if self.camera.sweep is None else 0)
 
-    def run(self, progress: Progress = silent) -> Frames:
+    def run(self, progress: Progress = ignore_progress) -> Frames:
         """Recover; see `recover`."""
         started = time.perf_counter()
         camera = self.camera
         if camera.sweep is None:
-            camera = fitted_to_shot(self.streak, camera, progress)
+            camera = fit_camera_to_shot(self.streak, camera, progress)
         measurement = measure(self.streak.counts, self.streak.saturated, camera)
         times = self.streak.times - camera.time_zero
         solving = time.perf_counter()
-        pieces = self.focus.pieces(camera, times, measurement, progress)
-        with self.place.current():
-            there = Measurement(self.place.put(measurement.readings), self.place.put(measurement.good))
-            result = recover_pieces(self.method, camera, there, pieces, progress)
+        pieces = self.focus.plan_segments(camera, times, measurement, progress)
+        with self.device.activate():
+            there = Measurement(
+                self.device.put(measurement.measurements), self.device.put(measurement.valid)
+            )
+            result = recover_segments(self.method, camera, there, pieces, progress)
             values = to_numpy(result.frames)
             solved = time.perf_counter()
-            residual = residual_of_pieces(camera, result.frames, there, pieces)
+            residual = compute_segments_residual(camera, result.frames, there, pieces)
         figures: dict[str, Scalar] = {
             "method": self.method.name,
             "focus": str(self.focus),
             "iterations": result.iterations,
-            "stopped_because": result.stopped_because,
+            "stopped_because": result.stop_reason,
             "relative_residual": residual,
             "seconds": time.perf_counter() - started,
             "frames_per_second": result.frames.shape[0] / (solved - solving - result.setup_seconds),
             "setup_seconds": result.setup_seconds,
-            "device": str(self.place),
+            "device": str(self.device),
         }
         return Frames(
             values=values,
@@ -124,14 +127,14 @@ def recover(
     streak: Streak,
     camera: Camera | None = None,
     method: str | Method = "tv",
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
     focus: Focus | None = None,
     device: str = "cpu",
 ) -> Frames:
     """Recover every transient frame of a streak image.
 
-    A camera without a sweep has it estimated from the shot (`estimate_skew`), refined together with the views' gains
-    and centres (`register`); the frames carry the camera that was used.
+    A camera without a sweep has it estimated from the shot (`estimate_skew`), refined together with
+    the views' gains and centres (`register_views`); the frames carry the camera that was used.
 
     Parameters
     ----------
@@ -140,13 +143,16 @@ def recover(
     camera : Camera, optional
         Defaults to the one that the streak image carries.
     method : str or Method
-        ``"tv"`` (default), ``"l1"``, ``"linear"``, ``"adjoint"``, or a configured `tofclip.solvers` method.
+        ``"tv"`` (default), ``"l1"``, ``"linear"``, ``"adjoint"``, or a configured `tofclip.solvers`
+        method.
     progress : callable
         Called with the number of frame iterations just done.
     focus : Focus, optional
-        `FixedFocus` (the default, at shear 0), `DepthLocked` or `SharpestFocus` of `tofclip.recovery`.
+        `FixedFocus` (the default, at shear 0), `DepthLocked` or `SharpestFocus` of
+        `tofclip.recovery`.
     device : str
-        ``"cpu"``, ``"cuda"``, ``"cuda:1"``, ``"auto"`` or a PyTorch device, see `tofclip.arrays.place_named`.
+        ``"cpu"``, ``"cuda"``, ``"cuda:1"``, ``"auto"`` or a PyTorch device, see
+        `tofclip.arrays.parse_device`.
 
     Returns
     -------
@@ -164,35 +170,39 @@ def recover(
     MissingDependencyError
         There is no such device.
     """
-    return prepare(streak, camera, method, focus, device).run(progress)
+    return prepare_recovery(streak, camera, method, focus, device).run(progress)
 
 
-def prepare(
+def prepare_recovery(
     streak: Streak,
     camera: Camera | None = None,
     method: str | Method = "tv",
     focus: Focus | None = None,
     device: str = "cpu",
-) -> Task:
+) -> RecoveryTask:
     """Check what `recover` needs before any work is done; arguments as there."""
     camera = camera or streak.camera
     if camera is None:
-        raise InputError(f"{streak.source} carries no camera: give one (--camera camera.h5, made by calibrate)")
+        raise InputError(
+            f"{streak.source} carries no camera: give one (--camera camera.h5, made by calibrate)"
+        )
     _ = streak.times  # a missing axis is refused before minutes of work
-    focus = AT_THE_CALIBRATED_DEPTH if focus is None else focus
-    focus.require(camera)
-    solver = method_named(method) if isinstance(method, str) else method
-    return Task(streak, camera, solver, focus, place_named(device))
+    focus = DEFAULT_FOCUS if focus is None else focus
+    focus.check_camera(camera)
+    solver = make_method(method) if isinstance(method, str) else method
+    return RecoveryTask(streak, camera, solver, focus, parse_device(device))
 
 
-def fitted_to_shot(streak: Streak, camera: Camera, progress: Progress = silent) -> Camera:
+def fit_camera_to_shot(
+    streak: Streak, camera: Camera, progress: Progress = ignore_progress
+) -> Camera:
     """Return `camera` with sweep, gains and centres found from the shot itself."""
     skew = estimate_skew(streak.counts, camera)
     coarse = replace(camera, sweep=skew.sweep)
-    return register(streak.counts, streak.saturated, coarse, progress).camera
+    return register_views(streak.counts, streak.saturated, coarse, progress).camera
 
 
-def time_shift_bins(camera: Camera) -> list[float]:
+def compute_view_delays_bins(camera: Camera) -> list[float]:
     """Rows by which each view is late at the first row, relative to the reference view."""
     if camera.sweep is None:
         return [0.0] * camera.views

@@ -1,23 +1,25 @@
-"""Sequences: a folder, a glob pattern or an HDF5 stack of shots or frames, turned into as many results.
+"""Sequences: a folder, a glob pattern or an HDF5 stack of shots or frames, turned into as many
+results.
 
-What is done to one of them stands here once; one file, a sequence here and a sequence on a cluster take the same way.
+What is done to one of them stands here once; one file, a sequence here and a sequence on a cluster
+take the same way.
 """
 
-from tofclip.sequences.clouds import Clouds
-from tofclip.sequences.inputs import FileShot, Shot, StackShot, files_in, is_sequence, shots_in
-from tofclip.sequences.ranging import Ranging
-from tofclip.sequences.recovering import Recovery
-from tofclip.sequences.sweep import variants
+from tofclip.sequences.clouds import CloudSettings
+from tofclip.sequences.inputs import FileShot, Shot, StackShot, is_sequence, list_files, list_shots
+from tofclip.sequences.ranging import RangingSettings
+from tofclip.sequences.recovering import RecoverySettings
+from tofclip.sequences.sweep import expand_sweep
 
 __all__ = [
-    "Clouds",
+    "CloudSettings",
     "FileShot",
-    "Ranging",
-    "Recovery",
+    "RangingSettings",
+    "RecoverySettings",
     "Shot",
     "StackShot",
-    "files_in",
+    "expand_sweep",
     "is_sequence",
-    "shots_in",
-    "variants",
+    "list_files",
+    "list_shots",
 ]

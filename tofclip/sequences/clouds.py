@@ -7,19 +7,19 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from tofclip.arrays import place_named
+from tofclip.arrays import parse_device
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud, Returns, depth, point_cloud
-from tofclip.sequences.inputs import result_paths
-from tofclip.sequences.jobs import Job, claim
-from tofclip.sequences.recovering import device_setting
+from tofclip.sequences.inputs import make_result_paths
+from tofclip.sequences.jobs import Job, lock_output_folder
+from tofclip.sequences.recovering import normalise_device
 from tofclip.shots import Frames
 
-DEPTH_PICTURE = ".exr"
+DEPTH_IMAGE_SUFFIX = ".exr"
 
 
 @dataclass(frozen=True)
-class Clouds:
+class CloudSettings:
     """How frames become a cloud.
 
     Parameters
@@ -29,14 +29,14 @@ class Clouds:
     voxel : float, optional
         One point for each cube of this side, m; all points by default.
     device : str
-        Where returns are looked for, by a name that `tofclip.arrays.place_named` knows.
+        Where returns are looked for, by a name that `tofclip.arrays.parse_device` knows.
     """
 
     drop_outliers: bool = False
     voxel: float | None = None
     device: str = "cpu"
 
-    def found(self, frames: Frames, origin: str) -> tuple[PointCloud, Returns]:
+    def make_cloud(self, frames: Frames, origin: str) -> tuple[PointCloud, Returns]:
         """Find each pixel's returns and place them in space.
 
         Raises
@@ -44,39 +44,52 @@ class Clouds:
         InputError
             There is none; `origin` says whose frames they were.
         """
-        from tofclip.lidar.processing import downsampled, without_outliers
+        from tofclip.lidar.processing import downsample_cloud, remove_outliers
 
-        place = place_named(self.device)
-        with place.current():
-            returns = depth(replace(frames, values=place.put(frames.values)))
+        device = parse_device(self.device)
+        with device.activate():
+            returns = depth(replace(frames, values=device.put(frames.values)))
         if len(returns) == 0:
-            raise InputError(f"{origin}: no return stands out of the background, so there is no point to write")
+            raise InputError(
+                f"{origin}: no return stands out of the background, so there is no point to write"
+            )
         cloud = replace(point_cloud(returns), provenance=frames.provenance)
         if self.drop_outliers:
-            cloud = without_outliers(cloud)
-        return (cloud if self.voxel is None else downsampled(cloud, self.voxel)), returns
+            cloud = remove_outliers(cloud)
+        return (cloud if self.voxel is None else downsample_cloud(cloud, self.voxel)), returns
 
     def jobs(self, frames: Mapping[str, Path], folder: Path, suffix: str) -> list[Job]:
-        """Return one job for each file of frames, which writes its cloud into `folder`; see `Recovery.jobs`."""
-        settings = {"verb": "cloud", **asdict(self), "suffix": suffix, "device": device_setting(self.device)}
-        claim(folder, settings)
-        paths = result_paths(frames, folder, suffix)
-        return [Job(name, paths[name], partial(write_cloud, self, file, paths[name])) for name, file in frames.items()]
+        """Return one job for each file of frames, which writes its cloud into `folder`; see
+        `Recovery.jobs`.
+        """
+        settings = {
+            "verb": "cloud",
+            **asdict(self),
+            "suffix": suffix,
+            "device": normalise_device(self.device),
+        }
+        lock_output_folder(folder, settings)
+        paths = make_result_paths(frames, folder, suffix)
+        return [
+            Job(name, paths[name], partial(write_cloud, self, file, paths[name]))
+            for name, file in frames.items()
+        ]
 
 
-def write_cloud(clouds: Clouds, frames: Path, result: Path) -> int:
-    """Read frames, write their cloud, or their depth picture where that is asked for; return the number of points.
+def write_cloud(clouds: CloudSettings, frames: Path, result: Path) -> int:
+    """Read frames, write their cloud, or their depth picture where that is asked for; return the
+    number of points.
 
     Memory: the frames, and about as much again while returns are looked for.
     """
-    cloud, returns = clouds.found(Frames.load(frames), str(frames))
+    cloud, returns = clouds.make_cloud(Frames.load(frames), str(frames))
     save_cloud(cloud, returns, result)
     return len(cloud)
 
 
 def save_cloud(cloud: PointCloud, returns: Returns, path: Path) -> None:
     """Write a cloud, or the depth picture of its returns where the name ends in .exr."""
-    if path.suffix.lower() == DEPTH_PICTURE:
+    if path.suffix.lower() == DEPTH_IMAGE_SUFFIX:
         from tofclip.lidar.depth_exr import save_depth
 
         save_depth(returns, path)

@@ -10,10 +10,10 @@ from pathlib import Path
 
 from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.io import read_streak
-from tofclip.sequences.jobs.folder import SETTINGS
+from tofclip.sequences.jobs.output_folder import SETTINGS_NAME
 from tofclip.shots import Streak
 from tofclip.shots.stack import StreakStack
-from tofclip.storage import SIGNATURE
+from tofclip.storage import HDF5_SIGNATURE
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class StackShot:
 
     def __call__(self) -> Streak:
         """Read the shot."""
-        shot = StreakStack(self.path).shot(self.number)
+        shot = StreakStack(self.path).read_shot(self.number)
         return shot if self.bin_width is None else shot.with_bin_width(self.bin_width)
 
 
@@ -61,14 +61,16 @@ Shot = FileShot | StackShot
 
 
 def is_sequence(source: str | Path) -> bool:
-    """Tell whether `source` is a folder, a glob pattern or an HDF5 stack of streak images, and no single file."""
+    """Tell whether `source` is a folder, a glob pattern or an HDF5 stack of streak images, and no
+    single file.
+    """
     text, path = str(source), Path(source)
     if "://" in text:
         return False
     return path.is_dir() or (_is_stack(path) if path.exists() else glob.has_magic(text))
 
 
-def shots_in(source: str | Path, bin_width: float | None = None) -> dict[str, Shot]:
+def list_shots(source: str | Path, bin_width: float | None = None) -> dict[str, Shot]:
     """Return the shots of a sequence by name, in order.
 
     Parameters
@@ -85,17 +87,18 @@ def shots_in(source: str | Path, bin_width: float | None = None) -> dict[str, Sh
     """
     path = Path(source)
     if path.is_dir() or not path.exists():
-        return {name: FileShot(file, bin_width) for name, file in files_in(source).items()}
+        return {name: FileShot(file, bin_width) for name, file in list_files(source).items()}
     path = path.absolute()
     numbers = range(len(StreakStack(path)))
     return {f"{path.stem}_{number:06d}": StackShot(path, number, bin_width) for number in numbers}
 
 
-def files_in(source: str | Path) -> dict[str, Path]:
+def list_files(source: str | Path) -> dict[str, Path]:
     """Return the files of a folder or a glob pattern by name, in the order of their names.
 
-    A file's name is its path from the folder that they have in common, without the ending. Paths are absolute: a
-    cluster's workers run elsewhere. Hidden files are left out, and the settings that a run leaves beside its results.
+    A file's name is its path from the folder that they have in common, without the ending. Paths
+    are absolute: a cluster's workers run elsewhere. Hidden files are left out, and the settings
+    that a run leaves beside its results.
 
     Raises
     ------
@@ -106,12 +109,14 @@ def files_in(source: str | Path) -> dict[str, Path]:
     """
     folder = Path(source)
     if folder.is_dir():
-        found = [path for path in folder.iterdir() if path.name != SETTINGS]
+        found = [path for path in folder.iterdir() if path.name != SETTINGS_NAME]
     elif glob.has_magic(str(source)):
         found = [Path(name) for name in glob.glob(str(source), recursive=True)]
     else:
         raise StorageError(f"{source}: no such folder or pattern")
-    files = sorted(path.absolute() for path in found if path.is_file() and not path.name.startswith("."))
+    files = sorted(
+        path.absolute() for path in found if path.is_file() and not path.name.startswith(".")
+    )
     if not files:
         raise InputError(f"{source}: there is no file")
     common = Path(os.path.commonpath([path.parent for path in files]))
@@ -119,12 +124,14 @@ def files_in(source: str | Path) -> dict[str, Path]:
     for path in files:
         name = path.relative_to(common).with_suffix("").as_posix()
         if name in named:
-            raise InputError(f"{named[name]} and {path.name} have one name; choose some by a pattern: '*{path.suffix}'")
+            raise InputError(
+                f"{named[name]} and {path.name} have one name; choose some by a pattern: '*{path.suffix}'"
+            )
         named[name] = path
     return named
 
 
-def result_paths(names: Mapping[str, object], folder: Path, suffix: str) -> dict[str, Path]:
+def make_result_paths(names: Mapping[str, object], folder: Path, suffix: str) -> dict[str, Path]:
     """Return where the result of each input goes, absolute, and make the folders for them."""
     paths = {name: folder.resolve() / f"{name}{suffix}" for name in names}
     for parent in {path.parent for path in paths.values()}:
@@ -136,7 +143,7 @@ def _is_stack(path: Path) -> bool:
     """Tell a stack from a single streak image: it has one more dimension."""
     try:
         with open(path, "rb") as file:
-            if file.read(len(SIGNATURE)) != SIGNATURE:
+            if file.read(len(HDF5_SIGNATURE)) != HDF5_SIGNATURE:
                 return False
         StreakStack(path)
     except (OSError, FileFormatError):

@@ -1,4 +1,6 @@
-"""Shot after shot to cloud after cloud, with what does not change from shot to shot worked out once."""
+"""Shot after shot to cloud after cloud, with what does not change from shot to shot worked out
+once.
+"""
 
 from __future__ import annotations
 
@@ -14,25 +16,25 @@ from tofclip.camera import Camera, Measurement, Rectifier
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.cloud import PointCloud, point_cloud
 from tofclip.lidar.detection import Detection
-from tofclip.lidar.lit.rows import LitRows, Place
 from tofclip.lidar.returns import Returns
 from tofclip.lidar.search import ReturnSearch
-from tofclip.lidar.traces import Bins, Traces
-from tofclip.recovery.focus import AT_THE_CALIBRATED_DEPTH, Focus
-from tofclip.recovery.plan import fitted_to_shot, prepare
+from tofclip.lidar.signal_rows.selection import RowBlock, SignalRowFinder
+from tofclip.lidar.traces import TraceBins, Traces
+from tofclip.recovery.focus import DEFAULT_FOCUS, Focus
+from tofclip.recovery.plan import fit_camera_to_shot, prepare_recovery
 from tofclip.shots import Streak
 from tofclip.solvers import LinearInverse
-from tofclip.solvers.traces import InverseTraces, patch_order
-from tofclip.threads import one_per_core
+from tofclip.solvers.traces import InverseTraces, order_by_patch
+from tofclip.threads import map_per_core
 
 FloatArray = NDArray[np.float64]
 Shot = Callable[[], Streak]
 
-LARGEST_JITTER_BIN = 32
+MAX_JITTER_BINS = 32
 
 
 @dataclass(frozen=True)
-class Step:
+class SequenceCloud:
     """One cloud of a sequence.
 
     Parameters
@@ -49,17 +51,19 @@ class Step:
     late_bin: FloatArray
 
 
-class Ranger:
+class RangingPipeline:
     """Makes clouds of shots of one camera by the linear inverse, which needs no iterations.
 
-    Sweep, operators, inverted Gram matrices and filters are worked out once. No transient cube is made: pixels are
-    recovered a few at a time, and their returns are sought at once (`tofclip.solvers.traces`). Rows that hold no light
-    are left out, but for a sample that tells background and noise (`tofclip.lidar.lit`).
+    Sweep, operators, inverted Gram matrices and filters are worked out once. No transient cube is
+    made: pixels are recovered a few at a time, and their returns are sought at once
+    (`tofclip.solvers.traces`). Rows that hold no light are left out, but for a sample that tells
+    background and noise (`tofclip.lidar.signal_rows`).
 
     Parameters
     ----------
     camera : Camera
-        With its sweep; one that has to be found from a shot is found from the first (`fitted_to_shot`) beforehand.
+        With its sweep; one that has to be found from a shot is found from the first
+        (`fit_camera_to_shot`) beforehand.
     row_times : (rows,) array
         Instant of each row, s.
     method : LinearInverse, optional
@@ -69,7 +73,8 @@ class Ranger:
 
     Notes
     -----
-    Memory: a (columns, columns) matrix for each shear, and for a shot as much again as its readings.
+    Memory: a (columns, columns) matrix for each shear, and for a shot as much again as its
+    readings.
     """
 
     def __init__(
@@ -77,29 +82,34 @@ class Ranger:
         camera: Camera,
         row_times: FloatArray,
         method: LinearInverse | None = None,
-        focus: Focus = AT_THE_CALIBRATED_DEPTH,
+        focus: Focus = DEFAULT_FOCUS,
         detection: Detection | None = None,
     ) -> None:
-        focus.require(camera)
+        focus.check_camera(camera)
         method = LinearInverse() if method is None else method
         self.camera = camera
         self.times = np.asarray(row_times, dtype=np.float64) - camera.time_zero
         self.rectifier = Rectifier(camera, self.times.size)
         nothing = Measurement(np.empty((0, 0), np.float32), np.empty((0, 0), bool))
-        pieces = focus.pieces(camera, self.times, nothing)
-        alive, self.pixels = ~camera.dead_columns, patch_order(camera.image_shape)
+        pieces = focus.plan_segments(camera, self.times, nothing)
+        alive, self.pixels = ~camera.dead_columns, order_by_patch(camera.image_shape)
         self.places = [
-            Place(piece.frames, InverseTraces(method.prepare(camera.operator(piece.shear), alive), self.pixels))
+            RowBlock(
+                piece.frames,
+                InverseTraces(method.prepare(camera.operator(piece.shear), alive), self.pixels),
+            )
             for piece in pieces
         ]
         shears = np.repeat([piece.shear for piece in pieces], [piece.size for piece in pieces])
         self._search = ReturnSearch(camera, self.times, detection, shears=shears)
         row = float(self.times[-1] - self.times[0]) / (self.times.size - 1)
         limit, width = self._search.detection.signal_to_noise, self._search.pulse.fwhm / row
-        self._lit = LitRows(self.places, width, limit, self._search.reach_bins)
+        self._lit = SignalRowFinder(self.places, width, limit, self._search.reach_bins)
 
     @classmethod
-    def for_shot(cls, shot: Streak, camera: Camera | None = None, focus: Focus = AT_THE_CALIBRATED_DEPTH) -> Ranger:
+    def for_shot(
+        cls, shot: Streak, camera: Camera | None = None, focus: Focus = DEFAULT_FOCUS
+    ) -> RangingPipeline:
         """Prepare for shots like this one; a sweep that is not known is found from it.
 
         Parameters
@@ -115,45 +125,56 @@ class Ranger:
         MissingTimeAxisError, InputError, CalibrationError
             As for `tofclip.recover`.
         """
-        known = prepare(shot, camera, LinearInverse(), focus).camera
-        return cls(known if known.sweep is not None else fitted_to_shot(shot, known), shot.times, focus=focus)
+        known = prepare_recovery(shot, camera, LinearInverse(), focus).camera
+        return cls(
+            known if known.sweep is not None else fit_camera_to_shot(shot, known),
+            shot.times,
+            focus=focus,
+        )
 
-    def returns(self, readings: NDArray[np.float32]) -> Returns:
+    def find_returns(self, measurements: NDArray[np.float32]) -> Returns:
         """Find the returns in one shot's rectified readings, (columns, rows)."""
-        return self.search(self.recover(readings))
+        return self.search(self.recover(measurements))
 
-    def recover(self, readings: NDArray[np.float32]) -> Traces:
-        """Do what a shot needs as a whole before its pixels are recovered, a few at a time, by whoever asks for them.
+    def recover(self, measurements: NDArray[np.float32]) -> Traces:
+        """Do what a shot needs as a whole before its pixels are recovered, a few at a time, by
+        whoever asks for them.
 
         Parameters
         ----------
-        readings : (columns, rows) float32 array
+        measurements : (columns, rows) float32 array
             Rectified.
         """
-        if readings.shape != (self.camera.slit_width_px, self.times.size):
-            raise ShapeError("readings", (self.camera.slit_width_px, self.times.size), readings.shape)
-        return _ShotTraces(self, readings, self._lit.bins(readings))
+        if measurements.shape != (self.camera.slit_width_px, self.times.size):
+            raise ShapeError(
+                "readings", (self.camera.slit_width_px, self.times.size), measurements.shape
+            )
+        return _ShotTraces(self, measurements, self._lit.bins(measurements))
 
     def search(self, traces: Traces) -> Returns:
         """Find the returns in what `recover` returned."""
-        return self._search.returns(traces)
+        return self._search.find_returns(traces)
 
-    def cloud(self, readings: NDArray[np.float32]) -> PointCloud:
+    def cloud(self, measurements: NDArray[np.float32]) -> PointCloud:
         """Make the cloud of one shot's rectified readings, (columns, rows)."""
-        return point_cloud(self.returns(readings))
+        return point_cloud(self.find_returns(measurements))
 
 
 class _ShotTraces:
     """Traces of a shot, recovered as they are asked for; see `tofclip.lidar.traces.Traces`."""
 
-    def __init__(self, ranger: Ranger, readings: NDArray[np.float32], bins: Bins) -> None:
-        self.pixels, self.bins = ranger.pixels, bins
+    def __init__(
+        self, pipeline: RangingPipeline, measurements: NDArray[np.float32], bins: TraceBins
+    ) -> None:
+        self.pixels, self.bins = pipeline.pixels, bins
         self._parts: list[tuple[InverseTraces, slice, NDArray[np.float32]]] = []
-        for place in ranger.places:
+        for place in pipeline.places:
             first, last = np.searchsorted(bins.numbers, [place.rows.start, place.rows.stop])
             if first < last:
-                some = np.take(readings, bins.numbers[first:last], axis=1)
-                self._parts.append((place.inverse, slice(first, last), place.inverse.inverse.weights(some)))
+                some = np.take(measurements, bins.numbers[first:last], axis=1)
+                self._parts.append(
+                    (place.inverse, slice(first, last), place.inverse.inverse.weights(some))
+                )
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
         for inverse, held, weights in self._parts:
@@ -161,7 +182,7 @@ class _ShotTraces:
 
 
 @dataclass
-class Jitter:
+class JitterEstimator:
     """Finds by how many rows a shot is late, from its light over time.
 
     Parameters
@@ -174,38 +195,55 @@ class Jitter:
     _spectrum: Any = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        self._spectrum = np.conj(np.fft.rfft(_edges(self.reference), 2 * self.reference.size))
+        self._spectrum = np.conj(
+            np.fft.rfft(_differentiate_root(self.reference), 2 * self.reference.size)
+        )
 
     def late_bin(self, light: FloatArray) -> float:
         """Rows by which `light` comes later than the reference, below a row; at most 32 either way."""
-        agreement = np.fft.irfft(np.fft.rfft(_edges(light), 2 * light.size) * self._spectrum)
-        reach = min(LARGEST_JITTER_BIN, light.size // 2 - 1)
+        agreement = np.fft.irfft(
+            np.fft.rfft(_differentiate_root(light), 2 * light.size) * self._spectrum
+        )
+        reach = min(MAX_JITTER_BINS, light.size // 2 - 1)
         near = np.concatenate([agreement[-reach:], agreement[: reach + 1]])
         best = int(near.argmax())
         if best in (0, near.size - 1):
             return float(best - reach)
         left, centre, right = near[best - 1 : best + 2]
-        return best - reach + float((right - left) / 2 / max(2 * centre - left - right, np.finfo(np.float64).tiny))
+        return (
+            best
+            - reach
+            + float((right - left) / 2 / max(2 * centre - left - right, np.finfo(np.float64).tiny))
+        )
 
 
-def light_over_time(streak: Streak, camera: Camera) -> FloatArray:
-    """Sum of each raw row over the reference view's middle, where neighbouring views' skew does not matter."""
+def compute_light_curve(streak: Streak, camera: Camera) -> FloatArray:
+    """Sum of each raw row over the reference view's middle, where neighbouring views' skew does not
+    matter.
+    """
     reference = int(np.argmin(np.abs(camera.view_positions)))
     half = camera.image_shape[1] // 4
     middle = round(camera.centres_px[reference])
-    return np.asarray(streak.counts[:, max(0, middle - half) : middle + half + 1].sum(axis=1, dtype=np.float64))
+    return np.asarray(
+        streak.counts[:, max(0, middle - half) : middle + half + 1].sum(axis=1, dtype=np.float64)
+    )
 
 
-def clouds(
-    shots: Sequence[Shot], ranger: Ranger, average: int = 1, steady: bool = True, first: int = 0
-) -> Iterator[Step]:
-    """Yield one cloud for every `average` successive shots; what is left over at the end makes one more.
+def make_clouds(
+    shots: Sequence[Shot],
+    pipeline: RangingPipeline,
+    average: int = 1,
+    steady: bool = True,
+    first: int = 0,
+) -> Iterator[SequenceCloud]:
+    """Yield one cloud for every `average` successive shots; what is left over at the end makes one
+    more.
 
     Parameters
     ----------
     shots : sequence of callables
         Each reads its shot when it is called, on the thread that works on it.
-    ranger : Ranger
+    pipeline : Ranger
     average : int
         Shots whose readings are averaged.
     steady : bool
@@ -220,29 +258,31 @@ def clouds(
 
     Notes
     -----
-    Every core works on a cloud of its own. Memory: a shot for each core, with what is recovered of it, and what a
-    `Ranger` takes.
+    Every core works on a cloud of its own. Memory: a shot for each core, with what is recovered of
+    it, and what a `RangingPipeline` takes.
     """
     if not shots or average < 1 or first < 0:
         raise InputError("a sequence needs at least one shot, and at least one to average")
-    jitter = Jitter(light_over_time(shots[0](), ranger.camera)) if steady else None
+    jitter = JitterEstimator(compute_light_curve(shots[0](), pipeline.camera)) if steady else None
 
-    def step(start: int) -> Step:
+    def step(start: int) -> SequenceCloud:
         numbers = range(start, min(start + average, len(shots)))
-        cloud, late = averaged([shots[number] for number in numbers], ranger, jitter)
-        return Step(cloud, numbers, late)
+        cloud, late = make_average_cloud([shots[number] for number in numbers], pipeline, jitter)
+        return SequenceCloud(cloud, numbers, late)
 
-    yield from one_per_core(step, range(first * average, len(shots), average))
+    yield from map_per_core(step, range(first * average, len(shots), average))
 
 
-def averaged(shots: Sequence[Shot], ranger: Ranger, jitter: Jitter | None) -> tuple[PointCloud, FloatArray]:
+def make_average_cloud(
+    shots: Sequence[Shot], pipeline: RangingPipeline, jitter: JitterEstimator | None
+) -> tuple[PointCloud, FloatArray]:
     """Make one cloud of successive shots.
 
     Parameters
     ----------
     shots : sequence of callables
         At least one; one is in memory at a time.
-    ranger : Ranger
+    pipeline : Ranger
     jitter : Jitter, optional
         None: the shots are taken as they come.
 
@@ -254,26 +294,28 @@ def averaged(shots: Sequence[Shot], ranger: Ranger, jitter: Jitter | None) -> tu
     """
     late = np.zeros(len(shots))
 
-    def readings(place: int) -> NDArray[np.float32]:
+    def measurements(place: int) -> NDArray[np.float32]:
         streak = shots[place]()
         if jitter is not None:
-            late[place] = jitter.late_bin(light_over_time(streak, ranger.camera))
-        return ranger.rectifier.readings(streak.counts, late=float(late[place]))
+            late[place] = jitter.late_bin(compute_light_curve(streak, pipeline.camera))
+        return pipeline.rectifier.measurements(streak.counts, delay=float(late[place]))
 
-    total = readings(0)
+    total = measurements(0)
     for place in range(1, len(shots)):
-        total += readings(place)
+        total += measurements(place)
     total /= len(shots)
-    return ranger.cloud(total), late
+    return pipeline.cloud(total), late
 
 
-def cloud_path(folder: Path, number: int, suffix: str) -> Path:
+def build_cloud_path(folder: Path, number: int, suffix: str) -> Path:
     """Return where cloud `number` of a sequence is kept."""
     return folder / f"cloud_{number:06d}{suffix}"
 
 
-def _edges(light: FloatArray) -> FloatArray:
-    """Changes of the root of the light: near objects outshine far ones, and a constant says nothing."""
+def _differentiate_root(light: FloatArray) -> FloatArray:
+    """Changes of the root of the light: near objects outshine far ones, and a constant says
+    nothing.
+    """
     rise = np.diff(np.sqrt(np.maximum(light - np.median(light), 0)), prepend=0.0)
     length: float = float(np.linalg.norm(rise)) or 1.0
     return rise / length

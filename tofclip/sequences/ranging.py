@@ -1,4 +1,6 @@
-"""Streak images straight to point clouds, by the linear inverse, with all that is prepared once kept in a file."""
+"""Streak images straight to point clouds, by the linear inverse, with all that is prepared once
+kept in a file.
+"""
 
 from __future__ import annotations
 
@@ -12,24 +14,31 @@ from numpy.typing import NDArray
 
 from tofclip.camera import Camera
 from tofclip.errors import InputError
-from tofclip.recovery import SharpestFocus, fitted_to_shot, focus_named, prepare
+from tofclip.recovery import SharpestFocus, fit_camera_to_shot, parse_focus, prepare_recovery
 from tofclip.sequences.inputs import Shot
-from tofclip.sequences.jobs import Job, claim
-from tofclip.sequences.ranger import Jitter, Ranger, averaged, cloud_path, light_over_time
+from tofclip.sequences.jobs import Job, lock_output_folder
+from tofclip.sequences.ranger import (
+    JitterEstimator,
+    RangingPipeline,
+    build_cloud_path,
+    compute_light_curve,
+    make_average_cloud,
+)
 from tofclip.shots import Streak
-from tofclip.storage import Field, Record, sha256_of
+from tofclip.storage import Field, Record, compute_sha256
 
-PLAN = "plan.h5"
+PLAN_NAME = "plan.h5"
 
 
 @dataclass(frozen=True)
-class Ranging:
+class RangingSettings:
     """How the shots of a sequence become clouds.
 
     Parameters
     ----------
     camera : Path, optional
-        By default the one inside the first shot. A sweep that it does not know is found from that shot.
+        By default the one inside the first shot. A sweep that it does not know is found from that
+        shot.
     time_zero : float, optional
         Reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
     focus : str
@@ -47,7 +56,7 @@ class Ranging:
     steady: bool = True
 
     def __post_init__(self) -> None:
-        if isinstance(focus_named(self.focus), SharpestFocus):
+        if isinstance(parse_focus(self.focus), SharpestFocus):
             raise InputError("a sequence has one focus for all shots: depth-locked or fixed:S")
         if self.average < 1:
             raise InputError("a sequence needs at least one shot to average")
@@ -55,56 +64,72 @@ class Ranging:
     def jobs(self, shots: Mapping[str, Shot], folder: Path, suffix: str) -> list[Job]:
         """Return one job for each cloud, which writes it into `folder`.
 
-        The folder is made, and claimed for these settings (`tofclip.sequences.jobs.claim`). What is prepared for
-        all shots is kept there; a run that goes on uses it again.
+        The folder is made, and claimed for these settings
+        (`tofclip.sequences.jobs.lock_output_folder`). What is prepared for all shots is kept there;
+        a run that goes on uses it again.
         """
-        plan, readers = folder.resolve() / PLAN, list(shots.values())
+        plan, readers = folder.resolve() / PLAN_NAME, list(shots.values())
         made = None if plan.exists() else self.plan(readers[0]())
-        camera = None if self.camera is None else sha256_of(self.camera)
+        camera = None if self.camera is None else compute_sha256(self.camera)
         settings = {"verb": "lidar sequence", **asdict(self), "camera": camera, "suffix": suffix}
-        claim(folder, settings | {"bin_width": readers[0].bin_width})
+        lock_output_folder(folder, settings | {"bin_width": readers[0].bin_width})
         if made is not None:
             made.save(plan)
-        version, jobs = sha256_of(plan), []
+        version, jobs = compute_sha256(plan), []
         for number in range(-(-len(readers) // self.average)):
             some = tuple(readers[number * self.average : (number + 1) * self.average])
-            result = cloud_path(folder.resolve(), number, suffix)
-            jobs.append(Job(result.stem, result, partial(write_cloud_of, plan, version, some, result)))
+            result = build_cloud_path(folder.resolve(), number, suffix)
+            jobs.append(
+                Job(result.stem, result, partial(write_average_cloud, plan, version, some, result))
+            )
         return jobs
 
     def plan(self, first: Streak) -> Record:
-        """Return what all shots share: camera, time axis, focus, and the first shot's light over time."""
-        task = prepare(first, None if self.camera is None else Camera.load(self.camera), "linear")
-        known = task.camera if self.time_zero is None else task.camera.replace(time_zero=self.time_zero)
+        """Return what all shots share: camera, time axis, focus, and the first shot's light over
+        time.
+        """
+        task = prepare_recovery(
+            first, None if self.camera is None else Camera.load(self.camera), "linear"
+        )
+        known = (
+            task.camera if self.time_zero is None else task.camera.replace(time_zero=self.time_zero)
+        )
         if known.sweep is None:
-            known = fitted_to_shot(first, known)
-        focus_named(self.focus).require(known)
-        light = light_over_time(first, known) if self.steady else np.empty(0)
-        fields = {"row_times": Field(first.times, "s", ("time",)), "light": Field(light, "count", ("time",))}
+            known = fit_camera_to_shot(first, known)
+        parse_focus(self.focus).check_camera(known)
+        light = compute_light_curve(first, known) if self.steady else np.empty(0)
+        fields = {
+            "row_times": Field(first.times, "s", ("time",)),
+            "light": Field(light, "count", ("time",)),
+        }
         return Record("ranging", fields, {"focus": self.focus}, {"camera": known.to_record()})
 
 
-def write_cloud_of(plan: Path, version: str, shots: tuple[Shot, ...], result: Path) -> tuple[int, list[float]]:
+def write_average_cloud(
+    plan: Path, version: str, shots: tuple[Shot, ...], result: Path
+) -> tuple[int, list[float]]:
     """Write the cloud of some shots; return its points and how many rows each shot was late.
 
-    Operators and inverted matrices are made once in a process for each `version` (SHA-256) of the plan. Memory: one
-    shot, and twice as much again for its readings and what is recovered of them.
+    Operators and inverted matrices are made once in a process for each `version` (SHA-256) of the
+    plan. Memory: one shot, and twice as much again for its readings and what is recovered of them.
     """
-    ranger, jitter = _prepared(plan, version)
-    cloud, late = averaged(shots, ranger, jitter)
+    pipeline, jitter = _load_plan(plan, version)
+    cloud, late = make_average_cloud(shots, pipeline, jitter)
     cloud.save(result)
     return len(cloud), [float(one) for one in late]
 
 
 @lru_cache(maxsize=2)
-def _prepared(plan: Path, version: str) -> tuple[Ranger, Jitter | None]:
+def _load_plan(plan: Path, version: str) -> tuple[RangingPipeline, JitterEstimator | None]:
     record = Record.load(plan, "ranging")
     camera = Camera.from_record(record.child("camera", "camera"))
-    times, light = (_field(record, name, units) for name, units in (("row_times", "s"), ("light", "count")))
-    ranger = Ranger(camera, times, focus=focus_named(str(record.attribute("focus"))))
-    return ranger, Jitter(light) if light.size else None
+    times, light = (
+        _read_field(record, name, units) for name, units in (("row_times", "s"), ("light", "count"))
+    )
+    pipeline = RangingPipeline(camera, times, focus=parse_focus(str(record.attribute("focus"))))
+    return pipeline, JitterEstimator(light) if light.size else None
 
 
-def _field(record: Record, name: str, units: str) -> NDArray[np.float64]:
+def _read_field(record: Record, name: str, units: str) -> NDArray[np.float64]:
     values: NDArray[np.float64] = record.array(name, np.float64, 1, units)
     return values

@@ -7,13 +7,15 @@ from dataclasses import replace
 from itertools import product
 
 from tofclip.errors import InputError
-from tofclip.sequences.recovering import Recovery
+from tofclip.sequences.recovering import RecoverySettings
 
-KINDS = {"method": str, "iterations": int, "weight": float, "focus": str}
+PARAMETER_TYPES = {"method": str, "iterations": int, "weight": float, "focus": str}
 """Settings that can be swept, and what their values are."""
 
 
-def variants(recovery: Recovery, values: Mapping[str, Sequence[str]]) -> dict[str, Recovery]:
+def expand_sweep(
+    recovery: RecoverySettings, values: Mapping[str, Sequence[str]]
+) -> dict[str, RecoverySettings]:
     """Return a recovery for every combination of values, by a name that can be a folder's.
 
     Parameters
@@ -26,16 +28,17 @@ def variants(recovery: Recovery, values: Mapping[str, Sequence[str]]) -> dict[st
     Raises
     ------
     InputError
-        No such setting, no such value, or a combination that does not exist, such as iterations of ``linear``.
+        No such setting, no such value, or a combination that does not exist, such as iterations of
+        ``linear``.
     """
-    unknown = [name for name in values if name not in KINDS]
+    unknown = [name for name in values if name not in PARAMETER_TYPES]
     if unknown:
-        raise InputError(f"'{unknown[0]}' cannot be swept; take {', '.join(KINDS)}")
+        raise InputError(f"'{unknown[0]}' cannot be swept; take {', '.join(PARAMETER_TYPES)}")
     found = {}
     for chosen in product(*values.values()):
         named = dict(zip(values, chosen, strict=True))
         try:
-            settings = {name: KINDS[name](value) for name, value in named.items()}
+            settings = {name: PARAMETER_TYPES[name](value) for name, value in named.items()}
         except ValueError as fault:
             raise InputError(f"sweep: {fault}") from fault
         label = ",".join(f"{name}={value}" for name, value in named.items())

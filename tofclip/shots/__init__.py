@@ -1,4 +1,6 @@
-"""The two pictures of a transient: the streak image that was measured and the frames recovered from it."""
+"""The two pictures of a transient: the streak image that was measured and the frames recovered from
+it.
+"""
 
 from tofclip.shots.frames import Frames
 from tofclip.shots.streak import Streak

@@ -23,10 +23,11 @@ class Frames:
     Parameters
     ----------
     values : (time, y, x) array
-        Brightness in counts, float32, y pointing down. Of any library: what is done with the frames is done there, if
-        it can be, and what can be done in NumPy only says so. Files hold NumPy's.
+        Brightness in counts, float32, y pointing down. Of any library: what is done with the frames
+        is done there, if it can be, and what can be done in NumPy only says so. Files hold NumPy's.
     times : (time,) array
-        Time of flight of each frame, s, strictly increasing: the camera's time zero is already taken off.
+        Time of flight of each frame, s, strictly increasing: the camera's time zero is already
+        taken off.
     camera : Camera
         The camera, with the gains and the sweep that were used for this shot.
     figures : mapping
@@ -91,7 +92,9 @@ class Frames:
             values=record.array("values", np.float32, 3, "count"),
             times=record.array("times", np.float64, 1, "s"),
             camera=Camera.from_record(record.child("camera", "camera")),
-            shears=record.array("shears", np.float64, 1, "px") if "shears" in record.fields else np.empty(0),
+            shears=record.array("shears", np.float64, 1, "px")
+            if "shears" in record.fields
+            else np.empty(0),
             figures=record.attributes,
             attachments={k: v for k, v in record.children.items() if k != "camera"},
             provenance=record.provenance,

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.shots.streak import Streak
-from tofclip.storage import atomic_path, reading
+from tofclip.storage import atomic_path, translate_read_errors
 
 
 class StreakStack:
-    """A sequence of streak images in an HDF5 file: dataset ``counts`` (shot, time, column), ``row_times`` (time) in s.
+    """A sequence of streak images in an HDF5 file: dataset ``counts`` (shot, time, column),
+    ``row_times`` (time) in s.
 
     Any program can write such a file. Only the shot that is asked for is in memory.
 
@@ -33,7 +34,7 @@ class StreakStack:
         import h5py
 
         self.path = Path(path)
-        with reading(path):
+        with translate_read_errors(path):
             open(path, "rb").close()
         try:
             with h5py.File(path, "r") as file:
@@ -42,14 +43,18 @@ class StreakStack:
                     np.asarray(file["row_times"], dtype=np.float64) if "row_times" in file else None
                 )
         except (OSError, KeyError, RuntimeError, AttributeError) as fault:
-            raise FileFormatError(path, "is no stack of streak images: it needs a dataset 'counts'") from fault
+            raise FileFormatError(
+                path, "is no stack of streak images: it needs a dataset 'counts'"
+            ) from fault
         if len(self._shape) != 3 or 0 in self._shape:
-            raise FileFormatError(path, f"'counts' must be (shot, time, column), found {self._shape}")
+            raise FileFormatError(
+                path, f"'counts' must be (shot, time, column), found {self._shape}"
+            )
 
     def __len__(self) -> int:
         return self._shape[0]
 
-    def shot(self, number: int, camera: Camera | None = None) -> Streak:
+    def read_shot(self, number: int, camera: Camera | None = None) -> Streak:
         """Read one shot, from 0."""
         import h5py
 
@@ -64,11 +69,13 @@ class StreakStack:
 
     def __iter__(self) -> Iterator[Streak]:
         for number in range(len(self)):
-            yield self.shot(number)
+            yield self.read_shot(number)
 
 
 def save_stack(shots: Iterable[Streak], path: str | Path) -> int:
-    """Write shots to one file, whole or not at all; return how many. All have the first one's shape and time axis."""
+    """Write shots to one file, whole or not at all; return how many. All have the first one's shape
+    and time axis.
+    """
     import h5py
 
     number = 0
@@ -76,7 +83,12 @@ def save_stack(shots: Iterable[Streak], path: str | Path) -> int:
         for shot in shots:
             if number == 0:
                 shape = shot.counts.shape
-                options = {"maxshape": (None, *shape), "chunks": (1, *shape), "compression": "gzip", "shuffle": True}
+                options = {
+                    "maxshape": (None, *shape),
+                    "chunks": (1, *shape),
+                    "compression": "gzip",
+                    "shuffle": True,
+                }
                 stored = file.create_dataset("counts", (0, *shape), np.float32, **options)
                 if shot.row_times is not None:
                     file.create_dataset("row_times", data=shot.row_times).attrs["units"] = "s"

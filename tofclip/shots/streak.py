@@ -24,7 +24,8 @@ class Streak:
     counts : (rows, columns) array
         Sensor readings, kept as float32. May hold negative values (background already subtracted).
     row_times : (rows,) array or None
-        Instant of each row, s, strictly increasing, not necessarily evenly. None where the file has no time axis.
+        Instant of each row, s, strictly increasing, not necessarily evenly. None where the file has
+        no time axis.
     saturated : (rows, columns) bool array or None
         Pixels that reached the sensor's limit.
     metadata : mapping of str to str
@@ -32,7 +33,8 @@ class Streak:
     camera : Camera or None
         The camera that took it, where the file carries one.
     attachments : mapping of str to Record
-        Further records that belong to the shot and travel on to its frames unchanged, such as a relay wall.
+        Further records that belong to the shot and travel on to its frames unchanged, such as a
+        relay wall.
     source : str
         Where it came from, for messages.
     provenance : mapping
@@ -41,7 +43,8 @@ class Streak:
     Raises
     ------
     InputError
-        Not a 2D array, empty, holding NaN or infinity, all zero, or with a time axis that does not increase.
+        Not a 2D array, empty, holding NaN or infinity, all zero, or with a time axis that does not
+        increase.
     """
 
     counts: NDArray[np.float32]
@@ -54,25 +57,31 @@ class Streak:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        with np.errstate(over="ignore"):  # too large for float32 becomes infinite, which is refused below
+        with np.errstate(
+            over="ignore"
+        ):  # too large for float32 becomes infinite, which is refused below
             counts = np.ascontiguousarray(self.counts, dtype=np.float32)
         object.__setattr__(self, "counts", counts)
         if counts.ndim != 2 or counts.size == 0:
             raise ShapeError(f"{self.source}: a streak image", "(rows, columns)", counts.shape)
         bad = counts.size - int(np.count_nonzero(np.isfinite(counts)))
         if bad:
-            raise InputError(f"{self.source}: {bad} pixels are NaN or infinite; replace them or mark them as saturated")
+            raise InputError(
+                f"{self.source}: {bad} pixels are NaN or infinite; replace them or mark them as saturated"
+            )
         if not np.any(counts):
             raise InputError(f"{self.source}: every pixel is zero; was the shutter closed?")
         if self.saturated is not None and self.saturated.shape != counts.shape:
             raise ShapeError("saturated", counts.shape, self.saturated.shape)
         if self.row_times is not None:
-            object.__setattr__(self, "row_times", self._checked_times(self.row_times))
+            object.__setattr__(self, "row_times", self._check_times(self.row_times))
 
-    def _checked_times(self, times: Any) -> NDArray[np.float64]:
+    def _check_times(self, times: Any) -> NDArray[np.float64]:
         checked = np.asarray(times, dtype=np.float64)
         if checked.shape != (self.counts.shape[0],):
-            raise ShapeError(f"{self.source}: the time axis", (self.counts.shape[0],), checked.shape)
+            raise ShapeError(
+                f"{self.source}: the time axis", (self.counts.shape[0],), checked.shape
+            )
         if not np.all(np.isfinite(checked)) or np.any(np.diff(checked) <= 0):
             raise InputError(f"{self.source}: the time axis must be finite and increase row by row")
         return checked
@@ -90,7 +99,9 @@ class Streak:
         """Return the same picture with evenly spaced rows of `bin_width` seconds, the first at 0."""
         if not (np.isfinite(bin_width) and bin_width > 0):
             raise InputError(f"bin width must be a positive number of seconds, got {bin_width}")
-        return replace(self, row_times=np.arange(self.counts.shape[0], dtype=np.float64) * float(bin_width))
+        return replace(
+            self, row_times=np.arange(self.counts.shape[0], dtype=np.float64) * float(bin_width)
+        )
 
     def to_record(self) -> Record:
         """Return everything that has to be stored."""
@@ -124,7 +135,9 @@ class Streak:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the streak image, its camera and its attachments to one HDF5 file, whole or not at all."""
+        """Write the streak image, its camera and its attachments to one HDF5 file, whole or not at
+        all.
+        """
         self.to_record().save(path)
 
     @classmethod

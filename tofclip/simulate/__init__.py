@@ -1,23 +1,25 @@
-"""Simulated shots of known scenes: what a streak camera behind a row of lenslets would have recorded, and the truth."""
+"""Simulated shots of known scenes: what a streak camera behind a row of lenslets would have
+recorded, and the truth.
+"""
 
-from tofclip.simulate.demo import default_camera, default_instrument, default_scene
+from tofclip.simulate.demo import make_default_camera, make_default_instrument, make_default_scene
+from tofclip.simulate.ground_truth import GroundTruth, render_true_frames
 from tofclip.simulate.instrument import Instrument, StreakDetector
 from tofclip.simulate.scene import Plate, Scene
-from tofclip.simulate.score import score
-from tofclip.simulate.shot import SimulatedShot, simulate
-from tofclip.simulate.truth import Truth, true_frames
+from tofclip.simulate.score import score_returns
+from tofclip.simulate.shot import SimulatedShot, simulate_shot
 
 __all__ = [
+    "GroundTruth",
     "Instrument",
     "Plate",
     "Scene",
     "SimulatedShot",
     "StreakDetector",
-    "Truth",
-    "default_camera",
-    "default_instrument",
-    "default_scene",
-    "score",
-    "simulate",
-    "true_frames",
+    "make_default_camera",
+    "make_default_instrument",
+    "make_default_scene",
+    "render_true_frames",
+    "score_returns",
+    "simulate_shot",
 ]

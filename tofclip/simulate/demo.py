@@ -1,8 +1,8 @@
 """The scene and the instrument of the demonstration.
 
-The instrument is modelled on the seed paper's: seven lenslets whose lines lie between -43 and 48 degrees on a slit of
-1344 pixels, 20 ps rows, a 60 ps response, and a sweep that is skewed between the views by up to 16 rows. Its exposure
-gives the brightest streak pixel 2000 photons.
+The instrument is modelled on the seed paper's: seven lenslets whose lines lie between -43 and 48
+degrees on a slit of 1344 pixels, 20 ps rows, a 60 ps response, and a sweep that is skewed between
+the views by up to 16 rows. Its exposure gives the brightest streak pixel 2000 photons.
 """
 
 from __future__ import annotations
@@ -12,20 +12,28 @@ import numpy as np
 from tofclip.camera import Camera, SkewSweep
 from tofclip.simulate.instrument import Instrument, StreakDetector
 from tofclip.simulate.scene import Plate, Scene, Vector
-from tofclip.simulate.shapes import Pattern, checkerboard, cut_out, letter, plain, rings, stripes
+from tofclip.simulate.shapes import (
+    Pattern,
+    cut_pattern,
+    make_checkerboard,
+    make_letter,
+    make_plain_pattern,
+    make_rings,
+    make_stripes,
+)
 
 CENTRES_PX = (147.7, 320.0, 490.2, 664.1, 835.5, 1011.5, 1192.3)
 ANGLES_DEG = (-43.3, -25.7, -12.7, 0.6, 22.9, 37.5, 48.0)
 GAINS = (0.92, 1.08, 1.02, 0.90, 1.02, 0.96, 1.10)
-OFFSETS_BIN = (-16.3, -10.4, -4.8, 0.0, 3.9, 8.2, 12.0)
+OFFSETS_BINS = (-16.3, -10.4, -4.8, 0.0, 3.9, 8.2, 12.0)
 STRETCHES = (0.009, 0.008, 0.004, 0.0, -0.001, -0.006, -0.006)
-TIME_ZERO = -10.784e-9
+TIME_ZERO_S = -10.784e-9
 FOCAL_LENGTH_PX = 560.0
-LENSLET_PITCH = 2.3e-3
-FOCUS_DISTANCE = 2.3
+LENSLET_PITCH_M = 2.3e-3
+FOCUS_DISTANCE_M = 2.3
 
 
-def default_camera() -> Camera:
+def make_default_camera() -> Camera:
     """Return the demonstration's camera, with its true gains and sweep."""
     return Camera(
         centres_px=np.array(CENTRES_PX),
@@ -33,39 +41,62 @@ def default_camera() -> Camera:
         image_shape=(128, 128),
         slit_width_px=1344,
         gains=np.array(GAINS),
-        sweep=SkewSweep(np.array(CENTRES_PX), np.array(OFFSETS_BIN), np.array(STRETCHES)),
-        time_zero=TIME_ZERO,
+        sweep=SkewSweep(np.array(CENTRES_PX), np.array(OFFSETS_BINS), np.array(STRETCHES)),
+        time_zero=TIME_ZERO_S,
         pulse_fwhm=60e-12,
         focal_length_px=FOCAL_LENGTH_PX,
-        lenslet_pitch=LENSLET_PITCH,
-        focus_distance=FOCUS_DISTANCE,
+        lenslet_pitch=LENSLET_PITCH_M,
+        focus_distance=FOCUS_DISTANCE_M,
     )
 
 
-def default_instrument() -> Instrument:
+def make_default_instrument() -> Instrument:
     """Return the demonstration's camera with its detector."""
-    return Instrument(default_camera(), StreakDetector(full_scale_photons=1900.0))
+    return Instrument(make_default_camera(), StreakDetector(full_scale_photons=1900.0))
 
 
-def default_scene() -> Scene:
+def make_default_scene() -> Scene:
     """Return four cut-out letters and three textured plates between 1.7 and 3.2 m."""
     return Scene(
         (
-            _plate(cut_out(letter("U"), plain(0.8)), (-25, -24), 34, 1.75),
-            _plate(cut_out(letter("C"), plain(0.8)), (23, -27), 34, 2.05, yaw=0.15),
-            _plate(cut_out(letter("L"), plain(0.8)), (-24, 22), 32, 2.35),
-            _plate(cut_out(letter("A"), plain(0.8)), (22, 20), 36, 2.62, pitch=-0.15),
-            _plate(checkerboard(4, 0.3, 0.9), (2, -2), 36, 2.85, yaw=-0.3),
-            _plate(rings(3, 0.3, 0.9), (-2, 36), 36, 3.0),
-            _plate(stripes(4, 0.3, 0.9), (0, 0), 96, 3.18),
+            _make_plate(
+                cut_pattern(make_letter("U"), make_plain_pattern(0.8)), (-25, -24), 34, 1.75
+            ),
+            _make_plate(
+                cut_pattern(make_letter("C"), make_plain_pattern(0.8)),
+                (23, -27),
+                34,
+                2.05,
+                yaw=0.15,
+            ),
+            _make_plate(
+                cut_pattern(make_letter("L"), make_plain_pattern(0.8)), (-24, 22), 32, 2.35
+            ),
+            _make_plate(
+                cut_pattern(make_letter("A"), make_plain_pattern(0.8)),
+                (22, 20),
+                36,
+                2.62,
+                pitch=-0.15,
+            ),
+            _make_plate(make_checkerboard(4, 0.3, 0.9), (2, -2), 36, 2.85, yaw=-0.3),
+            _make_plate(make_rings(3, 0.3, 0.9), (-2, 36), 36, 3.0),
+            _make_plate(make_stripes(4, 0.3, 0.9), (0, 0), 96, 3.18),
         )
     )
 
 
-def _plate(
-    pattern: Pattern, middle_px: tuple[float, float], side_px: float, depth: float, yaw: float = 0.0, pitch: float = 0.0
+def _make_plate(
+    pattern: Pattern,
+    middle_px: tuple[float, float],
+    side_px: float,
+    depth: float,
+    yaw: float = 0.0,
+    pitch: float = 0.0,
 ) -> Plate:
-    """Square plate that appears around pixel offset `middle_px` (x, y) from the optical axis, `side_px` wide."""
+    """Square plate that appears around pixel offset `middle_px` (x, y) from the optical axis,
+    `side_px` wide.
+    """
     pixel = depth / FOCAL_LENGTH_PX
     centre: Vector = (middle_px[0] * pixel, middle_px[1] * pixel, depth)
     return Plate(centre, (side_px * pixel, side_px * pixel), pattern, yaw, pitch)

@@ -37,9 +37,15 @@ class StreakDetector:
 
     def __post_init__(self) -> None:
         if not (self.rows >= 1 and self.bin_width > 0):
-            raise InputError(f"a detector needs rows and a positive bin width, got {self.rows} and {self.bin_width}")
-        if not (self.peak_photons > 0 and self.background_photons >= 0 and self.full_scale_photons > 0):
-            raise InputError("peak and full scale must be positive numbers of photons, the background not negative")
+            raise InputError(
+                f"a detector needs rows and a positive bin width, got {self.rows} and {self.bin_width}"
+            )
+        if not (
+            self.peak_photons > 0 and self.background_photons >= 0 and self.full_scale_photons > 0
+        ):
+            raise InputError(
+                "peak and full scale must be positive numbers of photons, the background not negative"
+            )
 
     @property
     def row_times(self) -> NDArray[np.float64]:
@@ -90,9 +96,16 @@ class Instrument:
         return np.array([self.camera.lenslet_pitch * position, 0.0, 0.0])
 
     def pixel_grid(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Rays of a picture: X and Y from the optical axis in pixels, flat, sub-pixel by sub-pixel in raster order."""
-        (rows, columns), (axis_row, axis_column) = self.camera.image_shape, self.camera.optical_axis_px
-        y, x = np.meshgrid(self._samples(rows) - axis_row, self._samples(columns) - axis_column, indexing="ij")
+        """Rays of a picture: X and Y from the optical axis in pixels, flat, sub-pixel by sub-pixel
+        in raster order.
+        """
+        (rows, columns), (axis_row, axis_column) = (
+            self.camera.image_shape,
+            self.camera.optical_axis_px,
+        )
+        y, x = np.meshgrid(
+            self._samples(rows) - axis_row, self._samples(columns) - axis_column, indexing="ij"
+        )
         return x.ravel(), y.ravel()
 
     def _samples(self, pixels: int) -> NDArray[np.float64]:
@@ -100,10 +113,14 @@ class Instrument:
         samples: NDArray[np.float64] = (np.arange(pixels * side) + 0.5) / side - 0.5
         return samples
 
-    def directions(self, x: NDArray[np.float64], y: NDArray[np.float64], position: float = 0.0) -> NDArray[np.float64]:
-        """Directions (n, 3), with z = 1, in which the view at `position` sees its picture points (x, y).
+    def directions(
+        self, x: NDArray[np.float64], y: NDArray[np.float64], position: float = 0.0
+    ) -> NDArray[np.float64]:
+        """Directions (n, 3), with z = 1, in which the view at `position` sees its picture points
+        (x, y).
 
-        A view's picture is laid so that a point at the focus distance appears at the same place in all views.
+        A view's picture is laid so that a point at the focus distance appears at the same place in
+        all views.
         """
         focal = self.camera.focal_length_px
         aside = self.camera.lenslet_pitch * position / self.camera.focus_distance

@@ -1,7 +1,7 @@
 """From a scene to the expected streak image, ray by ray.
 
-Nothing here uses the projection operator that recovery inverts: rays are cast from each lenslet, and each ray's light
-is put on the slit where the ray falls and when it arrives.
+Nothing here uses the projection operator that recovery inverts: rays are cast from each lenslet,
+and each ray's light is put on the slit where the ray falls and when it arrives.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from tofclip.units import SPEED_OF_LIGHT
 FloatArray = NDArray[np.float64]
 
 FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
-REACH_SIGMAS = 5.0  # a Gaussian leaves 6e-7 of its energy outside
+EXTENT_SIGMAS = 5.0  # a Gaussian leaves 6e-7 of its energy outside
 
 
 class RayBundle(NamedTuple):
@@ -42,10 +42,10 @@ class RayBundle(NamedTuple):
     brightness: FloatArray
 
 
-def view_rays(scene: Scene, instrument: Instrument, position: float) -> RayBundle:
+def cast_view_rays(scene: Scene, instrument: Instrument, position: float) -> RayBundle:
     """Cast the rays of the view at `position` view steps; those that bring no light are left out."""
     x, y = instrument.pixel_grid()
-    hits = scene.look(instrument.viewpoint(position), instrument.directions(x, y, position))
+    hits = scene.cast_rays(instrument.viewpoint(position), instrument.directions(x, y, position))
     bright = (hits.plate != NO_PLATE) & (hits.reflectance > 0)
     share = 1 / instrument.rays_per_pixel_side**2
     return RayBundle(
@@ -56,38 +56,53 @@ def view_rays(scene: Scene, instrument: Instrument, position: float) -> RayBundl
     )
 
 
-def streak_of_rays(rays: RayBundle, view: int, instrument: Instrument) -> FloatArray:
-    """Put one view's light on the streak image: (rows, columns), in the units of the rays' brightness."""
+def render_streak(rays: RayBundle, view: int, instrument: Instrument) -> FloatArray:
+    """Put one view's light on the streak image: (rows, columns), in the units of the rays'
+    brightness.
+    """
     camera, detector = instrument.camera, instrument.detector
     slit = camera.centres_px[view] + rays.x - rays.y * np.tan(camera.angles[view])
     row = (rays.time + camera.time_zero) / detector.bin_width
-    row, slit, stretch = _swept(camera, row, slit)
-    ray, column, light = _share_columns(slit, camera.gains[view] * rays.brightness, instrument.rays_per_pixel_side)
-    first, pulse = share_rows(row, stretch * pulse_sigma_bins(instrument))
+    row, slit, stretch = _apply_sweep(camera, row, slit)
+    ray, column, light = _split_over_columns(
+        slit, camera.gains[view] * rays.brightness, instrument.rays_per_pixel_side
+    )
+    first, pulse = spread_over_rows(row, stretch * compute_pulse_sigma_bins(instrument))
     reach, width = pulse.shape[1], camera.slit_width_px
     seen = (first[ray] > -reach) & (first[ray] < detector.rows) & (column >= 0) & (column < width)
     ray, column, light = ray[seen], column[seen], light[seen]
-    rows = first[ray][:, np.newaxis] + np.arange(reach, 2 * reach)  # the screen has a margin for pulses it cuts off
+    rows = first[ray][:, np.newaxis] + np.arange(
+        reach, 2 * reach
+    )  # the screen has a margin for pulses it cuts off
     amount = light[:, np.newaxis] * pulse[ray]
-    with_margin = gathered(rows * width + column[:, np.newaxis], amount, (detector.rows + 2 * reach, width))
+    with_margin = accumulate_cells(
+        rows * width + column[:, np.newaxis], amount, (detector.rows + 2 * reach, width)
+    )
     return with_margin[reach:-reach]
 
 
-def _swept(camera: Camera, row: FloatArray, slit: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _apply_sweep(
+    camera: Camera, row: FloatArray, slit: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Raw row and column of rectified positions, and how many raw rows a rectified one takes there."""
     if camera.sweep is None:
         return row, slit, np.ones_like(row)
     raw_row, raw_column = camera.sweep.raw_position(row, slit)
-    stretch = camera.sweep.raw_position(row + 0.5, slit)[0] - camera.sweep.raw_position(row - 0.5, slit)[0]
+    stretch = (
+        camera.sweep.raw_position(row + 0.5, slit)[0]
+        - camera.sweep.raw_position(row - 0.5, slit)[0]
+    )
     return raw_row, raw_column, stretch
 
 
-def _share_columns(
+def _split_over_columns(
     position: FloatArray, light: FloatArray, side: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
-    """Split each ray, 1/side of a pixel wide, exactly between the one or two slit pixels that it covers.
+    """Split each ray, 1/side of a pixel wide, exactly between the one or two slit pixels that it
+    covers.
 
-    Slit pixel j reaches from j - 1/2 to j + 1/2. Returns ray number, slit pixel and amount of light, piece by piece.
+    Slit pixel j reaches from j - 1/2 to j + 1/2. Returns ray number, slit pixel and amount of
+    light, piece by piece.
     """
     left_edge = position - 0.5 / side
     column = np.floor(left_edge + 0.5)
@@ -100,22 +115,26 @@ def _share_columns(
     )
 
 
-def gathered(cell: NDArray[np.intp], amount: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+def accumulate_cells(
+    cell: NDArray[np.intp], amount: FloatArray, shape: tuple[int, ...]
+) -> FloatArray:
     """Add each amount to its cell, numbered in raster order, of an array of `shape`."""
     total: Any = np.bincount(cell.ravel(), amount.ravel(), minlength=int(np.prod(shape)))
     return np.asarray(total, dtype=np.float64).reshape(shape)
 
 
-def pulse_sigma_bins(instrument: Instrument) -> float:
+def compute_pulse_sigma_bins(instrument: Instrument) -> float:
     """Standard deviation of the Gaussian pulse in rows of the rectified streak image."""
     return float(instrument.camera.pulse_fwhm / FWHM_PER_SIGMA / instrument.detector.bin_width)
 
 
-def share_rows(row: FloatArray, sigma: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
-    """Share of a Gaussian pulse around `row` that falls on each row: first row (n,) and shares (n, reach)."""
+def spread_over_rows(row: FloatArray, sigma: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+    """Share of a Gaussian pulse around `row` that falls on each row: first row (n,) and shares (n,
+    reach).
+    """
     if row.size == 0:
         return np.zeros(0, dtype=np.intp), np.zeros((0, 1))
-    half = int(np.ceil(REACH_SIGMAS * sigma.max() + 0.5))
+    half = int(np.ceil(EXTENT_SIGMAS * sigma.max() + 0.5))
     first = np.round(row).astype(np.intp) - half
     edges = first[:, np.newaxis] + np.arange(2 * half + 2) - 0.5
     return first, np.diff(ndtr((edges - row[:, np.newaxis]) / sigma[:, np.newaxis]), axis=1)

@@ -13,7 +13,9 @@ from tofclip.errors import InputError, ShapeError
 FloatArray = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
-SHADOW_MARGIN = 1e-6  # relative distance before a surface at which rounding no longer makes it shade itself
+SHADOW_MARGIN = (
+    1e-6  # relative distance before a surface at which rounding no longer makes it shade itself
+)
 NO_PLATE = -1
 
 
@@ -30,13 +32,14 @@ class Plate:
     reflectance : (rows, columns) array
         Diffuse reflectance over the rectangle, 0..1, row 0 on top. NaN: cut out, light passes.
     yaw, pitch : float
-        Turn about the vertical axis (positive: the right side goes back) and then about the plate's own horizontal
-        axis (positive: the upper side goes back), rad. Both zero: facing the camera.
+        Turn about the vertical axis (positive: the right side goes back) and then about the plate's
+        own horizontal axis (positive: the upper side goes back), rad. Both zero: facing the camera.
 
     Raises
     ------
     ShapeError, InputError
-        A reflectance that is no picture or lies outside 0..1, a size that is not positive, or nothing but holes.
+        A reflectance that is no picture or lies outside 0..1, a size that is not positive, or
+        nothing but holes.
     """
 
     centre: Vector
@@ -51,8 +54,12 @@ class Plate:
             raise ShapeError("a plate's reflectance", "(rows, columns)", reflectance.shape)
         solid = reflectance[~np.isnan(reflectance)]
         if solid.size == 0 or solid.min() < 0 or solid.max() > 1:
-            raise InputError("a plate's reflectance must lie within 0..1 where it is not NaN, and be so somewhere")
-        if min(self.size) <= 0 or not np.all(np.isfinite([*self.centre, *self.size, self.yaw, self.pitch])):
+            raise InputError(
+                "a plate's reflectance must lie within 0..1 where it is not NaN, and be so somewhere"
+            )
+        if min(self.size) <= 0 or not np.all(
+            np.isfinite([*self.centre, *self.size, self.yaw, self.pitch])
+        ):
             raise InputError("a plate needs a finite position and a positive size")
         object.__setattr__(self, "reflectance", reflectance)
 
@@ -64,8 +71,11 @@ class Plate:
         down = np.cos(self.pitch) * np.array([0.0, 1.0, 0.0]) - np.sin(self.pitch) * ahead
         return right, down, np.cross(right, down)
 
-    def meet(self, origin: FloatArray, directions: FloatArray) -> tuple[FloatArray, NDArray[np.float32]]:
-        """Where rays from `origin` meet the plate, in lengths of `directions` (inf: they miss), and what is there.
+    def intersect(
+        self, origin: FloatArray, directions: FloatArray
+    ) -> tuple[FloatArray, NDArray[np.float32]]:
+        """Where rays from `origin` meet the plate, in lengths of `directions` (inf: they miss), and
+        what is there.
 
         Parameters
         ----------
@@ -122,7 +132,8 @@ class Scene:
     ----------
     plates : tuple of Plate
     lamp : (float, float, float)
-        Position of the source, m. At the origin it is co-located with the reference view, which then sees no shadow.
+        Position of the source, m. At the origin it is co-located with the reference view, which
+        then sees no shadow.
     """
 
     plates: tuple[Plate, ...]
@@ -132,9 +143,9 @@ class Scene:
         if not self.plates:
             raise InputError("a scene needs at least one plate")
 
-    def look(self, viewpoint: FloatArray, directions: FloatArray) -> Hits:
+    def cast_rays(self, viewpoint: FloatArray, directions: FloatArray) -> Hits:
         """Follow rays from `viewpoint` along `directions`, (n, 3), to the nearest surface."""
-        reach, plate, reflectance = self._nearest(viewpoint, directions)
+        reach, plate, reflectance = self._find_nearest(viewpoint, directions)
         seen = plate != NO_PLATE
         path, distance, shade = (np.zeros(plate.shape) for _ in range(3))
         points = viewpoint + reach[seen, np.newaxis] * directions[seen]
@@ -143,18 +154,22 @@ class Scene:
         path[seen] = (distance[seen] + np.linalg.norm(points - viewpoint, axis=1)) / 2
         normals = np.stack([one.axes[2] for one in self.plates])[plate[seen]]
         cosine = np.abs(np.sum(rays * normals, axis=1)) / distance[seen]
-        lit = self._nearest(np.asarray(self.lamp), rays)[0] > 1 - SHADOW_MARGIN
+        lit = self._find_nearest(np.asarray(self.lamp), rays)[0] > 1 - SHADOW_MARGIN
         shade[seen] = reflectance[seen] * cosine * lit
         return Hits(plate, path, distance, shade)
 
-    def _nearest(
+    def _find_nearest(
         self, origin: FloatArray, directions: FloatArray
     ) -> tuple[FloatArray, NDArray[np.intp], NDArray[np.float32]]:
         reach = np.full(directions.shape[0], np.inf)
         plate = np.full(directions.shape[0], NO_PLATE, dtype=np.intp)
         reflectance = np.zeros(directions.shape[0], dtype=np.float32)
         for number, candidate in enumerate(self.plates):
-            distance, here = candidate.meet(origin, directions)
+            distance, here = candidate.intersect(origin, directions)
             nearer = distance < reach
-            reach[nearer], plate[nearer], reflectance[nearer] = distance[nearer], number, here[nearer]
+            reach[nearer], plate[nearer], reflectance[nearer] = (
+                distance[nearer],
+                number,
+                here[nearer],
+            )
         return reach, plate, reflectance

@@ -7,11 +7,11 @@ from scipy.ndimage import binary_dilation
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Returns
-from tofclip.simulate.truth import Truth
+from tofclip.simulate.ground_truth import GroundTruth
 from tofclip.units import SPEED_OF_LIGHT
 
 
-def score(returns: Returns, truth: Truth) -> dict[str, float]:
+def score_returns(returns: Returns, truth: GroundTruth) -> dict[str, float]:
     """Compare each target pixel's most intense return with the true range.
 
     Parameters
@@ -22,12 +22,12 @@ def score(returns: Returns, truth: Truth) -> dict[str, float]:
     Returns
     -------
     dict
-        ``median_depth_error_m``: median absolute range error of the target pixels that have a return;
-        ``share_within_one_bin``: share of all target pixels whose return is within ``c * bin_width / 2`` of the
-        truth, so that a missing return counts against it;
+        ``median_depth_error_m``: median absolute range error of the target pixels that have a
+        return; ``share_within_one_bin``: share of all target pixels whose return is within ``c *
+        bin_width / 2`` of the truth, so that a missing return counts against it;
         ``share_with_return``: share of the target pixels that have a return;
-        ``false_return_share``: share of all returns that lie more than a pixel away from anything in the scene;
-        ``bin_m``: ``c * bin_width / 2``.
+        ``false_return_share``: share of all returns that lie more than a pixel away from anything
+        in the scene; ``bin_m``: ``c * bin_width / 2``.
 
     Raises
     ------

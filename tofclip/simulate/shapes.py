@@ -13,12 +13,13 @@ from tofclip.errors import InputError
 Outline = NDArray[np.float64]
 Pattern = NDArray[np.float32]
 
-STROKE = 0.26  # width of a letter's stroke
+STROKE_WIDTH = 0.26  # width of a letter's stroke
 TEXELS = 192  # per side; finer than the rays at every range that the rest of this room uses
 
 
-def letter(name: str) -> list[Outline]:
-    """Outlines of a capital letter: closed polygons, (corners, 2); a second one inside the first is a hole.
+def make_letter(name: str) -> list[Outline]:
+    """Outlines of a capital letter: closed polygons, (corners, 2); a second one inside the first is
+    a hole.
 
     Parameters
     ----------
@@ -30,36 +31,38 @@ def letter(name: str) -> list[Outline]:
     return LETTERS[name]
 
 
-def cut_out(outlines: list[Outline], pattern: Pattern) -> Pattern:
+def cut_pattern(outlines: list[Outline], pattern: Pattern) -> Pattern:
     """Keep of `pattern` what lies inside the outlines (even-odd rule); the rest becomes NaN."""
     rows, columns = pattern.shape
-    y, x = np.meshgrid((np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij")
+    y, x = np.meshgrid(
+        (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
+    )
     inside = np.zeros(pattern.shape, dtype=bool)
     for outline in outlines:
-        inside ^= _within(outline, x, y)
+        inside ^= _is_within(outline, x, y)
     return np.where(inside, pattern, np.nan).astype(np.float32)
 
 
-def plain(reflectance: float) -> Pattern:
+def make_plain_pattern(reflectance: float) -> Pattern:
     """An even surface."""
     return np.full((TEXELS, TEXELS), reflectance, dtype=np.float32)
 
 
-def checkerboard(squares: int, dark: float, bright: float) -> Pattern:
+def make_checkerboard(squares: int, dark: float, bright: float) -> Pattern:
     """A board of `squares` x `squares` fields, bright in the upper left corner."""
     field = np.arange(TEXELS) * squares // TEXELS
     odd = (field[:, np.newaxis] + field) % 2 == 1
     return np.where(odd, dark, bright).astype(np.float32)
 
 
-def stripes(number: int, dark: float, bright: float) -> Pattern:
+def make_stripes(number: int, dark: float, bright: float) -> Pattern:
     """Slanted stripes with smooth borders, `number` of them across the plate."""
     y, x = np.meshgrid(np.arange(TEXELS) / TEXELS, np.arange(TEXELS) / TEXELS, indexing="ij")
     wave = 0.5 + 0.5 * np.sin(2 * np.pi * number * (x + 0.5 * y))
     return (dark + (bright - dark) * wave).astype(np.float32)
 
 
-def rings(number: int, dark: float, bright: float) -> Pattern:
+def make_rings(number: int, dark: float, bright: float) -> Pattern:
     """A round plate with concentric rings; NaN outside the disc."""
     y, x = np.meshgrid(np.linspace(-1, 1, TEXELS), np.linspace(-1, 1, TEXELS), indexing="ij")
     radius = np.hypot(x, y)
@@ -67,7 +70,9 @@ def rings(number: int, dark: float, bright: float) -> Pattern:
     return np.where(radius <= 1, dark + (bright - dark) * wave, np.nan).astype(np.float32)
 
 
-def _within(outline: Outline, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _is_within(
+    outline: Outline, x: NDArray[np.float64], y: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """Points with an odd number of the polygon's edges on their right."""
     inside = np.zeros(x.shape, dtype=bool)
     for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
@@ -77,37 +82,58 @@ def _within(outline: Outline, x: NDArray[np.float64], y: NDArray[np.float64]) ->
     return inside
 
 
-def _arc(radius: tuple[float, float], centre: tuple[float, float], start: float, stop: float) -> Outline:
+def _make_arc(
+    radius: tuple[float, float], centre: tuple[float, float], start: float, stop: float
+) -> Outline:
     """Points of an ellipse from angle `start` to `stop`, degrees, 0 to the right and 90 down."""
     angle = np.radians(np.linspace(start, stop, 33))
-    return np.stack([centre[0] + radius[0] * np.cos(angle), centre[1] + radius[1] * np.sin(angle)], axis=-1)
+    return np.stack(
+        [centre[0] + radius[0] * np.cos(angle), centre[1] + radius[1] * np.sin(angle)], axis=-1
+    )
 
 
-def _letter_u() -> list[Outline]:
-    outer = _arc((0.5, 0.45), (0.5, 0.55), 180, 0)
-    inner = _arc((0.5 - STROKE, 0.45 - STROKE), (0.5, 0.55), 0, 180)
-    return [np.vstack([[(0, 0)], outer, [(1, 0), (1 - STROKE, 0)], inner, [(STROKE, 0)]])]
-
-
-def _letter_c() -> list[Outline]:
-    outer = _arc((0.5, 0.5), (0.5, 0.5), 40, 320)
-    inner = _arc((0.5 - STROKE, 0.5 - STROKE), (0.5, 0.5), 320, 40)
-    return [np.vstack([outer, inner])]
-
-
-def _letter_l() -> list[Outline]:
+def _make_letter_u() -> list[Outline]:
+    outer = _make_arc((0.5, 0.45), (0.5, 0.55), 180, 0)
+    inner = _make_arc((0.5 - STROKE_WIDTH, 0.45 - STROKE_WIDTH), (0.5, 0.55), 0, 180)
     return [
-        np.array([(0.1, 0), (0.1 + STROKE, 0), (0.1 + STROKE, 1 - STROKE), (0.95, 1 - STROKE), (0.95, 1), (0.1, 1)])
+        np.vstack([[(0, 0)], outer, [(1, 0), (1 - STROKE_WIDTH, 0)], inner, [(STROKE_WIDTH, 0)]])
     ]
 
 
-def _letter_a() -> list[Outline]:
+def _make_letter_c() -> list[Outline]:
+    outer = _make_arc((0.5, 0.5), (0.5, 0.5), 40, 320)
+    inner = _make_arc((0.5 - STROKE_WIDTH, 0.5 - STROKE_WIDTH), (0.5, 0.5), 320, 40)
+    return [np.vstack([outer, inner])]
+
+
+def _make_letter_l() -> list[Outline]:
+    return [
+        np.array(
+            [
+                (0.1, 0),
+                (0.1 + STROKE_WIDTH, 0),
+                (0.1 + STROKE_WIDTH, 1 - STROKE_WIDTH),
+                (0.95, 1 - STROKE_WIDTH),
+                (0.95, 1),
+                (0.1, 1),
+            ]
+        )
+    ]
+
+
+def _make_letter_a() -> list[Outline]:
     outer = [(0.36, 0), (0.64, 0), (1, 1), (0.72, 1), (0.65, 0.78), (0.35, 0.78), (0.28, 1), (0, 1)]
     return [np.array(outer), np.array([(0.5, 0.24), (0.6, 0.58), (0.4, 0.58)])]
 
 
-def _letter_v() -> list[Outline]:
+def _make_letter_v() -> list[Outline]:
     return [np.array([(0, 0), (0.28, 0), (0.5, 0.6), (0.72, 0), (1, 0), (0.64, 1), (0.36, 1)])]
 
 
-LETTERS = {"A": _letter_a(), "C": _letter_c(), "L": _letter_l(), "U": _letter_u(), "V": _letter_v()}
+LETTERS = {
+    "A": _make_letter_a(),
+    "C": _make_letter_c(),
+    "L": _make_letter_l(),
+    "U": _make_letter_u(),
+    "V": _make_letter_v(),
+}

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.shots import Streak
+from tofclip.simulate.ground_truth import GroundTruth
 from tofclip.simulate.instrument import Instrument
-from tofclip.simulate.render import streak_of_rays, view_rays
+from tofclip.simulate.render import cast_view_rays, render_streak
 from tofclip.simulate.scene import Scene
-from tofclip.simulate.truth import Truth
-from tofclip.storage import provenance
+from tofclip.storage import collect_provenance
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ class SimulatedShot:
 
     streak: Streak
     camera: Camera
-    truth: Truth
+    truth: GroundTruth
     signal: NDArray[np.float32]
     exposure: float
 
 
-def simulate(scene: Scene, instrument: Instrument, seed: int) -> SimulatedShot:
+def simulate_shot(scene: Scene, instrument: Instrument, seed: int) -> SimulatedShot:
     """Take one shot of `scene`.
 
     Parameters
@@ -60,7 +60,7 @@ def simulate(scene: Scene, instrument: Instrument, seed: int) -> SimulatedShot:
     camera, detector = instrument.camera, instrument.detector
     light = np.zeros((detector.rows, camera.slit_width_px))
     for view, position in enumerate(camera.view_positions):
-        light += streak_of_rays(view_rays(scene, instrument, float(position)), view, instrument)
+        light += render_streak(cast_view_rays(scene, instrument, float(position)), view, instrument)
     if not light.any():
         raise InputError(
             "no light of the scene reaches the streak image: check positions, number of rows and time zero"
@@ -73,6 +73,14 @@ def simulate(scene: Scene, instrument: Instrument, seed: int) -> SimulatedShot:
         saturated,
         camera=camera,
         source="simulated streak image",
-        provenance=provenance({"seed": seed, "peak_photons": detector.peak_photons, "exposure": exposure}),
+        provenance=collect_provenance(
+            {"seed": seed, "peak_photons": detector.peak_photons, "exposure": exposure}
+        ),
     )
-    return SimulatedShot(streak, camera, Truth.of(scene, instrument), (exposure * light).astype(np.float32), exposure)
+    return SimulatedShot(
+        streak,
+        camera,
+        GroundTruth.from_scene(scene, instrument),
+        (exposure * light).astype(np.float32),
+        exposure,
+    )

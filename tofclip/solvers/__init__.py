@@ -1,16 +1,16 @@
 """Solvers that know no physics: an operator, a data term and a prior in, pictures out."""
 
 from tofclip.solvers.data_terms import DataTerm, Huber, LeastSquares, Poisson
-from tofclip.solvers.direct import Adjoint, LinearInverse, PreparedInverse
+from tofclip.solvers.direct import Backprojection, LinearInverse, PreparedInverse
 from tofclip.solvers.fista import Fista
+from tofclip.solvers.iteration import Progress, Result, StoppingRule, ignore_progress, iterate
 from tofclip.solvers.iterative import ProximalMethod, Sparse, TotalVariation, Wavelets
-from tofclip.solvers.loop import Progress, Result, Stopping, iterate, silent
 from tofclip.solvers.method import Method, relative_residual
 from tofclip.solvers.plug_and_play import PlugAndPlay, RegularisationByDenoising
 from tofclip.solvers.proximal import NonnegativeSparsity, NonnegativeTotalVariation
 
 __all__ = [
-    "Adjoint",
+    "Backprojection",
     "DataTerm",
     "Fista",
     "Huber",
@@ -27,10 +27,10 @@ __all__ = [
     "RegularisationByDenoising",
     "Result",
     "Sparse",
-    "Stopping",
+    "StoppingRule",
     "TotalVariation",
     "Wavelets",
+    "ignore_progress",
     "iterate",
     "relative_residual",
-    "silent",
 ]

@@ -1,8 +1,10 @@
-"""Compiled inner loops of the solvers, on blocks of frames side by side: `LANES` of them, or a single one.
+"""Compiled inner loops of the solvers, on blocks of frames side by side: `LANES` of them, or a
+single one.
 
-Every array is C-contiguous with the frames as last axis, so that one vector instruction treats many frames at once and
-every frame's result is independent of its neighbours in the block. Sums over a picture are taken row by row and added
-up in float64, because a solver compares objectives that differ in the sixth digit.
+Every array is C-contiguous with the frames as last axis, so that one vector instruction treats many
+frames at once and every frame's result is independent of its neighbours in the block. Sums over a
+picture are taken row by row and added up in float64, because a solver compares objectives that
+differ in the sixth digit.
 """
 
 from __future__ import annotations
@@ -10,20 +12,26 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tofclip.operators.kernels import sparse_times_block
+from tofclip.operators.kernels import multiply_sparse_block
 from tofclip.threads import LANES
 
-TILE = 32
+TILE_PIXELS = 32
 
-compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy")
-inlined = njit(inline="always")  # so that a full block's number of lanes is a constant to the compiler
+fast_njit = njit(
+    nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy"
+)
+inline_njit = njit(
+    inline="always"
+)  # so that a full block's number of lanes is a constant to the compiler
 
 
-@compiled
-def nonnegative_shrinkage(current, previous, momentum, gradient, step, threshold, total):
-    """``previous = max(z - step * gradient - threshold, 0)`` with ``z = current + momentum * (current - previous)``.
+@fast_njit
+def shrink_nonnegative(current, previous, momentum, gradient, step, threshold, total):
+    """``previous = max(z - step * gradient - threshold, 0)`` with ``z = current + momentum *
+    (current - previous)``.
 
-    Pictures are (rows, columns, lanes), `momentum` is (lanes,); `total` (lanes,) float64 gets the sum of the result.
+    Pictures are (rows, columns, lanes), `momentum` is (lanes,); `total` (lanes,) float64 gets the
+    sum of the result.
     """
     lanes = current.shape[2]
     partial = np.empty(lanes, current.dtype)
@@ -40,8 +48,8 @@ def nonnegative_shrinkage(current, previous, momentum, gradient, step, threshold
         total += partial
 
 
-@compiled
-def gradient_step(current, previous, momentum, gradient, step):
+@fast_njit
+def take_gradient_step(current, previous, momentum, gradient, step):
     """``gradient = z - step * gradient`` with ``z = current + momentum * (current - previous)``."""
     lanes = current.shape[2]
     for row in range(current.shape[0]):
@@ -52,23 +60,26 @@ def gradient_step(current, previous, momentum, gradient, step):
                 gradient[row, column, lane] = point - step * gradient[row, column, lane]
 
 
-@compiled
-def lanes_to_frames(block, frames):
-    """``frames[lane, pixel] = block[pixel, lane]`` for as many lanes as there are frames; contiguous 2D arrays.
+@fast_njit
+def copy_lanes_to_frames(block, frames):
+    """``frames[lane, pixel] = block[pixel, lane]`` for as many lanes as there are frames;
+    contiguous 2D arrays.
 
-    Tile by tile, so that both sides move whole cache lines: several times faster than a strided copy.
+    Tile by tile, so that both sides move whole cache lines: several times faster than a strided
+    copy.
     """
     pixels = block.shape[0]
-    for first in range(0, pixels, TILE):
-        last = min(first + TILE, pixels)
+    for first in range(0, pixels, TILE_PIXELS):
+        last = min(first + TILE_PIXELS, pixels)
         for lane in range(frames.shape[0]):
             for pixel in range(first, last):
                 frames[lane, pixel] = block[pixel, lane]
 
 
-@compiled
-def traces_of_pixels(tile_starts, columns, values, weights, traces, span):
-    """``traces[:, span[0] + t] = M @ weights[t // LANES, :, t % LANES]`` for a sparse matrix M in column tiles.
+@fast_njit
+def compute_traces(tile_starts, columns, values, weights, traces, span):
+    """``traces[:, span[0] + t] = M @ weights[t // LANES, :, t % LANES]`` for a sparse matrix M in
+    column tiles.
 
     Parameters
     ----------
@@ -79,7 +90,7 @@ def traces_of_pixels(tile_starts, columns, values, weights, traces, span):
     """
     part = np.empty((traces.shape[0], LANES), traces.dtype)
     for block in range(weights.shape[0]):
-        sparse_times_block(tile_starts, columns, values, weights[block], part)
+        multiply_sparse_block(tile_starts, columns, values, weights[block], part)
         first = span[0] + block * LANES
         last = min(first + LANES, span[1])
         for row in range(part.shape[0]):
@@ -87,26 +98,38 @@ def traces_of_pixels(tile_starts, columns, values, weights, traces, span):
                 traces[row, column] = part[row, column - first]
 
 
-@compiled
-def highest_pixels(tile_starts, columns, values, scales, block, highest):
-    """Raise `highest` to the largest ``scales * (M @ block)`` over the rows of a sparse matrix M, lane by lane.
+@fast_njit
+def update_peaks(tile_starts, columns, values, scales, block, highest):
+    """Raise `highest` to the largest ``scales * (M @ block)`` over the rows of a sparse matrix M,
+    lane by lane.
 
     Parameters
     ----------
     tile_starts, columns, values
         See `tofclip.operators.sparse.Tiles`.
     scales : (M's rows,) array
-    block : (M's columns, LANES) array
+    take_block : (M's columns, LANES) array
     highest : (LANES,) array
     """
-    part = np.empty((4 * TILE, LANES), block.dtype)
+    part = np.empty((4 * TILE_PIXELS, LANES), block.dtype)
     for first in range(0, scales.size, part.shape[0]):
         rows = min(part.shape[0], scales.size - first)
-        sparse_times_block(tile_starts[:, first : first + rows + 1], columns, values, block, part[:rows])
+        multiply_sparse_block(
+            tile_starts[:, first : first + rows + 1], columns, values, block, part[:rows]
+        )
         for row in range(0, rows, 4):  # four at a time, for one look at the highest so far
-            second, third, fourth = min(row + 1, rows - 1), min(row + 2, rows - 1), min(row + 3, rows - 1)
+            second, third, fourth = (
+                min(row + 1, rows - 1),
+                min(row + 2, rows - 1),
+                min(row + 3, rows - 1),
+            )
             a, b, c, d = part[row], part[second], part[third], part[fourth]
-            s, t, u, v = scales[first + row], scales[first + second], scales[first + third], scales[first + fourth]
+            s, t, u, v = (
+                scales[first + row],
+                scales[first + second],
+                scales[first + third],
+                scales[first + fourth],
+            )
             for lane in range(LANES):
                 one, two, three, four = s * a[lane], t * b[lane], u * c[lane], v * d[lane]
                 one, three = one if one > two else two, three if three > four else four
@@ -114,23 +137,28 @@ def highest_pixels(tile_starts, columns, values, scales, block, highest):
                 highest[lane] = one if one > highest[lane] else highest[lane]
 
 
-@compiled
-def put_back(candidate, current, rejected):
-    """``candidate = current`` in the lanes where `rejected` is 1; it is 0 elsewhere. Arrays are (..., lanes)."""
+@fast_njit
+def restore_frames(candidate, current, rejected):
+    """``candidate = current`` in the lanes where `rejected` is 1; it is 0 elsewhere. Arrays are
+    (..., lanes).
+    """
     lanes = candidate.shape[2]
     for row in range(current.shape[0]):
         for column in range(current.shape[1]):
             for lane in range(lanes):
                 here = candidate[row, column, lane]
-                candidate[row, column, lane] = here + rejected[lane] * (current[row, column, lane] - here)
+                candidate[row, column, lane] = here + rejected[lane] * (
+                    current[row, column, lane] - here
+                )
 
 
-@inlined
+@inline_njit
 def _primal_row(row, noisy, dual, weight, result, lanes):
-    """One row of ``result = max(noisy + weight * div(dual), 0)``; `dual` is (2, rows, columns, lanes).
+    """One row of ``result = max(noisy + weight * div(dual), 0)``; `dual` is (2, rows, columns,
+    lanes).
 
-    The last row of the vertical and the last column of the horizontal dual are always zero (the difference across the
-    border is), so only the first ones need care.
+    The last row of the vertical and the last column of the horizontal dual are always zero (the
+    difference across the border is), so only the first ones need care.
     """
     above = max(row - 1, 0)
     has_above = noisy.dtype.type(row > 0)
@@ -140,10 +168,12 @@ def _primal_row(row, noisy, dual, weight, result, lanes):
         for lane in range(lanes):
             divergence = dual[0, row, column, lane] - has_above * dual[0, above, column, lane]
             divergence += dual[1, row, column, lane] - has_left * dual[1, row, left, lane]
-            result[row, column, lane] = max(noisy[row, column, lane] + weight * divergence, np.float32(0))
+            result[row, column, lane] = max(
+                noisy[row, column, lane] + weight * divergence, np.float32(0)
+            )
 
 
-@inlined
+@inline_njit
 def _dual_row(row, picture, dual, step, lanes):
     """One row of ``dual = project(dual + step * grad(picture))`` onto vectors of length at most 1."""
     below = min(row + 1, picture.shape[0] - 1)
@@ -158,7 +188,7 @@ def _dual_row(row, picture, dual, step, lanes):
             dual[1, row, column, lane] = horizontal * shrink
 
 
-@inlined
+@inline_njit
 def _dual_sweeps(noisy, dual, weight, sweeps, result, lanes):
     rows = noisy.shape[0]
     step = 1 / (8 * weight)
@@ -170,11 +200,13 @@ def _dual_sweeps(noisy, dual, weight, sweeps, result, lanes):
             _dual_row(row, result, dual, step, lanes)
 
 
-@compiled
-def total_variation_dual_sweeps(noisy, dual, weight, sweeps, result):
-    """Projected-gradient sweeps on the dual of ``1/2 |x - noisy|^2 + weight * TV(x), x >= 0`` (Chambolle 2004).
+@fast_njit
+def sweep_total_variation_dual(noisy, dual, weight, sweeps, result):
+    """Projected-gradient sweeps on the dual of ``1/2 |x - noisy|^2 + weight * TV(x), x >= 0``
+    (Chambolle 2004).
 
-    The primal row below is made before a dual row changes, so that a sweep passes through memory once.
+    The primal row below is made before a dual row changes, so that a sweep passes through memory
+    once.
     """
     if noisy.shape[2] == LANES:
         _dual_sweeps(noisy, dual, weight, sweeps, result, LANES)
@@ -182,8 +214,8 @@ def total_variation_dual_sweeps(noisy, dual, weight, sweeps, result):
         _dual_sweeps(noisy, dual, weight, sweeps, result, noisy.shape[2])
 
 
-@inlined
-def _primal(noisy, dual, weight, result, total, lanes):
+@inline_njit
+def _primal_block(noisy, dual, weight, result, total, lanes):
     rows, columns = noisy.shape[0], noisy.shape[1]
     partial = np.empty(lanes, noisy.dtype)
     total[:] = 0
@@ -203,20 +235,24 @@ def _primal(noisy, dual, weight, result, total, lanes):
         total += partial
 
 
-@compiled
-def total_variation_primal(noisy, dual, weight, result, total):
-    """Make the picture that belongs to `dual`; `total` (lanes,) float64 gets its isotropic total variation."""
+@fast_njit
+def compute_total_variation_primal(noisy, dual, weight, result, total):
+    """Make the picture that belongs to `dual`; `total` (lanes,) float64 gets its isotropic total
+    variation.
+    """
     if noisy.shape[2] == LANES:
-        _primal(noisy, dual, weight, result, total, LANES)
+        _primal_block(noisy, dual, weight, result, total, LANES)
     else:
-        _primal(noisy, dual, weight, result, total, noisy.shape[2])
+        _primal_block(noisy, dual, weight, result, total, noisy.shape[2])
 
 
-@compiled
-def light_field_primal(noisy, dual, weight, angular, result):
-    """``result = max(noisy + weight * div(dual), 0)``; arrays are (v, u, rows, columns, lanes), `dual` four of them.
+@fast_njit
+def compute_light_field_primal(noisy, dual, weight, angular, result):
+    """``result = max(noisy + weight * div(dual), 0)``; arrays are (v, u, rows, columns, lanes),
+    `dual` four of them.
 
-    The last difference along every axis crosses the border and is always zero, so only the first needs care.
+    The last difference along every axis crosses the border and is always zero, so only the first
+    needs care.
     """
     down, across, rows, columns, lanes = noisy.shape
     for v in range(down):
@@ -224,8 +260,12 @@ def light_field_primal(noisy, dual, weight, angular, result):
             for row in range(rows):
                 for column in range(columns):
                     for lane in range(lanes):
-                        divergence = dual[0, v, u, row, column, lane] + dual[1, v, u, row, column, lane]
-                        between = dual[2, v, u, row, column, lane] + dual[3, v, u, row, column, lane]
+                        divergence = (
+                            dual[0, v, u, row, column, lane] + dual[1, v, u, row, column, lane]
+                        )
+                        between = (
+                            dual[2, v, u, row, column, lane] + dual[3, v, u, row, column, lane]
+                        )
                         if row > 0:
                             divergence -= dual[0, v, u, row - 1, column, lane]
                         if column > 0:
@@ -234,12 +274,14 @@ def light_field_primal(noisy, dual, weight, angular, result):
                             between -= dual[2, v - 1, u, row, column, lane]
                         if u > 0:
                             between -= dual[3, v, u - 1, row, column, lane]
-                        value = noisy[v, u, row, column, lane] + weight * (divergence + angular * between)
+                        value = noisy[v, u, row, column, lane] + weight * (
+                            divergence + angular * between
+                        )
                         result[v, u, row, column, lane] = max(value, np.float32(0))
 
 
-@inlined
-def _differences(field, v, u, row, column, lane, angular):
+@inline_njit
+def _forward_differences(field, v, u, row, column, lane, angular):
     """The four forward differences at a sample, 0 across borders."""
     down, across, rows, columns = field.shape[:4]
     here = field[v, u, row, column, lane]
@@ -251,8 +293,8 @@ def _differences(field, v, u, row, column, lane, angular):
     )
 
 
-@compiled
-def light_field_dual(field, dual, step, angular):
+@fast_njit
+def update_light_field_dual(field, dual, step, angular):
     """``dual = project(dual + step * grad(field))`` onto vectors of length at most 1."""
     down, across, rows, columns, lanes = field.shape
     for v in range(down):
@@ -260,7 +302,7 @@ def light_field_dual(field, dual, step, angular):
             for row in range(rows):
                 for column in range(columns):
                     for lane in range(lanes):
-                        slope = _differences(field, v, u, row, column, lane, angular)
+                        slope = _forward_differences(field, v, u, row, column, lane, angular)
                         a = dual[0, v, u, row, column, lane] + step * slope[0]
                         b = dual[1, v, u, row, column, lane] + step * slope[1]
                         c = dual[2, v, u, row, column, lane] + step * slope[2]
@@ -272,8 +314,8 @@ def light_field_dual(field, dual, step, angular):
                         dual[3, v, u, row, column, lane] = d * shrink
 
 
-@compiled
-def light_field_variation(field, angular, total):
+@fast_njit
+def sum_light_field_variation(field, angular, total):
     """Add the isotropic variation of each lane to `total` (lanes,), float64."""
     down, across, rows, columns, lanes = field.shape
     for v in range(down):
@@ -281,5 +323,5 @@ def light_field_variation(field, angular, total):
             for row in range(rows):
                 for column in range(columns):
                     for lane in range(lanes):
-                        a, b, c, d = _differences(field, v, u, row, column, lane, angular)
+                        a, b, c, d = _forward_differences(field, v, u, row, column, lane, angular)
                         total[lane] += np.sqrt(a * a + b * b + c * c + d * d)

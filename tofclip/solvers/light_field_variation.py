@@ -8,14 +8,16 @@ import numpy as np
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.solvers.iterative import ProximalMethod
-from tofclip.solvers.proximal import Array, Regulariser, checked_weight
+from tofclip.solvers.proximal import Array, Regulariser, validate_weight
 
 
 class NonnegativeLightFieldVariation:
-    """``weight * TV(h)`` for h >= 0 over (v, u, y, x), the angular differences counted `angular` times.
+    """``weight * TV(h)`` for h >= 0 over (v, u, y, x), the angular differences counted `angular`
+    times.
 
-    Isotropic: the length of the four differences at each sample. The dual is kept from call to call, as in
-    `NonnegativeTotalVariation`; one sweep a call. Memory: four duals and two temporaries of the light field's size.
+    Isotropic: the length of the four differences at each sample. The dual is kept from call to
+    call, as in `NonnegativeTotalVariation`; one sweep a call. Memory: four duals and two
+    temporaries of the light field's size.
 
     Parameters
     ----------
@@ -30,10 +32,10 @@ class NonnegativeLightFieldVariation:
     def __init__(self, weight: float, grid: tuple[int, int], angular: float) -> None:
         if not (np.isfinite(angular) and angular >= 0):
             raise InputError(f"the angular weight must be finite and not negative, got {angular}")
-        self.weight, self.grid, self.angular = checked_weight(weight), grid, angular
+        self.weight, self.grid, self.angular = validate_weight(weight), grid, angular
         self._dual: Array | None = None
 
-    def descend(
+    def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
     ) -> tuple[Array, Array]:
         from tofclip.solvers import kernels
@@ -43,32 +45,38 @@ class NonnegativeLightFieldVariation:
             raise ShapeError("the light field's views", self.grid[0] * self.grid[1], views)
         flat = (views * rows, columns, lanes)
         pair = (a.reshape(flat) for a in (current, previous))
-        kernels.gradient_step(*pair, momentum, gradient.reshape(flat), current.dtype.type(step))
+        kernels.take_gradient_step(
+            *pair, momentum, gradient.reshape(flat), current.dtype.type(step)
+        )
         shape = (*self.grid, rows, columns, lanes)
         if self._dual is None:
             self._dual = np.zeros((4, *shape), current.dtype)
         noisy, result = gradient.reshape(shape), previous.reshape(shape)
         weight, angular = current.dtype.type(step * self.weight), current.dtype.type(self.angular)
         if weight > 0:
-            kernels.light_field_primal(noisy, self._dual, weight, angular, result)
-            kernels.light_field_dual(result, self._dual, 1 / (8 * weight * (1 + angular * angular)), angular)
+            kernels.compute_light_field_primal(noisy, self._dual, weight, angular, result)
+            kernels.update_light_field_dual(
+                result, self._dual, 1 / (8 * weight * (1 + angular * angular)), angular
+            )
         total = np.zeros(lanes)
-        kernels.light_field_primal(noisy, self._dual, weight, angular, result)
-        kernels.light_field_variation(result, angular, total)
+        kernels.compute_light_field_primal(noisy, self._dual, weight, angular, result)
+        kernels.sum_light_field_variation(result, angular, total)
         return previous, self.weight * total
 
 
 @dataclass(frozen=True)
 class LightFieldVariation(ProximalMethod):
-    """Nonnegative light fields with sharp borders, their views alike (4D total variation; supplement Eq. 20).
+    """Nonnegative light fields with sharp borders, their views alike (4D total variation;
+    supplement Eq. 20).
 
     Parameters
     ----------
     grid : (int, int)
         Views down and across.
     angular : float
-        How much a difference between neighbouring views counts beside one between neighbouring pixels. Views differ
-        by their parallax: 0.5 suits disparities of about a pixel, more suits less.
+        How much a difference between neighbouring views counts beside one between neighbouring
+        pixels. Views differ by their parallax: 0.5 suits disparities of about a pixel, more suits
+        less.
     """
 
     weight: float = 1e-2
@@ -77,5 +85,5 @@ class LightFieldVariation(ProximalMethod):
     angular: float = 0.5
     name = "light-field tv"
 
-    def _regulariser(self, weight: float) -> Regulariser:
+    def _make_regulariser(self, weight: float) -> Regulariser:
         return NonnegativeLightFieldVariation(weight, self.grid, self.angular)

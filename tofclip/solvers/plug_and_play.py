@@ -10,26 +10,29 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import require_numpy
 from tofclip.errors import InputError
-from tofclip.operators import LinearOperator, squared_norm
+from tofclip.operators import LinearOperator, estimate_squared_norm
 from tofclip.solvers.data_terms import DataTerm
 from tofclip.solvers.denoisers import CollaborativeWiener, Denoiser
+from tofclip.solvers.iteration import Progress, Result, ignore_progress
 from tofclip.solvers.iterative import NORM_ITERATIONS, ProximalMethod
-from tofclip.solvers.loop import Progress, Result, silent
 from tofclip.solvers.method import Array, Mask
-from tofclip.threads import one_blas_thread
+from tofclip.threads import limit_blas_threads
 
-BRIGHTEST = 0.999  # quantile that stands for the brightest pixel: a single hot one must not set the scale
+PEAK_QUANTILE = (
+    0.999  # quantile that stands for the brightest pixel: a single hot one must not set the scale
+)
 
 
 @dataclass(frozen=True)
 class PlugAndPlay:
     """Half-quadratic splitting with a denoiser in the place of the prior's proximal map.
 
-    ``x = argmin data(A h) + coupling / 2 |h - z|^2``, then ``z = denoise(x)``, a few times, from a variational
-    method's result onwards; z is returned. S. Venkatakrishnan, C. Bouman, B. Wohlberg, GlobalSIP 2013, 945. There is
-    no objective that falls: the number of calls is what stops it. The defaults were found on light fields whose model
-    error (what is out of focus) is far larger than their noise; on those, `strength` from 0.08 to 0.12 and `coupling`
-    from 0.1 to 0.3 differ by a tenth of the error.
+    ``x = argmin data(A h) + coupling / 2 |h - z|^2``, then ``z = denoise(x)``, a few times, from a
+    variational method's result onwards; z is returned. S. Venkatakrishnan, C. Bouman, B. Wohlberg,
+    GlobalSIP 2013, 945. There is no objective that falls: the number of calls is what stops it. The
+    defaults were found on light fields whose model error (what is out of focus) is far larger than
+    their noise; on those, `strength` from 0.08 to 0.12 and `coupling` from 0.1 to 0.3 differ by a
+    tenth of the error.
 
     Parameters
     ----------
@@ -59,35 +62,47 @@ class PlugAndPlay:
             raise InputError("strength and coupling of a denoiser must be positive")
 
     def recover(
-        self, operator: LinearOperator, readings: Array, good: Mask = None, progress: Progress = silent
+        self,
+        operator: LinearOperator,
+        measurements: Array,
+        valid: Mask = None,
+        progress: Progress = ignore_progress,
     ) -> Result:
-        """Recover one picture per column of `readings`; see `Method`."""
-        require_numpy("recovery with a denoiser", readings)
-        started = self.start.recover(operator, readings, good, progress)
-        coupling = self.coupling * squared_norm(operator, NORM_ITERATIONS)
+        """Recover one picture per column of `measurements`; see `Method`."""
+        require_numpy("recovery with a denoiser", measurements)
+        started = self.start.recover(operator, measurements, valid, progress)
+        coupling = self.coupling * estimate_squared_norm(operator, NORM_ITERATIONS)
         frames = np.empty_like(started.frames)
-        with one_blas_thread():  # the products of small groups of patches are too small to share
+        with limit_blas_threads():  # the products of small groups of patches are too small to share
             for number, picture in enumerate(started.frames):
                 column = slice(number, number + 1)
-                kept = None if good is None else good[:, column]
-                misfit = self.start.data_term(readings[:, column].astype(operator.dtype, copy=False), kept)
-                frames[number] = self._refined(operator, misfit, picture, coupling)
+                kept = None if valid is None else valid[:, column]
+                misfit = self.start.data_term(
+                    measurements[:, column].astype(operator.dtype, copy=False), kept
+                )
+                frames[number] = self._alternate(operator, misfit, picture, coupling)
                 progress(self.calls)
         why = f"{self.calls} calls of the denoiser done"
-        return replace(started, frames=frames, iterations=started.iterations + self.calls, stopped_because=why)
+        return replace(
+            started, frames=frames, iterations=started.iterations + self.calls, stop_reason=why
+        )
 
-    def _refined(self, operator: LinearOperator, misfit: DataTerm, picture: Array, coupling: float) -> Array:
-        deviation = self.strength * float(np.quantile(picture, BRIGHTEST))
+    def _alternate(
+        self, operator: LinearOperator, misfit: DataTerm, picture: Array, coupling: float
+    ) -> Array:
+        deviation = self.strength * float(np.quantile(picture, PEAK_QUANTILE))
         if deviation <= 0:
             return picture
         fitted = clean = picture
         for _ in range(self.calls):
-            fitted = np.maximum(nearest_fit(operator, misfit, clean, coupling), 0)
+            fitted = np.maximum(solve_data_step(operator, misfit, clean, coupling), 0)
             clean = np.maximum(self.denoiser(fitted, clean, deviation), 0)
-        return self._answer(fitted, clean)
+        return self._select_estimate(fitted, clean)
 
-    def _answer(self, fitted: Array, clean: Array) -> Array:
-        """Return the picture that counts, of the last that met the data and the last that was denoised."""
+    def _select_estimate(self, fitted: Array, clean: Array) -> Array:
+        """Return the picture that counts, of the last that met the data and the last that was
+        denoised.
+        """
         return clean
 
     def work(self, frames: int) -> int:
@@ -99,20 +114,25 @@ class PlugAndPlay:
 class RegularisationByDenoising(PlugAndPlay):
     """The fixed point of ``A'(A h - f) + coupling (h - denoise(h)) = 0``.
 
-    Y. Romano, M. Elad, P. Milanfar, SIAM J. Imaging Sci. 10, 1804 (2017), its fixed-point iteration: what
-    plug-and-play does, but the picture that meets the data is the answer, not the denoised one.
+    Y. Romano, M. Elad, P. Milanfar, SIAM J. Imaging Sci. 10, 1804 (2017), its fixed-point
+    iteration: what plug-and-play does, but the picture that meets the data is the answer, not the
+    denoised one.
     """
 
     strength: float = 0.08
     coupling: float = 0.3
     name = "regularisation by denoising"
 
-    def _answer(self, fitted: Array, clean: Array) -> Array:
+    def _select_estimate(self, fitted: Array, clean: Array) -> Array:
         return fitted
 
 
-def nearest_fit(
-    operator: LinearOperator, misfit: DataTerm, anchor: NDArray[Any], coupling: float, iterations: int = 10
+def solve_data_step(
+    operator: LinearOperator,
+    misfit: DataTerm,
+    anchor: NDArray[Any],
+    coupling: float,
+    iterations: int = 10,
 ) -> NDArray[Any]:
     """Minimise ``misfit(A h) + coupling / 2 |h - anchor|^2`` near `anchor`, by conjugate gradients.
 
@@ -144,7 +164,9 @@ def nearest_fit(
         if energy == 0:
             break
         step = normal(direction)
-        length = energy / float(np.vdot(direction, step))  # a Python number keeps float32 arrays float32
+        length = energy / float(
+            np.vdot(direction, step)
+        )  # a Python number keeps float32 arrays float32
         solution += length * direction
         residual -= length * step
         before, energy = energy, float(np.vdot(residual, residual))

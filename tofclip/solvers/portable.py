@@ -1,4 +1,6 @@
-"""The solvers' inner loops with the functions of the array API standard: for CuPy, PyTorch and whatever follows it."""
+"""The solvers' inner loops with the functions of the array API standard: for CuPy, PyTorch and
+whatever follows it.
+"""
 
 from __future__ import annotations
 
@@ -6,27 +8,37 @@ from tofclip.arrays import Array, namespace, zeros
 
 
 class PortableLoops:
-    """Loops on arrays of any library, each a few passes through memory, for many frames at once; see `Loops`."""
+    """Loops on arrays of any library, each a few passes through memory, for many frames at once;
+    see `Loops`.
+    """
 
-    def shrunk(
-        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float, threshold: float
+    def prox_l1(
+        self,
+        current: Array,
+        previous: Array,
+        momentum: Array,
+        gradient: Array,
+        step: float,
+        threshold: float,
     ) -> tuple[Array, Array]:
         """Leave all arrays but `gradient` as they are."""
         xp = namespace(current)
-        noisy = self.descended(current, previous, momentum, gradient, step)
+        noisy = self.gradient_step(current, previous, momentum, gradient, step)
         noisy -= threshold
         result = xp.clip(noisy, min=0.0)
         pixels = tuple(range(result.ndim - 1))
         return result, xp.sum(result, axis=pixels, dtype=xp.float64)
 
-    def descended(self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float) -> Array:
+    def gradient_step(
+        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
+    ) -> Array:
         """Leave all arrays but `gradient` as they are."""
         gradient *= -step
         gradient += current
         gradient += momentum * (current - previous)
         return gradient
 
-    def variation_shrunk(
+    def prox_tv(
         self, noisy: Array, dual: Array | None, weight: float, sweeps: int, result: Array
     ) -> tuple[Array, Array, Array]:
         """Leave all arrays as they are."""
@@ -35,26 +47,28 @@ class PortableLoops:
             dual = zeros((2, *noisy.shape), noisy)
         if weight > 0:
             for _ in range(sweeps):
-                dual = _projected(dual + _differences(_primal(noisy, dual, weight)) / (8 * weight))
-        result = _primal(noisy, dual, weight)
-        length = xp.sqrt(xp.sum(_differences(result) ** 2, axis=0))
+                dual = _project_to_unit_ball(
+                    dual + _forward_differences(_primal_block(noisy, dual, weight)) / (8 * weight)
+                )
+        result = _primal_block(noisy, dual, weight)
+        length = xp.sqrt(xp.sum(_forward_differences(result) ** 2, axis=0))
         return result, xp.sum(length, axis=(0, 1), dtype=xp.float64), dual
 
-    def squared_sums(self, values: Array) -> Array:
+    def sum_squares(self, values: Array) -> Array:
         """Square and add."""
         xp = namespace(values)
         return xp.sum(values * values, axis=0, dtype=xp.float64)
 
-    def put_back(self, values: Array, before: Array, refused: Array) -> Array:
+    def restore_frames(self, values: Array, before: Array, rejected: Array) -> Array:
         """Choose frame by frame, without asking the device whether there is anything to do."""
-        return namespace(values).where(refused, before, values)
+        return namespace(values).where(rejected, before, values)
 
 
-def _primal(noisy: Array, dual: Array, weight: float) -> Array:
+def _primal_block(noisy: Array, dual: Array, weight: float) -> Array:
     """Return ``max(noisy + weight * div(dual), 0)``.
 
-    The last row of the vertical and the last column of the horizontal dual are always zero (the difference across the
-    border is), and take the place of what comes before the first.
+    The last row of the vertical and the last column of the horizontal dual are always zero (the
+    difference across the border is), and take the place of what comes before the first.
     """
     xp = namespace(noisy)
     down, across = dual[0, ...], dual[1, ...]
@@ -66,15 +80,17 @@ def _primal(noisy: Array, dual: Array, weight: float) -> Array:
     return xp.clip(divergence, min=0.0)
 
 
-def _differences(picture: Array) -> Array:
-    """Return the differences to the next row and column, (2, rows, columns, frames); 0 across the border."""
+def _forward_differences(picture: Array) -> Array:
+    """Return the differences to the next row and column, (2, rows, columns, frames); 0 across the
+    border.
+    """
     xp = namespace(picture)
     below = xp.concat([picture[1:, ...], picture[-1:, ...]], axis=0)
     right = xp.concat([picture[:, 1:, ...], picture[:, -1:, ...]], axis=1)
     return xp.stack([below, right]) - picture
 
 
-def _projected(dual: Array) -> Array:
+def _project_to_unit_ball(dual: Array) -> Array:
     """Return `dual` projected onto vectors of length at most 1."""
     xp = namespace(dual)
     length = xp.sqrt(xp.sum(dual * dual, axis=0))

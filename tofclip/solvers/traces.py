@@ -1,8 +1,9 @@
-"""The linear inverse pixel by pixel: a few pixels at all instants, instead of all pixels at a few instants.
+"""The linear inverse pixel by pixel: a few pixels at all instants, instead of all pixels at a few
+instants.
 
-Whoever looks at one pixel's brightness over time, as the search for returns does, never needs the transient cube: the
-dense part of the inverse, which is small, is worked out for the whole shot, and the sparse part for a few pixels at a
-time, whose traces stay in cache.
+Whoever looks at one pixel's brightness over time, as the search for returns does, never needs the
+transient cube: the dense part of the inverse, which is small, is worked out for the whole shot, and
+the sparse part for a few pixels at a time, whose traces stay in cache.
 """
 
 from __future__ import annotations
@@ -18,10 +19,13 @@ from tofclip.operators.sparse import Tiles
 from tofclip.solvers.direct import PreparedInverse
 from tofclip.solvers.method import Array
 
-PATCH_ROWS, PATCH_COLUMNS = 8, 8  # the readings that such a patch looks at stay in the second-level cache
+PATCH_ROWS, PATCH_COLUMNS = (
+    8,
+    8,
+)  # the readings that such a patch looks at stay in the second-level cache
 
 
-def patch_order(image_shape: tuple[int, int]) -> NDArray[np.int64]:
+def order_by_patch(image_shape: tuple[int, int]) -> NDArray[np.int64]:
     """Return the numbers of all pixels of a picture, counted in raster order, patch by patch."""
     row, column = np.divmod(np.arange(image_shape[0] * image_shape[1]), image_shape[1])
     return np.lexsort((column, row, column // PATCH_COLUMNS, row // PATCH_ROWS))
@@ -35,33 +39,35 @@ class InverseTraces:
     inverse : PreparedInverse
         Of a sparse matrix in float32.
     pixels : (n,) int array
-        Numbers of the pixels, counted in raster order; see `patch_order`.
+        Numbers of the pixels, counted in raster order; see `order_by_patch`.
     """
 
     def __init__(self, inverse: PreparedInverse, pixels: NDArray[np.int64]) -> None:
         if not isinstance(inverse.operator, SparseMatrix):
-            raise InputError(f"traces of single pixels need a sparse matrix, not {inverse.operator!r}")
+            raise InputError(
+                f"traces of single pixels need a sparse matrix, not {inverse.operator!r}"
+            )
         self.inverse = inverse
-        self._tiles = Tiles.of(inverse.operator.matrix.T.tocsr()[pixels])
+        self._tiles = Tiles.from_csr(inverse.operator.matrix.T.tocsr()[pixels])
 
-    def brightest(self, block: Array) -> Array:
+    def peak_response(self, block: Array) -> Array:
         """Return how far the brightest pixel of each back-projected frame stands out.
 
         Parameters
         ----------
-        block : (readings, LANES) contiguous array
+        take_block : (readings, LANES) contiguous array
             In units of their noise.
 
         Returns
         -------
         (LANES,) array
-            The largest ``a'f / |a|`` over the columns a of A: the response of the filter that is matched to a lone
-            pixel, in units of its noise. Never below zero.
+            The largest ``a'f / |a|`` over the columns a of A: the response of the filter that is
+            matched to a lone pixel, in units of its noise. Never below zero.
         """
-        from tofclip.solvers.kernels import highest_pixels
+        from tofclip.solvers.kernels import update_peaks
 
         highest = np.zeros(block.shape[1], block.dtype)
-        highest_pixels(*self._tiles, self._scales, block, highest)
+        update_peaks(*self._tiles, self._scales, block, highest)
         return highest
 
     @cached_property
@@ -85,8 +91,8 @@ class InverseTraces:
         frames : slice
             As many as the readings had.
         """
-        from tofclip.solvers.kernels import traces_of_pixels
+        from tofclip.solvers.kernels import compute_traces
 
         starts = np.ascontiguousarray(self._tiles.starts[:, piece.start : piece.stop + 1])
         span = frames.start, frames.stop
-        traces_of_pixels(starts, self._tiles.columns, self._tiles.values, weights, traces, span)
+        compute_traces(starts, self._tiles.columns, self._tiles.values, weights, traces, span)

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofclip.solvers.proximal import Array, checked_weight
+from tofclip.solvers.proximal import Array, validate_weight
 
-SHIFTS = 4
+SHIFT_COUNT = 4
 """Grid positions that are averaged over."""
 
 
 class NonnegativeWavelets:
-    """``weight * |W h|_1`` over the details of a wavelet transform, averaged over shifts, for h >= 0.
+    """``weight * |W h|_1`` over the details of a wavelet transform, averaged over shifts, for h >=
+    0.
 
-    Cycle spinning (R. Coifman, D. Donoho, 1995): the picture is shifted, its details are shrunk, it is shifted back,
-    and the results are averaged. The average of proximal maps is the proximal map of the penalties' proximal average
-    (Y. Yu, NIPS 2013), so with shifts that stay the same the solver's objective still falls. The approximation is
-    not shrunk. One instance belongs to one block.
+    Cycle spinning (R. Coifman, D. Donoho, 1995): the picture is shifted, its details are shrunk, it
+    is shifted back, and the results are averaged. The average of proximal maps is the proximal map
+    of the penalties' proximal average (Y. Yu, NIPS 2013), so with shifts that stay the same the
+    solver's objective still falls. The approximation is not shrunk. One instance belongs to one
+    block.
 
     Parameters
     ----------
@@ -29,43 +31,45 @@ class NonnegativeWavelets:
     """
 
     def __init__(self, weight: float, wavelet: str = "db4", seed: int = 0) -> None:
-        self.weight = checked_weight(weight)
+        self.weight = validate_weight(weight)
         self.wavelet = wavelet
-        self._shifts = np.random.default_rng(seed).integers(0, 64, (SHIFTS, 2))
+        self._shifts = np.random.default_rng(seed).integers(0, 64, (SHIFT_COUNT, 2))
 
-    def descend(
+    def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
     ) -> tuple[Array, Array]:
-        from tofclip.solvers.kernels import gradient_step
+        from tofclip.solvers.kernels import take_gradient_step
 
-        gradient_step(current, previous, momentum, gradient, current.dtype.type(step))
+        take_gradient_step(current, previous, momentum, gradient, current.dtype.type(step))
         previous[:] = 0
         penalty = np.zeros(current.shape[-1])
         for shift in self._shifts:
             shifted = np.roll(gradient, shift, (0, 1))
-            shrunk, total = self._shrunk(shifted, step * self.weight)
+            shrunk, total = self._shrink_details(shifted, step * self.weight)
             previous += np.roll(shrunk, -shift, (0, 1))
             penalty += total
-        previous /= SHIFTS
+        previous /= SHIFT_COUNT
         np.maximum(previous, 0, out=previous)
-        return previous, self.weight * penalty / SHIFTS
+        return previous, self.weight * penalty / SHIFT_COUNT
 
-    def _shrunk(self, picture: Array, threshold: float) -> tuple[Array, Array]:
+    def _shrink_details(self, picture: Array, threshold: float) -> tuple[Array, Array]:
         """Shrink the details; return the picture and the sum of its details' sizes for each frame."""
         import pywt
 
         grid = {"wavelet": self.wavelet, "mode": "periodization", "axes": (0, 1)}
-        coefficients = pywt.wavedec2(picture, level=_levels(picture), **grid)
+        coefficients = pywt.wavedec2(picture, level=_count_levels(picture), **grid)
         total = np.zeros(picture.shape[-1])
         kept = [coefficients[0]]
         for details in coefficients[1:]:
-            soft = tuple(pywt.threshold(band, threshold, "soft").astype(picture.dtype) for band in details)
+            soft = tuple(
+                pywt.threshold(band, threshold, "soft").astype(picture.dtype) for band in details
+            )
             total += sum(np.abs(band).sum(axis=(0, 1), dtype=np.float64) for band in soft)
             kept.append(soft)
         rows, columns = picture.shape[:2]
         return pywt.waverec2(kept, **grid)[:rows, :columns], total
 
 
-def _levels(picture: Array) -> int:
+def _count_levels(picture: Array) -> int:
     """As deep as the approximation still has a dozen pixels a side."""
     return max(1, int(np.log2(min(picture.shape[:2]) / 12)))

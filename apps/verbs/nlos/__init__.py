@@ -16,7 +16,7 @@ app.command()(demo.demo)
 
 
 @app.callback(invoke_without_command=True)
-def _without_verb(context: typer.Context) -> None:
+def _show_help(context: typer.Context) -> None:
     """Image the scene hidden around a corner."""
     if context.invoked_subcommand is None:
         print(context.get_help())

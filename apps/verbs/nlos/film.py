@@ -10,73 +10,90 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from apps.nlos.methods import ImagingSettings
-from apps.options import AsJson
-from apps.settings import SettingsFile, setting, takes
+from apps.options import JsonOption
+from apps.settings import SettingsOption, add_setting_flags, setting_field
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid, TransientImaging, TransientVideo
     from nlos.geometry import FloatArray
 
-METHODS = ("rsd", "hybrid")
+FILM_METHODS = ("rsd", "hybrid")
 """They keep the band's frequencies apart from the laser's wave, the quicker one first."""
 
-FORMATS = (".mp4", ".gif", ".h5")
-PICTURES_PER_SECOND = 12.5
+FILM_SUFFIXES = (".mp4", ".gif", ".h5")
+FRAME_RATE_HZ = 12.5
 NANOSECOND = 1e-9
-SIGMAS_BEFORE = 2.0
-"""Before the flash reaches the first voxel, and after it left the last: standard deviations of the virtual pulse."""
+MARGIN_SIGMAS = 2.0
+"""Before the flash reaches the first voxel, and after it left the last: standard deviations of the
+virtual pulse.
+"""
 
-HEADING = "tofclip nlos film CAPTURE --settings THIS --out FILM"
+SETTINGS_HEADING = "tofclip nlos film CAPTURE --settings THIS --out FILM"
 
 
 @dataclass(frozen=True)
 class FilmSettings(ImagingSettings):
     """What is filmed, and when."""
 
-    method: str | None = setting(
-        "NAME", f"{' or '.join(METHODS)}.", shown="the quickest that suits the capture", choices=METHODS
+    method: str | None = setting_field(
+        "NAME",
+        f"{' or '.join(FILM_METHODS)}.",
+        shown="the quickest that suits the capture",
+        choices=FILM_METHODS,
     )
-    instants: int = setting("N", "How many.", 60)
-    first_ns: float | None = setting("NS", "First instant after the flash.", shown="before it meets the first voxel")
-    last_ns: float | None = setting("NS", "Last instant.", shown="after it left the last voxel")
-    every_depth: bool = setting(None, "Keep every depth, not only the brightest along every line of sight: .h5.", False)
+    instants: int = setting_field("N", "How many.", 60)
+    first_ns: float | None = setting_field(
+        "NS", "First instant after the flash.", shown="before it meets the first voxel"
+    )
+    last_ns: float | None = setting_field(
+        "NS", "Last instant.", shown="after it left the last voxel"
+    )
+    every_depth: bool = setting_field(
+        None, "Keep every depth, not only the brightest along every line of sight: .h5.", False
+    )
 
 
-@takes(FilmSettings)
+@add_setting_flags(FilmSettings)
 def film(
-    source: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Recovered frames of a relay wall, or a capture.")],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The film to write, .mp4 or .gif; or its numbers, .h5.")],
-    settings: SettingsFile = None,
-    as_json: AsJson = False,
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="CAPTURE", help="Recovered frames of a relay wall, or a capture."),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(metavar="FILE", help="The film to write, .mp4 or .gif; or its numbers, .h5."),
+    ],
+    settings: SettingsOption = None,
+    as_json: JsonOption = False,
     **flags: Any,
 ) -> None:
     """Film the hidden scene while the laser's flash passes through it.
 
-    A hidden thing lights up when the flash reaches it, so that near things show before far ones; light that met several
-    things shows once more at the last of them. Needs a capture of one laser spot, and rsd or hybrid. Times count from
-    the moment when the flash leaves its spot on the wall.
+    A hidden thing lights up when the flash reaches it, so that near things show before far ones;
+    light that met several things shows once more at the last of them. Needs a capture of one laser
+    spot, and rsd or hybrid. Times count from the moment when the flash leaves its spot on the wall.
 
-    The part of the box that is bright is found as by nlos reconstruct. The settings that were told or found are written
-    beside the film (.toml) and give the same one.
+    The part of the box that is bright is found as by nlos reconstruct. The settings that were told
+    or found are written beside the film (.toml) and give the same one.
 
     Example: tofclip nlos film capture.h5 --out flash.gif
     """
-    from apps.nlos.imaging import prepared, warnings_in_a_line
+    from apps.nlos.imaging import preprocess_capture, warnings_to_stderr
     from apps.report import report
-    from apps.settings import save, told
+    from apps.settings import load_settings, save_settings
     from nlos.io import read_capture
 
-    wanted = told(FilmSettings, settings, flags)
+    wanted = load_settings(FilmSettings, settings, flags)
     beside = out.with_suffix(".toml")
     _require_writable(out, beside, (source,) if settings is None else (source, settings))
-    _require_sense(wanted, out)
-    capture = prepared(read_capture(source), wanted)
+    _check_settings(wanted, out)
+    capture = preprocess_capture(read_capture(source), wanted)
     started = time.perf_counter()
-    with warnings_in_a_line():
-        found, video = _filmed(capture, wanted)
+    with warnings_to_stderr():
+        found, video = _make_video(capture, wanted)
     seconds = time.perf_counter() - started
-    _write(replace(video, provenance=_history(video, source, found)), out)
-    save(found, beside, HEADING)
+    _write_video(replace(video, provenance=_build_video_provenance(video, source, found)), out)
+    save_settings(found, beside, SETTINGS_HEADING)
     figures = {
         "method": found.method,
         "wavelength_mm": found.wavelength_mm,
@@ -93,72 +110,86 @@ def film(
 def _require_writable(out: Path, beside: Path, inputs: tuple[Path, ...]) -> None:
     from apps.files import require_writable
 
-    require_writable(out, *FORMATS, inputs=inputs)
+    require_writable(out, *FILM_SUFFIXES, inputs=inputs)
     require_writable(beside, inputs=inputs)
 
 
-def _require_sense(settings: FilmSettings, out: Path) -> None:
+def _check_settings(settings: FilmSettings, out: Path) -> None:
     """Refuse what no capture could be filmed by, before any is read."""
-    from apps.mp4 import opencv
-    from apps.nlos.methods import built, names_in, require_taken
+    from apps.mp4 import import_opencv
+    from apps.nlos.methods import build_method, parse_method_names, require_used_settings
     from tofclip.errors import InputError
 
-    names = METHODS if settings.method is None else names_in(settings.method)
-    if not set(names) <= set(METHODS):
-        raise InputError(f"films are made by {' or '.join(METHODS)}, not by {settings.method}")
-    require_taken(settings, names)
+    names = FILM_METHODS if settings.method is None else parse_method_names(settings.method)
+    if not set(names) <= set(FILM_METHODS):
+        raise InputError(f"films are made by {' or '.join(FILM_METHODS)}, not by {settings.method}")
+    require_used_settings(settings, names)
     for name in names:
-        built(name, settings if settings.wavelength_mm is not None else replace(settings, wavelength_mm=1.0))
+        build_method(
+            name,
+            settings
+            if settings.wavelength_mm is not None
+            else replace(settings, wavelength_mm=1.0),
+        )
     if settings.instants < 1:
         raise InputError(f"a film needs at least one instant, got {settings.instants}")
     if settings.every_depth and out.suffix.lower() != ".h5":
-        raise InputError(f"{out}: a film shows one picture per instant; write every depth to a .h5 file")
+        raise InputError(
+            f"{out}: a film shows one picture per instant; write every depth to a .h5 file"
+        )
     if out.suffix.lower() == ".mp4":
-        opencv()
+        import_opencv()
 
 
-def _filmed(capture: Capture, wanted: FilmSettings) -> tuple[FilmSettings, TransientVideo]:
+def _make_video(capture: Capture, wanted: FilmSettings) -> tuple[FilmSettings, TransientVideo]:
     """Find what is not told, and film the capture."""
-    from apps.nlos.imaging import boxed, scales_of
-    from apps.nlos.methods import built, spelt_out
-    from apps.progress import progress
+    from apps.nlos.imaging import choose_grid, find_scales
+    from apps.nlos.methods import build_method, fill_in_defaults
+    from apps.progress import show_progress
     from nlos import TransientImaging
 
-    found = replace(wanted, **scales_of(wanted, capture)._asdict())
-    method = found.method or _quickest(found, capture)
-    found = replace(spelt_out(found, [method]), method=method)
-    imaging = TransientImaging(built(method, found))  # type: ignore[arg-type]
-    found, grid = boxed(found, capture)
+    found = replace(wanted, **find_scales(wanted, capture)._asdict())
+    method = found.method or _choose_method(found, capture)
+    found = replace(fill_in_defaults(found, [method]), method=method)
+    imaging = TransientImaging(build_method(method, found))  # type: ignore[arg-type]
+    found, grid = choose_grid(found, capture)
     imaging.supports(capture, grid).require()
-    found, times = _instants(found, capture, grid, imaging)
+    found, times = _choose_instants(found, capture, grid, imaging)
     take = imaging.video if found.every_depth else imaging.front_views
-    with progress("filming", grid.size) as advance:
+    with show_progress("filming", grid.size) as advance:
         return found, take(capture, grid, times, advance)
 
 
-def _quickest(settings: FilmSettings, capture: Capture) -> str:
-    """Name the quickest of the two methods that takes a capture; where none does, the one that says why."""
-    from apps.nlos.imaging import box_of
-    from apps.nlos.methods import built
+def _choose_method(settings: FilmSettings, capture: Capture) -> str:
+    """Name the quickest of the two methods that takes a capture; where none does, the one that says
+    why.
+    """
+    from apps.nlos.imaging import fill_box
+    from apps.nlos.methods import build_method
     from tofclip.units import MILLIMETRE
 
-    _, grid = box_of(settings, capture, (settings.voxel_mm or 0.0) * MILLIMETRE)
-    return next((name for name in METHODS if built(name, settings).supports(capture, grid)), METHODS[-1])
+    _, grid = fill_box(settings, capture, (settings.voxel_mm or 0.0) * MILLIMETRE)
+    return next(
+        (name for name in FILM_METHODS if build_method(name, settings).supports(capture, grid)),
+        FILM_METHODS[-1],
+    )
 
 
-def _instants(
+def _choose_instants(
     settings: FilmSettings, capture: Capture, grid: Grid, imaging: TransientImaging
 ) -> tuple[FilmSettings, FloatArray]:
     """Return evenly spaced instants, s, and the settings with the first and the last of them."""
     import numpy as np
 
-    from nlos.exposure import leg
+    from nlos.illumination_groups import find_leg_bounds
     from tofclip.errors import InputError
     from tofclip.units import SPEED_OF_LIGHT
 
-    nearest, farthest = leg(capture.lasers, grid)
-    room = SIGMAS_BEFORE * imaging.method.pulse.sigma
-    first, last = ((way / SPEED_OF_LIGHT) / NANOSECOND for way in (nearest - room, farthest + room))
+    nearest, farthest = find_leg_bounds(capture.lasers, grid)
+    room = MARGIN_SIGMAS * imaging.method.pulse.sigma
+    first, last = (
+        (plan / SPEED_OF_LIGHT) / NANOSECOND for plan in (nearest - room, farthest + room)
+    )
     first = first if settings.first_ns is None else settings.first_ns
     last = last if settings.last_ns is None else settings.last_ns
     if last < first:
@@ -167,22 +198,26 @@ def _instants(
     return found, NANOSECOND * np.linspace(first, last, settings.instants)
 
 
-def _history(video: TransientVideo, source: Path, found: FilmSettings) -> dict[str, Any]:
-    from apps.files import history
-    from apps.settings import plain
+def _build_video_provenance(
+    video: TransientVideo, source: Path, found: FilmSettings
+) -> dict[str, Any]:
+    from apps.files import build_provenance
+    from apps.settings import settings_to_dict
 
-    return history({"verb": "nlos film", **plain(found)}, source, earlier=video.provenance)
+    return build_provenance(
+        {"verb": "nlos film", **settings_to_dict(found)}, source, earlier=video.provenance
+    )
 
 
-def _write(video: TransientVideo, out: Path) -> None:
-    from apps.mp4 import filming
-    from nlos.film import pictures
+def _write_video(video: TransientVideo, out: Path) -> None:
+    from apps.mp4 import open_film
+    from nlos.film import render_frames
 
     if out.suffix.lower() == ".h5":
         video.save(out)
     elif out.suffix.lower() == ".gif":
         video.save_film(out)
     else:
-        with filming(out, PICTURES_PER_SECOND) as film:
-            for picture in pictures(video):
+        with open_film(out, FRAME_RATE_HZ) as film:
+            for picture in render_frames(video):
                 film.add(picture)

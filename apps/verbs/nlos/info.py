@@ -9,55 +9,66 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from apps.nlos.methods import METHODS, ImagingSettings
-from apps.options import AsJson
-from apps.settings import SettingsFile, takes
+from apps.options import JsonOption
+from apps.settings import SettingsOption, add_setting_flags
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid
 
-WIDEST_BLUR = 0.5
+MAX_BLUR_FRACTION = 0.5
 """A wavelength is usable while a point's image is narrower than this share of the wall."""
 
-BLUR = 1.2
-"""Width of a point's image in units of wavelength * distance / width of the wall; see `nlos.resolution`."""
+BLUR_FACTOR = 1.2
+"""Width of a point's image in units of wavelength * distance / width of the wall; see
+`nlos.resolution`.
+"""
 
 
-@takes(ImagingSettings)
+@add_setting_flags(ImagingSettings)
 def info(
-    source: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Recovered frames of a relay wall, or a capture.")],
-    settings: SettingsFile = None,
-    as_json: AsJson = False,
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="CAPTURE", help="Recovered frames of a relay wall, or a capture."),
+    ],
+    settings: SettingsOption = None,
+    as_json: JsonOption = False,
     **flags: Any,
 ) -> None:
-    """Tell a capture's geometry and sampling, usable wavelengths, resolution, and which methods suit it.
+    """Tell a capture's geometry and sampling, usable wavelengths, resolution, and which methods
+    suit it.
 
-    Resolution is the width of a point's image that a perfect instrument would give in the middle of the box. Memory is
-    an estimate for filling the whole box with voxels.
+    Resolution is the width of a point's image that a perfect instrument would give in the middle of
+    the box. Memory is an estimate for filling the whole box with voxels.
 
     Example: tofclip nlos info capture.h5
     """
-    from apps.nlos.imaging import box_of, prepared, scales_of
+    from apps.nlos.imaging import fill_box, find_scales, preprocess_capture
     from apps.nlos.truth import HiddenTruth
     from apps.report import report
-    from apps.settings import told
+    from apps.settings import load_settings
     from nlos.io import read_capture
     from tofclip.units import MILLIMETRE
 
-    wanted = told(ImagingSettings, settings, flags)
-    capture = prepared(read_capture(source), wanted)
-    scales = scales_of(wanted, capture)
-    found, grid = box_of(replace(wanted, **scales._asdict()), capture, scales.voxel_mm * MILLIMETRE)
+    wanted = load_settings(ImagingSettings, settings, flags)
+    capture = preprocess_capture(read_capture(source), wanted)
+    scales = find_scales(wanted, capture)
+    found, grid = fill_box(
+        replace(wanted, **scales._asdict()), capture, scales.voxel_mm * MILLIMETRE
+    )
     figures = {
-        "wall": _wall(capture),
-        "laser": _laser(capture),
-        "record": _record(capture),
-        "wavelength_mm": {**_usable(capture, grid, found.cycles), "chosen": scales.wavelength_mm},
-        "resolution_m": _resolution(capture, grid, found),
+        "wall": _describe_wall(capture),
+        "laser": _describe_laser(capture),
+        "record": _describe_time_axis(capture),
+        "wavelength_mm": {
+            **_find_usable_wavelengths(capture, grid, found.cycles),
+            "chosen": scales.wavelength_mm,
+        },
+        "resolution_m": _compute_resolution(capture, grid, found),
         "box_m": {"x": found.x_m, "y": found.y_m, "z": (found.near_m, found.far_m)},
         "voxels": {"size_mm": scales.voxel_mm, "shape": grid.shape},
-        "truth": HiddenTruth.inside(source) is not None,
+        "truth": HiddenTruth.load(source) is not None,
     }
-    methods = {name: _suitability(name, found, capture, grid) for name in METHODS}
+    methods = {name: _check_method(name, found, capture, grid) for name in METHODS}
     if as_json:
         report({**figures, "methods": methods}, as_json)
         return
@@ -68,8 +79,8 @@ def info(
     report({**figures, **lines}, as_json)
 
 
-def _wall(capture: Capture) -> dict[str, Any]:
-    from apps.nlos.imaging import sampling_step
+def _describe_wall(capture: Capture) -> dict[str, Any]:
+    from apps.nlos.imaging import find_sampling_step
     from nlos.rsd.wall import PlanarWall
     from tofclip.errors import InputError
 
@@ -86,14 +97,14 @@ def _wall(capture: Capture) -> dict[str, Any]:
         "width_m": width,
         "height_m": height,
         "relief_m": relief,
-        "step_m": sampling_step(capture),
+        "step_m": find_sampling_step(capture),
     }
 
 
-def _laser(capture: Capture) -> str:
-    from nlos.exposure import exposures
+def _describe_laser(capture: Capture) -> str:
+    from nlos.illumination_groups import group_by_illumination
 
-    parts = exposures(capture)
+    parts = group_by_illumination(capture)
     if parts[0].laser is None:
         return "confocal"
     if len(parts) > 1:
@@ -102,7 +113,7 @@ def _laser(capture: Capture) -> str:
     return f"one spot at ({x:.3g}, {y:.3g}, {z:.3g}) m"
 
 
-def _record(capture: Capture) -> dict[str, Any]:
+def _describe_time_axis(capture: Capture) -> dict[str, Any]:
     from tofclip.units import PICOSECOND
 
     paths = capture.axis.paths
@@ -115,38 +126,40 @@ def _record(capture: Capture) -> dict[str, Any]:
     }
 
 
-def _usable(capture: Capture, grid: Grid, cycles: float) -> dict[str, float]:
+def _find_usable_wavelengths(capture: Capture, grid: Grid, cycles: float) -> dict[str, float]:
     """Bounds of the carrier: what is sampled finely enough, and what still resolves something, mm."""
-    from apps.nlos.imaging import shortest_wavelength
+    from apps.nlos.imaging import find_shortest_wavelength
     from tofclip.units import MILLIMETRE
 
     low, high = capture.points.min(axis=0), capture.points.max(axis=0)
     width = float(max(high[0] - low[0], high[1] - low[1]))
     distance = float(grid.z[[0, -1]].mean() - capture.points[:, 2].mean())
     return {
-        "shortest": shortest_wavelength(capture, cycles) / MILLIMETRE,
-        "longest": WIDEST_BLUR * width**2 / (BLUR * distance) / MILLIMETRE,
+        "shortest": find_shortest_wavelength(capture, cycles) / MILLIMETRE,
+        "longest": MAX_BLUR_FRACTION * width**2 / (BLUR_FACTOR * distance) / MILLIMETRE,
     }
 
 
-def _resolution(capture: Capture, grid: Grid, found: ImagingSettings) -> dict[str, Any]:
+def _compute_resolution(capture: Capture, grid: Grid, found: ImagingSettings) -> dict[str, Any]:
     from dataclasses import asdict
 
     from nlos.band import VirtualPulse
-    from nlos.resolution import diffraction_limit
+    from nlos.resolution import compute_diffraction_limit
     from tofclip.units import MILLIMETRE
 
     middle = [float(axis[[0, -1]].mean()) for axis in (grid.x, grid.y, grid.z)]
     pulse = VirtualPulse((found.wavelength_mm or 0.0) * MILLIMETRE, found.cycles)
-    return {**asdict(diffraction_limit(capture, middle, pulse)), "at": middle}
+    return {**asdict(compute_diffraction_limit(capture, middle, pulse)), "at": middle}
 
 
-def _suitability(name: str, found: ImagingSettings, capture: Capture, grid: Grid) -> dict[str, Any]:
-    from apps.nlos.costs import memory_of
-    from apps.nlos.methods import built
+def _check_method(
+    name: str, found: ImagingSettings, capture: Capture, grid: Grid
+) -> dict[str, Any]:
+    from apps.nlos.costs import estimate_memory
+    from apps.nlos.methods import build_method
 
-    imaging = built(name, found)
+    imaging = build_method(name, found)
     support = imaging.supports(capture, grid)
     if not support:
         return {"suits": False, "reason": support.reason}
-    return {"suits": True, "memory_mib": memory_of(imaging, capture, grid) / 2**20}
+    return {"suits": True, "memory_mib": estimate_memory(imaging, capture, grid) / 2**20}

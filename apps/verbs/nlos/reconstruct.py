@@ -15,196 +15,246 @@ import typer
 
 from apps.nlos.methods import METHODS
 from apps.nlos.refining import RefinementSettings
-from apps.options import AsJson, Cluster, Device
-from apps.settings import SettingsFile, setting, takes
+from apps.options import ClusterOption, DeviceOption, JsonOption
+from apps.settings import SettingsOption, add_setting_flags, setting_field
 
 if TYPE_CHECKING:
-    from apps.nlos.files import Results
+    from apps.nlos.files import ResultFiles
     from nlos import Capture, Volume
     from tofclip.sequences.jobs import Job, Report
 
-SOME_FAILED = 1
-STOPPED = ("iterations", "stopped_because")
+EXIT_SOME_FAILED = 1
+STOP_KEYS = ("iterations", "stopped_because")
 """What is told of an iteration."""
 
 SETTINGS_SUFFIX = ".toml"
-FOLDER_SETTINGS = ".settings.toml"
-HEADING = "tofclip nlos reconstruct CAPTURE --settings THIS --out VOLUME"
+FOLDER_SETTINGS_NAME = ".settings.toml"
+SETTINGS_HEADING = "tofclip nlos reconstruct CAPTURE --settings THIS --out VOLUME"
 
 
 @dataclass(frozen=True)
 class ReconstructSettings(RefinementSettings):
     """How a capture is imaged and written."""
 
-    method: str | None = setting(
-        "NAME", f"One of {', '.join(METHODS)}.", shown="the quickest that suits the capture", choices=METHODS
+    method: str | None = setting_field(
+        "NAME",
+        f"One of {', '.join(METHODS)}.",
+        shown="the quickest that suits the capture",
+        choices=METHODS,
     )
-    point_fraction: float = setting(
+    point_fraction: float = setting_field(
         "SHARE", "Voxels with this share of the brightest become points of .ply, .pcd, .csv.", 0.3
     )
 
 
 @dataclass(frozen=True)
-class _Order:
+class _ImagingRequest:
     """What is asked for every capture: settings, and where to compute."""
 
     settings: ReconstructSettings
     device: str
 
 
-@takes(ReconstructSettings)
+@add_setting_flags(ReconstructSettings)
 def reconstruct(
     source: Annotated[
         Path,
-        typer.Argument(metavar="CAPTURE", help="Recovered frames of a relay wall, a capture, or a folder."),
+        typer.Argument(
+            metavar="CAPTURE", help="Recovered frames of a relay wall, a capture, or a folder."
+        ),
     ],
     out: Annotated[
-        Path, typer.Option(metavar="FILE", help="The volume to write, .h5, .vti, .npz, .exr or .ply; or a folder.")
+        Path,
+        typer.Option(
+            metavar="FILE", help="The volume to write, .h5, .vti, .npz, .exr or .ply; or a folder."
+        ),
     ],
     png: Annotated[
         Path | None,
-        typer.Option(metavar="PNG", help="Picture of the volume, three views.", show_default="only in a folder"),
+        typer.Option(
+            metavar="PNG",
+            help="Picture of the volume, three views.",
+            show_default="only in a folder",
+        ),
     ] = None,
-    settings: SettingsFile = None,
+    settings: SettingsOption = None,
     suffix: Annotated[
         list[str] | None,
-        typer.Option(metavar=".EXT", help="Format of the volumes in a folder; may be repeated.", show_default=".h5"),
+        typer.Option(
+            metavar=".EXT",
+            help="Format of the volumes in a folder; may be repeated.",
+            show_default=".h5",
+        ),
     ] = None,
-    cluster: Cluster = None,
-    device: Device = "cpu",
-    as_json: AsJson = False,
+    cluster: ClusterOption = None,
+    device: DeviceOption = "cpu",
+    as_json: JsonOption = False,
     **flags: Any,
 ) -> None:
     """Image the hidden scene from the transients on a relay wall.
 
-    rsd is quick and for planar, evenly scanned walls, hybrid nearly as quick and for any wall; backprojection takes
-    every wall, laser and grid, and is slow. These three see through a virtual pulse and give the same picture.
-    filtered-backprojection, lct (light-cone transform) and fk (f-k migration) do without; the last two want a confocal
-    scan of a planar wall.
+    rsd is quick and for planar, evenly scanned walls, hybrid nearly as quick and for any wall;
+    backprojection takes every wall, laser and grid, and is slow. These three see through a virtual
+    pulse and give the same picture. filtered-backprojection, lct (light-cone transform) and fk (f-k
+    migration) do without; the last two want a confocal scan of a planar wall.
 
-    The space in front of the wall is looked over with voxels of half a wavelength first, by the quickest of the first
-    three; then the part that is bright is imaged with the voxels asked for. The settings that were told or found are
-    written beside the volume (.toml); given back by --settings they make the same volume, on another --device to some
-    hundred-thousandths.
+    The space in front of the wall is looked over with voxels of half a wavelength first, by the
+    quickest of the first three; then the part that is bright is imaged with the voxels asked for.
+    The settings that were told or found are written beside the volume (.toml); given back by
+    --settings they make the same volume, on another --device to some hundred-thousandths.
 
-    --refine looks for the albedo that explains the capture best, at the cost of some four images per iteration.
+    --refine looks for the albedo that explains the capture best, at the cost of some four images
+      per iteration.
 
-    With --device rsd, hybrid and backprojection compute elsewhere, on a graphics processor; the others cannot.
+    With --device rsd, hybrid and backprojection compute elsewhere, on a graphics processor; the
+    others cannot.
 
-    Of a folder every capture is imaged into the folder --out. Captures whose results are there already are skipped.
-    If some fail, the others are done all the same, and the exit status is 1.
+    Of a folder every capture is imaged into the folder --out. Captures whose results are there
+    already are skipped. If some fail, the others are done all the same, and the exit status is 1.
 
     Example: tofclip nlos reconstruct capture.h5 --out volume.h5 --png volume.png
     """
-    from apps.nlos.files import Results, is_folder_of_captures
+    from apps.nlos.files import ResultFiles, is_capture_folder
     from apps.report import report
-    from apps.sequences import device_told
-    from apps.settings import told
+    from apps.sequences import resolve_device
+    from apps.settings import load_settings
     from tofclip.errors import InputError
 
-    order = _Order(told(ReconstructSettings, settings, flags), device)
-    _require_sense(order.settings)
-    device_told(device, cluster)
-    if is_folder_of_captures(source):
+    order = _ImagingRequest(load_settings(ReconstructSettings, settings, flags), device)
+    _check_settings(order.settings)
+    resolve_device(device, cluster)
+    if is_capture_folder(source):
         _reconstruct_folder(source, out, order, suffix or [".h5"], (cluster, as_json))
         return
     if cluster is not None:
         raise InputError(f"{source}: --cluster is for a folder of captures")
-    results = Results([out], png, out.with_suffix(SETTINGS_SUFFIX))
+    results = ResultFiles([out], png, out.with_suffix(SETTINGS_SUFFIX))
     results.require_writable(source, *([] if settings is None else [settings]))
-    report(_reconstructed(source, results, order), as_json, results.all)
+    report(_reconstruct_single(source, results, order), as_json, results.paths)
 
 
-def _require_sense(settings: ReconstructSettings) -> None:
+def _check_settings(settings: ReconstructSettings) -> None:
     """Refuse settings that no capture could make sense of, before any is read."""
-    from apps.nlos.methods import QUICKEST_FIRST, built, names_in, require_taken
-    from apps.nlos.refining import require_refinable
+    from apps.nlos.methods import (
+        METHODS_BY_SPEED,
+        build_method,
+        parse_method_names,
+        require_used_settings,
+    )
+    from apps.nlos.refining import require_valid_refinement
     from tofclip.errors import InputError
 
     if not 0 <= settings.point_fraction <= 1:
-        raise InputError(f"point_fraction is a share between 0 and 1, got {settings.point_fraction}")
-    names = QUICKEST_FIRST if settings.method is None else names_in(settings.method)
+        raise InputError(
+            f"point_fraction is a share between 0 and 1, got {settings.point_fraction}"
+        )
+    names = METHODS_BY_SPEED if settings.method is None else parse_method_names(settings.method)
     if settings.method is not None and len(names) > 1:
-        raise InputError(f"one method is asked for, got '{settings.method}'; nlos compare takes several")
-    require_refinable(settings, settings.method)
-    require_taken(settings, names)
+        raise InputError(
+            f"one method is asked for, got '{settings.method}'; nlos compare takes several"
+        )
+    require_valid_refinement(settings, settings.method)
+    require_used_settings(settings, names)
     for name in names:
-        built(name, settings if settings.wavelength_mm is not None else replace(settings, wavelength_mm=1.0))
+        build_method(
+            name,
+            settings
+            if settings.wavelength_mm is not None
+            else replace(settings, wavelength_mm=1.0),
+        )
 
 
-def _reconstructed(source: Path, results: Results, order: _Order) -> dict[str, Any]:
+def _reconstruct_single(
+    source: Path, results: ResultFiles, order: _ImagingRequest
+) -> dict[str, Any]:
     """Image one capture, write its results, and return the figures."""
-    from apps.nlos.files import with_history, write_volume
-    from apps.nlos.imaging import prepared, warnings_in_a_line
-    from apps.nlos.methods import place_for
-    from apps.settings import plain, save
+    from apps.nlos.files import add_provenance, write_volume
+    from apps.nlos.imaging import preprocess_capture, warnings_to_stderr
+    from apps.nlos.methods import choose_device
+    from apps.settings import save_settings, settings_to_dict
     from nlos.io import read_capture
-    from tofclip.arrays import Place
+    from tofclip.arrays import ComputeDevice
 
-    place = place_for(order.device, order.settings)
-    capture = prepared(read_capture(source), order.settings)
+    device = choose_device(order.device, order.settings)
+    capture = preprocess_capture(read_capture(source), order.settings)
     started = time.perf_counter()
-    with warnings_in_a_line():
-        found, volume = _imaged(capture.on(place), order.settings)
-    volume = volume.on(Place())
+    with warnings_to_stderr():
+        found, volume = _image_capture(capture.on(device), order.settings)
+    volume = volume.on(ComputeDevice())
     seconds, imaging = time.perf_counter() - started, volume.provenance["imaging"]
-    volume = with_history(volume, source, {"verb": "nlos reconstruct", "device": str(place), **plain(found)})
+    volume = add_provenance(
+        volume,
+        source,
+        {"verb": "nlos reconstruct", "device": str(device), **settings_to_dict(found)},
+    )
     for path in results.volumes:
         write_volume(volume, path, found.point_fraction)
     if results.picture is not None:
         volume.save_picture(results.picture)
-    save(found, results.settings, HEADING)
+    save_settings(found, results.settings, SETTINGS_HEADING)
     return {
         "method": found.method,
-        "device": str(place),
-        **({"refine": found.refine, **{name: imaging[name] for name in STOPPED}} if found.refine else {}),
+        "device": str(device),
+        **(
+            {"refine": found.refine, **{name: imaging[name] for name in STOP_KEYS}}
+            if found.refine
+            else {}
+        ),
         "wavelength_mm": found.wavelength_mm,
         "voxel_mm": found.voxel_mm,
         "voxels": volume.grid.shape,
         "wall_points": len(capture.points),
         "seconds": seconds,
         "voxels_per_second": volume.grid.size / seconds,
-        "peak_m": dict(zip("xyz", volume.brightest(), strict=True)),
+        "peak_m": dict(zip("xyz", volume.find_brightest(), strict=True)),
     }
 
 
-def _imaged(capture: Capture, wanted: ReconstructSettings) -> tuple[ReconstructSettings, Volume]:
+def _image_capture(
+    capture: Capture, wanted: ReconstructSettings
+) -> tuple[ReconstructSettings, Volume]:
     """Find what is not told, and image the capture."""
-    from apps.nlos.imaging import box_of, boxed, imaged, scales_of
-    from apps.nlos.methods import built, quickest, spelt_out
-    from apps.nlos.refining import REFINED, refined
+    from apps.nlos.imaging import choose_grid, fill_box, find_scales, image_capture
+    from apps.nlos.methods import build_method, choose_quickest_method, fill_in_defaults
+    from apps.nlos.refining import REFINED_METHOD, build_refinement
     from tofclip.units import MILLIMETRE
 
-    scales = scales_of(wanted, capture)
+    scales = find_scales(wanted, capture)
     found = replace(wanted, **scales._asdict())
-    method = REFINED if found.refine else found.method
+    method = REFINED_METHOD if found.refine else found.method
     if method is None:
-        method = quickest(found, capture, box_of(found, capture, scales.voxel_mm * MILLIMETRE)[1])
-    found = replace(spelt_out(found, [method]), method=method)
-    found, grid = boxed(found, capture)
+        method = choose_quickest_method(
+            found, capture, fill_box(found, capture, scales.voxel_mm * MILLIMETRE)[1]
+        )
+    found = replace(fill_in_defaults(found, [method]), method=method)
+    found, grid = choose_grid(found, capture)
     if not found.refine:
-        return found, imaged("imaging", built(method, found), capture, grid)
-    found, refinement = refined(found, grid)
-    return found, imaged("refining", refinement, capture, grid)
+        return found, image_capture("imaging", build_method(method, found), capture, grid)
+    found, refinement = build_refinement(found, grid)
+    return found, image_capture("refining", refinement, capture, grid)
 
 
 def _reconstruct_folder(
-    source: Path, out: Path, order: _Order, suffixes: Sequence[str], how: tuple[str | None, bool]
+    source: Path,
+    out: Path,
+    order: _ImagingRequest,
+    suffixes: Sequence[str],
+    how: tuple[str | None, bool],
 ) -> None:
     """Image every capture of a folder whose results are not there yet."""
     from apps.files import make_folder
-    from apps.nlos.files import captures_in, require_apart
+    from apps.nlos.files import list_captures, require_separate_folder
     from apps.report import report
-    from apps.sequences import run_all
-    from tofclip.sequences.jobs import run
+    from apps.sequences import run_with_progress
+    from tofclip.sequences.jobs import run_jobs
 
     cluster, as_json = how
     _require_formats(suffixes)
-    require_apart(source, out)
-    sources = captures_in(source)
+    require_separate_folder(source, out)
+    sources = list_captures(source)
     make_folder(out)
-    _keep_to(out / FOLDER_SETTINGS, order.settings)
-    jobs, skipped = _jobs(sources, out, order, suffixes)
+    _check_folder_settings(out / FOLDER_SETTINGS_NAME, order.settings)
+    jobs, skipped = _plan_jobs(sources, out, order, suffixes)
     imaged: list[dict[str, Any]] = []
 
     def note(report: Report) -> None:
@@ -212,39 +262,52 @@ def _reconstruct_folder(
             imaged.append({"capture": report.name, **report.figures})
 
     # Here every capture has a bar of its own; on a cluster there is one for all.
-    summary = run(jobs, None, note) if cluster is None else run_all("imaging", jobs, cluster, note)
+    summary = (
+        run_jobs(jobs, None, note)
+        if cluster is None
+        else run_with_progress("imaging", jobs, cluster, note)
+    )
     imaged.sort(key=lambda one: str(one["capture"]))
     failed = {failure.name: failure.problem for failure in summary.failures}
     for name, reason in failed.items():
         print(f"tofclip: failed: {name}: {reason}", file=sys.stderr)
-    counts = {"captures": len(sources), "imaged": summary.done, "skipped": len(skipped), "failed": len(failed)}
+    counts = {
+        "captures": len(sources),
+        "imaged": summary.done,
+        "skipped": len(skipped),
+        "failed": len(failed),
+    }
     lists = {"imaged": imaged, "skipped": skipped, "failed": failed} if as_json else {}
     report({**counts, **lists}, as_json, [out])
     if failed:
-        raise typer.Exit(SOME_FAILED)
+        raise typer.Exit(EXIT_SOME_FAILED)
 
 
-def _jobs(sources: Sequence[Path], out: Path, order: _Order, suffixes: Sequence[str]) -> tuple[list[Job], list[str]]:
+def _plan_jobs(
+    sources: Sequence[Path], out: Path, order: _ImagingRequest, suffixes: Sequence[str]
+) -> tuple[list[Job], list[str]]:
     """Return one job for each capture without results, and the names of the others."""
     from tofclip.sequences.jobs import Job
 
     jobs, skipped = [], []
     for path in sources:
-        results = _results_in(out.resolve(), path.stem, suffixes)
-        if results.up_to_date(path):
+        results = _name_results(out.resolve(), path.stem, suffixes)
+        if results.is_up_to_date(path):
             skipped.append(path.name)
             continue
-        results.settings.unlink(missing_ok=True)  # it says that results are whole, and these are of an older capture
-        work = partial(_imaged_of_many, path.resolve(), results, order)
-        jobs.append(Job(path.name, results.settings, work, tuple(results.all[:-1])))
+        results.settings.unlink(
+            missing_ok=True
+        )  # it says that results are whole, and these are of an older capture
+        work = partial(_run_job, path.resolve(), results, order)
+        jobs.append(Job(path.name, results.settings, work, tuple(results.paths[:-1])))
     return jobs, skipped
 
 
-def _imaged_of_many(source: Path, results: Results, order: _Order) -> dict[str, Any]:
+def _run_job(source: Path, results: ResultFiles, order: _ImagingRequest) -> dict[str, Any]:
     """Image one capture, here or on a worker, and tell a person which one it is."""
     if sys.stderr.isatty() and threading.current_thread() is threading.main_thread():
         print(source.name, file=sys.stderr)
-    return _reconstructed(source, results, order)
+    return _reconstruct_single(source, results, order)
 
 
 def _require_formats(suffixes: Sequence[str]) -> None:
@@ -253,25 +316,30 @@ def _require_formats(suffixes: Sequence[str]) -> None:
 
     for suffix in suffixes:
         if suffix not in VOLUME_SUFFIXES:
-            raise InputError(f"no format of volumes is called '{suffix}'; use one of {', '.join(VOLUME_SUFFIXES)}")
+            raise InputError(
+                f"no format of volumes is called '{suffix}'; use one of {', '.join(VOLUME_SUFFIXES)}"
+            )
 
 
-def _results_in(folder: Path, stem: str, suffixes: Sequence[str]) -> Results:
-    from apps.nlos.files import Results
+def _name_results(folder: Path, stem: str, suffixes: Sequence[str]) -> ResultFiles:
+    from apps.nlos.files import ResultFiles
 
     volumes = [folder / f"{stem}{suffix}" for suffix in suffixes]
-    return Results(volumes, folder / f"{stem}.png", folder / f"{stem}{SETTINGS_SUFFIX}")
+    return ResultFiles(volumes, folder / f"{stem}.png", folder / f"{stem}{SETTINGS_SUFFIX}")
 
 
-def _keep_to(file: Path, wanted: ReconstructSettings) -> None:
+def _check_folder_settings(file: Path, wanted: ReconstructSettings) -> None:
     """Refuse to mix results of different settings in one folder."""
-    from apps.settings import plain, save, told
+    from apps.settings import load_settings, save_settings, settings_to_dict
     from tofclip.errors import InputError
 
     if not file.exists():
-        save(wanted, file, "tofclip nlos reconstruct FOLDER --settings THIS --out RESULTS")
+        save_settings(wanted, file, "tofclip nlos reconstruct FOLDER --settings THIS --out RESULTS")
         return
-    before, now = plain(told(ReconstructSettings, file, {})), plain(wanted)
+    before, now = (
+        settings_to_dict(load_settings(ReconstructSettings, file, {})),
+        settings_to_dict(wanted),
+    )
     for name in sorted(before.keys() | now.keys()):
         if before.get(name) != now.get(name):
             raise InputError(

@@ -10,41 +10,43 @@ from typing import Annotated, Any
 import typer
 
 from apps.nlos.scene import SceneSettings
-from apps.options import AsJson
-from apps.settings import SettingsFile, takes
+from apps.options import JsonOption
+from apps.settings import SettingsOption, add_setting_flags
 
-HEADING = "tofclip nlos simulate --settings THIS --out CAPTURE"
+SETTINGS_HEADING = "tofclip nlos simulate --settings THIS --out CAPTURE"
 
 
-@takes(SceneSettings)
+@add_setting_flags(SceneSettings)
 def simulate(
     out: Annotated[Path, typer.Option(metavar="H5", help="The capture to write.")],
-    settings: SettingsFile = None,
-    as_json: AsJson = False,
+    settings: SettingsOption = None,
+    as_json: JsonOption = False,
     **flags: Any,
 ) -> None:
     """Simulate the capture of a known hidden scene before a relay wall.
 
-    Letters and meshes hide what is behind them; light that meets several surfaces is left out. The capture carries the
-    truth, for nlos compare. The settings are written beside it (.toml).
+    Letters and meshes hide what is behind them; light that meets several surfaces is left out. The
+    capture carries the truth, for nlos compare. The settings are written beside it (.toml).
 
     Example: tofclip nlos simulate --letters T --wall cylinder --wall-points 32 --out capture.h5
     """
-    from apps.files import RECORD_SUFFIXES, history, require_writable
-    from apps.nlos.scene import simulated
+    from apps.files import RECORD_SUFFIXES, build_provenance, require_writable
+    from apps.nlos.scene import simulate_scene
     from apps.report import report
-    from apps.settings import plain, save, told
+    from apps.settings import load_settings, save_settings, settings_to_dict
 
-    chosen = told(SceneSettings, settings, flags)
+    chosen = load_settings(SceneSettings, settings, flags)
     inputs = [path for path in (settings, chosen.mesh and Path(chosen.mesh)) if path]
     beside = out.with_suffix(".toml")
     require_writable(out, *RECORD_SUFFIXES, inputs=tuple(inputs))
     require_writable(beside, inputs=tuple(inputs))
     started = time.perf_counter()
-    capture, truth = simulated(chosen)
-    past = history({"verb": "nlos simulate", **plain(chosen)}, *inputs, earlier=capture.provenance)
-    truth.record_with(replace(capture, provenance=past)).save(out)
-    save(chosen, beside, HEADING)
+    capture, truth = simulate_scene(chosen)
+    past = build_provenance(
+        {"verb": "nlos simulate", **settings_to_dict(chosen)}, *inputs, earlier=capture.provenance
+    )
+    truth.attach_to_record(replace(capture, provenance=past)).save(out)
+    save_settings(chosen, beside, SETTINGS_HEADING)
     figures = {
         "wall_points": len(capture.points),
         "bins": capture.axis.bins,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apps.studies.complexity import iteration_costs
+from apps.studies.complexity import measure_iteration_costs
 from tofclip.light_field import LightField
 
 
@@ -13,7 +13,9 @@ from tofclip.light_field import LightField
 def costs() -> list:
     views = np.array([(v, u) for v in range(-2, 2) for u in range(-2, 2)], np.float64)
     pictures = np.random.default_rng(0).random((16, 64, 64)).astype(np.float32)
-    return iteration_costs(LightField(pictures, views), -0.3, exposures=4, sampling_ratio=0.5, repeats=5)
+    return measure_iteration_costs(
+        LightField(pictures, views), -0.3, exposures=4, sampling_ratio=0.5, repeats=5
+    )
 
 
 def test_every_method_of_the_table_is_there(costs):
@@ -23,11 +25,22 @@ def test_every_method_of_the_table_is_there(costs):
 
 def test_readings_and_unknowns_are_those_of_the_paper(costs):
     """r N^2, N^2 and m readings; n_a^2 N^2 unknowns of a light field, N^2 of a picture."""
-    assert [cost.readings for cost in costs] == [4 * 4096, 4 * 4096, 4096, 4096, 2048, 2048, 2048, 2048]
+    assert [cost.measurements for cost in costs] == [
+        4 * 4096,
+        4 * 4096,
+        4096,
+        4096,
+        2048,
+        2048,
+        2048,
+        2048,
+    ]
     assert [cost.unknowns for cost in costs] == [16 * 4096] * 6 + [4096] * 2
 
 
 def test_refocusing_one_picture_is_cheaper_than_recovering_the_light_field(costs):
-    """By the prior alone 16 times less work; three times leaves room for everything else on a busy machine."""
+    """By the prior alone 16 times less work; three times leaves room for everything else on a busy
+    machine.
+    """
     assert costs[6].seconds < costs[4].seconds / 3
     assert all(0 < cost.model_seconds < 1 and 0 < cost.seconds < 1 for cost in costs)

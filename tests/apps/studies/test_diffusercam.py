@@ -7,7 +7,7 @@ import pytest
 
 from apps.studies.diffusercam import (
     DiffuserRecording,
-    diffuser_model,
+    build_diffuser_model,
     read_diffuser_recording,
     recover_diffuser_scene,
 )
@@ -25,7 +25,9 @@ def recoveries(hand) -> list:
 
 
 def test_the_hand_explains_the_readings(recoveries):
-    """Acceptance: a relative residual below 1 % from the full and from two and three times fewer pixels an axis."""
+    """Acceptance: a relative residual below 1 % from the full and from two and three times fewer
+    pixels an axis.
+    """
     assert [recovery.relative_residual < 0.01 for recovery in recoveries] == [True] * 3
 
 
@@ -42,8 +44,11 @@ def test_the_hand_lies_where_it_is_and_is_the_same_from_fewer_pixels(recoveries)
 
 def test_a_mirrored_point_spread_explains_it_much_worse(hand, recoveries):
     """The residual can tell a wrong model: this is the control for the figure above."""
-    mirrored = DiffuserRecording(hand.point_spread[:, ::-1], hand.readings)
-    assert recover_diffuser_scene(mirrored, 3, 100).relative_residual > 3 * recoveries[2].relative_residual
+    mirrored = DiffuserRecording(hand.point_spread[:, ::-1], hand.measurements)
+    assert (
+        recover_diffuser_scene(mirrored, 3, 100).relative_residual
+        > 3 * recoveries[2].relative_residual
+    )
 
 
 @pytest.mark.parametrize("pitch", [1, 2])
@@ -53,10 +58,13 @@ def test_a_known_scene_comes_back(pitch):
     blank = DiffuserRecording(spread, np.ones((20, 24)))
     scene = np.zeros((40, 48))
     scene[20, 24], scene[14, 9] = 1.0, 0.6
-    readings = diffuser_model(blank, 1)(scene).reshape(20, 24).astype(np.float64)
-    recovery = recover_diffuser_scene(DiffuserRecording(spread, readings), pitch, 1000)
+    measurements = build_diffuser_model(blank, 1)(scene).reshape(20, 24).astype(np.float64)
+    recovery = recover_diffuser_scene(DiffuserRecording(spread, measurements), pitch, 1000)
     brightest = np.argsort(recovery.scene, axis=None)[-2:]
-    assert {tuple(int(n) for n in np.unravel_index(k, scene.shape)) for k in brightest} == {(20, 24), (14, 9)}
+    assert {tuple(int(n) for n in np.unravel_index(k, scene.shape)) for k in brightest} == {
+        (20, 24),
+        (14, 9),
+    }
     assert recovery.relative_residual < 0.02
     assert recovery.iterations == 1000
 

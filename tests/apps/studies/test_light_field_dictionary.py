@@ -34,11 +34,15 @@ def scene(seed: int) -> LightField:
 
 def test_a_light_field_comes_back_from_one_exposure(monkeypatch):
     pytest.importorskip("sklearn")
-    monkeypatch.setattr("apps.studies.light_field_dictionary.TRAINING_PATCHES", 500)  # a quarter of the time
+    monkeypatch.setattr(
+        "apps.studies.light_field_dictionary.TRAINING_PATCHES", 500
+    )  # a quarter of the time
     dictionary = learn_dictionary([scene(1), scene(2)], patch_px=6, atoms=48, seed=0)
     assert dictionary.atoms.shape == (48, 9, 6, 6)
     assert dictionary.patch_px == 6
-    np.testing.assert_allclose(np.linalg.norm(dictionary.atoms.reshape(48, -1), axis=1), 1, rtol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(dictionary.atoms.reshape(48, -1), axis=1), 1, rtol=1e-5
+    )
     true, camera = scene(3), MarwahCamera(SHAPE, VIEWS, 1, 0)
     exposure = camera.light_field_model()(true.pictures).reshape(SHAPE)
     found = recover_with_dictionary(exposure, camera.codes(), dictionary)
@@ -50,14 +54,18 @@ def test_a_light_field_comes_back_from_one_exposure(monkeypatch):
 
 
 def test_a_patch_made_of_few_atoms_is_found():
-    """Two of twenty random atoms and brightness: the exposure's 64 pixels tell which, the weight takes its toll."""
+    """Two of twenty random atoms and brightness: the exposure's 64 pixels tell which, the weight
+    takes its toll.
+    """
     random = np.random.default_rng(0)
     atoms = random.standard_normal((20, 9, 8, 8)).astype(np.float32)
     atoms[0] = 1
     atoms /= np.linalg.norm(atoms.reshape(20, -1), axis=1)[:, None, None, None]
     true = 30 * atoms[0] + 5 * atoms[7] - 4 * atoms[12]
     codes = MarwahCamera((8, 8), VIEWS, 1, 1).codes()
-    found = recover_with_dictionary((codes * true).sum(axis=0), codes, LightFieldDictionary(atoms), 1e-4, 2000)
+    found = recover_with_dictionary(
+        (codes * true).sum(axis=0), codes, LightFieldDictionary(atoms), 1e-4, 2000
+    )
     np.testing.assert_allclose(found, true, atol=0.02 * np.abs(true).max())
 
 

@@ -1,22 +1,27 @@
-"""The studies of the paper on small scenes: their numbers are those of independent measurements and recoveries."""
+"""The studies of the paper on small scenes: their numbers are those of independent measurements and
+recoveries.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from apps.studies import dealing_table, light_field_processing, shiny_bodies, whole_light_fields
-from apps.studies.cases import BORDER_PX, Case, measured, solve
+from apps.studies import angle_assignment as dealing_table
+from apps.studies import glossy_plate as shiny_bodies
+from apps.studies import light_field_processing
+from apps.studies import light_field_recovery as whole_light_fields
+from apps.studies.cases import BORDER_PX, Case, measure_case, solve_cases
 from apps.studies.library import Library
-from apps.studies.light_field_processing import share_of_right_depths
+from apps.studies.light_field_processing import compute_depth_accuracy
 from apps.studies.outcome import Row
-from apps.studies.registry import STUDIES, studies_called
+from apps.studies.registry import STUDIES, find_studies
 from tofclip.errors import InputError
-from tofclip.light_field.measurement import Setup, measure
+from tofclip.light_field.measurement import CameraSetup, measure
 from tofclip.metrics import nmse
 from tofclip.recovery.light_field import ClipRecovery
 from tofclip.simulate.light_fields import CameraArray
-from tofclip.solvers.hold_out import Choice
+from tofclip.solvers.cross_validation import WeightChoice
 
 ARRAY = CameraArray((40, 40), 4, focal_length_px=50.0, view_step=0.04, samples=1)
 
@@ -29,10 +34,12 @@ def library() -> Library:
 def test_a_solved_case_is_what_measuring_and_recovering_by_hand_gives(library):
     case = Case(("a",), "letters", "line", 1.0, -0.4, 2.5)
     steps: list[int] = []
-    (solved,) = solve([case], library, 2, steps.append)
+    (solved,) = solve_cases([case], library, 2, steps.append)
     light_field = library.light_field("letters")
-    by_hand = ClipRecovery().recover(measure(light_field, Setup("line", 1.0, 0)), -0.4)
-    again = ClipRecovery(weight=by_hand.weight).recover(measure(light_field, Setup("line", 1.0, 1)), -0.4)
+    by_hand = ClipRecovery().recover(measure(light_field, CameraSetup("line", 1.0, 0)), -0.4)
+    again = ClipRecovery(weight=by_hand.weight).recover(
+        measure(light_field, CameraSetup("line", 1.0, 1)), -0.4
+    )
     truth = light_field.refocus(-0.4)
     expected = [100 * nmse(one.picture, truth, BORDER_PX) for one in (by_hand, again)]
     np.testing.assert_allclose(solved.percent, expected, rtol=1e-3)
@@ -40,9 +47,12 @@ def test_a_solved_case_is_what_measuring_and_recovering_by_hand_gives(library):
 
 
 def test_white_noise_is_as_strong_as_asked(library):
-    quiet, noisy = (measured(Case((), "letters", "line", 2.0, 0.0, white_noise=n), library, 0) for n in (0.0, 0.1))
+    quiet, noisy = (
+        measure_case(Case((), "letters", "line", 2.0, 0.0, white_noise=n), library, 0)
+        for n in (0.0, 0.1)
+    )
     # 80 x 40 readings: the standard deviation of a standard deviation is 1.3 %
-    deviation = np.std(noisy.readings - quiet.readings) / np.std(quiet.readings)
+    deviation = np.std(noisy.measurements - quiet.measurements) / np.std(quiet.measurements)
     assert deviation == pytest.approx(0.1, rel=0.06)
 
 
@@ -60,7 +70,9 @@ def test_scenes_are_rendered_once_and_variants_differ(library):
     )
     assert (len(whole.pictures), len(middle.pictures)) == (16, 16)
     assert middle.views.min() == -2
-    assert not np.array_equal(library.light_field("blocks:flip").pictures, library.light_field("blocks").pictures)
+    assert not np.array_equal(
+        library.light_field("blocks:flip").pictures, library.light_field("blocks").pictures
+    )
     with pytest.raises(InputError, match="--data"):
         library.light_field("data:render_letters")
 
@@ -79,7 +91,7 @@ def test_recorded_light_fields_join_where_their_folder_is_given(shared_data):
 
 
 def test_the_hand_needs_its_recording_and_explains_it(library, shared_data):
-    (study,) = studies_called("fig4d")
+    (study,) = find_studies("fig4d")
     with pytest.raises(InputError, match="--data"):
         study.work(library, 1, lambda _: None)
     steps: list[int] = []
@@ -90,43 +102,51 @@ def test_the_hand_needs_its_recording_and_explains_it(library, shared_data):
 
 
 def test_every_study_can_be_called_by_its_tables_and_figures_names():
-    names = [name for study in STUDIES for name in (study.name, *study.also)]
+    names = [name for study in STUDIES for name in (study.name, *study.aliases)]
     assert len(names) == len(set(names))
-    wanted = [f"table{n}" for n in range(1, 11)] + [f"fig{n}" for n in (*range(4, 14), *range(15, 19))]
+    wanted = [f"table{n}" for n in range(1, 11)] + [
+        f"fig{n}" for n in (*range(4, 14), *range(15, 19))
+    ]
     assert set(wanted) <= set(names)
-    assert studies_called("fig16") == studies_called("table8")
-    assert studies_called("all") == STUDIES
+    assert find_studies("fig16") == find_studies("table8")
+    assert find_studies("all") == STUDIES
     with pytest.raises(InputError, match="table2"):
-        studies_called("table99")
+        find_studies("table99")
 
 
 def test_depth_and_viewpoints_of_true_light_fields_are_scored(monkeypatch):
     monkeypatch.setattr(light_field_processing, "SCENES", ("letters", "blocks"))
     fine = Library(array=CameraArray((64, 64), 8, focal_length_px=80.0, view_step=0.025))
     steps: list[int] = []
-    outcome = light_field_processing.light_field_processing(fine, 1, steps.append)
+    outcome = light_field_processing.run_light_field_processing(fine, 1, steps.append)
     figures = {row.labels: row.mean for row in outcome.rows}
     assert sum(steps) == 2
     assert figures["letters", "right plane, % of textured pixels"] >= 95
-    synthesised, kept = "viewpoint between the views, NMSE in %", "reference view in its place, NMSE in %"
-    assert all(figures[scene, synthesised] < 0.7 * figures[scene, kept] for scene in ("letters", "blocks"))
+    synthesised, kept = (
+        "viewpoint between the views, NMSE in %",
+        "reference view in its place, NMSE in %",
+    )
+    assert all(
+        figures[scene, synthesised] < 0.7 * figures[scene, kept] for scene in ("letters", "blocks")
+    )
 
 
 def test_a_map_of_depths_that_is_wrong_scores_as_wrong():
     true = np.zeros((30, 30))
     true[:, 15:] = 1
     picture = np.random.default_rng(0).random((30, 30))
-    assert share_of_right_depths(true, true, picture, 0.2) == 1
-    assert share_of_right_depths(true + 0.5, true, picture, 0.2) == 0
-    assert 0.3 < share_of_right_depths(np.zeros((30, 30)), true, picture, 0.2) < 0.8
+    assert compute_depth_accuracy(true, true, picture, 0.2) == 1
+    assert compute_depth_accuracy(true + 0.5, true, picture, 0.2) == 0
+    assert 0.3 < compute_depth_accuracy(np.zeros((30, 30)), true, picture, 0.2) < 0.8
 
 
 @pytest.mark.parametrize("name", ["table6", "table7"])
 def test_tables_have_a_row_for_each_case_and_count_their_steps(library, name, monkeypatch):
-    # rows and steps are at stake here; the search for weights has tests of its own and takes most of the time
-    found = Choice(2e-2, np.array([2e-2]), np.array([1.0]))
+    # rows and steps are at stake here; the search for weights has tests of its own and takes most
+    # of the time
+    found = WeightChoice(2e-2, np.array([2e-2]), np.array([1.0]))
     monkeypatch.setattr("tofclip.recovery.light_field.choose_weight", lambda *_: found)
-    (study,) = studies_called(name)
+    (study,) = find_studies(name)
     steps: list[int] = []
     outcome = study.work(library, 1, steps.append)
     assert sum(steps) == study.steps
@@ -141,15 +161,19 @@ def test_tables_have_a_row_for_each_case_and_count_their_steps(library, name, mo
 def test_a_light_field_recovered_from_many_readings_is_near_the_true_one(library):
     """As many readings as unknowns would be SR 16; at 8 total variation has little to fill in."""
     case = Case((), "letters", "line", 8.0, 0.0)
-    found = whole_light_fields.recovered_light_field(case, library, 0)
+    found = whole_light_fields.recover_light_field(case, library, 0)
     truth = library.light_field("letters")
     np.testing.assert_array_equal(found.views, truth.views)
     assert nmse(found.pictures, truth.pictures, BORDER_PX) < 0.1
 
 
 def test_a_glossy_plate_is_uneven_but_keeps_its_place():
-    """84 % was measured for both, at full size: wider baselines for the picture's size spoil the recovery itself."""
-    outcome = shiny_bodies.shiny_bodies(Library(array=CameraArray(samples=1)), 1, lambda _: None)
+    """84 % was measured for both, at full size: wider baselines for the picture's size spoil the
+    recovery itself.
+    """
+    outcome = shiny_bodies.run_glossy_plate(
+        Library(array=CameraArray(samples=1)), 1, lambda _: None
+    )
     figures = {row.labels: row.mean for row in outcome.rows}
     uneven, right = "unevenness over the views, %", "right plane, % of textured pixels"
     assert figures["glossy", uneven] > 1.5 * figures["matt", uneven]
@@ -159,5 +183,5 @@ def test_a_glossy_plate_is_uneven_but_keeps_its_place():
 
 def test_dealing_takes_recorded_scenes_only_where_there_are_any(library, monkeypatch):
     monkeypatch.setattr(dealing_table, "RATIOS", (1.0,))
-    outcome = dealing_table.dealing_table(library, 1, lambda _: None)
+    outcome = dealing_table.run_angle_assignment(library, 1, lambda _: None)
     assert {row.labels[0] for row in outcome.rows} == {"letters", "blocks"}

@@ -1,14 +1,14 @@
 """How a camera's numbers are found: from pictures of a point source, and from the shot itself."""
 
-from tofclip.camera.calibration.focus_pictures import FocusCalibration, calibrate
+from tofclip.camera.calibration.focus_pictures import FocusCalibration, calibrate_views
 from tofclip.camera.calibration.parallax import (
     Parallax,
-    parallax_from_centres,
-    parallax_from_shears,
-    sharpest_shears,
-    sharpness,
+    find_sharpest_shears,
+    fit_parallax_to_centres,
+    fit_parallax_to_shears,
+    measure_sharpness,
 )
-from tofclip.camera.calibration.registration import Registration, register
+from tofclip.camera.calibration.registration import Registration, register_views
 from tofclip.camera.calibration.skew import SkewEstimate, estimate_skew
 
 __all__ = [
@@ -16,11 +16,11 @@ __all__ = [
     "Parallax",
     "Registration",
     "SkewEstimate",
-    "calibrate",
+    "calibrate_views",
     "estimate_skew",
-    "parallax_from_centres",
-    "parallax_from_shears",
-    "register",
-    "sharpest_shears",
-    "sharpness",
+    "find_sharpest_shears",
+    "fit_parallax_to_centres",
+    "fit_parallax_to_shears",
+    "measure_sharpness",
+    "register_views",
 ]

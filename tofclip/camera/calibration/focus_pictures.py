@@ -1,7 +1,9 @@
-"""Slit centres and line angles from pictures of a point source, taken with the sweep standing still (focus mode).
+"""Slit centres and line angles from pictures of a point source, taken with the sweep standing still
+(focus mode).
 
-With the slit open the source makes one bright line for each cylindrical lenslet: its angle is the view's. With the
-slit closed only the crossing of line and slit remains: its column is the view's centre.
+With the slit open the source makes one bright line for each cylindrical lenslet: its angle is the
+view's. With the slit closed only the crossing of line and slit remains: its column is the view's
+centre.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ FloatArray = NDArray[np.float64]
 DOT_HALF_WIDTH_PX = 14  # the core of a dot; aberrated tails beyond it would pull the centre
 SLIT_HALF_HEIGHT_PX = 6
 LINE_THRESHOLD = 0.15  # of the line's brightness at the slit
-LINE_SEGMENTS = 12  # pieces whose scatter about the line tells how straight it is
-FAINTEST_DOT = 8.0  # standard deviations of the picture's noise
+LINE_SEGMENT_COUNT = 12  # pieces whose scatter about the line tells how straight it is
+MIN_DOT_SNR = 8.0  # standard deviations of the picture's noise
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,8 @@ class FocusCalibration:
     Parameters
     ----------
     centres_px, angles : (views,) array
-        Slit columns (0-based) and angles from the vertical, rad, positive where the column grows with the row.
+        Slit columns (0-based) and angles from the vertical, rad, positive where the column grows
+        with the row.
     centre_uncertainty_px, angle_uncertainty : (views,) array
         One standard deviation.
     dot_rows_px : (views,) array
@@ -57,7 +60,8 @@ class FocusCalibration:
     dots: FloatArray
 
     def camera(self, **settings: Any) -> Camera:
-        """Make a `Camera`; the picture is as high as the longest line and as wide as the views' pitch.
+        """Make a `Camera`; the picture is as high as the longest line and as wide as the views'
+        pitch.
 
         Parameters
         ----------
@@ -65,7 +69,11 @@ class FocusCalibration:
             Further entries of `Camera`, such as ``time_zero`` or another ``image_shape``.
         """
         height = int((self.line_rows_px[:, 1] - self.line_rows_px[:, 0]).max()) // 2 * 2
-        width = int(np.median(np.diff(self.centres_px))) // 2 * 2 if self.centres_px.size > 1 else height
+        width = (
+            int(np.median(np.diff(self.centres_px))) // 2 * 2
+            if self.centres_px.size > 1
+            else height
+        )
         return Camera(
             **{
                 "centres_px": self.centres_px,
@@ -79,14 +87,19 @@ class FocusCalibration:
         )
 
 
-def calibrate(
-    line: ArrayLike, line_background: ArrayLike, dot: ArrayLike, dot_background: ArrayLike, views: int = 7
+def calibrate_views(
+    line: ArrayLike,
+    line_background: ArrayLike,
+    dot: ArrayLike,
+    dot_background: ArrayLike,
+    views: int = 7,
 ) -> FocusCalibration:
     """Find each view's slit centre and line angle.
 
-    A centre is the middle of a Gaussian fitted to the core of the dot's profile along the slit; its uncertainty comes
-    from the fit. An angle is that of the line's principal axis (total least squares weighted by brightness); its
-    uncertainty comes from the scatter of the line's segments about it, so that a bent line counts as an uncertain one.
+    A centre is the middle of a Gaussian fitted to the core of the dot's profile along the slit; its
+    uncertainty comes from the fit. An angle is that of the line's principal axis (total least
+    squares weighted by brightness); its uncertainty comes from the scatter of the line's segments
+    about it, so that a bent line counts as an uncertain one.
 
     Parameters
     ----------
@@ -104,7 +117,10 @@ def calibrate(
     CalibrationError
         Fewer dots than views stand out, or a dot lies on no line.
     """
-    signal, dots = _difference(line, line_background), _difference(dot, dot_background)
+    signal, dots = (
+        _subtract_background(line, line_background),
+        _subtract_background(dot, dot_background),
+    )
     if signal.shape != dots.shape:
         raise ShapeError("the dot pictures", f"{signal.shape} like the line pictures", dots.shape)
     slit_row, columns = _find_dots(dots, views)
@@ -113,11 +129,19 @@ def calibrate(
         np.array(values) for values in zip(*fits, strict=True)
     )
     return FocusCalibration(
-        centre, angle, centre_error, angle_error, row, np.stack([first, last], axis=1), crossing, signal, dots
+        centre,
+        angle,
+        centre_error,
+        angle_error,
+        row,
+        np.stack([first, last], axis=1),
+        crossing,
+        signal,
+        dots,
     )
 
 
-def _difference(picture: ArrayLike, background: ArrayLike) -> FloatArray:
+def _subtract_background(picture: ArrayLike, background: ArrayLike) -> FloatArray:
     a, b = np.asarray(picture, dtype=np.float64), np.asarray(background, dtype=np.float64)
     if a.ndim != 2 or a.shape != b.shape:
         raise ShapeError("a background picture", a.shape, b.shape)
@@ -134,10 +158,12 @@ def _find_dots(dots: FloatArray, views: int) -> tuple[int, NDArray[np.intp]]:
 
     clean = median_filter(dots, 3)  # single hot pixels survive no 3 x 3 median
     slit_row = int(gaussian_filter1d(clean.sum(axis=1), 2).argmax())
-    profile = gaussian_filter1d(_slit_band(clean, slit_row).sum(axis=0), 4)
+    profile = gaussian_filter1d(_crop_slit_band(clean, slit_row).sum(axis=0), 4)
     noise = 1.4826 * float(np.median(np.abs(profile - np.median(profile))))
     distance = max(1, dots.shape[1] // (2 * views + 1))
-    peaks, _ = find_peaks(profile, height=np.median(profile) + FAINTEST_DOT * noise, distance=distance)
+    peaks, _ = find_peaks(
+        profile, height=np.median(profile) + MIN_DOT_SNR * noise, distance=distance
+    )
     if peaks.size < views:
         raise CalibrationError(
             f"found {peaks.size} dots on the slit, expected {views}: check that the dot picture was taken with the "
@@ -147,19 +173,35 @@ def _find_dots(dots: FloatArray, views: int) -> tuple[int, NDArray[np.intp]]:
     return slit_row, np.sort(strongest)
 
 
-def _slit_band(picture: FloatArray, row: int) -> FloatArray:
+def _crop_slit_band(picture: FloatArray, row: int) -> FloatArray:
     return picture[max(0, row - SLIT_HALF_HEIGHT_PX) : row + SLIT_HALF_HEIGHT_PX + 1]
 
 
-def _fit_view(signal: FloatArray, dots: FloatArray, slit_row: int, column: int) -> tuple[float, ...]:
-    centre, centre_error = _fit_dot(_slit_band(dots, slit_row).sum(axis=0), column)
-    band = np.maximum(_slit_band(dots, slit_row)[:, column - DOT_HALF_WIDTH_PX : column + DOT_HALF_WIDTH_PX + 1], 0)
+def _fit_view(
+    signal: FloatArray, dots: FloatArray, slit_row: int, column: int
+) -> tuple[float, ...]:
+    centre, centre_error = _fit_dot(_crop_slit_band(dots, slit_row).sum(axis=0), column)
+    band = np.maximum(
+        _crop_slit_band(dots, slit_row)[
+            :, column - DOT_HALF_WIDTH_PX : column + DOT_HALF_WIDTH_PX + 1
+        ],
+        0,
+    )
     rows = np.arange(band.shape[0]) + max(0, slit_row - SLIT_HALF_HEIGHT_PX)
     dot_row = float(np.average(rows, weights=band.sum(axis=1)))
-    row, col, brightness = _line_pixels(signal, slit_row, column)
-    slope, crossing, slope_error = _principal_line(row - dot_row, col, brightness)
+    row, col, brightness = _find_line_pixels(signal, slit_row, column)
+    slope, crossing, slope_error = _fit_principal_line(row - dot_row, col, brightness)
     angle_error = slope_error / (1 + slope**2)
-    return centre, centre_error, dot_row, float(np.arctan(slope)), angle_error, crossing, row.min(), row.max()
+    return (
+        centre,
+        centre_error,
+        dot_row,
+        float(np.arctan(slope)),
+        angle_error,
+        crossing,
+        row.min(),
+        row.max(),
+    )
 
 
 def _fit_dot(profile: FloatArray, column: int) -> tuple[float, float]:
@@ -170,7 +212,9 @@ def _fit_dot(profile: FloatArray, column: int) -> tuple[float, float]:
     x = np.arange(first, min(profile.size, column + DOT_HALF_WIDTH_PX + 1), dtype=np.float64)
     y = profile[first : first + x.size]
 
-    def model(x: FloatArray, height: float, centre: float, width: float, floor: float) -> FloatArray:
+    def model(
+        x: FloatArray, height: float, centre: float, width: float, floor: float
+    ) -> FloatArray:
         value: FloatArray = height * np.exp(-((x - centre) ** 2) / (2 * width**2)) + floor
         return value
 
@@ -181,24 +225,34 @@ def _fit_dot(profile: FloatArray, column: int) -> tuple[float, float]:
     return float(best[1]), float(np.sqrt(covariance[1, 1]))
 
 
-def _line_pixels(signal: FloatArray, slit_row: int, column: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rows, columns and brightness of the connected bright region that crosses the slit at `column`."""
+def _find_line_pixels(
+    signal: FloatArray, slit_row: int, column: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rows, columns and brightness of the connected bright region that crosses the slit at
+    `column`.
+    """
     from scipy.ndimage import gaussian_filter, label
 
     smooth = gaussian_filter(signal, 1.5)
     near = smooth[max(0, slit_row - 5) : slit_row + 6, max(0, column - 6) : column + 7]
     if near.max() <= 0:
-        raise CalibrationError(f"no line crosses the slit near column {column}: is the line picture's slit open?")
+        raise CalibrationError(
+            f"no line crosses the slit near column {column}: is the line picture's slit open?"
+        )
     regions, _ = label(smooth > LINE_THRESHOLD * near.max())
     top, left = np.unravel_index(int(near.argmax()), near.shape)
     inside = regions == regions[max(0, slit_row - 5) + top, max(0, column - 6) + left]
     rows, columns = np.nonzero(inside)
-    if np.ptp(rows) < 2 * LINE_SEGMENTS:
-        raise CalibrationError(f"the line near column {column} is only {np.ptp(rows)} px long; no angle can be fitted")
+    if np.ptp(rows) < 2 * LINE_SEGMENT_COUNT:
+        raise CalibrationError(
+            f"the line near column {column} is only {np.ptp(rows)} px long; no angle can be fitted"
+        )
     return rows.astype(np.float64), columns.astype(np.float64), signal[rows, columns]
 
 
-def _principal_line(rows: FloatArray, columns: FloatArray, brightness: FloatArray) -> tuple[float, float, float]:
+def _fit_principal_line(
+    rows: FloatArray, columns: FloatArray, brightness: FloatArray
+) -> tuple[float, float, float]:
     """Slope (columns per row), column at row 0 and the slope's standard deviation."""
     weights = np.maximum(brightness, 0)
     points = np.stack([rows, columns])
@@ -208,11 +262,11 @@ def _principal_line(rows: FloatArray, columns: FloatArray, brightness: FloatArra
     slope = float(right / down)
     along = (points - middle[:, np.newaxis]).T @ axes[:, 1]
     across = (points - middle[:, np.newaxis]).T @ axes[:, 0]
-    cuts = np.quantile(along, np.linspace(0, 1, LINE_SEGMENTS + 1))
-    piece = np.clip(np.searchsorted(cuts, along, side="right") - 1, 0, LINE_SEGMENTS - 1)
-    total = np.bincount(piece, weights, LINE_SEGMENTS)
-    position = np.bincount(piece, weights * along, LINE_SEGMENTS) / total
-    deviation = np.bincount(piece, weights * across, LINE_SEGMENTS) / total
-    scatter = np.sqrt(np.sum(deviation**2) / (LINE_SEGMENTS - 2))
+    cuts = np.quantile(along, np.linspace(0, 1, LINE_SEGMENT_COUNT + 1))
+    piece = np.clip(np.searchsorted(cuts, along, side="right") - 1, 0, LINE_SEGMENT_COUNT - 1)
+    total = np.bincount(piece, weights, LINE_SEGMENT_COUNT)
+    position = np.bincount(piece, weights * along, LINE_SEGMENT_COUNT) / total
+    deviation = np.bincount(piece, weights * across, LINE_SEGMENT_COUNT) / total
+    scatter = np.sqrt(np.sum(deviation**2) / (LINE_SEGMENT_COUNT - 2))
     tilt_error = scatter / np.sqrt(np.sum((position - position.mean()) ** 2))
     return slope, float(middle[1] - slope * middle[0]), float(tilt_error * (1 + slope**2))

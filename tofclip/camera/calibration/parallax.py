@@ -1,7 +1,7 @@
 """How far the views move apart with range: lenslet pitch and focus distance.
 
-They come from shears, or slit centres, of targets at known distances; the shears from the shot itself, whose time gates
-are in focus where the views agree with one picture.
+They come from shears, or slit centres, of targets at known distances; the shears from the shot
+itself, whose time gates are in focus where the views agree with one picture.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofclip.camera import Camera, Measurement
 from tofclip.errors import CalibrationError, InputError, ShapeError
-from tofclip.solvers import Progress, Sparse, relative_residual, silent
+from tofclip.solvers import Progress, Sparse, ignore_progress, relative_residual
 
 FloatArray = NDArray[np.float64]
 
-LOOK = Sparse(weight=5e-3, iterations=30)
+GATE_METHOD = Sparse(weight=5e-3, iterations=30)
 """How a gate is recovered to see whether its views agree."""
 
 
@@ -30,26 +30,28 @@ class Parallax:
     ----------
     strength : float
         Focal length (px) times lenslet pitch (m), px m.
-    nearness : float
-        Inverse of the focus distance, 1/m; may come out slightly negative where the views are focused on infinity.
+    focus_dioptres : float
+        Inverse of the focus distance, 1/m; may come out slightly negative where the views are
+        focused on infinity.
     misfit_px : float
         Root mean square of what the fit leaves, pixels of shear, or of a slit centre.
     """
 
     strength: float
-    nearness: float
+    focus_dioptres: float
     misfit_px: float
 
-    def applied(self, camera: Camera) -> Camera:
+    def apply_to(self, camera: Camera) -> Camera:
         """Return `camera` with this parallax.
 
-        A negative strength (views numbered against the sense in which near objects move) turns the view positions
-        round, so that near objects have negative shear. A focus beyond infinity counts as infinity.
+        A negative strength (views numbered against the sense in which near objects move) turns the
+        view positions round, so that near objects have negative shear. A focus beyond infinity
+        counts as infinity.
         """
         return camera.replace(
             view_positions=camera.view_positions * np.sign(self.strength),
             lenslet_pitch=abs(self.strength) / camera.focal_length_px,
-            focus_distance=1 / self.nearness if self.nearness > 0 else np.inf,
+            focus_distance=1 / self.focus_dioptres if self.focus_dioptres > 0 else np.inf,
         )
 
 
@@ -64,7 +66,8 @@ class FocusCurve:
     shears : (gates,) array
         Where each is highest, between the shears tried.
     weight : (gates,) array
-        How surely: relative curvature at the maximum times the gate's light; 0 where the maximum lies at an end.
+        How surely: relative curvature at the maximum times the gate's light; 0 where the maximum
+        lies at an end.
     """
 
     agreement: FloatArray
@@ -72,7 +75,9 @@ class FocusCurve:
     weight: FloatArray
 
 
-def parallax_from_shears(shears: ArrayLike, distances: ArrayLike, weight: ArrayLike | None = None) -> Parallax:
+def fit_parallax_to_shears(
+    shears: ArrayLike, distances: ArrayLike, weight: ArrayLike | None = None
+) -> Parallax:
     """Fit s(d) to shears of surfaces at known distances.
 
     Parameters
@@ -101,7 +106,9 @@ def parallax_from_shears(shears: ArrayLike, distances: ArrayLike, weight: ArrayL
     return Parallax(float(strength), float(constant / strength), float(misfit))
 
 
-def parallax_from_centres(camera: Camera, centres_px: ArrayLike, distances: ArrayLike) -> Parallax:
+def fit_parallax_to_centres(
+    camera: Camera, centres_px: ArrayLike, distances: ArrayLike
+) -> Parallax:
     """Fit s(d) to the views' slit centres, measured with a target at known distances.
 
     Parameters
@@ -120,24 +127,25 @@ def parallax_from_centres(camera: Camera, centres_px: ArrayLike, distances: Arra
     moved = centres - camera.centres_px[:, np.newaxis]
     moved -= moved.mean(axis=0)  # all views together: the target was moved sideways
     shears = aside @ moved / np.sum(aside**2)
-    fitted = parallax_from_shears(shears, distances)
-    nearness = 1 / np.asarray(distances, dtype=np.float64) - fitted.nearness
+    fitted = fit_parallax_to_shears(shears, distances)
+    nearness = 1 / np.asarray(distances, dtype=np.float64) - fitted.focus_dioptres
     left = moved + fitted.strength * aside[:, np.newaxis] * nearness
     left -= left.mean(axis=1, keepdims=True)  # a view's own centre is not the parallax's concern
-    return Parallax(fitted.strength, fitted.nearness, float(np.sqrt(np.mean(left**2))))
+    return Parallax(fitted.strength, fitted.focus_dioptres, float(np.sqrt(np.mean(left**2))))
 
 
-def sharpest_shears(
+def find_sharpest_shears(
     measurement: Measurement,
     camera: Camera,
     gates: Sequence[slice],
     shears: ArrayLike,
-    progress: Progress = silent,
+    progress: Progress = ignore_progress,
 ) -> FocusCurve:
     """Recover every gate at every shear and see where the views agree best with one picture.
 
-    Wrongly sheared views contradict each other, and no nonnegative picture of few bright pixels explains them all. In
-    the depth-of-field arrangement, where little defocuses, that tells more than the pictures' sharpness.
+    Wrongly sheared views contradict each other, and no nonnegative picture of few bright pixels
+    explains them all. In the depth-of-field arrangement, where little defocuses, that tells more
+    than the pictures' sharpness.
 
     Parameters
     ----------
@@ -158,19 +166,23 @@ def sharpest_shears(
     for column, shear in enumerate(tried):
         operator = camera.operator(float(shear))
         for row, gate in enumerate(gates):
-            readings = np.ascontiguousarray(measurement.readings[:, gate])
-            good = np.ascontiguousarray(measurement.good[:, gate])
-            if operator.adjoint(readings * good).max() <= 0:
-                progress(LOOK.work(readings.shape[1]))  # dark
+            measurements = np.ascontiguousarray(measurement.measurements[:, gate])
+            valid = np.ascontiguousarray(measurement.valid[:, gate])
+            if operator.adjoint(measurements * valid).max() <= 0:
+                progress(GATE_METHOD.work(measurements.shape[1]))  # dark
                 continue
-            frames = LOOK.recover(operator, readings, good, progress).frames
-            table[row, column] = relative_residual(operator, frames, readings, good) ** -2
-    light = np.array([np.sum((measurement.readings * measurement.good)[:, gate].clip(0)) for gate in gates])
-    return _curve(table, tried, light)
+            frames = GATE_METHOD.recover(operator, measurements, valid, progress).frames
+            table[row, column] = relative_residual(operator, frames, measurements, valid) ** -2
+    light = np.array(
+        [np.sum((measurement.measurements * measurement.valid)[:, gate].clip(0)) for gate in gates]
+    )
+    return _fit_focus_curve(table, tried, light)
 
 
-def sharpness(frames: NDArray[np.float32]) -> float:
-    """Mean square over squared mean of the frames, weighted by their light; 1 for even pictures, 0 without light."""
+def measure_sharpness(frames: NDArray[np.float32]) -> float:
+    """Mean square over squared mean of the frames, weighted by their light; 1 for even pictures, 0
+    without light.
+    """
     flat = frames.reshape(frames.shape[0], -1)
     light = flat.sum(axis=1, dtype=np.float64)
     square = np.einsum("tp,tp->t", flat, flat, dtype=np.float64)
@@ -180,12 +192,14 @@ def sharpness(frames: NDArray[np.float32]) -> float:
     return float(np.average(square[lit] * flat.shape[1] / light[lit] ** 2, weights=light[lit]))
 
 
-def _curve(table: FloatArray, tried: FloatArray, light: FloatArray) -> FocusCurve:
+def _fit_focus_curve(table: FloatArray, tried: FloatArray, light: FloatArray) -> FocusCurve:
     """Vertex of the parabola through each maximum and its neighbours."""
     rows = np.arange(table.shape[0])
     best = table.argmax(axis=1)
     inner = best.clip(1, max(1, tried.size - 2))
-    left, centre, right = (table[rows, (inner + side).clip(0, tried.size - 1)] for side in (-1, 0, 1))
+    left, centre, right = (
+        table[rows, (inner + side).clip(0, tried.size - 1)] for side in (-1, 0, 1)
+    )
     bend = 2 * centre - left - right
     firm = (best == inner) & (bend > 0)
     beyond = np.divide((right - left) / 2, bend, out=np.zeros_like(centre), where=firm)

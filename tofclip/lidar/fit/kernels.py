@@ -1,8 +1,8 @@
 """The compiled fit of pulses to a trace.
 
-A pulse is handed over in two parts, because arrays inside a tuple cost a lock each time they are taken out: `curve`,
-(samples, 2) brightness and slope, and `scale`, samples per second, origin, first and last instant that matter; see
-`tofclip.lidar.Pulse.table`.
+A pulse is handed over in two parts, because arrays inside a tuple cost a lock each time they are
+taken out: `curve`, (samples, 2) brightness and slope, and `scale`, samples per second, origin,
+first and last instant that matter; see `tofclip.lidar.Pulse.kernel_table`.
 """
 
 from __future__ import annotations
@@ -10,22 +10,32 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-EVEN = (1.0, 0.0)  # variance of a bin, as constant and factor of its expected brightness: the same everywhere
-CONVERGED_BINS = 5e-3  # the next step would be smaller by far
+EVEN_VARIANCE = (
+    1.0,
+    0.0,
+)  # variance of a bin, as constant and factor of its expected brightness: the same everywhere
+CONVERGENCE_STEP_BINS = 5e-3  # the next step would be smaller by far
 
-# Without counts of the arrays' owners, which cost a lock for every array that is handed on; nothing here allocates.
+# Without counts of the arrays' owners, which cost a lock for every array that is handed on; nothing
+# here allocates.
 compiled = njit(nogil=True, cache=True, error_model="numpy", _nrt=False)
-inlined = njit(inline="always")  # called for every bin: handing over the arrays would cost more than the work
+inlined = njit(
+    inline="always"
+)  # called for every bin: handing over the arrays would cost more than the work
 
 
 @compiled
-def window(times, near, arrival, scale):
-    """First bin and the bin after the last one that a return at `arrival` reaches; `near` guesses them."""
-    return first_from(times, near[0], arrival + scale[2]), first_from(times, near[1], arrival + scale[3])
+def find_pulse_window(times, near, arrival, scale):
+    """First bin and the bin after the last one that a return at `arrival` reaches; `near` guesses
+    them.
+    """
+    return find_first_bin(times, near[0], arrival + scale[2]), find_first_bin(
+        times, near[1], arrival + scale[3]
+    )
 
 
 @compiled
-def first_from(times, near, instant):
+def find_first_bin(times, near, instant):
     """First bin at `instant` or later, step by step from a bin near it."""
     while near > 0 and times[near - 1] >= instant:
         near -= 1
@@ -35,8 +45,10 @@ def first_from(times, near, instant):
 
 
 @inlined
-def pulse_at(time, curve, scale):
-    """Pulse and its slope at `time` after the arrival, by linear interpolation; zero outside the samples."""
+def interpolate_pulse(time, curve, scale):
+    """Pulse and its slope at `time` after the arrival, by linear interpolation; zero outside the
+    samples.
+    """
     position = time * scale[0] + scale[1]
     p = d = 0.0
     if 0 <= position < curve.shape[0] - 1:
@@ -48,47 +60,54 @@ def pulse_at(time, curve, scale):
 
 
 @inlined
-def unexplained(trace, times, background, curve, scale, estimate, i, without):
+def compute_residual(trace, times, background, curve, scale, estimate, i, without):
     """Bin i less the background and all returns except number `without` (-1: less all of them)."""
     rest = trace[i] - background
     for k in range(estimate.shape[0]):
         if k != without:
-            rest -= estimate[k, 1] * pulse_at(times[i] - estimate[k, 0], curve, scale)[0]
+            rest -= estimate[k, 1] * interpolate_pulse(times[i] - estimate[k, 0], curve, scale)[0]
     return rest
 
 
 @compiled
-def refine(trace, times, background, curve, scale, estimate, variance, rounds):
-    """Least-squares arrival and height of every return, by Gauss-Newton steps on one return at a time.
+def refine_returns(trace, times, background, curve, scale, estimate, variance, rounds):
+    """Least-squares arrival and height of every return, by Gauss-Newton steps on one return at a
+    time.
 
-    Taking turns, each against what the others leave, undoes the pull of returns that overlap. A bin weighs as much as
-    its variance, ``variance[0] + variance[1] * expected``, is small. With `EVEN` that is the plain fit; with ``(0, 1)``
-    and photon counts it is Fisher scoring, which ends at the Poisson likelihood's maximum. A return that moved no more
-    and that no moving one reaches is left alone.
+    Taking turns, each against what the others leave, undoes the pull of returns that overlap. A bin
+    weighs as much as its variance, ``variance[0] + variance[1] * expected``, is small. With
+    `EVEN_VARIANCE` that is the plain fit; with ``(0, 1)`` and photon counts it is Fisher scoring,
+    which ends at the Poisson likelihood's maximum. A return that moved no more and that no moving
+    one reaches is left alone.
 
-    `estimate` is (returns, 5): arrival, height, first bin and the bin after the last one that it reaches, or what is
-    near them, and by how many bins it moved last, which is overwritten.
+    `estimate` is (returns, 5): arrival, height, first bin and the bin after the last one that it
+    reaches, or what is near them, and by how many bins it moved last, which is overwritten.
     """
     estimate[:, 4] = np.inf
     for _ in range(rounds):
         largest = 0.0
         for k in range(estimate.shape[0]):
-            crowded, moving = neighbours(estimate, k, curve, scale)
-            if moving >= CONVERGED_BINS:
-                sums = normal_equations(trace, times, background, curve, scale, estimate, k, crowded, variance)
-                gauss_newton_step(times, sums, estimate[k])
+            crowded, moving = check_overlap(estimate, k, curve, scale)
+            if moving >= CONVERGENCE_STEP_BINS:
+                sums = sum_normal_equations(
+                    trace, times, background, curve, scale, estimate, k, crowded, variance
+                )
+                take_gauss_newton_step(times, sums, estimate[k])
                 largest = max(largest, estimate[k, 4])
-        if largest < CONVERGED_BINS:
+        if largest < CONVERGENCE_STEP_BINS:
             break
 
 
 @compiled
-def neighbours(estimate, k, curve, scale):
+def check_overlap(estimate, k, curve, scale):
     """Whether another return reaches return k, and the most that one of them moved.
 
     One reaches the other if it has light in bins that count for the other.
     """
-    before, after = scale[1] / scale[0] + scale[3], (curve.shape[0] - 1 - scale[1]) / scale[0] - scale[2]
+    before, after = (
+        scale[1] / scale[0] + scale[3],
+        (curve.shape[0] - 1 - scale[1]) / scale[0] - scale[2],
+    )
     crowded, moving = False, estimate[k, 4]
     for other in range(estimate.shape[0]):
         later = estimate[other, 0] - estimate[k, 0]
@@ -99,20 +118,23 @@ def neighbours(estimate, k, curve, scale):
 
 
 @compiled
-def normal_equations(trace, times, background, curve, scale, estimate, k, crowded, variance):
-    """Sums over the bins of return k, of their pulse p, its slope d and the rest r: pp, pd, dd, pr, dr; see `refine`.
+def sum_normal_equations(trace, times, background, curve, scale, estimate, k, crowded, variance):
+    """Sums over the bins of return k, of their pulse p, its slope d and the rest r: pp, pd, dd, pr,
+    dr; see `refine_returns`.
 
     The bins are entered in `estimate`. Only if it is `crowded` are the other returns taken off.
     """
     arrival, height = estimate[k, 0], estimate[k, 1]
-    first, last = window(times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale)
+    first, last = find_pulse_window(
+        times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale
+    )
     estimate[k, 2], estimate[k, 3] = first, last
     pp = pd = dd = pr = dr = 0.0
     for i in range(first, last):
-        p, d = pulse_at(times[i] - arrival, curve, scale)
+        p, d = interpolate_pulse(times[i] - arrival, curve, scale)
         rest = trace[i] - background
         if crowded:
-            rest = unexplained(trace, times, background, curve, scale, estimate, i, k)
+            rest = compute_residual(trace, times, background, curve, scale, estimate, i, k)
         if variance[1] != 0:
             weight = 1 / (variance[0] + variance[1] * (trace[i] - rest + height * p))
             pp += weight * p * p
@@ -130,8 +152,10 @@ def normal_equations(trace, times, background, curve, scale, estimate, k, crowde
 
 
 @compiled
-def gauss_newton_step(times, sums, own):
-    """Improve one return's arrival and height in place, and enter by how many bins it moved (at most one)."""
+def take_gauss_newton_step(times, sums, own):
+    """Improve one return's arrival and height in place, and enter by how many bins it moved (at
+    most one).
+    """
     pp, pd, dd, pr, dr = sums
     determinant = pp * dd - pd * pd
     own[4] = 0.0
@@ -143,50 +167,61 @@ def gauss_newton_step(times, sums, own):
         return
     first, last = int(own[2]), int(own[3])
     bin_width = (times[last - 1] - times[first]) / (last - 1 - first)
-    step = -(pp * dr - pd * pr) / (determinant * height)  # model: height * p(t - arrival), whose slope is -height * d
+    step = -(pp * dr - pd * pr) / (
+        determinant * height
+    )  # model: height * p(t - arrival), whose slope is -height * d
     step = min(max(step, -bin_width), bin_width)
     own[0], own[1], own[4] = own[0] + step, height, abs(step) / bin_width
 
 
 @compiled
-def describe(trace, times, background, noise, curve, scale, estimate, least, profile, found):
-    """Write instant, sum and standard deviation of every return that proves itself; return their number.
+def measure_returns(trace, times, background, noise, curve, scale, estimate, least, profile, found):
+    """Write instant, sum and standard deviation of every return that proves itself; return their
+    number.
 
-    It has to lie on the time axis and to respond, height times root of the pulse's energy, by more than `least`.
-    `profile`, (bins, 3), is overwritten.
+    It has to lie on the time axis and to respond, height times root of the pulse's energy, by more
+    than `least`. `profile`, (bins, 3), is overwritten.
     """
     number = 0
     for k in range(estimate.shape[0]):
         arrival, height = estimate[k, 0], estimate[k, 1]
         if height <= 0 or arrival < times[0] or arrival > times[-1]:
             continue
-        crowded, _ = neighbours(estimate, k, curve, scale)
-        first, last = window(times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale)
+        crowded, _ = check_overlap(estimate, k, curve, scale)
+        first, last = find_pulse_window(
+            times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale
+        )
         pp = pd = dd = 0.0
         for i in range(first, last):
-            p, d = pulse_at(times[i] - arrival, curve, scale)
+            p, d = interpolate_pulse(times[i] - arrival, curve, scale)
             rest = trace[i] - background - height * p
             if crowded:
-                rest = unexplained(trace, times, background, curve, scale, estimate, i, k) - height * p
+                rest = (
+                    compute_residual(trace, times, background, curve, scale, estimate, i, k)
+                    - height * p
+                )
             profile[i, 0], profile[i, 1], profile[i, 2] = p, d, rest
             pp += p * p
             pd += p * d
             dd += d * d
         if height * np.sqrt(pp) <= least or pp * dd <= pd * pd:
             continue
-        total, deviation = sum_and_deviation(profile[first:last], height, noise, pp, pd, dd)
+        total, deviation = estimate_sum_and_deviation(
+            profile[first:last], height, noise, pp, pd, dd
+        )
         found[number, 0], found[number, 1], found[number, 2] = arrival, total, deviation
         number += 1
     return number
 
 
 @compiled
-def sum_and_deviation(profile, height, noise, pp, pd, dd):
+def estimate_sum_and_deviation(profile, height, noise, pp, pd, dd):
     """Sum of a return over its bins, and the standard deviation of its arrival.
 
-    The variance of a bin is taken as ``noise^2 + dispersion * brightness`` (quasi-Poisson). The dispersion is what
-    makes the expected sum of squared residuals, ``sum_i variance_i (1 - h_i)`` with the fit's leverages h, equal to
-    the one found; the variances are then carried through the least-squares fit.
+    The variance of a bin is taken as ``noise^2 + dispersion * brightness`` (quasi-Poisson). The
+    dispersion is what makes the expected sum of squared residuals, ``sum_i variance_i (1 - h_i)``
+    with the fit's leverages h, equal to the one found; the variances are then carried through the
+    least-squares fit.
 
     Parameters
     ----------
@@ -208,7 +243,9 @@ def sum_and_deviation(profile, height, noise, pp, pd, dd):
         unfitted += height * p * (1 - p * p * per_pp - across * across * per_across)
         weighted += across * across * height * p
     misfit += 2 * noise * noise  # two of the bins' worth of noise went into the fit
-    variance = noise * noise * across_energy + max(misfit, 0.0) / max(unfitted, 1e-3 * total) * weighted
+    variance = (
+        noise * noise * across_energy + max(misfit, 0.0) / max(unfitted, 1e-3 * total) * weighted
+    )
     return total, np.sqrt(variance) / (across_energy * height)
 
 

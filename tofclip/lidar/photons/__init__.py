@@ -1,24 +1,25 @@
 """Range from counted photons, up to the limit that their number sets.
 
-Two kinds of data have an estimator each. Recovered frames carry the nearly even errors of an inverse problem:
-`tofclip.lidar.depth` fits the pulse to them by least squares. The bins of a photon-counting detector are Poisson
-distributed: for them the log-matched filter and the weighted fit of this room reach the maximum likelihood. Peaks,
-overlapping returns and positions below a bin are found by the same compiled steps.
+Two kinds of data have an estimator each. Recovered frames carry the nearly even errors of an
+inverse problem: `tofclip.lidar.depth` fits the pulse to them by least squares. The bins of a
+photon-counting detector are Poisson distributed: for them the log-matched filter and the weighted
+fit of this room reach the maximum likelihood. Peaks, overlapping returns and positions below a bin
+are found by the same compiled steps.
 """
 
 from tofclip.lidar.photons.accuracy import Accuracy, measure_accuracy
 from tofclip.lidar.photons.detector import Arrivals, PhotonDetector
-from tofclip.lidar.photons.limits import range_bound
-from tofclip.lidar.photons.pile_up import undo_pile_up
-from tofclip.lidar.photons.smooth import Smoothness, locate_smoothly
+from tofclip.lidar.photons.limits import compute_range_bound
+from tofclip.lidar.photons.pile_up import correct_pile_up
+from tofclip.lidar.photons.smoothing import Smoothness, locate_with_smoothness
 
 __all__ = [
     "Accuracy",
     "Arrivals",
     "PhotonDetector",
     "Smoothness",
-    "locate_smoothly",
+    "compute_range_bound",
+    "correct_pile_up",
+    "locate_with_smoothness",
     "measure_accuracy",
-    "range_bound",
-    "undo_pile_up",
 ]

@@ -1,4 +1,6 @@
-"""Trials against the photon limit: simulated histograms through the detector, beside the Cramer-Rao bound."""
+"""Trials against the photon limit: simulated histograms through the detector, beside the Cramer-Rao
+bound.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,7 @@ import numpy as np
 
 from tofclip.errors import InputError
 from tofclip.lidar.photons.detector import FloatArray, PhotonDetector
-from tofclip.lidar.photons.limits import range_bound
+from tofclip.lidar.photons.limits import compute_range_bound
 from tofclip.units import SPEED_OF_LIGHT
 
 
@@ -19,11 +21,13 @@ class Accuracy:
     Parameters
     ----------
     rms_m : float
-        Root mean square range error of the detected returns, wrongly placed ones included, m; NaN without any.
+        Root mean square range error of the detected returns, wrongly placed ones included, m; NaN
+        without any.
     bound_m : float
         Cramer-Rao bound of the range, m.
     ratio : float
-        The first over the second. Near 1 where the bound holds; more when noise is mistaken for the return.
+        The first over the second. Near 1 where the bound holds; more when noise is mistaken for the
+        return.
     detection_rate : float
         Share of the histograms with a return in which one was found.
     false_alarm_rate : float
@@ -61,11 +65,17 @@ def measure_accuracy(
     """
     if trials < 1:
         raise InputError(f"at least one trial is needed, got {trials}")
-    bound = range_bound(detector.pulse, detector.bin_width, photons, background)
-    present, absent, chance = (np.random.default_rng(one) for one in np.random.SeedSequence(seed).spawn(3))
+    bound = compute_range_bound(detector.pulse, detector.bin_width, photons, background)
+    present, absent, chance = (
+        np.random.default_rng(one) for one in np.random.SeedSequence(seed).spawn(3)
+    )
     arrival = present.uniform(detector.bins / 4, 3 * detector.bins / 4, trials) * detector.bin_width
-    found = detector.locate(draw_histograms(detector, arrival, photons, background, present), _seed(chance))
-    false = detector.locate(absent.poisson(background, (trials, detector.bins)), _seed(chance)).detected[:, 0]
+    found = detector.locate(
+        draw_histograms(detector, arrival, photons, background, present), _draw_seed(chance)
+    )
+    false = detector.locate(
+        absent.poisson(background, (trials, detector.bins)), _draw_seed(chance)
+    ).detected[:, 0]
     detected = found.detected[:, 0]
     error = (found.range[:, 0] - SPEED_OF_LIGHT * arrival / 2)[detected]
     rms = float(np.sqrt(np.mean(error**2))) if error.size else float("nan")
@@ -73,7 +83,11 @@ def measure_accuracy(
 
 
 def draw_histograms(
-    detector: PhotonDetector, arrival: FloatArray, photons: float, background: float, noise: np.random.Generator
+    detector: PhotonDetector,
+    arrival: FloatArray,
+    photons: float,
+    background: float,
+    noise: np.random.Generator,
 ) -> FloatArray:
     """Draw histograms with one return each, (n, bins).
 
@@ -91,5 +105,5 @@ def draw_histograms(
     return noise.poisson(photons * share + background).astype(np.float64)
 
 
-def _seed(chance: np.random.Generator) -> int:
+def _draw_seed(chance: np.random.Generator) -> int:
     return int(chance.integers(1 << 62))

@@ -1,7 +1,7 @@
 """The compiled search for returns in histograms of photons.
 
-Positions below a bin and overlapping returns are treated by the steps of `tofclip.lidar.fit.kernels`; here is what
-Poisson statistics add.
+Positions below a bin and overlapping returns are treated by the steps of
+`tofclip.lidar.fit.kernels`; here is what Poisson statistics add.
 """
 
 from __future__ import annotations
@@ -9,18 +9,26 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tofclip.lidar.fit.kernels import pulse_at, refine, unexplained, window
+from tofclip.lidar.fit.kernels import (
+    compute_residual,
+    find_pulse_window,
+    interpolate_pulse,
+    refine_returns,
+)
 
-POISSON = (0.0, 1.0)  # the variance of a bin is what is expected in it
-ROUNDS = 16  # the weights change with the estimate, which takes some rounds more than the plain fit
-HALF_A_PHOTON = 0.5  # lets an empty histogram have a background
+POISSON_VARIANCE = (0.0, 1.0)  # the variance of a bin is what is expected in it
+MAX_ITERATIONS = (
+    16  # the weights change with the estimate, which takes some rounds more than the plain fit
+)
+MIN_PHOTONS = 0.5  # lets an empty histogram have a background
 
 
 @njit(nogil=True, cache=True)
-def best_score(counts, weights, first):
+def find_best_score(counts, weights, first):
     """Largest log-matched filter response over all bins, and its bin.
 
-    ``score[j] = sum_w weights[w] * counts[j + first + w]``; photons are few, so each one adds to the bins it concerns.
+    ``score[j] = sum_w weights[w] * counts[j + first + w]``; photons are few, so each one adds to
+    the bins it concerns.
     """
     score = np.zeros(counts.size)
     for i in range(counts.size):
@@ -34,26 +42,31 @@ def best_score(counts, weights, first):
 
 
 @njit(nogil=True, cache=True)
-def best_scores(histograms, weights, first, best):
+def find_best_scores(histograms, weights, first, best):
     """Fill `best` with the largest response of each histogram."""
     for row in range(histograms.shape[0]):
-        best[row] = best_score(histograms[row], weights, first)[0]
+        best[row] = find_best_score(histograms[row], weights, first)[0]
 
 
 @njit(nogil=True, cache=True)
-def best_scores_of_scattered(photons, bins, noise, weights, first, best):
-    """Fill `best` with the best scores of histograms over which `photons` are thrown evenly by a random generator."""
+def simulate_best_scores(photons, bins, noise, weights, first, best):
+    """Fill `best` with the best scores of histograms over which `photons` are thrown evenly by a
+    random generator.
+    """
     counts = np.zeros(bins)
     for trial in range(best.size):
         counts[:] = 0
         for _ in range(photons):
             counts[noise.integers(0, bins)] += 1
-        best[trial] = best_score(counts, weights, first)[0]
+        best[trial] = find_best_score(counts, weights, first)[0]
 
 
 @njit(nogil=True, cache=True)
-def take_strongest(rest, free, dither, level, table, first, scale, times, peaks, numbers):
-    """Find the strongest return of each histogram and take its bins out, for the next one to be sought in the rest.
+def extract_strongest_returns(
+    rest, free, dither, level, table, first, scale, times, peaks, numbers
+):
+    """Find the strongest return of each histogram and take its bins out, for the next one to be
+    sought in the rest.
 
     Parameters
     ----------
@@ -65,7 +78,7 @@ def take_strongest(rest, free, dither, level, table, first, scale, times, peaks,
         Added to the scores, to decide ties.
     level : (n,) int64 array
         Row of the table for each histogram; negative: nothing is sought.
-    table : (levels,), (levels, width) arrays
+    kernel_table : (levels,), (levels, width) arrays
         Threshold and filter weights.
     first : int
         Bin of the first weight relative to the return's.
@@ -78,79 +91,95 @@ def take_strongest(rest, free, dither, level, table, first, scale, times, peaks,
     for row in range(rest.shape[0]):
         if level[row] < 0:
             continue
-        score, best = best_score(rest[row], weights[level[row]], first)
+        score, best = find_best_score(rest[row], weights[level[row]], first)
         if score + dither[row] <= thresholds[level[row]]:
             continue
         peaks[row, numbers[row]] = best
         numbers[row] += 1
-        begin, end = window(times, (best, best), times[best], scale)
+        begin, end = find_pulse_window(times, (best, best), times[best], scale)
         rest[row, begin:end] = 0
         free[row] -= end - begin
 
 
 @njit(nogil=True, cache=True)
-def locate(histograms, peaks, numbers, curve, scale, times, found):
+def fit_histograms(histograms, peaks, numbers, curve, scale, times, found):
     """Refine the returns of each histogram to the likelihood's maximum.
 
     Parameters
     ----------
     histograms : (n, bins) float64 array
     peaks, numbers
-        As `take_strongest` left them.
+        As `extract_strongest_returns` left them.
     curve, scale, times
         As in `tofclip.lidar.fit.kernels`.
     found : (n, most returns, 3) float64 array
-        Overwritten with arrival, photons and standard deviation of the arrival where there is a return.
+        Overwritten with arrival, photons and standard deviation of the arrival where there is a
+        return.
     """
     estimate = np.empty((peaks.shape[1], 5))
     for row in range(histograms.shape[0]):
         trace, number = histograms[row], numbers[row]
-        background = quiet_rate(trace, times, peaks[row, :number], scale)
+        background = estimate_background(trace, times, peaks[row, :number], scale)
         for k in range(number):
             peak = peaks[row, k]
             estimate[k, 0], estimate[k, 2], estimate[k, 3] = times[peak], peak, peak
-            estimate[k, 1] = first_height(trace, times, background, curve, scale, peak)
-        refine(trace, times, background, curve, scale, estimate[:number], POISSON, ROUNDS)
+            estimate[k, 1] = estimate_height(trace, times, background, curve, scale, peak)
+        refine_returns(
+            trace,
+            times,
+            background,
+            curve,
+            scale,
+            estimate[:number],
+            POISSON_VARIANCE,
+            MAX_ITERATIONS,
+        )
         for k in range(number):
-            summarise(trace, times, background, curve, scale, estimate[:number], k, found[row, k])
+            summarise_return(
+                trace, times, background, curve, scale, estimate[:number], k, found[row, k]
+            )
 
 
 @njit(nogil=True, cache=True)
-def quiet_rate(trace, times, peaks, scale):
+def estimate_background(trace, times, peaks, scale):
     """Background photons of a bin, from the bins that no return reaches."""
     free = np.ones(trace.size, np.bool_)
     for peak in peaks:
-        first, last = window(times, (peak, peak), times[peak], scale)
+        first, last = find_pulse_window(times, (peak, peak), times[peak], scale)
         free[first:last] = False
     photons = bins = 0.0
     for i in range(trace.size):
         if free[i]:
             photons += trace[i]
             bins += 1
-    return (photons + HALF_A_PHOTON) / max(bins, 1.0)
+    return (photons + MIN_PHOTONS) / max(bins, 1.0)
 
 
 @njit(nogil=True, cache=True)
-def first_height(trace, times, background, curve, scale, peak):
+def estimate_height(trace, times, background, curve, scale, peak):
     """Height of a return from the photons around its bin; never less than half a photon's."""
     arrival = times[peak]
-    first, last = window(times, (peak, peak), arrival, scale)
+    first, last = find_pulse_window(times, (peak, peak), arrival, scale)
     area = excess = 0.0
     for i in range(first, last):
-        area += pulse_at(times[i] - arrival, curve, scale)[0]
+        area += interpolate_pulse(times[i] - arrival, curve, scale)[0]
         excess += trace[i] - background
-    return max(excess, HALF_A_PHOTON) / max(area, 1e-3)
+    return max(excess, MIN_PHOTONS) / max(area, 1e-3)
 
 
 @njit(nogil=True, cache=True)
-def summarise(trace, times, background, curve, scale, estimate, k, found):
+def summarise_return(trace, times, background, curve, scale, estimate, k, found):
     """Arrival, photons and the arrival's Cramer-Rao deviation at the estimate."""
     arrival, height = estimate[k, 0], estimate[k, 1]
-    first, last = window(times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale)
+    first, last = find_pulse_window(
+        times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale
+    )
     pp = pd = dd = total = 0.0
     for i in range(first, last):
-        p, d = pulse_at(times[i] - arrival, curve, scale)
-        weight = 1 / (trace[i] - unexplained(trace, times, background, curve, scale, estimate, i, -1))
+        p, d = interpolate_pulse(times[i] - arrival, curve, scale)
+        weight = 1 / (
+            trace[i] - compute_residual(trace, times, background, curve, scale, estimate, i, -1)
+        )
         pp += weight * p * p
         pd += weight * p * d
         dd += weight * d * d
@@ -161,7 +190,7 @@ def summarise(trace, times, background, curve, scale, estimate, k, found):
 
 
 @njit(nogil=True, cache=True)
-def scores(histograms, weights, first, score):
+def compute_scores(histograms, weights, first, score):
     """Log-matched filter response of each histogram at each bin, (n, bins)."""
     score[:] = 0
     for row in range(histograms.shape[0]):
@@ -174,11 +203,12 @@ def scores(histograms, weights, first, score):
 
 
 @njit(nogil=True, cache=True)
-def add_path(score, slope_cost, jump_cost, total):
+def add_path_scores(score, slope_cost, jump_cost, total):
     """Add to `total` the best score of all paths that reach each entry along the first axis.
 
-    From one step to the next a path may keep its bin for nothing, change by one bin at `slope_cost`, or by any number
-    at `jump_cost`: the recursion of semi-global matching. `score` and `total` are (steps, lanes, bins).
+    From one step to the next a path may keep its bin for nothing, change by one bin at
+    `slope_cost`, or by any number at `jump_cost`: the recursion of semi-global matching. `score`
+    and `total` are (steps, lanes, bins).
     """
     path, before = np.empty(score.shape[2]), np.empty(score.shape[2])
     for lane in range(score.shape[1]):
@@ -197,8 +227,9 @@ def add_path(score, slope_cost, jump_cost, total):
 
 
 @njit(nogil=True, cache=True)
-def pool(counts, label, reach, apart, pooled, contributors):
-    """Sum each pixel's histogram with those of neighbours on the same surface, moved to the pixel's own bin.
+def pool_neighbours(counts, label, reach, apart, pooled, contributors):
+    """Sum each pixel's histogram with those of neighbours on the same surface, moved to the pixel's
+    own bin.
 
     Parameters
     ----------

@@ -8,14 +8,14 @@ from tofclip.errors import InputError
 from tofclip.lidar.pulse import Pulse
 from tofclip.units import SPEED_OF_LIGHT
 
-PHASES = 16  # positions of the arrival within a bin that the bound is averaged over
+BIN_PHASES = 16  # positions of the arrival within a bin that the bound is averaged over
 
 
-def range_bound(pulse: Pulse, bin_width: float, photons: float, background: float) -> float:
+def compute_range_bound(pulse: Pulse, bin_width: float, photons: float, background: float) -> float:
     """Least standard deviation of the range that an unbiased estimate can have (Cramer-Rao).
 
-    Photons are Poisson distributed; arrival and number of photons are unknown, the background is known. The variance
-    is averaged over where in a bin the pulse arrives.
+    Photons are Poisson distributed; arrival and number of photons are unknown, the background is
+    known. The variance is averaged over where in a bin the pulse arrives.
 
     Parameters
     ----------
@@ -43,14 +43,16 @@ def range_bound(pulse: Pulse, bin_width: float, photons: float, background: floa
             "bin width and photons must be positive and the background not negative, got "
             f"{bin_width}, {photons} and {background}"
         )
-    shape = pulse.binned(bin_width)
+    shape = pulse.integrate_bins(bin_width)
     first, last = shape.extent(0.0)
     bins = np.arange(np.floor(first / bin_width) - 1, np.ceil(last / bin_width) + 2) * bin_width
-    late = bins - ((np.arange(PHASES) + 0.5) / PHASES - 0.5)[:, np.newaxis] * bin_width
+    late = bins - ((np.arange(BIN_PHASES) + 0.5) / BIN_PHASES - 0.5)[:, np.newaxis] * bin_width
     height = photons * bin_width / shape.area
     signal, slope = height * shape(late), height * shape.slope_at(late)
     expected = signal + background
     weight = np.divide(1.0, expected, out=np.zeros_like(expected), where=expected > 0)
-    delay, mixed, amount = (np.sum(weight * term, axis=1) for term in (slope**2, slope * signal, signal**2))
+    delay, mixed, amount = (
+        np.sum(weight * term, axis=1) for term in (slope**2, slope * signal, signal**2)
+    )
     variance = 1 / (delay - mixed**2 / amount)
     return float(SPEED_OF_LIGHT / 2 * np.sqrt(variance.mean()))

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from tofclip.arrays import Array, device_of, namespace
+from tofclip.arrays import Array, namespace, native_device
 
 
-def looked_up(table: Array, numbers: Array) -> Array:
+def gather_entries(table: Array, numbers: Array) -> Array:
     """Return ``table[numbers]`` for a one-dimensional table and numbers of any shape."""
     xp = namespace(table, numbers)
     return xp.reshape(xp.take(table, xp.reshape(numbers, (-1,)), axis=0), numbers.shape)
 
 
-def picked(columns: Array, rows: Array) -> Array:
+def gather_rows(columns: Array, rows: Array) -> Array:
     """Return ``columns[rows[i, n], n]``; `rows` is (i, n), or (n,) for one entry of each column."""
     xp = namespace(columns, rows)
     if rows.ndim == 1:
@@ -19,8 +19,10 @@ def picked(columns: Array, rows: Array) -> Array:
     return xp.take_along_axis(columns, rows, axis=0)
 
 
-def span(first: Array, width: int, last: Array, end: int) -> tuple[Array, Array]:
-    """Return the numbers from `first` on, (width, n), none beyond ``end - 1``, and which of them are below `last`."""
+def build_index_window(first: Array, width: int, last: Array, end: int) -> tuple[Array, Array]:
+    """Return the numbers from `first` on, (width, n), none beyond ``end - 1``, and which of them
+    are below `last`.
+    """
     xp = namespace(first, last)
-    numbers = first + xp.arange(width, dtype=first.dtype, device=device_of(first))[:, None]
+    numbers = first + xp.arange(width, dtype=first.dtype, device=native_device(first))[:, None]
     return xp.clip(numbers, max=end - 1), numbers < last

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import Array, as_type, namespace, to_numpy
 from tofclip.lidar.detection import Detection
-from tofclip.lidar.portable.fit import PulseFit
+from tofclip.lidar.portable.fit import PulseFitter
 from tofclip.lidar.portable.peaks import Filters, PeakSearch
 from tofclip.lidar.pulse import Pulse
 from tofclip.shots import Frames
-from tofclip.threads import blocks
+from tofclip.threads import split_blocks
 
 FloatArray = NDArray[np.float64]
 Candidates = tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]
@@ -19,7 +19,8 @@ Candidates = tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]
 WORKING_BYTES = 1 << 30
 """What a search may take for the pixels that it looks at at once."""
 
-WORKING_TRACES = 8  # arrays of the traces' size at once: they, centred, two filters' responses, maxima, temporaries
+# arrays of the traces' size at once: they, centred, two filters' responses, maxima, temporaries
+WORKING_ARRAYS = 8
 
 
 class PortableTraces:
@@ -31,14 +32,16 @@ class PortableTraces:
     """
 
     def __init__(self, frames: Frames) -> None:
-        self.values = namespace(frames.values).reshape(as_type(frames.values, np.float32), (frames.times.size, -1))
+        self.values = namespace(frames.values).reshape(
+            as_type(frames.values, np.float32), (frames.times.size, -1)
+        )
 
 
 class PortableSearch:
     """What `tofclip.lidar.kernels.find_returns` does, for many pixels at once.
 
-    Peaks and fits are found step for step as there; only what was found, a few numbers for each return, is fetched.
-    Memory on the device: 1 GiB beside the frames.
+    Peaks and fits are found step for step as there; only what was found, a few numbers for each
+    return, is fetched. Memory on the device: 1 GiB beside the frames.
 
     Parameters
     ----------
@@ -50,32 +53,45 @@ class PortableSearch:
     detection : Detection
     """
 
-    def __init__(self, times: FloatArray, filters: Filters, pulse: Pulse, detection: Detection) -> None:
-        self._peaks, self._fit = PeakSearch(times, filters, pulse, detection), PulseFit(times, pulse)
-        self._least = detection.signal_to_noise
+    def __init__(
+        self, times: FloatArray, filters: Filters, pulse: Pulse, detection: Detection
+    ) -> None:
+        self._peaks, self._fit = (
+            PeakSearch(times, filters, pulse, detection),
+            PulseFitter(times, pulse),
+        )
+        self._min_signal_to_noise = detection.signal_to_noise
 
-    def candidates(self, traces: Array) -> Candidates:
-        """Return pixel number, instant, counts and deviation of every candidate, in raster and time order.
+    def find_candidates(self, traces: Array) -> Candidates:
+        """Return pixel number, instant, counts and deviation of every candidate, in raster and time
+        order.
 
         Parameters
         ----------
         traces : (bins, pixels) float32 array
         """
         bins, pixels = traces.shape
-        at_once = max(1, WORKING_BYTES // (WORKING_TRACES * bins * np.dtype(np.float32).itemsize))
-        found = [self._some(traces[:, piece], piece.start) for piece in blocks(pixels, at_once)]
+        at_once = max(1, WORKING_BYTES // (WORKING_ARRAYS * bins * np.dtype(np.float32).itemsize))
+        found = [
+            self._search_pixels(traces[:, piece], piece.start)
+            for piece in split_blocks(pixels, at_once)
+        ]
         pixel, time, signal, deviation = (np.concatenate(part) for part in zip(*found, strict=True))
         return pixel, time, signal, deviation
 
-    def _some(self, traces: Array, number: int) -> Candidates:
+    def _search_pixels(self, traces: Array, number: int) -> Candidates:
         """Search some pixels, the first of which has the given number."""
         xp = namespace(traces)
-        peaks = self._peaks.peaks(traces)
-        (pixels,) = xp.nonzero(xp.any(peaks.kept, axis=0))
-        chosen = peaks.of(pixels)
-        fit = self._fit.refined(xp.take(traces, pixels, axis=1), chosen)
-        described = self._fit.described(fit, chosen.noise, self._least * chosen.noise)
-        proven, signal, deviation = (to_numpy(xp.stack(list(part))) for part in zip(*described, strict=True))
+        peaks = self._peaks.find_peaks(traces)
+        (pixels,) = xp.nonzero(xp.any(peaks.valid, axis=0))
+        chosen = peaks.select(pixels)
+        fit = self._fit.refine(xp.take(traces, pixels, axis=1), chosen)
+        described = self._fit.measure_returns(
+            fit, chosen.noise, self._min_signal_to_noise * chosen.noise
+        )
+        proven, signal, deviation = (
+            to_numpy(xp.stack(list(part))) for part in zip(*described, strict=True)
+        )
         time, numbers = to_numpy(xp.stack(fit.arrival)), number + to_numpy(pixels).astype(np.int64)
         pixel = np.broadcast_to(numbers, proven.shape)[proven]
         order = np.lexsort((time[proven], pixel))

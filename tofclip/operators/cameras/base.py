@@ -11,8 +11,8 @@ import numpy as np
 
 from tofclip.errors import InputError
 from tofclip.operators.base import Identity, LinearOperator
-from tofclip.operators.joined import BlockDiagonal
 from tofclip.operators.shear import View
+from tofclip.operators.stacking import BlockDiagonal
 
 
 class LightFieldCamera(ABC):
@@ -31,11 +31,11 @@ class LightFieldCamera(ABC):
 
     Attributes
     ----------
-    used : tuple of int
+    used_views : tuple of int
         Numbers of the views that get readings, in the order of the readings.
-    readings : int
+    measurements : int
         How many readings there are.
-    row_length : int
+    correlation_length : int
         Consecutive readings on a detector whose errors are alike; 1 where each stands for itself.
 
     Raises
@@ -45,37 +45,47 @@ class LightFieldCamera(ABC):
     """
 
     name: ClassVar[str]
-    readings: int
-    row_length: int = 1
+    measurements: int
+    correlation_length: int = 1
 
-    def __init__(self, image_shape: tuple[int, int], views: Sequence[View], sampling_ratio: float, seed: int) -> None:
+    def __init__(
+        self, image_shape: tuple[int, int], views: Sequence[View], sampling_ratio: float, seed: int
+    ) -> None:
         if not (np.isfinite(sampling_ratio) and sampling_ratio > 0):
             raise InputError(f"the sampling ratio must be positive, got {sampling_ratio}")
         self.image_shape, self.views = image_shape, tuple(views)
         self.sampling_ratio, self.seed = sampling_ratio, seed
-        self.used = self._deal()
+        self.used_views = self._assign_measurements()
 
     @abstractmethod
-    def _deal(self) -> tuple[int, ...]:
-        """Give readings to views and set `readings`; return the numbers of the views that get any."""
+    def _assign_measurements(self) -> tuple[int, ...]:
+        """Give readings to views and set `measurements`; return the numbers of the views that get
+        any.
+        """
 
     @cached_property
     def encoders(self) -> tuple[LinearOperator, ...]:
         """A_k of the used views."""
-        return self._encoders()
+        return self._build_encoders()
 
     @abstractmethod
-    def _encoders(self) -> tuple[LinearOperator, ...]:
+    def _build_encoders(self) -> tuple[LinearOperator, ...]:
         """Build A_k of the used views."""
 
     @abstractmethod
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
-        """Return F(d): from the picture refocused at `shear`, seen from `reference`, to the readings (Eq. 21)."""
+        """Return F(d): from the picture refocused at `shear`, seen from `reference`, to the
+        readings (Eq. 21).
+        """
 
     def weighting(self) -> LinearOperator:
-        """Return the weights W that readings and model get in a recovery; 1 unless the camera has a reason."""
-        return Identity((self.readings,))
+        """Return the weights W that readings and model get in a recovery; 1 unless the camera has a
+        reason.
+        """
+        return Identity((self.measurements,))
 
     def light_field_model(self) -> LinearOperator:
-        """Return the map from the used views' pictures, (views, rows, columns), to the readings (Eq. 20)."""
+        """Return the map from the used views' pictures, (views, rows, columns), to the readings
+        (Eq. 20).
+        """
         return BlockDiagonal(self.encoders)

@@ -11,13 +11,20 @@ from numpy.typing import NDArray
 from tofclip.errors import InputError
 from tofclip.operators.base import Diagonal, LinearOperator
 from tofclip.operators.cameras.base import LightFieldCamera
-from tofclip.operators.coded_views import MaskedViews, ShearedViews, WeightedViews, sheared_mask
-from tofclip.operators.joined import Stack
+from tofclip.operators.coded_views import (
+    MaskedViews,
+    ShearedViews,
+    WeightedViews,
+    make_sheared_mask,
+)
 from tofclip.operators.sensors import DenseSensor
 from tofclip.operators.shear import View
+from tofclip.operators.stacking import Stack
 
-MASK_SHEAR = 1.0
-"""Pixels from view to view by which Marwah's mask appears moved: no two views see a pixel through the same cell."""
+MASK_SHEAR_PX = 1.0
+"""Pixels from view to view by which Marwah's mask appears moved: no two views see a pixel through
+the same cell.
+"""
 
 
 class CompressiveCamera(LightFieldCamera):
@@ -26,14 +33,14 @@ class CompressiveCamera(LightFieldCamera):
     The sampling ratio is the number of exposures, a whole number.
     """
 
-    def _deal(self) -> tuple[int, ...]:
+    def _assign_measurements(self) -> tuple[int, ...]:
         self.exposures = round(self.sampling_ratio)
         if self.exposures < 1 or self.exposures != self.sampling_ratio:
             raise InputError(
                 "every exposure of this camera reads all pixels: its sampling ratio is their number, a whole one, "
                 f"not {self.sampling_ratio}"
             )
-        self.readings = self.exposures * self.image_shape[0] * self.image_shape[1]
+        self.measurements = self.exposures * self.image_shape[0] * self.image_shape[1]
         return tuple(range(len(self.views)))
 
     @abstractmethod
@@ -42,7 +49,9 @@ class CompressiveCamera(LightFieldCamera):
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d): the light field's model after the shears."""
-        return self.light_field_model() @ ShearedViews(self.image_shape, self.views, shear, reference)
+        return self.light_field_model() @ ShearedViews(
+            self.image_shape, self.views, shear, reference
+        )
 
 
 class ApertureMaskCamera(CompressiveCamera):
@@ -52,9 +61,11 @@ class ApertureMaskCamera(CompressiveCamera):
     def weights(self) -> NDArray[np.float64]:
         """Return the share of each view's light that each mask lets pass, (exposures, views)."""
 
-    def _encoders(self) -> tuple[LinearOperator, ...]:
+    def _build_encoders(self) -> tuple[LinearOperator, ...]:
         sensor, even = DenseSensor(self.image_shape), np.ones(self.image_shape)
-        return tuple(Stack([sensor @ Diagonal(share * even) for share in own]) for own in self.weights().T)
+        return tuple(
+            Stack([sensor @ Diagonal(share * even) for share in own]) for own in self.weights().T
+        )
 
     def light_field_model(self) -> LinearOperator:
         """Return Eq. 17 for all exposures."""
@@ -62,31 +73,41 @@ class ApertureMaskCamera(CompressiveCamera):
 
 
 class AshokCamera(ApertureMaskCamera):
-    """Masks of open and closed cells from a Hadamard matrix (A. Ashok, M. A. Neifeld, Proc. SPIE 7690, 76900Q (2010)).
+    """Masks of open and closed cells from a Hadamard matrix (A. Ashok, M. A. Neifeld, Proc. SPIE
+    7690, 76900Q (2010)).
 
-    The first exposure is an ordinary photograph, all cells open; the others are drawn from the matrix.
+    The first exposure is an ordinary photograph, all cells open; the others are drawn from the
+    matrix.
     """
 
     name: ClassVar[str] = "ashok"
 
-    def _deal(self) -> tuple[int, ...]:
-        used = super()._deal()
+    def _assign_measurements(self) -> tuple[int, ...]:
+        used = super()._assign_measurements()
         self._order = 1 << (len(self.views) - 1).bit_length()
         if self.exposures > self._order:
-            raise InputError(f"{len(used)} views have at most {self._order} different masks, not {self.exposures}")
+            raise InputError(
+                f"{len(used)} views have at most {self._order} different masks, not {self.exposures}"
+            )
         return used
 
     def weights(self) -> NDArray[np.float64]:
         """Return the masks."""
         from scipy.linalg import hadamard
 
-        others = 1 + np.random.default_rng(self.seed).permutation(self._order - 1)[: self.exposures - 1]
-        open_cells: NDArray[np.float64] = (1 + hadamard(self._order)[np.append(0, others), : len(self.views)]) / 2
+        others = (
+            1 + np.random.default_rng(self.seed).permutation(self._order - 1)[: self.exposures - 1]
+        )
+        open_cells: NDArray[np.float64] = (
+            1 + hadamard(self._order)[np.append(0, others), : len(self.views)]
+        ) / 2
         return open_cells
 
 
 class BabacanCamera(ApertureMaskCamera):
-    """Masks of random grey cells (S. D. Babacan et al., IEEE Trans. Image Process. 21, 4746 (2012))."""
+    """Masks of random grey cells (S. D. Babacan et al., IEEE Trans. Image Process. 21, 4746
+    (2012)).
+    """
 
     name: ClassVar[str] = "babacan"
 
@@ -98,23 +119,27 @@ class BabacanCamera(ApertureMaskCamera):
 class MarwahCamera(CompressiveCamera):
     """One exposure through a random mask just in front of the sensor.
 
-    Each view sees the mask moved by `MASK_SHEAR` pixels against its neighbour (Eq. 18; K. Marwah et al., ACM Trans.
-    Graph. 32, 46 (2013)).
+    Each view sees the mask moved by `MASK_SHEAR_PX` pixels against its neighbour (Eq. 18; K. Marwah
+    et al., ACM Trans. Graph. 32, 46 (2013)).
     """
 
     name: ClassVar[str] = "marwah"
 
-    def _deal(self) -> tuple[int, ...]:
-        used = super()._deal()
+    def _assign_measurements(self) -> tuple[int, ...]:
+        used = super()._assign_measurements()
         if self.exposures != 1:
-            raise InputError(f"this camera takes one exposure, not {self.exposures}; set the sampling ratio to 1")
+            raise InputError(
+                f"this camera takes one exposure, not {self.exposures}; set the sampling ratio to 1"
+            )
         return used
 
     def codes(self) -> NDArray[np.float64]:
         """Return the mask as each view sees it, (views, rows, columns)."""
-        return sheared_mask(self.image_shape, self.views, MASK_SHEAR, np.random.default_rng(self.seed))
+        return make_sheared_mask(
+            self.image_shape, self.views, MASK_SHEAR_PX, np.random.default_rng(self.seed)
+        )
 
-    def _encoders(self) -> tuple[LinearOperator, ...]:
+    def _build_encoders(self) -> tuple[LinearOperator, ...]:
         sensor = DenseSensor(self.image_shape)
         return tuple(sensor @ Diagonal(code) for code in self.codes())
 

@@ -9,8 +9,14 @@ from numpy.typing import NDArray
 
 from tofclip.errors import InputError
 from tofclip.operators.base import LinearOperator
+from tofclip.operators.cameras.angle_assignment import (
+    CORRELATION_LENGTH_PX,
+    AngleAssignment,
+    assign_evenly,
+    assign_randomly,
+    count_lines,
+)
 from tofclip.operators.cameras.base import LightFieldCamera
-from tofclip.operators.cameras.dealing import ALIKE_PX, Deal, count_of_lines, dealt_at_random, dealt_evenly
 from tofclip.operators.radon import RadonProjection
 from tofclip.operators.shear import View
 
@@ -18,51 +24,64 @@ from tofclip.operators.shear import View
 class LineCamera(LightFieldCamera):
     """CLIP-1D: line projections, their angles dealt to the views at random (supplement Note 6).
 
-    ``sampling_ratio * rows * columns / detector`` angles, evenly in [0, pi). A detector has as many pixels as the
-    picture's longer side.
+    ``sampling_ratio * rows * columns / detector`` angles, evenly in [0, pi). A detector has as many
+    pixels as the picture's longer side.
     """
 
     name: ClassVar[str] = "line"
 
-    def _deal(self) -> tuple[int, ...]:
+    def _assign_measurements(self) -> tuple[int, ...]:
         self.detector_px = max(self.image_shape)
-        count = count_of_lines(self.image_shape, self.detector_px, self.sampling_ratio)
-        self.readings, self.row_length = count * self.detector_px, min(ALIKE_PX, self.detector_px)
-        used, self.angles = self._dealt(np.arange(count) * np.pi / count)
+        count = count_lines(self.image_shape, self.detector_px, self.sampling_ratio)
+        self.measurements, self.correlation_length = (
+            count * self.detector_px,
+            min(CORRELATION_LENGTH_PX, self.detector_px),
+        )
+        used, self.angles = self._assign_angles(np.arange(count) * np.pi / count)
         return used
 
-    def _dealt(self, angles: NDArray[np.float64]) -> Deal:
+    def _assign_angles(self, angles: NDArray[np.float64]) -> AngleAssignment:
         """Give angles to views."""
-        return dealt_at_random(angles, len(self.views), np.random.default_rng(self.seed))
+        return assign_randomly(angles, len(self.views), np.random.default_rng(self.seed))
 
-    def _encoders(self) -> tuple[LinearOperator, ...]:
-        return tuple(self._projection(own, np.zeros(own.size)) for own in self.angles)
+    def _build_encoders(self) -> tuple[LinearOperator, ...]:
+        return tuple(self._make_projection(own, np.zeros(own.size)) for own in self.angles)
 
-    def _projection(self, angles: NDArray[np.float64], offsets_px: NDArray[np.float64]) -> RadonProjection:
+    def _make_projection(
+        self, angles: NDArray[np.float64], offsets_px: NDArray[np.float64]
+    ) -> RadonProjection:
         return RadonProjection(self.image_shape, self.detector_px, angles, offsets_px)
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d) as one sparse matrix: a sheared view is one whose detector is offset."""
         offsets = []
-        for view, angles in zip(self.used, self.angles, strict=True):
-            down, right = (shear * (a - b) for a, b in zip(self.views[view], reference, strict=True))
+        for view, angles in zip(self.used_views, self.angles, strict=True):
+            down, right = (
+                shear * (a - b) for a, b in zip(self.views[view], reference, strict=True)
+            )
             if not max(abs(down), abs(right)) < self.detector_px:
-                raise InputError(f"shear {shear} moves view {self.views[view]} out of the field; take a smaller one")
+                raise InputError(
+                    f"shear {shear} moves view {self.views[view]} out of the field; take a smaller one"
+                )
             offsets.append(right * np.cos(angles) + down * np.sin(angles))
-        return self._projection(np.concatenate(self.angles), np.concatenate(offsets))
+        return self._make_projection(np.concatenate(self.angles), np.concatenate(offsets))
 
 
-class SpreadLineCamera(LineCamera):
-    """CLIP-1D with angles dealt so that neighbouring ones look from places spread evenly over the aperture.
+class EvenAngleLineCamera(LineCamera):
+    """CLIP-1D with angles dealt so that neighbouring ones look from places spread evenly over the
+    aperture.
 
-    What is out of focus is then blurred rather than torn into streaks, and which seed was drawn hardly matters
-    (`apps.studies.dealing_table` shows how much better it is than dealing at random).
+    What is out of focus is then blurred rather than torn into streaks, and which seed was drawn
+    hardly matters (`apps.studies.angle_assignment` shows how much better it is than dealing at
+    random).
     """
 
     name: ClassVar[str] = "line-spread"
 
-    def _dealt(self, angles: NDArray[np.float64]) -> Deal:
-        """Deal evenly; directions that differ by 6 px at the picture's border stand for the aperture together."""
+    def _assign_angles(self, angles: NDArray[np.float64]) -> AngleAssignment:
+        """Deal evenly; directions that differ by 6 px at the picture's border stand for the
+        aperture together.
+        """
         neighbours = 4 * angles.size / max(self.image_shape)
         cycle = max(2, 1 << max(round(np.log2(neighbours)), 0))
-        return dealt_evenly(angles, self.views, cycle, np.random.default_rng(self.seed))
+        return assign_evenly(angles, self.views, cycle, np.random.default_rng(self.seed))

@@ -11,64 +11,71 @@ from tofclip.errors import InputError
 from tofclip.operators.base import LinearOperator
 from tofclip.operators.cameras.base import LightFieldCamera
 from tofclip.operators.convolution import PointSpreadConvolution
-from tofclip.operators.joined import Integration
 from tofclip.operators.point_spreads import (
     ApertureElement,
     CodedAperture,
     CubicPhasePlate,
     Diffuser,
     MeasuredPointSpreads,
-    sheared_point_spreads,
-    view_point_spreads,
+    shear_point_spreads,
+    trace_view_point_spreads,
 )
 from tofclip.operators.sensors import DenseSensor, PitchedSensor
 from tofclip.operators.shear import View
+from tofclip.operators.stacking import Integration
 
 
 class PointSpreadCamera(LightFieldCamera):
-    """Every view goes through its own part of the aperture; their light adds up on one sparse sensor (Eq. 4, 5).
+    """Every view goes through its own part of the aperture; their light adds up on one sparse
+    sensor (Eq. 4, 5).
 
     The sensor's pixels are spread evenly over the picture, as many as the sampling ratio asks for.
     """
 
     @abstractmethod
-    def element(self) -> ApertureElement:
+    def make_element(self) -> ApertureElement:
         """Return what stands in the aperture."""
 
-    def _deal(self) -> tuple[int, ...]:
-        self.sensor = sparse_sensor(self.image_shape, self.sampling_ratio)
-        (self.readings,) = self.sensor.shape_out
-        spreads = view_point_spreads(self.element(), self.views, self.image_shape)
+    def _assign_measurements(self) -> tuple[int, ...]:
+        self.sensor = make_sparse_sensor(self.image_shape, self.sampling_ratio)
+        (self.measurements,) = self.sensor.shape_out
+        spreads = trace_view_point_spreads(self.make_element(), self.views, self.image_shape)
         used = np.flatnonzero(spreads.any(axis=(1, 2)))
         if used.size == 0:
             raise InputError("the aperture lets no light through; take another seed")
         self._spreads = spreads[used]
         return tuple(int(view) for view in used)
 
-    def _encoders(self) -> tuple[LinearOperator, ...]:
-        return tuple(self.sensor @ self._convolution(spread) for spread in self._spreads)
+    def _build_encoders(self) -> tuple[LinearOperator, ...]:
+        return tuple(self.sensor @ self._make_convolution(spread) for spread in self._spreads)
 
-    def _convolution(self, spread: np.ndarray) -> PointSpreadConvolution:
+    def _make_convolution(self, spread: np.ndarray) -> PointSpreadConvolution:
         return PointSpreadConvolution(self.image_shape, spread)
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d): one convolution with the depth's PSF, read by the sensor."""
-        views = [self.views[view] for view in self.used]
-        return self.sensor @ self._convolution(
-            sheared_point_spreads(self._spreads, views, shear, reference).sum(axis=0)
+        views = [self.views[view] for view in self.used_views]
+        return self.sensor @ self._make_convolution(
+            shear_point_spreads(self._spreads, views, shear, reference).sum(axis=0)
         )
 
     def light_field_model(self) -> LinearOperator:
-        """Return the map from the used views' pictures to the readings: the sum of what each puts on the sensor."""
-        return self.sensor @ Integration([self._convolution(spread) for spread in self._spreads])
+        """Return the map from the used views' pictures to the readings: the sum of what each puts
+        on the sensor.
+        """
+        return self.sensor @ Integration(
+            [self._make_convolution(spread) for spread in self._spreads]
+        )
 
 
 class CodedApertureCamera(PointSpreadCamera):
-    """A random mask of open and closed cells, one for each view. In focus (s = 0) nothing is encoded."""
+    """A random mask of open and closed cells, one for each view. In focus (s = 0) nothing is
+    encoded.
+    """
 
     name: ClassVar[str] = "coded-aperture"
 
-    def element(self) -> CodedAperture:
+    def make_element(self) -> CodedAperture:
         """Return the mask; at least one of its cells is open."""
         random = np.random.default_rng(self.seed)
         cells = tuple(len({view[axis] for view in self.views}) for axis in (0, 1))
@@ -82,7 +89,7 @@ class CubicPhaseCamera(PointSpreadCamera):
 
     name: ClassVar[str] = "cubic-phase"
 
-    def element(self) -> CubicPhasePlate:
+    def make_element(self) -> CubicPhasePlate:
         """Return the phase plate."""
         return CubicPhasePlate(min(self.image_shape) / 5)
 
@@ -92,21 +99,23 @@ class DiffuserCamera(PointSpreadCamera):
 
     name: ClassVar[str] = "diffuser"
 
-    def element(self) -> Diffuser:
+    def make_element(self) -> Diffuser:
         """Return the diffuser."""
         return Diffuser(min(self.image_shape) / 9, 0.25, self.seed)
 
 
 class MeasuredCamera:
-    """A camera known by its PSFs only, measured with a point source at several depths (supplement Note 4).
+    """A camera known by its PSFs only, measured with a point source at several depths (supplement
+    Note 4).
 
     Parameters
     ----------
     image_shape : (int, int)
     point_spreads : MeasuredPointSpreads
     sensor : LinearOperator, optional
-        From the light on the sensor's plane to the readings, any of `tofclip.operators.sensors`; its plane may be
-        smaller than the picture. The default reads every pixel of a plane as large as the picture.
+        From the light on the sensor's plane to the readings, any of `tofclip.operators.sensors`;
+        its plane may be smaller than the picture. The default reads every pixel of a plane as large
+        as the picture.
     """
 
     def __init__(
@@ -121,11 +130,13 @@ class MeasuredCamera:
     def model(self, shear: float) -> LinearOperator:
         """Return F(d): from the picture at `shear` to the readings."""
         plane = (self.sensor.shape_in[0], self.sensor.shape_in[1])
-        spread = self.point_spreads.at(shear)
-        return self.sensor @ PointSpreadConvolution(self.image_shape, spread, plane, self.sensor.dtype)
+        spread = self.point_spreads.interpolate(shear)
+        return self.sensor @ PointSpreadConvolution(
+            self.image_shape, spread, plane, self.sensor.dtype
+        )
 
 
-def sparse_sensor(image_shape: tuple[int, int], sampling_ratio: float) -> PitchedSensor:
+def make_sparse_sensor(image_shape: tuple[int, int], sampling_ratio: float) -> PitchedSensor:
     """Spread as many pixels evenly over the picture as the sampling ratio asks for.
 
     Raises
@@ -135,9 +146,13 @@ def sparse_sensor(image_shape: tuple[int, int], sampling_ratio: float) -> Pitche
     """
     rows, columns = image_shape
     if not 0 < sampling_ratio <= 1:
-        raise InputError(f"one area sensor gives sampling ratios above 0 up to 1, not {sampling_ratio}")
+        raise InputError(
+            f"one area sensor gives sampling ratios above 0 up to 1, not {sampling_ratio}"
+        )
     kept_rows = min(max(round(rows * np.sqrt(sampling_ratio)), 1), rows)
     kept_columns = min(round(sampling_ratio * rows * columns / kept_rows), columns)
     if kept_columns < 1:
-        raise InputError(f"a sampling ratio of {sampling_ratio} gives no sensor pixel; take a larger one")
+        raise InputError(
+            f"a sampling ratio of {sampling_ratio} gives no sensor pixel; take a larger one"
+        )
     return PitchedSensor(image_shape, (rows / kept_rows, columns / kept_columns))

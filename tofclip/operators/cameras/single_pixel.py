@@ -9,9 +9,9 @@ import numpy as np
 from tofclip.errors import InputError
 from tofclip.operators.base import LinearOperator
 from tofclip.operators.cameras.base import LightFieldCamera
-from tofclip.operators.joined import Stack
 from tofclip.operators.shear import LinearShear, View
 from tofclip.operators.single_pixel import HadamardCodes
+from tofclip.operators.stacking import Stack
 from tofclip.operators.weighting import MeanWeighting
 
 
@@ -20,7 +20,7 @@ class SinglePixelCamera(LightFieldCamera):
 
     name: ClassVar[str] = "single-pixel"
 
-    def _deal(self) -> tuple[int, ...]:
+    def _assign_measurements(self) -> tuple[int, ...]:
         rows, columns = self.image_shape
         self.codes = round(self.sampling_ratio * rows * columns / len(self.views))
         if self.codes < 1:
@@ -28,10 +28,10 @@ class SinglePixelCamera(LightFieldCamera):
                 f"a sampling ratio of {self.sampling_ratio} gives {len(self.views)} views less than one code each; "
                 "take a larger one"
             )
-        self.readings = self.codes * len(self.views)
+        self.measurements = self.codes * len(self.views)
         return tuple(range(len(self.views)))
 
-    def _encoders(self) -> tuple[LinearOperator, ...]:
+    def _build_encoders(self) -> tuple[LinearOperator, ...]:
         seeds = np.random.SeedSequence(self.seed).generate_state(len(self.views))
         return tuple(HadamardCodes(self.image_shape, self.codes, int(seed)) for seed in seeds)
 
@@ -40,10 +40,10 @@ class SinglePixelCamera(LightFieldCamera):
         return Stack(
             [
                 encoder @ LinearShear(self.image_shape, shear, self.views[view], reference)
-                for view, encoder in zip(self.used, self.encoders, strict=True)
+                for view, encoder in zip(self.used_views, self.encoders, strict=True)
             ]
         )
 
     def weighting(self) -> LinearOperator:
         """Return the weights that keep the mean of each view's codes from swamping the rest."""
-        return MeanWeighting([self.codes] * len(self.used))
+        return MeanWeighting([self.codes] * len(self.used_views))

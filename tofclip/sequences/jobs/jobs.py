@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from tofclip.errors import TofclipError
-from tofclip.storage import one_line
-from tofclip.threads import one_blas_thread
+from tofclip.storage import format_error_line
+from tofclip.threads import limit_blas_threads
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,16 @@ class Job:
     result : Path
         The file it makes, whole or not at all; on a cluster, where every worker can write it.
     work : callable
-        Makes the file; may return a few figures about it. It has to survive pickling: a `functools.partial` of a
-        function of a module with names of files and numbers.
-    beside : tuple of Path
+        Makes the file; may return a few figures about it. It has to survive pickling: a
+        `functools.partial` of a function of a module with names of files and numbers.
+    extra_outputs : tuple of Path
         Further files that it writes, before the result.
     """
 
     name: str
     result: Path
     work: Callable[[], Any]
-    beside: tuple[Path, ...] = ()
+    extra_outputs: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Summary:
     seconds: float
 
     @classmethod
-    def of(cls, reports: Iterable[Report], started: float) -> Summary:
+    def from_reports(cls, reports: Iterable[Report], started: float) -> Summary:
         """Sum up reports as they come; `started` is a reading of `time.perf_counter`."""
         done, failures, processes, peak = 0, [], set(), 0
         for report in reports:
@@ -106,33 +106,38 @@ class Summary:
             processes.add(report.process)
             peak = max(peak, report.peak_bytes)
         failures.sort(key=lambda failure: failure.name)
-        return cls(done, tuple(failures), len(processes - {""}), peak, time.perf_counter() - started)
+        return cls(
+            done, tuple(failures), len(processes - {""}), peak, time.perf_counter() - started
+        )
 
 
-def unfinished(jobs: Iterable[Job]) -> list[Job]:
+def select_unfinished(jobs: Iterable[Job]) -> list[Job]:
     """Return the jobs whose result is not there yet."""
     return [job for job in jobs if not job.result.exists()]
 
 
-def attempt(job: Job) -> Report:
-    """Do a job unless its result is there; whatever goes wrong is told in the report, so that the others go on.
+def run_job(job: Job) -> Report:
+    """Do a job unless its result is there; whatever goes wrong is told in the report, so that the
+    others go on.
 
-    The libraries of linear algebra get one thread: with more, they round differently, and jobs would give other results
-    on a cluster than here.
+    The libraries of linear algebra get one thread: with more, they round differently, and jobs
+    would give other results on a cluster than here.
     """
     problem, figures = "", None
     try:
         if not job.result.exists():
-            with one_blas_thread():
+            with limit_blas_threads():
                 figures = job.work()
     except TofclipError as fault:
-        problem = one_line(fault)
+        problem = format_error_line(fault)
     except Exception as fault:
-        problem = f"unforeseen {type(fault).__name__}: {one_line(fault)}"
-    return Report(job.name, problem, figures, f"{platform.node()}:{os.getpid()}", peak_memory_bytes())
+        problem = f"unforeseen {type(fault).__name__}: {format_error_line(fault)}"
+    return Report(
+        job.name, problem, figures, f"{platform.node()}:{os.getpid()}", measure_peak_memory_bytes()
+    )
 
 
-def peak_memory_bytes() -> int:
+def measure_peak_memory_bytes() -> int:
     """Most memory that this process has held so far; 0 where the system does not tell."""
     try:
         import resource

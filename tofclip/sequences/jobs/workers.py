@@ -1,4 +1,6 @@
-"""Where jobs run: on workers started for them on this machine, or on those of a scheduler that is there already."""
+"""Where jobs run: on workers started for them on this machine, or on those of a scheduler that is
+there already.
+"""
 
 from __future__ import annotations
 
@@ -17,20 +19,21 @@ if TYPE_CHECKING:
     from distributed import Client
 
 LOCAL = "local"
-SCHEMES = ("tcp://", "tls://")
+ADDRESS_SCHEMES = ("tcp://", "tls://")
 WAIT_SECONDS = 30.0
 
 
 @contextlib.contextmanager
-def workers(where: str) -> Iterator[Client]:
+def connect_workers(where: str) -> Iterator[Client]:
     """Yield a client of the workers that `where` names.
 
     Parameters
     ----------
     where : str
-        ``local``: one worker for each core of this machine; ``local:N``: so many, which share the cores;
-        ``tcp://HOST:PORT`` or ``tls://HOST:PORT``: a scheduler (``dask scheduler``), whose workers (``dask worker``)
-        have this version of this program and see the files under the same names.
+        ``local``: one worker for each core of this machine; ``local:N``: so many, which share the
+        cores; ``tcp://HOST:PORT`` or ``tls://HOST:PORT``: a scheduler (``dask scheduler``), whose
+        workers (``dask worker``) have this version of this program and see the files under the same
+        names.
 
     Raises
     ------
@@ -39,34 +42,42 @@ def workers(where: str) -> Iterator[Client]:
     MissingDependencyError
         dask.distributed is not installed.
     """
-    number = local_workers(where)
+    number = count_local_workers(where)
     try:
         import distributed
     except ImportError as fault:
-        raise MissingDependencyError("--cluster needs dask.distributed: pip install 'tofclip[cluster]'") from fault
-    opened = _on_this_machine(distributed, number) if number else _at_address(distributed, where)
+        raise MissingDependencyError(
+            "--cluster needs dask.distributed: pip install 'tofclip[cluster]'"
+        ) from fault
+    opened = (
+        _start_local_cluster(distributed, number)
+        if number
+        else _connect_scheduler(distributed, where)
+    )
     with opened as client:
         yield client
 
 
-def local_workers(where: str) -> int:
+def count_local_workers(where: str) -> int:
     """Return how many workers to start on this machine; 0: none, `where` is an address."""
     name, separator, number = where.partition(":")
     if name == LOCAL and not separator:
         return thread_count()
     if name == LOCAL and number.isdecimal() and int(number) >= 1:
         return int(number)
-    if where.startswith(SCHEMES) and len(where.split("://")[1]) > 0:
+    if where.startswith(ADDRESS_SCHEMES) and len(where.split("://")[1]) > 0:
         return 0
     raise InputError(f"no cluster is called '{where}'; use local, local:N or tcp://HOST:PORT")
 
 
 @contextlib.contextmanager
-def _on_this_machine(distributed: Any, number: int) -> Iterator[Client]:
-    """Start processes of one job at a time that share the cores, each minded by another that replaces it if it dies."""
+def _start_local_cluster(distributed: Any, number: int) -> Iterator[Client]:
+    """Start processes of one job at a time that share the cores, each minded by another that
+    replaces it if it dies.
+    """
     threads = str(max(1, thread_count() // number))
-    with _quiet():
-        with _unheard_by_children():
+    with _silence_log():
+        with _shield_children_from_interrupt():
             cluster = distributed.LocalCluster(
                 n_workers=number,
                 threads_per_worker=1,
@@ -80,28 +91,34 @@ def _on_this_machine(distributed: Any, number: int) -> Iterator[Client]:
 
 
 @contextlib.contextmanager
-def _at_address(distributed: Any, where: str) -> Iterator[Client]:
+def _connect_scheduler(distributed: Any, where: str) -> Iterator[Client]:
     try:
         client = distributed.Client(where, timeout=WAIT_SECONDS)
     except (OSError, ValueError) as fault:
-        raise InputError(f"{where}: no scheduler answers; start one with 'dask scheduler'") from fault
-    with _quiet(), client:
-        _greet(client, where)
+        raise InputError(
+            f"{where}: no scheduler answers; start one with 'dask scheduler'"
+        ) from fault
+    with _silence_log(), client:
+        _check_workers(client, where)
         yield client
 
 
-def _greet(client: Client, where: str) -> None:
+def _check_workers(client: Client, where: str) -> None:
     """Refuse a cluster without workers, or with workers that have not this version of this program."""
     try:
         client.wait_for_workers(1, timeout=WAIT_SECONDS)
         found = set(client.run(_version).values())
     except TimeoutError as fault:
-        raise InputError(f"{where}: the scheduler has no worker; start some with 'dask worker {where}'") from fault
+        raise InputError(
+            f"{where}: the scheduler has no worker; start some with 'dask worker {where}'"
+        ) from fault
     except Exception as fault:
         raise InputError(f"{where}: its workers have no tofclip {__version__}: {fault}") from fault
     if found != {__version__}:
         versions = ", ".join(sorted(found))
-        raise InputError(f"{where}: its workers have tofclip {versions}, this is {__version__}; install the same")
+        raise InputError(
+            f"{where}: its workers have tofclip {versions}, this is {__version__}; install the same"
+        )
 
 
 def _version() -> str:
@@ -109,8 +126,10 @@ def _version() -> str:
 
 
 @contextlib.contextmanager
-def _unheard_by_children() -> Iterator[None]:
-    """Keep processes started now from hearing Ctrl-C: a terminal sends it to all, and we end them ourselves."""
+def _shield_children_from_interrupt() -> Iterator[None]:
+    """Keep processes started now from hearing Ctrl-C: a terminal sends it to all, and we end them
+    ourselves.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -122,7 +141,7 @@ def _unheard_by_children() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def _silence_log() -> Iterator[None]:
     """Keep the library's log off the screen: what matters is told in the summary."""
     logger = logging.getLogger("distributed")
     before = logger.level

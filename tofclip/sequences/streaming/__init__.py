@@ -1,7 +1,9 @@
-"""Shots to clouds while they come: stages side by side, little held between them, every latency measured."""
+"""Shots to clouds while they come: stages side by side, little held between them, every latency
+measured.
+"""
 
 from tofclip.sequences.streaming.channel import Policy
 from tofclip.sequences.streaming.pipeline import StreamedCloud, stream_clouds
-from tofclip.sequences.streaming.stages import Passage, Stage, in_stages
+from tofclip.sequences.streaming.stages import Stage, StreamItem, run_stages
 
-__all__ = ["Passage", "Policy", "Stage", "StreamedCloud", "in_stages", "stream_clouds"]
+__all__ = ["Policy", "Stage", "StreamItem", "StreamedCloud", "run_stages", "stream_clouds"]

@@ -16,7 +16,7 @@ POLICIES: tuple[Policy, ...] = ("block", "drop_oldest")
 Entry = TypeVar("Entry")
 
 
-class ClosedError(Exception):
+class ChannelClosedError(Exception):
     """Nobody takes entries any more."""
 
 
@@ -39,7 +39,9 @@ class Channel(Generic[Entry]):
         if capacity < 1:
             raise InputError(f"a channel holds one entry or more, not {capacity}")
         if policy not in POLICIES:
-            raise InputError(f"a full channel's policy is one of {', '.join(POLICIES)}, not '{policy}'")
+            raise InputError(
+                f"a full channel's policy is one of {', '.join(POLICIES)}, not '{policy}'"
+            )
         self._capacity, self._policy = capacity, policy
         self._entries: deque[Entry] = deque()
         self._changed = Condition()
@@ -63,7 +65,7 @@ class Channel(Generic[Entry]):
                 else:
                     self._changed.wait()
             if self._closed:
-                raise ClosedError
+                raise ChannelClosedError
             self._entries.append(entry)
             self._changed.notify_all()
 

@@ -10,11 +10,11 @@ from time import perf_counter
 from typing import Any
 
 from tofclip.lidar.cloud import PointCloud, point_cloud
-from tofclip.sequences.ranger import Ranger
+from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming.channel import Policy
-from tofclip.sequences.streaming.stages import READ, WAIT, Stage, in_stages
+from tofclip.sequences.streaming.stages import READ, WAIT, Stage, run_stages
 from tofclip.shots import Streak
-from tofclip.threads import on_this_thread, one_blas_thread, thread_count
+from tofclip.threads import limit_blas_threads, limit_to_calling_thread, thread_count
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class StreamedCloud:
     shot : int
         Number of its shot in the source, from 0; what was dropped has been counted.
     seconds : mapping
-        What each stage took: ``"read"`` (the source, which is no latency), ``"wait"`` (until its turn came),
-        ``"rectify"``, ``"recover"``, ``"range"`` and ``"place"``.
+        What each stage took: ``"read"`` (the source, which is no latency), ``"wait"`` (until its
+        turn came), ``"rectify"``, ``"recover"``, ``"range"`` and ``"place"``.
     latency : float
         Time from when the shot was there until its cloud was handed out, s.
     """
@@ -40,23 +40,27 @@ class StreamedCloud:
 
 
 def stream_clouds(
-    shots: Iterable[Streak], ranger: Ranger | None = None, held: int = 1, policy: Policy = "block"
+    shots: Iterable[Streak],
+    pipeline: RangingPipeline | None = None,
+    queue_size: int = 1,
+    policy: Policy = "block",
 ) -> Generator[StreamedCloud, None, None]:
     """Yield the cloud of every shot by the linear inverse, as soon as it is made.
 
-    A shot is rectified and recovered, its returns are found and placed in space, all on one core, while the other cores
-    work on other shots and the next ones are read. Until the stream ends, NumPy's products keep to one thread.
+    A shot is rectified and recovered, its returns are found and placed in space, all on one core,
+    while the other cores work on other shots and the next ones are read. Until the stream ends,
+    NumPy's products keep to one thread.
 
     Parameters
     ----------
     shots : iterable of Streak
         A file's, a folder's or an instrument's; it is read on a thread of its own.
-    ranger : Ranger, optional
+    pipeline : Ranger, optional
         By default one for the camera that the first shot carries.
-    held : int
+    queue_size : int
         Shots that wait before each stage, at most.
     policy : "block" or "drop_oldest"
-        What happens when shots come faster than the clouds are taken; see `in_stages`.
+        What happens when shots come faster than the clouds are taken; see `run_stages`.
 
     Raises
     ------
@@ -64,37 +68,42 @@ def stream_clouds(
 
     Notes
     -----
-    Memory: ``3 * (held + 1)`` shots, one more for each core with what is recovered of it, and what a `Ranger` takes.
+    Memory: ``3 * (held + 1)`` shots, one more for each core with what is recovered of it, and what
+    a `RangingPipeline` takes.
     """
     coming = iter(shots)
-    if ranger is None:
+    if pipeline is None:
         first = next(coming, None)
         if first is None:
             return
-        ranger, coming = Ranger.for_shot(first), _with_first(first, coming)
-    own = ranger
+        pipeline, coming = RangingPipeline.for_shot(first), _prepend_shot(first, coming)
+    own = pipeline
 
-    def made(shot: Streak) -> tuple[PointCloud, dict[str, float]]:
-        with on_this_thread():
-            return _cloud_of(shot, own)
+    def make_timed_cloud(shot: Streak) -> tuple[PointCloud, dict[str, float]]:
+        with limit_to_calling_thread():
+            return _make_cloud(shot, own)
 
-    # A core for each shot: shared out among all, a shot would be done sooner, but cores would wait for each other.
-    with one_blas_thread(), ThreadPoolExecutor(thread_count(), "stream work") as cores:
-        stages = Stage("begin", lambda shot: cores.submit(made, shot)), Stage("end", Future.result)
-        with closing(in_stages(coming, stages, held, policy)) as passages:
-            for passage in passages:
-                cloud, seconds = passage.value
-                waited = passage.latency - sum(seconds.values())
-                told = {READ: passage.seconds[READ], WAIT: waited, **seconds}
-                yield StreamedCloud(cloud, passage.number, told, passage.latency)
+    # A core for each shot: shared out among all, a shot would be done sooner, but cores would wait
+    # for each other.
+    with limit_blas_threads(), ThreadPoolExecutor(thread_count(), "stream work") as cores:
+        stages = (
+            Stage("begin", lambda shot: cores.submit(make_timed_cloud, shot)),
+            Stage("end", Future.result),
+        )
+        with closing(run_stages(coming, stages, queue_size, policy)) as items:
+            for item in items:
+                cloud, seconds = item.value
+                waited = item.latency - sum(seconds.values())
+                told = {READ: item.seconds[READ], WAIT: waited, **seconds}
+                yield StreamedCloud(cloud, item.number, told, item.latency)
 
 
-def _cloud_of(shot: Streak, ranger: Ranger) -> tuple[PointCloud, dict[str, float]]:
+def _make_cloud(shot: Streak, pipeline: RangingPipeline) -> tuple[PointCloud, dict[str, float]]:
     """Make the cloud of a shot; return it and what each step took, s."""
     steps: dict[str, Callable[[Any], Any]] = {
-        "rectify": lambda streak: ranger.rectifier.readings(streak.counts),
-        "recover": ranger.recover,
-        "range": ranger.search,
+        "rectify": lambda streak: pipeline.rectifier.measurements(streak.counts),
+        "recover": pipeline.recover,
+        "range": pipeline.search,
         "place": point_cloud,
     }
     value: Any = shot
@@ -106,7 +115,7 @@ def _cloud_of(shot: Streak, ranger: Ranger) -> tuple[PointCloud, dict[str, float
     return value, seconds
 
 
-def _with_first(first: Streak, others: Iterator[Streak]) -> Iterator[Streak]:
+def _prepend_shot(first: Streak, others: Iterator[Streak]) -> Iterator[Streak]:
     """Put a shot back before the others; closing this closes them."""
     yield first
     yield from others

@@ -1,18 +1,30 @@
-"""Light fields of scenes with a known answer: solid bodies in 3D, ray-cast for each view, with their exact shears."""
+"""Light fields of scenes with a known answer: solid bodies in 3D, ray-cast for each view, with
+their exact shears.
+"""
 
 from tofclip.simulate.light_fields.array import CameraArray
 from tofclip.simulate.light_fields.bodies import Body, Box, Rectangle, Sphere
 from tofclip.simulate.light_fields.materials import Lambertian, Specular
-from tofclip.simulate.light_fields.pulsed import Clock, PulsedScene, flash, flash_view
-from tofclip.simulate.light_fields.render import RenderedLightField, Scene, render, render_view, shear_map
-from tofclip.simulate.light_fields.scenes import SCENES, known_scene
+from tofclip.simulate.light_fields.pulsed import (
+    PulsedScene,
+    TimeAxis,
+    render_flash,
+    render_flash_view,
+)
+from tofclip.simulate.light_fields.render import (
+    RenderedLightField,
+    Scene,
+    render_light_field,
+    render_shear_map,
+    render_view,
+)
+from tofclip.simulate.light_fields.scenes import SCENES, make_scene
 
 __all__ = [
     "SCENES",
     "Body",
     "Box",
     "CameraArray",
-    "Clock",
     "Lambertian",
     "PulsedScene",
     "Rectangle",
@@ -20,10 +32,11 @@ __all__ = [
     "Scene",
     "Specular",
     "Sphere",
-    "flash",
-    "flash_view",
-    "known_scene",
-    "render",
+    "TimeAxis",
+    "make_scene",
+    "render_flash",
+    "render_flash_view",
+    "render_light_field",
+    "render_shear_map",
     "render_view",
-    "shear_map",
 ]

@@ -1,4 +1,6 @@
-"""A grid of pinhole cameras, all looking the same way, their pictures shifted to agree at one distance."""
+"""A grid of pinhole cameras, all looking the same way, their pictures shifted to agree at one
+distance.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from tofclip.operators.shear import View
 
 @dataclass(frozen=True)
 class CameraArray:
-    """Cameras at ``(u, v) * view_step`` metres in the plane z = 0, looking along z; x points right and y down.
+    """Cameras at ``(u, v) * view_step`` metres in the plane z = 0, looking along z; x points right
+    and y down.
 
     Parameters
     ----------
@@ -60,16 +63,26 @@ class CameraArray:
     def views(self) -> NDArray[np.float64]:
         """(v, u) of each camera in raster order, (views, 2)."""
         numbers = (np.arange(count) - count // 2 for count in self._view_counts)
-        return np.stack(np.meshgrid(*numbers, indexing="ij"), axis=-1).reshape(-1, 2).astype(np.float64)
+        return (
+            np.stack(np.meshgrid(*numbers, indexing="ij"), axis=-1)
+            .reshape(-1, 2)
+            .astype(np.float64)
+        )
 
-    def place(self, view: View) -> NDArray[np.float64]:
-        """Where the camera at (v, u) stands, (x, y, z) in metres; fractions are places between the array's."""
+    def position(self, view: View) -> NDArray[np.float64]:
+        """Where the camera at (v, u) stands, (x, y, z) in metres; fractions are places between the
+        array's.
+        """
         return np.array([view[1] * self.view_step, view[0] * self.view_step, 0.0])
 
     def shear(self, depth: ArrayLike) -> NDArray[np.float64]:
-        """Shear s in pixels per view step of points at `depth` metres along z (supplement Note 1, s = 0 at focus)."""
+        """Shear s in pixels per view step of points at `depth` metres along z (supplement Note 1, s
+        = 0 at focus).
+        """
         inverse = 1 / np.asarray(depth, np.float64)
-        shear: NDArray[np.float64] = self.focal_length_px * self.view_step * (1 / self.focus - inverse)
+        shear: NDArray[np.float64] = (
+            self.focal_length_px * self.view_step * (1 / self.focus - inverse)
+        )
         return shear
 
     def depth(self, shear: float) -> float:
@@ -82,11 +95,15 @@ class CameraArray:
         """
         inverse = 1 / self.focus - shear / (self.focal_length_px * self.view_step)
         if not inverse > 0:
-            raise InputError(f"shear {shear} lies beyond infinity for this camera array; take a smaller one")
+            raise InputError(
+                f"shear {shear} lies beyond infinity for this camera array; take a smaller one"
+            )
         return 1 / inverse
 
     def point(self, x: float, y: float, shear: float) -> NDArray[np.float64]:
-        """The point (x, y, z) in metres that the reference view sees `x`, `y` pixels off its centre at a shear."""
+        """The point (x, y, z) in metres that the reference view sees `x`, `y` pixels off its centre
+        at a shear.
+        """
         depth = self.depth(shear)
         return np.array([x / self.focal_length_px * depth, y / self.focal_length_px * depth, depth])
 
@@ -107,13 +124,18 @@ class CameraArray:
             As long as the way from the camera to the plane in focus.
         """
         rows, columns = self.image_shape
-        origin = self.place(view)
-        y, x = (_sample_places(count, samples) * self.focus / self.focal_length_px for count in (rows, columns))
+        origin = self.position(view)
+        y, x = (
+            _sample_positions(count, samples) * self.focus / self.focal_length_px
+            for count in (rows, columns)
+        )
         at_focus = np.stack(np.broadcast_arrays(x, y[:, np.newaxis], self.focus), axis=-1)
         return origin, at_focus.reshape(-1, 3) - origin
 
 
-def _sample_places(pixels: int, samples: int) -> NDArray[np.float64]:
-    """Places of the samples in pixels from the middle of the picture's central pixel, number n // 2."""
+def _sample_positions(pixels: int, samples: int) -> NDArray[np.float64]:
+    """Places of the samples in pixels from the middle of the picture's central pixel, number n //
+    2.
+    """
     places: NDArray[np.float64] = (np.arange(pixels * samples) + 0.5) / samples - 0.5 - pixels // 2
     return places

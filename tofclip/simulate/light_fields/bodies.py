@@ -24,25 +24,25 @@ class Hits:
         In lengths of the ray's direction; infinite where it misses.
     normal : (rays, 3) array
         Of length 1, towards the ray's origin.
-    place : (rays, 2) array
+    pattern_position : (rays, 2) array
         On the pattern, from 0 to 1, right and down; meaningless where the ray misses.
     """
 
     distance: Array
     normal: Array
-    place: Array
+    pattern_position: Array
 
 
 class Shape(ABC):
     """A surface around the origin; x right, y down, z away from the reader."""
 
     @abstractmethod
-    def hits(self, origin: Array, directions: Array) -> Hits:
+    def intersect(self, origin: Array, directions: Array) -> Hits:
         """Return where rays from (3,) `origin` along (rays, 3) `directions` first meet the surface."""
 
     @property
     @abstractmethod
-    def half(self) -> Array:
+    def half_extent(self) -> Array:
         """Half of the width, height and thickness of an upright box that holds the shape, m."""
 
 
@@ -60,15 +60,18 @@ class Rectangle(Shape):
     height: float
 
     @property
-    def half(self) -> Array:
+    def half_extent(self) -> Array:
         """Half of width, height and thickness, m."""
         return np.array([self.width, self.height, 0.0]) / 2
 
-    def hits(self, origin: Array, directions: Array) -> Hits:
+    def intersect(self, origin: Array, directions: Array) -> Hits:
         """Return where rays meet the plate, from either side."""
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = -origin[2] / directions[:, 2]
-            place = (origin[:2] + distance[:, np.newaxis] * directions[:, :2]) / (self.width, self.height) + 0.5
+            place = (origin[:2] + distance[:, np.newaxis] * directions[:, :2]) / (
+                self.width,
+                self.height,
+            ) + 0.5
             right, down = place.T
             met = (distance > 0) & (right >= 0) & (right < 1) & (down >= 0) & (down < 1)
         normal = np.zeros_like(directions)
@@ -89,11 +92,11 @@ class Sphere(Shape):
     radius: float
 
     @property
-    def half(self) -> Array:
+    def half_extent(self) -> Array:
         """The radius three times, m."""
         return np.full(3, self.radius)
 
-    def hits(self, origin: Array, directions: Array) -> Hits:
+    def intersect(self, origin: Array, directions: Array) -> Hits:
         """Return where rays from outside meet the ball."""
         along, square = directions @ origin, np.einsum("ij,ij->i", directions, directions)
         below_root = along**2 - square * (origin @ origin - self.radius**2)
@@ -120,15 +123,17 @@ class Box(Shape):
     thickness: float
 
     @property
-    def half(self) -> Array:
+    def half_extent(self) -> Array:
         """Half of width, height and thickness, m."""
         return np.array([self.width, self.height, self.thickness]) / 2
 
-    def hits(self, origin: Array, directions: Array) -> Hits:
+    def intersect(self, origin: Array, directions: Array) -> Hits:
         """Return where rays from outside meet the block."""
-        half = self.half
+        half = self.half_extent
         with np.errstate(divide="ignore", invalid="ignore"):
-            slabs = np.sort(np.stack([(-half - origin) / directions, (half - origin) / directions]), axis=0)
+            slabs = np.sort(
+                np.stack([(-half - origin) / directions, (half - origin) / directions]), axis=0
+            )
         axis, distance = slabs[0].argmax(axis=1), slabs[0].max(axis=1)
         met = (distance > 0) & (distance <= slabs[1].min(axis=1))
         met_at = np.where(met, distance, 0.0)
@@ -158,35 +163,57 @@ class Body:
     centre: Array
     axes: Array = field(default_factory=lambda: np.eye(3))
 
-    def hits(self, origin: Array, directions: Array) -> Hits:
+    def intersect(self, origin: Array, directions: Array) -> Hits:
         """Return where rays meet the body; holes of its pattern let them pass."""
-        found = self.shape.hits((origin - self.centre) @ self.axes, directions @ self.axes)
-        solid = self.material.solid(found.place)
-        return Hits(np.where(solid, found.distance, np.inf), found.normal @ self.axes.T, found.place)
+        found = self.shape.intersect((origin - self.centre) @ self.axes, directions @ self.axes)
+        solid = self.material.is_solid(found.pattern_position)
+        return Hits(
+            np.where(solid, found.distance, np.inf),
+            found.normal @ self.axes.T,
+            found.pattern_position,
+        )
 
-    def candidates(self, origin: Array, directions: Array) -> Array:
-        """Return the numbers of those rays, all forward, that may meet the body; most of a picture's do not."""
-        (x, y, z), (width, height, thickness) = self.centre - origin, np.abs(self.axes) @ self.shape.half
+    def select_candidate_rays(self, origin: Array, directions: Array) -> Array:
+        """Return the numbers of those rays, all forward, that may meet the body; most of a
+        picture's do not.
+        """
+        (x, y, z), (width, height, thickness) = (
+            self.centre - origin,
+            np.abs(self.axes) @ self.shape.half_extent,
+        )
         if z <= thickness:
             return np.arange(len(directions))
-        beside, below = ((side + thickness * abs(off) / z) / (z - thickness) for side, off in ((width, x), (height, y)))
+        beside, below = (
+            (side + thickness * abs(off) / z) / (z - thickness)
+            for side, off in ((width, x), (height, y))
+        )
         slopes = directions[:, :2] / directions[:, 2:]
-        return np.flatnonzero((abs(slopes[:, 0] - x / z) <= beside) & (abs(slopes[:, 1] - y / z) <= below))
+        return np.flatnonzero(
+            (abs(slopes[:, 0] - x / z) <= beside) & (abs(slopes[:, 1] - y / z) <= below)
+        )
 
-    def shifted(self, x: float, y: float, z: float = 0.0) -> Body:
+    def shift(self, x: float, y: float, z: float = 0.0) -> Body:
         """Return the body moved by metres."""
         return replace(self, centre=self.centre + np.array([x, y, z]))
 
-    def flipped(self) -> Body:
+    def flip(self) -> Body:
         """Return the body mirrored left to right in its own middle."""
         return replace(self, axes=np.diag([-1.0, 1.0, 1.0]) @ self.axes)
 
-    def turned(self, angle: float) -> Body:
-        """Return the body turned clockwise, as seen, about its middle and the line of sight; `angle` in rad."""
+    def rotate(self, angle: float) -> Body:
+        """Return the body turned clockwise, as seen, about its middle and the line of sight;
+        `angle` in rad.
+        """
         cosine, sine = np.cos(angle), np.sin(angle)
-        return replace(self, axes=np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]) @ self.axes)
+        return replace(
+            self, axes=np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]) @ self.axes
+        )
 
-    def tilted(self, angle: float) -> Body:
-        """Return the body turned about the upright line through its middle, its right side away; `angle` in rad."""
+    def tilt(self, angle: float) -> Body:
+        """Return the body turned about the upright line through its middle, its right side away;
+        `angle` in rad.
+        """
         cosine, sine = np.cos(angle), np.sin(angle)
-        return replace(self, axes=np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]) @ self.axes)
+        return replace(
+            self, axes=np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]) @ self.axes
+        )

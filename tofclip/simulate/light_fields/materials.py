@@ -12,7 +12,7 @@ from tofclip.errors import InputError
 
 Array = NDArray[Any]
 
-AMBIENT = 0.4
+AMBIENT_FRACTION = 0.4
 """Share of the light that comes from everywhere."""
 
 
@@ -45,7 +45,7 @@ class Lambertian:
         found: Array = self.pattern[row, column]
         return found
 
-    def solid(self, place: Array) -> Array:
+    def is_solid(self, place: Array) -> Array:
         """Tell where there is no hole."""
         return np.isfinite(self.reflectance(place))
 
@@ -60,13 +60,14 @@ class Lambertian:
         light : (3,) array
             Towards the lamp, length 1.
         """
-        lit: Array = AMBIENT + (1 - AMBIENT) * np.maximum(normal @ light, 0)
+        lit: Array = AMBIENT_FRACTION + (1 - AMBIENT_FRACTION) * np.maximum(normal @ light, 0)
         return self.reflectance(place) * lit
 
 
 @dataclass(frozen=True)
 class Specular(Lambertian):
-    """A glossy surface: a matt one, and a lobe about the mirror's direction (B. T. Phong, Commun. ACM 18, 311, 1975).
+    """A glossy surface: a matt one, and a lobe about the mirror's direction (B. T. Phong, Commun.
+    ACM 18, 311, 1975).
 
     Parameters
     ----------

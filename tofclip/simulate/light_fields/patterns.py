@@ -13,7 +13,9 @@ TEXELS = 384  # on the longer side
 LINE_SPACING = 1.3  # of capital letters' height
 
 
-def written(text: str, ink: float, paper: float = float("nan"), margin: float = 0.08) -> Pattern:
+def make_text_pattern(
+    text: str, ink: float, paper: float = float("nan"), margin: float = 0.08
+) -> Pattern:
     """Bold capitals that fill a rectangle; each line is as wide as the rectangle.
 
     Parameters
@@ -32,14 +34,18 @@ def written(text: str, ink: float, paper: float = float("nan"), margin: float = 
     inside = np.zeros((TEXELS, TEXELS), bool)
     for number, line in enumerate(lines):
         top = margin + number * step * LINE_SPACING
-        inside |= _line(line, (margin, 1 - margin), (top, top + step))
+        inside |= _rasterise_line(line, (margin, 1 - margin), (top, top + step))
     return np.where(inside, ink, paper).astype(np.float32)
 
 
-def mottled(dark: float, bright: float, grains: int, seed: int) -> Pattern:
-    """Smooth random blotches, about `grains` across the pattern, with every brightness from dark to bright."""
+def make_mottled_pattern(dark: float, bright: float, grains: int, seed: int) -> Pattern:
+    """Smooth random blotches, about `grains` across the pattern, with every brightness from dark to
+    bright.
+    """
     if not 0 < grains < TEXELS:
-        raise InputError(f"a mottled pattern has from 1 to {TEXELS - 1} grains across, not {grains}")
+        raise InputError(
+            f"a mottled pattern has from 1 to {TEXELS - 1} grains across, not {grains}"
+        )
     random = np.random.default_rng(seed)
     spectrum = np.fft.rfft2(random.standard_normal((TEXELS, TEXELS)))
     frequency = np.hypot(np.fft.fftfreq(TEXELS)[:, np.newaxis], np.fft.rfftfreq(TEXELS)) * TEXELS
@@ -49,12 +55,16 @@ def mottled(dark: float, bright: float, grains: int, seed: int) -> Pattern:
     return pattern
 
 
-def _line(line: str, across: tuple[float, float], down: tuple[float, float]) -> NDArray[np.bool_]:
+def _rasterise_line(
+    line: str, across: tuple[float, float], down: tuple[float, float]
+) -> NDArray[np.bool_]:
     """Texels inside the letters of one line, stretched to a part of the unit square."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
 
-    outline = TextPath((0, 0), line, size=10, prop=FontProperties(family="DejaVu Sans", weight="bold"))
+    outline = TextPath(
+        (0, 0), line, size=10, prop=FontProperties(family="DejaVu Sans", weight="bold")
+    )
     box = outline.get_extents()
     middle = (np.arange(TEXELS) + 0.5) / TEXELS
     x = box.x0 + (middle - across[0]) / (across[1] - across[0]) * box.width

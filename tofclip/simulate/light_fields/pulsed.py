@@ -1,8 +1,8 @@
-"""Time of flight in light fields: which instant brings which light to which pixel of each view, lamps and shadows
-included.
+"""Time of flight in light fields: which instant brings which light to which pixel of each view,
+lamps and shadows included.
 
-Light goes from a lamp to a surface and on to a view; a lamp that something else shades adds nothing. Interreflections
-are left out.
+Light goes from a lamp to a surface and on to a view; a lamp that something else shades adds
+nothing. Interreflections are left out.
 """
 
 from __future__ import annotations
@@ -17,14 +17,16 @@ from tofclip.errors import InputError, ShapeError
 from tofclip.operators.shear import View
 from tofclip.simulate.light_fields.array import CameraArray
 from tofclip.simulate.light_fields.bodies import Body
-from tofclip.simulate.light_fields.render import look
-from tofclip.simulate.render import FWHM_PER_SIGMA, gathered, share_rows
-from tofclip.threads import one_blas_thread, run_blocks
+from tofclip.simulate.light_fields.render import cast_rays
+from tofclip.simulate.render import FWHM_PER_SIGMA, accumulate_cells, spread_over_rows
+from tofclip.threads import limit_blas_threads, run_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
 Array = NDArray[Any]
 
-SHADOW_MARGIN = 1e-6  # relative distance before a surface at which rounding no longer makes it shade itself
+SHADOW_MARGIN = (
+    1e-6  # relative distance before a surface at which rounding no longer makes it shade itself
+)
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class PulsedScene:
 
 
 @dataclass(frozen=True)
-class Clock:
+class TimeAxis:
     """Bins of time, and how long the instrument's answer to an instant is.
 
     Parameters
@@ -90,50 +92,67 @@ class Clock:
         return np.linspace(self.start, self.start + (self.bins - 1) * self.bin_width, self.bins)
 
     @classmethod
-    def covering(cls, near: float, far: float, bin_width: float, pulse_fwhm: float) -> Clock:
+    def for_ranges(cls, near: float, far: float, bin_width: float, pulse_fwhm: float) -> TimeAxis:
         """Return a clock for surfaces from `near` to `far` metres away, lamps beside the views."""
         start = 2 * near / SPEED_OF_LIGHT
-        return cls(start, bin_width, int(np.ceil(2 * (far - near) / SPEED_OF_LIGHT / bin_width)) + 1, pulse_fwhm)
+        return cls(
+            start,
+            bin_width,
+            int(np.ceil(2 * (far - near) / SPEED_OF_LIGHT / bin_width)) + 1,
+            pulse_fwhm,
+        )
 
 
-def flash(scene: PulsedScene, array: CameraArray, clock: Clock) -> NDArray[np.float32]:
+def render_flash(
+    scene: PulsedScene, array: CameraArray, time_axis: TimeAxis
+) -> NDArray[np.float32]:
     """Return what every view sees at every instant, (views, rows, columns, bins).
 
-    A surface of reflectance 1 that faces all lamps from the distance of the array's focus has brightness 1, summed
-    over time. Memory beyond the result is about 1 kB for each ray of a view and thread.
+    A surface of reflectance 1 that faces all lamps from the distance of the array's focus has
+    brightness 1, summed over time. Memory beyond the result is about 1 kB for each ray of a view
+    and thread.
     """
     views = array.views
-    pictures = np.empty((len(views), *array.image_shape, clock.bins), np.float32)
+    pictures = np.empty((len(views), *array.image_shape, time_axis.bins), np.float32)
 
     def some(which: slice) -> None:
         for number in range(which.start, which.stop):
-            pictures[number] = flash_view(scene, array, clock, (views[number, 0], views[number, 1]))
+            pictures[number] = render_flash_view(
+                scene, array, time_axis, (views[number, 0], views[number, 1])
+            )
 
-    with one_blas_thread():  # the threads are used for views
+    with limit_blas_threads():  # the threads are used for views
         run_blocks(some, len(views), 1)
     return pictures
 
 
-def flash_view(scene: PulsedScene, array: CameraArray, clock: Clock, view: View) -> Array:
+def render_flash_view(
+    scene: PulsedScene, array: CameraArray, time_axis: TimeAxis, view: View
+) -> Array:
     """Return what the camera at (v, u) sees at every instant, (rows, columns, bins) float32."""
     origin, directions = array.rays(view, array.samples)
-    sight = look(scene.bodies, origin, directions)
+    sight = cast_rays(scene.bodies, origin, directions)
     seen = np.flatnonzero(np.isfinite(sight.distance))
-    normal, reflectance = sight.normal[seen], _reflectance(scene, sight.body[seen], sight.place[seen])
+    normal, reflectance = (
+        sight.normal[seen],
+        _look_up_reflectance(scene, sight.body[seen], sight.pattern_position[seen]),
+    )
     points = origin + sight.distance[seen, np.newaxis] * directions[seen]
     back = np.linalg.norm(points - origin, axis=1)
-    pixel = _pixels(array)[seen]
-    total = np.zeros((*array.image_shape, clock.bins))
+    pixel = _number_pixels(array)[seen]
+    total = np.zeros((*array.image_shape, time_axis.bins))
     for lamp in scene.lamps:
-        lit = irradiance(scene.bodies, lamp, points, normal) * reflectance
+        lit = compute_irradiance(scene.bodies, lamp, points, normal) * reflectance
         bright = lit > 0
         way = np.linalg.norm(points[bright] - lamp, axis=1) + back[bright]
-        total += _sorted_by_time(pixel[bright], way / SPEED_OF_LIGHT, lit[bright], clock, total.shape)
+        total += _bin_by_time(
+            pixel[bright], way / SPEED_OF_LIGHT, lit[bright], time_axis, total.shape
+        )
     share = array.focus**2 / len(scene.lamps) / array.samples**2
     return (share * total).astype(np.float32)
 
 
-def _reflectance(scene: PulsedScene, body: Array, place: Array) -> Array:
+def _look_up_reflectance(scene: PulsedScene, body: Array, place: Array) -> Array:
     found = np.zeros(body.size)
     for number, one in enumerate(scene.bodies):
         own = body == number
@@ -141,7 +160,9 @@ def _reflectance(scene: PulsedScene, body: Array, place: Array) -> Array:
     return found
 
 
-def irradiance(bodies: tuple[Body, ...], lamp: Array, points: Array, normal: Array) -> Array:
+def compute_irradiance(
+    bodies: tuple[Body, ...], lamp: Array, points: Array, normal: Array
+) -> Array:
     """Return how strongly one lamp lights points: cosine over distance squared, nothing in shadow.
 
     Parameters
@@ -156,24 +177,26 @@ def irradiance(bodies: tuple[Body, ...], lamp: Array, points: Array, normal: Arr
     distance = np.linalg.norm(rays, axis=1)
     facing = -np.einsum("ij,ij->i", rays, normal) / distance
     candidates = np.flatnonzero(facing > 0)
-    nearest = look(bodies, lamp, rays[candidates]).distance
+    nearest = cast_rays(bodies, lamp, rays[candidates]).distance
     light = np.zeros(len(points))
     lit = candidates[nearest > 1 - SHADOW_MARGIN]
     light[lit] = facing[lit] / distance[lit] ** 2
     return light
 
 
-def _sorted_by_time(pixel: Array, time: Array, light: Array, clock: Clock, shape: tuple[int, ...]) -> Array:
+def _bin_by_time(
+    pixel: Array, time: Array, light: Array, time_axis: TimeAxis, shape: tuple[int, ...]
+) -> Array:
     """Put each ray's light on the bins over which its pulse is spread."""
-    sigma = np.full(time.shape, clock.pulse_fwhm / FWHM_PER_SIGMA / clock.bin_width)
-    first, shares = share_rows((time - clock.start) / clock.bin_width, sigma)
+    sigma = np.full(time.shape, time_axis.pulse_fwhm / FWHM_PER_SIGMA / time_axis.bin_width)
+    first, shares = spread_over_rows((time - time_axis.start) / time_axis.bin_width, sigma)
     bins = first[:, np.newaxis] + np.arange(shares.shape[1])
-    inside = (bins >= 0) & (bins < clock.bins)
-    cell = pixel[:, np.newaxis] * clock.bins + bins
-    return gathered(cell[inside], (shares * light[:, np.newaxis])[inside], shape)
+    inside = (bins >= 0) & (bins < time_axis.bins)
+    cell = pixel[:, np.newaxis] * time_axis.bins + bins
+    return accumulate_cells(cell[inside], (shares * light[:, np.newaxis])[inside], shape)
 
 
-def _pixels(array: CameraArray) -> Array:
+def _number_pixels(array: CameraArray) -> Array:
     """Raster number of the pixel to which each ray belongs."""
     numbers = np.arange(int(np.prod(array.image_shape))).reshape(array.image_shape)
     return numbers.repeat(array.samples, axis=0).repeat(array.samples, axis=1).ravel()

@@ -14,11 +14,11 @@ from tofclip.light_field import LightField
 from tofclip.operators.shear import View
 from tofclip.simulate.light_fields.array import CameraArray
 from tofclip.simulate.light_fields.bodies import Body
-from tofclip.threads import one_blas_thread, run_blocks
+from tofclip.threads import limit_blas_threads, run_blocks
 
 Array = NDArray[Any]
 
-LIGHT = (-0.35, -0.45, -0.82)
+LIGHT_DIRECTION = (-0.35, -0.45, -0.82)
 """Towards the lamp: over the viewer's left shoulder."""
 
 
@@ -34,7 +34,7 @@ class Scene:
     """
 
     bodies: tuple[Body, ...]
-    light: tuple[float, float, float] = LIGHT
+    light: tuple[float, float, float] = LIGHT_DIRECTION
 
     def __post_init__(self) -> None:
         if not self.bodies:
@@ -51,14 +51,15 @@ class RenderedLightField:
     ----------
     light_field : LightField
     shears : (rows, columns) float32 array
-        Shear of what the reference view (0, 0) sees in the middle of each pixel; infinite where it sees nothing.
+        Shear of what the reference view (0, 0) sees in the middle of each pixel; infinite where it
+        sees nothing.
     """
 
     light_field: LightField
     shears: Array
 
 
-def render(scene: Scene, array: CameraArray) -> RenderedLightField:
+def render_light_field(scene: Scene, array: CameraArray) -> RenderedLightField:
     """Render every view of an array; memory is about 200 bytes for each ray of one view and thread."""
     views = array.views
     pictures = np.empty((len(views), *array.image_shape), np.float32)
@@ -68,32 +69,36 @@ def render(scene: Scene, array: CameraArray) -> RenderedLightField:
             v, u = views[number]
             pictures[number] = render_view(scene, array, (float(v), float(u)))
 
-    with one_blas_thread():  # the threads are used for views
+    with limit_blas_threads():  # the threads are used for views
         run_blocks(some, len(views), 1)
-    return RenderedLightField(LightField(pictures, views), shear_map(scene, array))
+    return RenderedLightField(LightField(pictures, views), render_shear_map(scene, array))
 
 
 def render_view(scene: Scene, array: CameraArray, view: View) -> Array:
-    """Return what the camera at (v, u) sees, (rows, columns) float32; fractions are cameras between the array's."""
+    """Return what the camera at (v, u) sees, (rows, columns) float32; fractions are cameras between
+    the array's.
+    """
     origin, directions = array.rays(view, array.samples)
-    _, brightness = _cast(scene, origin, directions)
+    _, brightness = _shade_rays(scene, origin, directions)
     rows, columns = array.image_shape
     by_pixel = brightness.reshape(rows, array.samples, columns, array.samples)
     picture: Array = by_pixel.mean(axis=(1, 3)).astype(np.float32)
     return picture
 
 
-def shear_map(scene: Scene, array: CameraArray, view: View = (0.0, 0.0)) -> Array:
-    """Return the shear of what a view sees in the middle of each pixel, (rows, columns) float32; infinite: nothing."""
+def render_shear_map(scene: Scene, array: CameraArray, view: View = (0.0, 0.0)) -> Array:
+    """Return the shear of what a view sees in the middle of each pixel, (rows, columns) float32;
+    infinite: nothing.
+    """
     origin, directions = array.rays(view, 1)
-    distance, _ = _cast(scene, origin, directions)
+    distance, _ = _shade_rays(scene, origin, directions)
     seen = np.isfinite(distance)
     depth = np.where(seen, distance, 1.0) * array.focus  # directions reach to the plane in focus
     return np.where(seen, array.shear(depth), np.inf).reshape(array.image_shape).astype(np.float32)
 
 
 @dataclass(frozen=True)
-class Sight:
+class FirstHits:
     """What rays meet first.
 
     Parameters
@@ -104,37 +109,41 @@ class Sight:
         Number of the body, meaningless where there is none.
     normal : (rays, 3) array
         Of length 1, towards the ray's origin.
-    place : (rays, 2) array
+    pattern_position : (rays, 2) array
         On the body's pattern.
     """
 
     distance: Array
     body: Array
     normal: Array
-    place: Array
+    pattern_position: Array
 
 
-def look(bodies: Sequence[Body], origin: Array, directions: Array) -> Sight:
-    """Follow rays from (3,) `origin` along (rays, 3) `directions`, all with z > 0, to the nearest surface."""
+def cast_rays(bodies: Sequence[Body], origin: Array, directions: Array) -> FirstHits:
+    """Follow rays from (3,) `origin` along (rays, 3) `directions`, all with z > 0, to the nearest
+    surface.
+    """
     count = len(directions)
     nearest, number = np.full(count, np.inf), np.zeros(count, np.intp)
     normal, place = np.zeros((count, 3)), np.zeros((count, 2))
     for index, body in enumerate(bodies):
-        rays = body.candidates(origin, directions)
-        found = body.hits(origin, directions[rays])
+        rays = body.select_candidate_rays(origin, directions)
+        found = body.intersect(origin, directions[rays])
         closer = found.distance < nearest[rays]
         seen = rays[closer]
         nearest[seen], number[seen] = found.distance[closer], index
-        normal[seen], place[seen] = found.normal[closer], found.place[closer]
-    return Sight(nearest, number, normal, place)
+        normal[seen], place[seen] = found.normal[closer], found.pattern_position[closer]
+    return FirstHits(nearest, number, normal, place)
 
 
-def _cast(scene: Scene, origin: Array, directions: Array) -> tuple[Array, Array]:
+def _shade_rays(scene: Scene, origin: Array, directions: Array) -> tuple[Array, Array]:
     """Distance to the nearest surface along each ray and the light that comes back from it."""
-    sight = look(scene.bodies, origin, directions)
+    sight = cast_rays(scene.bodies, origin, directions)
     brightness = np.zeros(len(directions))
     light = np.array(scene.light) / np.linalg.norm(scene.light)
     for index, body in enumerate(scene.bodies):
         own = np.flatnonzero(np.isfinite(sight.distance) & (sight.body == index))
-        brightness[own] = body.material.radiance(sight.place[own], sight.normal[own], directions[own], light)
+        brightness[own] = body.material.radiance(
+            sight.pattern_position[own], sight.normal[own], directions[own], light
+        )
     return sight.distance, brightness

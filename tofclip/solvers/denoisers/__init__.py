@@ -1,4 +1,6 @@
-"""Denoisers that serve as priors: each takes a picture and the noise to remove, and knows nothing of any camera."""
+"""Denoisers that serve as priors: each takes a picture and the noise to remove, and knows nothing
+of any camera.
+"""
 
 from tofclip.solvers.denoisers.block_matching import BlockMatching
 from tofclip.solvers.denoisers.collaborative import CollaborativeWiener

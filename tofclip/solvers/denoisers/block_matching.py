@@ -1,4 +1,6 @@
-"""BM3D, from a package that is free for non-commercial use only and therefore not installed by default."""
+"""BM3D, from a package that is free for non-commercial use only and therefore not installed by
+default.
+"""
 
 from __future__ import annotations
 

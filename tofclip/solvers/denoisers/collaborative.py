@@ -12,12 +12,14 @@ from tofclip.solvers.denoisers.denoiser import Picture
 
 @dataclass(frozen=True)
 class CollaborativeWiener:
-    """Every patch is filtered together with its likes: the second step of non-local Bayes, the pilot as its first.
+    """Every patch is filtered together with its likes: the second step of non-local Bayes, the
+    pilot as its first.
 
-    M. Lebrun, A. Buades, J.-M. Morel, SIAM J. Imaging Sci. 6, 1665 (2013), Eq. 3.6: mean and covariance of a group
-    come from the pilot, and ``x = mean + C (C + deviation^2 I)^-1 (y - mean)`` is the best linear estimate of each of
-    its patches. In a loop that calls a denoiser again and again, the pilot is what the last call returned. About as
-    good as BM3D here and five times faster, under our own licence.
+    M. Lebrun, A. Buades, J.-M. Morel, SIAM J. Imaging Sci. 6, 1665 (2013), Eq. 3.6: mean and
+    covariance of a group come from the pilot, and ``x = mean + C (C + deviation^2 I)^-1 (y -
+    mean)`` is the best linear estimate of each of its patches. In a loop that calls a denoiser
+    again and again, the pilot is what the last call returned. About as good as BM3D here and five
+    times faster, under our own licence.
 
     Parameters
     ----------
@@ -46,13 +48,17 @@ class CollaborativeWiener:
         ShapeError
             Picture and pilot differ in shape.
         """
-        from tofclip.solvers.denoisers.kernels import filter_groups
+        from tofclip.solvers.denoisers.kernels import filter_patch_groups
 
         if pilot.shape != noisy.shape:
             raise ShapeError("the pilot picture", noisy.shape, pilot.shape)
         if min(noisy.shape) < self.patch_px:
-            raise InputError(f"a picture of {noisy.shape} is smaller than a patch of {self.patch_px} px")
+            raise InputError(
+                f"a picture of {noisy.shape} is smaller than a patch of {self.patch_px} px"
+            )
         settings = (self.patch_px, self.stride_px, self.reach_px, self.group)
         seen = np.ascontiguousarray(noisy, np.float32)
-        clean = filter_groups(seen, np.ascontiguousarray(pilot, np.float32), np.float32(deviation), settings)
+        clean = filter_patch_groups(
+            seen, np.ascontiguousarray(pilot, np.float32), np.float32(deviation), settings
+        )
         return np.asarray(clean, noisy.dtype)

@@ -5,14 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-compiled = njit(nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy")
+fast_njit = njit(
+    nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "reassoc"}, error_model="numpy"
+)
 
 
-@compiled
-def _distances(pilot, row, column, patch, reach, distances, corners):
-    """Squared distances of the patches around one; `corners` gets where they begin. Returns how many there are.
+@fast_njit
+def _patch_distances(pilot, row, column, patch, reach, distances, corners):
+    """Squared distances of the patches around one; `corners` gets where they begin. Returns how
+    many there are.
 
-    The patch itself comes first, so that it is in its own group however many others are just like it.
+    The patch itself comes first, so that it is in its own group however many others are just like
+    it.
     """
     distances[0] = -1
     corners[0, 0], corners[0, 1] = row, column
@@ -33,7 +37,7 @@ def _distances(pilot, row, column, patch, reach, distances, corners):
     return count
 
 
-@compiled
+@fast_njit
 def _keep_nearest(distances, corners, count, wanted):
     """Move the `wanted` nearest corners to the front; returns how many there are."""
     if count <= wanted:
@@ -47,8 +51,8 @@ def _keep_nearest(distances, corners, count, wanted):
     return kept
 
 
-@compiled
-def _gather(picture, corners, patch, group):
+@fast_njit
+def _gather_patches(picture, corners, patch, group):
     for member in range(group.shape[0]):
         row, column = corners[member]
         for i in range(patch):
@@ -56,7 +60,7 @@ def _gather(picture, corners, patch, group):
                 group[member, i * patch + j] = picture[row + i, column + j]
 
 
-@compiled
+@fast_njit
 def _wiener_gain(centred, variance):
     """Return ``(C + variance I)^-1 C`` of the group's covariance C."""
     covariance = np.dot(centred.T, centred) / np.float32(centred.shape[0])
@@ -66,8 +70,8 @@ def _wiener_gain(centred, variance):
     return np.linalg.solve(loaded, covariance)
 
 
-@compiled
-def _scatter(group, corners, patch, weight, total, weights):
+@fast_njit
+def _scatter_patches(group, corners, patch, weight, total, weights):
     for member in range(group.shape[0]):
         row, column = corners[member]
         for i in range(patch):
@@ -76,11 +80,13 @@ def _scatter(group, corners, patch, weight, total, weights):
                 weights[row + i, column + j] += weight
 
 
-@compiled
-def filter_groups(noisy, pilot, deviation, settings):
-    """Filter groups of similar patches and average where they overlap, steadier groups counting more.
+@fast_njit
+def filter_patch_groups(noisy, pilot, deviation, settings):
+    """Filter groups of similar patches and average where they overlap, steadier groups counting
+    more.
 
-    `settings` is (side of a patch, stride, reach of the search, patches in a group); pictures are float32.
+    `settings` is (side of a patch, stride, reach of the search, patches in a group); pictures are
+    float32.
     """
     patch, stride, reach, wanted = settings
     rows, columns = noisy.shape
@@ -92,13 +98,18 @@ def filter_groups(noisy, pilot, deviation, settings):
         row = min(step_row * stride, rows - patch)
         for step_column in range((columns - patch + stride - 1) // stride + 1):
             column = min(step_column * stride, columns - patch)
-            count = _distances(pilot, row, column, patch, reach, distances, corners)
+            count = _patch_distances(pilot, row, column, patch, reach, distances, corners)
             members = _keep_nearest(distances, corners, count, wanted)
-            alike, seen = np.empty((members, patch * patch), np.float32), np.empty((members, patch * patch), np.float32)
-            _gather(pilot, corners, patch, alike)
-            _gather(noisy, corners, patch, seen)
+            alike, seen = (
+                np.empty((members, patch * patch), np.float32),
+                np.empty((members, patch * patch), np.float32),
+            )
+            _gather_patches(pilot, corners, patch, alike)
+            _gather_patches(noisy, corners, patch, seen)
             mean = alike.sum(axis=0) / np.float32(members)
             gain = _wiener_gain(alike - mean, variance)
             clean = np.dot(seen - mean, gain) + mean
-            _scatter(clean, corners, patch, 1 / (np.trace(gain) + np.float32(1)), total, weights)
+            _scatter_patches(
+                clean, corners, patch, 1 / (np.trace(gain) + np.float32(1)), total, weights
+            )
     return total / weights

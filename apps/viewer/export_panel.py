@@ -1,0 +1,160 @@
+"""What can be taken along from the page: screenshots, the points that are shown, places to look
+from; and its keys.
+"""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from apps.viewer.raster import BACKGROUND
+from apps.viewer.server import run_in_page
+from apps.viewer.session import Session
+from apps.viewer.viewpoint import Viewpoint
+
+if TYPE_CHECKING:
+    import viser
+
+Post = Callable[[Callable[[], None]], None]
+RENDER_TIMEOUT_S = 20.0  # s
+MAX_SIDE_PX = 1600
+
+KEY_TABLE_SCRIPT = """
+if (!window.tofclipKeys) {
+  window.tofclipKeys = true;
+  document.addEventListener("keydown", (event) => {
+    if (event.key !== "?" || ["INPUT", "TEXTAREA"].includes(document.activeElement.tagName)) return;
+    for (const button of document.querySelectorAll("button"))
+      if (button.textContent.trim() === "keys") button.click();
+  });
+}
+"""
+
+
+class ExportPanel:
+    """Screenshot, export, bookmarks and keys.
+
+    Parameters
+    ----------
+    server : ViserServer
+    session : Session
+    post : callable
+    viewpoint : Viewpoint
+        Where one looks from at first.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, session: Session, post: Post, viewpoint: Viewpoint
+    ) -> None:
+        self._server, self._session, self._post = server, session, post
+        self._bookmarked_views: dict[str, tuple[Any, Any]] = {
+            "start": (viewpoint.eye, viewpoint.target)
+        }
+        gui = server.gui
+        gui.add_button("screenshot").on_click(lambda event: self._send_screenshot(event.client))
+        gui.add_button("export", hint="the points that are shown, as PLY").on_click(
+            lambda event: self._post(lambda: self._send_points(event.client))
+        )
+        self._bookmarks: Any = gui.add_dropdown("view from", ("start",))
+        self._bookmarks.on_update(self._go_to_bookmark)
+        gui.add_button("bookmark", hint="remember where one looks from").on_click(
+            lambda event: self._add_bookmark(event.client)
+        )
+        gui.add_button("keys", hint="also: ?").on_click(lambda event: self._show_keys(event.client))
+        self._keys = self._add_keys()
+        run_in_page(server, KEY_TABLE_SCRIPT)
+
+    def _send_screenshot(self, client: viser.ClientHandle | None) -> None:
+        if client is None:
+            return
+        shrink = min(
+            1.0, MAX_SIDE_PX / max(client.camera.image_height, client.camera.image_width, 1)
+        )
+        height, width = (
+            round(shrink * side) for side in (client.camera.image_height, client.camera.image_width)
+        )
+        drawn = client.get_render(height, width, transport_format="png", timeout=RENDER_TIMEOUT_S)
+        client.send_file_download("tofclip.png", _encode_png(drawn), save_immediately=True)
+
+    def _send_points(self, client: viser.ClientHandle | None) -> None:
+        shown = self._session.latest
+        if client is None or shown is None:
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "shown.ply"
+            shown.cloud.save(path)
+            client.send_file_download("tofclip.ply", path.read_bytes(), save_immediately=True)
+
+    def _add_bookmark(self, client: viser.ClientHandle | None) -> None:
+        if client is None:
+            return
+        name = f"view {len(self._bookmarked_views)}"
+        self._bookmarked_views[name] = client.camera.position.copy(), client.camera.look_at.copy()
+        self._bookmarks.options = tuple(self._bookmarked_views)
+        self._bookmarks.value = name
+
+    def _go_to_bookmark(self, event: Any) -> None:
+        if event.client is not None:
+            event.client.camera.position, event.client.camera.look_at = self._bookmarked_views[
+                event.target.value
+            ]
+
+    def _show_keys(self, client: viser.ClientHandle | None) -> None:
+        if client is None:
+            return
+        with client.gui.add_modal("keys") as modal:
+            rows = "\n".join(f"| {key} | {label} |" for key, label in self._keys)
+            client.gui.add_markdown(
+                f"| key | what it does |\n|---|---|\n{rows}\n| ? | this table |"
+            )
+            client.gui.add_button("close").on_click(lambda _: modal.close())
+
+    def _add_keys(self) -> list[tuple[str, str]]:
+        """Give keys to what is done most."""
+        session = self._session
+        own = (
+            ("space", "play or pause", self._toggle_playback),
+            ("arrowleft", "one frame back", lambda: session.step(-1)),
+            ("arrowright", "one frame on", lambda: session.step(1)),
+            ("pageup", "ten frames back", lambda: session.step(-10)),
+            ("pagedown", "ten frames on", lambda: session.step(10)),
+            ("home", "first frame", lambda: session.jump(0)),
+            ("end", "last frame", lambda: session.jump(len(session.source))),
+            ("L", "follow a live source", session.follow),
+        )
+        for key, label, act in own:
+            self._add_key(key, label, self._make_handler(act))
+        self._add_key("S", "screenshot", lambda event: self._send_screenshot(event.client))
+        self._add_key("B", "bookmark this view", lambda event: self._add_bookmark(event.client))
+        return [(key, label) for key, label, _ in own] + [
+            ("S", "screenshot"),
+            ("B", "bookmark this view"),
+        ]
+
+    def _make_handler(self, act: Callable[[], None]) -> Callable[[Any], None]:
+        return lambda _: self._post(act)
+
+    def _add_key(self, key: Any, label: str, act: Callable[[Any], None]) -> None:
+        self._server.gui.add_command(label, hotkey=key).on_trigger(act)
+
+    def _toggle_playback(self) -> None:
+        if self._session.clock.playing:
+            self._session.pause()
+        else:
+            self._session.play()
+
+
+def _encode_png(drawn: Any) -> bytes:
+    """Put a picture with a transparent ground on a dark one, as on the page."""
+    from matplotlib.image import imsave
+
+    share = drawn[..., 3:] / 255.0 if drawn.shape[-1] == 4 else 1.0
+    flat = drawn[..., :3] * share + np.array(BACKGROUND) * (1 - share)
+    file = io.BytesIO()
+    imsave(file, np.rint(flat).astype(np.uint8), format="png")
+    return file.getvalue()

@@ -1,0 +1,124 @@
+"""Recovery while one looks: the linear inverse at any shear, each prepared once."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apps.viewer.source import FloatArray, Gate, View
+from tofclip.camera import Camera
+from tofclip.lidar import Detection, Returns, depth, point_cloud
+from tofclip.lidar.detection import SCENE_BRIGHTNESS_QUANTILE
+from tofclip.lidar.processing import select_points
+from tofclip.shots import Frames
+from tofclip.solvers import LinearInverse
+from tofclip.solvers.direct import PreparedInverse
+
+Readings = NDArray[np.float32]
+
+MAX_SHEARS = 6
+SHEAR_LIMITS = (-3.0, 3.0)
+"""Pixels per view step between which a picture can be focused anew."""
+
+MIN_FRAMES = 3
+"""Without a neighbour on either side no return is located."""
+
+
+class LinearRecovery:
+    """Turns the readings of one camera into frames, at any shear.
+
+    Parameters
+    ----------
+    camera : Camera
+    times : (frames,) array
+        Time of flight of each reading, s.
+
+    Notes
+    -----
+    Memory: one operator and one matrix (columns, columns) for each of the last 6 shears. Safe to
+    share by threads.
+    """
+
+    def __init__(self, camera: Camera, times: FloatArray) -> None:
+        self.camera, self.times = camera, times
+        self._inverses: OrderedDict[float, PreparedInverse] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def frames(self, measurements: Readings, shear: float, gate: Gate) -> Frames:
+        """Recover the frames of a gate.
+
+        Parameters
+        ----------
+        measurements : (columns, frames) array
+            Rectified, of the whole shot.
+        shear : float
+            Pixels per view step.
+        gate : Gate
+        """
+        part = np.ascontiguousarray(measurements[:, gate.frames])
+        found = self._prepare_inverse(shear).recover(part).frames
+        times = self.times[gate.frames]
+        return Frames(found, times, self.camera, shears=np.full(times.size, shear))
+
+    def view(
+        self, measurements: Readings, shear: float, gate: Gate, least_intensity: float = 0.0
+    ) -> View:
+        """Recover the frames of a gate and locate their returns.
+
+        Parameters
+        ----------
+        readings, shear, gate
+            As for `frames`.
+        least_intensity : float
+            Weaker returns are left out: a dark gate does not tell by itself that it is dark.
+            Counts, referred to 1 m.
+        """
+        found = make_view(depth(self.frames(measurements, shear, self._widen_gate(gate))))
+        return found if least_intensity <= 0 else select_brighter(found, least_intensity)
+
+    def _widen_gate(self, gate: Gate) -> Gate:
+        first = max(0, min(gate.first, self.times.size - MIN_FRAMES))
+        return Gate(first, max(gate.stop, first + MIN_FRAMES))
+
+    def _prepare_inverse(self, shear: float) -> PreparedInverse:
+        key = round(shear, 6)
+        with self._lock:
+            if key not in self._inverses:
+                self._inverses[key] = LinearInverse().prepare(
+                    self.camera.operator(key), ~self.camera.dead_columns
+                )
+                if len(self._inverses) > MAX_SHEARS:
+                    self._inverses.popitem(last=False)
+            self._inverses.move_to_end(key)
+            return self._inverses[key]
+
+
+def make_view(returns: Returns) -> View:
+    """Place returns in space and keep which pixel saw them."""
+    return View(point_cloud(returns), np.stack([returns.y, returns.x], axis=-1))
+
+
+def find_min_intensity(whole: View) -> float:
+    """Return the intensity below which a return of a shot does not count, as `Detection` has it for
+    all of its frames.
+
+    Parameters
+    ----------
+    whole : View
+        Of all frames.
+    """
+    light = whole.cloud.intensity
+    return (
+        float(np.quantile(light, SCENE_BRIGHTNESS_QUANTILE)) * Detection().min_scene_fraction
+        if light.size
+        else 0.0
+    )
+
+
+def select_brighter(view: View, intensity: float) -> View:
+    """Return the points of at least so many counts."""
+    kept = view.cloud.intensity >= intensity
+    return View(select_points(view.cloud, kept), None if view.pixels is None else view.pixels[kept])

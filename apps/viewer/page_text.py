@@ -1,0 +1,96 @@
+"""The page's own pieces of HTML: where one is, and what the colours mean. Names of files are
+escaped.
+"""
+
+from __future__ import annotations
+
+import html
+from dataclasses import dataclass
+
+import numpy as np
+
+from apps.viewer.colouring import PALETTE_SIZE, Scale, load_palette
+
+GRADIENT_STOPS = 24
+SCALE_TICKS = 6
+HTML_STYLE = "padding:0.2em 0.8em 0.6em;font-size:0.85em;line-height:1.5"
+
+
+@dataclass(frozen=True)
+class Status:
+    """What the line at the top says.
+
+    Parameters
+    ----------
+    label : str
+        ``"LIVE"`` or ``"REPLAY"``.
+    frame, frames : int
+    points : int
+    data_rate, frame_rate, display_rate : float
+        Frames per second that come in, that are sent to the page, and that it has drawn.
+    latency : float
+        From here to the page and back, s; NaN where nobody looks.
+    cloud_latency : float
+        From when a shot came in until its cloud was there, s; NaN where none comes in.
+    lost : int
+        Shots that came in too fast and were dropped.
+    failure_text : str
+    """
+
+    label: str
+    frame: int
+    frames: int
+    points: int
+    data_rate: float
+    frame_rate: float
+    display_rate: float
+    latency: float
+    cloud_latency: float = float("nan")
+    lost: int = 0
+    failure_text: str = ""
+
+    @property
+    def html(self) -> str:
+        """The line, with ids for scripts."""
+        colour = "#e5484d" if self.label == "LIVE" else "#3e8ed0"
+        latency = (
+            f", there and back {1e3 * self.latency:.0f} ms" if np.isfinite(self.latency) else ""
+        )
+        lost = f", {self.lost} dropped" if self.lost else ""
+        coming = (
+            f"<br>shot to cloud {1e3 * self.cloud_latency:.0f} ms{lost}"
+            if np.isfinite(self.cloud_latency)
+            else ""
+        )
+        trouble = (
+            f"<div style='color:#e5484d'>{html.escape(self.failure_text)}</div>"
+            if self.failure_text
+            else ""
+        )
+        return (
+            f"<div style='{HTML_STYLE}'><b id='label' style='color:{colour}'>{self.label}</b> "
+            f"frame <b id='frame-number'>{self.frame}</b> of {self.frames}, <span id='points'>{self.points}</span> "
+            f"points<br><span id='rates'>data {self.data_rate:.1f}/s, frames {self.frame_rate:.1f}/s, display "
+            f"{self.display_rate:.1f}/s{latency}{coming}</span>{trouble}</div>"
+        )
+
+
+def render_scale_html(scale: Scale) -> str:
+    """Return the colours in a row, with the values of some of them below."""
+    colours = load_palette(scale.palette)[
+        np.linspace(0, PALETTE_SIZE - 1, GRADIENT_STOPS).round().astype(int)
+    ]
+    stops = ",".join(f"rgb({red},{green},{blue})" for red, green, blue in colours.tolist())
+    values = scale.values[np.linspace(0, PALETTE_SIZE - 1, SCALE_TICKS).round().astype(int)]
+    ticks = "".join(f"<span>{value:.3g}</span>" for value in values)
+    unit = f" ({scale.unit})" if scale.unit else ""
+    return (
+        f"<div id='scale' style='{HTML_STYLE}'>{scale.quantity}{unit}"
+        f"<div style='height:0.9em;background:linear-gradient(to right,{stops})'></div>"
+        f"<div style='display:flex;justify-content:space-between'>{ticks}</div></div>"
+    )
+
+
+def format_page_title(title: str) -> str:
+    """Return what stands above the controls."""
+    return f"tofclip · {title}"[:60]

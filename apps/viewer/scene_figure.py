@@ -1,0 +1,157 @@
+"""A picture of what is shown, with its scale in metres, made without a screen."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apps.viewer.colouring import PALETTE_SIZE, load_palette
+from apps.viewer.viewpoint import Viewpoint, place_viewpoint
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from apps.viewer.colouring import Scale
+    from apps.viewer.render import Renderer
+    from apps.viewer.session import DisplayedFrame
+
+PICTURE_SHAPE_PX = (640, 960)
+DOTS_PER_INCH = 100
+COLOUR_BAR_TICKS = 7
+BOX_COLOUR = "#8b93a3"
+LABELLED_EDGES = ((6, 7), (4, 6), (2, 6))
+"""Edges of the box, by corners, that carry their length: those of its far side, which is always in
+the picture.
+"""
+
+FEW_POINTS, MANY_POINTS = 20_000, 200_000
+
+Image = NDArray[np.uint8]
+
+
+class SceneFigure:
+    """A figure around a rendered scene: box, colours, words. Pictures of a film share one.
+
+    Parameters
+    ----------
+    title : str
+    first : Shown
+        Says from where one looks.
+    renderer : Renderer
+    """
+
+    def __init__(self, title: str, first: DisplayedFrame, renderer: Renderer) -> None:
+        self._title, self._renderer = title, renderer
+        self.viewpoint = place_viewpoint(first.cloud.xyz, PICTURE_SHAPE_PX[1] / PICTURE_SHAPE_PX[0])
+        self._figure, self._axes, self._image = _make_axes()
+        if len(first.cloud):
+            _draw_box(self._axes, self.viewpoint, first.cloud.xyz)
+            self._axes.set_aspect("equal")
+        self._draw_colours(first.scale)
+        self._canvas: Any = None  # matplotlib's own annotations leave most of a canvas untyped
+        self._background: Any = None
+        self._text = self._axes.set_title("", fontsize=9, loc="left")
+
+    def draw(self, shown: DisplayedFrame) -> Figure:
+        """Put what is shown into the figure, and return it."""
+        image = self._renderer.draw(
+            shown, self.viewpoint, PICTURE_SHAPE_PX, choose_point_size(len(shown.cloud))
+        )
+        self._image.set_data(image)
+        note = (
+            ""
+            if self._renderer.name == "pyvista"
+            else "   drawn by matplotlib: no working graphics library here"
+        )
+        self._text.set_text(f"{self._title}, frame {shown.frame}: {len(shown.cloud)} points{note}")
+        return self._figure
+
+    def pixels(self, shown: DisplayedFrame) -> Image:
+        """Return the whole figure as an image, (rows, columns, 3), its sides even numbers of
+        pixels.
+        """
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        self.draw(shown)
+        moving = (self._image, *self._axes.lines, *self._axes.texts, self._text)
+        if self._canvas is None:  # what stays is laid out and drawn once
+            self._canvas = FigureCanvasAgg(self._figure)
+            for artist in moving:
+                artist.set_animated(True)
+            self._canvas.draw()
+            self._figure.set_layout_engine("none")
+            self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+        self._canvas.restore_region(self._background)
+        for artist in moving:
+            self._axes.draw_artist(artist)
+        drawn = np.asarray(self._canvas.buffer_rgba())[..., :3]
+        rows, columns = (side - side % 2 for side in drawn.shape[:2])
+        return np.ascontiguousarray(drawn[:rows, :columns])
+
+    def _draw_colours(self, scale: Scale) -> None:
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import ListedColormap
+
+        mapped = ScalarMappable(cmap=ListedColormap(load_palette(scale.palette) / 255.0))
+        mapped.set_clim(0, PALETTE_SIZE - 1)
+        places = np.linspace(0, PALETTE_SIZE - 1, COLOUR_BAR_TICKS)
+        bar = self._figure.colorbar(mapped, ax=self._axes, shrink=0.8, pad=0.01, ticks=places)
+        bar.set_ticklabels([f"{scale.values[round(place)]:.3g}" for place in places])
+        bar.set_label(
+            f"{scale.quantity} ({scale.unit})" if scale.unit else scale.quantity, fontsize=9
+        )
+        bar.ax.tick_params(labelsize=8)
+
+
+def save_picture(title: str, shown: DisplayedFrame, renderer: Renderer, out: Path) -> None:
+    """Write a picture of what is shown, whole or not at all."""
+    from apps.figures.style import save_figure
+
+    save_figure(SceneFigure(title, shown, renderer).draw(shown), out)
+
+
+def _make_axes() -> tuple[Figure, Any, Any]:
+    """An empty figure, its axes, and the image in them."""
+    from apps.figures.style import make_figure
+
+    figure = make_figure(
+        PICTURE_SHAPE_PX[1] / DOTS_PER_INCH + 1.2, PICTURE_SHAPE_PX[0] / DOTS_PER_INCH + 0.4
+    )
+    axes = figure.subplots()
+    image = axes.imshow(np.zeros((*PICTURE_SHAPE_PX, 3), np.uint8), interpolation="nearest")
+    axes.set_axis_off()
+    return figure, axes, image
+
+
+def _draw_box(axes: Any, viewpoint: Viewpoint, xyz: NDArray[np.float32]) -> None:
+    """Draw the box around nearly all points, and say how long its sides are."""
+    low, high = np.percentile(xyz, (0.5, 99.5), axis=0)
+    corners = np.array(
+        [[(low, high)[(n >> axis) & 1][axis] for axis in range(3)] for n in range(8)]
+    )
+    row, column, _ = viewpoint.project(corners, PICTURE_SHAPE_PX)
+    for first, second in combinations(range(8), 2):
+        axis = {1: 0, 2: 1, 4: 2}.get(first ^ second)
+        if axis is not None:
+            ends = [first, second]
+            axes.plot(column[ends], row[ends], color=BOX_COLOUR, linewidth=0.6, alpha=0.6)
+            if (first, second) in LABELLED_EDGES:
+                _label_length(axes, column[ends], row[ends], "xyz"[axis], high[axis] - low[axis])
+    axes.set_xlim(-0.5, PICTURE_SHAPE_PX[1] - 0.5)
+    axes.set_ylim(PICTURE_SHAPE_PX[0] - 0.5, -0.5)
+
+
+def _label_length(
+    axes: Any, column: NDArray[Any], row: NDArray[Any], name: str, length: float
+) -> None:
+    words = {"color": BOX_COLOUR, "fontsize": 7, "ha": "center", "va": "bottom", "clip_on": True}
+    axes.text(float(column.mean()), float(row.mean()), f"{name} {length:.3g} m", **words)
+
+
+def choose_point_size(points: int) -> int:
+    """Return the side of a drawn point: larger where there are few."""
+    return 6 if points < FEW_POINTS else 3 if points < MANY_POINTS else 2

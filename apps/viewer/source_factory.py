@@ -1,0 +1,188 @@
+"""From what a user names to something that can be looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from apps.viewer.clouds import CLOUD_SUFFIXES, CloudSource, find_clouds
+from tofclip.errors import FileFormatError, InputError
+from tofclip.storage import HDF5_SIGNATURE, Record, translate_read_errors
+
+if TYPE_CHECKING:
+    from apps.viewer.source import Source
+    from tofclip.camera import Camera
+    from tofclip.shots import Streak
+    from tofclip.shots.stack import StreakStack
+
+
+@dataclass(frozen=True)
+class ShotOptions:
+    """What has to be known about raw shots.
+
+    Parameters
+    ----------
+    camera : Path, optional
+        The camera's file; by default the camera that travels with the shot.
+    bin_width : float, optional
+        Duration of a row, s; by default the shot's own time axis.
+    time_zero : float, optional
+        Reading of the time axis at which light of range 0 would arrive, s; by default the camera's.
+    """
+
+    camera: Path | None = None
+    bin_width: float | None = None
+    time_zero: float | None = None
+
+
+def open_source(name: str, options: ShotOptions | None = None) -> Source:
+    """Open a file, a folder of files, or the address of an instrument.
+
+    Parameters
+    ----------
+    name : str
+        Frames, cloud, volume, shot or stack of shots (HDF5); a cloud of another format; a raw
+        streak image; a folder of clouds or of streak images; or an address such as
+        ``sim+linospad2://?seed=1``.
+    options : Extras, optional
+
+    Raises
+    ------
+    InputError, StorageError, FileFormatError, DeviceError
+        It cannot be opened, or is nothing to look at.
+    """
+    options = options or ShotOptions()
+    if "://" in name:
+        return _open_instrument(name, options)
+    path = Path(name)
+    if path.is_dir():
+        return _open_folder(path, options)
+    with translate_read_errors(path), open(path, "rb") as file:
+        start = file.read(len(HDF5_SIGNATURE))
+    if start == HDF5_SIGNATURE:
+        return _open_hdf5(path, options)
+    if path.suffix.lower() in CLOUD_SUFFIXES and not (
+        path.suffix.lower() == ".npz" and _is_lift_archive(path)
+    ):
+        return CloudSource(path.name, [path])
+    return _open_shots(path.name, [partial(_read_shot, path, options)], options)
+
+
+def _open_hdf5(path: Path, options: ShotOptions) -> Source:
+    from apps.viewer.transient import TransientSource
+    from tofclip.shots import Frames
+
+    if _is_stack(path):
+        from tofclip.shots.stack import StreakStack
+
+        stack = StreakStack(path)
+        return _open_shots(
+            path.name,
+            [partial(_read_stacked_shot, stack, number, options) for number in range(len(stack))],
+            options,
+        )
+    record = Record.load(path)
+    if record.kind == "frames":
+        return TransientSource(path.name, Frames.from_record(record))
+    if record.kind == "volume":
+        from apps.viewer.volume import VolumeSource
+        from nlos import Volume
+
+        return VolumeSource(path.name, Volume.from_record(record))
+    if record.kind == "cloud":
+        return CloudSource(path.name, [path])
+    if record.kind == "streak":
+        return _open_shots(path.name, [partial(_read_shot, path, options)], options)
+    raise FileFormatError(
+        path, f"holds a {record.kind} record; frames, clouds, volumes and shots can be looked at"
+    )
+
+
+def _open_folder(path: Path, options: ShotOptions) -> Source:
+    if clouds := find_clouds(path):
+        return CloudSource(path.name, clouds)
+    shots = sorted(entry for entry in path.iterdir() if entry.is_file() and entry.name[0] != ".")
+    if not shots:
+        raise InputError(f"{path}: the folder holds nothing to look at")
+    return _open_shots(path.name, [partial(_read_shot, shot, options) for shot in shots], options)
+
+
+def _open_shots(title: str, shots: Sequence[Callable[[], Streak]], options: ShotOptions) -> Source:
+    """Shots in files. A single one becomes a transient, so that time can be walked through."""
+    from apps.viewer.linear_recovery import LinearRecovery
+    from apps.viewer.shots import StoredShotSource
+    from apps.viewer.source import Gate
+    from apps.viewer.transient import TransientSource
+    from tofclip.camera import measure
+
+    first = shots[0]()
+    camera = _find_camera(first, options)
+    if len(shots) > 1:
+        return StoredShotSource(title, shots, camera)
+    measured = measure(first.counts, first.saturated, camera)
+    linear = LinearRecovery(camera, first.times - camera.time_zero)
+    return TransientSource(
+        title,
+        linear.frames(measured.measurements, 0.0, Gate(0, first.times.size)),
+        measured.measurements,
+    )
+
+
+def _open_instrument(address: str, options: ShotOptions) -> Source:
+    """An instrument that goes on, or a recording, which is gathered once."""
+    from apps.viewer.live import LiveShotSource, take_first
+    from devices.transients import read_transient, read_transients
+
+    if address.lower().startswith("file://"):
+        return _open_shots(address, [lambda: read_transient(address, options.bin_width)], options)
+    first, rest = take_first(read_transients(address, options.bin_width), address)
+    return LiveShotSource(address, rest, _find_camera(first, options), first)
+
+
+def _find_camera(shot: Streak, options: ShotOptions) -> Camera:
+    """The camera of a row of shots; a sweep that is not known is found from the first one."""
+    from tofclip.camera import Camera
+    from tofclip.recovery import fit_camera_to_shot, prepare_recovery
+
+    known = prepare_recovery(
+        shot, None if options.camera is None else Camera.load(options.camera), "linear"
+    ).camera
+    if options.time_zero is not None:
+        known = known.replace(time_zero=options.time_zero)
+    return known if known.sweep is not None else fit_camera_to_shot(shot, known)
+
+
+def _read_shot(path: Path, options: ShotOptions) -> Streak:
+    from tofclip.io import read_streak
+
+    return read_streak(path, options.bin_width)
+
+
+def _read_stacked_shot(stack: StreakStack, number: int, options: ShotOptions) -> Streak:
+    shot = stack.read_shot(number)
+    return shot if options.bin_width is None else shot.with_bin_width(options.bin_width)
+
+
+def _is_stack(path: Path) -> bool:
+    """Whether an HDF5 file is a stack of shots, which any program may have written."""
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            return "format" not in file.attrs and "counts" in file
+    except OSError as fault:
+        raise FileFormatError(path, "is damaged or incomplete") from fault
+
+
+def _is_lift_archive(path: Path) -> bool:
+    """Whether an archive is a shot rather than a cloud."""
+    import zipfile
+
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return not {"x_m.npy", "x.npy"} & set(archive.namelist())
+    except zipfile.BadZipFile as fault:
+        raise FileFormatError(path, "is no NumPy archive, or a damaged one") from fault

@@ -1,0 +1,34 @@
+"""Trying again until an instrument that went away is back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import monotonic, sleep
+from typing import TypeVar
+
+from tofclip.errors import DeviceDisconnectedError, DeviceNotFoundError, DeviceTimeoutError
+
+T = TypeVar("T")
+
+RETRY_INTERVAL_S = 0.1
+"""Seconds between two attempts."""
+
+
+def retry_connect(connect: Callable[[], T], seconds: float) -> T:
+    """Return what `connect` returns, which is called again while nobody answers.
+
+    Raises
+    ------
+    DeviceDisconnectedError
+        Nobody answered for `seconds`.
+    """
+    deadline = monotonic() + seconds
+    while True:
+        try:
+            return connect()
+        except (DeviceNotFoundError, DeviceDisconnectedError, DeviceTimeoutError) as fault:
+            if monotonic() > deadline:
+                raise DeviceDisconnectedError(
+                    f"the connection broke and nobody answered for {seconds:g} s ({fault})"
+                ) from fault
+            sleep(RETRY_INTERVAL_S)

@@ -1,0 +1,109 @@
+"""The parts of a capture that one illumination made, and a band in which no voxel sees an echo of
+the record.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.band import Band, VirtualPulse
+from nlos.capture import Capture
+from nlos.geometry import Grid
+from nlos.method import Support
+from nlos.time_axis import TimeAxis
+
+FloatArray = NDArray[np.float64]
+
+MIN_POINTS_PER_SPOT = 4
+"""With fewer wall points per laser spot, a wave from each spot is not worth its own field."""
+
+
+@dataclass(frozen=True, eq=False)
+class IlluminationGroup:
+    """Wall points whose light started at one laser spot, or at each point itself.
+
+    Parameters
+    ----------
+    laser : (3,) array or None
+        m; None for a confocal scan, in which the way out is the way back.
+    indices : (n,) int array
+        Which of the capture's valid points.
+    """
+
+    laser: FloatArray | None
+    indices: NDArray[np.intp]
+
+    @property
+    def legs(self) -> int:
+        """How often the field's wave runs between wall and voxel: 1, or 2 if confocal."""
+        return 2 if self.laser is None else 1
+
+    def compute_phasors(self, capture: Capture, band: Band) -> NDArray[np.complex64]:
+        """Return the phasors of the members, shape (n, frequencies)."""
+        traces = capture.traces()
+        return np.asarray(
+            band.compute_phasors(
+                traces if len(self.indices) == len(traces) else traces[self.indices]
+            ),
+            np.complex64,
+        )
+
+
+def group_by_illumination(capture: Capture) -> list[IlluminationGroup]:
+    """Sort the valid wall points of a capture by laser spot."""
+    everyone = np.arange(len(capture.points))
+    if len(capture.lasers) == 1:
+        return [IlluminationGroup(capture.lasers[0], everyone)]
+    if np.array_equal(capture.lasers, capture.points):
+        return [IlluminationGroup(None, everyone)]
+    spots, belonging = np.unique(capture.lasers, axis=0, return_inverse=True)
+    return [
+        IlluminationGroup(spot, np.flatnonzero(belonging.ravel() == i))
+        for i, spot in enumerate(spots)
+    ]
+
+
+def check_illumination_support(capture: Capture) -> Support:
+    """Check that each laser spot lit enough for a field of its own."""
+    count = len(group_by_illumination(capture))
+    if count * MIN_POINTS_PER_SPOT > len(capture.points):
+        return Support(
+            f"{count} laser spots for {len(capture.points)} wall points: a field per spot needs at least "
+            f"{MIN_POINTS_PER_SPOT} points each; image such pairs by back-projection"
+        )
+    return Support()
+
+
+def choose_unaliased_band(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Band:
+    """Return the pulse's band over a period so long that every voxel sees the record once, or
+    silence.
+
+    Evenly spaced frequencies repeat a signal with their period; where the paths of the grid go
+    beyond the record, the record is continued with silence.
+    """
+    outward, back = find_leg_bounds(capture.lasers, grid), find_leg_bounds(capture.points, grid)
+    return choose_band_for_paths(capture.axis, pulse, outward[0] + back[0], outward[1] + back[1])
+
+
+def choose_band_for_paths(
+    axis: TimeAxis, pulse: VirtualPulse, shortest: float, longest: float
+) -> Band:
+    """Return the pulse's band over a period in which paths from `shortest` to `longest` (m) meet
+    the record once.
+    """
+    tail = Band(pulse, axis).tail_bins * axis.spacing
+    period = max(longest - (axis.start - tail), axis.paths[-1] + tail - shortest)
+    bins = max(axis.bins, int(np.ceil(period / axis.spacing)) - 2 * Band(pulse, axis).tail_bins)
+    return Band(pulse, TimeAxis(bins, axis.bin_width, axis.start))
+
+
+def find_leg_bounds(ends: FloatArray, grid: Grid) -> tuple[float, float]:
+    """Bounds of the way between any of some points (n, 3) and any voxel, m."""
+    axes = (grid.x, grid.y, grid.z)
+    low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
+    outside = np.maximum(np.maximum(low - ends, ends - high), 0)
+    across = np.maximum(np.abs(ends - low), np.abs(high - ends))
+    return float(np.linalg.norm(outside, axis=1).min()), float(np.linalg.norm(across, axis=1).max())

@@ -1,0 +1,166 @@
+"""The rows of a shot in which something may have come back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.lidar.traces import TraceBins
+from tofclip.solvers.traces import InverseTraces
+from tofclip.threads import LANES, run_blocks
+
+FloatImage = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+BOX_LENGTH_WIDTHS = (
+    1.7  # a sum over so much of a Gaussian pulse stands out nearly as far as the matched filter's
+)
+DARK_FRACTION, DARKEST_FRACTION = 0.25, 0.05
+MAX_DARK_ENERGY_RATIO, NOISE_ENERGY_RATIO = 1.5, 1.25  # in mean square; noise alone makes a tenth
+THRESHOLD_FACTOR = 1.2  # than the limit has an instant to stand out
+MIN_DARK_ROWS = 24  # dark rows at least, which know the noise of a dark pixel to a seventh
+MAX_ROW_FRACTION = 0.75  # of all rows: what needs more of them is as well searched everywhere
+COLUMNS_PER_BLOCK = 192
+
+
+@dataclass(frozen=True)
+class RowBlock:
+    """Successive rows that are recovered alike.
+
+    Parameters
+    ----------
+    rows : slice
+    inverse : InverseTraces
+    """
+
+    rows: slice
+    inverse: InverseTraces
+
+
+class SignalRowFinder:
+    """Tells the rows of a shot that hold light from those where only noise is.
+
+    Readings are summed over a pulse's length, once per pulse width, and each sum is brought to the
+    noise of its column. Back-projection, which is the matched filter of a lone pixel in even noise,
+    then says how far the brightest pixel of each instant stands out. Of noise alone the brightest
+    of 16 000 pixels stands out by 4.2, and by more than 1.2 times the usual limit of 5 in one
+    instant of three hundred: such instants are searched in vain.
+
+    What this leaves out is the faintest of lone pixels. The search judges a return by the inverse,
+    in which a pixel stands out less than in the back-projection (in the seed paper's instrument
+    0.63 to 0.93 times as far, mostly 0.9), but by the noise of the pixel's own trace, to which
+    bright neighbours add at other instants: four times as much as noise alone, in the
+    demonstration's scene. So where there are other objects, whatever reaches the limit is seen
+    here. In full darkness, a single pixel that stands out of its trace by 5, 6, 7 and 8 is found in
+    15, 43, 78 and 98 of 100 cases; a search of all rows finds 50, 75, 98 and 100. The light of
+    several pixels adds up.
+
+    Parameters
+    ----------
+    row_blocks : sequence of Place
+        In order and without gaps.
+    pulse_rows : float
+        Full width at half maximum of a return, a symmetric one, in rows.
+    limit : float
+        Signal-to-noise from which a response counts as a return.
+    reach : int
+        Rows on either side of a return that its search and its fit look at.
+    """
+
+    def __init__(
+        self, places: Sequence[RowBlock], pulse_rows: float, limit: float, reach: int
+    ) -> None:
+        self.rows = places[-1].rows.stop
+        self._reach, self._threshold = reach, THRESHOLD_FACTOR * limit
+        self._step = max(1, round(pulse_rows))
+        self._length = min(self.rows, max(1, round(BOX_LENGTH_WIDTHS * pulse_rows)))
+        middles, owners = [], []
+        for place in places:
+            instants = np.arange(place.rows.start, place.rows.stop, self._step)
+            filled = np.full(-(-instants.size // LANES) * LANES, -1)
+            filled[: instants.size] = instants
+            middles.append(filled.reshape(-1, LANES))
+            owners += [place.inverse] * len(middles[-1])
+        self._middles, self._owners = np.concatenate(middles), owners
+        self._taken = self._middles >= 0
+        self._starts = np.clip(self._middles - self._length // 2, 0, self.rows - self._length)
+
+    def bins(self, measurements: FloatImage) -> TraceBins:
+        """Return the rows worth recovering, and a sample of the dark ones that stands for the rest.
+
+        All rows, if a quarter of the shot is not nearly as dark as the darkest twentieth, or if not
+        much would be left out.
+
+        Parameters
+        ----------
+        measurements : (columns, rows) float32 array
+
+        Notes
+        -----
+        Memory: as much as the readings, divided by the rows of a pulse width.
+        """
+        lit = self._find_signal_bins(measurements)
+        searched = self._mark_rows_near(lit, self._step // 2 + 1)
+        kept = self._mark_rows_near(lit, self._step // 2 + 1 + self._reach)
+        number = MIN_DARK_ROWS + -(int(kept.sum()) + MIN_DARK_ROWS) % LANES
+        dark = np.flatnonzero(~kept)
+        if self.rows - dark.size + number > MAX_ROW_FRACTION * self.rows:
+            return TraceBins.all_bins(self.rows)
+        bin_weights = kept.astype(np.float32)
+        bin_weights[dark[np.linspace(0, dark.size - 1, number).round().astype(np.intp)]] = (
+            dark.size / number
+        )
+        numbers = np.flatnonzero(bin_weights)
+        return TraceBins(numbers, searched[numbers], bin_weights[numbers])
+
+    def _find_signal_bins(self, measurements: FloatImage) -> Mask:
+        from tofclip.lidar.signal_rows.kernels import (
+            compute_energies,
+            standardise_columns,
+            sum_boxes,
+        )
+
+        sums = np.empty((len(self._starts), measurements.shape[0], LANES), np.float32)
+        energy = np.empty(self._starts.shape, np.float32)
+        run_blocks(
+            lambda piece: sum_boxes(
+                measurements, self._starts, self._length, (piece.start, piece.stop), sums
+            ),
+            measurements.shape[0],
+            COLUMNS_PER_BLOCK,
+        )
+        compute_energies(sums, energy)
+        measured = self._taken & (energy > 0)
+        if not measured.any():
+            return self._taken
+        darkest, quiet = np.quantile(energy[measured], [DARKEST_FRACTION, DARK_FRACTION])
+        if quiet > MAX_DARK_ENERGY_RATIO * darkest:
+            return self._taken
+        counted = (measured & (energy <= max(quiet, NOISE_ENERGY_RATIO * darkest))).astype(
+            np.float32
+        )
+        run_blocks(
+            lambda piece: standardise_columns(sums, counted, (piece.start, piece.stop)),
+            measurements.shape[0],
+            COLUMNS_PER_BLOCK,
+        )
+        highest = np.empty(self._starts.shape, np.float32)
+
+        def project(piece: slice) -> None:
+            highest[piece.start] = self._owners[piece.start].peak_response(sums[piece.start])
+
+        run_blocks(project, len(highest), 1)
+        lit: Mask = self._taken & (highest >= self._threshold)
+        return lit
+
+    def _mark_rows_near(self, lit: Mask, distance: int) -> Mask:
+        """Rows within `distance` of the middle of a lit instant."""
+        middles = self._middles[lit]
+        steps = np.zeros(self.rows + 1, np.int64)
+        np.add.at(steps, np.maximum(middles - distance, 0), 1)
+        np.add.at(steps, np.minimum(middles + distance + 1, self.rows), -1)
+        near: Mask = np.cumsum(steps[:-1]) > 0
+        return near

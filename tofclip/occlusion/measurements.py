@@ -1,0 +1,169 @@
+"""Readings of a light-field camera at every instant, and the returns that follow each other in
+them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import ShapeError
+from tofclip.light_field.measurement import CameraSetup, ClipMeasurement
+from tofclip.operators.light_field_camera import LightFieldCamera
+from tofclip.simulate.light_fields import CameraArray, TimeAxis
+from tofclip.units import SPEED_OF_LIGHT
+
+Array = NDArray[Any]
+
+MIN_PROMINENCE = 0.004
+"""Rise of a return above what is around it, relative to the strongest: far above photon noise, far
+below a surface.
+"""
+
+DISTANCE_SAMPLES = (
+    2000  # distances at which times of flight are tabulated: steps below a hundredth of a bin
+)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The instrument: where views and lamps stand, and what each view reads.
+
+    Parameters
+    ----------
+    array : CameraArray
+    lamps : (lamps, 3) array
+        m; they flash together.
+    setup : Setup
+        Which nonlocal readings the views get.
+    """
+
+    array: CameraArray
+    lamps: NDArray[np.float64]
+    setup: CameraSetup
+
+    @cached_property
+    def camera(self) -> LightFieldCamera:
+        """The encoders of all views."""
+        return self.setup.camera(self.array.image_shape, self.array.views)
+
+    def compute_flight_time(self, distance: Array) -> Array:
+        """Return the mean time of flight, over lamps and views, of points on the axis, s;
+        `distance` (n,) in m.
+        """
+        places = np.stack([self.array.position((v, u)) for v, u in self.array.views])
+        points = np.stack([0 * distance, 0 * distance, distance], axis=-1)[:, np.newaxis]
+        ways = (
+            np.linalg.norm(points - ends, axis=-1).mean(axis=1) for ends in (self.lamps, places)
+        )
+        time: Array = sum(ways) / SPEED_OF_LIGHT
+        return time
+
+
+@dataclass(frozen=True)
+class Return:
+    """What comes back from about one distance.
+
+    Parameters
+    ----------
+    distance : float
+        m along the axis.
+    bins : slice
+        Instants at which its light arrives.
+    """
+
+    distance: float
+    bins: slice
+
+
+@dataclass(frozen=True)
+class TimedMeasurements:
+    """Readings of every view at every instant.
+
+    Parameters
+    ----------
+    values : (readings, bins) float32 array
+    rig : Rig
+    time_axis : Clock
+
+    Raises
+    ------
+    ShapeError
+        The rig makes another number of readings, or the clock has other bins.
+    """
+
+    values: Array
+    rig: Rig
+    time_axis: TimeAxis
+
+    def __post_init__(self) -> None:
+        expected = (self.rig.camera.measurements, self.time_axis.bins)
+        if self.values.shape != expected:
+            raise ShapeError("the readings of this rig", expected, self.values.shape)
+
+    @property
+    def history(self) -> Array:
+        """All readings together at each instant, (bins,)."""
+        total: Array = self.values.sum(axis=0, dtype=np.float64)
+        return total
+
+    def find_returns(self) -> tuple[Return, ...]:
+        """Find the two strongest returns, the nearer first; a gate ends at the darkest instant
+        between them.
+        """
+        from scipy.signal import find_peaks
+
+        history = np.concatenate([[0.0], self.history, [0.0]])
+        peaks, found = find_peaks(history, prominence=MIN_PROMINENCE * history.max())
+        if not peaks.size:
+            return ()
+        strongest = np.sort(peaks[np.argsort(found["prominences"])[-2:]])
+        between = (
+            int(low + np.argmin(history[low:high])) - 1
+            for low, high in pairwise(strongest.tolist())
+        )
+        return tuple(
+            self._locate_return(slice(*ends))
+            for ends in pairwise([0, *between, self.time_axis.bins])
+        )
+
+    def _locate_return(self, bins: slice) -> Return:
+        weight = np.maximum(self.history[bins], 0)
+        time = float(weight @ self.time_axis.times[bins] / weight.sum())
+        reach = self.time_axis.times[[0, -1]] * SPEED_OF_LIGHT / 2
+        distances = np.linspace(0.5 * reach[0], 1.1 * reach[1], DISTANCE_SAMPLES)
+        return Return(
+            float(np.interp(time, self.rig.compute_flight_time(distances), distances)), bins
+        )
+
+    def sum_gate(self, bins: slice) -> Array:
+        """Return the readings summed over some instants, (readings,) float32."""
+        total: Array = self.values[:, bins].sum(axis=1)
+        return total
+
+    def measurement(self, bins: slice) -> ClipMeasurement:
+        """Return what an ordinary recovery takes, of some instants."""
+        array = self.rig.array
+        return ClipMeasurement(self.sum_gate(bins), array.views, array.image_shape, self.rig.setup)
+
+
+def measure_views(pictures: Array, rig: Rig, time_axis: TimeAxis) -> TimedMeasurements:
+    """Measure true views, (views, rows, columns, bins), without noise."""
+    camera = rig.camera
+    return TimedMeasurements(
+        camera.light_field_model()(pictures[list(camera.used_views)]), rig, time_axis
+    )
+
+
+def add_poisson_noise(light: Array, photons_per_unit: float, random: np.random.Generator) -> Array:
+    """Return light as counted photons tell it, in the unit it came in: float32, Poisson
+    distributed.
+    """
+    photons = random.poisson(np.maximum(light, 0) * photons_per_unit)
+    found: Array = (photons / photons_per_unit).astype(np.float32)
+    return found

@@ -1,0 +1,117 @@
+"""What does not change from shot to shot, made once in a process: operators and inverted matrices
+of a camera.
+
+Things are known by their content: two shots whose files carry the same camera share its operators.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from threading import Lock
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from tofclip.arrays import Array, namespace, to_numpy
+from tofclip.camera import Camera
+from tofclip.operators import LinearOperator
+from tofclip.operators.projection import LineProjection
+from tofclip.solvers import LinearInverse, Progress, Result, ignore_progress
+from tofclip.solvers.direct import PreparedInverse
+from tofclip.storage import Record
+
+MAX_CACHED_CAMERAS = 2
+MAX_CACHED_OPERATORS = 16
+"""Of each camera: frames at more shears than that make the further operators anew."""
+
+_camera_cache: dict[str, Camera] = {}
+_lock = Lock()
+
+
+class CachingCamera(Camera):
+    """A camera that keeps the operators it made.
+
+    Memory: for each of at most 16 shears 16 bytes for each of ``views * rows * columns * 2``
+    entries.
+    """
+
+    def operator(self, shear: float = 0.0, dtype: DTypeLike = np.float32) -> LineProjection:
+        """Return F(d), see `Camera.operator`; the same object for the same arguments."""
+        made: dict[tuple[float, str], LineProjection] = self.__dict__.setdefault("_made", {})
+        key = float(shear), np.dtype(dtype).str
+        found = made.get(key) or super().operator(shear, dtype)
+        if len(made) < MAX_CACHED_OPERATORS:
+            made[key] = found
+        return found
+
+
+def get_cached_camera(camera: Camera) -> Camera:
+    """Return the camera of the same content that this process has kept, with its operators."""
+    key = hash_record(camera.to_record())
+    with _lock:
+        if key not in _camera_cache:
+            while len(_camera_cache) >= MAX_CACHED_CAMERAS:
+                _camera_cache.pop(next(iter(_camera_cache)))
+            _camera_cache[key] = CachingCamera(
+                **{one.name: getattr(camera, one.name) for one in fields(camera)}
+            )
+        return _camera_cache[key]
+
+
+def hash_record(record: Record) -> str:
+    """SHA-256 of a record's arrays and numbers, and of those inside it."""
+    found = hashlib.sha256()
+    for name, field in sorted(record.fields.items()):
+        found.update(f"{name} {field.values.dtype.str} {field.values.shape} {field.units}".encode())
+        found.update(np.ascontiguousarray(field.values).tobytes())
+    found.update(repr(sorted(record.attributes.items())).encode())
+    for name, child in sorted(record.children.items()):
+        found.update(f"{name} {hash_record(child)}".encode())
+    return found.hexdigest()
+
+
+@dataclass(frozen=True, repr=False)
+class CachedInverse:
+    """The linear inverse, whose Gram matrices are inverted once for each operator that is kept.
+
+    Parameters
+    ----------
+    method : LinearInverse
+    """
+
+    method: LinearInverse
+    name = "linear"
+    portable = True
+
+    def __repr__(self) -> str:
+        return repr(self.method)
+
+    def recover(
+        self,
+        operator: LinearOperator,
+        measurements: Array,
+        valid: Array | None = None,
+        progress: Progress = ignore_progress,
+    ) -> Result:
+        """Recover one picture per column of `measurements`; see `LinearInverse.recover`."""
+        alive = (
+            np.ones(operator.shape_out, bool)
+            if valid is None
+            else to_numpy(namespace(valid).any(valid, axis=1))
+        )
+        return _prepare_inverse(self.method, operator, alive.tobytes()).recover(
+            measurements, progress
+        )
+
+    def work(self, frames: int) -> int:
+        """Return how many frame iterations `recover` reports at most."""
+        return self.method.work(frames)
+
+
+@lru_cache(maxsize=MAX_CACHED_OPERATORS)
+def _prepare_inverse(
+    method: LinearInverse, operator: LinearOperator, alive: bytes
+) -> PreparedInverse:
+    return method.prepare(operator, np.frombuffer(alive, bool))

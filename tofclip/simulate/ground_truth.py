@@ -1,0 +1,128 @@
+"""What a perfect instrument would see from the reference viewpoint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
+
+from tofclip.shots import Frames
+from tofclip.simulate.instrument import Instrument
+from tofclip.simulate.render import accumulate_cells, compute_pulse_sigma_bins, spread_over_rows
+from tofclip.simulate.scene import NO_PLATE, Scene
+from tofclip.units import SPEED_OF_LIGHT
+
+MIN_REFLECTANCE = 0.1  # a surface that reflects less says too little about where it is
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """The reference view, pixel by pixel.
+
+    Parameters
+    ----------
+    range : (y, x) float32 array
+        Distance along the line of sight, m, of the plate that fills most of the pixel; NaN where
+        there is none.
+    reflectance : (y, x) float32 array
+        Diffuse reflectance times the cosine of incidence, averaged over the pixel.
+    target : (y, x) bool array
+        Pixels whose range can be asked for: the pixel and its eight neighbours lie on one and the
+        same plate, with a reflectance of at least 0.1 everywhere.
+    bin_width : float
+        Duration of a bin of the shot, s, which sets the scale of range errors.
+    """
+
+    range: NDArray[np.float32]
+    reflectance: NDArray[np.float32]
+    target: NDArray[np.bool_]
+    bin_width: float
+
+    @classmethod
+    def from_scene(cls, scene: Scene, instrument: Instrument) -> GroundTruth:
+        """Look at `scene` from the reference viewpoint."""
+        x, y = instrument.pixel_grid()
+        hits = scene.cast_rays(instrument.viewpoint(0.0), instrument.directions(x, y))
+        plate, path, reflectance = (
+            _group_by_pixel(values, instrument)
+            for values in (hits.plate, hits.path, hits.reflectance)
+        )
+        filled = np.stack(
+            [np.mean(plate == number, axis=-1) for number in range(len(scene.plates))]
+        )
+        most = np.argmax(filled, axis=0)[..., np.newaxis]
+        own = plate == most
+        count = own.sum(axis=-1)
+        distance = np.full(count.shape, np.nan, dtype=np.float32)
+        np.divide(
+            (path * own).sum(axis=-1), count, out=distance, where=count > 0, casting="same_kind"
+        )
+        firm = np.all(reflectance >= MIN_REFLECTANCE, axis=-1)
+        whole = (binary_erosion((share == 1) & firm, np.ones((3, 3))) for share in filled)
+        return cls(
+            range=distance,
+            reflectance=reflectance.mean(axis=-1).astype(np.float32),
+            target=np.logical_or.reduce(list(whole)),
+            bin_width=instrument.detector.bin_width,
+        )
+
+
+def render_true_frames(scene: Scene, instrument: Instrument, exposure: float = 1.0) -> Frames:
+    """Transient frames that a perfect camera at the reference viewpoint would deliver, without
+    noise or background.
+
+    Parameters
+    ----------
+    scene : Scene
+    instrument : Instrument
+    exposure : float
+        Photons for reflectance 1 at 1 m that fills a pixel.
+
+    Returns
+    -------
+    Frames
+        On the time axis of the instrument's streak images, time zero taken off.
+    """
+    camera, detector = instrument.camera, instrument.detector
+    x, y = instrument.pixel_grid()
+    hits = scene.cast_rays(instrument.viewpoint(0.0), instrument.directions(x, y))
+    pixel = _number_pixels(instrument)
+    seen = hits.plate != NO_PLATE
+    brightness = (
+        exposure
+        / instrument.rays_per_pixel_side**2
+        * hits.reflectance[seen]
+        / hits.distance[seen] ** 2
+    )
+    row = (2 * hits.path[seen] / SPEED_OF_LIGHT + camera.time_zero) / detector.bin_width
+    first, shares = spread_over_rows(row, np.full(row.shape, compute_pulse_sigma_bins(instrument)))
+    rows = first[:, np.newaxis] + np.arange(shares.shape[1])
+    inside = (rows >= 0) & (rows < detector.rows)
+    shape = (detector.rows, *camera.image_shape)
+    cell = rows * int(np.prod(camera.image_shape)) + pixel[seen][:, np.newaxis]
+    values = accumulate_cells(cell[inside], (shares * brightness[:, np.newaxis])[inside], shape)
+    times = detector.row_times - camera.time_zero
+    # The reference view itself has no parallax: its pictures are those that the right shear would
+    # give.
+    shears = camera.shear_at(
+        np.maximum(SPEED_OF_LIGHT * times / 2, detector.bin_width * SPEED_OF_LIGHT)
+    )
+    return Frames(values.astype(np.float32), times, camera, shears=shears)
+
+
+def _group_by_pixel(values: NDArray[Any], instrument: Instrument) -> NDArray[Any]:
+    """Sort flat sub-pixel values into (rows, columns, rays of the pixel)."""
+    (rows, columns), side = instrument.camera.image_shape, instrument.rays_per_pixel_side
+    return values.reshape(rows, side, columns, side).swapaxes(1, 2).reshape(rows, columns, side**2)
+
+
+def _number_pixels(instrument: Instrument) -> NDArray[np.intp]:
+    """Raster number of the pixel to which each sub-pixel ray belongs."""
+    side = instrument.rays_per_pixel_side
+    numbers = np.arange(int(np.prod(instrument.camera.image_shape))).reshape(
+        instrument.camera.image_shape
+    )
+    return numbers.repeat(side, axis=0).repeat(side, axis=1).ravel()

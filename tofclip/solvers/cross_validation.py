@@ -1,0 +1,139 @@
+"""The weight of a prior, chosen by how well readings are predicted that the recovery has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.arrays import require_numpy
+from tofclip.errors import InputError
+from tofclip.operators import LinearOperator
+from tofclip.solvers.iterative import ProximalMethod
+from tofclip.solvers.method import Array
+from tofclip.threads import thread_count
+
+INITIAL_WEIGHT = 10**-1.75
+"""Relative weight that is tried first."""
+
+WEIGHT_RATIO = 10**0.375
+"""Between one trial and the next."""
+
+MAX_TRIALS = 10
+"""At most so many: from the first weight this reaches three decades up or down."""
+
+FOLD_COUNT = 8
+"""Parts that the readings are dealt into; each is predicted from the other seven."""
+
+SINGLE_FOLD_RUNS = 4096
+"""Runs of readings of which one fold alone is a fair sample: the others are not tried."""
+
+
+@dataclass(frozen=True)
+class WeightChoice:
+    """The weights tried and what their recoveries failed to predict.
+
+    Parameters
+    ----------
+    weight : float
+        The best, between those tried.
+    trial_weights : (trials,) array
+        Ascending.
+    errors : (trials,) array
+        Value of the data term on the readings held out, all folds together.
+    """
+
+    weight: float
+    trial_weights: NDArray[np.float64]
+    errors: NDArray[np.float64]
+
+
+def choose_weight(
+    method: ProximalMethod, operator: LinearOperator, measurements: Array, run: int, seed: int = 0
+) -> WeightChoice:
+    """Choose the weight at which readings left out of the recovery are predicted best (eight-fold
+    cross-validation).
+
+    No noise level and no true picture are needed, which is why this is taken instead of the
+    discrepancy principle or SURE: what F(d) cannot explain (surfaces out of focus) is no noise of a
+    known strength, and generalised cross-validation takes it for signal. Trials go downhill from
+    the first weight until the minimum is bracketed; a parabola in the weight's logarithm refines
+    it.
+
+    Parameters
+    ----------
+    method : ProximalMethod
+        Its own weight does not matter.
+    operator : LinearOperator
+        Pictures (rows, columns) to readings (readings,).
+    measurements : (readings,) array
+        Of one picture.
+    run : int
+        Consecutive readings that are left out together: neighbours on a detector hardly differ, so
+        that single ones would be predicted by their neighbours' errors.
+    seed : int
+        Of the deal.
+    """
+    require_numpy("the choice of a prior's weight", measurements)
+    held = assign_folds(measurements.size, run, seed)
+    parts = np.split(held, held.shape[1], axis=1)
+    column = measurements[:, np.newaxis]
+
+    def unpredicted(trial: ProximalMethod, out: NDArray[np.bool_]) -> float:
+        picture = trial.recover(operator, column, ~out).frames[0]
+        return float(trial.data_term(column, out).value(operator(picture)[:, np.newaxis])[0])
+
+    def error(weight: float) -> float:
+        # the compiled loops of one picture keep one core busy and release the interpreter
+        with ThreadPoolExecutor(min(thread_count(), len(parts))) as pool:
+            return sum(pool.map(partial(unpredicted, replace(method, weight=weight)), parts))
+
+    return _search_downhill(error)
+
+
+def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
+    """Deal runs of consecutive readings into folds; return (readings, folds), True where a reading
+    is left out.
+    """
+    if -(-count // run) < FOLD_COUNT:
+        run = max(1, count // FOLD_COUNT)
+    runs = -(-count // run)
+    if runs < 2:
+        raise InputError(
+            "one reading alone cannot choose its own prior's weight; give the weight as a number"
+        )
+    dealt = np.random.default_rng(seed).permutation(runs) % min(FOLD_COUNT, runs)
+    used = 1 if runs >= SINGLE_FOLD_RUNS else min(FOLD_COUNT, runs)
+    out: NDArray[np.bool_] = np.repeat(dealt, run)[:count, np.newaxis] == np.arange(used)
+    return out
+
+
+def _search_downhill(error: Callable[[float], float]) -> WeightChoice:
+    """Try weights up or down from the first, whichever lowers the error, until it rises again."""
+    errors = {step: error(INITIAL_WEIGHT * WEIGHT_RATIO**step) for step in (0, 1)}
+    direction = 1 if errors[1] < errors[0] else -1
+    while len(errors) < MAX_TRIALS:
+        best = min(errors, key=errors.__getitem__)
+        if best + direction in errors:
+            break
+        errors[best + direction] = error(INITIAL_WEIGHT * WEIGHT_RATIO ** (best + direction))
+    steps = sorted(errors)
+    values = np.array([errors[step] for step in steps])
+    return WeightChoice(
+        float(INITIAL_WEIGHT * WEIGHT_RATIO ** _parabola_minimum(steps, values)),
+        INITIAL_WEIGHT * WEIGHT_RATIO ** np.array(steps, float),
+        values,
+    )
+
+
+def _parabola_minimum(steps: list[int], errors: NDArray[np.float64]) -> float:
+    """Return where the parabola through the best step and its neighbours is lowest."""
+    best = int(np.argmin(errors))
+    if not 0 < best < len(steps) - 1:
+        return float(steps[best])
+    left, middle, right = errors[best - 1 : best + 2]
+    return steps[best] + float(0.5 * (left - right) / (left - 2 * middle + right))
