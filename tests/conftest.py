@@ -1,11 +1,32 @@
-"""What every test may ask for."""
+"""What every test may ask for, and what holds for all of them on any machine."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # Workers share the cores: products on threads of their own would only wait for each other.
+    # This has to be said before NumPy is loaded.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import pytest
+from hypothesis import HealthCheck, settings
+
+# How long an example takes says nothing where the first one compiles, or where other programs run.
+settings.register_profile("anywhere", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("anywhere")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep the tests of a file on one worker, so that it makes what they share once.
+
+    A mark ``xdist_group`` puts the tests of several files together, or splits a file.
+    """
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
 @pytest.fixture(scope="session")

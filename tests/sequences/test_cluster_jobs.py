@@ -21,6 +21,8 @@ from tofclip.sequences.jobs import (
 )
 from tofclip.sequences.jobs.workers import connect_workers, count_local_workers
 
+pytestmark = pytest.mark.xdist_group("cluster")  # one cluster for all of them
+
 MANY = 60  # many times what two workers are given at once
 
 

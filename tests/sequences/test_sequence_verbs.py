@@ -22,6 +22,8 @@ from nlos.simulate import PointScene
 from nlos.time_axis import TimeAxis
 from tofclip import Frames
 
+pytestmark = pytest.mark.xdist_group("cluster")  # one cluster for all of them
+
 ROOT = Path(tofclip.__file__).parents[1]
 
 

@@ -30,6 +30,8 @@ from tofclip.sequences.jobs import run_jobs, select_unfinished
 from tofclip.solvers import LinearInverse
 from tofclip.storage import Record
 
+pytestmark = pytest.mark.xdist_group("cluster")  # one cluster for all of them
+
 SHOTS = 6
 
 
