@@ -2,15 +2,18 @@ from __future__ import annotations
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from tofclip.errors import InputError
 from tofclip.threads import (
     LANES,
     THREADS_VARIABLE,
+    limit_blas_threads,
     limit_to_calling_thread,
-    map_per_core,
+    map_parallel,
     run_blocks,
     split_blocks,
     thread_count,
@@ -87,7 +90,7 @@ def test_items_have_a_core_each_and_come_back_in_order(monkeypatch, threads):
             busy[0] -= 1
         return item, len(names)
 
-    assert list(map_per_core(work, range(10))) == [(item, 1) for item in range(10)]
+    assert list(map_parallel(work, range(10))) == [(item, 1) for item in range(10)]
     assert most[0] <= int(threads)
 
 
@@ -100,7 +103,7 @@ def test_a_failed_item_ends_the_row_in_its_place_and_few_are_begun_after_it():
             raise InputError("the third")
         return item
 
-    coming = map_per_core(work, iter(range(1000)))
+    coming = map_parallel(work, iter(range(1000)))
     assert [next(coming), next(coming)] == [0, 1]
     with pytest.raises(InputError, match="the third"):
         next(coming)
@@ -115,7 +118,7 @@ def test_items_are_taken_as_they_are_needed():
             taken.append(item)
             yield item
 
-    coming = map_per_core(lambda item: item, items())
+    coming = map_parallel(lambda item: item, items())
     assert next(coming) == 0
     assert len(taken) == thread_count() + 1
     coming.close()
@@ -130,3 +133,36 @@ def test_work_on_this_thread_stays_there_when_a_part_of_it_asks_for_the_same(mon
             pass
         run_blocks(lambda _: names.add(threading.current_thread().name), 8 * LANES)
     assert names == {threading.current_thread().name}
+
+
+def _blas_threads() -> list[int]:
+    return [
+        library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"
+    ]
+
+
+def test_overlapping_blas_limits_hold_until_the_last_ends_and_then_restore():
+    with threadpool_limits(2, user_api="blas"):
+        before = _blas_threads()
+        first, second = limit_blas_threads(), limit_blas_threads()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        during = _blas_threads()
+        second.__exit__(None, None, None)
+        assert set(during) == {1}
+        assert _blas_threads() == before == [2] * len(before)
+
+
+def test_blas_limits_of_many_threads_leave_the_number_as_it_was():
+    def limit_briefly(_: int) -> set[int]:
+        with limit_blas_threads():
+            time.sleep(0.001)
+            return set(_blas_threads())
+
+    with threadpool_limits(2, user_api="blas"):
+        before = _blas_threads()
+        with ThreadPoolExecutor(8) as pool:
+            during = set().union(*pool.map(limit_briefly, range(64)))
+        assert during == {1}
+        assert _blas_threads() == before

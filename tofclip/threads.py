@@ -1,8 +1,8 @@
-"""Blocks and threads: how a batch of pictures is cut up and shared between the processor's cores.
+"""Work on every core: blocks of an array, or independent jobs, on a few Python threads.
 
-The compiled kernels of this package are serial and release the interpreter lock; whoever has many
-frames cuts them into blocks and runs the blocks on a few Python threads. There is no second thread
-pool (OpenMP, numba's) to fight with.
+The compiled kernels of this package are serial and release the interpreter lock. Work is therefore
+shared between cores in one place, here, by threads that each take one job at a time. There is no
+second thread pool (OpenMP, numba's) to compete with, and BLAS is limited to one thread meanwhile.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from tofclip.errors import InputError
 
 if TYPE_CHECKING:
-    from threadpoolctl import ThreadpoolController
+    from threadpoolctl import LibController
 
-T = TypeVar("T")
-Made = TypeVar("Made")
+Job = TypeVar("Job")
+Result = TypeVar("Result")
 
 LANES = 32
 """Frames per block: a row of a block is two full vectors of 512 bits, and a 174 x 174 picture stays
@@ -33,8 +33,8 @@ THREADS_VARIABLE = "TOFCLIP_THREADS"
 
 
 def thread_count() -> int:
-    """Threads to use: the environment's ``TOFCLIP_THREADS``, else one for each core this process
-    may run on.
+    """Return how many threads to use: the environment's ``TOFCLIP_THREADS``, else one for each core
+    that this process may run on.
 
     Raises
     ------
@@ -55,9 +55,7 @@ _thread_state = threading.local()
 
 @contextmanager
 def limit_to_calling_thread() -> Iterator[None]:
-    """Let `run_blocks` work on the calling thread alone, for whoever has other work for the other
-    cores.
-    """
+    """Let `map_parallel` and `run_blocks` work on the calling thread alone."""
     before = _is_limited()
     _thread_state.alone = True
     try:
@@ -70,32 +68,68 @@ def _is_limited() -> bool:
     return getattr(_thread_state, "alone", False)
 
 
-def map_per_core(work: Callable[[T], Made], items: Iterable[T]) -> Generator[Made, None, None]:
-    """Yield what `work` makes of each item, in order, while every core is busy with another one of
-    them.
+def _limit_worker() -> None:
+    """Make a worker keep to itself: a job within a job would only wait for the same cores."""
+    _thread_state.alone = True
 
-    Items that share the cores wait for each other; items that have one each do not. `thread_count`
-    of them are worked on at a time, and as many results are kept at most. NumPy's products keep to
-    one thread until the end. The first exception is raised where its result would be.
+
+@contextmanager
+def open_worker_pool(threads: int | None = None) -> Iterator[Executor]:
+    """Yield an executor with a thread for each core, for jobs that each keep to one core.
+
+    At the end of the block, jobs that have not begun are cancelled and those under way waited for.
+    BLAS has one thread meanwhile.
+
+    Parameters
+    ----------
+    threads : int, optional
+        `thread_count` by default.
     """
-
-    def alone(item: T) -> Made:
-        with limit_to_calling_thread():
-            return work(item)
-
-    count = thread_count()
-    with limit_blas_threads(), ThreadPoolExecutor(count, "tofclip") as cores:
-        under_way: deque[Future[Made]] = deque()
+    pool = ThreadPoolExecutor(threads or thread_count(), "tofclip", _limit_worker)
+    with limit_blas_threads():
         try:
-            for item in items:
-                under_way.append(cores.submit(alone, item))
-                if len(under_way) > count:
-                    yield under_way.popleft().result()
-            while under_way:
-                yield under_way.popleft().result()
+            yield pool
         finally:
-            for one in under_way:
-                one.cancel()
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def map_parallel(
+    work: Callable[[Job], Result], jobs: Iterable[Job], lookahead: int | None = None
+) -> Generator[Result, None, None]:
+    """Yield ``work(job)`` for each job, in order, while the other cores work on the next ones.
+
+    The one parallel map of this package. Every job has one core to itself: maps within `work` run
+    on its thread, and BLAS products too. Results come one at a time, so that the caller can report
+    progress between them. The first exception is raised in its result's place, and no further job
+    is started.
+
+    Parameters
+    ----------
+    work : callable
+        Must not depend on the order in which jobs are done.
+    jobs : iterable
+        Taken one by one, as they are needed.
+    lookahead : int, optional
+        Jobs that may be under way or done before their turn; it bounds the results in memory. By
+        default one per thread.
+
+    Examples
+    --------
+    >>> list(map_parallel(abs, [-1, 2, -3]))
+    [1, 2, 3]
+    """
+    threads = 1 if _is_limited() else thread_count()
+    if threads == 1:
+        yield from map(work, jobs)
+        return
+    with open_worker_pool(threads) as pool:
+        pending: deque[Future[Result]] = deque()
+        for job in jobs:
+            pending.append(pool.submit(work, job))
+            if len(pending) > (lookahead or threads):
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
 
 
 def split_blocks(total: int, size: int = LANES) -> Iterator[slice]:
@@ -105,41 +139,90 @@ def split_blocks(total: int, size: int = LANES) -> Iterator[slice]:
 
 
 def run_blocks(work: Callable[[slice], None], total: int, size: int = LANES) -> None:
-    """Call `work` on every block of ``range(total)``, on `thread_count` threads; the first
-    exception is raised.
+    """Call `work` on every block of ``range(total)``, blocks on all cores; see `map_parallel`.
 
     An interruption (Ctrl-C) waits for the blocks under way and starts no further ones.
+
+    Parameters
+    ----------
+    work : callable
+        Called with the slice of a block. Blocks must not write to the same memory.
+    total : int
+        Length of the axis that is cut.
+    size : int
+        Length of a block, at most.
     """
-    pieces = list(split_blocks(total, size))
-    threads = 1 if _is_limited() else min(thread_count(), len(pieces))
-    if threads <= 1:
-        for piece in pieces:
-            work(piece)
+    blocks = list(split_blocks(total, size))
+    if len(blocks) == 1:  # on the calling thread, with all threads that BLAS has
+        work(blocks[0])
         return
-    pool = ThreadPoolExecutor(threads, thread_name_prefix="tofclip")
-    try:
-        for _ in pool.map(work, pieces):
-            pass
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    for _ in map_parallel(work, blocks, lookahead=len(blocks)):
+        pass
 
 
-def limit_blas_threads() -> AbstractContextManager[Any]:
+class _BlasLimit:
+    """What `limit_blas_threads` has changed in this process, for all its threads."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.open_blocks = 0
+        self.before: list[int] = []
+
+
+_blas_limit = _BlasLimit()
+
+
+@contextmanager
+def limit_blas_threads() -> Iterator[None]:
     """Keep matrix products on the threads that call them.
 
     Where blocks keep every core busy already, BLAS threads of its own would wait for, and spin
-    against, ours.
+    against, ours. Most libraries have one number of threads for the whole process: blocks on
+    several threads are counted, the first one sets the limit and the last one restores what was
+    there before. Libraries that run on OpenMP have a number for each calling thread.
     """
-    limited: AbstractContextManager[Any] = _blas_controller().limit(limits=1, user_api="blas")
-    return limited
+    shared, per_thread = _blas_libraries()
+    own_before = [library.get_num_threads() for library in per_thread]
+    with _blas_limit.lock:
+        if _blas_limit.open_blocks == 0:
+            _blas_limit.before = [library.get_num_threads() for library in shared]
+            _set_blas_threads(shared, [1] * len(shared))
+        _blas_limit.open_blocks += 1
+    _set_blas_threads(per_thread, [1] * len(per_thread))
+    try:
+        yield
+    finally:
+        _set_blas_threads(per_thread, own_before)
+        with _blas_limit.lock:
+            _blas_limit.open_blocks -= 1
+            if _blas_limit.open_blocks == 0:
+                _set_blas_threads(shared, _blas_limit.before)
+
+
+def _set_blas_threads(libraries: list[LibController], numbers: list[int]) -> None:
+    for library, number in zip(libraries, numbers, strict=True):
+        # From 3.8 on, threadpoolctl lets only the thread that came first set OpenBLAS's number and
+        # ignores all others, which leaves them unlimited. Here the lock and the count keep order.
+        release = getattr(library, "clear_controlling_thread", lambda force: None)
+        release(force=True)
+        library.set_num_threads(number)
+        release(force=True)
 
 
 @cache
-def _blas_controller() -> ThreadpoolController:
-    """The linear-algebra libraries that are loaded; looking for them takes as long as a small
-    image.
+def _blas_libraries() -> tuple[list[LibController], list[LibController]]:
+    """Return the linear-algebra libraries that are loaded: those with one number of threads for the
+    process, and those with one for each thread.
+
+    Looking for them takes as long as a small image.
     """
     import scipy.linalg  # noqa: F401 - brings one of its own beside NumPy's
     from threadpoolctl import ThreadpoolController
 
-    return ThreadpoolController()
+    found = [
+        library
+        for library in ThreadpoolController().lib_controllers
+        if library.user_api == "blas" and library.get_num_threads() is not None
+    ]
+    own = [library for library in found if getattr(library, "threading_layer", "") == "openmp"]
+    return [library for library in found if library not in own], own

@@ -25,7 +25,7 @@ from tofclip.recovery.plan import fit_camera_to_shot, prepare_recovery
 from tofclip.shots import Streak
 from tofclip.solvers import LinearInverse
 from tofclip.solvers.traces import InverseTraces, order_by_patch
-from tofclip.threads import map_per_core
+from tofclip.threads import map_parallel
 
 FloatArray = NDArray[np.float64]
 Shot = Callable[[], Streak]
@@ -270,7 +270,7 @@ def make_clouds(
         cloud, late = make_average_cloud([shots[number] for number in numbers], pipeline, jitter)
         return SequenceCloud(cloud, numbers, late)
 
-    yield from map_per_core(step, range(first * average, len(shots), average))
+    yield from map_parallel(step, range(first * average, len(shots), average))
 
 
 def make_average_cloud(

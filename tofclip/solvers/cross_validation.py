@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,7 +14,7 @@ from tofclip.errors import InputError
 from tofclip.operators import LinearOperator
 from tofclip.solvers.iterative import ProximalMethod
 from tofclip.solvers.method import Array
-from tofclip.threads import thread_count
+from tofclip.threads import map_parallel
 
 INITIAL_WEIGHT = 10**-1.75
 """Relative weight that is tried first."""
@@ -89,8 +88,7 @@ def choose_weight(
 
     def error(weight: float) -> float:
         # the compiled loops of one picture keep one core busy and release the interpreter
-        with ThreadPoolExecutor(min(thread_count(), len(parts))) as pool:
-            return sum(pool.map(partial(unpredicted, replace(method, weight=weight)), parts))
+        return sum(map_parallel(partial(unpredicted, replace(method, weight=weight)), parts))
 
     return _search_downhill(error)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import dataclass
 from time import perf_counter
@@ -14,7 +14,7 @@ from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming.channel import Policy
 from tofclip.sequences.streaming.stages import READ, WAIT, Stage, run_stages
 from tofclip.shots import Streak
-from tofclip.threads import limit_blas_threads, limit_to_calling_thread, thread_count
+from tofclip.threads import open_worker_pool
 
 
 @dataclass(frozen=True)
@@ -79,15 +79,11 @@ def stream_clouds(
         pipeline, coming = RangingPipeline.for_shot(first), _prepend_shot(first, coming)
     own = pipeline
 
-    def make_timed_cloud(shot: Streak) -> tuple[PointCloud, dict[str, float]]:
-        with limit_to_calling_thread():
-            return _make_cloud(shot, own)
-
     # A core for each shot: shared out among all, a shot would be done sooner, but cores would wait
     # for each other.
-    with limit_blas_threads(), ThreadPoolExecutor(thread_count(), "stream work") as cores:
+    with open_worker_pool() as cores:
         stages = (
-            Stage("begin", lambda shot: cores.submit(make_timed_cloud, shot)),
+            Stage("begin", lambda shot: cores.submit(_make_cloud, shot, own)),
             Stage("end", Future.result),
         )
         with closing(run_stages(coming, stages, queue_size, policy)) as items:
