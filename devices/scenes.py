@@ -14,14 +14,15 @@ from tofclip.shots import Streak
 from tofclip.simulate import (
     GroundTruth,
     Instrument,
-    Plate,
     Scene,
     StreakDetector,
     make_default_instrument,
     make_default_scene,
+    make_plate,
     simulate_shot,
 )
-from tofclip.simulate.shapes import (
+from tofclip.simulate.bodies import Body
+from tofclip.simulate.patterns import (
     Pattern,
     cut_pattern,
     make_letter,
@@ -145,11 +146,11 @@ def _make_plate(
     depth: float,
     yaw: float = 0.0,
     pitch: float = 0.0,
-) -> Plate:
+) -> Body:
     """Square plate; `middle` (x, y) from the optical axis and `side` are in 128ths of the picture's
     side.
     """
     unit = depth / make_default_instrument().camera.focal_length_px
-    return Plate(
+    return make_plate(
         (middle[0] * unit, middle[1] * unit, depth), (side * unit, side * unit), pattern, yaw, pitch
     )

@@ -159,10 +159,10 @@ class Experiment:
     @cached_property
     def truth(self) -> Array:
         """What the middle view would see of the target, were there no occluder, (rows, columns)."""
-        picture: Array = self._middle_view(self.scene.target, self.rig.array).sum(axis=-1)
+        picture: Array = self._render_middle_view(self.scene.target, self.rig.array).sum(axis=-1)
         return picture
 
-    def _middle_view(self, bodies: tuple[Body, ...], array: CameraArray) -> Array:
+    def _render_middle_view(self, bodies: tuple[Body, ...], array: CameraArray) -> Array:
         return render_flash_view(
             PulsedScene(bodies, self.rig.lamps), array, self.time_axis, MIDDLE_VIEW
         )
@@ -190,7 +190,7 @@ class Experiment:
         """The target by the middle view alone, its pixels as many as the others' readings; occluder
         gated away.
         """
-        seen = self._middle_view((*self.scene.target, *self.scene.occluder), self._single_array)
+        seen = self._render_middle_view((*self.scene.target, *self.scene.occluder), self._single_array)
         random = np.random.default_rng([self.settings.seed, 2])
         noisy = add_poisson_noise(seen, self._photons_per_unit(seen), random)
         gates = [one.bins for one in self.measurements.find_returns()]
@@ -200,7 +200,7 @@ class Experiment:
     @cached_property
     def single_view_truth(self) -> Array:
         """What the single view would see of the target, were there no occluder."""
-        picture: Array = self._middle_view(self.scene.target, self._single_array).sum(axis=-1)
+        picture: Array = self._render_middle_view(self.scene.target, self._single_array).sum(axis=-1)
         return picture
 
     @property

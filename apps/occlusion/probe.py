@@ -28,7 +28,7 @@ from tofclip.simulate.light_fields import (
     TimeAxis,
     render_flash,
 )
-from tofclip.simulate.shapes import cut_pattern, make_letter, make_plain_pattern
+from tofclip.simulate.patterns import cut_pattern, make_letter, make_plain_pattern
 from tofclip.solvers import TotalVariation
 
 Array = NDArray[Any]

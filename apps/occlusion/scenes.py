@@ -18,8 +18,14 @@ from numpy.typing import NDArray
 from tofclip.errors import InputError
 from tofclip.occlusion.region import InactiveRegion
 from tofclip.simulate.light_fields import Body, Lambertian, Rectangle, Sphere
-from tofclip.simulate.light_fields.patterns import make_mottled_pattern, make_text_pattern
-from tofclip.simulate.shapes import cut_pattern, make_letter, make_plain_pattern, make_rings
+from tofclip.simulate.patterns import (
+    cut_pattern,
+    make_letter,
+    make_mottled_pattern,
+    make_plain_pattern,
+    make_rings,
+    make_text_pattern,
+)
 
 BASELINE_M = 15e-3
 OCCLUDER_DISTANCE_M = 50e-3

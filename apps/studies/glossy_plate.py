@@ -19,10 +19,9 @@ from tofclip.light_field.measurement import CameraSetup, measure
 from tofclip.metrics import nmse
 from tofclip.operators import LinearShear
 from tofclip.recovery.light_field import ClipRecovery
+from tofclip.simulate.bodies import Body
 from tofclip.simulate.light_fields import Lambertian, Rectangle, Scene, Specular, render_light_field
-from tofclip.simulate.light_fields.bodies import Body
-from tofclip.simulate.light_fields.patterns import make_text_pattern
-from tofclip.simulate.shapes import make_plain_pattern
+from tofclip.simulate.patterns import make_plain_pattern, make_text_pattern
 
 SHEAR, SIZE_PX = -0.6, 72.0
 SHEAR_STEP = 0.3

@@ -14,13 +14,14 @@ from tofclip.shots import Frames
 from tofclip.shots.stack import save_stack
 from tofclip.simulate import (
     Instrument,
-    Plate,
     Scene,
     StreakDetector,
+    make_plate,
     render_true_frames,
     simulate_shot,
 )
-from tofclip.simulate.shapes import make_checkerboard
+from tofclip.simulate.bodies import Body
+from tofclip.simulate.patterns import make_checkerboard
 
 CENTRES = 40.0 + 60 * np.arange(5)
 CAMERA = Camera(
@@ -37,9 +38,9 @@ CAMERA = Camera(
 )
 
 
-def plate(distance: float, place_px: float) -> Plate:
+def plate(distance: float, place_px: float) -> Body:
     pixel = distance / 100.0
-    return Plate(
+    return make_plate(
         (place_px * pixel, place_px * pixel, distance),
         (9 * pixel, 9 * pixel),
         make_checkerboard(3, 0.1, 0.9),

@@ -15,8 +15,8 @@ from tofclip.lidar.signal_rows.selection import RowBlock, SignalRowFinder
 from tofclip.lidar.traces import TraceBins
 from tofclip.recovery import DepthLockedFocus, FixedFocus, recover
 from tofclip.sequences.ranger import RangingPipeline
-from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate_shot
-from tofclip.simulate.shapes import make_checkerboard
+from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
+from tofclip.simulate.patterns import make_checkerboard
 from tofclip.solvers import LinearInverse
 from tofclip.solvers.traces import InverseTraces, order_by_patch
 from tofclip.threads import LANES
@@ -142,7 +142,7 @@ def test_boxes_are_sums_of_successive_rows():
 
 SCENE = Scene(
     tuple(
-        Plate(
+        make_plate(
             (place * distance / 100, place * distance / 100, distance),
             (0.08, 0.08),
             make_checkerboard(3, 0.3, 0.9),

@@ -19,9 +19,8 @@ from tofclip.simulate.light_fields import (
     render_flash,
     render_flash_view,
 )
-from tofclip.simulate.light_fields.pulsed import compute_irradiance
-from tofclip.simulate.light_fields.render import cast_rays
-from tofclip.simulate.shapes import make_plain_pattern
+from tofclip.simulate.patterns import make_plain_pattern
+from tofclip.simulate.rays import cast_rays, compute_irradiance
 from tofclip.units import SPEED_OF_LIGHT
 
 ARRAY = CameraArray(
@@ -37,7 +36,7 @@ def plate(side: float, z: float, x: float = 0.0) -> Body:
 
 def test_a_row_of_cameras_has_views_to_both_sides():
     np.testing.assert_array_equal(ARRAY.views, [[0, -1], [0, 0], [0, 1]])
-    np.testing.assert_allclose(ARRAY.place((0.0, 1.0)), [5e-3, 0, 0])
+    np.testing.assert_allclose(ARRAY.position((0.0, 1.0)), [5e-3, 0, 0])
 
 
 @pytest.mark.parametrize("z", [0.06, 0.15])

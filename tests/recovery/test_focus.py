@@ -23,13 +23,14 @@ from tofclip.recovery import (
 )
 from tofclip.simulate import (
     Instrument,
-    Plate,
     Scene,
     StreakDetector,
+    make_plate,
     render_true_frames,
     simulate_shot,
 )
-from tofclip.simulate.shapes import cut_pattern, make_letter, make_plain_pattern
+from tofclip.simulate.bodies import Body
+from tofclip.simulate.patterns import cut_pattern, make_letter, make_plain_pattern
 from tofclip.solvers import Backprojection, Sparse
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -57,10 +58,12 @@ def camera(order: tuple[int, ...] = (3, 0, 5, 1, 6, 2, 4)) -> Camera:
     )
 
 
-def plate(name: str, place: tuple[int, int], distance: float) -> Plate:
+def plate(name: str, place: tuple[int, int], distance: float) -> Body:
     pixel = distance / FOCAL
     pattern = cut_pattern(make_letter(name), make_plain_pattern(0.8))
-    return Plate((place[0] * pixel, place[1] * pixel, distance), (18 * pixel, 18 * pixel), pattern)
+    return make_plate(
+        (place[0] * pixel, place[1] * pixel, distance), (18 * pixel, 18 * pixel), pattern
+    )
 
 
 SCENE = Scene(tuple(plate(n, p, d) for n, p, d in zip("UCLAU", PLACES, RANGES, strict=True)))

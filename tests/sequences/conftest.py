@@ -12,8 +12,9 @@ import pytest
 from tofclip import Streak
 from tofclip.camera import Camera, SkewSweep
 from tofclip.shots.stack import save_stack
-from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate_shot
-from tofclip.simulate.shapes import make_checkerboard
+from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
+from tofclip.simulate.bodies import Body
+from tofclip.simulate.patterns import make_checkerboard
 
 CENTRES = 40.0 + 60 * np.arange(5)
 SHOTS = 6
@@ -53,9 +54,9 @@ def camera() -> Camera:
 def streaks(camera: Camera) -> list[Streak]:
     """Shots of two plates that differ in their noise."""
 
-    def plate(distance: float, place_px: float) -> Plate:
+    def plate(distance: float, place_px: float) -> Body:
         pixel = distance / 100.0
-        return Plate(
+        return make_plate(
             (place_px * pixel, place_px * pixel, distance),
             (9 * pixel, 9 * pixel),
             make_checkerboard(3, 0.3, 0.9),

@@ -23,8 +23,9 @@ from tofclip.sequences.ranger import (
     make_clouds,
 )
 from tofclip.shots.stack import StreakStack, save_stack
-from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate_shot
-from tofclip.simulate.shapes import make_checkerboard
+from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
+from tofclip.simulate.bodies import Body
+from tofclip.simulate.patterns import make_checkerboard
 from tofclip.units import SPEED_OF_LIGHT
 
 CENTRES = 40.0 + 60 * np.arange(5)
@@ -49,9 +50,9 @@ def camera(time_zero: float = -6e-9) -> Camera:
     )
 
 
-def plate(distance: float, place_px: float) -> Plate:
+def plate(distance: float, place_px: float) -> Body:
     pixel = distance / 100.0
-    return Plate(
+    return make_plate(
         (place_px * pixel, place_px * pixel, distance),
         (9 * pixel, 9 * pixel),
         make_checkerboard(3, 0.3, 0.9),

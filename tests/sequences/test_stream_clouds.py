@@ -12,8 +12,8 @@ from tofclip.recovery import recover
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Streak
-from tofclip.simulate import Instrument, Plate, Scene, StreakDetector, simulate_shot
-from tofclip.simulate.shapes import make_plain_pattern
+from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
+from tofclip.simulate.patterns import make_plain_pattern
 
 CENTRES = 30.0 + 45 * np.arange(4)
 
@@ -33,7 +33,7 @@ def shots(number: int) -> list[Streak]:
     made = []
     for shot in range(number):
         scene = Scene(
-            (Plate((0.0, 0.0, 1.4 - 0.05 * shot), (0.05, 0.05), make_plain_pattern(0.8)),)
+            (make_plate((0.0, 0.0, 1.4 - 0.05 * shot), (0.05, 0.05), make_plain_pattern(0.8)),)
         )
         made.append(simulate_shot(scene, Instrument(still(camera), detector), shot).streak)
     return made

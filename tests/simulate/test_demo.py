@@ -18,7 +18,7 @@ from tofclip.simulate import (
     score_returns,
     simulate_shot,
 )
-from tofclip.simulate.shapes import cut_pattern, make_letter, make_plain_pattern
+from tofclip.simulate.patterns import cut_pattern, make_letter, make_plain_pattern
 from tofclip.units import SPEED_OF_LIGHT
 
 BIN_M = SPEED_OF_LIGHT * 20e-12 / 2

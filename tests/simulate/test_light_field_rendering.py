@@ -21,9 +21,15 @@ from tofclip.simulate.light_fields import (
     render_shear_map,
     render_view,
 )
-from tofclip.simulate.light_fields.patterns import make_mottled_pattern, make_text_pattern
 from tofclip.simulate.light_fields.scenes import edit_scene, remove_occluder
-from tofclip.simulate.shapes import cut_pattern, make_checkerboard, make_letter, make_plain_pattern
+from tofclip.simulate.patterns import (
+    cut_pattern,
+    make_checkerboard,
+    make_letter,
+    make_mottled_pattern,
+    make_plain_pattern,
+    make_text_pattern,
+)
 
 ARRAY = CameraArray((40, 48), 4, focal_length_px=60.0, view_step=0.05, samples=2)
 HEAD_ON = (0.0, 0.0, -1.0)
@@ -114,7 +120,9 @@ def test_only_a_glossy_ball_looks_different_from_other_sides():
         seen = []
         for origin, direction in zip(origins, directions, strict=True):
             hit = body.intersect(origin, direction[np.newaxis])
-            seen.append(material.radiance(hit.place, hit.normal, direction[np.newaxis], light)[0])
+            seen.append(
+                material.radiance(hit.pattern_position, hit.normal, direction[np.newaxis], light)[0]
+            )
         return abs(seen[1] - seen[0])
 
     assert change(Lambertian(make_plain_pattern(0.5))) < 1e-6

@@ -8,16 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tofclip.errors import InputError, ShapeError
-from tofclip.simulate import Plate, Scene
-from tofclip.simulate.scene import NO_PLATE
-from tofclip.simulate.shapes import cut_pattern, make_letter, make_plain_pattern, make_rings
+from tofclip.simulate import Scene, make_plate
+from tofclip.simulate.bodies import Body
+from tofclip.simulate.patterns import cut_pattern, make_letter, make_plain_pattern, make_rings
+from tofclip.simulate.rays import NO_BODY, cast_rays, look_up_reflectance
 
 ORIGIN = np.zeros(3)
 AHEAD = np.array([[0.0, 0.0, 1.0]])
 
 
-def wall(depth: float, side: float = 10.0, reflectance: float = 0.5, **turned: float) -> Plate:
-    return Plate((0.0, 0.0, depth), (side, side), np.full((4, 4), reflectance), **turned)
+def wall(depth: float, side: float = 10.0, reflectance: float = 0.5, **turned: float) -> Body:
+    return make_plate((0.0, 0.0, depth), (side, side), np.full((4, 4), reflectance), **turned)
 
 
 @settings(max_examples=60, deadline=None)
@@ -27,8 +28,8 @@ def wall(depth: float, side: float = 10.0, reflectance: float = 0.5, **turned: f
 )  # fmt: skip
 def test_a_turned_plate_is_met_in_its_plane(yaw, pitch, depth, right, down):
     plate = wall(depth, 100.0, yaw=yaw, pitch=pitch)
-    distance, _ = plate.intersect(ORIGIN, np.array([[right, down, 1.0]]))
-    across, along, normal = plate.axes
+    distance = plate.intersect(ORIGIN, np.array([[right, down, 1.0]])).distance
+    across, along, normal = plate.axes.T
     np.testing.assert_allclose([across @ along, across @ normal, along @ normal], 0, atol=1e-12)
     point = distance[0] * np.array([right, down, 1.0])
     assert (point - [0, 0, depth]) @ normal == pytest.approx(0, abs=1e-9 * depth)
@@ -36,35 +37,36 @@ def test_a_turned_plate_is_met_in_its_plane(yaw, pitch, depth, right, down):
 
 def test_positive_yaw_turns_the_right_side_back_and_positive_pitch_the_upper_side():
     beside, above = np.array([[0.1, 0.0, 1.0]]), np.array([[0.0, -0.1, 1.0]])
-    assert wall(2.0, yaw=0.3).intersect(ORIGIN, beside)[0][0] > 2.0
-    assert wall(2.0, pitch=0.3).intersect(ORIGIN, above)[0][0] > 2.0
+    assert wall(2.0, yaw=0.3).intersect(ORIGIN, beside).distance[0] > 2.0
+    assert wall(2.0, pitch=0.3).intersect(ORIGIN, above).distance[0] > 2.0
 
 
 def test_the_pattern_is_upright_and_not_mirrored():
     pattern = np.array([[0.1, 0.2], [0.3, np.nan]])
-    plate = Plate((0, 0, 1), (0.2, 0.2), pattern)
+    plate = make_plate((0, 0, 1), (0.2, 0.2), pattern)
     corners = np.array([[-0.05, -0.05, 1], [0.05, -0.05, 1], [-0.05, 0.05, 1], [0.05, 0.05, 1]])
-    distance, reflectance = plate.intersect(ORIGIN, corners)
+    hits = cast_rays((plate,), ORIGIN, corners)
+    reflectance = look_up_reflectance((plate,), hits)
     np.testing.assert_allclose(reflectance[:3], [0.1, 0.2, 0.3], rtol=1e-6)
-    assert distance.tolist() == [1.0, 1.0, 1.0, np.inf]
+    assert hits.distance.tolist() == [1.0, 1.0, 1.0, np.inf]
 
 
 def test_the_nearest_plate_is_seen_through_the_holes_of_none():
-    hole = Plate((0, 0, 1), (1, 1), np.array([[np.nan, 0.9]]))
+    hole = make_plate((0, 0, 1), (1, 1), np.array([[np.nan, 0.9]]))
     scene = Scene((wall(3.0), hole, wall(2.0)))
-    hits = scene.cast_rays(ORIGIN, np.array([[0.1, 0, 1], [-0.1, 0, 1], [9.0, 0, 1]]))
-    assert hits.plate.tolist() == [1, 2, NO_PLATE]
+    hits = scene.trace(ORIGIN, np.array([[0.1, 0, 1], [-0.1, 0, 1], [9.0, 0, 1]]))
+    assert hits.body.tolist() == [1, 2, NO_BODY]
     np.testing.assert_allclose(hits.path[:2], np.hypot(1, 0.1) * np.array([1, 2]))
     assert hits.reflectance[2] == 0
 
 
 def test_what_is_behind_the_camera_is_not_seen():
-    assert Scene((wall(-1.0),)).cast_rays(ORIGIN, AHEAD).plate.tolist() == [NO_PLATE]
+    assert Scene((wall(-1.0),)).trace(ORIGIN, AHEAD).body.tolist() == [NO_BODY]
 
 
 def test_path_is_half_of_there_and_back_from_different_places():
     viewpoint = np.array([3.0, 0.0, 0.0])
-    hits = Scene((wall(4.0),)).cast_rays(
+    hits = Scene((wall(4.0),)).trace(
         viewpoint, np.array([[-0.75, 0.0, 1.0]])
     )  # hits (0, 0, 4): 4 m from the lamp
     assert hits.path[0] == pytest.approx((4.0 + 5.0) / 2)
@@ -72,21 +74,21 @@ def test_path_is_half_of_there_and_back_from_different_places():
 
 
 def test_a_slanted_surface_is_lit_by_the_cosine():
-    hits = Scene((wall(2.0, yaw=np.pi / 3),)).cast_rays(ORIGIN, AHEAD)
+    hits = Scene((wall(2.0, yaw=np.pi / 3),)).trace(ORIGIN, AHEAD)
     assert hits.reflectance[0] == pytest.approx(0.5 * np.cos(np.pi / 3))
 
 
 def test_a_plate_casts_a_shadow_that_a_distant_lamp_moves_aside():
-    card = Plate((0, 0, 1.0), (0.1, 0.1), make_plain_pattern(0.9))
+    card = make_plate((0, 0, 1.0), (0.1, 0.1), make_plain_pattern(0.9))
     behind = np.array(
         [[0.2, 0.0, 2.0], [0.0, 0.0, 2.0]]
     )  # points on the wall, as directions from the origin
-    beside = Scene((card, wall(2.0)), lamp=(-0.2, 0.0, 0.0)).cast_rays(ORIGIN, behind)
-    assert beside.plate.tolist() == [1, 0]
+    beside = Scene((card, wall(2.0)), lamp=(-0.2, 0.0, 0.0)).trace(ORIGIN, behind)
+    assert beside.body.tolist() == [1, 0]
     assert (
         beside.reflectance[0] == 0
     )  # the line from the lamp to (0.2, 0, 2) passes the card's middle
-    colocated = Scene((card, wall(2.0))).cast_rays(ORIGIN, behind)
+    colocated = Scene((card, wall(2.0))).trace(ORIGIN, behind)
     assert np.all(colocated.reflectance > 0)
 
 
@@ -127,16 +129,16 @@ def test_a_disc_of_rings_is_round():
 
 def test_unusable_scenes_are_refused():
     with pytest.raises(ShapeError, match="reflectance"):
-        Plate((0, 0, 1), (1, 1), np.zeros(3))
+        make_plate((0, 0, 1), (1, 1), np.zeros(3))
     with pytest.raises(InputError, match=r"within 0\.\.1"):
-        Plate((0, 0, 1), (1, 1), np.full((2, 2), 1.5))
+        make_plate((0, 0, 1), (1, 1), np.full((2, 2), 1.5))
     with pytest.raises(InputError, match=r"within 0\.\.1"):
-        Plate((0, 0, 1), (1, 1), np.full((2, 2), np.nan))
+        make_plate((0, 0, 1), (1, 1), np.full((2, 2), np.nan))
     with pytest.raises(InputError, match="positive size"):
-        Plate((0, 0, 1), (0, 1), make_plain_pattern(0.5))
+        make_plate((0, 0, 1), (0, 1), make_plain_pattern(0.5))
     with pytest.raises(InputError, match="finite position"):
-        Plate((0, 0, np.inf), (1, 1), make_plain_pattern(0.5))
-    with pytest.raises(InputError, match="at least one plate"):
+        make_plate((0, 0, np.inf), (1, 1), make_plain_pattern(0.5))
+    with pytest.raises(InputError, match="at least one body"):
         Scene(())
     with pytest.raises(InputError, match="no outline is known for 'Q'"):
         make_letter("Q")

@@ -13,14 +13,15 @@ from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
 from tofclip.simulate import (
     Instrument,
-    Plate,
     Scene,
     StreakDetector,
+    make_plate,
     render_true_frames,
     simulate_shot,
 )
+from tofclip.simulate.bodies import Body
+from tofclip.simulate.patterns import cut_pattern, make_letter, make_plain_pattern, make_stripes
 from tofclip.simulate.render import cast_view_rays, render_streak
-from tofclip.simulate.shapes import cut_pattern, make_letter, make_plain_pattern, make_stripes
 from tofclip.units import SPEED_OF_LIGHT
 
 CENTRES = np.array([60.0, 170.3, 280.8])
@@ -47,10 +48,10 @@ def instrument(rows: int = 200, around: float = 2.0, **camera: object) -> Instru
     return Instrument(made, StreakDetector(rows=rows), rays_per_pixel_side=6)
 
 
-def spot(x_px: float, y_px: float, depth: float) -> Plate:
+def spot(x_px: float, y_px: float, depth: float) -> Body:
     """A square as large as a pixel, seen from the reference view at (x, y) from the optical axis."""
     pixel = depth / FOCAL
-    return Plate((x_px * pixel, y_px * pixel, depth), (pixel, pixel), np.ones((1, 1)))
+    return make_plate((x_px * pixel, y_px * pixel, depth), (pixel, pixel), np.ones((1, 1)))
 
 
 def centroid(amounts: np.ndarray) -> float:
@@ -123,7 +124,9 @@ def test_the_pulse_has_its_width_and_a_sub_bin_delay():
 
 def test_no_light_is_lost_between_the_rays_and_the_slit():
     made = instrument()
-    scene = Scene((Plate((0.02, -0.01, 2.1), (0.25, 0.2), make_stripes(3, 0.2, 0.9), yaw=0.2),))
+    scene = Scene(
+        (make_plate((0.02, -0.01, 2.1), (0.25, 0.2), make_stripes(3, 0.2, 0.9), yaw=0.2),)
+    )
     for view in range(3):
         rays = cast_view_rays(scene, made, float(made.camera.view_positions[view]))
         # the pulse is cut at 5 standard deviations, 6e-7 of its energy
@@ -138,7 +141,7 @@ def test_light_beyond_the_screen_is_lost_quietly():
     np.testing.assert_allclose(late, whole[:61])
     aside = made.camera.replace(centres_px=np.array([1.0, 170.3, 338.0]))
     edge = view_image(
-        Scene((Plate((0, 0, 2), (0.5, 0.4), make_plain_pattern(0.8)),)),
+        Scene((make_plate((0, 0, 2), (0.5, 0.4), make_plain_pattern(0.8)),)),
         replace(made, camera=aside),
         0,
     )
@@ -146,7 +149,9 @@ def test_light_beyond_the_screen_is_lost_quietly():
         0
         < edge.sum()
         < 0.7
-        * view_image(Scene((Plate((0, 0, 2), (0.5, 0.4), make_plain_pattern(0.8)),)), made, 0).sum()
+        * view_image(
+            Scene((make_plate((0, 0, 2), (0.5, 0.4), make_plain_pattern(0.8)),)), made, 0
+        ).sum()
     )
 
 
@@ -158,7 +163,7 @@ def test_recovery_s_operator_agrees_with_the_ray_caster(depth):
     pixel = depth / FOCAL
     scene = Scene(
         (
-            Plate(
+            make_plate(
                 (0, 0, depth),
                 (30 * pixel, 30 * pixel),
                 cut_pattern(make_letter("A"), make_plain_pattern(0.9)),
@@ -180,8 +185,8 @@ def test_recovery_s_operator_agrees_with_the_ray_caster(depth):
 
 
 def test_a_side_view_looks_behind_the_occluder():
-    near = Plate((0, 0, 1.0), (0.1, 0.3), np.full((1, 1), 0.5))
-    hidden = Plate((0, 0, 2.0), (0.1, 0.1), np.full((1, 1), 0.5))
+    near = make_plate((0, 0, 1.0), (0.1, 0.3), np.full((1, 1), 0.5))
+    hidden = make_plate((0, 0, 2.0), (0.1, 0.1), np.full((1, 1), 0.5))
     made = instrument(lenslet_pitch=0.12)
     behind = slice(45, 76)  # rows around range 2 m
     assert view_image(Scene((near, hidden), lamp=(0.0, -1.0, 0.0)), made, 1)[behind].sum() == 0
@@ -218,7 +223,7 @@ def test_a_sweep_that_is_skewed_moves_and_stretches_the_rows():
 
 @pytest.fixture(scope="module")
 def flat_shot():
-    scene = Scene((Plate((0, 0, 2), (0.6, 0.5), make_plain_pattern(0.8)),))
+    scene = Scene((make_plate((0, 0, 2), (0.6, 0.5), make_plain_pattern(0.8)),))
     made = instrument()
     detector = StreakDetector(
         rows=200, peak_photons=500, background_photons=3.0, full_scale_photons=480
@@ -270,7 +275,7 @@ def test_a_shot_says_when_each_row_was_and_carries_its_camera(flat_shot):
 def test_unusable_instruments_and_empty_shots_are_refused():
     with pytest.raises(InputError, match="no light of the scene"):
         simulate_shot(
-            Scene((Plate((0, 0, -2.0), (1, 1), make_plain_pattern(0.5)),)), instrument(), 0
+            Scene((make_plate((0, 0, -2.0), (1, 1), make_plain_pattern(0.5)),)), instrument(), 0
         )
     with pytest.raises(InputError, match="no light of the scene"):
         simulate_shot(Scene((spot(0, 0, 20.0),)), instrument(), 0)  # arrives after the last row

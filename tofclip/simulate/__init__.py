@@ -5,20 +5,20 @@ recorded, and the truth.
 from tofclip.simulate.demo import make_default_camera, make_default_instrument, make_default_scene
 from tofclip.simulate.ground_truth import GroundTruth, render_true_frames
 from tofclip.simulate.instrument import Instrument, StreakDetector
-from tofclip.simulate.scene import Plate, Scene
+from tofclip.simulate.scene import Scene, make_plate
 from tofclip.simulate.score import score_returns
 from tofclip.simulate.shot import SimulatedShot, simulate_shot
 
 __all__ = [
     "GroundTruth",
     "Instrument",
-    "Plate",
     "Scene",
     "SimulatedShot",
     "StreakDetector",
     "make_default_camera",
     "make_default_instrument",
     "make_default_scene",
+    "make_plate",
     "render_true_frames",
     "score_returns",
     "simulate_shot",

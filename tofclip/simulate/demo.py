@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from tofclip.camera import Camera, SkewSweep
+from tofclip.simulate.bodies import Body, Vector
 from tofclip.simulate.instrument import Instrument, StreakDetector
-from tofclip.simulate.scene import Plate, Scene, Vector
-from tofclip.simulate.shapes import (
+from tofclip.simulate.patterns import (
     Pattern,
     cut_pattern,
     make_checkerboard,
@@ -21,6 +21,7 @@ from tofclip.simulate.shapes import (
     make_rings,
     make_stripes,
 )
+from tofclip.simulate.scene import Scene, make_plate
 
 CENTRES_PX = (147.7, 320.0, 490.2, 664.1, 835.5, 1011.5, 1192.3)
 ANGLES_DEG = (-43.3, -25.7, -12.7, 0.6, 22.9, 37.5, 48.0)
@@ -59,44 +60,44 @@ def make_default_scene() -> Scene:
     """Return four cut-out letters and three textured plates between 1.7 and 3.2 m."""
     return Scene(
         (
-            _make_plate(
+            _place_plate(
                 cut_pattern(make_letter("U"), make_plain_pattern(0.8)), (-25, -24), 34, 1.75
             ),
-            _make_plate(
+            _place_plate(
                 cut_pattern(make_letter("C"), make_plain_pattern(0.8)),
                 (23, -27),
                 34,
                 2.05,
                 yaw=0.15,
             ),
-            _make_plate(
+            _place_plate(
                 cut_pattern(make_letter("L"), make_plain_pattern(0.8)), (-24, 22), 32, 2.35
             ),
-            _make_plate(
+            _place_plate(
                 cut_pattern(make_letter("A"), make_plain_pattern(0.8)),
                 (22, 20),
                 36,
                 2.62,
                 pitch=-0.15,
             ),
-            _make_plate(make_checkerboard(4, 0.3, 0.9), (2, -2), 36, 2.85, yaw=-0.3),
-            _make_plate(make_rings(3, 0.3, 0.9), (-2, 36), 36, 3.0),
-            _make_plate(make_stripes(4, 0.3, 0.9), (0, 0), 96, 3.18),
+            _place_plate(make_checkerboard(4, 0.3, 0.9), (2, -2), 36, 2.85, yaw=-0.3),
+            _place_plate(make_rings(3, 0.3, 0.9), (-2, 36), 36, 3.0),
+            _place_plate(make_stripes(4, 0.3, 0.9), (0, 0), 96, 3.18),
         )
     )
 
 
-def _make_plate(
+def _place_plate(
     pattern: Pattern,
     middle_px: tuple[float, float],
     side_px: float,
     depth: float,
     yaw: float = 0.0,
     pitch: float = 0.0,
-) -> Plate:
+) -> Body:
     """Square plate that appears around pixel offset `middle_px` (x, y) from the optical axis,
     `side_px` wide.
     """
     pixel = depth / FOCAL_LENGTH_PX
     centre: Vector = (middle_px[0] * pixel, middle_px[1] * pixel, depth)
-    return Plate(centre, (side_px * pixel, side_px * pixel), pattern, yaw, pitch)
+    return make_plate(centre, (side_px * pixel, side_px * pixel), pattern, yaw, pitch)

@@ -11,8 +11,9 @@ from scipy.ndimage import binary_erosion
 
 from tofclip.shots import Frames
 from tofclip.simulate.instrument import Instrument
-from tofclip.simulate.render import accumulate_cells, compute_pulse_sigma_bins, spread_over_rows
-from tofclip.simulate.scene import NO_PLATE, Scene
+from tofclip.simulate.rays import NO_BODY, bin_by_time, number_ray_pixels
+from tofclip.simulate.render import compute_pulse_sigma_bins
+from tofclip.simulate.scene import Scene
 from tofclip.units import SPEED_OF_LIGHT
 
 MIN_REFLECTANCE = 0.1  # a surface that reflects less says too little about where it is
@@ -45,13 +46,13 @@ class GroundTruth:
     def from_scene(cls, scene: Scene, instrument: Instrument) -> GroundTruth:
         """Look at `scene` from the reference viewpoint."""
         x, y = instrument.pixel_grid()
-        hits = scene.cast_rays(instrument.viewpoint(0.0), instrument.directions(x, y))
+        hits = scene.trace(instrument.viewpoint(0.0), instrument.directions(x, y))
         plate, path, reflectance = (
             _group_by_pixel(values, instrument)
-            for values in (hits.plate, hits.path, hits.reflectance)
+            for values in (hits.body, hits.path, hits.reflectance)
         )
         filled = np.stack(
-            [np.mean(plate == number, axis=-1) for number in range(len(scene.plates))]
+            [np.mean(plate == number, axis=-1) for number in range(len(scene.bodies))]
         )
         most = np.argmax(filled, axis=0)[..., np.newaxis]
         own = plate == most
@@ -88,9 +89,9 @@ def render_true_frames(scene: Scene, instrument: Instrument, exposure: float = 1
     """
     camera, detector = instrument.camera, instrument.detector
     x, y = instrument.pixel_grid()
-    hits = scene.cast_rays(instrument.viewpoint(0.0), instrument.directions(x, y))
-    pixel = _number_pixels(instrument)
-    seen = hits.plate != NO_PLATE
+    hits = scene.trace(instrument.viewpoint(0.0), instrument.directions(x, y))
+    pixel = number_ray_pixels(camera.image_shape, instrument.rays_per_pixel_side)
+    seen = hits.body != NO_BODY
     brightness = (
         exposure
         / instrument.rays_per_pixel_side**2
@@ -98,31 +99,20 @@ def render_true_frames(scene: Scene, instrument: Instrument, exposure: float = 1
         / hits.distance[seen] ** 2
     )
     row = (2 * hits.path[seen] / SPEED_OF_LIGHT + camera.time_zero) / detector.bin_width
-    first, shares = spread_over_rows(row, np.full(row.shape, compute_pulse_sigma_bins(instrument)))
-    rows = first[:, np.newaxis] + np.arange(shares.shape[1])
-    inside = (rows >= 0) & (rows < detector.rows)
-    shape = (detector.rows, *camera.image_shape)
-    cell = rows * int(np.prod(camera.image_shape)) + pixel[seen][:, np.newaxis]
-    values = accumulate_cells(cell[inside], (shares * brightness[:, np.newaxis])[inside], shape)
+    shape = (int(np.prod(camera.image_shape)), detector.rows)
+    sigma = compute_pulse_sigma_bins(instrument)
+    by_pixel = bin_by_time(pixel[seen], row, brightness, sigma, shape)
+    values = np.ascontiguousarray(by_pixel.T, np.float32).reshape(-1, *camera.image_shape)
     times = detector.row_times - camera.time_zero
     # The reference view itself has no parallax: its pictures are those that the right shear would
     # give.
     shears = camera.shear_at(
         np.maximum(SPEED_OF_LIGHT * times / 2, detector.bin_width * SPEED_OF_LIGHT)
     )
-    return Frames(values.astype(np.float32), times, camera, shears=shears)
+    return Frames(values, times, camera, shears=shears)
 
 
 def _group_by_pixel(values: NDArray[Any], instrument: Instrument) -> NDArray[Any]:
     """Sort flat sub-pixel values into (rows, columns, rays of the pixel)."""
     (rows, columns), side = instrument.camera.image_shape, instrument.rays_per_pixel_side
     return values.reshape(rows, side, columns, side).swapaxes(1, 2).reshape(rows, columns, side**2)
-
-
-def _number_pixels(instrument: Instrument) -> NDArray[np.intp]:
-    """Raster number of the pixel to which each sub-pixel ray belongs."""
-    side = instrument.rays_per_pixel_side
-    numbers = np.arange(int(np.prod(instrument.camera.image_shape))).reshape(
-        instrument.camera.image_shape
-    )
-    return numbers.repeat(side, axis=0).repeat(side, axis=1).ravel()

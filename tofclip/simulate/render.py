@@ -6,21 +6,18 @@ and each ray's light is put on the slit where the ray falls and when it arrives.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from tofclip.camera import Camera
 from tofclip.simulate.instrument import Instrument
-from tofclip.simulate.scene import NO_PLATE, Scene
+from tofclip.simulate.rays import FWHM_PER_SIGMA, NO_BODY, accumulate_cells, spread_pulse
+from tofclip.simulate.scene import Scene
 from tofclip.units import SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float64]
-
-FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
-EXTENT_SIGMAS = 5.0  # a Gaussian leaves 6e-7 of its energy outside
 
 
 class RayBundle(NamedTuple):
@@ -45,8 +42,8 @@ class RayBundle(NamedTuple):
 def cast_view_rays(scene: Scene, instrument: Instrument, position: float) -> RayBundle:
     """Cast the rays of the view at `position` view steps; those that bring no light are left out."""
     x, y = instrument.pixel_grid()
-    hits = scene.cast_rays(instrument.viewpoint(position), instrument.directions(x, y, position))
-    bright = (hits.plate != NO_PLATE) & (hits.reflectance > 0)
+    hits = scene.trace(instrument.viewpoint(position), instrument.directions(x, y, position))
+    bright = (hits.body != NO_BODY) & (hits.reflectance > 0)
     share = 1 / instrument.rays_per_pixel_side**2
     return RayBundle(
         x[bright],
@@ -67,7 +64,7 @@ def render_streak(rays: RayBundle, view: int, instrument: Instrument) -> FloatAr
     ray, column, light = _split_over_columns(
         slit, camera.gains[view] * rays.brightness, instrument.rays_per_pixel_side
     )
-    first, pulse = spread_over_rows(row, stretch * compute_pulse_sigma_bins(instrument))
+    first, pulse = spread_pulse(row, stretch * compute_pulse_sigma_bins(instrument))
     reach, width = pulse.shape[1], camera.slit_width_px
     seen = (first[ray] > -reach) & (first[ray] < detector.rows) & (column >= 0) & (column < width)
     ray, column, light = ray[seen], column[seen], light[seen]
@@ -115,26 +112,6 @@ def _split_over_columns(
     )
 
 
-def accumulate_cells(
-    cell: NDArray[np.intp], amount: FloatArray, shape: tuple[int, ...]
-) -> FloatArray:
-    """Add each amount to its cell, numbered in raster order, of an array of `shape`."""
-    total: Any = np.bincount(cell.ravel(), amount.ravel(), minlength=int(np.prod(shape)))
-    return np.asarray(total, dtype=np.float64).reshape(shape)
-
-
 def compute_pulse_sigma_bins(instrument: Instrument) -> float:
     """Standard deviation of the Gaussian pulse in rows of the rectified streak image."""
     return float(instrument.camera.pulse_fwhm / FWHM_PER_SIGMA / instrument.detector.bin_width)
-
-
-def spread_over_rows(row: FloatArray, sigma: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
-    """Share of a Gaussian pulse around `row` that falls on each row: first row (n,) and shares (n,
-    reach).
-    """
-    if row.size == 0:
-        return np.zeros(0, dtype=np.intp), np.zeros((0, 1))
-    half = int(np.ceil(EXTENT_SIGMAS * sigma.max() + 0.5))
-    first = np.round(row).astype(np.intp) - half
-    edges = first[:, np.newaxis] + np.arange(2 * half + 2) - 0.5
-    return first, np.diff(ndtr((edges - row[:, np.newaxis]) / sigma[:, np.newaxis]), axis=1)

@@ -1,27 +1,28 @@
-"""What stands in front of the camera: flat plates with a printed or cut-out pattern, and a lamp."""
+"""What stands in front of a streak camera: bodies, most of them flat plates, and one pulsed lamp."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError
+from tofclip.simulate.bodies import Body, Lambertian, Rectangle, Vector
+from tofclip.simulate.rays import NO_BODY, cast_rays, compute_irradiance, look_up_reflectance
 
 FloatArray = NDArray[np.float64]
-Vector = tuple[float, float, float]
-
-SHADOW_MARGIN = (
-    1e-6  # relative distance before a surface at which rounding no longer makes it shade itself
-)
-NO_PLATE = -1
 
 
-@dataclass(frozen=True)
-class Plate:
-    """A flat, diffusely reflecting rectangle.
+def make_plate(
+    centre: Vector,
+    size: tuple[float, float],
+    reflectance: ArrayLike,
+    yaw: float = 0.0,
+    pitch: float = 0.0,
+) -> Body:
+    """Return a flat, diffusely reflecting rectangle.
 
     Parameters
     ----------
@@ -35,72 +36,31 @@ class Plate:
         Turn about the vertical axis (positive: the right side goes back) and then about the plate's
         own horizontal axis (positive: the upper side goes back), rad. Both zero: facing the camera.
 
+    Returns
+    -------
+    Body
+
     Raises
     ------
     ShapeError, InputError
-        A reflectance that is no picture or lies outside 0..1, a size that is not positive, or
+        A reflectance that is not a picture or lies outside 0..1, a size that is not positive, or
         nothing but holes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> plate = make_plate((0, 0, 2.0), (0.3, 0.2), np.full((1, 1), 0.8))
+    >>> plate.intersect(np.zeros(3), np.array([[0.0, 0.0, 1.0]])).distance
+    array([2.])
     """
-
-    centre: Vector
-    size: tuple[float, float]
-    reflectance: NDArray[np.float32]
-    yaw: float = 0.0
-    pitch: float = 0.0
-
-    def __post_init__(self) -> None:
-        reflectance = np.array(self.reflectance, dtype=np.float32)
-        if reflectance.ndim != 2 or reflectance.size == 0:
-            raise ShapeError("a plate's reflectance", "(rows, columns)", reflectance.shape)
-        solid = reflectance[~np.isnan(reflectance)]
-        if solid.size == 0 or solid.min() < 0 or solid.max() > 1:
-            raise InputError(
-                "a plate's reflectance must lie within 0..1 where it is not NaN, and be so somewhere"
-            )
-        if min(self.size) <= 0 or not np.all(
-            np.isfinite([*self.centre, *self.size, self.yaw, self.pitch])
-        ):
-            raise InputError("a plate needs a finite position and a positive size")
-        object.__setattr__(self, "reflectance", reflectance)
-
-    @property
-    def axes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Unit vectors to the plate's right, down, and along its normal."""
-        right = np.array([np.cos(self.yaw), 0.0, np.sin(self.yaw)])
-        ahead = np.array([-np.sin(self.yaw), 0.0, np.cos(self.yaw)])
-        down = np.cos(self.pitch) * np.array([0.0, 1.0, 0.0]) - np.sin(self.pitch) * ahead
-        return right, down, np.cross(right, down)
-
-    def intersect(
-        self, origin: FloatArray, directions: FloatArray
-    ) -> tuple[FloatArray, NDArray[np.float32]]:
-        """Where rays from `origin` meet the plate, in lengths of `directions` (inf: they miss), and
-        what is there.
-
-        Parameters
-        ----------
-        origin : (3,) array
-            m.
-        directions : (n, 3) array
-
-        Returns
-        -------
-        distance : (n,) float64 array
-        reflectance : (n,) float32 array
-        """
-        right, down, normal = self.axes
-        offset = np.asarray(self.centre) - origin
-        with np.errstate(divide="ignore", invalid="ignore"):
-            distance = (offset @ normal) / (directions @ normal)
-            column = (distance * (directions @ right) - offset @ right) / self.size[0] + 0.5
-            row = (distance * (directions @ down) - offset @ down) / self.size[1] + 0.5
-        inside = (distance > 0) & (row >= 0) & (row < 1) & (column >= 0) & (column < 1)
-        rows, columns = self.reflectance.shape
-        reflectance = np.full(distance.shape, np.nan, dtype=np.float32)
-        reflectance[inside] = self.reflectance[
-            (row[inside] * rows).astype(np.intp), (column[inside] * columns).astype(np.intp)
-        ]
-        return np.where(np.isnan(reflectance), np.inf, distance), reflectance
+    material = Lambertian(np.array(reflectance, dtype=np.float32))
+    if min(size) <= 0 or not np.all(np.isfinite([*centre, *size, yaw, pitch])):
+        raise InputError("a plate needs a finite position and a positive size")
+    right = np.array([np.cos(yaw), 0.0, np.sin(yaw)])
+    ahead = np.array([-np.sin(yaw), 0.0, np.cos(yaw)])
+    down = np.cos(pitch) * np.array([0.0, 1.0, 0.0]) - np.sin(pitch) * ahead
+    axes = np.stack([right, down, np.cross(right, down)], axis=-1)
+    return Body(Rectangle(*size), material, np.asarray(centre, np.float64), axes)
 
 
 class Hits(NamedTuple):
@@ -108,17 +68,17 @@ class Hits(NamedTuple):
 
     Attributes
     ----------
-    plate : (n,) int array
-        Number of the plate; `NO_PLATE` where the ray meets none.
+    body : (n,) int array
+        Number of the body; `NO_BODY` where the ray meets none.
     path : (n,) array
-        Half the way of the light from the lamp over the surface to the viewpoint, m.
+        Half of the path of the light from the lamp over the surface to the viewpoint, m.
     distance : (n,) array
         Distance of the surface from the lamp, m.
     reflectance : (n,) array
         Diffuse reflectance times the cosine of incidence; 0 in shadow.
     """
 
-    plate: NDArray[np.intp]
+    body: NDArray[np.intp]
     path: FloatArray
     distance: FloatArray
     reflectance: FloatArray
@@ -126,50 +86,56 @@ class Hits(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """Plates lit by one pulsed point source.
+    """Bodies lit by one pulsed point source.
 
     Parameters
     ----------
-    plates : tuple of Plate
+    bodies : tuple of Body
     lamp : (float, float, float)
-        Position of the source, m. At the origin it is co-located with the reference view, which
-        then sees no shadow.
+        Position of the source, m, before the bodies. At the origin it is co-located with the
+        reference view, which then sees no shadow.
+
+    Raises
+    ------
+    InputError
+        There is no body.
     """
 
-    plates: tuple[Plate, ...]
+    bodies: tuple[Body, ...]
     lamp: Vector = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not self.plates:
-            raise InputError("a scene needs at least one plate")
+        if not self.bodies:
+            raise InputError("a scene needs at least one body")
 
-    def cast_rays(self, viewpoint: FloatArray, directions: FloatArray) -> Hits:
-        """Follow rays from `viewpoint` along `directions`, (n, 3), to the nearest surface."""
-        reach, plate, reflectance = self._find_nearest(viewpoint, directions)
-        seen = plate != NO_PLATE
-        path, distance, shade = (np.zeros(plate.shape) for _ in range(3))
-        points = viewpoint + reach[seen, np.newaxis] * directions[seen]
-        rays = points - np.asarray(self.lamp)
-        distance[seen] = np.linalg.norm(rays, axis=1)
-        path[seen] = (distance[seen] + np.linalg.norm(points - viewpoint, axis=1)) / 2
-        normals = np.stack([one.axes[2] for one in self.plates])[plate[seen]]
-        cosine = np.abs(np.sum(rays * normals, axis=1)) / distance[seen]
-        lit = self._find_nearest(np.asarray(self.lamp), rays)[0] > 1 - SHADOW_MARGIN
-        shade[seen] = reflectance[seen] * cosine * lit
-        return Hits(plate, path, distance, shade)
+    def trace(self, viewpoint: FloatArray, directions: FloatArray) -> Hits:
+        """Follow rays to the nearest surface and from there to the lamp.
 
-    def _find_nearest(
-        self, origin: FloatArray, directions: FloatArray
-    ) -> tuple[FloatArray, NDArray[np.intp], NDArray[np.float32]]:
-        reach = np.full(directions.shape[0], np.inf)
-        plate = np.full(directions.shape[0], NO_PLATE, dtype=np.intp)
-        reflectance = np.zeros(directions.shape[0], dtype=np.float32)
-        for number, candidate in enumerate(self.plates):
-            distance, here = candidate.intersect(origin, directions)
-            nearer = distance < reach
-            reach[nearer], plate[nearer], reflectance[nearer] = (
-                distance[nearer],
-                number,
-                here[nearer],
-            )
-        return reach, plate, reflectance
+        Parameters
+        ----------
+        viewpoint : (3,) float array
+            m.
+        directions : (n, 3) float array
+            All with z > 0.
+
+        Returns
+        -------
+        Hits
+        """
+        first, lamp = cast_rays(self.bodies, viewpoint, directions), np.asarray(self.lamp)
+        seen = first.body != NO_BODY
+        points = viewpoint + first.distance[seen, np.newaxis] * directions[seen]
+        lamp_distance = np.linalg.norm(points - lamp, axis=1)
+        irradiance = compute_irradiance(self.bodies, lamp, points, first.normal[seen])
+
+        def scatter(values: Any) -> FloatArray:
+            spread = np.zeros(seen.shape)
+            spread[seen] = values
+            return spread
+
+        return Hits(
+            first.body,
+            scatter((lamp_distance + np.linalg.norm(points - viewpoint, axis=1)) / 2),
+            scatter(lamp_distance),
+            look_up_reflectance(self.bodies, first) * scatter(irradiance * lamp_distance**2),
+        )

@@ -2,9 +2,8 @@
 their exact shears.
 """
 
+from tofclip.simulate.bodies import Body, Box, Lambertian, Rectangle, Specular, Sphere
 from tofclip.simulate.light_fields.array import CameraArray
-from tofclip.simulate.light_fields.bodies import Body, Box, Rectangle, Sphere
-from tofclip.simulate.light_fields.materials import Lambertian, Specular
 from tofclip.simulate.light_fields.pulsed import (
     PulsedScene,
     TimeAxis,

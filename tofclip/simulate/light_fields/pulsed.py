@@ -15,18 +15,21 @@ from numpy.typing import NDArray
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators.shear import View
+from tofclip.simulate.bodies import Body
 from tofclip.simulate.light_fields.array import CameraArray
-from tofclip.simulate.light_fields.bodies import Body
-from tofclip.simulate.light_fields.render import cast_rays
-from tofclip.simulate.render import FWHM_PER_SIGMA, accumulate_cells, spread_over_rows
+from tofclip.simulate.rays import (
+    FWHM_PER_SIGMA,
+    NO_BODY,
+    bin_by_time,
+    cast_rays,
+    compute_irradiance,
+    look_up_reflectance,
+    number_ray_pixels,
+)
 from tofclip.threads import limit_blas_threads, run_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
 Array = NDArray[Any]
-
-SHADOW_MARGIN = (
-    1e-6  # relative distance before a surface at which rounding no longer makes it shade itself
-)
 
 
 @dataclass(frozen=True)
@@ -132,71 +135,19 @@ def render_flash_view(
     """Return what the camera at (v, u) sees at every instant, (rows, columns, bins) float32."""
     origin, directions = array.rays(view, array.samples)
     sight = cast_rays(scene.bodies, origin, directions)
-    seen = np.flatnonzero(np.isfinite(sight.distance))
-    normal, reflectance = (
-        sight.normal[seen],
-        _look_up_reflectance(scene, sight.body[seen], sight.pattern_position[seen]),
-    )
+    seen = np.flatnonzero(sight.body != NO_BODY)
+    reflectance = look_up_reflectance(scene.bodies, sight)[seen]
     points = origin + sight.distance[seen, np.newaxis] * directions[seen]
     back = np.linalg.norm(points - origin, axis=1)
-    pixel = _number_pixels(array)[seen]
-    total = np.zeros((*array.image_shape, time_axis.bins))
+    pixel = number_ray_pixels(array.image_shape, array.samples)[seen]
+    shape = (int(np.prod(array.image_shape)), time_axis.bins)
+    sigma = time_axis.pulse_fwhm / FWHM_PER_SIGMA / time_axis.bin_width
+    total = np.zeros(shape)
     for lamp in scene.lamps:
-        lit = compute_irradiance(scene.bodies, lamp, points, normal) * reflectance
-        bright = lit > 0
-        way = np.linalg.norm(points[bright] - lamp, axis=1) + back[bright]
-        total += _bin_by_time(
-            pixel[bright], way / SPEED_OF_LIGHT, lit[bright], time_axis, total.shape
-        )
+        light = compute_irradiance(scene.bodies, lamp, points, sight.normal[seen]) * reflectance
+        lit = light > 0
+        path = np.linalg.norm(points[lit] - lamp, axis=1) + back[lit]
+        position = (path / SPEED_OF_LIGHT - time_axis.start) / time_axis.bin_width
+        total += bin_by_time(pixel[lit], position, light[lit], sigma, shape)
     share = array.focus**2 / len(scene.lamps) / array.samples**2
-    return (share * total).astype(np.float32)
-
-
-def _look_up_reflectance(scene: PulsedScene, body: Array, place: Array) -> Array:
-    found = np.zeros(body.size)
-    for number, one in enumerate(scene.bodies):
-        own = body == number
-        found[own] = one.material.reflectance(place[own])
-    return found
-
-
-def compute_irradiance(
-    bodies: tuple[Body, ...], lamp: Array, points: Array, normal: Array
-) -> Array:
-    """Return how strongly one lamp lights points: cosine over distance squared, nothing in shadow.
-
-    Parameters
-    ----------
-    bodies : tuple of Body
-        What may stand in the way.
-    lamp : (3,) array
-    points, normal : (points, 3) arrays
-        On surfaces, m; and where these face, length 1.
-    """
-    rays = points - lamp
-    distance = np.linalg.norm(rays, axis=1)
-    facing = -np.einsum("ij,ij->i", rays, normal) / distance
-    candidates = np.flatnonzero(facing > 0)
-    nearest = cast_rays(bodies, lamp, rays[candidates]).distance
-    light = np.zeros(len(points))
-    lit = candidates[nearest > 1 - SHADOW_MARGIN]
-    light[lit] = facing[lit] / distance[lit] ** 2
-    return light
-
-
-def _bin_by_time(
-    pixel: Array, time: Array, light: Array, time_axis: TimeAxis, shape: tuple[int, ...]
-) -> Array:
-    """Put each ray's light on the bins over which its pulse is spread."""
-    sigma = np.full(time.shape, time_axis.pulse_fwhm / FWHM_PER_SIGMA / time_axis.bin_width)
-    first, shares = spread_over_rows((time - time_axis.start) / time_axis.bin_width, sigma)
-    bins = first[:, np.newaxis] + np.arange(shares.shape[1])
-    inside = (bins >= 0) & (bins < time_axis.bins)
-    cell = pixel[:, np.newaxis] * time_axis.bins + bins
-    return accumulate_cells(cell[inside], (shares * light[:, np.newaxis])[inside], shape)
-
-
-def _number_pixels(array: CameraArray) -> Array:
-    """Raster number of the pixel to which each ray belongs."""
-    numbers = np.arange(int(np.prod(array.image_shape))).reshape(array.image_shape)
-    return numbers.repeat(array.samples, axis=0).repeat(array.samples, axis=1).ravel()
+    return (share * total).astype(np.float32).reshape(*array.image_shape, time_axis.bins)

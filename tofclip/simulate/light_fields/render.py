@@ -1,8 +1,7 @@
-"""Ray casting: what each camera of an array sees of a scene, nearest surface first."""
+"""Light fields under a distant lamp: what each camera of an array sees of a scene."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +11,9 @@ from numpy.typing import NDArray
 from tofclip.errors import InputError
 from tofclip.light_field import LightField
 from tofclip.operators.shear import View
+from tofclip.simulate.bodies import Body
 from tofclip.simulate.light_fields.array import CameraArray
-from tofclip.simulate.light_fields.bodies import Body
+from tofclip.simulate.rays import cast_rays
 from tofclip.threads import limit_blas_threads, run_blocks
 
 Array = NDArray[Any]
@@ -97,52 +97,13 @@ def render_shear_map(scene: Scene, array: CameraArray, view: View = (0.0, 0.0)) 
     return np.where(seen, array.shear(depth), np.inf).reshape(array.image_shape).astype(np.float32)
 
 
-@dataclass(frozen=True)
-class FirstHits:
-    """What rays meet first.
-
-    Parameters
-    ----------
-    distance : (rays,) array
-        In lengths of the ray's direction; infinite where it meets nothing.
-    body : (rays,) int array
-        Number of the body, meaningless where there is none.
-    normal : (rays, 3) array
-        Of length 1, towards the ray's origin.
-    pattern_position : (rays, 2) array
-        On the body's pattern.
-    """
-
-    distance: Array
-    body: Array
-    normal: Array
-    pattern_position: Array
-
-
-def cast_rays(bodies: Sequence[Body], origin: Array, directions: Array) -> FirstHits:
-    """Follow rays from (3,) `origin` along (rays, 3) `directions`, all with z > 0, to the nearest
-    surface.
-    """
-    count = len(directions)
-    nearest, number = np.full(count, np.inf), np.zeros(count, np.intp)
-    normal, place = np.zeros((count, 3)), np.zeros((count, 2))
-    for index, body in enumerate(bodies):
-        rays = body.select_candidate_rays(origin, directions)
-        found = body.intersect(origin, directions[rays])
-        closer = found.distance < nearest[rays]
-        seen = rays[closer]
-        nearest[seen], number[seen] = found.distance[closer], index
-        normal[seen], place[seen] = found.normal[closer], found.pattern_position[closer]
-    return FirstHits(nearest, number, normal, place)
-
-
 def _shade_rays(scene: Scene, origin: Array, directions: Array) -> tuple[Array, Array]:
     """Distance to the nearest surface along each ray and the light that comes back from it."""
     sight = cast_rays(scene.bodies, origin, directions)
     brightness = np.zeros(len(directions))
     light = np.array(scene.light) / np.linalg.norm(scene.light)
     for index, body in enumerate(scene.bodies):
-        own = np.flatnonzero(np.isfinite(sight.distance) & (sight.body == index))
+        own = np.flatnonzero(sight.body == index)
         brightness[own] = body.material.radiance(
             sight.pattern_position[own], sight.normal[own], directions[own], light
         )

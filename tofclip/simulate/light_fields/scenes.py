@@ -10,18 +10,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofclip.errors import InputError
+from tofclip.simulate.bodies import Body, Box, Lambertian, Material, Rectangle, Specular, Sphere
 from tofclip.simulate.light_fields.array import CameraArray
-from tofclip.simulate.light_fields.bodies import Body, Box, Rectangle, Sphere
-from tofclip.simulate.light_fields.materials import Lambertian, Material, Specular
-from tofclip.simulate.light_fields.patterns import make_mottled_pattern, make_text_pattern
 from tofclip.simulate.light_fields.render import Scene
-from tofclip.simulate.shapes import (
+from tofclip.simulate.patterns import (
     cut_pattern,
     make_checkerboard,
     make_letter,
+    make_mottled_pattern,
     make_plain_pattern,
     make_rings,
     make_stripes,
+    make_text_pattern,
 )
 
 DESIGN_WIDTH_PX = (
