@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -79,7 +79,7 @@ def simulate(
         "bad_fraction": bad_fraction,
         "photons": photons or 0.0,
     }
-    measurement.to_record(build_provenance(settings, light_field)).save(out)
+    replace(measurement, provenance=build_provenance(settings, light_field)).save(out)
     figures = {
         "readings": measurement.measurements.size,
         "image_shape": measurement.image_shape,
@@ -138,12 +138,11 @@ def recover(
     from apps.report import report
     from tofclip.light_field.measurement import ClipMeasurement
     from tofclip.recovery.light_field import ClipRecovery
-    from tofclip.storage import Record
 
     inputs = (measurement,) if truth is None else (measurement, truth)
     require_writable(out, ".h5", ".png", ".exr", inputs=inputs)
     settings = ClipRecovery(prior, preset, _parse_weight(weight), data_term)
-    measurements = ClipMeasurement.from_record(Record.load(measurement, "clip_measurement"))
+    measurements = ClipMeasurement.load(measurement)
     recovered = settings.recover(measurements, shear)
     figures: dict[str, Any] = (
         {} if truth is None else _score_picture(recovered.picture, truth, shear)

@@ -82,7 +82,7 @@ def test_a_measurement_survives_its_file(encoder, tmp_path):
     from tofclip.storage import Record
 
     made = measure(light_field(), CameraSetup(encoder, 0.5, 7))
-    made.to_record({}).save(tmp_path / "m.h5")
+    made.save(tmp_path / "m.h5")
     back = ClipMeasurement.from_record(Record.load(tmp_path / "m.h5", "clip_measurement"))
     np.testing.assert_array_equal(back.measurements, made.measurements)
     assert (back.setup, back.image_shape) == (made.setup, made.image_shape)

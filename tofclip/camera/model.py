@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from tofclip.camera.sweep import FloatArray, Sweep, sweep_from_record
 from tofclip.errors import CalibrationError
 from tofclip.operators.projection import LineProjection
-from tofclip.storage import Field, Record
+from tofclip.records import Storable, stored_array, stored_child, stored_value
+from tofclip.storage import Record
 
 DEFAULT_FOCAL_LENGTH_PX = 265.0
 """Mean over three set-ups of the same family of instruments (244, 271 and 282 px), fitted to the measured positions of
@@ -20,7 +21,7 @@ the wall points that their pixels see. A camera with other lenslets needs its ow
 
 
 @dataclass(frozen=True)
-class Camera:
+class Camera(Storable):
     """A row of cylindrical lenslets in front of a line sensor.
 
     Scene point (X, Y), in pixels from the optical axis of view k, falls on slit column
@@ -73,22 +74,46 @@ class Camera:
         not positive.
     """
 
-    centres_px: FloatArray
-    angles: FloatArray
-    image_shape: tuple[int, int]
-    slit_width_px: int
-    gains: FloatArray = field(default_factory=lambda: np.empty(0))
-    view_positions: FloatArray = field(default_factory=lambda: np.empty(0))
-    sweep: Sweep | None = None
-    dead_columns: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
-    time_zero: float = 0.0
-    pulse_fwhm: float = 60e-12
-    focal_length_px: float = DEFAULT_FOCAL_LENGTH_PX
-    lenslet_pitch: float = 0.0
-    focus_distance: float = np.inf
-    distortion: FloatArray = field(default_factory=lambda: np.zeros(5))
-    centre_uncertainty_px: FloatArray = field(default_factory=lambda: np.empty(0))
-    angle_uncertainty: FloatArray = field(default_factory=lambda: np.empty(0))
+    RECORD_KIND = "camera"
+
+    centres_px: FloatArray = field(metadata=stored_array("px", "view", name="centres"))
+    angles: FloatArray = field(metadata=stored_array("rad", "view"))
+    image_shape: tuple[int, int] = field(metadata=stored_array("px", "yx", dtype=np.int64))
+    slit_width_px: int = field(metadata=stored_value("slit_width_px", dtype=int))
+    gains: FloatArray = field(
+        default_factory=lambda: np.empty(0), metadata=stored_array("", "view")
+    )
+    view_positions: FloatArray = field(
+        default_factory=lambda: np.empty(0), metadata=stored_array("view step", "view")
+    )
+    sweep: Sweep | None = field(
+        default=None, metadata=stored_child(sweep_from_record, optional=True)
+    )
+    dead_columns: NDArray[np.bool_] = field(
+        default_factory=lambda: np.empty(0, dtype=bool),
+        metadata=stored_array("", "column", dtype=bool),
+    )
+    time_zero: float = field(default=0.0, metadata=stored_value("time_zero_s"))
+    pulse_fwhm: float = field(default=60e-12, metadata=stored_value("pulse_fwhm_s"))
+    focal_length_px: float = field(
+        default=DEFAULT_FOCAL_LENGTH_PX, metadata=stored_value("focal_length_px")
+    )
+    lenslet_pitch: float = field(
+        default=0.0, metadata=stored_value("lenslet_pitch_m", optional=True)
+    )
+    focus_distance: float = field(
+        default=np.inf, metadata=stored_value("focus_distance_m", optional=True)
+    )
+    distortion: FloatArray = field(
+        default_factory=lambda: np.zeros(5), metadata=stored_array("", "coefficient", optional=True)
+    )
+    centre_uncertainty_px: FloatArray = field(
+        default_factory=lambda: np.empty(0),
+        metadata=stored_array("px", "view", name="centre_uncertainty"),
+    )
+    angle_uncertainty: FloatArray = field(
+        default_factory=lambda: np.empty(0), metadata=stored_array("rad", "view")
+    )
 
     def __post_init__(self) -> None:
         views = np.size(self.centres_px)
@@ -228,62 +253,6 @@ class Camera:
     def replace(self, **changes: Any) -> Camera:
         """Return a copy with some entries changed, validated afresh."""
         return replace(self, **changes)
-
-    def to_record(self) -> Record:
-        """Return everything that has to be stored."""
-        per_view = ("view",)
-        fields = {
-            "centres": Field(self.centres_px, "px", per_view),
-            "angles": Field(self.angles, "rad", per_view),
-            "gains": Field(self.gains, "", per_view),
-            "view_positions": Field(self.view_positions, "view step", per_view),
-            "centre_uncertainty": Field(self.centre_uncertainty_px, "px", per_view),
-            "angle_uncertainty": Field(self.angle_uncertainty, "rad", per_view),
-            "dead_columns": Field(self.dead_columns.astype(np.uint8), "", ("column",)),
-            "distortion": Field(self.distortion, "", ("coefficient",)),
-            "image_shape": Field(np.array(self.image_shape, dtype=np.int64), "px", ("yx",)),
-        }
-        attributes = {
-            "slit_width_px": self.slit_width_px,
-            "time_zero_s": self.time_zero,
-            "pulse_fwhm_s": self.pulse_fwhm,
-            "focal_length_px": self.focal_length_px,
-            "lenslet_pitch_m": self.lenslet_pitch,
-            "focus_distance_m": self.focus_distance,
-        }
-        children = {} if self.sweep is None else {"sweep": self.sweep.to_record()}
-        return Record("camera", fields, attributes, children)
-
-    @classmethod
-    def from_record(cls, record: Record) -> Camera:
-        """Rebuild a camera from its stored numbers."""
-        rows, columns = record.array("image_shape", np.int64, 1, "px")
-        return cls(
-            centres_px=record.array("centres", np.float64, 1, "px"),
-            angles=record.array("angles", np.float64, 1, "rad"),
-            image_shape=(int(rows), int(columns)),
-            slit_width_px=int(record.attribute("slit_width_px")),
-            gains=record.array("gains", np.float64, 1),
-            view_positions=record.array("view_positions", np.float64, 1, "view step"),
-            sweep=sweep_from_record(record.children["sweep"])
-            if "sweep" in record.children
-            else None,
-            dead_columns=record.array("dead_columns", np.uint8, 1).astype(bool),
-            time_zero=float(record.attribute("time_zero_s")),
-            pulse_fwhm=float(record.attribute("pulse_fwhm_s")),
-            focal_length_px=float(record.attribute("focal_length_px")),
-            distortion=record.array("distortion", np.float64, 1)
-            if "distortion" in record.fields
-            else np.zeros(5),
-            lenslet_pitch=float(record.attribute("lenslet_pitch_m", 0.0)),
-            focus_distance=float(record.attribute("focus_distance_m", np.inf)),
-            centre_uncertainty_px=record.array("centre_uncertainty", np.float64, 1, "px"),
-            angle_uncertainty=record.array("angle_uncertainty", np.float64, 1, "rad"),
-        )
-
-    def save(self, path: str | Path) -> None:
-        """Write the camera to an HDF5 file, whole or not at all."""
-        self.to_record().save(path)
 
     @classmethod
     def load(cls, path: str | Path) -> Camera:

@@ -8,14 +8,15 @@ slit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import CalibrationError, FileFormatError, ShapeError
-from tofclip.storage import Field, Record
+from tofclip.records import Storable, stored_array
+from tofclip.storage import Record
 
 FloatArray = NDArray[np.float64]
 
@@ -35,7 +36,7 @@ class Sweep(Protocol):
 
 
 @dataclass(frozen=True)
-class SkewSweep:
+class SkewSweep(Storable):
     """A time skew per view: ``raw row = offset_k + (1 + stretch_k) * row`` at each view's centre.
 
     Between two centres offset and stretch are interpolated linearly, beyond the outer ones they go
@@ -51,9 +52,11 @@ class SkewSweep:
         Relative excess of rows per instant.
     """
 
-    centres_px: FloatArray
-    offsets_bin: FloatArray
-    stretches: FloatArray
+    RECORD_KIND = "skew_sweep"
+
+    centres_px: FloatArray = field(metadata=stored_array("px", "view", name="centres"))
+    offsets_bin: FloatArray = field(metadata=stored_array("bin", "view", name="offsets"))
+    stretches: FloatArray = field(metadata=stored_array("", "view"))
 
     def __post_init__(self) -> None:
         for name in ("centres_px", "offsets_bin", "stretches"):
@@ -71,27 +74,9 @@ class SkewSweep:
         raw_row, raw_column = np.broadcast_arrays(offset + (1.0 + stretch) * row, column)
         return raw_row, raw_column
 
-    def to_record(self) -> Record:
-        return Record(
-            "skew_sweep",
-            {
-                "centres": Field(self.centres_px, "px", ("view",)),
-                "offsets": Field(self.offsets_bin, "bin", ("view",)),
-                "stretches": Field(self.stretches, "", ("view",)),
-            },
-        )
-
-    @classmethod
-    def from_record(cls, record: Record) -> SkewSweep:
-        return cls(
-            record.array("centres", np.float64, 1, "px"),
-            record.array("offsets", np.float64, 1, "bin"),
-            record.array("stretches", np.float64, 1),
-        )
-
 
 @dataclass(frozen=True)
-class PolynomialSweep:
+class PolynomialSweep(Storable):
     """A bivariate quadratic map, as MATLAB's ``fitgeotrans(..., 'polynomial', 2)`` makes it.
 
     ``u = c . [1, x, y, x*y, x^2, y^2]`` in normalised 0-based coordinates, x = column, y = row,
@@ -104,20 +89,22 @@ class PolynomialSweep:
         (x, y) normalisation: ``normalised = (pixel - origin) / scale``.
     """
 
-    column_coefficients: FloatArray
-    row_coefficients: FloatArray
-    rectified_origin: FloatArray
-    rectified_scale: FloatArray
-    raw_origin: FloatArray
-    raw_scale: FloatArray
+    RECORD_KIND = "polynomial_sweep"
+
+    column_coefficients: FloatArray = field(metadata=stored_array(dimensions=1))
+    row_coefficients: FloatArray = field(metadata=stored_array(dimensions=1))
+    rectified_origin: FloatArray = field(metadata=stored_array("px", "xy"))
+    rectified_scale: FloatArray = field(metadata=stored_array("px", "xy"))
+    raw_origin: FloatArray = field(metadata=stored_array("px", "xy"))
+    raw_scale: FloatArray = field(metadata=stored_array("px", "xy"))
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            values = np.asarray(getattr(self, field.name), dtype=np.float64)
-            object.__setattr__(self, field.name, values)
-            expected = (6,) if field.name.endswith("coefficients") else (2,)
+        for item in fields(self):
+            values = np.asarray(getattr(self, item.name), dtype=np.float64)
+            object.__setattr__(self, item.name, values)
+            expected = (6,) if item.name.endswith("coefficients") else (2,)
             if values.shape != expected:
-                raise ShapeError(f"polynomial sweep's {field.name}", expected, values.shape)
+                raise ShapeError(f"polynomial sweep's {item.name}", expected, values.shape)
         if not (np.all(self.rectified_scale) and np.all(self.raw_scale)):
             raise CalibrationError("a polynomial sweep's scales must not be zero")
 
@@ -131,33 +118,9 @@ class PolynomialSweep:
             u * self.raw_scale[0] + self.raw_origin[0],
         )
 
-    def to_record(self) -> Record:
-        return Record(
-            "polynomial_sweep",
-            {
-                "column_coefficients": Field(self.column_coefficients),
-                "row_coefficients": Field(self.row_coefficients),
-                "rectified_origin": Field(self.rectified_origin, "px", ("xy",)),
-                "rectified_scale": Field(self.rectified_scale, "px", ("xy",)),
-                "raw_origin": Field(self.raw_origin, "px", ("xy",)),
-                "raw_scale": Field(self.raw_scale, "px", ("xy",)),
-            },
-        )
-
-    @classmethod
-    def from_record(cls, record: Record) -> PolynomialSweep:
-        return cls(
-            record.array("column_coefficients", np.float64, 1),
-            record.array("row_coefficients", np.float64, 1),
-            record.array("rectified_origin", np.float64, 1, "px"),
-            record.array("rectified_scale", np.float64, 1, "px"),
-            record.array("raw_origin", np.float64, 1, "px"),
-            record.array("raw_scale", np.float64, 1, "px"),
-        )
-
 
 @dataclass(frozen=True)
-class ProjectiveSweep:
+class ProjectiveSweep(Storable):
     """A homography: ``[raw column, raw row, 1] ~ matrix @ [column, row, 1]``, 0-based pixels.
 
     Parameters
@@ -165,7 +128,9 @@ class ProjectiveSweep:
     matrix : (3, 3) array
     """
 
-    matrix: FloatArray
+    RECORD_KIND = "projective_sweep"
+
+    matrix: FloatArray = field(metadata=stored_array("px", dimensions=2))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "matrix", np.asarray(self.matrix, dtype=np.float64))
@@ -179,24 +144,13 @@ class ProjectiveSweep:
         raw_row = (h[1, 0] * column + h[1, 1] * row + h[1, 2]) / weight
         return raw_row, raw_column
 
-    def to_record(self) -> Record:
-        return Record("projective_sweep", {"matrix": Field(self.matrix, "px")})
-
-    @classmethod
-    def from_record(cls, record: Record) -> ProjectiveSweep:
-        return cls(record.array("matrix", np.float64, 2, "px"))
-
 
 def sweep_from_record(record: Record) -> Sweep:
     """Rebuild whichever sweep `record` describes."""
-    kinds: dict[str, type[SkewSweep] | type[PolynomialSweep] | type[ProjectiveSweep]] = {
-        "skew_sweep": SkewSweep,
-        "polynomial_sweep": PolynomialSweep,
-        "projective_sweep": ProjectiveSweep,
-    }
-    if record.kind not in kinds:
-        raise FileFormatError(record.origin, f"holds an unknown sweep '{record.kind}'")
-    return kinds[record.kind].from_record(record)
+    for kind in (SkewSweep, PolynomialSweep, ProjectiveSweep):
+        if record.kind == kind.RECORD_KIND:
+            return kind.from_record(record)
+    raise FileFormatError(record.origin, f"holds an unknown sweep '{record.kind}'")
 
 
 def _evaluate_quadratic(c: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:

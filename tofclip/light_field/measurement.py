@@ -5,7 +5,7 @@ they pose.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 from tofclip.errors import InputError, ShapeError
 from tofclip.light_field import LightField
 from tofclip.operators.light_field_camera import CAMERAS, LightFieldCamera
-from tofclip.storage import Field, Record
+from tofclip.records import (
+    Storable,
+    stored_array,
+    stored_part,
+    stored_provenance,
+    stored_value,
+)
 
 
 @dataclass(frozen=True)
@@ -30,9 +36,9 @@ class CameraSetup:
     seed : int
     """
 
-    encoder: str
-    sampling_ratio: float
-    seed: int
+    encoder: str = field(metadata=stored_value(dtype=str))
+    sampling_ratio: float = field(metadata=stored_value())
+    seed: int = field(metadata=stored_value(dtype=int))
 
     def camera(self, image_shape: tuple[int, int], views: NDArray[np.float64]) -> LightFieldCamera:
         """Build the camera; the same setup builds the same one again."""
@@ -44,7 +50,7 @@ class CameraSetup:
 
 
 @dataclass(frozen=True)
-class ClipMeasurement:
+class ClipMeasurement(Storable):
     """Readings and the camera that made them.
 
     Parameters
@@ -56,13 +62,20 @@ class ClipMeasurement:
     setup : Setup
     photons_per_unit : float
         What a reading of 1 means in counted photons; 0: not known.
+    provenance : mapping
+        How they came about.
     """
 
-    measurements: NDArray[Any]
-    views: NDArray[np.float64]
-    image_shape: tuple[int, int]
-    setup: CameraSetup
-    photons_per_unit: float = 0.0
+    RECORD_KIND = "clip_measurement"
+
+    measurements: NDArray[Any] = field(
+        metadata=stored_array("", "reading", dtype=np.float32, name="readings")
+    )
+    views: NDArray[np.float64] = field(metadata=stored_array("", "view", "vu"))
+    image_shape: tuple[int, int] = field(metadata=stored_value("rows", "columns", dtype=int))
+    setup: CameraSetup = field(metadata=stored_part(CameraSetup))
+    photons_per_unit: float = field(default=0.0, metadata=stored_value())
+    provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
 
     def __post_init__(self) -> None:
         if not np.all(np.isfinite(self.measurements)):
@@ -99,40 +112,6 @@ class ClipMeasurement:
             )
         counted: NDArray[Any] = self.measurements * np.float32(self.photons_per_unit)
         return counted
-
-    def to_record(self, provenance: Mapping[str, Any]) -> Record:
-        """Return what is written to a file."""
-        return Record(
-            "clip_measurement",
-            {
-                "readings": Field(self.measurements, "", ("reading",)),
-                "views": Field(self.views, "", ("view", "vu")),
-            },
-            {
-                "rows": self.image_shape[0],
-                "columns": self.image_shape[1],
-                "encoder": self.setup.encoder,
-                "sampling_ratio": self.setup.sampling_ratio,
-                "seed": self.setup.seed,
-                "photons_per_unit": self.photons_per_unit,
-            },
-            provenance=provenance,
-        )
-
-    @classmethod
-    def from_record(cls, record: Record) -> ClipMeasurement:
-        """Rebuild a measurement from its record."""
-        setup = CameraSetup(
-            str(record.attribute("encoder")),
-            float(record.attribute("sampling_ratio")),
-            int(record.attribute("seed")),
-        )
-        shape = (int(record.attribute("rows")), int(record.attribute("columns")))
-        views, photons = (
-            record.array("views", np.float64, 2),
-            float(record.attribute("photons_per_unit")),
-        )
-        return cls(record.array("readings", np.float32, 1), views, shape, setup, photons)
 
 
 def measure(light_field: LightField, setup: CameraSetup) -> ClipMeasurement:

@@ -4,20 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import Array, namespace, to_numpy
+from tofclip.arrays import Array, namespace
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
-from tofclip.storage import Field, Record, Scalar
+from tofclip.records import (
+    Storable,
+    stored_array,
+    stored_attachments,
+    stored_attributes,
+    stored_child,
+    stored_provenance,
+)
+from tofclip.storage import Record, Scalar
 
 
 @dataclass(frozen=True)
-class Frames:
+class Frames(Storable):
     """A transient cube with its axes and the camera that saw it.
 
     Parameters
@@ -40,13 +47,17 @@ class Frames:
         Shear at which each frame was recovered, pixels per view step; 0 everywhere by default.
     """
 
-    values: Array
-    times: NDArray[np.float64]
-    camera: Camera
-    figures: Mapping[str, Scalar] = field(default_factory=dict)
-    attachments: Mapping[str, Record] = field(default_factory=dict)
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    shears: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    RECORD_KIND = "frames"
+
+    values: Array = field(metadata=stored_array("count", "time", "y", "x", dtype=np.float32))
+    times: NDArray[np.float64] = field(metadata=stored_array("s", "time"))
+    camera: Camera = field(metadata=stored_child(Camera.from_record, "camera"))
+    figures: Mapping[str, Scalar] = field(default_factory=dict, metadata=stored_attributes())
+    attachments: Mapping[str, Record] = field(default_factory=dict, metadata=stored_attachments())
+    provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
+    shears: NDArray[np.float64] = field(
+        default_factory=lambda: np.empty(0), metadata=stored_array("px", "time", optional=True)
+    )
 
     def __post_init__(self) -> None:
         times = np.asarray(self.times, dtype=np.float64)
@@ -70,41 +81,3 @@ class Frames:
         if self.times.size == 1:
             raise InputError("a single frame has no bin width")
         return float((self.times[-1] - self.times[0]) / (self.times.size - 1))
-
-    def to_record(self) -> Record:
-        """Return everything that has to be stored."""
-        return Record(
-            "frames",
-            {
-                "values": Field(to_numpy(self.values), "count", ("time", "y", "x")),
-                "times": Field(self.times, "s", ("time",)),
-                "shears": Field(self.shears, "px", ("time",)),
-            },
-            self.figures,
-            {**self.attachments, "camera": self.camera.to_record()},
-            self.provenance,
-        )
-
-    @classmethod
-    def from_record(cls, record: Record) -> Frames:
-        """Rebuild frames from what was stored."""
-        return cls(
-            values=record.array("values", np.float32, 3, "count"),
-            times=record.array("times", np.float64, 1, "s"),
-            camera=Camera.from_record(record.child("camera", "camera")),
-            shears=record.array("shears", np.float64, 1, "px")
-            if "shears" in record.fields
-            else np.empty(0),
-            figures=record.attributes,
-            attachments={k: v for k, v in record.children.items() if k != "camera"},
-            provenance=record.provenance,
-        )
-
-    def save(self, path: str | Path) -> None:
-        """Write the frames, their camera and attachments to one HDF5 file, whole or not at all."""
-        self.to_record().save(path)
-
-    @classmethod
-    def load(cls, path: str | Path) -> Frames:
-        """Read frames that `save` wrote."""
-        return cls.from_record(Record.load(path, "frames"))

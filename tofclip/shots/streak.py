@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,11 +11,20 @@ from numpy.typing import NDArray
 
 from tofclip.camera import Camera
 from tofclip.errors import InputError, MissingTimeAxisError, ShapeError
-from tofclip.storage import Field, Record
+from tofclip.records import (
+    Storable,
+    stored_array,
+    stored_attachments,
+    stored_child,
+    stored_origin,
+    stored_provenance,
+    stored_texts,
+)
+from tofclip.storage import Record
 
 
 @dataclass(frozen=True)
-class Streak:
+class Streak(Storable):
     """A streak image with whatever its file said about it.
 
     Parameters
@@ -47,14 +55,24 @@ class Streak:
         increase.
     """
 
-    counts: NDArray[np.float32]
-    row_times: NDArray[np.float64] | None = None
-    saturated: NDArray[np.bool_] | None = None
-    metadata: Mapping[str, str] = field(default_factory=dict)
-    camera: Camera | None = None
-    attachments: Mapping[str, Record] = field(default_factory=dict)
-    source: str = "streak image"
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    RECORD_KIND = "streak"
+
+    counts: NDArray[np.float32] = field(
+        metadata=stored_array("count", "time", "column", dtype=np.float32)
+    )
+    row_times: NDArray[np.float64] | None = field(
+        default=None, metadata=stored_array("s", "time", optional=True)
+    )
+    saturated: NDArray[np.bool_] | None = field(
+        default=None, metadata=stored_array("", "time", "column", dtype=bool, optional=True)
+    )
+    metadata: Mapping[str, str] = field(default_factory=dict, metadata=stored_texts())
+    camera: Camera | None = field(
+        default=None, metadata=stored_child(Camera.from_record, optional=True)
+    )
+    attachments: Mapping[str, Record] = field(default_factory=dict, metadata=stored_attachments())
+    source: str = field(default="streak image", metadata=stored_origin())
+    provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
 
     def __post_init__(self) -> None:
         with np.errstate(
@@ -102,45 +120,3 @@ class Streak:
         return replace(
             self, row_times=np.arange(self.counts.shape[0], dtype=np.float64) * float(bin_width)
         )
-
-    def to_record(self) -> Record:
-        """Return everything that has to be stored."""
-        fields = {"counts": Field(self.counts, "count", ("time", "column"))}
-        if self.row_times is not None:
-            fields["row_times"] = Field(self.row_times, "s", ("time",))
-        if self.saturated is not None:
-            fields["saturated"] = Field(self.saturated.astype(np.uint8), "", ("time", "column"))
-        children = dict(self.attachments)
-        if self.camera is not None:
-            children["camera"] = self.camera.to_record()
-        children["metadata"] = Record("metadata", attributes=dict(self.metadata))
-        return Record("streak", fields, {}, children, self.provenance)
-
-    @classmethod
-    def from_record(cls, record: Record) -> Streak:
-        """Rebuild a streak image from what was stored."""
-        attachments = dict(record.children)
-        camera = attachments.pop("camera", None)
-        metadata = attachments.pop("metadata", None)
-        has_times, has_mask = "row_times" in record.fields, "saturated" in record.fields
-        return cls(
-            counts=record.array("counts", np.float32, 2, "count"),
-            row_times=record.array("row_times", np.float64, 1, "s") if has_times else None,
-            saturated=record.array("saturated", np.uint8, 2).astype(bool) if has_mask else None,
-            metadata={k: str(v) for k, v in metadata.attributes.items()} if metadata else {},
-            camera=Camera.from_record(camera) if camera else None,
-            attachments=attachments,
-            source=record.origin or "streak image",
-            provenance=record.provenance,
-        )
-
-    def save(self, path: str | Path) -> None:
-        """Write the streak image, its camera and its attachments to one HDF5 file, whole or not at
-        all.
-        """
-        self.to_record().save(path)
-
-    @classmethod
-    def load(cls, path: str | Path) -> Streak:
-        """Read a streak image that `save` wrote."""
-        return cls.from_record(Record.load(path, "streak"))
