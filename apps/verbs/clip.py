@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -148,9 +148,12 @@ def recover(
         {} if truth is None else _score_picture(recovered.picture, truth, shear)
     )
     figures |= {
-        field.name: getattr(recovered, field.name)
-        for field in fields(recovered)
-        if field.name != "picture"
+        "weight": recovered.weight,
+        "iterations": recovered.iterations,
+        "stopped_because": recovered.stop_reason,
+        "seconds": recovered.seconds,
+        "seconds_setup": recovered.seconds_setup,
+        "seconds_weight": recovered.seconds_weight,
     }
     past = {
         "verb": "clip recover",

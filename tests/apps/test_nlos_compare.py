@@ -86,9 +86,9 @@ def test_the_demonstration(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     for name, value in {
         "WALL_POINTS": 24,
-        "FACET": 0.06,
-        "WAVELENGTH": 0.34,
-        "VOXEL": 0.06,
+        "FACET_M": 0.06,
+        "WAVELENGTH_M": 0.34,
+        "VOXEL_M": 0.06,
     }.items():
         monkeypatch.setattr(demo, name, value)
     found = object_of(run, "demo", "--out", tmp_path / "demo", "--png", tmp_path / "picture.png")

@@ -144,7 +144,7 @@ def test_losses_are_told_apart() -> None:
     # A transfer of 512 bytes holds 85 or 86 records of which it has the beginning.
     assert 50 + 85 <= stats.lost_device <= 50 + 87
     assert 9 <= stats.malformed <= 10
-    assert [batch.after_gap for batch in outcome.batches].count_records(True) == 1
+    assert [batch.after_gap for batch in outcome.batches].count(True) == 1
 
 
 def test_scripts_are_drawn_from_their_seed_and_read_from_text() -> None:

@@ -135,8 +135,8 @@ def test_any_hdf5_program_opens_it_at_every_moment(tmp_path: Path) -> None:
         file.append(piece[:100], piece[100:])
         with h5py.File(path) as opened:
             assert opened[DATASET_NAME].shape == (len(content),)
-        file.tell()
-        file.tell()
+        file.commit()
+        file.commit()
         content += piece
         assert file.length == len(content)
         with h5py.File(path) as opened:

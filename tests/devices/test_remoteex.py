@@ -147,7 +147,7 @@ def test_after_an_unplugged_cable_the_stream_goes_on(camera: Make) -> None:
         source.stop()
         require_balance(source)
     assert source.stats.reconnects == 1
-    assert gaps.count_records(True) == 1
+    assert gaps.count(True) == 1
 
 
 def test_a_camera_that_stays_away(camera: Make) -> None:
@@ -237,7 +237,7 @@ def test_answers_about_pictures_that_make_no_sense(answer: bytes, problem: str) 
     with LoopbackServer(scripted({PICTURE: answer})) as commands, data_server(b"pixels") as data:
         link = RemoteExClient(HOST, commands.port, data.port, 2)
         with pytest.raises(ProtocolError, match=problem):
-            link.picture(0)
+            link.read_frame(0)
         link.close()
 
 
@@ -246,9 +246,9 @@ def test_messages_are_kept_while_an_answer_is_awaited() -> None:
     with LoopbackServer(scripted(answers)) as commands, data_server(b"") as data:
         link = RemoteExClient(HOST, commands.port, data.port, 0.3)
         assert link.ask("AcqStop") == ()
-        assert link.message(1).arguments == ("RingBuffer", "1")
+        assert link.read_message(1).arguments == ("RingBuffer", "1")
         with pytest.raises(DeviceTimeoutError):
-            link.message(0.05)
+            link.read_message(0.05)
         with pytest.raises(
             DeviceTimeoutError, match=r"AcqStart\(\) for 0\.3 s; it is not asked again"
         ):

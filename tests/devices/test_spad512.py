@@ -199,7 +199,7 @@ def test_after_an_unplugged_cable_the_pictures_go_on(array: Array) -> None:
             assert batch is not None
             gaps += [batch.after_gap]
         finished(source)
-    assert (source.stats.reconnects, source.stats.malformed, gaps.count_records(True)) == (1, 1, 1)
+    assert (source.stats.reconnects, source.stats.malformed, gaps.count(True)) == (1, 1, 1)
 
 
 def test_what_the_server_complains_of_is_passed_on(array: Array) -> None:

@@ -230,10 +230,10 @@ def test_unusable_values_are_refused(wrong: str, said: str) -> None:
 
 def test_odd_answers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     _, bus = tagger()
-    monkeypatch.setattr(EmulatedTimeTagger, "_reply", lambda *_: 3)
+    monkeypatch.setattr(EmulatedTimeTagger, "_send_reply", lambda *_: 3)
     with pytest.raises(ProtocolError, match="answered 3 bytes"):
         open_on_backend(Uri.parse("timetag://"), "", bus)
-    monkeypatch.setattr(EmulatedTimeTagger, "_reply", lambda *_: 4)
+    monkeypatch.setattr(EmulatedTimeTagger, "_send_reply", lambda *_: 4)
     with pytest.raises(ProtocolError, match="0 Hz"):
         open_on_backend(Uri.parse("timetag://"), "", bus)
 
@@ -298,6 +298,6 @@ def test_a_defect_in_the_thread_reaches_the_reader(monkeypatch: pytest.MonkeyPat
     def fail(*_: object) -> int:
         raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr(EmulatedTimeTagger, "_hand_over", fail)
+    monkeypatch.setattr(EmulatedTimeTagger, "_send_data", fail)
     with devices.open(SMALL) as source, pytest.raises(ZeroDivisionError):
         source.read()

@@ -164,7 +164,7 @@ def test_recorded_boards_see_the_scene_with_their_own_tables_only(
         for number in range(100):
             words = np.frombuffer(simulated.encode_cycle(number), np.uint8)
             histogram.add(codec.decode(words, codec.start).records)
-        figures = score_returns(depth(recover(histogram.streak(light.camera))), light.truth)
+        figures = score_returns(depth(recover(histogram.to_streak(light.camera))), light.truth)
         errors.append(figures["median_depth_error_m"])
     # 0.8 mm with the tables and 315 mm without them, where the pixels' offsets are 11 ns or 1.6 m
     # apart.

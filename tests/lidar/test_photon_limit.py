@@ -178,7 +178,7 @@ def test_unusable_histograms_and_settings_are_refused(detector):
     for settings_ in (
         {"false_alarm_rate": 1e-5},
         {"bins": 12},
-        {"most_returns": 0},
+        {"max_returns": 0},
         {"bin_width": 0.0},
     ):
         with pytest.raises(InputError):

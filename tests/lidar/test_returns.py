@@ -292,10 +292,10 @@ def test_unusable_input_is_refused():
     [
         ({"signal_to_noise": -1.0}, "must not be negative"),
         ({"signal_to_noise": float("nan")}, "must not be negative"),
-        ({"share_of_scene": 1.5}, "between 0 and 1"),
-        ({"share_of_instant": -0.1}, "between 0 and 1"),
-        ({"share_of_pixel": float("nan")}, "between 0 and 1"),
-        ({"most_returns": 0}, "1 to 255"),
+        ({"min_scene_fraction": 1.5}, "between 0 and 1"),
+        ({"min_time_bin_fraction": -0.1}, "between 0 and 1"),
+        ({"min_pixel_fraction": float("nan")}, "between 0 and 1"),
+        ({"max_returns": 0}, "1 to 255"),
     ],
 )
 def test_unusable_limits_are_refused(wrong, words):
