@@ -190,7 +190,9 @@ class Experiment:
         """The target by the middle view alone, its pixels as many as the others' readings; occluder
         gated away.
         """
-        seen = self._render_middle_view((*self.scene.target, *self.scene.occluder), self._single_array)
+        seen = self._render_middle_view(
+            (*self.scene.target, *self.scene.occluder), self._single_array
+        )
         random = np.random.default_rng([self.settings.seed, 2])
         noisy = add_poisson_noise(seen, self._photons_per_unit(seen), random)
         gates = [one.bins for one in self.measurements.find_returns()]
@@ -200,7 +202,9 @@ class Experiment:
     @cached_property
     def single_view_truth(self) -> Array:
         """What the single view would see of the target, were there no occluder."""
-        picture: Array = self._render_middle_view(self.scene.target, self._single_array).sum(axis=-1)
+        picture: Array = self._render_middle_view(self.scene.target, self._single_array).sum(
+            axis=-1
+        )
         return picture
 
     @property

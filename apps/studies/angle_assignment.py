@@ -11,7 +11,7 @@ from apps.studies.outcome import Advance, Outcome, Panel, Study
 RATIOS = (2.0, 1.0, 0.5, 0.25)
 SCENES = {"letters": -0.4, "blocks": -0.6}
 RECORDED_SCENES = {"render_letters": -0.3, "render_planes": 0.0, "hci_antinous": 0.0}
-ENCODERS = ("line", "line-spread")
+ENCODERS = ("line", "line-even")
 
 
 def run_angle_assignment(library: Library, seeds: int, advance: Advance) -> Outcome:

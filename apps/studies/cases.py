@@ -29,7 +29,7 @@ BORDER_PX = 12
 
 CAMERA_NAMES = {
     "line": "CLIP-1D",
-    "line-spread": "CLIP-1D, even",
+    "line-even": "CLIP-1D, even",
     "single-pixel": "CLIP-0D",
     "diffuser": "CLIP-2D",
 }

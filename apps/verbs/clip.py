@@ -31,10 +31,10 @@ def simulate(
         str,
         typer.Option(
             metavar="NAME",
-            help="line, line-spread, single-pixel, coded-line, coded-aperture, cubic-phase or diffuser.",
+            help="line, line-even, single-pixel, coded-line, coded-aperture, cubic-phase or diffuser.",
             autocompletion=make_completer(
                 "line",
-                "line-spread",
+                "line-even",
                 "single-pixel",
                 "coded-line",
                 "coded-aperture",

@@ -74,7 +74,7 @@ def bare_codes() -> Callable[[], object]:
 def table(ratio: float, repeats: int) -> list[dict[str, object]]:
     """One row for each camera: milliseconds of its model, and of it relative to its floor."""
     product = bare_sparse_product(ratio)
-    floors = {"line": product, "line-spread": product, "single-pixel": bare_codes()}
+    floors = {"line": product, "line-even": product, "single-pixel": bare_codes()}
     rows = []
     for name in CAMERAS:
         operator = model(name, min(ratio, 1.0) if name in AREA_SENSORS else ratio)

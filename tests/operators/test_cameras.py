@@ -125,7 +125,7 @@ def test_a_measured_camera_without_a_lens_sees_beyond_its_sensor():
     ("name", "weight", "worst"),
     [
         ("line", 1.5e-2, 0.10),
-        ("line-spread", 2.5e-2, 0.045),
+        ("line-even", 2.5e-2, 0.045),
         ("single-pixel", 7e-2, 0.045),
         ("coded-line", 1e-2, 0.18),
         ("coded-aperture", 1e-2, 0.13),

@@ -165,3 +165,7 @@ def test_an_incomplete_grid_of_views_is_refused(scene):
     some = LightField(scene.pictures[:-1], scene.views[:-1])
     with pytest.raises(InputError, match="complete grid"):
         recover_light_field(measurements(some))
+
+
+def test_the_older_name_of_even_angles_is_still_read() -> None:
+    assert CameraSetup("line-spread", 0.5, 0) == CameraSetup("line-even", 0.5, 0)

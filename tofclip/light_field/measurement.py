@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.light_field import LightField
-from tofclip.operators.light_field_camera import CAMERAS, LightFieldCamera
+from tofclip.operators.light_field_camera import CAMERAS, EvenAngleLineCamera, LightFieldCamera
 from tofclip.records import (
     Storable,
     stored_array,
@@ -39,6 +39,11 @@ class CameraSetup:
     encoder: str = field(metadata=stored_value(dtype=str))
     sampling_ratio: float = field(metadata=stored_value())
     seed: int = field(metadata=stored_value(dtype=int))
+
+    def __post_init__(self) -> None:
+        # The name in commands and files of version 0.1.0; to go with the next version.
+        if self.encoder == "line-spread":
+            object.__setattr__(self, "encoder", EvenAngleLineCamera.name)
 
     def camera(self, image_shape: tuple[int, int], views: NDArray[np.float64]) -> LightFieldCamera:
         """Build the camera; the same setup builds the same one again."""

@@ -76,7 +76,7 @@ class EvenAngleLineCamera(LineCamera):
     random).
     """
 
-    name: ClassVar[str] = "line-spread"
+    name: ClassVar[str] = "line-even"
 
     def _assign_angles(self, angles: NDArray[np.float64]) -> AngleAssignment:
         """Deal evenly; directions that differ by 6 px at the picture's border stand for the
