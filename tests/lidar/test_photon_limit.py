@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import binom
+from scipy.stats import binom, exponnorm
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Pulse
@@ -74,6 +74,33 @@ def test_background_and_wide_bins_raise_the_bound():
     assert compute_range_bound(pulse, 2 * FWHM, 50, 0.1) > 1.7 * compute_range_bound(
         pulse, BIN, 50, 0.1
     )
+
+
+@pytest.mark.parametrize("width_ps", [20, 90])
+@pytest.mark.parametrize("background", [0.0, 0.5])
+def test_the_bound_is_that_of_the_whole_fisher_matrix(width_ps, background):
+    """Arrival and amount both unknown, over all places within a bin: a skewed pulse in bins as wide
+    as itself, by finite differences of its distribution function.
+    """
+    sigma, decay, photons, width = 20e-12, 80e-12, 50.0, width_ps * 1e-12
+
+    def expected(arrival: float, amount: float) -> np.ndarray:
+        edges = (np.arange(-15, 60) - 0.5) * width - arrival
+        cumulative = exponnorm.cdf(edges, decay / sigma, scale=sigma)
+        return amount * np.diff(cumulative)
+
+    variances = []
+    for phase in (np.arange(64) + 0.5) / 64 - 0.5:
+        at, step = phase * width, 1e-4 * width
+        slope = (expected(at + step, photons) - expected(at - step, photons)) / (2 * step)
+        light = expected(at, photons)
+        seen = light + background > 1e-9
+        weight = 1 / (light + background)[seen]
+        derivatives = np.stack([slope, light / photons])[:, seen]
+        variances.append(np.linalg.inv(derivatives * weight @ derivatives.T)[0, 0])
+    pulse = Pulse.exponentially_modified(sigma * np.sqrt(8 * np.log(2)), decay)
+    found = compute_range_bound(pulse, width, photons, background)
+    assert found == pytest.approx(metres(np.sqrt(np.mean(variances))), rel=0.02)
 
 
 @pytest.mark.parametrize(

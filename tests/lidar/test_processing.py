@@ -171,6 +171,22 @@ def test_the_lens_is_undone(k, row, column):
     assert down[0] * 200 + 64 == pytest.approx(row, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("coefficients", "expected"),
+    [
+        # OpenCV's order k1, k2, p1, p2, k3; by hand, at x = 0.3, y = -0.2, r^2 = 0.13
+        ((1.0, 0, 0, 0, 0), (0.3 * 1.13, -0.2 * 1.13)),
+        ((0, 1.0, 0, 0, 0), (0.3 * (1 + 0.13**2), -0.2 * (1 + 0.13**2))),
+        ((0, 0, 1.0, 0, 0), (0.3 - 0.12, -0.2 + 0.13 + 0.08)),
+        ((0, 0, 0, 1.0, 0), (0.3 + 0.13 + 0.18, -0.2 - 0.12)),
+        ((0, 0, 0, 0, 1.0), (0.3 * (1 + 0.13**3), -0.2 * (1 + 0.13**3))),
+    ],
+)
+def test_each_coefficient_of_the_lens_bends_as_published(coefficients, expected):
+    found = distort_directions(np.array([0.3]), np.array([-0.2]), np.array(coefficients))
+    assert np.ravel(found) == pytest.approx(expected, abs=1e-12)
+
+
 def test_impossible_lenses_are_refused(tmp_path):
     camera = Camera(
         np.array([60.0]), np.array([0.0]), (128, 96), 200, distortion=np.array([-9.0, 0, 0, 0, 0])

@@ -276,3 +276,34 @@ def test_the_recorded_letter_s_stands_at_half_a_metre(
     assert rows[0.15][left].mean() > 1.3 * rows[0.15][right].mean()
     for bar, gap in ((-0.15, -0.06), (0.05, -0.06), (0.05, 0.15)):
         assert rows[bar][middle].mean() > 1.15 * rows[gap][middle].mean()
+
+
+@named
+def test_the_weights_undo_exactly_four_powers_of_the_distance(
+    method: LightCone | FKMigration,
+) -> None:
+    """As if brightness had not fallen at all: the same image from signals times distance^4."""
+    assert method.falloff == 4
+    capture, grid = confocal([HIDDEN, (0.0, 0.1, 0.45)]), around(HIDDEN, 0.3, 0.03)
+    brighter = replace(
+        capture, signal=capture.signal * np.arange(AXIS.bins)[:, np.newaxis, np.newaxis] ** 4.0
+    )
+    unweighted = replace(method, falloff=0.0).reconstruct(brighter, grid).values
+    found = method.reconstruct(capture, grid).values
+    assert np.allclose(found / found.max(), unweighted / unweighted.max(), atol=1e-4)
+
+
+def test_the_light_cone_transform_reads_depths_to_a_fraction_of_a_bin() -> None:
+    """A sample of u = z^2 is the mean over an interval and stands for its middle: half a sample is
+    more than half a bin near the wall.
+    """
+    axis = TimeAxis(bins=48, bin_width=160e-12)
+    errors = []
+    for depth in np.arange(0.40, 0.60, 0.017):
+        point = (X[13], Y[11], depth)
+        depths = depth + 0.002 * np.arange(-40, 41)
+        grid = Grid(X[13:14], Y[11:12], depths)
+        line = LightCone().reconstruct(confocal([point], axis=axis), grid).values[:, 0, 0]
+        bright = np.where(line > line.max() / 2, line, 0)
+        errors.append(np.sum(bright * depths) / np.sum(bright) - depth)
+    assert abs(np.mean(errors)) < 0.2 * axis.spacing / 2

@@ -46,6 +46,16 @@ def test_refocusing_moves_each_view_by_its_position(angle, shear, x, y):
         assert seen == pytest.approx(centre + x - y * np.tan(angle) + shear * position, abs=1e-9)
 
 
+@pytest.mark.parametrize("shape", [(20, 20), (21, 20), (20, 21), (21, 21)])
+def test_the_optical_axis_of_even_and_odd_pictures_is_their_middle_pixel(shape):
+    projection = LineProjection(shape, 101, [50.0], [0.5], [1.0], np.float64)
+    for row, column in ((10, 10), (3, 5), (0, 19)):
+        picture = np.zeros(shape)
+        picture[row, column] = 1
+        expected = 50 + (column - 10) - (row - 10) * np.tan(0.5)
+        assert centroid(projection(picture)) == pytest.approx(expected, abs=1e-12)
+
+
 def test_a_vertical_line_response_sums_columns():
     picture = np.random.default_rng(0).random((7, 9))
     slit = LineProjection((7, 9), 9, [4.0], [0.0], [1.0], np.float64)(picture)

@@ -51,3 +51,15 @@ def test_a_band_limited_picture_is_shifted(kind):
     # 0.5 %.
     bound = 5e-3 if kind is LinearShear else 1e-12
     assert np.abs(seen - np.cos(x - 0.3 * 2 * np.pi / 32))[:, 1:].max() < bound
+
+
+@pytest.mark.parametrize("shift", [0.3, 0.5, -1.2])
+def test_the_finest_pattern_fades_with_a_fractional_shift_and_moves_no_other_way(shift):
+    """A pattern at the Nyquist frequency has no phase: shifted, only its cosine is left."""
+    rows, columns = np.indices((8, 16))
+    finest, wave = (-1.0) ** rows, np.cos(2 * np.pi * 3 * columns / 16)
+    seen = FourierShear((8, 16), shift, (1, 0), dtype=np.float64)(finest * wave)
+    np.testing.assert_allclose(seen, np.cos(np.pi * shift) * finest * wave, atol=1e-12)
+    finest, wave = (-1.0) ** columns, np.cos(2 * np.pi * 3 * rows / 8)
+    seen = FourierShear((8, 16), shift, (0, 1), dtype=np.float64)(finest * wave)
+    np.testing.assert_allclose(seen, np.cos(np.pi * shift) * finest * wave, atol=1e-12)

@@ -174,5 +174,25 @@ def test_tolerance_stops_and_says_so():
     assert done.objective[-1] < limited.objective[-1]
 
 
+class _Scripted:
+    """A solver whose objectives, and whether a step was refused, are given beforehand."""
+
+    def __init__(self, *steps: tuple[float, bool]) -> None:
+        self._steps = list(steps)
+        self.objective, self.rejected = np.array([10.0]), np.array([False])
+
+    def step(self) -> None:
+        value, refused = self._steps.pop(0)
+        self.objective, self.rejected = np.array([value]), np.array([refused])
+
+
+def test_a_refused_step_is_not_convergence():
+    """The objective stands still because the step was undone, not because it is the least."""
+    solver = _Scripted((9.0, False), (9.0, True), (7.0, False), (7.0, False), (1.0, False))
+    history = iterate(solver, StoppingRule(5, 1e-3), ignore_progress, 1)
+    assert history.converged
+    assert history.objective.tolist() == [10, 9, 9, 7, 7]
+
+
 def _lanes(measurements: np.ndarray) -> np.ndarray:
     return np.tile(measurements[:, np.newaxis], (1, LANES))
