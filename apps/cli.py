@@ -1,6 +1,6 @@
 """The console program `tofclip`: one verb, one small module in `apps.verbs`.
 
-Nothing heavy is imported before a verb runs, so that help appears at once.
+A verb's module is imported when the verb is called, so that the program's own help appears at once.
 """
 
 from __future__ import annotations
@@ -13,42 +13,19 @@ from typing import Annotated
 
 import typer
 
-from apps.help import set_help_texts
-from apps.verbs import (
-    bench,
-    calibrate,
-    clip,
-    cloud,
-    convert,
-    demo,
-    devices,
-    info,
-    lidar,
-    nlos,
-    occlusion,
-    record,
-    recover,
-    reproduce,
-    stream,
-    view,
+from apps.help import (
+    DEBUG_FLAG,
+    EPILOG,
+    EXIT_BROKEN_PIPE,
+    EXIT_DEFECT,
+    EXIT_INPUT_ERROR,
+    EXIT_INTERRUPTED,
 )
+from apps.lazy_verbs import VerbTable, make_lazy_group
 from tofclip import __version__
 from tofclip.errors import TofclipError
 
-EXIT_INPUT_ERROR = 2
-EXIT_DEFECT = 1
-EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
-EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
-
-DEBUG_FLAG = "--debug"
-COMPLETION_VARIABLE = (
-    "_TOFCLIP_COMPLETE"  # what shells set while they ask typer how a word may go on
-)
-EPILOG = (
-    f"Exit status: 0 done; {EXIT_INPUT_ERROR} unusable input, with one line on standard error that says what to do; "
-    f"{EXIT_INTERRUPTED} interrupted; {EXIT_DEFECT} some of a sequence failed, or a defect of this program. "
-    f"{DEBUG_FLAG} anywhere shows where an error came from."
-)
+COMPLETION_VARIABLE = "_TOFCLIP_COMPLETE"  # set by shells that ask how a command line may go on
 
 VERB_OVERVIEW = f"""\
 tofclip {__version__}: 3D from streak images, through occluders and around corners
@@ -89,24 +66,32 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
 
   tofclip VERB --help explains a verb. Exit status: 0 done, 1 some failed, 2 unusable input, 130 interrupted."""
 
-app = typer.Typer(name="tofclip", pretty_exceptions_enable=False, epilog=EPILOG)
-app.command()(demo.demo)
-app.command()(calibrate.calibrate)
-app.command()(recover.recover)
-app.command()(cloud.cloud)
-app.command()(view.view)
-app.command()(stream.stream)
-app.add_typer(lidar.app, name="lidar")
-app.add_typer(nlos.app, name="nlos")
-app.add_typer(clip.app, name="clip")
-app.add_typer(occlusion.app, name="occlusion")
-app.command()(reproduce.reproduce)
-app.command()(bench.bench)
-app.add_typer(devices.app, name="devices")
-app.command()(record.record)
-app.command()(convert.convert)
-app.command()(info.info)
-set_help_texts(app, EPILOG)
+VERBS: VerbTable = {
+    "demo": "Simulate a scene of letters and plates, recover it from one streak image, and compare with the truth.",
+    "calibrate": "Find every view's slit centre and line angle, and draw the fits over the data.",
+    "recover": "Recover every transient frame of a raw streak image, or of each one of a sequence.",
+    "cloud": "Find each pixel's returns and place them in space: x right, y down, z forward, in metres.",
+    "view": "Look at a source: on a page of the browser, in a window, as a picture or as a film.",
+    "stream": "Make a cloud of each shot by the linear inverse while the next ones come, and tell rate and latencies.",
+    "lidar": "How well a range can be known, and how the views' parallax grows with it; many shots in a row.",
+    "nlos": "Image the scene hidden around a corner.",
+    "clip": "Light fields from few nonlocal readings.",
+    "occlusion": "See through occluders: which places no view can see, and a demonstration of the others.",
+    "reproduce": "Make tables and figures of the paper again, its figures beside ours.",
+    "bench": "Measure time and memory, each beside the least that the work needs.",
+    "devices": "Streak cameras, SPAD sensors, time taggers and their recordings.",
+    "record": "Record an instrument: its bytes as they come, with clock, accounts and calibration.",
+    "convert": "Turn a streak image into this program's HDF5, with its time axis, camera, text and relay wall inside.",
+    "info": "Say what kind of thing a file holds: shapes, axes, units, text, and how it came about.",
+}
+"""Each verb's module in `apps.verbs` and its line in the list of commands."""
+
+app = typer.Typer(
+    name="tofclip",
+    cls=make_lazy_group("apps.verbs", VERBS),
+    pretty_exceptions_enable=False,
+    epilog=EPILOG,
+)
 
 
 @app.callback(invoke_without_command=True)

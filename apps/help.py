@@ -16,22 +16,35 @@ if TYPE_CHECKING:
     import typer
 
 PROGRAM = "tofclip"
+
+EXIT_INPUT_ERROR = 2
+EXIT_DEFECT = 1
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells report it
+EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
+
+DEBUG_FLAG = "--debug"
+EPILOG = (
+    f"Exit status: 0 done; {EXIT_INPUT_ERROR} unusable input, with one line on standard error that says what to do; "
+    f"{EXIT_INTERRUPTED} interrupted; {EXIT_DEFECT} some of a sequence failed, or a defect of this program. "
+    f"{DEBUG_FLAG} anywhere shows where an error came from."
+)
+
 EXAMPLE_MARK = "Example:"
 MAX_EXAMPLE_WIDTH = (
     72  # of an example, so that it fits the narrowest usual terminal with its indentation
 )
 
 
-def set_help_texts(app: typer.Typer, closing: str) -> None:
-    """Give every verb its help, made from its docstring, with `closing` as the last paragraph."""
+def set_help_texts(app: typer.Typer) -> None:
+    """Give every verb its help, made from its docstring; the exit statuses are its last paragraph."""
     for verb in app.registered_commands:
         prose, examples = split_docstring(verb.callback.__doc__ if verb.callback else None)
         shown = [f"{EXAMPLE_MARK}\n    {wrap_command(example)}" for example in examples]
         verb.help = _escape_markup("\n\n".join(prose))
-        verb.epilog = _escape_markup("\n\n".join([*shown, closing]))
+        verb.epilog = _escape_markup("\n\n".join([*shown, EPILOG]))
     for group in app.registered_groups:
         if group.typer_instance is not None:
-            set_help_texts(group.typer_instance, closing)
+            set_help_texts(group.typer_instance)
 
 
 def split_docstring(docstring: str | None) -> tuple[list[str], list[str]]:

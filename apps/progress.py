@@ -9,6 +9,9 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
 Advance = Callable[[int], None]
 
 _screen_lock = threading.Lock()
@@ -47,15 +50,6 @@ def _open_bar(title: str, total: int) -> Iterator[Advance]:
 
 @contextlib.contextmanager
 def _draw_bar(title: str, total: int) -> Iterator[Advance]:
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TaskProgressColumn,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
     columns = (
         TextColumn("{task.description}"),
         BarColumn(None),

@@ -11,6 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from apps.progress import show_progress
+from apps.report import report
+from tofclip.arrays import parse_device
+from tofclip.errors import MissingDependencyError
+from tofclip.sequences.jobs import run_jobs, select_unfinished
+
 if TYPE_CHECKING:
     from tofclip.sequences.jobs import Job, Report, Summary
 
@@ -36,9 +42,6 @@ def run_with_progress(
     watch : callable, optional
         Called with each report.
     """
-    from apps.progress import show_progress
-    from tofclip.sequences.jobs import run_jobs, select_unfinished
-
     missing = select_unfinished(jobs)
     with show_progress(title, len(missing)) as advance:
 
@@ -57,9 +60,6 @@ def resolve_device(device: str, cluster: str | None) -> str:
     InputError, MissingDependencyError
         It is no name of a device, or not here, where there is no cluster.
     """
-    from tofclip.arrays import parse_device
-    from tofclip.errors import MissingDependencyError
-
     try:
         found = str(parse_device(device))
     except MissingDependencyError:
@@ -90,8 +90,6 @@ def report_summary(
     typer.Exit
         With status 1: there were failures.
     """
-    from apps.report import report
-
     attempted = summary.done + len(summary.failures)
     told = {
         "results": summary.done,

@@ -23,6 +23,7 @@ import typer
 
 from apps.options import make_completer
 from tofclip.errors import FileFormatError, InputError
+from tofclip.storage import atomic_path, translate_read_errors
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -110,8 +111,6 @@ def save_settings(settings: DataclassInstance, path: Path, heading: str) -> None
     """Write the settings that have a value, whole or not at all; given back, they are the same to
     the last bit.
     """
-    from tofclip.storage import atomic_path
-
     lines = [
         f"# {heading}",
         *(f"{name} = {_to_toml(value)}" for name, value in settings_to_dict(settings).items()),
@@ -138,8 +137,6 @@ def _make_flags(kind: type[DataclassInstance]) -> list[inspect.Parameter]:
 
 
 def _read_file(kind: type[DataclassInstance], file: Path) -> dict[str, Any]:
-    from tofclip.storage import translate_read_errors
-
     with translate_read_errors(file), open(file, "rb") as opened:
         try:
             found = tomllib.load(opened)

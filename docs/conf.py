@@ -10,9 +10,11 @@ from pathlib import Path
 from sphinx.application import Sphinx
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent))
+sys.path[:0] = [str(HERE.parent), str(HERE)]
 
-from tofclip import __version__  # noqa: E402 - the path has to be known first
+from verb_pages import write_pages  # noqa: E402 - the path has to be known first
+
+from tofclip import __version__  # noqa: E402
 
 project = "ToF-CLIP"
 author = "The ToF-CLIP developers"
@@ -27,7 +29,7 @@ myst_heading_anchors = 3
 smartquotes = False  # they would turn -- of an option into a dash
 default_role = "py:obj"
 autodoc_default_options = {"members": True}
-autodoc_typehints = "none"  # the docstrings tell shapes and units, which types cannot
+autodoc_typehints = "none"  # the docstrings give shapes and units, which types cannot
 napoleon_google_docstring = False
 napoleon_use_param = False
 napoleon_use_rtype = False
@@ -39,8 +41,6 @@ html_show_sphinx = False
 
 def write_verb_pages(app: Sphinx) -> None:
     """Make a page for each verb from the program, before pages are looked for."""
-    from apps.documentation import write_pages
-
     write_pages(Path(app.srcdir) / "verbs")
 
 

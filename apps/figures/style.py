@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tofclip.storage import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
 BRIGHTNESS_COLOURMAP = "inferno"
@@ -29,6 +29,8 @@ def make_figure(width: float, height: float) -> Figure:
     """Make an empty figure, in inches. It draws with Agg: no display is needed and pyplot is left
     alone.
     """
+    from matplotlib.figure import Figure  # a third of a second that only a verb's pictures need
+
     return Figure(figsize=(width, height), dpi=DOTS_PER_INCH, layout="constrained")
 
 

@@ -4,6 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from nlos import Backprojection, FilteredBackprojection, FKMigration, Hybrid, LightCone
+from nlos.backprojection import TABLE_BYTES
+from nlos.confocal.scan import BYTES_PER_SAMPLE
+from nlos.illumination_groups import choose_unaliased_band, group_by_illumination
+from nlos.rsd.diffraction import BYTES_PER_WAVE, DiffractionPlan
+from nlos.rsd.planar import build_waves
+from nlos.rsd.wall import PlanarWall
+
 if TYPE_CHECKING:
     from nlos import Capture, Grid
     from nlos.method import Reconstructor
@@ -24,10 +32,6 @@ def estimate_memory(imaging: Reconstructor, capture: Capture, grid: Grid) -> int
 
     Good to about a factor of two; `tofclip nlos compare` measures.
     """
-    from nlos import Backprojection, FilteredBackprojection, FKMigration, LightCone
-    from nlos.backprojection import TABLE_BYTES
-    from nlos.confocal.scan import BYTES_PER_SAMPLE
-
     volume = grid.size * (SUM_BYTES + MAGNITUDE_BYTES)
     if isinstance(imaging, LightCone | FKMigration):
         return volume + 8 * len(capture.points) * capture.axis.bins * BYTES_PER_SAMPLE
@@ -45,12 +49,6 @@ def estimate_memory(imaging: Reconstructor, capture: Capture, grid: Grid) -> int
 
 def _estimate_spectra_bytes(imaging: Reconstructor, capture: Capture, grid: Grid) -> int:
     """Bytes of a field on a plane and of its plane waves, at all frequencies of the pulse."""
-    from nlos import Hybrid
-    from nlos.illumination_groups import choose_unaliased_band, group_by_illumination
-    from nlos.rsd.diffraction import BYTES_PER_WAVE, DiffractionPlan
-    from nlos.rsd.planar import build_waves
-    from nlos.rsd.wall import PlanarWall
-
     group = group_by_illumination(capture)[0]
     band = choose_unaliased_band(capture, grid, imaging.pulse)  # type: ignore[attr-defined]
     if isinstance(imaging, Hybrid):

@@ -12,12 +12,18 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from apps.nlos.methods import Imaging, ImagingSettings, build_method, choose_quickest_method
 from apps.progress import show_progress
+from nlos import Grid
+from nlos.band import BAND_EDGE_LEVEL, VirtualPulse
+from nlos.illumination_groups import group_by_illumination
+from nlos.preparation import rebin_capture, remove_first_bounce
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
-    from nlos import Capture, Grid, Volume
+    from nlos import Capture, Volume
     from nlos.geometry import FloatArray
     from nlos.method import Reconstructor
 
@@ -32,8 +38,6 @@ WAVELENGTH_DIGITS = 2
 
 def preprocess_capture(capture: Capture, settings: ImagingSettings) -> Capture:
     """Blank the wall's own light and put bins together, as the settings tell."""
-    from nlos.preparation import rebin_capture, remove_first_bounce
-
     if settings.gate_m is not None:
         capture = remove_first_bounce(capture, settings.gate_m)
     return (
@@ -48,10 +52,6 @@ def find_shortest_wavelength(capture: Capture, cycles: float) -> float:
     The band's shortest wave is sampled twice along the wall (four times in a confocal scan, where
     the path grows on both legs) and twice along the record.
     """
-    import numpy as np
-
-    from nlos.band import BAND_EDGE_LEVEL, VirtualPulse
-
     pulse = VirtualPulse(1.0, cycles)
     highest = 1 + math.sqrt(-2 * math.log(BAND_EDGE_LEVEL)) / (pulse.sigma * pulse.wavenumber)
     confocal = len(capture.lasers) > 1 and np.array_equal(capture.lasers, capture.points)
@@ -97,8 +97,6 @@ def fill_box(settings: Imaging, capture: Capture, voxel: float) -> tuple[Imaging
     """Fill the box that is told, or the space in front of the wall where it is not, with voxels of
     `voxel` m.
     """
-    from nlos import Grid
-
     front = Grid.in_front_of(capture, voxel, settings.near_m, settings.far_m)
     x = _axis_limits(front.x) if settings.x_m is None else settings.x_m
     y = _axis_limits(front.y) if settings.y_m is None else settings.y_m
@@ -117,8 +115,6 @@ def choose_grid(settings: Imaging, capture: Capture) -> tuple[Imaging, Grid]:
     farthest depths for the brightest things. The settings that come back hold the box itself and
     find the same voxels once more.
     """
-    from nlos import Grid
-
     scales = find_scales(settings, capture)
     voxel, coarse = scales.voxel_mm * MILLIMETRE, scales.wavelength_mm * MILLIMETRE / 2
     bounded, _ = fill_box(settings, capture, voxel)
@@ -137,8 +133,6 @@ def image_capture(title: str, imaging: Reconstructor, capture: Capture, grid: Gr
     """Image the hidden scene under a progress bar that counts look-ups or voxels, whichever the
     method does.
     """
-    from nlos.illumination_groups import group_by_illumination
-
     imaging.supports(capture, grid).require()
     lookups = getattr(imaging, "lookups", None)
     total = lookups(capture, grid) if lookups else grid.size * len(group_by_illumination(capture))

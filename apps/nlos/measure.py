@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apps.nlos.imaging import image_capture
+from nlos import Grid
 
 if TYPE_CHECKING:
     from apps.nlos.truth import HiddenTruth
-    from nlos import Capture, Grid, Volume
+    from nlos import Capture, Volume
     from nlos.method import Reconstructor
 
 WARM_UP_VOXELS = 8
@@ -57,8 +58,6 @@ def measure_imaging(
 
     A few voxels are imaged first, so that loading the compiled loops is not counted.
     """
-    from nlos import Grid
-
     few = slice(WARM_UP_VOXELS)
     imaging.reconstruct(capture, Grid(grid.x[few], grid.y[few], grid.z[:1]))
     before = _reset_peak_memory()

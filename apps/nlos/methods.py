@@ -8,14 +8,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import nlos
 from apps.settings import setting_field
+from tofclip.arrays import ComputeDevice, parse_device
 from tofclip.errors import InputError
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid
     from nlos.method import Reconstructor
-    from tofclip.arrays import ComputeDevice
 
 PULSE_SETTINGS = ("wavelength_mm", "cycles")
 
@@ -117,8 +118,6 @@ def require_used_settings(settings: ImagingSettings, methods: Sequence[str]) -> 
 
 def build_method(method: str, settings: ImagingSettings) -> Reconstructor:
     """Build a method; what no setting tells is left to its class."""
-    import nlos
-
     class_name, names = METHODS[method]
     arguments = {}
     for name in names:
@@ -159,8 +158,6 @@ def choose_device(device: str, settings: ImagingSettings) -> ComputeDevice:
     """Return the place that a name asks for; ``auto`` stays with the compiled loops where a method
     has nothing else.
     """
-    from tofclip.arrays import ComputeDevice, parse_device
-
     named, refine = (getattr(settings, name, None) for name in ("method", "refine"))
     portable = named in (None, *PORTABLE_METHODS) and refine is None
     return ComputeDevice() if device == "auto" and not portable else parse_device(device)

@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 from apps.nlos.methods import ImagingSettings, build_method
 from apps.settings import setting_field
+from nlos import Refinement
+from nlos.refinement.refine import build_total_variation
 from tofclip.errors import InputError
+from tofclip.solvers import Sparse
 
 if TYPE_CHECKING:
-    from nlos import Grid, Hybrid, Refinement
+    from nlos import Grid, Hybrid
 
 PRIORS = ("l1", "tv")
 REFINED_METHOD = "hybrid"
@@ -71,10 +74,6 @@ def build_refinement(settings: Refining, grid: Grid) -> tuple[Refining, Refineme
     """Build the refinement that settings ask for on a grid; the settings come back with what nobody
     told.
     """
-    from nlos import Refinement
-    from nlos.refinement.refine import build_total_variation
-    from tofclip.solvers import Sparse
-
     weight = DEFAULT_PRIOR_WEIGHT if settings.prior_weight is None else settings.prior_weight
     iterations = settings.iterations or DEFAULT_ITERATIONS
     prior = (

@@ -4,21 +4,33 @@ make of it.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from apps.nlos.truth import HiddenTruth
 from apps.settings import setting_field
+from nlos.simulate import (
+    HiddenScene,
+    Lambert,
+    Material,
+    PointScene,
+    Retroreflector,
+    Surface,
+    add_poisson_noise,
+    build_relay_wall,
+)
+from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
-from tofclip.units import MILLIMETRE, PICOSECOND
+from tofclip.units import MILLIMETRE, PICOSECOND, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
-    from apps.nlos.truth import HiddenTruth
     from nlos import Capture
     from nlos.geometry import FloatArray
-    from nlos.simulate import HiddenScene, PointScene, Surface
-    from nlos.time_axis import TimeAxis
 
 SCANS = ("single", "confocal")
 WALLS = ("planar", "cylinder", "wavy", "relief", "plates")
@@ -83,8 +95,6 @@ def simulate_scene(settings: SceneSettings) -> tuple[Capture, HiddenTruth]:
     InputError
         Several kinds of things are hidden, a name is unknown, or a number makes no sense.
     """
-    from nlos.simulate import add_poisson_noise, build_relay_wall
-
     if settings.scan not in SCANS:
         raise InputError(f"no scan is called '{settings.scan}'; choose {' or '.join(SCANS)}")
     if settings.background and settings.peak_counts is None:
@@ -109,11 +119,6 @@ def simulate_scene(settings: SceneSettings) -> tuple[Capture, HiddenTruth]:
 
 def build_hidden_scene(settings: SceneSettings) -> tuple[HiddenScene | PointScene, HiddenTruth]:
     """Build what is hidden, and say where it is."""
-    import numpy as np
-
-    from apps.nlos.truth import HiddenTruth
-    from nlos.simulate import HiddenScene, PointScene
-
     told = [name for name in ("letters", "points", "mesh") if getattr(settings, name) is not None]
     if len(told) > 1:
         raise InputError(f"{' and '.join(told)} cannot be hidden together; choose one of them")
@@ -126,8 +131,6 @@ def build_hidden_scene(settings: SceneSettings) -> tuple[HiddenScene | PointScen
 
 def find_nearest_wall_point(wall: FloatArray, place: tuple[float, float]) -> FloatArray:
     """Return the wall point whose x and y are nearest to a place, m."""
-    import numpy as np
-
     known = wall[np.isfinite(wall).all(axis=-1)]
     spot: FloatArray = known[np.argmin(np.linalg.norm(known[:, :2] - place, axis=1))]
     return spot
@@ -141,13 +144,6 @@ def choose_time_axis(
 
     A sum of distances is largest at a corner of the box about what is hidden.
     """
-    import itertools
-
-    import numpy as np
-
-    from nlos.time_axis import TimeAxis
-    from tofclip.units import SPEED_OF_LIGHT
-
     if not (math.isfinite(bin_width) and bin_width > 0):
         raise InputError(
             f"the bin width must be a positive number of picoseconds, got {bin_width / PICOSECOND:g}"
@@ -162,8 +158,6 @@ def choose_time_axis(
 
 
 def _build_surface(settings: SceneSettings) -> Surface:
-    from nlos.simulate import Lambert, Material, Retroreflector, Surface
-
     materials: dict[str, Material] = {"matte": Lambert(), "retroreflecting": Retroreflector()}
     if settings.material not in materials:
         raise InputError(

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from tofclip.errors import InputError
+from tofclip.errors import FileFormatError, InputError
 from tofclip.storage import HDF5_SIGNATURE, Field, Record
 
 if TYPE_CHECKING:
@@ -56,8 +57,6 @@ class HiddenTruth:
 
     @classmethod
     def _read(cls, path: Path) -> HiddenTruth | None:
-        from tofclip.errors import FileFormatError
-
         try:
             found = Record.load(path).children.get(RECORD_KIND)
         except FileFormatError:  # another laboratory's HDF5
@@ -70,8 +69,6 @@ class HiddenTruth:
 
     def mask_near(self, grid: Grid, reach: float) -> NDArray[np.bool_]:
         """Voxels (z, y, x) whose centres lie within `reach` m of something hidden."""
-        from scipy.spatial import cKDTree
-
         if reach <= 0:
             raise InputError(f"the reach about hidden things must be positive, got {reach} m")
         z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")

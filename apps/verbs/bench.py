@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from apps.benchmarks.page import render_page as made_page
+from apps.benchmarks.registry import find_cases
+from apps.benchmarks.run import count_processes, run_cases
+from apps.files import require_writable
 from apps.options import JsonOption
+from apps.progress import show_progress
+from apps.report import report
+from tofclip.storage import atomic_path
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,23 +43,15 @@ def bench(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure time and memory, each against what the work cannot do without; all of it takes less
-    than ten minutes.
+    """Measure time and memory, each beside the least that the work needs.
 
-    Other programs slow it down: close them. TOFCLIP_THREADS bounds the number of threads.
+    All cases together take less than ten minutes. Other programs slow it down: close them.
+    TOFCLIP_THREADS bounds the number of threads.
 
     Example: tofclip bench recovery
 
     Example: tofclip bench --page benchmarks.md --json
     """
-    from apps.benchmarks.page import render_page as made_page
-    from apps.benchmarks.registry import find_cases
-    from apps.benchmarks.run import count_processes, run_cases
-    from apps.files import require_writable
-    from apps.progress import show_progress
-    from apps.report import report
-    from tofclip.storage import atomic_path
-
     cases = find_cases(name)
     if page is not None:
         require_writable(page, ".md")

@@ -5,9 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
+from apps.figures.calibration import make_calibration_figure
+from apps.figures.style import save_figure
+from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
 from apps.options import JsonOption, PreviewOption, TimeZeroOption
+from apps.report import report
+from tofclip.camera.calibration import calibrate_views as fit
+from tofclip.io import read_streak
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
@@ -49,18 +56,13 @@ def calibrate(
     preview: PreviewOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find every view's slit centre and line angle, with uncertainties and a picture of the fits
-    over the data.
+    """Find every view's slit centre and line angle, and draw the fits over the data.
+
+    The uncertainty of every parameter is written as well.
 
     Example: tofclip calibrate --line line.tif --line-background line_background.tif --dot dot.tif
     --dot-background dot_background.tif --out camera.h5
     """
-    from apps.figures.calibration import make_calibration_figure
-    from apps.figures.style import save_figure
-    from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
-    from tofclip.camera.calibration import calibrate_views as fit
-    from tofclip.io import read_streak
-
     pictures = (line, line_background, dot, dot_background)
     preview = preview or out.with_suffix(".png")
     require_writable(out, *RECORD_SUFFIXES, inputs=pictures)
@@ -79,10 +81,6 @@ def calibrate(
 
 
 def _report_calibration(found: FocusCalibration, as_json: bool, written: list[Path]) -> None:
-    import numpy as np
-
-    from apps.report import report
-
     figures: dict[str, Any] = {
         "angles_deg": np.rad2deg(found.angles),
         "centres_px": found.centres_px,

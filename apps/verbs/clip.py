@@ -8,7 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from apps.files import RECORD_SUFFIXES, build_provenance, require_writable
 from apps.options import JsonOption, make_completer
+from apps.report import report
+from tofclip.errors import InputError
+from tofclip.io.light_fields import read_light_field
+from tofclip.light_field.measurement import (
+    CameraSetup,
+    ClipMeasurement,
+    corrupt_measurement,
+    measure,
+)
+from tofclip.metrics import nmse, nmse_energy
+from tofclip.recovery.light_field import ClipRecovery
+from tofclip.storage import Field, Record, atomic_path
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -64,11 +77,6 @@ def simulate(
     Example: tofclip clip simulate light_field.npz --encoder line --sampling-ratio 0.5 --out
     readings.h5
     """
-    from apps.files import RECORD_SUFFIXES, build_provenance, require_writable
-    from apps.report import report
-    from tofclip.io.light_fields import read_light_field
-    from tofclip.light_field.measurement import CameraSetup, corrupt_measurement, measure
-
     require_writable(out, *RECORD_SUFFIXES, inputs=(light_field,))
     known = read_light_field(light_field)
     setup = CameraSetup(encoder, sampling_ratio, seed)
@@ -134,11 +142,6 @@ def recover(
 
     Example: tofclip clip recover readings.h5 --shear -0.3 --preset quality --out picture.png
     """
-    from apps.files import require_writable
-    from apps.report import report
-    from tofclip.light_field.measurement import ClipMeasurement
-    from tofclip.recovery.light_field import ClipRecovery
-
     inputs = (measurement,) if truth is None else (measurement, truth)
     require_writable(out, ".h5", ".png", ".exr", inputs=inputs)
     settings = ClipRecovery(prior, preset, _parse_weight(weight), data_term)
@@ -168,8 +171,6 @@ def recover(
 
 def _parse_weight(text: str) -> float | None:
     """Return the weight that was asked for, None for `auto`."""
-    from tofclip.errors import InputError
-
     if text == "auto":
         return None
     try:
@@ -180,9 +181,6 @@ def _parse_weight(text: str) -> float | None:
 
 def _score_picture(picture: NDArray[Any], truth: Path, shear: float) -> dict[str, float]:
     """Compare with the true views' shift-and-add."""
-    from tofclip.io.light_fields import read_light_field
-    from tofclip.metrics import nmse, nmse_energy
-
     refocused = read_light_field(truth).refocus(shear)
     return {
         "nmse": nmse(picture, refocused, SCORED_BORDER_PX),
@@ -197,9 +195,6 @@ def _write_picture(
     """Write the picture; a PNG is scaled to the picture's own brightest pixel, the others keep the
     values.
     """
-    from apps.files import build_provenance
-    from tofclip.storage import Field, Record, atomic_path
-
     if out.suffix.lower() == ".h5":
         fields_kept = {"picture": Field(picture, "", ("y", "x"))}
         past = build_provenance(settings, measurement)

@@ -8,12 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from apps.files import build_provenance, require_writable
 from apps.options import ClusterOption, DeviceOption, JsonOption
+from apps.report import report
+from apps.sequences import report_summary, resolve_device, run_with_progress
+from tofclip.errors import InputError
+from tofclip.sequences import CloudSettings, is_sequence, list_files
+from tofclip.sequences.clouds import save_cloud
+from tofclip.shots import Frames
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from tofclip.lidar import PointCloud, Returns
-    from tofclip.sequences import CloudSettings
 
 CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".h5")
 DEPTH_SUFFIX = ".exr"
@@ -60,10 +66,6 @@ def cloud(
 
     Example: tofclip cloud 'frames/*.h5' --out clouds/ --cluster local
     """
-    from apps.sequences import resolve_device
-    from tofclip.errors import InputError
-    from tofclip.sequences import CloudSettings, is_sequence
-
     clouds = CloudSettings(
         drop_outliers, None if voxel_mm is None else voxel_mm * MILLIMETRE, device
     )
@@ -80,8 +82,6 @@ def cloud(
 
 def require_format(suffix: str, *further: str) -> None:
     """Refuse an ending that names no format of clouds."""
-    from tofclip.errors import InputError
-
     if suffix not in (*CLOUD_SUFFIXES, *further):
         raise InputError(
             f"no cloud format is called '{suffix}'; use one of {', '.join((*CLOUD_SUFFIXES, *further))}"
@@ -91,9 +91,6 @@ def require_format(suffix: str, *further: str) -> None:
 def _convert_sequence(
     clouds: CloudSettings, frames: Path, out: Path, suffix: str, how: tuple[str | None, str, bool]
 ) -> None:
-    from apps.sequences import report_summary, run_with_progress
-    from tofclip.sequences import list_files
-
     require_format(suffix, DEPTH_SUFFIX)
     cluster, device, as_json = how
     jobs = clouds.jobs(list_files(frames), out, suffix)
@@ -107,10 +104,6 @@ def _convert_sequence(
 def _convert_single(
     clouds: CloudSettings, frames: Path, made: tuple[Path, str], as_json: bool
 ) -> None:
-    from apps.files import build_provenance, require_writable
-    from tofclip.sequences.clouds import save_cloud
-    from tofclip.shots import Frames
-
     out, _ = made
     require_writable(out, *CLOUD_SUFFIXES, DEPTH_SUFFIX, inputs=(frames,))
     recovered = Frames.load(frames)
@@ -123,8 +116,6 @@ def _convert_single(
 def _report_cloud(
     points: PointCloud, returns: Returns, as_json: bool, made: tuple[Path, str]
 ) -> None:
-    from apps.report import report
-
     (rows, columns), (out, device) = returns.camera.image_shape, made
     figures = {
         "points": len(points),

@@ -7,7 +7,10 @@ from typing import Annotated
 
 import typer
 
+from apps.files import RECORD_SUFFIXES, require_writable
 from apps.options import JsonOption
+from apps.report import report
+from tofclip.io import read_streak
 from tofclip.units import PICOSECOND
 
 
@@ -25,10 +28,6 @@ def convert(
 
     Example: tofclip convert wall.npz --out wall.h5
     """
-    from apps.files import RECORD_SUFFIXES, require_writable
-    from apps.report import report
-    from tofclip.io import read_streak
-
     require_writable(out, *RECORD_SUFFIXES, inputs=(streak,))
     shot = read_streak(streak, None if bin_width_ps is None else bin_width_ps * PICOSECOND)
     shot.save(out)

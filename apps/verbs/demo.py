@@ -9,7 +9,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from apps.figures.demo import make_demo_figure
+from apps.figures.style import save_figure
+from apps.files import build_provenance, make_folder
 from apps.options import JsonOption
+from apps.progress import show_progress
+from apps.report import report
+from tofclip.lidar import depth, point_cloud
+from tofclip.metrics import nmse
+from tofclip.recovery import prepare_recovery
+from tofclip.simulate import (
+    make_default_instrument,
+    make_default_scene,
+    render_true_frames,
+    score_returns,
+    simulate_shot,
+)
 
 if TYPE_CHECKING:
     from tofclip.lidar import PointCloud, Returns
@@ -34,11 +49,6 @@ def demo(
 
     Example: tofclip demo --out demo-output
     """
-    from apps.figures.demo import make_demo_figure
-    from apps.figures.style import save_figure
-    from apps.files import make_folder
-    from apps.report import report
-
     started = time.perf_counter()
     make_folder(out)
     run = _run_demo(seed)
@@ -70,17 +80,6 @@ class DemoRun:
 
 def _run_demo(seed: int) -> DemoRun:
     """The whole way, from a scene to a point cloud."""
-    from apps.files import build_provenance
-    from apps.progress import show_progress
-    from tofclip.lidar import depth, point_cloud
-    from tofclip.recovery import prepare_recovery
-    from tofclip.simulate import (
-        make_default_instrument,
-        make_default_scene,
-        render_true_frames,
-        simulate_shot,
-    )
-
     scene, instrument = make_default_scene(), make_default_instrument()
     shot = simulate_shot(scene, instrument, seed)
     # What a calibration from focus pictures cannot know: sweep and gains have to be found from the
@@ -100,9 +99,6 @@ def _run_demo(seed: int) -> DemoRun:
 
 
 def _collect_metrics(run: DemoRun) -> dict[str, Any]:
-    from tofclip.metrics import nmse
-    from tofclip.simulate import score_returns
-
     picture, truth = run.frames.values.sum(axis=0), run.truth.values.sum(axis=0)
     return {
         **score_returns(run.returns, run.shot.truth),

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+import devices
+from apps.files import RECORD_SUFFIXES, require_writable
 from apps.options import JsonOption
+from apps.report import report
+from apps.verbs.record import show_time_progress
+from devices import discover, registry
+from devices.recording.check import repair as repaired
+from devices.recording.check import verify as verified
+from devices.throughput import measure_throughput
 
 EXIT_DAMAGED = 2
 
@@ -30,11 +39,6 @@ def list_(as_json: JsonOption = False) -> None:
 
     Example: tofclip devices list
     """
-    from dataclasses import asdict
-
-    from apps.report import report
-    from devices import discover, registry
-
     found = [asdict(one) for one in discover()]
     kinds = sorted({*registry.OPENERS, "file"})
     if as_json:
@@ -54,9 +58,6 @@ def info(uri: AddressArgument, as_json: JsonOption = False) -> None:
 
     Example: tofclip devices info 'sim+linospad2://?seed=1'
     """
-    import devices
-    from apps.report import report
-
     with devices.open(uri) as source:
         figures: dict[str, Any] = {
             **source.info.as_dict(),
@@ -81,11 +82,6 @@ def try_(
 
     Example: tofclip devices test 'sim+timetag://?seed=1' --seconds 1
     """
-    import devices
-    from apps.report import report
-    from apps.verbs.record import show_time_progress
-    from devices.throughput import measure_throughput
-
     with show_time_progress("reading", seconds) as watch:
         trial = measure_throughput(devices.open(uri), seconds, watch)
     report(trial.figures, as_json)
@@ -100,9 +96,6 @@ def verify(file: RecordingArgument, as_json: JsonOption = False) -> None:
 
     Example: tofclip devices verify run.h5
     """
-    from apps.report import report
-    from devices.recording.check import verify as verified
-
     found = verified(file)
     report(found.as_dict(), as_json)
     if not found.is_sound:
@@ -124,9 +117,5 @@ def repair(
 
     Example: tofclip devices repair run.h5 --out sound.h5
     """
-    from apps.files import RECORD_SUFFIXES, require_writable
-    from apps.report import report
-    from devices.recording.check import repair as repaired
-
     require_writable(out, *RECORD_SUFFIXES, inputs=(file,))
     report(repaired(file, out).as_dict(), as_json, [out])

@@ -6,12 +6,19 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from apps.options import JsonOption
+from apps.report import report, to_json_value
+from devices.recording.reader import read_head_if_recording
+from tofclip.errors import FileFormatError
+from tofclip.io import read_streak
+from tofclip.lidar import PointCloud
+from tofclip.storage import Record, translate_read_errors
 
 if TYPE_CHECKING:
-    from tofclip.storage import Field, Record
+    from tofclip.storage import Field
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 MAX_LISTED_VALUES = 9  # numbers that are shown one by one
@@ -28,8 +35,6 @@ def info(
 
     Example: tofclip info frames.h5
     """
-    from apps.report import report, to_json_value
-
     found = to_json_value({"file": file, **_describe_record(_read_record(file))})
     if as_json:
         report(found, as_json)
@@ -41,12 +46,6 @@ def _read_record(file: Path) -> Record:
     """Read our own records as they are, streak images and point clouds of other formats through
     their readers.
     """
-    from devices.recording.reader import read_head_if_recording
-    from tofclip.errors import FileFormatError
-    from tofclip.io import read_streak
-    from tofclip.lidar import PointCloud
-    from tofclip.storage import Record, translate_read_errors
-
     with translate_read_errors(file), open(file, "rb") as opened:
         start = opened.read(len(HDF5_SIGNATURE))
     if start == HDF5_SIGNATURE:
@@ -79,8 +78,6 @@ def _describe_record(record: Record) -> dict[str, Any]:
 
 
 def _describe_field(entry: Field) -> dict[str, Any]:
-    import numpy as np
-
     values = entry.values
     known = {
         "shape": values.shape,

@@ -4,12 +4,30 @@ clouds of many shots.
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from apps.figures.scene import make_scene_figure
+from apps.figures.style import save_figure
+from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
 from apps.options import ClusterOption, JsonOption, TimeZeroOption
+from apps.progress import show_progress
+from apps.report import report
+from apps.sequences import report_summary, run_with_progress
+from apps.verbs.cloud import require_format
+from tofclip.camera import Camera
+from tofclip.camera.calibration.parallax import GATE_METHOD
+from tofclip.errors import InputError
+from tofclip.io import read_streak
+from tofclip.lidar import Pulse, depth, point_cloud
+from tofclip.lidar.objects import find_objects
+from tofclip.lidar.photons import PhotonDetector, measure_accuracy
+from tofclip.recovery import fit_parallax_to_shot, prepare_recovery
+from tofclip.sequences import RangingSettings, list_shots
+from tofclip.shots import Frames
 from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
@@ -66,12 +84,6 @@ def accuracy(
     Example: tofclip lidar accuracy --photons 100 --background 0.1 --pulse-ps 60 --bin-width-ps 20
     --trials 200
     """
-    from dataclasses import asdict
-
-    from apps.report import report
-    from tofclip.lidar import Pulse
-    from tofclip.lidar.photons import PhotonDetector, measure_accuracy
-
     width = pulse_ps * PICOSECOND
     pulse = (
         Pulse.gaussian(width)
@@ -108,14 +120,6 @@ def parallax(
 
     Example: tofclip lidar parallax shot.tif --camera camera.h5 --out camera_locked.h5
     """
-    from apps.files import RECORD_SUFFIXES, require_writable
-    from apps.progress import show_progress
-    from apps.report import report
-    from tofclip.camera import Camera
-    from tofclip.camera.calibration.parallax import GATE_METHOD
-    from tofclip.io import read_streak
-    from tofclip.recovery import fit_parallax_to_shot, prepare_recovery
-
     require_writable(
         out, *RECORD_SUFFIXES, inputs=(streak,) if camera is None else (streak, camera)
     )
@@ -159,15 +163,6 @@ def scene(
 
     Example: tofclip lidar scene frames.h5 --out scene.png
     """
-    from apps.figures.scene import make_scene_figure
-    from apps.figures.style import save_figure
-    from apps.files import PICTURE_SUFFIXES, require_writable
-    from apps.report import report
-    from tofclip.errors import InputError
-    from tofclip.lidar import depth, point_cloud
-    from tofclip.lidar.objects import find_objects
-    from tofclip.shots import Frames
-
     require_writable(out, *PICTURE_SUFFIXES, inputs=(frames,))
     recovered = Frames.load(frames)
     cloud = point_cloud(depth(recovered))
@@ -233,10 +228,6 @@ def sequence(
 
     Example: tofclip lidar sequence shots/ --camera camera.h5 --out clouds/
     """
-    from apps.sequences import report_summary, run_with_progress
-    from apps.verbs.cloud import require_format
-    from tofclip.sequences import RangingSettings, list_shots
-
     require_format(suffix)
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
     zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from apps.figures.occlusion import make_occlusion_figure
+from apps.figures.occlusion_film import WALK_STEPS, save_flash_film, save_walk_film
+from apps.figures.style import save_figure
+from apps.files import PICTURE_SUFFIXES, make_folder, require_writable
+from apps.occlusion.experiment import DEFAULT_PHOTONS, Experiment, ExperimentSettings
+from apps.occlusion.probe import DISTANCE_FACTORS, probe_target
+from apps.occlusion.scenes import make_occlusion_scene
 from apps.options import JsonOption
+from apps.progress import show_progress
+from apps.report import report
+from tofclip.errors import InputError
+from tofclip.metrics import correlation_coefficient, nmse
+from tofclip.occlusion import InactiveRegion
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
-    from apps.occlusion.experiment import Experiment
     from apps.occlusion.probe import ProbeResult
 
 SCENE_NAMES = ("v-letter", "plate", "person", "tree", "bush", "trellis", "board")
@@ -52,10 +64,6 @@ def region(
     Example: tofclip occlusion region --baseline-mm 15 --width-mm 6 --distance-mm 50 --out
     region.png
     """
-    from apps.files import PICTURE_SUFFIXES, require_writable
-    from apps.report import report
-    from tofclip.occlusion import InactiveRegion
-
     if out is not None:
         require_writable(out, *PICTURE_SUFFIXES)
     found = InactiveRegion(
@@ -120,18 +128,6 @@ def demo(
 
     Example: tofclip occlusion demo --scene plate --out occlusion-output
     """
-    import time
-
-    from apps.figures.occlusion import make_occlusion_figure
-    from apps.figures.occlusion_film import WALK_STEPS, save_flash_film, save_walk_film
-    from apps.figures.style import save_figure
-    from apps.files import make_folder
-    from apps.occlusion.experiment import DEFAULT_PHOTONS, Experiment, ExperimentSettings
-    from apps.occlusion.scenes import make_occlusion_scene
-    from apps.progress import show_progress
-    from apps.report import report
-    from tofclip.errors import InputError
-
     started = time.perf_counter()
     if encoder not in DEFAULT_PHOTONS:
         raise InputError(f"unknown encoder '{encoder}'; take one of {', '.join(DEFAULT_PHOTONS)}")
@@ -159,9 +155,6 @@ def _run_experiment(experiment: Experiment) -> list[ProbeResult]:
     """Cast the rays, recover, and try small targets inside the inactive region and beyond, if it
     ends.
     """
-    from apps.occlusion.probe import DISTANCE_FACTORS, probe_target
-    from apps.progress import show_progress
-
     scene, probes = experiment.scene, []
     factors = DISTANCE_FACTORS if scene.region.is_bounded else ()
     with show_progress("looking past", 2 + len(factors)) as advance:
@@ -181,8 +174,6 @@ def _collect_metrics(experiment: Experiment, probes: Sequence[ProbeResult]) -> d
     """What is said about a run; correlations are with the target as seen with its occluder taken
     away.
     """
-    from tofclip.metrics import correlation_coefficient, nmse
-
     scene, truth = experiment.scene, experiment.truth
     own = (
         scene.distance,

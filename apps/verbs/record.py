@@ -10,7 +10,13 @@ from typing import Annotated
 
 import typer
 
+import devices
+from apps.files import RECORD_SUFFIXES, build_provenance, require_writable
 from apps.options import JsonOption
+from apps.progress import show_progress
+from apps.report import report
+from devices.recorder import record_source as recorded
+from tofclip.errors import InputError
 
 PROGRESS_STEPS_PER_S = 100
 
@@ -36,12 +42,6 @@ def record(
 
     Example: tofclip record 'sim+timetag://?seed=1' --out run.h5 --seconds 1
     """
-    import devices
-    from apps.files import RECORD_SUFFIXES, build_provenance, require_writable
-    from apps.report import report
-    from devices.recorder import record_source as recorded
-    from tofclip.errors import InputError
-
     if seconds is not None and not seconds > 0:
         raise InputError(f"--seconds must be positive, got {seconds:g}")
     require_writable(
@@ -66,8 +66,6 @@ def show_time_progress(title: str, seconds: float | None) -> Iterator[Callable[[
     """Show a bar that fills while time passes; yield a function to call with the seconds that have
     passed.
     """
-    from apps.progress import show_progress
-
     if seconds is None:
         yield lambda _: None
         return

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from apps.figures.preview import make_preview_figure
+from apps.figures.style import save_figure
+from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
 from apps.options import (
     ClusterOption,
     DeviceOption,
@@ -15,10 +18,18 @@ from apps.options import (
     TimeZeroOption,
     make_completer,
 )
+from apps.progress import show_progress
+from apps.report import report
+from apps.sequences import report_summary, resolve_device, run_with_progress
+from apps.verbs.cloud import CLOUD_SUFFIXES as CLOUD_SUFFIXES
+from tofclip.errors import InputError
+from tofclip.io import read_streak
+from tofclip.recovery import compute_view_delays_bins
+from tofclip.sequences import CloudSettings, RecoverySettings, expand_sweep, is_sequence, list_shots
+from tofclip.sequences.recovering import add_provenance
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.sequences import RecoverySettings
     from tofclip.shots import Frames, Streak
 
 
@@ -94,9 +105,6 @@ def recover(
 
     Example: tofclip recover shot.tif --camera camera.h5 --out frames.h5 --time-zero-ns -10.784
     """
-    from apps.sequences import resolve_device
-    from tofclip.sequences import RecoverySettings, is_sequence
-
     zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
     recovery = RecoverySettings(method, iterations, None, focus, camera, zero, device)
@@ -112,8 +120,6 @@ def recover(
 
 
 def _check_sequence_options(cloud: Path | None, preview: Path | None) -> None:
-    from tofclip.errors import InputError
-
     if cloud is not None:
         raise InputError("--cloud is for one shot; give the folder of frames to tofclip cloud")
     if preview is not None:
@@ -121,8 +127,6 @@ def _check_sequence_options(cloud: Path | None, preview: Path | None) -> None:
 
 
 def _check_single_options(streak: str, cluster: str | None, sweep: list[str] | None) -> None:
-    from tofclip.errors import InputError
-
     if cluster is not None or sweep:
         option = "--sweep" if cluster is None else "--cluster"
         raise InputError(
@@ -137,9 +141,6 @@ def _recover_sequence(
     sweep: list[str],
     how: tuple[str | None, str, bool],
 ) -> None:
-    from apps.sequences import report_summary, run_with_progress
-    from tofclip.sequences import expand_sweep, list_shots
-
     cluster, device, as_json = how
     found = list_shots(*shots)
     swept = expand_sweep(recovery, dict(map(_parse_sweep, sweep)))
@@ -162,14 +163,6 @@ def _recover_single(
     as_json: bool,
 ) -> None:
     """Recover one shot, with a picture of it and, where asked for, a cloud."""
-    from apps.figures.preview import make_preview_figure
-    from apps.figures.style import save_figure
-    from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
-    from apps.progress import show_progress
-    from apps.verbs.cloud import CLOUD_SUFFIXES as CLOUD_SUFFIXES
-    from tofclip.sequences import CloudSettings
-    from tofclip.sequences.recovering import add_provenance
-
     preview, cloud = further
     inputs = tuple(
         Path(name)
@@ -203,15 +196,10 @@ def _read_shot(streak: str, bin_width: float | None) -> Streak:
         from devices.transients import read_transient
 
         return read_transient(streak, bin_width)
-    from tofclip.io import read_streak
-
     return read_streak(streak, bin_width)
 
 
 def _report_frames(frames: Frames, as_json: bool, written: list[Path]) -> None:
-    from apps.report import report
-    from tofclip.recovery import compute_view_delays_bins
-
     known = frames.figures
     report(
         {

@@ -10,21 +10,30 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from apps.figures.reproduction import make_reproduction_figure
+from apps.figures.style import save_figure
+from apps.files import make_folder
 from apps.options import ClusterOption, JsonOption, make_completer
+from apps.progress import show_progress
+from apps.report import report
+from apps.reproduction import STUDY_FOLDER, load_result, make_result, write_page, write_result
+from apps.sequences import report_summary, run_with_progress
+from apps.studies.library import Library
+from apps.studies.registry import STUDIES, find_studies
+from tofclip import __version__
+from tofclip.errors import InputError
+from tofclip.sequences.jobs import Job
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from apps.reproduction import Result
-    from apps.studies.library import Library
     from apps.studies.outcome import Advance, Study
     from tofclip.sequences.jobs import Summary
 
 
 def _complete_study(incomplete: str) -> list[str]:
     """Complete the name of a study in the shell."""
-    from apps.studies.registry import STUDIES
-
     return make_completer(
         "all", *(name for study in STUDIES for name in (study.name, *study.aliases))
     )(incomplete)
@@ -63,13 +72,6 @@ def reproduce(
 
     Example: tofclip reproduce table2 --out reproduction --seeds 3
     """
-    from apps.files import make_folder
-    from apps.report import report
-    from apps.reproduction import STUDY_FOLDER, write_page
-    from apps.sequences import report_summary
-    from apps.studies.library import Library
-    from apps.studies.registry import find_studies
-
     studies = find_studies(name)
     _require_folder(data)
     folder = out / STUDY_FOLDER
@@ -94,8 +96,6 @@ def reproduce(
 
 
 def _require_folder(data: Path | None) -> None:
-    from tofclip.errors import InputError
-
     if data is not None and not data.is_dir():
         raise InputError(f"{data}: no such folder of recorded data")
 
@@ -113,8 +113,6 @@ def _is_possible(study: Study, library: Library) -> bool:
 
 def _describe_settings(study: Study, library: Library, seeds: int) -> dict[str, Any]:
     """What a result depends on, as it comes back from JSON."""
-    from tofclip import __version__
-
     recorded = None if library.data is None else library.data.name
     return {"name": study.name, "seeds": seeds, "data": recorded, "version": __version__}
 
@@ -123,10 +121,6 @@ def _run_on_cluster(
     studies: Sequence[Study], library: Library, seeds: int, folder: Path, cluster: str
 ) -> Summary:
     """Have the studies that are not there yet made by workers."""
-    from apps.reproduction import load_result
-    from apps.sequences import run_with_progress
-    from tofclip.sequences.jobs import Job
-
     data = None if library.data is None else library.data.resolve()
     jobs = []
     for study in studies:
@@ -141,24 +135,17 @@ def _run_on_cluster(
 
 def make_study(name: str, data: Path | None, seeds: int, folder: Path) -> None:
     """Make a study again and write it; light fields are rendered or read once in a process."""
-    from apps.studies.registry import find_studies
-
     (study,) = find_studies(name)
     _run_study(study, _load_library(data), seeds, folder, lambda _: None)
 
 
 @cache
 def _load_library(data: Path | None) -> Library:
-    from apps.studies.library import Library
-
     return Library(data)
 
 
 def _load_or_make_result(study: Study, library: Library, seeds: int, folder: Path) -> Result:
     """Return a study's result, made now unless the folder has it."""
-    from apps.progress import show_progress
-    from apps.reproduction import load_result
-
     kept = load_result(folder / f"{study.name}.json", _describe_settings(study, library, seeds))
     if kept is not None:
         print(f"{study.name}: kept from an earlier run", file=sys.stderr)
@@ -177,10 +164,6 @@ def _run_study(
     """Make a study, and write its picture, its tables, and at last the file that tells that it is
     finished.
     """
-    from apps.figures.reproduction import make_reproduction_figure
-    from apps.figures.style import save_figure
-    from apps.reproduction import make_result, write_result
-
     started = time.perf_counter()
     outcome = study.work(library, seeds if study.seeded else 1, advance)
     seconds = time.perf_counter() - started
@@ -196,9 +179,6 @@ def _run_study(
 
 def _load_all_results(library: Library, seeds: int, folder: Path) -> list[Result]:
     """Every result that the folder holds with these settings, in the order of the paper's tables."""
-    from apps.reproduction import load_result
-    from apps.studies.registry import STUDIES
-
     found = (
         load_result(folder / f"{study.name}.json", _describe_settings(study, library, seeds))
         for study in STUDIES

@@ -10,13 +10,21 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from apps.options import JsonOption, TimeZeroOption
+from apps.report import report
+from apps.verbs.cloud import require_format
+from tofclip.camera import Camera
+from tofclip.errors import InputError
+from tofclip.recovery import SharpestFocus, parse_focus
+from tofclip.sequences import list_shots
+from tofclip.sequences.ranger import RangingPipeline, build_cloud_path
+from tofclip.sequences.streaming import stream_clouds
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.sequences.ranger import RangingPipeline
     from tofclip.sequences.streaming import StreamedCloud
     from tofclip.shots import Streak
 
@@ -78,11 +86,6 @@ def stream(
 
     Example: tofclip stream 'sim+remoteex://?seed=1' --shots 20 --out clouds/
     """
-    from apps.report import report
-    from apps.verbs.cloud import require_format
-    from tofclip.errors import InputError
-    from tofclip.sequences.streaming import stream_clouds
-
     require_format(suffix)
     if shots is not None and shots < 1:
         raise InputError(f"--shots must be positive, got {shots}")
@@ -112,19 +115,12 @@ def _read_shots(source: str, bin_width: float | None) -> Iterator[Streak]:
         from devices.transients import read_transients
 
         return read_transients(source, bin_width)
-    from tofclip.sequences import list_shots
-
     return (shot() for shot in list_shots(source, bin_width).values())
 
 
 def _make_ranger(
     first: Streak, camera: Path | None, time_zero: float | None, focus: str
 ) -> RangingPipeline:
-    from tofclip.camera import Camera
-    from tofclip.errors import InputError
-    from tofclip.recovery import SharpestFocus, parse_focus
-    from tofclip.sequences.ranger import RangingPipeline
-
     chosen = parse_focus(focus)
     if isinstance(chosen, SharpestFocus):
         raise InputError("a stream has one focus for all shots: depth-locked or fixed:S")
@@ -144,8 +140,6 @@ def _consume_clouds(
     made: Iterable[StreamedCloud], out: Path | None, suffix: str
 ) -> Mapping[str, Any]:
     """Take the clouds as they come; return what is told at the end."""
-    from tofclip.sequences.ranger import build_cloud_path
-
     stages: dict[str, deque[float]] = {}
     latency: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
     clouds = points = last = 0
@@ -169,8 +163,6 @@ def _consume_clouds(
 
 
 def _compute_quantiles(seconds: Iterable[float]) -> Mapping[str, float]:
-    import numpy as np
-
     values = np.fromiter(seconds, np.float64)
     return (
         dict(zip(("median", "p95"), np.quantile(values, (0.5, 0.95)).tolist(), strict=True))

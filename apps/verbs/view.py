@@ -7,15 +7,24 @@ import sys
 import time
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from apps.files import require_writable
 from apps.options import JsonOption, TimeZeroOption
+from apps.progress import show_progress
+from apps.report import report
+from apps.viewer.access_control import AccessControl
+from apps.viewer.desktop import open_window
+from apps.viewer.film import choose_frames, save_film
+from apps.viewer.page import Page
+from apps.viewer.render import choose_renderer
+from apps.viewer.scene_figure import save_picture
+from apps.viewer.session import Session
+from apps.viewer.source_factory import ShotOptions, open_source
+from tofclip.errors import InputError
 from tofclip.units import NANOSECOND, PICOSECOND
-
-if TYPE_CHECKING:
-    from apps.viewer.session import Session
 
 
 def view(
@@ -72,9 +81,6 @@ def view(
 
     Example: tofclip view frames.h5 --png scene.png
     """
-    from apps.viewer.session import Session
-    from apps.viewer.source_factory import ShotOptions, open_source
-
     _check_outputs(desktop, png, mp4, source, camera)
     started = time.perf_counter()
     known = ShotOptions(
@@ -97,9 +103,6 @@ def view(
 def _check_outputs(
     desktop: bool, png: Path | None, mp4: Path | None, *inputs: str | Path | None
 ) -> None:
-    from apps.files import require_writable
-    from tofclip.errors import InputError
-
     if desktop + (png is not None) + (mp4 is not None) > 1:
         raise InputError("choose one of --desktop, --png and --mp4")
     files = tuple(Path(name) for name in inputs if name is not None and "://" not in str(name))
@@ -109,21 +112,12 @@ def _check_outputs(
 
 
 def _draw_picture(session: Session, out: Path, started: float, as_json: bool) -> None:
-    from apps.report import report
-    from apps.viewer.render import choose_renderer
-    from apps.viewer.scene_figure import save_picture
-
     shown, renderer = session.frame_at(0.0), choose_renderer()
     save_picture(session.source.title, shown, renderer, out)
     report(_collect_metrics(len(shown.cloud), renderer.name, started), as_json, [out])
 
 
 def _draw_film(session: Session, out: Path, started: float, as_json: bool) -> None:
-    from apps.progress import show_progress
-    from apps.report import report
-    from apps.viewer.film import choose_frames, save_film
-    from apps.viewer.render import choose_renderer
-
     renderer, pictures = choose_renderer(), len(choose_frames(session))
     with show_progress("filming", pictures) as advance:
         points = save_film(session, renderer, out, advance)
@@ -137,18 +131,12 @@ def _collect_metrics(points: int, backend: str, started: float) -> dict[str, Any
 
 
 def _open_window(session: Session) -> None:
-    from apps.viewer.desktop import open_window
-
     open_window(session)
 
 
 def _serve_page(
     session: Session, host: str, port: int | None, no_browser: bool, as_json: bool
 ) -> None:
-    from apps.report import report
-    from apps.viewer.access_control import AccessControl
-    from apps.viewer.page import Page
-
     with contextlib.closing(Page(session, AccessControl.for_host(host), port)) as page:
         report({"address": page.address}, as_json)
         sys.stdout.flush()  # whoever reads the address waits for it

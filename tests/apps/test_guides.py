@@ -9,11 +9,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
+from guides import find_hardware_commands, find_pictures, make_pictures, read_steps, run_guide
 from PIL import Image
+from verb_pages import collect_verbs
 
 import tofclip
-from apps.documentation import collect_verbs
-from apps.guides import find_hardware_commands, find_pictures, make_pictures, read_steps, run_guide
 
 DOCS = Path(tofclip.__file__).parents[1] / "docs"
 GUIDES = [DOCS / f"{name}.md" for name in ("tutorial", "own_camera", "own_wall", "own_light_field")]
@@ -68,11 +68,9 @@ def test_the_guide_to_ones_own_light_field(tmp_path: Path, monkeypatch: pytest.M
     assert {"field.h5", "spoilt.png"} | set(find_pictures(GUIDES[3])) <= there
 
 
-def test_the_page_on_graphics_processors(
-    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_page_on_gpus(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     provide(files, {"shot.h5": "streak.h5"}, tmp_path)
-    assert {"frames.h5", "scene.ply"} <= walked("graphics_processor.md", tmp_path, monkeypatch)
+    assert {"frames.h5", "scene.ply"} <= walked("gpu.md", tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("guide", GUIDES, ids=lambda guide: guide.stem)

@@ -4,6 +4,7 @@ is forgotten.
 
 from __future__ import annotations
 
+import importlib
 import os
 import shlex
 import subprocess
@@ -13,11 +14,12 @@ from pathlib import Path
 import pytest
 import typer
 from small_instrument import Run
+from verb_pages import collect_verbs, render_page, write_pages
 
 import tofclip
 from apps.cli import COMPLETION_VARIABLE, VERB_OVERVIEW
-from apps.documentation import collect_verbs, render_page, write_pages
 from apps.help import split_docstring, wrap_command
+from apps.lazy_verbs import load_command
 from apps.studies.registry import find_studies
 
 ROOT = Path(tofclip.__file__).parents[1]
@@ -34,6 +36,25 @@ def test_help_of_a_verb(run: Run, monkeypatch: pytest.MonkeyPatch, name: str) ->
     assert "Exit status: 0 done; 2 unusable input" in outcome.out
     for example in split_docstring(VERBS[name].callback.__doc__)[1]:
         assert all(line.strip() in outcome.out for line in wrap_command(example).splitlines())
+
+
+@pytest.mark.parametrize("package", ["apps", "apps.verbs.nlos"])
+def test_the_list_of_commands_says_what_the_verbs_say(package: str) -> None:
+    """The lists are written down, so that no verb needs to be imported for them."""
+    name = "apps.cli" if package == "apps" else package
+    prefix = "apps.verbs" if package == "apps" else package
+    for verb, line in importlib.import_module(name).VERBS.items():
+        text = load_command(f"{prefix}.{verb}", verb).help or ""
+        assert line == " ".join(text.split("\n\n")[0].split()), f"{name}.VERBS: {verb}"
+
+
+def test_a_verb_is_imported_when_it_is_called() -> None:
+    code = "import sys; from apps.cli import main; main(['info', '--help']); print(*sys.modules, file=sys.stderr)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    loaded = {name for name in done.stderr.split() if name.startswith("apps.verbs.")}
+    assert loaded == {"apps.verbs.info"}
 
 
 @pytest.mark.parametrize("name", VERBS)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import typer
 
-from apps.verbs.nlos import compare, demo, film, info, reconstruct, simulate
+from apps.lazy_verbs import VerbTable, make_lazy_group
 
-app = typer.Typer()
-app.command()(reconstruct.reconstruct)
-app.command()(film.film)
-app.command()(compare.compare)
-app.command()(simulate.simulate)
-app.command()(info.info)
-app.command()(demo.demo)
+VERBS: VerbTable = {
+    "reconstruct": "Image the hidden scene from the transients on a relay wall.",
+    "film": "Film the hidden scene while the laser's flash passes through it.",
+    "compare": "Image one capture by several methods, and show images, time, memory and figures of merit side by side.",
+    "simulate": "Simulate the capture of a known hidden scene before a relay wall.",
+    "info": "Tell a capture's geometry and sampling, usable wavelengths, resolution, and which methods suit it.",
+    "demo": "Hide two characters before a curved wall, simulate what the wall shows, and image them by two methods.",
+}
+"""Each verb's module and its line in the list of commands."""
+
+app = typer.Typer(cls=make_lazy_group("apps.verbs.nlos", VERBS))
 
 
 @app.callback(invoke_without_command=True)

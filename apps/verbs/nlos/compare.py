@@ -9,13 +9,44 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos.methods import METHODS, ImagingSettings
+from apps.figures.nlos_compare import make_comparison_figure
+from apps.figures.style import save_figure as save_figure
+from apps.files import PICTURE_SUFFIXES, make_folder, require_writable
+from apps.nlos.files import add_provenance
+from apps.nlos.imaging import (
+    choose_grid,
+    fill_box,
+    find_scales,
+    preprocess_capture,
+    warnings_to_stderr,
+)
+from apps.nlos.measure import compare_with_truth, measure_imaging, measure_sharpness
+from apps.nlos.methods import (
+    METHODS,
+    ImagingSettings,
+    build_method,
+    fill_in_defaults,
+    parse_method_names,
+    require_used_settings,
+)
+from apps.nlos.truth import HiddenTruth
 from apps.options import JsonOption
-from apps.settings import SettingsOption, add_setting_flags, setting_field
+from apps.report import report
+from apps.settings import (
+    SettingsOption,
+    add_setting_flags,
+    load_settings,
+    save_settings,
+    setting_field,
+    settings_to_dict,
+)
+from apps.studies.hidden_scene_adjoint import correlate_views
+from nlos.io import read_capture
+from tofclip.errors import InputError
+from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from apps.nlos.measure import MeasuredVolume
-    from apps.nlos.truth import HiddenTruth
     from nlos import Capture, Grid
     from nlos.method import Reconstructor
 
@@ -62,13 +93,6 @@ def compare(
 
     Example: tofclip nlos compare capture.h5 --methods hybrid,backprojection --out compare.png
     """
-    from apps.figures.nlos_compare import make_comparison_figure
-    from apps.figures.style import save_figure as save_figure
-    from apps.nlos.imaging import preprocess_capture, warnings_to_stderr
-    from apps.nlos.truth import HiddenTruth
-    from apps.settings import load_settings, save_settings
-    from nlos.io import read_capture
-
     wanted = load_settings(CompareSettings, settings, flags)
     written = [out, out.with_suffix(".toml")]
     _require_writable(written, volumes, (source,) if settings is None else (source, settings))
@@ -91,8 +115,6 @@ def compare(
 def _require_writable(
     pictures: Sequence[Path], volumes: Path | None, inputs: tuple[Path, ...]
 ) -> None:
-    from apps.files import PICTURE_SUFFIXES, make_folder, require_writable
-
     picture, settings = pictures
     require_writable(picture, *PICTURE_SUFFIXES, inputs=inputs)
     require_writable(settings, inputs=inputs)
@@ -101,8 +123,6 @@ def _require_writable(
 
 
 def _check_settings(settings: CompareSettings) -> None:
-    from apps.nlos.methods import build_method, parse_method_names, require_used_settings
-
     names = tuple(METHODS) if settings.methods is None else parse_method_names(settings.methods)
     require_used_settings(settings, names)
     for name in names:
@@ -120,11 +140,6 @@ def _choose_methods(
     """Choose methods and voxels; of methods that nobody named, those that do not suit are left out,
     with the reason.
     """
-    from apps.nlos.imaging import choose_grid, fill_box, find_scales
-    from apps.nlos.methods import build_method, fill_in_defaults, parse_method_names
-    from tofclip.errors import InputError
-    from tofclip.units import MILLIMETRE
-
     scales = find_scales(wanted, capture)
     found = replace(wanted, **scales._asdict())
     _, whole = fill_box(found, capture, scales.voxel_mm * MILLIMETRE)
@@ -143,8 +158,6 @@ def _choose_methods(
 def _measure_methods(
     methods: Mapping[str, Reconstructor], capture: Capture, grid: Grid
 ) -> dict[str, MeasuredVolume]:
-    from apps.nlos.measure import measure_imaging
-
     return {
         name: measure_imaging(name, imaging, capture, grid) for name, imaging in methods.items()
     }
@@ -154,9 +167,6 @@ def _collect_metrics(
     runs: Mapping[str, MeasuredVolume], truth: HiddenTruth | None
 ) -> dict[str, dict[str, Any]]:
     """Figures of every method; the first is the reference."""
-    from apps.nlos.measure import compare_with_truth, measure_sharpness
-    from apps.studies.hidden_scene_adjoint import correlate_views
-
     reference = next(iter(runs.values())).volume
     return {
         name: {
@@ -173,9 +183,6 @@ def _save_volumes(
     runs: Mapping[str, MeasuredVolume], folder: Path, source: Path, settings: CompareSettings
 ) -> Iterator[Path]:
     """Write each method's volume, and name the files."""
-    from apps.nlos.files import add_provenance
-    from apps.settings import settings_to_dict
-
     for name, run in runs.items():
         path = folder / f"{name}.h5"
         add_provenance(
@@ -193,8 +200,6 @@ def _report_comparison(
     as_json: bool,
     written: Sequence[Path],
 ) -> None:
-    from apps.report import report
-
     if as_json:
         report({"voxels": grid.shape, "methods": figures, "left_out": left_out}, as_json)
         return

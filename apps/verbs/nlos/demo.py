@@ -9,16 +9,27 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
+from apps.figures.nlos_demo import make_demo_figure
+from apps.figures.style import save_figure
+from apps.files import PICTURE_SUFFIXES, build_provenance, make_folder, require_writable
+from apps.nlos.measure import compare_with_truth, measure_imaging
+from apps.nlos.scene import find_nearest_wall_point
+from apps.nlos.truth import HiddenTruth
 from apps.options import JsonOption
+from apps.report import report
+from apps.studies.hidden_scene_adjoint import correlate_views
+from nlos import Backprojection, Grid, Hybrid
+from nlos.simulate import HiddenScene, Lambert, Surface, add_poisson_noise, build_relay_wall
+from nlos.time_axis import TimeAxis
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from apps.nlos.measure import MeasuredVolume
-    from apps.nlos.truth import HiddenTruth
-    from nlos import Capture, Grid
+    from nlos import Capture
 
 WALL_SHAPE, WALL_POINTS = "cylinder", 64
 FACET_M = 0.03
@@ -73,11 +84,6 @@ def demo(
 
     Example: tofclip nlos demo --out nlos-demo-output
     """
-    from apps.figures.nlos_demo import make_demo_figure
-    from apps.figures.style import save_figure
-    from apps.files import PICTURE_SUFFIXES, make_folder, require_writable
-    from apps.report import report
-
     started = time.perf_counter()
     make_folder(out)
     picture = out / "nlos_demo.png" if png is None else png
@@ -97,10 +103,6 @@ def demo(
 
 def _run_demo(seed: int) -> DemoRun:
     """The whole way, from a scene to three images."""
-    from apps.files import build_provenance
-    from apps.nlos.measure import measure_imaging
-    from nlos import Backprojection, Grid, Hybrid
-
     capture, truth = _simulate_capture(seed)
     capture = replace(
         capture,
@@ -121,13 +123,6 @@ def _run_demo(seed: int) -> DemoRun:
 
 
 def _simulate_capture(seed: int) -> tuple[Capture, HiddenTruth]:
-    import numpy as np
-
-    from apps.nlos.scene import find_nearest_wall_point
-    from apps.nlos.truth import HiddenTruth
-    from nlos.simulate import HiddenScene, Lambert, Surface, add_poisson_noise, build_relay_wall
-    from nlos.time_axis import TimeAxis
-
     surfaces = [
         Surface.letters(text, (x, 0.0, z), LETTER_HEIGHT_M, FACET_M, Lambert(albedo))
         for text, x, z, albedo in LETTERS
@@ -149,9 +144,6 @@ def _flatten_wall(capture: Capture) -> Capture:
 
 
 def _collect_metrics(run: DemoRun) -> dict[str, Any]:
-    from apps.nlos.measure import compare_with_truth
-    from apps.studies.hidden_scene_adjoint import correlate_views
-
     reference = run.images["backprojection"]
     figures: dict[str, Any] = {
         name: {

@@ -2,15 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos.methods import METHODS, ImagingSettings
+from apps.nlos.costs import estimate_memory
+from apps.nlos.imaging import (
+    fill_box,
+    find_sampling_step,
+    find_scales,
+    find_shortest_wavelength,
+    preprocess_capture,
+)
+from apps.nlos.methods import METHODS, ImagingSettings, build_method
+from apps.nlos.truth import HiddenTruth
 from apps.options import JsonOption
-from apps.settings import SettingsOption, add_setting_flags
+from apps.report import report
+from apps.settings import SettingsOption, add_setting_flags, load_settings
+from nlos.band import VirtualPulse
+from nlos.illumination_groups import group_by_illumination
+from nlos.io import read_capture
+from nlos.resolution import compute_diffraction_limit
+from nlos.rsd.wall import PlanarWall
+from tofclip.errors import InputError
+from tofclip.units import MILLIMETRE, PICOSECOND
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid
@@ -42,13 +59,6 @@ def info(
 
     Example: tofclip nlos info capture.h5
     """
-    from apps.nlos.imaging import fill_box, find_scales, preprocess_capture
-    from apps.nlos.truth import HiddenTruth
-    from apps.report import report
-    from apps.settings import load_settings
-    from nlos.io import read_capture
-    from tofclip.units import MILLIMETRE
-
     wanted = load_settings(ImagingSettings, settings, flags)
     capture = preprocess_capture(read_capture(source), wanted)
     scales = find_scales(wanted, capture)
@@ -80,10 +90,6 @@ def info(
 
 
 def _describe_wall(capture: Capture) -> dict[str, Any]:
-    from apps.nlos.imaging import find_sampling_step
-    from nlos.rsd.wall import PlanarWall
-    from tofclip.errors import InputError
-
     try:
         PlanarWall.of(capture.points)
         shape = "planar lattice"
@@ -102,8 +108,6 @@ def _describe_wall(capture: Capture) -> dict[str, Any]:
 
 
 def _describe_laser(capture: Capture) -> str:
-    from nlos.illumination_groups import group_by_illumination
-
     parts = group_by_illumination(capture)
     if parts[0].laser is None:
         return "confocal"
@@ -114,8 +118,6 @@ def _describe_laser(capture: Capture) -> str:
 
 
 def _describe_time_axis(capture: Capture) -> dict[str, Any]:
-    from tofclip.units import PICOSECOND
-
     paths = capture.axis.paths
     return {
         "bins": capture.axis.bins,
@@ -128,9 +130,6 @@ def _describe_time_axis(capture: Capture) -> dict[str, Any]:
 
 def _find_usable_wavelengths(capture: Capture, grid: Grid, cycles: float) -> dict[str, float]:
     """Bounds of the carrier: what is sampled finely enough, and what still resolves something, mm."""
-    from apps.nlos.imaging import find_shortest_wavelength
-    from tofclip.units import MILLIMETRE
-
     low, high = capture.points.min(axis=0), capture.points.max(axis=0)
     width = float(max(high[0] - low[0], high[1] - low[1]))
     distance = float(grid.z[[0, -1]].mean() - capture.points[:, 2].mean())
@@ -141,12 +140,6 @@ def _find_usable_wavelengths(capture: Capture, grid: Grid, cycles: float) -> dic
 
 
 def _compute_resolution(capture: Capture, grid: Grid, found: ImagingSettings) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    from nlos.band import VirtualPulse
-    from nlos.resolution import compute_diffraction_limit
-    from tofclip.units import MILLIMETRE
-
     middle = [float(axis[[0, -1]].mean()) for axis in (grid.x, grid.y, grid.z)]
     pulse = VirtualPulse((found.wavelength_mm or 0.0) * MILLIMETRE, found.cycles)
     return {**asdict(compute_diffraction_limit(capture, middle, pulse)), "at": middle}
@@ -155,9 +148,6 @@ def _compute_resolution(capture: Capture, grid: Grid, found: ImagingSettings) ->
 def _check_method(
     name: str, found: ImagingSettings, capture: Capture, grid: Grid
 ) -> dict[str, Any]:
-    from apps.nlos.costs import estimate_memory
-    from apps.nlos.methods import build_method
-
     imaging = build_method(name, found)
     support = imaging.supports(capture, grid)
     if not support:

@@ -9,9 +9,17 @@ from typing import Annotated, Any
 
 import typer
 
-from apps.nlos.scene import SceneSettings
+from apps.files import RECORD_SUFFIXES, build_provenance, require_writable
+from apps.nlos.scene import SceneSettings, simulate_scene
 from apps.options import JsonOption
-from apps.settings import SettingsOption, add_setting_flags
+from apps.report import report
+from apps.settings import (
+    SettingsOption,
+    add_setting_flags,
+    load_settings,
+    save_settings,
+    settings_to_dict,
+)
 
 SETTINGS_HEADING = "tofclip nlos simulate --settings THIS --out CAPTURE"
 
@@ -30,11 +38,6 @@ def simulate(
 
     Example: tofclip nlos simulate --letters T --wall cylinder --wall-points 32 --out capture.h5
     """
-    from apps.files import RECORD_SUFFIXES, build_provenance, require_writable
-    from apps.nlos.scene import simulate_scene
-    from apps.report import report
-    from apps.settings import load_settings, save_settings, settings_to_dict
-
     chosen = load_settings(SceneSettings, settings, flags)
     inputs = [path for path in (settings, chosen.mesh and Path(chosen.mesh)) if path]
     beside = out.with_suffix(".toml")

@@ -5,14 +5,14 @@ date.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import typer
-from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
+from typer.core import TyperArgument, TyperCommand, TyperOption
 
-from apps.cli import EPILOG, VERB_OVERVIEW, app
-from apps.help import PROGRAM, split_docstring
+from apps.cli import VERB_OVERVIEW, app
+from apps.help import EPILOG, PROGRAM, split_docstring
+from apps.lazy_verbs import walk_verbs
 
 COMPLETION_NOTE = """\
 `tofclip --install-completion` teaches the shell that it is called from (bash, zsh or fish) to complete verbs, options
@@ -21,15 +21,7 @@ and names of methods with the tab key; `tofclip --show-completion` only shows wh
 
 def collect_verbs() -> dict[str, TyperCommand]:
     """Return every verb that computes, by the words that call it, such as ``lidar scene``."""
-    return dict(_walk_commands(typer.main.get_command(app), ()))
-
-
-def _walk_commands(command: object, words: tuple[str, ...]) -> Iterator[tuple[str, TyperCommand]]:
-    if isinstance(command, TyperGroup):
-        for name, below in command.commands.items():
-            yield from _walk_commands(below, (*words, name))
-    elif isinstance(command, TyperCommand):
-        yield " ".join(words), command
+    return walk_verbs(typer.main.get_group(app))
 
 
 def write_pages(folder: Path) -> list[Path]:
@@ -80,7 +72,7 @@ def render_page(name: str, command: TyperCommand) -> str:
 
 
 def _collect_panels(command: TyperCommand, context: typer.Context) -> dict[str, list[str]]:
-    """Return what is told of arguments and options, under the headings that they have in the help."""
+    """Return the descriptions of arguments and options, under the headings that they have in the help."""
     panels: dict[str, list[str]] = {}
     for param in command.get_params(context):
         if isinstance(param, TyperArgument | TyperOption) and not param.hidden:
@@ -93,8 +85,8 @@ def _collect_panels(command: TyperCommand, context: typer.Context) -> dict[str, 
 
 def _format_entry(param: TyperArgument | TyperOption, context: typer.Context) -> str:
     """Return one term of a definition list."""
-    name, told_of_it = param.get_help_record(context) or (param.name, "")
-    return f"`{name}`\n: {_escape_markdown(told_of_it)}"
+    name, description = param.get_help_record(context) or (param.name, "")
+    return f"`{name}`\n: {_escape_markdown(description)}"
 
 
 def _render_index(pages: list[str]) -> str:

@@ -1,7 +1,7 @@
 """The guides' commands, run as they stand: tests run them on small files, and the guides' own
 pictures come from it.
 
-``python -m apps.guides docs/tutorial.md FOLDER`` runs a guide where all files of FOLDER are at
+``python docs/guides.py docs/tutorial.md FOLDER`` runs a guide where all files of FOLDER are at
 hand, and puts the pictures that the guide shows beside it.
 """
 
@@ -18,6 +18,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
+
 from apps.cli import main
 from apps.help import PROGRAM
 from tofclip.storage import atomic_path
@@ -29,7 +31,7 @@ PALETTE_SIZE = 256  # of a larger one: a quarter of the size, off by less than 1
 
 
 def read_steps(guide: Path) -> list[tuple[str, str]]:
-    """Return what a guide tells to run, in its order: ``("sh", command)`` or ``("python", code)``.
+    """Return a guide's steps, in its order: ``("sh", command)`` or ``("python", code)``.
 
     Blocks called ``console``, whose lines begin with a prompt, need an instrument, a screen or the
     network and are left out.
@@ -97,8 +99,6 @@ def make_pictures(guide: Path, inputs: Path) -> None:
 
 
 def _store_picture(picture: Path, place: Path) -> None:
-    from PIL import Image
-
     place.parent.mkdir(parents=True, exist_ok=True)
     if picture.stat().st_size <= MAX_UNREDUCED_BYTES:
         with atomic_path(place) as temporary:
