@@ -15,12 +15,12 @@ from apps.files import require_writable
 from apps.options import JsonOption, TimeZeroOption
 from apps.progress import show_progress
 from apps.report import report
-from apps.viewer.access_control import AccessControl
 from apps.viewer.desktop import open_window
 from apps.viewer.film import choose_frames, save_film
 from apps.viewer.page import Page
 from apps.viewer.render import choose_renderer
 from apps.viewer.scene_figure import save_picture
+from apps.viewer.server import parse_loopback
 from apps.viewer.session import Session
 from apps.viewer.source_factory import ShotOptions, open_source
 from tofclip.errors import InputError
@@ -54,7 +54,7 @@ def view(
     host: Annotated[
         str,
         typer.Option(
-            metavar="ADDRESS", help="Where the page is served; beyond loopback a token guards it."
+            metavar="ADDRESS", help="Where the page is served: a loopback address of this computer."
         ),
     ] = "127.0.0.1",
     no_browser: Annotated[
@@ -77,7 +77,7 @@ def view(
 
     The page is served to this computer only. Through ssh: ssh -L 8080:localhost:8080 HOST, then
     tofclip view SOURCE --port 8080 --no-browser there, and http://localhost:8080 here. On the page,
-    ? shows the keys.
+    K shows the keys.
 
     Example: tofclip view frames.h5 --png scene.png
     """
@@ -137,9 +137,9 @@ def _open_window(session: Session) -> None:
 def _serve_page(
     session: Session, host: str, port: int | None, no_browser: bool, as_json: bool
 ) -> None:
-    with contextlib.closing(Page(session, AccessControl.for_host(host), port)) as page:
+    with contextlib.closing(Page(session, port, parse_loopback(host))) as page:
         report({"address": page.address}, as_json)
-        sys.stdout.flush()  # whoever reads the address waits for it
+        sys.stdout.flush()  # a program that reads the address waits for it
         if not no_browser:
             webbrowser.open(page.address)
         page.run()

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apps.viewer.raster import BACKGROUND
-from apps.viewer.server import run_in_page
 from apps.viewer.session import Session
 from apps.viewer.viewpoint import Viewpoint
 
@@ -23,17 +22,6 @@ if TYPE_CHECKING:
 Post = Callable[[Callable[[], None]], None]
 RENDER_TIMEOUT_S = 20.0  # s
 MAX_SIDE_PX = 1600
-
-KEY_TABLE_SCRIPT = """
-if (!window.tofclipKeys) {
-  window.tofclipKeys = true;
-  document.addEventListener("keydown", (event) => {
-    if (event.key !== "?" || ["INPUT", "TEXTAREA"].includes(document.activeElement.tagName)) return;
-    for (const button of document.querySelectorAll("button"))
-      if (button.textContent.trim() === "keys") button.click();
-  });
-}
-"""
 
 
 class ExportPanel:
@@ -65,9 +53,8 @@ class ExportPanel:
         gui.add_button("bookmark", hint="remember where one looks from").on_click(
             lambda event: self._add_bookmark(event.client)
         )
-        gui.add_button("keys", hint="also: ?").on_click(lambda event: self._show_keys(event.client))
+        gui.add_button("keys", hint="also: K").on_click(lambda event: self._show_keys(event.client))
         self._keys = self._add_keys()
-        run_in_page(server, KEY_TABLE_SCRIPT)
 
     def _send_screenshot(self, client: viser.ClientHandle | None) -> None:
         if client is None:
@@ -109,9 +96,7 @@ class ExportPanel:
             return
         with client.gui.add_modal("keys") as modal:
             rows = "\n".join(f"| {key} | {label} |" for key, label in self._keys)
-            client.gui.add_markdown(
-                f"| key | what it does |\n|---|---|\n{rows}\n| ? | this table |"
-            )
+            client.gui.add_markdown(f"| key | what it does |\n|---|---|\n{rows}")
             client.gui.add_button("close").on_click(lambda _: modal.close())
 
     def _add_keys(self) -> list[tuple[str, str]]:
@@ -131,9 +116,11 @@ class ExportPanel:
             self._add_key(key, label, self._make_handler(act))
         self._add_key("S", "screenshot", lambda event: self._send_screenshot(event.client))
         self._add_key("B", "bookmark this view", lambda event: self._add_bookmark(event.client))
+        self._add_key("K", "this table", lambda event: self._show_keys(event.client))
         return [(key, label) for key, label, _ in own] + [
             ("S", "screenshot"),
             ("B", "bookmark this view"),
+            ("K", "this table"),
         ]
 
     def _make_handler(self, act: Callable[[], None]) -> Callable[[Any], None]:

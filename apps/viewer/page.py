@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from apps.viewer.access_control import AccessControl
 from apps.viewer.controls import Controls
 from apps.viewer.export_panel import ExportPanel
 from apps.viewer.page_text import Status, format_page_title
 from apps.viewer.rates import FramePacer, RateCounter
 from apps.viewer.selection_panel import NO_SHADOWS, SelectionPanel
-from apps.viewer.server import get_address, make_echo_request, start_server, stop_server
+from apps.viewer.server import LOOPBACK, get_address, start_server, stop_server
 from apps.viewer.session import DisplayedFrame, Session
 from apps.viewer.side_pictures import render_pictures
 from apps.viewer.viewpoint import Viewpoint, place_viewpoint
@@ -52,8 +51,9 @@ class Page:
     Parameters
     ----------
     session : Session
-    access_control : Door
     port : int, optional
+    host : str
+        A loopback address.
 
     Raises
     ------
@@ -61,20 +61,15 @@ class Page:
         As `start_server`.
     """
 
-    def __init__(
-        self, session: Session, access_control: AccessControl, port: int | None = None
-    ) -> None:
+    def __init__(self, session: Session, port: int | None = None, host: str = LOOPBACK) -> None:
         self.session = session
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stopping, self._woken = threading.Event(), threading.Event()
         first = session.frame_at(time.monotonic())
         self.viewpoint = place_viewpoint(first.cloud.xyz, SCENE_ASPECT)
-        self.server = start_server(access_control, port)
-        self.address = get_address(self.server, access_control)
+        self.server = start_server(port, host)
+        self.address = get_address(self.server, host)
         self._pace, self._frames = FramePacer(), RateCounter()
-        self._request_echo = make_echo_request(
-            self.server, lambda: self.post(lambda: self._pace.record_answer(time.monotonic()))
-        )
         self._set_up_scene()
         self.controls = Controls(self.server, session, self.post, first)
         self._selection_panel = SelectionPanel(self.server, session, self.post)
@@ -135,22 +130,20 @@ class Page:
         server.scene.add_point_cloud(
             "/camera/staying", staying, staying, point_size=1e-4, **POINT_STYLE
         )
-        server.on_client_connect(lambda _: self.post(self._reset_pace))
+        server.on_client_connect(lambda _: self.post(self._redraw_pictures))
 
-    def _reset_pace(self) -> None:
-        """A page that has just opened is not waited for: it has a history to catch up with."""
-        self._pace = FramePacer(self._pace.display_rate)
+    def _redraw_pictures(self) -> None:
+        """Show the flat pictures at once on a page that has just opened."""
         self._pictures_at, self._pictured = 0.0, None
 
     def _draw(self, shown: DisplayedFrame, now: float) -> None:
         server = self.server
         with server.atomic():
             self._draw_scene(shown)
-            self._request_echo()
         server.flush()
         self._drawn = shown
         self._frames.add(now)
-        self._pace.record_sent(now, len(server.get_clients()))
+        self._pace.record_sent(now, len(shown.cloud))
 
     def _draw_scene(self, shown: DisplayedFrame) -> None:
         scene = self.server.scene
@@ -190,8 +183,6 @@ class Page:
             len(shown.cloud),
             source.data_rate,
             self._frames.per_second(now),
-            self._pace.display_rate.per_second(now),
-            self._pace.latency,
             source.latency,
             source.lost,
             source.failure_text,

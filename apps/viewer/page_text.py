@@ -26,10 +26,8 @@ class Status:
         ``"LIVE"`` or ``"REPLAY"``.
     frame, frames : int
     points : int
-    data_rate, frame_rate, display_rate : float
-        Frames per second that come in, that are sent to the page, and that it has drawn.
-    latency : float
-        From here to the page and back, s; NaN where nobody looks.
+    data_rate, frame_rate : float
+        Frames per second that come in, and that are sent to the page.
     cloud_latency : float
         From when a shot came in until its cloud was there, s; NaN where none comes in.
     lost : int
@@ -43,8 +41,6 @@ class Status:
     points: int
     data_rate: float
     frame_rate: float
-    display_rate: float
-    latency: float
     cloud_latency: float = float("nan")
     lost: int = 0
     failure_text: str = ""
@@ -53,9 +49,6 @@ class Status:
     def html(self) -> str:
         """The line, with ids for scripts."""
         colour = "#e5484d" if self.label == "LIVE" else "#3e8ed0"
-        latency = (
-            f", there and back {1e3 * self.latency:.0f} ms" if np.isfinite(self.latency) else ""
-        )
         lost = f", {self.lost} dropped" if self.lost else ""
         coming = (
             f"<br>shot to cloud {1e3 * self.cloud_latency:.0f} ms{lost}"
@@ -70,8 +63,8 @@ class Status:
         return (
             f"<div style='{HTML_STYLE}'><b id='label' style='color:{colour}'>{self.label}</b> "
             f"frame <b id='frame-number'>{self.frame}</b> of {self.frames}, <span id='points'>{self.points}</span> "
-            f"points<br><span id='rates'>data {self.data_rate:.1f}/s, frames {self.frame_rate:.1f}/s, display "
-            f"{self.display_rate:.1f}/s{latency}{coming}</span>{trouble}</div>"
+            f"points<br><span id='rates'>data {self.data_rate:.1f}/s, shown "
+            f"{self.frame_rate:.1f}/s{coming}</span>{trouble}</div>"
         )
 
 

@@ -1,4 +1,4 @@
-"""How many frames pass each second, and how long they take to the page and back."""
+"""How many frames pass each second, and how many a page can take."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 RATE_WINDOW_S = 2.0
 """s over which frames are counted."""
 
-MAX_FRAMES_IN_FLIGHT = 2
-
-ACK_TIMEOUT_S = 1.0
-"""s after which a page that does not answer is no longer waited for."""
+MAX_FRAMES_PER_S = 30.0
+MAX_POINTS_PER_S = 2e6
+"""What a browser with a software renderer takes without falling behind."""
 
 
 @dataclass
@@ -33,30 +32,22 @@ class RateCounter:
 
 @dataclass
 class FramePacer:
-    """Holds frames back until every page has drawn an earlier one, so that none pile up on a slow
-    line.
+    """Holds frames back so that none pile up in a page: large clouds are sent less often."""
 
-    Two are on their way at most: while one is drawn, the next travels.
-    """
+    _next: float = 0.0
 
-    display_rate: RateCounter = field(default_factory=RateCounter)
-    latency: float = float("nan")
-    _sent: deque[float] = field(default_factory=deque)
-    _pages: int = 0
+    def record_sent(self, now: float, points: int) -> None:
+        """Note that a frame was sent.
 
-    def record_sent(self, now: float, pages: int) -> None:
-        """Note that a frame was sent to so many pages."""
-        self._pages = pages
-        self._sent.extend([now] * pages)
-
-    def record_answer(self, now: float) -> None:
-        """Note that a page has drawn a frame."""
-        if self._sent:
-            self.latency = now - self._sent.popleft()
-            self.display_rate.add(now)
+        Parameters
+        ----------
+        now : float
+            Time in s.
+        points : int
+            Of the frame.
+        """
+        self._next = now + max(1 / MAX_FRAMES_PER_S, points / MAX_POINTS_PER_S)
 
     def can_send(self, now: float) -> bool:
-        """Whether the next frame can go."""
-        if self._sent and now - self._sent[0] > ACK_TIMEOUT_S:
-            self._sent.clear()
-        return len(self._sent) < MAX_FRAMES_IN_FLIGHT * max(1, self._pages)
+        """Whether the next frame can go at time `now`, s."""
+        return now >= self._next

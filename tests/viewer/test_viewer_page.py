@@ -15,7 +15,6 @@ import pytest
 from matplotlib.image import imread
 from viewer_scenes import frames, volume
 
-from apps.viewer.access_control import AccessControl
 from apps.viewer.page import Page
 from apps.viewer.session import GATE_AROUND_FRAME, Session
 from apps.viewer.transient import TransientSource
@@ -51,7 +50,7 @@ class Seen:
     """A served session and the tab that looks at it."""
 
     def __init__(self, browser: Any, session: Session) -> None:
-        self.page, self.complaints = Page(session, AccessControl()), []
+        self.page, self.complaints = Page(session), []
         self._thread = threading.Thread(target=self.page.run, daemon=True)
         self._thread.start()
         self.tab = browser.new_page(viewport={"width": 1100, "height": 640})
@@ -227,9 +226,9 @@ def test_screenshot_export_and_bookmark(seen: Seen, tmp_path: Path) -> None:
     seen.choose("view from", "start")
 
 
-def test_a_question_mark_shows_the_keys(seen: Seen) -> None:
-    seen.tab.evaluate("document.activeElement.blur()")  # into a box, a question mark is typed
-    seen.tab.keyboard.press("?")
+def test_k_shows_the_keys(seen: Seen) -> None:
+    seen.tab.evaluate("document.activeElement.blur()")  # into a box, a K is typed
+    seen.tab.keyboard.press("k")
     seen.tab.get_by_text("play or pause").first.wait_for()
     seen.press("close")
 
