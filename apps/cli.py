@@ -6,7 +6,9 @@ A verb's module is imported when the verb is called, so that the program's own h
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Sequence
 from typing import Annotated
@@ -117,6 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = DEBUG_FLAG in words
+    _heed_end_signals()
     try:
         status = app(
             [word for word in words if word != DEBUG_FLAG],
@@ -136,6 +139,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if status == EXIT_INTERRUPTED:
         print("tofclip: interrupted; no unfinished file was left behind", file=sys.stderr)
     return int(status or 0)
+
+
+def _heed_end_signals() -> None:
+    """Let SIGTERM and SIGHUP end the program as Ctrl-C does, so that instruments are switched off
+    and files closed; where it was started to ignore one of them, it still does.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, signal.default_int_handler)
 
 
 def _report_error(fault: Exception) -> int:

@@ -32,6 +32,13 @@ class DecodedSource(Source):
     def stats(self) -> Stats:
         return self._ledger.stats
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether nothing is missing beyond what `stats` reports; False for a recording that was
+        cut or repaired.
+        """
+        return True
+
     def _decode_piece(self, piece: Piece) -> Batch:
         """Hand a piece to the tap and decode it."""
         if self.tap is not None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
+from types import FrameType
 from typing import Any
 
 from devices.decoded_source import DecodedSource
@@ -16,7 +19,9 @@ from devices.statistics import Stats
 from tofclip.errors import DeviceTimeoutError, InputError, TofclipError
 
 POLL_INTERVAL_S = 0.25
-"""Seconds after which the recorder looks at the clock, though nothing came."""
+"""Seconds after which the recorder looks at the clock and at its file, though nothing came."""
+
+END_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
 ProgressCallback = Callable[[float], None]
 
@@ -39,60 +44,88 @@ class RecordingSummary:
 
 
 def record_source(
-    source: Source, path: Path, seconds: float = float("inf"), provenance: Mapping[str, Any] | None = None,
+    source: Source,
+    path: Path,
+    seconds: float = float("inf"),
+    provenance: Mapping[str, Any] | None = None,
     watch: ProgressCallback | None = None,
-) -> RecordingSummary:  # fmt: skip
+    overwrite: bool = False,
+) -> RecordingSummary:
     """Read a source to its end, or for some time, and write everything that comes to `path`.
 
-    However this ends (an exception, Ctrl-C, a killed program), the file holds what came until then,
-    and can be opened. The source is closed. Memory: the source's.
+    However this ends (an exception, a signal, a killed program), the file holds what came until
+    then, and can be opened. On Ctrl-C, SIGTERM and SIGHUP the instrument is stopped, and what it
+    and the buffer still hold is recorded before `KeyboardInterrupt` is raised; a second signal
+    gives that up. The source is closed. Memory: the source's.
 
     Parameters
     ----------
     source : Source
         One that has bytes to tap: a live instrument, or another recording.
     path : Path
+        Locked meanwhile; a second recorder is refused.
     seconds : float
     provenance : mapping
         How it came about.
     watch : callable
         Called with the seconds that have passed, now and then.
+    overwrite : bool
+        Replace `path` if it exists.
+
+    Returns
+    -------
+    RecordingSummary
 
     Raises
     ------
     InputError
-        The source has no bytes to tap.
+        The source has no bytes to tap, or `path` exists.
     StorageError
-        The disk is full; what was recorded before is safe.
+        The disk is full, or the file was removed; what was recorded before is safe. Or another
+        recorder writes it.
     DeviceError
         The instrument failed; what came before is in the file.
+    KeyboardInterrupt
+        After a signal, once the recording has been ended in order.
     """
-    if not isinstance(source, DecodedSource):
-        raise InputError(
-            f"{source.info.instrument}: comes from a file already, there is nothing to record"
-        )
-    head = make_head(source.codec, source.info, source.calibration, dict(provenance or {}))
-    begin = monotonic()
-    with source, contextlib.closing(RecordingWriter(path, head)) as writer:
-        source.tap = writer.add
-        fault = "interrupted"
-        try:
-            _drain_source(
-                source, begin + seconds, lambda: (watch or _ignore_progress)(monotonic() - begin)
+    with source:
+        if not isinstance(source, DecodedSource):
+            raise InputError(
+                f"{source.info.instrument}: comes from a file already, there is nothing to record"
             )
-            fault = ""
-        except TofclipError as failure:
-            fault = str(failure)
-            raise
-        finally:
-            source.close()
-            writer.finish(source.stats, fault)
-        return RecordingSummary(monotonic() - begin, writer.bytes_flushed, source.stats)
+        head = make_head(source.codec, source.info, source.calibration, dict(provenance or {}))
+        begin = monotonic()
+        with (
+            _defer_end_signals() as interrupted,
+            contextlib.closing(RecordingWriter(path, head, overwrite)) as writer,
+        ):
+            source.tap = writer.add
+
+            def report() -> None:
+                writer.check()
+                if watch is not None:
+                    watch(monotonic() - begin)
+
+            fault = "interrupted"
+            try:
+                _read_all(source, begin + seconds, interrupted, report)
+                fault = "interrupted" if interrupted.is_set() else ""
+            except TofclipError as failure:
+                fault = str(failure)
+                raise
+            finally:
+                source.close()
+                writer.finish(source.stats, fault, source.is_complete)
+        if interrupted.is_set():
+            raise KeyboardInterrupt
+        return RecordingSummary(monotonic() - begin, writer.bytes_written, source.stats)
 
 
-def _drain_source(source: Source, deadline: float, report: Callable[[], None]) -> None:
-    """Read until the deadline or the end, then stop the source and read what is left."""
-    while (left := deadline - monotonic()) > 0:
+def _read_all(
+    source: Source, deadline: float, interrupted: threading.Event, report: Callable[[], None]
+) -> None:
+    """Read until the deadline, the end or a signal, then stop the source and read what is left."""
+    while (left := deadline - monotonic()) > 0 and not interrupted.is_set():
         report()
         with contextlib.suppress(DeviceTimeoutError):
             if source.read(min(left, POLL_INTERVAL_S)) is None:
@@ -102,5 +135,31 @@ def _drain_source(source: Source, deadline: float, report: Callable[[], None]) -
         pass
 
 
-def _ignore_progress(seconds: float) -> None:
-    """Nobody watches."""
+@contextlib.contextmanager
+def _defer_end_signals() -> Iterator[threading.Event]:
+    """Yield an event that the first signal to end sets, so that no piece is cut in two; the second
+    raises `KeyboardInterrupt`.
+
+    Does nothing outside the main thread, which is the only one that gets signals, and leaves
+    signals alone that the program was started to ignore.
+    """
+    interrupted = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield interrupted
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if interrupted.is_set():
+            raise KeyboardInterrupt
+        interrupted.set()
+
+    numbers = [getattr(signal, name) for name in END_SIGNALS if hasattr(signal, name)]
+    before = {number: signal.getsignal(number) for number in numbers}
+    heeded = [number for number in numbers if before[number] is not signal.SIG_IGN]
+    for number in heeded:
+        signal.signal(number, interrupt)
+    try:
+        yield interrupted
+    finally:
+        for number in heeded:
+            signal.signal(number, before[number] or signal.SIG_DFL)

@@ -11,13 +11,17 @@ from typing import Any, NamedTuple
 from devices.decoded_source import DecodedSource
 from devices.ledger import Ledger
 from devices.recording.blocks import BlockKind
-from devices.recording.reader import Block, Damage, Recording
+from devices.recording.reader import Block, Damage, Ending, Recording
 from devices.source import READ_TIMEOUT_S, Batch, Info
 from devices.uri import Uri
 from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError
 from tofclip.storage import Record
 
 NS_PER_S = 1_000_000_000
+MAX_PAUSE_S = 10.0
+"""Longest pause between two pieces that is replayed: where the computer's clock was set while it
+recorded, the times of the pieces may be years apart.
+"""
 
 
 class _Checkpoint(NamedTuple):
@@ -41,12 +45,13 @@ class ReplaySource(DecodedSource):
     ----------
     path : Path
     is_paced : bool
-        Let as much time pass between two pieces as there was when they were recorded.
+        Let as much time pass between two pieces as there was when they were recorded, but at most
+        `MAX_PAUSE_S`.
 
     Raises
     ------
     StorageError, FileFormatError
-        FileFormatError where the file is no recording, or a damaged one.
+        FileFormatError where the file is not a recording, or is a damaged one.
     """
 
     def __init__(self, path: Path, is_paced: bool = False) -> None:
@@ -54,9 +59,10 @@ class ReplaySource(DecodedSource):
         super().__init__(self._recording.codec, Ledger())
         self._info = self._recording.info
         self._is_paced = is_paced
+        self._is_complete = False
         self._blocks = list(self._list_blocks())
         self._next = self._skip = 0
-        self._begin: tuple[float, int] | None = None
+        self._last_due: tuple[float, int] | None = None
         self._checkpoints = [
             _Checkpoint(self.codec.start, 0, 0)
         ]  # of every block up to the furthest that was read
@@ -69,6 +75,10 @@ class ReplaySource(DecodedSource):
     @property
     def calibration(self) -> Record | None:
         return self._recording.head.children.get("calibration")
+
+    @property
+    def is_complete(self) -> bool:
+        return self._is_complete
 
     @property
     def is_seekable(self) -> bool:
@@ -89,11 +99,17 @@ class ReplaySource(DecodedSource):
     def seek(self, record: int) -> None:
         if record < 0:
             raise InputError(f"records are numbered from 0, got {record}")
-        tap, self.tap = self.tap, None
-        self._seek_to(bisect_right(self._checkpoints, record, key=lambda mark: mark.delivered) - 1)
-        while self._next < len(self._blocks) and self._checkpoints[self._next].delivered <= record:
-            self._decode_next()
-        self.tap = tap
+        tap = self.tap
+        self.tap = None  # what is stepped over is not read
+        try:
+            nearest = bisect_right(self._checkpoints, record, key=lambda mark: mark.delivered) - 1
+            self._seek_to(nearest)
+            while (
+                self._next < len(self._blocks) and self._checkpoints[self._next].delivered <= record
+            ):
+                self._decode_next()
+        finally:
+            self.tap = tap
         reached = self._checkpoints[self._next].delivered
         if record > reached:
             raise InputError(
@@ -124,29 +140,38 @@ class ReplaySource(DecodedSource):
         self._ledger = Ledger()
         self._ledger.receive(sum(block.header.records for block in self._blocks))
         self._ledger.deliver(delivered, malformed)
-        self._begin = None
+        self._last_due = None
 
     def _list_blocks(self) -> Iterator[Block]:
         for entry in self._recording.blocks:
             if isinstance(entry, Damage):
+                if entry.is_cut:
+                    return  # the program that recorded was killed; all before it is whole
                 raise FileFormatError(
                     self._recording.path,
                     f"is damaged at byte {entry.position}; tofclip devices repair makes a sound copy",
                 )
             if entry.header.kind is BlockKind.PIECE:
                 yield entry
+            elif entry.header.kind is BlockKind.END:
+                payload = self._recording.blocks.read_payload(entry)
+                self._is_complete = Ending.from_json(payload, self._recording.path).is_complete
 
     def _wait_until_due(self, block: Block, timeout: float) -> None:
-        """Wait until a block is due."""
+        """Wait until a block is due, `timeout` seconds at most; DeviceTimeoutError if it is not
+        then.
+        """
         now = monotonic()
-        if self._begin is None:
-            self._begin = now, block.header.time_ns
-        due = self._begin[0] + (block.header.time_ns - self._begin[1]) / NS_PER_S
+        due = now
+        if self._last_due is not None:
+            pause = (block.header.time_ns - self._last_due[1]) / NS_PER_S
+            due = self._last_due[0] + min(max(pause, 0.0), MAX_PAUSE_S)
         sleep(max(0.0, min(due - now, timeout)))
         if due - now > timeout:
             raise DeviceTimeoutError(
                 f"the next piece of {self._recording.path} is due in {due - now - timeout:.3g} s"
             )
+        self._last_due = due, block.header.time_ns
 
 
 def open_recording(uri: Uri) -> ReplaySource:

@@ -64,7 +64,7 @@ class RingBuffer:
         self._bytes = 0
         self._changed = threading.Condition()
         self._ended = False
-        self._fault: Exception | None = None
+        self._fault: BaseException | None = None
         self._lost_before_next = Gap.NONE
 
     def put(self, piece: Piece) -> None:
@@ -115,7 +115,7 @@ class RingBuffer:
                 raise self._fault
             return None
 
-    def fail(self, fault: Exception) -> None:
+    def fail(self, fault: BaseException) -> None:
         """End the stream with an exception; the first one counts."""
         with self._changed:
             self._fault = self._fault or fault

@@ -18,7 +18,7 @@ from devices.decoded_source import DecodedSource
 from devices.ledger import Ledger
 from devices.ring import Gap, OverflowPolicy, Piece, RingBuffer
 from devices.source import READ_TIMEOUT_S, Batch, Info
-from tofclip.errors import DeviceError, DeviceTimeoutError
+from tofclip.errors import DeviceTimeoutError
 from tofclip.storage import Record
 
 POLL_INTERVAL_S = 0.1
@@ -136,15 +136,17 @@ class StreamSource(DecodedSource):
         self._thread.join(STOP_TIMEOUT_S)
 
     def _run_reader(self) -> None:
-        """Move bytes from the instrument into the ring until the end; the thread's whole life."""
-        try:
-            _FeedReader(self._feed, self.codec, self._ledger, self._ring).run(self._stopping)
-        except Exception as fault:  # whoever reads gets to see it
-            self._ring.fail(fault)
-        try:
-            self._feed.close()
-        except DeviceError as fault:
-            self._ring.fail(fault)
+        """Move bytes from the instrument into the ring until the end; the thread's whole life.
+
+        Whatever goes wrong here, `read` raises it: a thread that ended without a word would look
+        like an instrument in the dark.
+        """
+        reader = _FeedReader(self._feed, self.codec, self._ledger, self._ring)
+        for step in (lambda: reader.run(self._stopping), self._feed.close):
+            try:
+                step()
+            except BaseException as fault:
+                self._ring.fail(fault)
         self._ring.end()
 
 

@@ -46,12 +46,13 @@ def _read_record(file: Path) -> Record:
     """Read our own records as they are, streak images and point clouds of other formats through
     their readers.
     """
+    recording = read_head_if_recording(file)
+    if recording is not None:
+        return recording  # its pieces do not fit into memory
     with translate_read_errors(file), open(file, "rb") as opened:
         start = opened.read(len(HDF5_SIGNATURE))
     if start == HDF5_SIGNATURE:
-        return read_head_if_recording(file) or Record.load(
-            file
-        )  # recordings do not fit into memory
+        return Record.load(file)
     if file.suffix.lower() not in TABLE_SUFFIXES:
         return read_streak(file).to_record()
     try:

@@ -33,12 +33,15 @@ def record(
         float | None,
         typer.Option(metavar="S", help="How long.", show_default="until its end, or Ctrl-C"),
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a recording that exists.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Record an instrument: its bytes as they come, with clock, accounts and calibration.
 
-    However this ends, by Ctrl-C or by a crash, the file holds what came until then and opens as
-    file://H5.
+    However this ends, by Ctrl-C, a signal or a crash, the file holds what came until then and opens
+    as file://H5. Its content is tofclip's own format, not HDF5, whatever its name ends in.
 
     Example: tofclip record 'sim+timetag://?seed=1' --out run.h5 --seconds 1
     """
@@ -50,7 +53,7 @@ def record(
     past = build_provenance({"verb": "record", "uri": uri, "seconds": seconds})
     with show_time_progress("recording", seconds) as watch:
         done = recorded(
-            devices.open(uri), out, math.inf if seconds is None else seconds, past, watch
+            devices.open(uri), out, math.inf if seconds is None else seconds, past, watch, overwrite
         )
     figures = done.stats.as_dict()
     rate = {

@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from devices.codec import Codec, as_bytes
 from devices.recording.blocks import BlockKind
-from devices.recording.reader import (
-    Block,
-    BlockReader,
-    Damage,
-    Recording,
-    build_codec_from_head,
-    parse_head,
-)
+from devices.recording.reader import Block, BlockReader, Damage, Ending, Recording
 from devices.recording.writer import RecordingWriter
 from devices.ring import Gap, Piece
 from devices.statistics import Stats
 from tofclip.errors import FileFormatError
-from tofclip.storage import translate_read_errors
-
-BUFFER_BYTES = 1 << 22
 
 
 @dataclass
@@ -35,13 +23,17 @@ class Findings:
     bytes : int
         Of the instrument, as they came.
     blocks, records, malformed, gaps : int
-        Sound blocks; records that decode, and such that do not; places where the recording says
+        Sound blocks; records that decode, and records that do not; places where the recording says
         that something is missing.
     damaged_blocks, damaged_bytes : int
         What is not what was written. Bytes behind the last block count as well.
+    cut_bytes : int
+        Of these, a last block that was never finished, because the program was killed or the file
+        truncated: no damage to what is before it.
     complete : bool
-        The recording was ended in order. One of a program that was killed is not, and good up to
-        its end.
+        The recording was ended in order, and nothing of it is missing. False for that of a program
+        that was killed, although it is good up to its end, and for a repaired copy of a damaged or
+        truncated recording, however often it is copied.
     stats : mapping
         The accounts at the end, empty where it was not ended in order.
     fault : str
@@ -55,6 +47,7 @@ class Findings:
     gaps: int = 0
     damaged_blocks: int = 0
     damaged_bytes: int = 0
+    cut_bytes: int = 0
     complete: bool = False
     stats: dict[str, int] = field(default_factory=dict)
     fault: str = ""
@@ -64,9 +57,11 @@ class Findings:
         """Whether everything in the file is what was written, and the accounts agree with the
         records.
         """
-        if self.damaged_blocks or not self.stats:
-            return not self.damaged_blocks
-        reported = Stats(**self.stats)
+        damaged_blocks = self.damaged_blocks - (1 if self.cut_bytes else 0)
+        if damaged_blocks or not self.stats:
+            return not damaged_blocks
+        known = {name: self.stats.get(name, 0) for name in Stats().as_dict()}
+        reported = Stats(**known)
         # A piece that was being decoded when the recording was interrupted is in the file and in
         # the accounts as unread; a record of which the end never came is in the accounts only.
         most = reported.delivered + reported.malformed + reported.unread
@@ -89,59 +84,46 @@ def verify(path: Path) -> Findings:
         FileFormatError where the file cannot be opened as a recording at all.
     """
     with Recording(path) as recording:
-        survey = _Inspector(recording.codec)
+        inspector = _Inspector(recording.codec)
         for entry in recording.blocks:
-            survey.inspect(recording.blocks, entry)
-        return survey.findings
+            inspector.inspect(recording.blocks, entry)
+        return inspector.findings
 
 
 def repair(path: Path, out: Path) -> Findings:
     """Copy every sound block of a recording into a new one; gaps are marked where something had to
-    be left out.
+    be left out, and the copy of a damaged or truncated recording never claims to be complete.
 
-    The file need not be readable as HDF5: its blocks are found by their own marks and checksums.
+    Parameters
+    ----------
+    path : Path
+        Also a recording of version 0.1.0.
+    out : Path
+        Replaced if it exists.
+
+    Returns
+    -------
+    Findings
+        Of `path`.
 
     Raises
     ------
     StorageError, FileFormatError
-        FileFormatError where not even the block that describes the instrument is left.
+        FileFormatError where not even a block that describes the instrument is left.
     """
-    with translate_read_errors(path), open(path, "rb", buffering=BUFFER_BYTES) as file:
-
-        def fetch(position: int, length: int) -> bytes:
-            file.seek(position)
-            return file.read(length)
-
-        blocks = BlockReader(path, fetch, os.fstat(file.fileno()).st_size)
-        return _copy_blocks(blocks, out)
-
-
-def _copy_blocks(blocks: BlockReader, out: Path) -> Findings:
-    entries = iter(blocks)
-    head = next(
-        (
-            entry
-            for entry in entries
-            if isinstance(entry, Block) and entry.header.kind is BlockKind.HEAD
-        ),
-        None,
-    )
-    if head is None:
-        raise FileFormatError(
-            blocks.path, "holds no sound description of its instrument; nothing can be saved"
-        )
-    described = parse_head(blocks.read_payload(head), blocks.path)
-    survey = _Inspector(build_codec_from_head(described, blocks.path))
-    writer = RecordingWriter(out, described)
-    try:
-        for entry in entries:
-            piece = survey.inspect(blocks, entry)
-            if piece is not None:
-                writer.add(piece)
-        writer.finish(survey.stats, survey.findings.fault)
-    finally:
-        writer.close()
-    return survey.findings
+    with Recording(path) as recording:
+        inspector = _Inspector(recording.codec)
+        writer = RecordingWriter(out, recording.head, overwrite=True)
+        try:
+            for entry in recording.blocks:
+                piece = inspector.inspect(recording.blocks, entry)
+                if piece is not None:
+                    writer.add(piece)
+            findings = inspector.findings
+            writer.finish(inspector.stats, findings.fault, findings.complete)
+        finally:
+            writer.close()
+    return inspector.findings
 
 
 class _Inspector:
@@ -149,8 +131,12 @@ class _Inspector:
 
     def __init__(self, codec: Codec) -> None:
         self.findings = Findings()
-        self._codec, self._state = codec, codec.start
+        self._codec = codec
+        self._state = codec.start
         self._gap = Gap.NONE
+        self._next_number = 0
+        self._holes = 0  # damaged stretches since the last sound header
+        self._is_missing_data = False
 
     @property
     def stats(self) -> Stats:
@@ -161,27 +147,45 @@ class _Inspector:
     def inspect(self, blocks: BlockReader, entry: Block | Damage) -> Piece | None:
         """Enter a block into the findings; return its piece if it is a sound one."""
         if isinstance(entry, Damage):
+            self._holes += 1
             self._count_damage(entry.length)
+            self.findings.cut_bytes += entry.length if entry.is_cut else 0
             return None
+        self._count_missing(entry)
         try:
             payload = blocks.read_payload(entry)
         except FileFormatError:
-            self._count_damage(entry.end - entry.position)
+            self._count_damage(
+                entry.end - entry.position, is_data=entry.header.kind is BlockKind.PIECE
+            )
             return None
         self.findings.blocks += 1
         if entry.header.kind is BlockKind.END:
-            self._read_ending(payload)
+            self._read_ending(Ending.from_json(payload, blocks.path))
         return self._decode_piece(entry, payload) if entry.header.kind is BlockKind.PIECE else None
 
-    def _count_damage(self, length: int) -> None:
+    def _count_missing(self, block: Block) -> None:
+        """Find whole blocks that are not there, by the numbers of those that are."""
+        if not block.header.is_legacy:
+            missing = block.header.number - self._next_number - self._holes
+            if missing > 0:
+                self._count_damage(0)
+                self.findings.damaged_blocks += missing - 1
+            self._next_number = block.header.number + 1
+        self._holes = 0
+
+    def _count_damage(self, length: int, is_data: bool = True) -> None:
         self.findings.damaged_blocks += 1
         self.findings.damaged_bytes += length
-        self._gap = Gap.LOSS
+        if is_data:
+            self._gap = Gap.LOSS
+            self._is_missing_data = True
+            self.findings.complete = False
 
-    def _read_ending(self, payload: bytes) -> None:
-        ending = json.loads(payload)
-        self.findings.complete = True
-        self.findings.stats, self.findings.fault = ending["stats"], ending["fault"]
+    def _read_ending(self, ending: Ending) -> None:
+        self.findings.complete = ending.is_complete and not self._is_missing_data
+        self.findings.stats = ending.stats
+        self.findings.fault = ending.fault
 
     def _decode_piece(self, block: Block, payload: bytes) -> Piece:
         piece = Piece(payload, block.header.records, max(block.header.gap, self._gap))

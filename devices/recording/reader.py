@@ -1,28 +1,29 @@
-"""Reading recordings, sound and damaged ones."""
+"""Reading recordings, sound and damaged ones, of this version and of 0.1.0."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import os
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import h5py
-import numpy as np
 
 from devices.codec import Codec
-from devices.recording.appendable_file import DATASET_NAME
-from devices.recording.blocks import HEADER_BYTES, MAGIC, BlockHeader, BlockKind
+from devices.recording.blocks import HEADER_BYTES, LEGACY_MAGIC, MAGIC, BlockHeader, BlockKind
 from devices.registry import build_codec
 from devices.ring import Piece
 from devices.source import Info
-from tofclip.errors import FileFormatError, InputError
-from tofclip.storage import Record, format_error_line, translate_read_errors
+from tofclip.errors import FileFormatError, InputError, StorageError
+from tofclip.storage import HDF5_SIGNATURE, Record, format_error_line, translate_read_errors
 
 RECORD_KIND = "recording"
+RECORDING_SUFFIXES = (".h5", ".hdf5")
 SEARCH_BYTES = 1 << 20
 """Bytes in which the next sound block is searched at once."""
 
@@ -34,21 +35,25 @@ class Damage:
     Parameters
     ----------
     position, length : int
-        Bytes of dataset ``raw``.
+        Bytes of the file.
+    is_cut : bool
+        It is the beginning of a last block that was never finished: a program was killed in the
+        middle of writing it, or the file was truncated.
     """
 
     position: int
     length: int
+    is_cut: bool = False
 
 
 @dataclass(frozen=True)
 class Block:
-    """A sound block.
+    """A block with a sound header.
 
     Parameters
     ----------
     position : int
-        Of its header, in dataset ``raw``.
+        Of its header, in the file.
     header : BlockHeader
     """
 
@@ -56,15 +61,21 @@ class Block:
     header: BlockHeader
 
     @property
+    def payload_position(self) -> int:
+        """Position of its payload."""
+        return self.position + self.header.header_bytes
+
+    @property
     def end(self) -> int:
         """Position behind it."""
-        return self.position + HEADER_BYTES + self.header.length
+        return self.payload_position + self.header.length
 
 
 class BlockReader:
-    """Blocks in anything that holds bytes; damage between them is stepped over and told.
+    """Blocks in anything that holds bytes; damage between them is stepped over and reported.
 
-    Memory: one block.
+    The first sound header decides which recording, and which version of the format, this is;
+    blocks of any other are not looked at. Memory: one block.
 
     Parameters
     ----------
@@ -73,21 +84,28 @@ class BlockReader:
     fetch : callable
         Takes position and length, returns these bytes, fewer at the end.
     length : int
+        Bytes there are.
     """
 
     def __init__(self, path: Path, fetch: Callable[[int, int], bytes], length: int) -> None:
-        self.path, self.length, self._fetch = path, length, fetch
+        self.path = path
+        self.length = length
+        self._fetch = fetch
 
     def __iter__(self) -> Iterator[Block | Damage]:
-        """Yield every block with a sound header, and what lies between them; payloads are not
+        """Yield every block with a sound header, and the damage between them; payloads are not
         looked at.
         """
+        first = self._first_header
         position = 0
+        if first is not None and first.is_legacy:
+            position = self._find_header(0)  # version 0.1.0 put an HDF5 file's beginning before
         while position < self.length:
             header = self._read_header(position)
             if header is None:
                 found = self._find_header(position + 1)
-                yield Damage(position, found - position)
+                is_cut = found == self.length and self._is_cut(position)
+                yield Damage(position, found - position, is_cut)
                 position = found
             else:
                 block = Block(position, header)
@@ -102,7 +120,7 @@ class BlockReader:
         FileFormatError
             It is not what was written.
         """
-        data = self._fetch(block.position + HEADER_BYTES, block.header.length)
+        data = self._fetch(block.payload_position, block.header.length)
         if not block.header.matches(data):
             raise FileFormatError(
                 self.path,
@@ -111,27 +129,105 @@ class BlockReader:
         return data
 
     def read_piece(self, block: Block) -> Piece:
-        """Return the piece of the stream that a block holds."""
+        """Return the piece of the stream that a block holds; raises as `read_payload`."""
         return Piece(self.read_payload(block), block.header.records, block.header.gap)
 
-    def _read_header(self, position: int) -> BlockHeader | None:
+    def find_head(self) -> Block | None:
+        """Return the first undamaged description of the instrument, None if there is none."""
+        for entry in self:
+            if isinstance(entry, Block) and entry.header.kind is BlockKind.HEAD:
+                with contextlib.suppress(FileFormatError):
+                    self.read_payload(entry)
+                    return entry
+        return None
+
+    @cached_property
+    def _first_header(self) -> BlockHeader | None:
+        """The first sound header of either version."""
+        found = [self._search(0, magic, lambda header: True) for magic in (MAGIC, LEGACY_MAGIC)]
+        first = min(found)
+        return self._parse_header(first) if first < self.length else None
+
+    def _parse_header(self, position: int) -> BlockHeader | None:
         """Read a header, or None if there is none or its payload would not lie within the file."""
         header = BlockHeader.unpack(self._fetch(position, HEADER_BYTES))
-        if header is None or position + HEADER_BYTES + header.length > self.length:
+        if header is None or position + header.header_bytes + header.length > self.length:
             return None
         return header
 
+    def _read_header(self, position: int) -> BlockHeader | None:
+        """Read a header of this recording, None where there is none."""
+        header = self._parse_header(position)
+        return header if header is not None and self._belongs(header) else None
+
+    def _is_cut(self, position: int) -> bool:
+        """Whether what is left of the file is the beginning of a block."""
+        data = self._fetch(position, HEADER_BYTES)
+        if self.length - position < HEADER_BYTES:
+            return data.startswith(MAGIC[: len(data)])
+        header = BlockHeader.unpack(data)
+        return header is not None and self._belongs(header)
+
+    def _belongs(self, header: BlockHeader) -> bool:
+        first = self._first_header
+        return (
+            first is not None
+            and header.recording == first.recording
+            and header.is_legacy == first.is_legacy
+        )
+
     def _find_header(self, position: int) -> int:
-        """Return where the next sound header begins, or the end."""
+        """Return where the next sound header of this recording begins, or the end."""
+        first = self._first_header
+        magic = LEGACY_MAGIC if first is not None and first.is_legacy else MAGIC
+        return self._search(position, magic, self._belongs)
+
+    def _search(self, position: int, magic: bytes, accept: Callable[[BlockHeader], bool]) -> int:
         while position < self.length:
-            stretch = self._fetch(position, SEARCH_BYTES + len(MAGIC) - 1)
-            at = stretch.find(MAGIC)
+            stretch = self._fetch(position, SEARCH_BYTES + len(magic) - 1)
+            at = stretch.find(magic)
             while at >= 0:
-                if self._read_header(position + at) is not None:
+                header = self._parse_header(position + at)
+                if header is not None and accept(header):
                     return position + at
-                at = stretch.find(MAGIC, at + 1)
+                at = stretch.find(magic, at + 1)
             position += SEARCH_BYTES
         return self.length
+
+
+@dataclass(frozen=True)
+class Ending:
+    """What a recording says at its end.
+
+    Parameters
+    ----------
+    stats : mapping
+        The accounts, by name.
+    fault : str
+        What ended it if it was not meant to end.
+    is_complete : bool
+        Nothing of what was recorded is missing. False for ever in a copy of a damaged or
+        truncated recording.
+    """
+
+    stats: dict[str, int]
+    fault: str
+    is_complete: bool
+
+    def to_json(self) -> bytes:
+        """Return the payload of an END block."""
+        known = {"stats": self.stats, "fault": self.fault, "complete": self.is_complete}
+        return json.dumps(known).encode()
+
+    @classmethod
+    def from_json(cls, payload: bytes, path: Path) -> Ending:
+        """Read the payload of an END block; FileFormatError where it is something else."""
+        try:
+            known = json.loads(payload)
+            stats = {str(name): int(value) for name, value in known["stats"].items()}
+            return cls(stats, str(known["fault"]), bool(known.get("complete", True)))
+        except (ValueError, TypeError, KeyError, AttributeError) as fault:
+            raise FileFormatError(path, "has accounts that cannot be read") from fault
 
 
 class Recording:
@@ -145,23 +241,20 @@ class Recording:
     Raises
     ------
     StorageError, FileFormatError
-        FileFormatError where the file is no recording; `devices.recording.check.repair` may know
-        better.
+        FileFormatError where the file is not a recording, or all copies of its head are damaged.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with translate_read_errors(path), open(path, "rb"):
-            pass
-        with self._translate_errors():
-            self._file = h5py.File(path, "r", locking=False)
-            raw = self._file.get(DATASET_NAME)
-        if not isinstance(raw, h5py.Dataset) or raw.ndim != 1 or raw.dtype != np.uint8:
-            raise FileFormatError(path, "is an HDF5 file, but no recording")
-        self._raw = raw
-        self.blocks = BlockReader(path, self._read_bytes, raw.shape[0])
-        self.head = self._read_head()
-        """What was known before the first piece."""
+        with translate_read_errors(path):
+            self._file = open(path, "rb", buffering=0)  # noqa: SIM115 - closed by `close`
+        self.blocks = BlockReader(path, self._read_bytes, os.fstat(self._file.fileno()).st_size)
+        try:
+            self.head = self._read_head()
+            """What was known before the first piece."""
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def codec(self) -> Codec:
@@ -171,9 +264,11 @@ class Recording:
     @property
     def info(self) -> Info:
         """What was known about the instrument."""
-        with self._translate_errors():
+        try:
             known = json.loads(str(self.head.attribute("info")))
             return Info(known.pop("instrument"), known.pop("serial"), known)
+        except (KeyError, TypeError, AttributeError, json.JSONDecodeError) as fault:
+            raise FileFormatError(self.path, "does not describe its instrument") from fault
 
     def close(self) -> None:
         """Close the file; closing twice is fine."""
@@ -186,40 +281,56 @@ class Recording:
         self.close()
 
     def _read_head(self) -> Record:
-        first = next(iter(self.blocks), None)
-        if not isinstance(first, Block) or first.header.kind is not BlockKind.HEAD:
+        head = self.blocks.find_head()
+        if head is None:
             raise FileFormatError(
-                self.path, "its first block is damaged; tofclip devices repair may help"
+                self.path, "is not a recording, or every copy of its head is damaged"
             )
-        return parse_head(self.blocks.read_payload(first), self.path)
+        return parse_head(self.blocks.read_payload(head), self.path)
 
     def _read_bytes(self, position: int, length: int) -> bytes:
-        with self._translate_errors():
-            return bytes(self._raw[position : position + length].tobytes())
+        return read_at(self._file.fileno(), position, length, self.path)
 
-    @contextlib.contextmanager
-    def _translate_errors(self) -> Iterator[None]:
+
+def read_at(file: int, position: int, length: int, path: Path) -> bytes:
+    """Read `length` bytes from `position` on, fewer at the end of the file; StorageError where the
+    disk fails.
+    """
+    pieces: list[bytes] = []
+    while length > 0:
         try:
-            yield
-        except (OSError, RuntimeError, KeyError, TypeError, json.JSONDecodeError) as fault:
-            raise FileFormatError(
-                self.path, f"is no recording, or a damaged one ({format_error_line(fault)})"
-            ) from fault
+            piece = os.pread(file, length, position)
+        except OSError as fault:
+            raise StorageError(f"{path}: cannot be read: {fault.strerror}") from fault
+        if not piece:
+            break
+        pieces.append(piece)
+        position += len(piece)
+        length -= len(piece)
+    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
 
 def read_head_if_recording(path: Path) -> Record | None:
-    """Return what a recording says about its instrument, None for any other HDF5 file; its bytes
-    are not read.
+    """Return what a recording says about its instrument, None for any other file; its pieces are
+    not read.
     """
-    with contextlib.suppress(OSError), h5py.File(path, "r", locking=False) as file:
-        if file.attrs.get("kind", b"") == RECORD_KIND.encode():
-            with Recording(path) as recording:
-                return recording.head
+    with translate_read_errors(path), open(path, "rb") as file:
+        start = file.read(len(HDF5_SIGNATURE))
+    if start == HDF5_SIGNATURE:
+        kind: Any = b""
+        with contextlib.suppress(OSError), h5py.File(path, "r", locking=False) as opened:
+            kind = opened.attrs.get("kind", b"")
+        if kind != RECORD_KIND.encode():
+            return None
+    elif path.suffix.lower() not in RECORDING_SUFFIXES:
+        return None
+    with contextlib.suppress(FileFormatError), Recording(path) as recording:
+        return recording.head
     return None
 
 
 def parse_head(image: bytes, path: Path) -> Record:
-    """Read the record in the HDF5 image that a HEAD block holds."""
+    """Read the record that the payload of a HEAD block, an HDF5 file, holds."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder, path.name)
         copy.write_bytes(image)
@@ -228,7 +339,7 @@ def parse_head(image: bytes, path: Path) -> Record:
 
 
 def build_codec_from_head(head: Record, path: Path) -> Codec:
-    """Build the codec that a recording's head names."""
+    """Build the codec that a recording's head names; FileFormatError where there is none such."""
     try:
         settings = json.loads(str(head.attribute("codec_settings")))
         return build_codec(str(head.attribute("codec")), settings)

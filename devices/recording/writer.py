@@ -1,30 +1,59 @@
-"""Writing recordings."""
+"""Writing recordings: blocks are appended to a file that is locked and never rewritten."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
+import os
+import secrets
+import tempfile
 from pathlib import Path
-from time import monotonic, time_ns
+from time import monotonic, monotonic_ns, time_ns
 from typing import Any
 
 from devices.codec import Codec
-from devices.recording.appendable_file import AppendableFile
-from devices.recording.blocks import BlockHeader, BlockKind
-from devices.ring import Piece
+from devices.recording.blocks import HEADER_BYTES, BlockHeader, BlockKind
+from devices.recording.reader import Ending
+from devices.ring import Gap, Piece
 from devices.source import Info
 from devices.statistics import Stats
+from tofclip.errors import InputError, StorageError
 from tofclip.storage import Record
 
-FLUSH_INTERVAL_S = 0.25
-"""At most this much of a recording is lost with a killed program."""
+try:
+    import fcntl
+except ImportError:  # Windows: there, nothing keeps a second recorder away
+    fcntl = None  # type: ignore[assignment]
 
-FLUSH_BYTES = 32 << 20
+HEAD_INTERVAL_BYTES = 64 << 20
+"""Payload after which the head is written once more."""
+
+SECTOR_BYTES = 4096
+
+CHECK_INTERVAL_S = 0.25
+"""Seconds after which the writer looks whether its file is still there."""
 
 
 def make_head(
     codec: Codec, info: Info, calibration: Record | None, provenance: dict[str, Any]
 ) -> Record:
-    """Describe an instrument: all of a recording that is known before the first piece."""
+    """Describe an instrument: all of a recording that is known before the first piece.
+
+    Parameters
+    ----------
+    codec : Codec
+        Reads the pieces that are going to be recorded.
+    info : Info
+    calibration : Record, optional
+    provenance : dict
+        How the recording came about; any JSON-serialisable tree.
+
+    Returns
+    -------
+    Record
+        For `RecordingWriter`.
+    """
     attributes = {
         "codec": codec.name,
         "codec_settings": json.dumps(dict(codec.settings)),
@@ -37,53 +66,230 @@ def make_head(
 class RecordingWriter:
     """A recording under way.
 
-    What was flushed is safe from anything that happens to this program. The system may take longer
-    to bring it to the disk: only `close` waits for that.
+    What `add` was given is in the file when it returns: a killed program loses nothing of it, and
+    nothing waits for more to come. The system may take longer to bring it to the disk: only
+    `close` waits for that.
 
     Parameters
     ----------
     path : Path
+        Locked until `close`, so that no second recorder writes to it.
     head : Record
         Made by `make_head`.
+    overwrite : bool
+        Replace a file that exists.
+
+    Raises
+    ------
+    InputError
+        The file exists and may not be replaced.
+    StorageError
+        Another recorder writes it, the folder is missing, or writing is not permitted.
     """
 
-    def __init__(self, path: Path, head: Record) -> None:
-        self.bytes_flushed = 0
-        """Payload of the pieces that a reader of the file sees by now."""
-        self._pending = 0
-        self._file = AppendableFile(
-            path,
-            head,
-            lambda image: BlockHeader.of(BlockKind.HEAD, image, time_ns()).pack() + image,
-        )
-        self.flush()
+    def __init__(self, path: Path, head: Record, overwrite: bool = False) -> None:
+        self.bytes_written = 0
+        """Payload of the pieces so far."""
+        self._path = path
+        self._recording = secrets.randbits(64)
+        self._number = 0
+        self._end = 0
+        self._bytes_since_head = 0
+        # Times by a clock that nobody sets, so that a replay at the recording's pace never waits
+        # for a day that did not pass.
+        self._clock_offset_ns = time_ns() - monotonic_ns()
+        self._checked_at = monotonic()
+        self._head = _render_head(head, path)
+        with contextlib.ExitStack() as stack:
+            self._file, temporary = _create_file(path, overwrite, stack)
+            self._append(BlockKind.HEAD, self._head)
+            self._append(BlockKind.HEAD, self._head)
+            _publish(temporary, path, overwrite)
+        self._inode = os.fstat(self._file).st_ino
 
     def add(self, piece: Piece) -> None:
-        """Append a piece; it is flushed soon."""
-        self._append(
-            BlockHeader.of(BlockKind.PIECE, piece.data, time_ns(), piece.records, piece.gap),
-            piece.data,
-        )
-        self._pending += len(piece.data)
-        if self._pending >= FLUSH_BYTES or monotonic() > self._flushed_at + FLUSH_INTERVAL_S:
-            self.flush()
+        """Append a piece of the stream.
 
-    def flush(self) -> None:
-        """Let readers of the file see everything up to now."""
-        self._file.commit()
-        self.bytes_flushed += self._pending
-        self._pending = 0
-        self._flushed_at = monotonic()
+        Raises
+        ------
+        StorageError
+            The disk is full or the file was removed; what was recorded before is safe.
+        """
+        self._append(BlockKind.PIECE, piece.data, piece.records, piece.gap)
+        self.bytes_written += len(piece.data)
+        self._bytes_since_head += len(piece.data)
+        if self._bytes_since_head >= max(HEAD_INTERVAL_BYTES, 100 * len(self._head)):
+            self._append(BlockKind.HEAD, self._head)
+            self._bytes_since_head = 0
+        self.check()
 
-    def finish(self, stats: Stats, fault: str = "") -> None:
-        """Append the accounts, and what ended the recording if it was not meant to end."""
-        text = json.dumps({"stats": stats.as_dict(), "fault": fault}).encode()
-        self._append(BlockHeader.of(BlockKind.END, text, time_ns()), text)
-        self.flush()
+    def check(self) -> None:
+        """Look now and then whether the file is still there.
+
+        Raises
+        ------
+        StorageError
+            It was removed or replaced, so that nobody will find what is being written.
+        """
+        if monotonic() < self._checked_at + CHECK_INTERVAL_S:
+            return
+        self._checked_at = monotonic()
+        try:
+            inode = os.stat(self._path).st_ino
+        except OSError:
+            inode = -1
+        if inode != self._inode:
+            raise StorageError(
+                f"{self._path}: was removed or replaced while it was being recorded; record again"
+            )
+
+    def finish(self, stats: Stats, fault: str = "", is_complete: bool = True) -> None:
+        """Append the accounts.
+
+        Parameters
+        ----------
+        stats : Stats
+        fault : str
+            What ended the recording if it was not meant to end.
+        is_complete : bool
+            False where something of it is known to be missing: a copy of a damaged recording.
+        """
+        with contextlib.suppress(StorageError):  # a full disk may still have room for the accounts
+            self._append(BlockKind.HEAD, self._head)
+        self._append(BlockKind.END, Ending(stats.as_dict(), fault, is_complete).to_json())
 
     def close(self) -> None:
-        """Hand everything to the disk; closing twice is fine."""
-        self._file.close()
+        """Hand everything to the disk, unlock and close; closing twice is fine.
 
-    def _append(self, header: BlockHeader, payload: bytes) -> None:
-        self._file.append(header.pack(), payload)
+        Raises
+        ------
+        StorageError
+            The disk failed.
+        """
+        if self._file < 0:
+            return
+        try:
+            os.fsync(self._file)
+        except OSError as fault:
+            raise self._explain(fault) from fault
+        finally:
+            os.close(self._file)
+            self._file = -1
+
+    def _append(
+        self, kind: BlockKind, payload: bytes, records: int = 0, gap: Gap = Gap.NONE
+    ) -> None:
+        """Append a block, whole or not at all."""
+        now = monotonic_ns() + self._clock_offset_ns
+        header = BlockHeader.of(kind, payload, now, records, gap, self._number, self._recording)
+        end = self._end
+        try:
+            for part in (header.pack(), payload):
+                rest = memoryview(part)
+                while rest:  # a signal, or a disk that is nearly full, makes short writes
+                    written = os.pwrite(self._file, rest, end)
+                    end += written
+                    rest = rest[written:]
+        except OSError as fault:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._file, self._end)
+            raise self._explain(fault) from fault
+        self._end = end
+        self._number += 1
+
+    def _explain(self, fault: OSError) -> StorageError:
+        return StorageError(
+            f"{self._path}: cannot be written: {fault.strerror}; what was recorded so far is safe"
+        )
+
+
+def _render_head(head: Record, path: Path) -> bytes:
+    """Return a record as the bytes of an HDF5 file."""
+    with tempfile.TemporaryDirectory() as folder:
+        image = Path(folder, path.name)
+        head.save(image)
+        content = image.read_bytes()
+    # Filled up to whole sectors, so that a lost one never costs two copies. HDF5 reads on as far as
+    # its own length says.
+    sectors = -(-(len(content) + HEADER_BYTES) // SECTOR_BYTES)
+    return content.ljust(sectors * SECTOR_BYTES - HEADER_BYTES, b"\0")
+
+
+def _create_file(path: Path, overwrite: bool, stack: contextlib.ExitStack) -> tuple[int, Path]:
+    """Create and lock a file beside `path`, which gets its name when the head is in it.
+
+    The lock on a file that exists already is held as long, so that of two recorders one is
+    refused.
+    """
+    old = _lock_existing(path)
+    if old is not None:
+        stack.callback(os.close, old)
+        if not overwrite:
+            raise InputError(
+                f"{path}: exists already; choose another name, or replace it with --overwrite"
+            )
+    try:
+        mode = 0o666  # less what the user's umask takes away
+        temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
+        file = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode)
+    except OSError as fault:
+        what = (
+            "the folder does not exist; create it first"
+            if isinstance(fault, FileNotFoundError)
+            else fault.strerror
+        )
+        raise StorageError(f"{path}: cannot be written: {what}") from fault
+    stack.callback(temporary.unlink, missing_ok=True)
+    stack.push(lambda kind, *_: os.close(file) if kind is not None else None)
+    _lock(file, path)
+    return file, temporary
+
+
+def _lock_existing(path: Path) -> int | None:
+    """Open and lock the file at `path`; None if there is none."""
+    while True:
+        try:
+            file = os.open(path, os.O_RDONLY)
+        except FileNotFoundError:
+            return None
+        except OSError as fault:
+            raise StorageError(f"{path}: cannot be written: {fault.strerror}") from fault
+        try:
+            _lock(file, path)
+            if os.path.exists(path) and os.stat(path).st_ino == os.fstat(file).st_ino:
+                return file
+        except BaseException:
+            os.close(file)
+            raise
+        os.close(file)  # somebody replaced it meanwhile
+
+
+def _lock(file: int, path: Path) -> None:
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as fault:
+        if fault.errno in (errno.EWOULDBLOCK, errno.EACCES):
+            raise StorageError(
+                f"{path}: is being written by another recorder; stop that, or choose another name"
+            ) from fault
+        # A file system without locks: nothing keeps a second recorder away.
+
+
+def _publish(temporary: Path, path: Path, overwrite: bool) -> None:
+    """Give the file its name; without `overwrite` never in place of another."""
+    try:
+        if overwrite:
+            os.replace(temporary, path)
+            return
+        try:
+            os.link(temporary, path)
+        except FileExistsError:
+            raise InputError(
+                f"{path}: exists already; choose another name, or replace it with --overwrite"
+            ) from None
+        except OSError:  # a file system without links
+            os.replace(temporary, path)
+    except OSError as fault:
+        raise StorageError(f"{path}: cannot be written: {fault.strerror}") from fault

@@ -1,7 +1,7 @@
 """Records in processes that are killed at random moments; a script, because it forks.
 
 ``killed_recorders.py FOLDER NUMBER SEED`` prints one line per recording: its file's name and the
-bytes that its recorder had reported as flushed.
+bytes that its recorder had reported as written.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 import devices
 from devices import recorder
 from devices.recording import writer
+from devices.ring import Piece
 
 ADDRESS = "sim+timetag://?seed={seed}&pace=realtime&rate=5e5&transfer_kib=2&faults=lost@20:50,corrupt@30:3"
 LONGEST_LIFE = 0.3
@@ -23,25 +24,24 @@ FLUSHED = 8
 
 
 class Reporting(writer.RecordingWriter):
-    """Says how much it has flushed."""
+    """Says how much it has written."""
 
     pipe = -1
 
-    def flush(self) -> None:
-        super().flush()
-        os.write(self.pipe, self.bytes_flushed.to_bytes(FLUSHED, "little"))
+    def add(self, piece: Piece) -> None:
+        super().add(piece)
+        os.write(self.pipe, self.bytes_written.to_bytes(FLUSHED, "little"))
 
 
 def live(path: Path, seed: int, pipe: int) -> None:
-    """Record until somebody ends it."""
+    """Record until it is killed."""
     Reporting.pipe = pipe
     vars(recorder)["RecordingWriter"] = Reporting
-    writer.FLUSH_INTERVAL_S = 0.005
     recorder.record_source(devices.open(ADDRESS.format(seed=seed)), path)
 
 
 def killed(path: Path, seed: int, life: float) -> int:
-    """Let a recorder live for some seconds; return what it had flushed, -1 if it had not come so
+    """Let a recorder live for some seconds; return what it had written, -1 if it had not come so
     far.
     """
     reading, writing = os.pipe()

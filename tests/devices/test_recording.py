@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import resource
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
-import h5py
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -19,10 +20,8 @@ from devices.codec import Records, as_bytes
 from devices.decoded_source import DecodedSource
 from devices.emulation.faults import draw_fault_script
 from devices.recorder import record_source
-from devices.recording.appendable_file import DATASET_NAME, AppendableFile
 from devices.recording.blocks import HEADER_BYTES, BlockHeader, BlockKind
 from devices.recording.check import repair, verify
-from devices.recording.checksum import lookup3
 from devices.recording.reader import Block, Recording
 from devices.recording.writer import RecordingWriter, make_head
 from devices.replay import ReplaySource
@@ -122,38 +121,49 @@ def test_everything_about_the_instrument_is_kept(tmp_path: Path) -> None:
         assert recording.head.provenance == {"verb": "test"}
 
 
-def test_any_hdf5_program_opens_it_at_every_moment(tmp_path: Path) -> None:
+def test_it_can_be_read_at_every_moment(tmp_path: Path) -> None:
     path = tmp_path / "run.h5"
-    content = b"begin"
-    file = AppendableFile(
-        path,
-        Record("recording", {}, {"note": "x"}, {"calibration": CALIBRATION}),
-        lambda _: content,
-    )
+    head = make_head(CODEC, Info("a tagger", "7"), CALIBRATION, {})
+    writer = RecordingWriter(path, head)
+    content = b""
     for number in range(1, 30):
-        piece = np.random.default_rng(number).bytes(997 * number)
-        file.append(piece[:100], piece[100:])
-        with h5py.File(path) as opened:
-            assert opened[DATASET_NAME].shape == (len(content),)
-        file.commit()
-        file.commit()
+        piece = np.random.default_rng(number).bytes(6 * number)
+        writer.add(Piece(piece, number))
         content += piece
-        assert file.length == len(content)
-        with h5py.File(path) as opened:
-            assert opened[DATASET_NAME][:].tobytes() == content
-            assert opened["calibration/table"][3] == 3
-    file.close()
-    file.close()
-    with h5py.File(path, "r+") as opened:  # and may go on with it
-        opened.attrs["looked_at"] = 1
-    with h5py.File(path) as opened:
-        assert opened[DATASET_NAME][:].tobytes() == content
+        with Recording(path) as recording:
+            pieces = [e for e in recording.blocks if isinstance(e, Block)]
+            read = [recording.blocks.read_payload(e) for e in pieces if e.header.kind == 2]
+            assert b"".join(read) == content
+            assert recording.head.children["calibration"].fields["table"].values[3] == 3
+    assert writer.bytes_written == len(content)
+    writer.close()
+    writer.close()
 
 
-def test_the_checksum_is_the_published_one() -> None:
-    # The self-test values in Jenkins's lookup3.c.
-    assert lookup3(b"") == 0xDEADBEEF
-    assert lookup3(b"Four score and seven years ago") == 0x17770551
+def test_a_recording_of_version_0_1_0_opens(tmp_path: Path) -> None:
+    """It was made by that version's own `RecordingWriter`."""
+    path = tmp_path / "run.h5"
+    path.write_bytes((Path(__file__).parent / "data" / "recording_0_1_0.h5").read_bytes())
+    found = verify(path)
+    assert (found.is_sound, found.complete, found.records, found.gaps) == (True, True, 150, 1)
+    with devices.open(f"file://{path}") as source:
+        assert source.info == Info("a tagger", "7", {"clock_hz": 5})
+        assert source.calibration is not None
+        assert source.calibration.fields["table"].values[3] == 3
+        assert [(len(one), one.after_gap) for one in source] == [
+            (50, False),
+            (50, False),
+            (50, True),
+        ]
+    assert repair(path, tmp_path / "new.h5").complete
+    again = verify(tmp_path / "new.h5")
+    assert (again.is_sound, again.complete, again.records, again.gaps) == (True, True, 150, 1)
+    assert joined(replayed(tmp_path / "new.h5")).tobytes() == joined(replayed(path)).tobytes()
+    content = bytearray(path.read_bytes())
+    for position in range(0, 3000, 97):  # its HDF5 part may be damaged as one likes
+        content[position] ^= 0x10
+    path.write_bytes(content)
+    assert verify(path).records == 150
 
 
 def test_killed_recorders_leave_what_they_flushed(tmp_path: Path) -> None:
@@ -175,9 +185,7 @@ def test_killed_recorders_leave_what_they_flushed(tmp_path: Path) -> None:
         assert not found.complete
         assert found.bytes >= int(flushed)
         require_true_records(path, int(name.removeprefix("run").removesuffix(".h5")))
-        assert (
-            repair(path, tmp_path / "whole.h5").bytes >= found.bytes
-        )  # with what was written but not yet told
+        assert repair(path, tmp_path / "whole.h5").bytes >= found.bytes
         with_records += found.records > 0
     assert with_records >= 12  # most moments are after the first flush
 
@@ -303,7 +311,7 @@ def test_a_paced_replay_waits_as_long_as_the_recorder_did(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = {"ns": 10**18, "s": 0.0, "slept": 0.0}
-    monkeypatch.setattr("devices.recording.writer.time_ns", lambda: clock["ns"])
+    monkeypatch.setattr("devices.recording.writer.monotonic_ns", lambda: clock["ns"])
     writer = RecordingWriter(tmp_path / "run.h5", make_head(CODEC, Info("x"), None, {}))
     one = np.array([(5, 1, 0)], RECORD_DTYPE)
     for _ in range(2):
@@ -339,15 +347,17 @@ def test_damage_is_found_and_the_rest_is_saved(
     pieces = written(path)
     with Recording(path) as recording:
         blocks = [entry for entry in recording.blocks if isinstance(entry, Block)]
-        begin = recording._raw.id.get_offset()
+    assert [one.header.kind for one in blocks[:2]] == [BlockKind.HEAD] * 2
+    blocks = blocks[1:]
     victim = data.draw(st.integers(1, PIECES))  # block 0 is the head
     where = data.draw(st.integers(blocks[victim].position, blocks[victim].end - 1))
     content = bytearray(path.read_bytes())
-    content[begin + where] ^= data.draw(st.integers(1, 255))
+    content[where] ^= data.draw(st.integers(1, 255))
     path.write_bytes(content)
     found = verify(path)
     assert not found.is_sound
-    assert (found.damaged_blocks, found.blocks) == (1, PIECES + 1)
+    assert (found.damaged_blocks, found.blocks) == (1, PIECES + 3)  # three heads, one ending
+    assert not found.complete
     assert found.damaged_bytes == HEADER_BYTES + 300
     with pytest.raises(FileFormatError, match="damaged"):
         replayed(path)
@@ -358,17 +368,21 @@ def test_damage_is_found_and_the_rest_is_saved(
     gaps = [number for number, batch in enumerate(saved) if batch.after_gap]
     assert gaps == ([victim - 1] if victim < PIECES else [])
     assert verify(out).is_sound
+    assert not verify(out).complete
+    repair(out, folder / "again.h5")
+    record_source(devices.open(f"file://{out}"), folder / "recorded.h5")
+    assert not verify(folder / "again.h5").complete
+    assert not verify(folder / "recorded.h5").complete
 
 
-def test_a_file_that_hdf5_cannot_open_is_rebuilt(tmp_path: Path) -> None:
+def test_a_file_without_its_front_and_end_is_rebuilt(tmp_path: Path) -> None:
     path, out = tmp_path / "run.h5", tmp_path / "out.h5"
     pieces = written(path, finish=False)
     content = path.read_bytes()
     path.write_bytes(bytes(2000) + content[2000:-20])
-    with pytest.raises(FileFormatError, match="no recording"):
-        verify(path)
+    assert verify(path).damaged_blocks == 2
     found = repair(path, out)
-    assert found.damaged_blocks == 1  # the one that was cut off
+    assert found.damaged_blocks == 2  # one head, and the one that was cut off
     np.testing.assert_array_equal(joined(replayed(out)), np.concatenate(pieces[:-1]))
     with ReplaySource(out) as source:
         assert source.calibration is not None
@@ -392,7 +406,7 @@ def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
 
 def test_records_of_other_kinds_and_unknown_codecs_are_refused(tmp_path: Path) -> None:
     CALIBRATION.save(tmp_path / "other.h5")
-    with pytest.raises(FileFormatError, match="no recording"):
+    with pytest.raises(FileFormatError, match="not a recording"):
         Recording(tmp_path / "other.h5")
     foreign = Record("recording", {}, {"codec": "unheard", "codec_settings": "{}", "info": "{}"})
     RecordingWriter(tmp_path / "run.h5", foreign).close()
@@ -411,3 +425,174 @@ def test_headers_that_cannot_be_are_none() -> None:
         BlockHeader(BlockKind.PIECE, Gap.NONE, 0, 0, 1 << 40, 0).pack(),
     ):
         assert BlockHeader.unpack(wrong) is None
+
+
+def test_one_flipped_bit_costs_one_block(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    pieces = written(path)
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
+    places = {*range(60), *rng.integers(len(content), size=340).tolist()}
+    for place in places:
+        flipped = bytearray(content)
+        flipped[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        found = verify(path)
+        assert found.damaged_blocks == 1
+        assert not found.is_sound
+        assert found.records >= 50 * (PIECES - 1)
+        assert found.complete == (found.records == 50 * PIECES and bool(found.stats)) or (
+            not found.complete  # a broken header may have been anything
+        )
+        assert repair(path, tmp_path / "out.h5").records == found.records
+    assert len(pieces) == PIECES
+
+
+def test_a_truncated_recording_is_good_up_to_its_end_and_says_that_it_is_cut(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.h5"
+    written(path)
+    content = path.read_bytes()
+    with Recording(path) as recording:
+        ends = [
+            entry.end
+            for entry in recording.blocks
+            if isinstance(entry, Block) and entry.header.kind is BlockKind.PIECE
+        ]
+    for length in (*range(5000, len(content), 997), len(content) - 1, *ends):
+        path.write_bytes(content[:length])
+        found = verify(path)
+        assert found.records == 50 * sum(end <= length for end in ends)
+        assert (found.is_sound, found.complete) == (True, False)
+        repair(path, tmp_path / "out.h5")
+        again = verify(tmp_path / "out.h5")
+        assert (again.is_sound, again.complete, again.records) == (True, False, found.records)
+
+
+def test_a_second_recorder_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    head = make_head(CODEC, Info("x"), None, {})
+    first = RecordingWriter(path, head)
+    for overwrite in (False, True):
+        with pytest.raises(StorageError, match="another recorder"):
+            RecordingWriter(path, head, overwrite)
+    first.add(Piece(b"", 0))
+    first.close()
+    with pytest.raises(InputError, match="--overwrite"):
+        RecordingWriter(path, head)
+    RecordingWriter(path, head, overwrite=True).close()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["run.h5"]
+    assert path.stat().st_mode & 0o777 == 0o666 & ~_umask()
+
+
+def _umask() -> int:
+    mask = os.umask(0o22)
+    os.umask(mask)
+    return mask
+
+
+@pytest.mark.parametrize("how", ["removed", "replaced"])
+def test_a_file_that_is_gone_is_noticed(tmp_path: Path, how: str) -> None:
+    path = tmp_path / "run.h5"
+    seen: list[float] = []
+
+    def watch(seconds: float) -> None:
+        if not seen:
+            path.unlink()
+            if how == "replaced":
+                path.write_bytes(b"something else")
+        seen.append(seconds)
+
+    quiet = f"{SIM}&pace=realtime&rate=1"
+    with pytest.raises(StorageError, match="removed or replaced"):
+        record_source(devices.open(quiet), path, 10, watch=watch)
+    assert seen[-1] < 5
+
+
+def test_what_a_quiet_stream_brought_is_in_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    writer = RecordingWriter(path, make_head(CODEC, Info("x"), None, {}))
+    one = np.array([(5, 1, 0)], RECORD_DTYPE)
+    writer.add(Piece(CODEC.encode(one), 1))
+    assert verify(path).records == 1  # although nothing comes after it
+    writer.close()
+
+
+def test_a_clock_that_is_set_does_not_stop_a_replay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = RecordingWriter(tmp_path / "run.h5", make_head(CODEC, Info("x"), None, {}))
+    one = np.array([(5, 1, 0)], RECORD_DTYPE)
+    for offset in (0, 10**18, -(10**18), 0):  # as a file of another program might say
+        writer._clock_offset_ns += offset
+        writer.add(Piece(CODEC.encode(one), 1))
+    writer.close()
+    slept: list[float] = []
+    monkeypatch.setattr("devices.replay.sleep", slept.append)
+    with ReplaySource(tmp_path / "run.h5", is_paced=True) as source:
+        for _ in range(4):
+            assert source.read(60.0) is not None
+    assert max(slept) <= 10.0
+
+
+def test_a_seek_that_fails_leaves_the_tap(tmp_path: Path) -> None:
+    path = tmp_path / "run.h5"
+    written(path)
+    content = bytearray(path.read_bytes())
+    with Recording(path) as recording:
+        blocks = [entry for entry in recording.blocks if isinstance(entry, Block)]
+    content[blocks[6].payload_position] ^= 1
+    path.write_bytes(content)
+    with ReplaySource(path) as source:
+        source.tap = lambda piece: None
+        with pytest.raises(FileFormatError, match="damaged"):
+            source.seek(599)
+        assert source.tap is not None
+
+
+def test_a_reader_thread_never_dies_silently(monkeypatch: pytest.MonkeyPatch) -> None:
+    class BrokenError(Exception):
+        pass
+
+    def fail(*_: object) -> None:
+        raise BrokenError("of an unforeseen kind")
+
+    for method in ("pull", "close"):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"devices.timetag.feed.TimeTaggerFeed.{method}", fail)
+            source = devices.open(SIM)
+            source.stop()
+            with pytest.raises(BrokenError):
+                list(source)
+            source.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_stops_and_drains(tmp_path: Path, number: signal.Signals) -> None:
+    """What waits in the buffer is recorded before the recorder ends."""
+    path = tmp_path / "run.h5"
+    source = devices.open("sim+timetag://?pace=realtime&rate=1e6")
+    reads = 0
+    read = source.read
+
+    def slow_read(timeout: float = 5.0) -> Batch | None:
+        nonlocal reads
+        reads += 1
+        if reads == 3:
+            time.sleep(0.3)
+            os.kill(os.getpid(), number)
+        return read(timeout)
+
+    source.read = slow_read  # type: ignore[method-assign]
+    before = signal.signal(number, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            record_source(source, path)
+        assert signal.getsignal(number) is signal.default_int_handler
+    finally:
+        signal.signal(number, before)
+    found = verify(path)
+    assert (found.is_sound, found.complete, found.fault) == (True, True, "interrupted")
+    assert found.stats["unread"] == 0
+    assert found.records == found.stats["delivered"] > 200_000
