@@ -1,5 +1,4 @@
-"""Settings of a verb: declared once, told by a TOML file or by flags, and written beside the
-result.
+"""Settings of a verb: declared once, set in a TOML file or by flags, and written beside the result.
 
 A verb's settings are a frozen dataclass whose fields `setting_field` makes. The name of a field is
 the key in the file and, with dashes, the flag. Flags win over the file. A field that is None has a
@@ -11,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import inspect
-import json
 import math
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
@@ -19,6 +17,7 @@ from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
+import tomli_w
 import typer
 
 from apps.options import make_completer
@@ -35,7 +34,7 @@ SettingsOption = Annotated[
     typer.Option(
         "--settings",
         metavar="TOML",
-        help="Settings that no flag tells; written beside each result.",
+        help="Settings for which there is no flag on the line; written beside each result.",
     ),
 ]
 
@@ -57,7 +56,7 @@ def setting_field(
     metavar, meaning : str
         For the help.
     default : object
-        What it is where nobody tells; None if it has to be found, or may be absent.
+        Its value if neither file nor flag sets it; None if it has to be found, or may be absent.
     shown : str, optional
         The default in words, for the help.
     choices : iterable of str
@@ -85,12 +84,25 @@ def add_setting_flags(kind: type[DataclassInstance]) -> Callable[[Verb], Verb]:
 
 
 def load_settings(kind: type[Settings], file: Path | None, flags: Mapping[str, Any]) -> Settings:
-    """Put together what a file and flags tell.
+    """Return the settings of a file and of flags; flags win.
+
+    Parameters
+    ----------
+    kind : type
+        The verb's settings.
+    file : Path or None
+        TOML.
+    flags : mapping
+        By the names of the settings; None where a flag was not given.
+
+    Returns
+    -------
+    An instance of `kind`.
 
     Raises
     ------
     StorageError, FileFormatError
-        The file cannot be read, or is no TOML.
+        The file cannot be read, or is not TOML.
     InputError
         It holds an unknown key, or a value of another type.
     """
@@ -108,15 +120,20 @@ def settings_to_dict(settings: DataclassInstance) -> dict[str, Any]:
 
 
 def save_settings(settings: DataclassInstance, path: Path, heading: str) -> None:
-    """Write the settings that have a value, whole or not at all; given back, they are the same to
+    """Write the settings that have a value, whole or not at all; read back, they are the same to
     the last bit.
+
+    Parameters
+    ----------
+    settings : dataclass instance
+    path : Path
+        TOML.
+    heading : str
+        A comment in the first line.
     """
-    lines = [
-        f"# {heading}",
-        *(f"{name} = {_to_toml(value)}" for name, value in settings_to_dict(settings).items()),
-    ]
+    text = f"# {heading}\n{tomli_w.dumps(settings_to_dict(settings))}"
     with atomic_path(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _make_flags(kind: type[DataclassInstance]) -> list[inspect.Parameter]:
@@ -141,7 +158,7 @@ def _read_file(kind: type[DataclassInstance], file: Path) -> dict[str, Any]:
         try:
             found = tomllib.load(opened)
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
-            raise FileFormatError(file, f"is no TOML file of settings ({fault})") from fault
+            raise FileFormatError(file, f"is not a TOML file of settings ({fault})") from fault
     hints = get_type_hints(kind)
     for name in found:
         if name not in hints:
@@ -180,11 +197,3 @@ def _convert_value(value: Any, hint: Any, where: str) -> Any:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _to_toml(value: Any) -> str:
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_to_toml, value))}]"
-    # TOML's basic strings and numbers are JSON's, but for the delete character, and for escapes of
-    # half a character.
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

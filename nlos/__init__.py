@@ -15,70 +15,7 @@ Conventions, used everywhere in this package:
   phase.
 """
 
-from __future__ import annotations
+import lazy_loader as lazy
 
-import importlib
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from nlos.backprojection import Backprojection
-    from nlos.capture import Capture
-    from nlos.confocal.light_cone import LightCone
-    from nlos.confocal.migration import FKMigration
-    from nlos.filtered import FilteredBackprojection
-    from nlos.geometry import Grid
-    from nlos.hybrid import Hybrid
-    from nlos.portable.prepared import PreparedImaging
-    from nlos.propagation.propagate import propagate
-    from nlos.refinement.refine import Refinement
-    from nlos.rsd.planar import PlanarRSD
-    from nlos.video import TransientImaging, TransientVideo
-    from nlos.volume import Volume
-
-__all__ = [
-    "Backprojection",
-    "Capture",
-    "FKMigration",
-    "FilteredBackprojection",
-    "Grid",
-    "Hybrid",
-    "LightCone",
-    "PlanarRSD",
-    "PreparedImaging",
-    "Refinement",
-    "TransientImaging",
-    "TransientVideo",
-    "Volume",
-    "propagate",
-]
-
-_HOMES = {
-    "Backprojection": "nlos.backprojection",
-    "Capture": "nlos.capture",
-    "FKMigration": "nlos.confocal.migration",
-    "FilteredBackprojection": "nlos.filtered",
-    "Grid": "nlos.geometry",
-    "Hybrid": "nlos.hybrid",
-    "LightCone": "nlos.confocal.light_cone",
-    "PlanarRSD": "nlos.rsd.planar",
-    "PreparedImaging": "nlos.portable.prepared",
-    "Refinement": "nlos.refinement.refine",
-    "TransientImaging": "nlos.video",
-    "TransientVideo": "nlos.video",
-    "Volume": "nlos.volume",
-    "propagate": "nlos.propagation.propagate",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name on first use, so that ``import nlos`` stays quick."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'nlos' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOMES[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    """List the public names, imported or not."""
-    return sorted({*globals(), *__all__})
+# `__init__.pyi` beside this file lists the public names.
+__getattr__, __dir__, __all__ = lazy.attach_stub(__name__, __file__)

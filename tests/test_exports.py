@@ -53,9 +53,15 @@ def test_public_names(module: str) -> None:
         assert name in dir(home)
 
 
+@pytest.mark.parametrize("module", ["tofclip", "nlos", "devices"])
+def test_a_list_of_names_shows_the_public_ones_only(module: str) -> None:
+    home = importlib.import_module(module)
+    assert dir(home) == sorted(home.__all__)
+
+
 @pytest.mark.parametrize("module", ["tofclip", "nlos"])
 def test_an_unknown_name_is_an_attribute_error(module: str) -> None:
-    with pytest.raises(AttributeError, match=f"module '{module}' has no attribute 'lidar_magic'"):
+    with pytest.raises(AttributeError, match=f"{module} attribute lidar_magic"):
         _ = importlib.import_module(module).lidar_magic
 
 

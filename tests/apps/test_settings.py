@@ -85,7 +85,7 @@ def test_what_makes_no_sense_is_refused(text: str, complaint: str, tmp_path: Pat
 def test_files_that_are_no_toml(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "settings.toml"
     path.write_bytes(content)
-    with pytest.raises(FileFormatError, match="is no TOML file of settings"):
+    with pytest.raises(FileFormatError, match="is not a TOML file of settings"):
         load_settings(Sample, path, {})
     with pytest.raises(StorageError, match="no such file"):
         load_settings(Sample, tmp_path / "absent.toml", {})
