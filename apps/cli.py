@@ -48,7 +48,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   cloud              recovered frames to a point cloud
   view               look at any of these, or an instrument: a page, a window, a picture, a film
   stream             an instrument's shots, a folder's or a stack's to clouds while they come, with latencies
-  lidar accuracy     how well counted photons tell a range, beside the theoretical limit
+  lidar accuracy     accuracy of ranges from counted photons, beside the Cramer-Rao bound
   lidar parallax     a shot to how the views move with range, for recover --focus depth-locked
   lidar scene        recovered frames to a list of objects and a picture
   lidar sequence     a folder or stack of shots to a sequence of clouds
@@ -58,7 +58,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   nlos simulate      the capture of a known hidden scene; nlos info: what a capture can show
   nlos demo          a hidden 3D before a curved wall, imaged quickly and slowly
   occlusion          what stands behind an occluder: inactive region, demonstration
-  clip               light fields from few readings: simulate a camera, recover a picture
+  clip               light fields from few measurements: simulate a camera, recover an image
   reproduce          the paper's tables and figures, made again: reproduce all --out DIR
   bench              how fast and how large all this is on this machine
   devices            instruments and their recordings: list, info, test, verify, repair
@@ -77,7 +77,7 @@ VERBS: VerbTable = {
     "stream": "Make a cloud of each shot by the linear inverse while the next ones come, and tell rate and latencies.",
     "lidar": "How well a range can be known, and how the views' parallax grows with it; many shots in a row.",
     "nlos": "Image the scene hidden around a corner.",
-    "clip": "Light fields from few nonlocal readings.",
+    "clip": "Light fields from few nonlocal measurements.",
     "occlusion": "See through occluders: which places no view can see, and a demonstration of the others.",
     "reproduce": "Make tables and figures of the paper again, its figures beside ours.",
     "bench": "Measure time and memory, each beside the least that the work needs.",

@@ -56,7 +56,7 @@ def load_result(path: Path, settings: Mapping[str, Any]) -> Result | None:
 
 
 def write_result(result: Result, folder: Path) -> list[Path]:
-    """Write NAME.md, NAME.csv and at last NAME.json, which tells that the study is finished."""
+    """Write NAME.md, NAME.csv and, last, NAME.json, which marks the study as finished."""
     name = result["name"]
     texts = {
         f"{name}.md": f"{render_section(result)}\n",

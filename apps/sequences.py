@@ -30,7 +30,7 @@ def run_with_progress(
     cluster: str | None,
     watch: Callable[[Report], object] = lambda _: None,
 ) -> Summary:
-    """Do what is not done yet, with a bar that tells the time left.
+    """Run the jobs that are not done yet, with a bar that shows the time left.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def resolve_device(device: str, cluster: str | None) -> str:
     Raises
     ------
     InputError, MissingDependencyError
-        It is no name of a device, or not here, where there is no cluster.
+        It is not the name of a device, or, without a cluster, the device is not on this computer.
     """
     try:
         found = str(parse_device(device))
@@ -91,7 +91,7 @@ def report_summary(
         With status 1: there were failures.
     """
     attempted = summary.done + len(summary.failures)
-    told = {
+    figures = {
         "results": summary.done,
         "kept_from_before": total - attempted,
         "failed": len(summary.failures),
@@ -105,9 +105,9 @@ def report_summary(
         failures = [
             {"name": failure.name, "problem": failure.problem} for failure in summary.failures
         ]
-        report({**told, "failures": failures}, as_json=True)
+        report({**figures, "failures": failures}, as_json=True)
     else:
-        report(told, as_json=False, written=[out])
+        report(figures, as_json=False, written=[out])
         for failure in summary.failures:
             print(f"failed: {failure.name}: {failure.problem}", file=sys.stderr)
     if summary.failures:

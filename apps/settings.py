@@ -34,7 +34,7 @@ SettingsOption = Annotated[
     typer.Option(
         "--settings",
         metavar="TOML",
-        help="Settings for which there is no flag on the line; written beside each result.",
+        help="Settings that no flag gives; written beside each result.",
     ),
 ]
 

@@ -74,7 +74,7 @@ def _format_headline(experiment: Experiment) -> str:
     views = len(experiment.rig.array.views)
     pixels = " \N{MULTIPLICATION SIGN} ".join(map(str, (views, side, side)))
     title = experiment.scene.title
-    return f"{title[0].upper()}{title[1:]}, seen with {measurements} readings instead of {pixels} pixels"
+    return f"{title[0].upper()}{title[1:]}, seen with {measurements} measurements instead of {pixels} pixels"
 
 
 def _select_pictures(experiment: Experiment) -> list[tuple[str, NDArray[Any], NDArray[Any] | None]]:
@@ -88,7 +88,7 @@ def _select_pictures(experiment: Experiment) -> list[tuple[str, NDArray[Any], ND
         ("one view,\nall its light", everything, None),
         ("a light-field camera,\nall pixels, refocused behind", scaled, truth),
         (
-            "one view with time of flight,\nas many pixels as readings",
+            "one view with time of flight,\nas many pixels as measurements",
             experiment.single_view,
             experiment.single_view_truth,
         ),
@@ -150,7 +150,7 @@ def draw_history(axes: Axes, experiment: Experiment) -> None:
     axes.set_ylim(MIN_RELATIVE_LIGHT, 2 * CAPTION_LEVEL)
     label_axes(
         axes,
-        "light of all readings together",
+        "sum of all measurements",
         "time after the flash (ps)",
         "relative to the brightest instant",
     )

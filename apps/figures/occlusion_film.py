@@ -49,14 +49,14 @@ class FlashFrame(NamedTuple):
 def save_flash_film(experiment: Experiment, path: Path) -> None:
     """Write a GIF: light reaches the occluder, then what stands behind it.
 
-    Each return is shown at its own brightness; the recovered pictures light up as the readings of
+    Each return is shown at its own brightness; the recovered pictures light up as the measurements of
     their gates do.
     """
     figure, frames = _make_canvas(8, 3.2), _make_flash_frames(experiment)
     left, right, time = figure.subplots(1, 3, gridspec_kw=PANEL_LAYOUT)
     images = _lay_out_pictures((left, right), ("what one view sees", "ToF-CLIP"), experiment)
     draw_history(time, experiment)
-    time.set_title("light of all readings", fontsize=SMALL_FONT_PT + 2)
+    time.set_title("sum of all measurements", fontsize=SMALL_FONT_PT + 2)
     time.set_ylabel("")
     time.tick_params(axis="y", labelleft=False)
     cursor = time.axvline(experiment.time_axis.start / PICOSECOND, color=UNSEEN_COLOUR, lw=2)
@@ -71,7 +71,7 @@ def save_flash_film(experiment: Experiment, path: Path) -> None:
 
 def save_walk_film(experiment: Experiment, path: Path, advance: Callable[[int], None]) -> None:
     """Write a GIF: the target walks past behind the occluder, each step flashed, measured and
-    recovered anew.
+    recovered again.
 
     Calls ``advance(1)`` after each of `WALK_STEPS`.
     """

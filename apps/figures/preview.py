@@ -38,7 +38,7 @@ CROP_THRESHOLD = 0.35  # of a frame's brightest pixel: what is dimmer is mostly 
 CROP_MARGIN_PX = 8
 WHITE_PERCENTILE = 99.5  # percent: a glint does not darken the rest
 LIT_THRESHOLD = 0.2  # pixels that are lighter decide about the scale of distances
-BRIGHT_AREA_PERCENTILE = 95.0  # percent: colours need light to be told apart
+BRIGHT_AREA_PERCENTILE = 95.0  # percent: colours need light to be distinguishable
 GAMMA = 0.6  # far objects stay visible beside near ones
 
 
@@ -54,7 +54,7 @@ class Moment:
 def make_preview_figure(streak: Streak, frames: Frames) -> Figure:
     """Draw a recovery.
 
-    Where time tells the range, brightness is multiplied by range squared, so that near and far
+    Where times are ranges, brightness is multiplied by range squared, so that near and far
     surfaces of one kind look alike.
     """
     moments = choose_moments(frames)

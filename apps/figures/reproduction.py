@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from apps.figures.style import DEPTH_COLOURMAP, SMALL_FONT_PT, draw_image, make_figure
@@ -18,8 +19,6 @@ MIN_SHEAR, MAX_SHEAR = -1.4, 0.8  # shears
 
 def make_reproduction_figure(title: str, outcome: Outcome) -> Figure:
     """Draw the panels of an outcome, one line below the other."""
-    import numpy as np
-
     lines = outcome.panels
     columns = max(map(len, lines))
     figure = make_figure(PANEL_INCHES * columns, (PANEL_INCHES + 0.35) * len(lines) + 0.4)

@@ -1,4 +1,4 @@
-"""`tofclip clip`: what a light-field camera with few readings would recover of a light field."""
+"""`tofclip clip`: what a light-field camera with few measurements would recover of a light field."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 SCORED_BORDER_PX = 12
 
-app = typer.Typer(help="Light fields from few nonlocal readings.", no_args_is_help=True)
+app = typer.Typer(help="Light fields from few nonlocal measurements.", no_args_is_help=True)
 
 
 @app.command()
@@ -56,23 +56,28 @@ def simulate(
             ),
         ),
     ],
-    out: Annotated[Path, typer.Option(metavar="H5", help="The readings to write.")],
+    out: Annotated[Path, typer.Option(metavar="H5", help="The measurements to write.")],
     sampling_ratio: Annotated[
         float, typer.Option(metavar="SR", help="Readings over pixels of one picture.")
     ] = 0.5,
     seed: Annotated[
-        int, typer.Option(metavar="N", min=0, help="Of angles, codes, photons and bad readings.")
+        int,
+        typer.Option(
+            metavar="N", min=0, help="For angles, codes, photons and corrupted measurements."
+        ),
     ] = 0,
     bad_fraction: Annotated[
         float, typer.Option(metavar="SHARE", help="Readings set to 0 or to the largest.")
     ] = 0.0,
     photons: Annotated[
         float | None,
-        typer.Option(metavar="N", help="Photons of the largest reading.", show_default="no noise"),
+        typer.Option(
+            metavar="N", help="Photons of the largest measurement.", show_default="no noise"
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the true views of a light field with a camera of few readings.
+    """Measure the true views of a light field with a camera of few measurements.
 
     Example: tofclip clip simulate light_field.npz --encoder line --sampling-ratio 0.5 --out
     readings.h5
@@ -129,7 +134,7 @@ def recover(
         str,
         typer.Option(
             metavar="NAME",
-            help="squares; huber for bad readings; poisson for few photons.",
+            help="squares; huber for corrupted measurements; poisson for few photons.",
             autocompletion=make_completer("squares", "huber", "poisson"),
         ),
     ] = "squares",

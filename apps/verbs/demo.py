@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from tofclip.shots import Frames, Streak
     from tofclip.simulate import SimulatedShot
 
-BORDER_PX = 12  # views leave the slit there: the picture's rim is scored by nobody
+BORDER_PX = 12  # views leave the slit there, so the picture's rim is not scored
 
 
 def demo(

@@ -60,7 +60,7 @@ def _read_record(file: Path) -> Record:
     except FileFormatError:
         if file.suffix.lower() != ".npz":
             raise
-    return read_streak(file).to_record()  # an archive that is no point cloud may be a LIFT shot
+    return read_streak(file).to_record()  # an archive that is not a point cloud may be a LIFT shot
 
 
 def _describe_record(record: Record) -> dict[str, Any]:

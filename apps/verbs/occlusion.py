@@ -107,7 +107,7 @@ def demo(
         float | None,
         typer.Option(
             metavar="N",
-            help="Of the brightest reading at its brightest.",
+            help="Of the largest measurement.",
             show_default="2000; single-pixel 1000000",
         ),
     ] = None,

@@ -67,7 +67,9 @@ def recover(
     iterations: Annotated[
         int | None,
         typer.Option(
-            metavar="N", help="At most so many, for tv and l1.", show_default="the method's"
+            metavar="N",
+            help="Maximum number of iterations of tv and l1.",
+            show_default="the method's",
         ),
     ] = None,
     focus: Annotated[

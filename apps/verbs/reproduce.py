@@ -161,7 +161,7 @@ def _load_or_make_result(study: Study, library: Library, seeds: int, folder: Pat
 def _run_study(
     study: Study, library: Library, seeds: int, folder: Path, advance: Advance
 ) -> Result:
-    """Make a study, and write its picture, its tables, and at last the file that tells that it is
+    """Run a study, and write its figure, its tables and, last, the file that marks it as
     finished.
     """
     started = time.perf_counter()

@@ -34,7 +34,7 @@ class AppearancePanel:
     session : Session
     post : callable
     first : Shown
-        Its extent is that of the filters as long as nobody narrows them.
+        Its extent is that of the filters until they are narrowed.
     """
 
     def __init__(
@@ -175,7 +175,7 @@ def _round_outwards(values: Any) -> Limits:
 
 
 def _narrow_limits(given: Limits, whole: Limits) -> Limits:
-    """A side that was not moved is no limit, whatever comes later."""
+    """A side that was not moved does not limit later frames."""
     low = given[0] if given[0] > whole[0] else NO_LIMITS[0]
     high = given[1] if given[1] < whole[1] else NO_LIMITS[1]
     return low, high

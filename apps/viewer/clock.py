@@ -11,7 +11,7 @@ MIN_SPEED, MAX_SPEED = 1 / 16, 16.0
 
 @dataclass
 class PlaybackClock:
-    """Counts frames while it runs; whoever asks brings the time along, in seconds of any steady
+    """Counts frames while it runs; the caller gives the time, in seconds of any steady
     clock.
 
     Parameters
@@ -58,7 +58,7 @@ class PlaybackClock:
         self._last_tick_s = None
 
     def step(self, frames: int, oldest: int, count: int) -> None:
-        """Stand still so many frames further on, or back."""
+        """Pause, and move by a number of frames, back where it is negative."""
         self.pause()
         self.jump(self.frame + frames, oldest, count)
 

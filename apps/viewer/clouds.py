@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from apps.viewer.source import Source, View
 from tofclip.errors import FileFormatError, InputError
 from tofclip.lidar import PointCloud
+from tofclip.lidar.export import read_table
 from tofclip.units import SPEED_OF_LIGHT
 
 CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz")
@@ -70,13 +71,11 @@ def read_cloud(path: Path) -> PointCloud:
     InputError, StorageError, FileFormatError
         The file cannot be read, or holds no positions.
     """
-    from tofclip.lidar.export import read_table
-
     if path.suffix.lower() == ".h5":
         return PointCloud.load(path)
     table = read_table(path)
     if missing := [axis for axis in "xyz" if axis not in table]:
-        raise FileFormatError(path, f"has no column '{missing[0]}', so it is no cloud of points")
+        raise FileFormatError(path, f"has no column '{missing[0]}', so it is not a point cloud")
     xyz = np.stack([table[axis] for axis in "xyz"], axis=-1)
     return make_cloud(xyz[np.all(np.isfinite(xyz), axis=1)] if len(table) == 3 else xyz, table)
 

@@ -18,7 +18,7 @@ PALETTE_SIZE = 256
 """Colours of a palette, and entries of a scale."""
 
 LIMIT_PERCENTILES = (1.0, 99.0)
-"""Percentiles between which colours are spread where nobody sets limits: a glint does not darken
+"""Percentiles between which colours are spread unless limits are set: a glint does not darken
 the rest.
 """
 
@@ -32,7 +32,7 @@ MAX_RANKED_POINTS = 100_000
 """Points from which an equalised scale is made; more would cost time and change nothing to be seen."""
 
 PALETTES = ("viridis", "cividis", "inferno", "magma", "plasma", "turbo", "grey")
-"""All but turbo are perceptually uniform; turbo tells most ranges apart."""
+"""All but turbo are perceptually uniform; turbo separates most ranges."""
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ def open_window(session: Session) -> None:
     Raises
     ------
     MissingDependencyError
-        There is no display, or no working graphics library; says which.
+        There is no display, or no working graphics library.
     """
     require_display()
     import pyvista

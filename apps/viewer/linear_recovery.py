@@ -21,20 +21,20 @@ Readings = NDArray[np.float32]
 
 MAX_SHEARS = 6
 SHEAR_LIMITS = (-3.0, 3.0)
-"""Pixels per view step between which a picture can be focused anew."""
+"""Pixels per view step between which a picture can be refocused."""
 
 MIN_FRAMES = 3
 """Without a neighbour on either side no return is located."""
 
 
 class LinearRecovery:
-    """Turns the readings of one camera into frames, at any shear.
+    """Turns the measurements of one camera into frames, at any shear.
 
     Parameters
     ----------
     camera : Camera
     times : (frames,) array
-        Time of flight of each reading, s.
+        Time of flight of each column of measurements, s.
 
     Notes
     -----
@@ -73,7 +73,7 @@ class LinearRecovery:
         readings, shear, gate
             As for `frames`.
         least_intensity : float
-            Weaker returns are left out: a dark gate does not tell by itself that it is dark.
+            Weaker returns are left out: a threshold relative to the gate would find noise in a dark one.
             Counts, referred to 1 m.
         """
         found = make_view(depth(self.frames(measurements, shear, self._widen_gate(gate))))
@@ -119,6 +119,6 @@ def find_min_intensity(whole: View) -> float:
 
 
 def select_brighter(view: View, intensity: float) -> View:
-    """Return the points of at least so many counts."""
+    """Return the points with a minimum number of counts."""
     kept = view.cloud.intensity >= intensity
     return View(select_points(view.cloud, kept), None if view.pixels is None else view.pixels[kept])

@@ -47,7 +47,7 @@ class LiveShotSource(ShotSource):
 
     Notes
     -----
-    Memory: 32 shots' readings and clouds.
+    Memory: the measurements and clouds of 32 shots.
     """
 
     def __init__(self, title: str, shots: Iterator[Streak], camera: Camera, first: Streak) -> None:

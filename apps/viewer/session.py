@@ -109,7 +109,7 @@ class Session:
         self.clock.jump(frame, self.source.oldest, len(self.source))
 
     def step(self, frames: int) -> None:
-        """Stand still so many frames further on, or back."""
+        """Pause, and move by a number of frames, back where it is negative."""
         self.following = False
         self.clock.step(frames, self.source.oldest, len(self.source))
 

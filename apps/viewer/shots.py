@@ -46,7 +46,7 @@ class ShotSource(Source):
 
     @abc.abstractmethod
     def measurements(self, number: int) -> Readings:
-        """Return the rectified readings of a shot, (columns, rows)."""
+        """Return the rectified measurements of a shot, (columns, rows)."""
 
     def rectify(self, streak: Streak) -> Readings:
         """Take dark level and sweep off a shot."""
@@ -98,7 +98,7 @@ class StoredShotSource(ShotSource):
 
     Notes
     -----
-    Memory: the readings of the last shot, and the last 16 clouds.
+    Memory: the measurements of the last shot, and the last 16 clouds.
     """
 
     def __init__(self, title: str, shots: Sequence[Callable[[], Streak]], camera: Camera) -> None:

@@ -29,7 +29,7 @@ def render_pictures(pictures: Mapping[str, Picture], scale: Scale) -> dict[str, 
     pictures : mapping of str to (rows, columns) array
         ``"depth"`` is in m, NaN where there is nothing; all others are brightness.
     scale : Scale
-        Colours of the depth: the same as the scene's where these tell the range, and else as many,
+        Colours of the depth: the same as the scene's where these show range, and otherwise as many,
         evenly.
 
     Returns

@@ -171,7 +171,7 @@ class Source(abc.ABC):
 
     def refocus(self, number: int, shear: float, gate: Gate) -> View:
         """Recover the frames of a gate once more, at another shear, pixels per view step."""
-        raise InputError(f"{self.title} holds no readings that could be focused anew")
+        raise InputError(f"{self.title} holds no measurements, so it cannot be refocused")
 
     def surface(self) -> TriangleMesh | None:
         """Return the surface to draw instead of points, None where points are shown."""

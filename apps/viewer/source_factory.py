@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import h5py
+
 from apps.viewer.clouds import CLOUD_SUFFIXES, CloudSource, find_clouds
+from apps.viewer.linear_recovery import LinearRecovery
+from apps.viewer.live import LiveShotSource, take_first
+from apps.viewer.shots import StoredShotSource
+from apps.viewer.source import Gate
+from apps.viewer.transient import TransientSource
+from devices.transients import read_transient, read_transients
+from tofclip.camera import Camera, measure
 from tofclip.errors import FileFormatError, InputError
+from tofclip.io import read_streak
+from tofclip.recovery import fit_camera_to_shot, prepare_recovery
+from tofclip.shots import Frames
 from tofclip.storage import HDF5_SIGNATURE, Record, translate_read_errors
 
 if TYPE_CHECKING:
     from apps.viewer.source import Source
-    from tofclip.camera import Camera
     from tofclip.shots import Streak
     from tofclip.shots.stack import StreakStack
 
@@ -72,9 +84,6 @@ def open_source(name: str, options: ShotOptions | None = None) -> Source:
 
 
 def _open_hdf5(path: Path, options: ShotOptions) -> Source:
-    from apps.viewer.transient import TransientSource
-    from tofclip.shots import Frames
-
     if _is_stack(path):
         from tofclip.shots.stack import StreakStack
 
@@ -112,12 +121,6 @@ def _open_folder(path: Path, options: ShotOptions) -> Source:
 
 def _open_shots(title: str, shots: Sequence[Callable[[], Streak]], options: ShotOptions) -> Source:
     """Shots in files. A single one becomes a transient, so that time can be walked through."""
-    from apps.viewer.linear_recovery import LinearRecovery
-    from apps.viewer.shots import StoredShotSource
-    from apps.viewer.source import Gate
-    from apps.viewer.transient import TransientSource
-    from tofclip.camera import measure
-
     first = shots[0]()
     camera = _find_camera(first, options)
     if len(shots) > 1:
@@ -133,9 +136,6 @@ def _open_shots(title: str, shots: Sequence[Callable[[], Streak]], options: Shot
 
 def _open_instrument(address: str, options: ShotOptions) -> Source:
     """An instrument that goes on, or a recording, which is gathered once."""
-    from apps.viewer.live import LiveShotSource, take_first
-    from devices.transients import read_transient, read_transients
-
     if address.lower().startswith("file://"):
         return _open_shots(address, [lambda: read_transient(address, options.bin_width)], options)
     first, rest = take_first(read_transients(address, options.bin_width), address)
@@ -144,9 +144,6 @@ def _open_instrument(address: str, options: ShotOptions) -> Source:
 
 def _find_camera(shot: Streak, options: ShotOptions) -> Camera:
     """The camera of a row of shots; a sweep that is not known is found from the first one."""
-    from tofclip.camera import Camera
-    from tofclip.recovery import fit_camera_to_shot, prepare_recovery
-
     known = prepare_recovery(
         shot, None if options.camera is None else Camera.load(options.camera), "linear"
     ).camera
@@ -156,8 +153,6 @@ def _find_camera(shot: Streak, options: ShotOptions) -> Camera:
 
 
 def _read_shot(path: Path, options: ShotOptions) -> Streak:
-    from tofclip.io import read_streak
-
     return read_streak(path, options.bin_width)
 
 
@@ -168,8 +163,6 @@ def _read_stacked_shot(stack: StreakStack, number: int, options: ShotOptions) ->
 
 def _is_stack(path: Path) -> bool:
     """Whether an HDF5 file is a stack of shots, which any program may have written."""
-    import h5py
-
     try:
         with h5py.File(path, "r") as file:
             return "format" not in file.attrs and "counts" in file
@@ -179,10 +172,8 @@ def _is_stack(path: Path) -> bool:
 
 def _is_lift_archive(path: Path) -> bool:
     """Whether an archive is a shot rather than a cloud."""
-    import zipfile
-
     try:
         with zipfile.ZipFile(path) as archive:
             return not {"x_m.npy", "x.npy"} & set(archive.namelist())
     except zipfile.BadZipFile as fault:
-        raise FileFormatError(path, "is no NumPy archive, or a damaged one") from fault
+        raise FileFormatError(path, "is not a NumPy archive, or is damaged") from fault

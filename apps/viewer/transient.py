@@ -28,7 +28,7 @@ PLAY_TIME_S = 12.0
 class TransientSource(Source):
     """Recovered frames: frame `n` of the source is instant `n`; the cloud is that of all instants.
 
-    To be focused anew, readings are needed. Where they are not at hand, as with a file of frames,
+    Refocusing needs measurements. Where they are not at hand, as with a file of frames,
     the camera predicts them from the frames, which explain the measured ones but for the recovery's
     residual.
 
@@ -37,11 +37,11 @@ class TransientSource(Source):
     title : str
     frames : Frames
     measurements : (columns, frames) array, optional
-        Rectified readings from which the frames were recovered.
+        Rectified measurements from which the frames were recovered.
 
     Notes
     -----
-    Memory: the frames, and on the first refocus their readings (columns, frames).
+    Memory: the frames, and on the first refocus their measurements (columns, frames).
     """
 
     def __init__(self, title: str, frames: Frames, measurements: Readings | None = None) -> None:

@@ -110,5 +110,5 @@ class VolumeSource(Source):
 
     def _make_cloud(self, xyz: NDArray[Any], brightness: NDArray[Any]) -> PointCloud:
         cloud = make_cloud(xyz, {"brightness": brightness})
-        # Depth behind the wall tells more than the distance from the origin of its coordinates.
+        # Depth behind the wall is more useful than the distance from the origin of its coordinates.
         return replace(cloud, range=cloud.xyz[:, 2])
