@@ -27,15 +27,14 @@ from tofclip.solvers import (
     StoppingRule,
     TotalVariation,
     Wavelets,
-    batches,
     ignore_progress,
     iterate,
+    loops,
     relative_residual,
 )
-from tofclip.solvers.compiled import CompiledLoops
 from tofclip.solvers.cross_validation import choose_weight
 from tofclip.solvers.light_field_variation import LightFieldVariation
-from tofclip.solvers.portable import PortableLoops
+from tofclip.solvers.loops import CompiledLoops, PortableLoops
 
 METHODS = [Sparse(iterations=40), TotalVariation(iterations=40), LinearInverse(), Backprojection()]
 # What is promised is 1e-4. Float32 sums in another order differ by 1e-6 or so, which the linear
@@ -109,8 +108,8 @@ def test_pieces_make_no_difference(device, method, monkeypatch):
     """
     measurements, valid = (device.put(array) for array in letters(5))
     whole = to_numpy(method.recover(projection(), measurements, valid).frames)
-    monkeypatch.setattr(batches, "WORKING_BYTES", 2 * batches.WORKING_PICTURES * 24 * 23 * 4)
-    assert batches.frames_per_block(projection(), measurements) == 2
+    monkeypatch.setattr(loops, "WORKING_BYTES", 2 * loops.WORKING_PICTURES * 24 * 23 * 4)
+    assert loops.frames_per_block(projection(), measurements) == 2
     assert (
         difference(to_numpy(method.recover(projection(), measurements, valid).frames), whole) < 1e-6
     )

@@ -27,7 +27,7 @@ from tofclip.solvers.data_terms import (
     estimate_robust_deviation,
 )
 from tofclip.solvers.denoisers import BlockMatching, CollaborativeWiener, Denoiser, NonlocalMeans
-from tofclip.solvers.iterative import ProximalMethod
+from tofclip.solvers.fista import ProximalMethod
 from tofclip.solvers.light_field_variation import LightFieldVariation
 from tofclip.solvers.plug_and_play import PlugAndPlay
 

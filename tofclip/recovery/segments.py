@@ -12,8 +12,8 @@ from tofclip.camera import Camera, Measurement
 from tofclip.operators import LinearOperator
 from tofclip.recovery.focus import FrameSegment
 from tofclip.solvers import Method, Progress, Result, ignore_progress, relative_residual
-from tofclip.solvers.batches import frames_per_block
-from tofclip.solvers.iterative import ProximalMethod
+from tofclip.solvers.fista import ProximalMethod
+from tofclip.solvers.loops import frames_per_block
 from tofclip.threads import split_blocks
 
 

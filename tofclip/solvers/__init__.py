@@ -2,12 +2,25 @@
 
 from tofclip.solvers.data_terms import DataTerm, Huber, LeastSquares, Poisson
 from tofclip.solvers.direct import Backprojection, LinearInverse, PreparedInverse
-from tofclip.solvers.fista import Fista
-from tofclip.solvers.iteration import Progress, Result, StoppingRule, ignore_progress, iterate
-from tofclip.solvers.iterative import ProximalMethod, Sparse, TotalVariation, Wavelets
-from tofclip.solvers.method import Method, relative_residual
+from tofclip.solvers.fista import (
+    Fista,
+    NonnegativeSparsity,
+    NonnegativeTotalVariation,
+    ProximalMethod,
+    Sparse,
+    TotalVariation,
+    Wavelets,
+)
+from tofclip.solvers.method import (
+    Method,
+    Progress,
+    Result,
+    StoppingRule,
+    ignore_progress,
+    iterate,
+    relative_residual,
+)
 from tofclip.solvers.plug_and_play import PlugAndPlay, RegularisationByDenoising
-from tofclip.solvers.proximal import NonnegativeSparsity, NonnegativeTotalVariation
 
 __all__ = [
     "Backprojection",

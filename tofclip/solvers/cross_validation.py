@@ -9,11 +9,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import require_numpy
+from tofclip.arrays import Array, require_numpy
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator
-from tofclip.solvers.iterative import ProximalMethod
-from tofclip.solvers.method import Array
+from tofclip.solvers.fista import ProximalMethod
 from tofclip.threads import map_parallel
 
 INITIAL_WEIGHT = 10**-1.75

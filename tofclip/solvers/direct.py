@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from tofclip.arrays import Array, ComputeDevice, PerDevice, is_numpy, namespace, to_numpy
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, SparseMatrix, estimate_squared_norm
-from tofclip.solvers.batches import PortableBatches, make_batches, write_frames
-from tofclip.solvers.iteration import Progress, Result, ignore_progress
-from tofclip.solvers.method import Mask, validate_measurements
+from tofclip.solvers.loops import PortableBatches, make_batches, write_frames
+from tofclip.solvers.method import Mask, Progress, Result, ignore_progress, validate_measurements
 from tofclip.threads import LANES, limit_blas_threads, run_blocks, split_blocks
 
 DENSE_BLOCK_ROWS = 336  # of the dense matrix, which are read from memory once for all frames

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tofclip.arrays import Array
 from tofclip.errors import InputError, ShapeError
-from tofclip.solvers.iterative import ProximalMethod
-from tofclip.solvers.proximal import Array, Regulariser, validate_weight
+from tofclip.solvers.fista import ProximalMethod, Regulariser, validate_weight
 
 
 class NonnegativeLightFieldVariation:

@@ -1,16 +1,26 @@
-"""The inner loops of the solvers, for the arrays of each library: compiled ones for NumPy's,
-portable ones for others.
+"""The inner loops of the solvers and the blocks of frames that they work on, for the arrays of each
+library.
 
-The last axis is the frames', side by side. `select_loops` is the one place where the choice is
+NumPy's arrays are worked on by compiled loops, in blocks of a few frames that stay in cache and are
+shared between threads. Arrays of other libraries are worked on with the functions of the array API
+standard, as many frames at once as fit into the memory of their device. The last axis of a block is
+the frames', side by side. `select_loops` and `make_batches` are the two places where the choice is
 made.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
-from typing import Protocol
+from math import prod
+from typing import Any, Protocol
 
-from tofclip.arrays import Array, is_numpy
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.arrays import Array, is_numpy, namespace, zeros
+from tofclip.operators import LinearOperator
+from tofclip.threads import LANES, run_blocks, split_blocks
 
 
 class Loops(Protocol):
@@ -73,13 +83,294 @@ def select_loops(array: Array) -> Loops:
 
 @cache
 def _compiled_loops() -> Loops:
-    from tofclip.solvers.compiled import CompiledLoops
-
     return CompiledLoops()
 
 
 @cache
 def _portable_loops() -> Loops:
-    from tofclip.solvers.portable import PortableLoops
-
     return PortableLoops()
+
+
+Sums = NDArray[np.float64]
+
+
+class CompiledLoops:
+    """Loops on contiguous NumPy arrays, each in one pass through memory, in place; see `Loops`."""
+
+    def __init__(self) -> None:
+        from tofclip.solvers import kernels  # numba takes half a second to import
+
+        self._kernels = kernels
+
+    def prox_l1(
+        self,
+        current: Array,
+        previous: Array,
+        momentum: Array,
+        gradient: Array,
+        step: float,
+        threshold: float,
+    ) -> tuple[Array, Sums]:
+        """Overwrite and return `previous`."""
+        number, total = current.dtype.type, np.empty(current.shape[-1])
+        # Every pixel is on its own: a block of volumes is one of tall pictures.
+        now, before, slope = (_flatten_rows(array) for array in (current, previous, gradient))
+        self._kernels.shrink_nonnegative(
+            now, before, momentum, slope, number(step), number(threshold), total
+        )
+        return previous, total
+
+    def gradient_step(
+        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
+    ) -> Array:
+        """Overwrite and return `gradient`."""
+        now, before, slope = (_flatten_rows(array) for array in (current, previous, gradient))
+        self._kernels.take_gradient_step(now, before, momentum, slope, current.dtype.type(step))
+        return gradient
+
+    def prox_tv(
+        self, noisy: Array, dual: Array | None, weight: float, sweeps: int, result: Array
+    ) -> tuple[Array, Sums, Array]:
+        """Overwrite and return `result` and `dual`."""
+        if dual is None:
+            dual = np.zeros((2, *noisy.shape), noisy.dtype)
+        weight, total = noisy.dtype.type(weight), np.empty(noisy.shape[-1])
+        if weight > 0:
+            self._kernels.sweep_total_variation_dual(noisy, dual, weight, sweeps, result)
+        self._kernels.compute_total_variation_primal(noisy, dual, weight, result, total)
+        return result, total, dual
+
+    def sum_squares(self, values: Array) -> Sums:
+        """Multiply and add without a temporary."""
+        total: Sums = np.einsum("if,if->f", values, values, dtype=np.float64)
+        return total
+
+    def restore_frames(self, values: Array, before: Array, rejected: NDArray[np.bool_]) -> Array:
+        """Overwrite and return `values`; most often there is nothing to do."""
+        if rejected.any():
+            self._kernels.restore_frames(
+                _flatten_rows(values), _flatten_rows(before), rejected.astype(values.dtype)
+            )
+        return values
+
+
+def _flatten_rows(array: Array) -> Array:
+    """The same memory as (rows, columns, frames)."""
+    return array.reshape(-1, *array.shape[-2:])
+
+
+class PortableLoops:
+    """Loops on arrays of any library, each a few passes through memory, for many frames at once;
+    see `Loops`.
+    """
+
+    def prox_l1(
+        self,
+        current: Array,
+        previous: Array,
+        momentum: Array,
+        gradient: Array,
+        step: float,
+        threshold: float,
+    ) -> tuple[Array, Array]:
+        """Leave all arrays but `gradient` as they are."""
+        xp = namespace(current)
+        noisy = self.gradient_step(current, previous, momentum, gradient, step)
+        noisy -= threshold
+        result = xp.clip(noisy, min=0.0)
+        pixels = tuple(range(result.ndim - 1))
+        return result, xp.sum(result, axis=pixels, dtype=xp.float64)
+
+    def gradient_step(
+        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
+    ) -> Array:
+        """Leave all arrays but `gradient` as they are."""
+        gradient *= -step
+        gradient += current
+        gradient += momentum * (current - previous)
+        return gradient
+
+    def prox_tv(
+        self, noisy: Array, dual: Array | None, weight: float, sweeps: int, result: Array
+    ) -> tuple[Array, Array, Array]:
+        """Leave all arrays as they are."""
+        xp = namespace(noisy)
+        if dual is None:
+            dual = zeros((2, *noisy.shape), noisy)
+        if weight > 0:
+            for _ in range(sweeps):
+                dual = _project_to_unit_ball(
+                    dual + _forward_differences(_primal_block(noisy, dual, weight)) / (8 * weight)
+                )
+        result = _primal_block(noisy, dual, weight)
+        length = xp.sqrt(xp.sum(_forward_differences(result) ** 2, axis=0))
+        return result, xp.sum(length, axis=(0, 1), dtype=xp.float64), dual
+
+    def sum_squares(self, values: Array) -> Array:
+        """Square and add."""
+        xp = namespace(values)
+        return xp.sum(values * values, axis=0, dtype=xp.float64)
+
+    def restore_frames(self, values: Array, before: Array, rejected: Array) -> Array:
+        """Choose frame by frame, without asking the device whether there is anything to do."""
+        return namespace(values).where(rejected, before, values)
+
+
+def _primal_block(noisy: Array, dual: Array, weight: float) -> Array:
+    """Return ``max(noisy + weight * div(dual), 0)``.
+
+    The last row of the vertical and the last column of the horizontal dual are always zero (the
+    difference across the border is), and take the place of what comes before the first.
+    """
+    xp = namespace(noisy)
+    down, across = dual[0, ...], dual[1, ...]
+    divergence = down - xp.roll(down, 1, axis=0)
+    divergence += across
+    divergence -= xp.roll(across, 1, axis=1)
+    divergence *= weight
+    divergence += noisy
+    return xp.clip(divergence, min=0.0)
+
+
+def _forward_differences(picture: Array) -> Array:
+    """Return the differences to the next row and column, (2, rows, columns, frames); 0 across the
+    border.
+    """
+    xp = namespace(picture)
+    below = xp.concat([picture[1:, ...], picture[-1:, ...]], axis=0)
+    right = xp.concat([picture[:, 1:, ...], picture[:, -1:, ...]], axis=1)
+    return xp.stack([below, right]) - picture
+
+
+def _project_to_unit_ball(dual: Array) -> Array:
+    """Return `dual` projected onto vectors of length at most 1."""
+    xp = namespace(dual)
+    length = xp.sqrt(xp.sum(dual * dual, axis=0))
+    return dual / xp.clip(length, min=1.0)
+
+
+WORKING_BYTES = 1 << 31
+"""What a solver may take for the frames it works on at once, besides readings and result."""
+
+WORKING_PICTURES = 16
+"""Arrays of the frames' size that total variation, which needs most, has at once: solution, dual,
+temporaries.
+"""
+
+
+class Batches(Protocol):
+    """A batch of readings, its results, and how they are cut up.
+
+    Attributes
+    ----------
+    frames : (frames, rows, columns) array
+        The results; where nothing was written yet, anything.
+    """
+
+    frames: Array
+
+    def zero_measurements(self) -> Array:
+        """Return readings of zero, as few frames as a block may have."""
+        ...
+
+    def take_block(self, values: Array, piece: slice) -> Array:
+        """Return the columns `piece` of (readings, frames) values, perhaps with empty ones after
+        them.
+        """
+        ...
+
+    def write_block(self, block: Array, piece: slice) -> None:
+        """Put a (rows, columns, frames of the block) block where its frames belong."""
+        ...
+
+    def for_each_piece(self, work: Callable[[slice], None]) -> None:
+        """Call `work` on every piece of the batch; the first exception is raised."""
+        ...
+
+
+def make_batches(operator: LinearOperator, measurements: Array) -> Batches:
+    """Return how (readings, frames) readings are cut up for recovery with `operator`."""
+    return (
+        CompiledBatches(operator, measurements)
+        if is_numpy(measurements)
+        else PortableBatches(operator, measurements)
+    )
+
+
+def frames_per_block(operator: LinearOperator, measurements: Array) -> int:
+    """Return how many frames a block has at most."""
+    if is_numpy(measurements):
+        return LANES
+    return max(
+        1, WORKING_BYTES // (WORKING_PICTURES * prod(operator.shape_in) * operator.dtype.itemsize)
+    )
+
+
+class CompiledBatches:
+    """Blocks of exactly `LANES` frames for compiled loops, on `tofclip.threads.thread_count`
+    threads; see `Batches`.
+
+    Memory beyond the result is bounded by a few blocks a thread.
+    """
+
+    def __init__(self, operator: LinearOperator, measurements: NDArray[Any]) -> None:
+        self._measurements = measurements
+        self.frames = np.empty((measurements.shape[1], *operator.shape_in), operator.dtype)
+
+    def zero_measurements(self) -> NDArray[Any]:
+        """Return a block like all others."""
+        return self.take_block(self._measurements, slice(0, 0))
+
+    def take_block(self, values: NDArray[Any], piece: slice) -> NDArray[Any]:
+        """Copy, with zeros after the last frame; a lone frame stays alone."""
+        return pad_block(values, piece)
+
+    def write_block(self, block: NDArray[Any], piece: slice) -> None:
+        """Copy what is no filling."""
+        write_frames(block, self.frames, piece)
+
+    def for_each_piece(self, work: Callable[[slice], None]) -> None:
+        """Share the pieces between threads."""
+        run_blocks(work, len(self.frames))
+
+
+class PortableBatches:
+    """As many frames at once as `WORKING_BYTES` allow, one piece after the other; see `Batches`."""
+
+    def __init__(self, operator: LinearOperator, measurements: Array) -> None:
+        self._measurements, self._size = measurements, frames_per_block(operator, measurements)
+        self.frames = zeros((measurements.shape[1], *operator.shape_in), measurements)
+
+    def zero_measurements(self) -> Array:
+        """Return a lone frame."""
+        return zeros((self._measurements.shape[0], 1), self._measurements)
+
+    def take_block(self, values: Array, piece: slice) -> Array:
+        """Choose the columns."""
+        return values[:, piece]
+
+    def write_block(self, block: Array, piece: slice) -> None:
+        """Copy with the frames as first axis."""
+        self.frames[piece, ...] = namespace(block).moveaxis(block, -1, 0)
+
+    def for_each_piece(self, work: Callable[[slice], None]) -> None:
+        """Work on one piece after the other."""
+        for piece in split_blocks(self.frames.shape[0], self._size):
+            work(piece)
+
+
+def pad_block(values: NDArray[Any], piece: slice) -> NDArray[Any]:
+    """Copy the columns `piece` into a block of exactly `LANES` columns, zero beyond them; a lone
+    frame stays alone.
+    """
+    block = np.zeros((values.shape[0], LANES if values.shape[1] > 1 else 1), values.dtype)
+    block[:, : piece.stop - piece.start] = values[:, piece]
+    return block
+
+
+def write_frames(block: NDArray[Any], frames: NDArray[Any], piece: slice) -> None:
+    """Put a (rows, columns, lanes) block where its frames belong."""
+    from tofclip.solvers.kernels import copy_lanes_to_frames
+
+    target = frames[piece].reshape(piece.stop - piece.start, -1)
+    copy_lanes_to_frames(block.reshape(-1, block.shape[-1]), target)

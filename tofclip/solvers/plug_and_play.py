@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import require_numpy
+from tofclip.arrays import Array, require_numpy
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, estimate_squared_norm
 from tofclip.solvers.data_terms import DataTerm
 from tofclip.solvers.denoisers import CollaborativeWiener, Denoiser
-from tofclip.solvers.iteration import Progress, Result, ignore_progress
-from tofclip.solvers.iterative import NORM_ITERATIONS, ProximalMethod
-from tofclip.solvers.method import Array, Mask
+from tofclip.solvers.fista import NORM_ITERATIONS, ProximalMethod
+from tofclip.solvers.method import Mask, Progress, Result, ignore_progress
 from tofclip.threads import limit_blas_threads
 
 PEAK_QUANTILE = (

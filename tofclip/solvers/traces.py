@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import Array
 from tofclip.errors import InputError
 from tofclip.operators import SparseMatrix
 from tofclip.operators.sparse import Tiles
 from tofclip.solvers.direct import PreparedInverse
-from tofclip.solvers.method import Array
 
 PATCH_ROWS, PATCH_COLUMNS = (
     8,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofclip.solvers.proximal import Array, validate_weight
+from tofclip.arrays import Array
+from tofclip.solvers.fista import validate_weight
 
 SHIFT_COUNT = 4
 """Grid positions that are averaged over."""
