@@ -1,4 +1,6 @@
-"""The weight of a prior, chosen by how well readings are predicted that the recovery has not seen."""
+"""The weight of a prior, chosen by how well measurements are predicted that the recovery has not
+seen.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,13 @@ WEIGHT_RATIO = 10**0.375
 """Between one trial and the next."""
 
 MAX_TRIALS = 10
-"""At most so many: from the first weight this reaches three decades up or down."""
+"""Maximum number: from the first weight this reaches three decades up or down."""
 
 FOLD_COUNT = 8
-"""Parts that the readings are dealt into; each is predicted from the other seven."""
+"""Parts that the measurements are assigned to; each is predicted from the other seven."""
 
 SINGLE_FOLD_RUNS = 4096
-"""Runs of readings of which one fold alone is a fair sample: the others are not tried."""
+"""Runs of measurements of which one fold alone is a fair sample: the others are not tried."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class WeightChoice:
     trial_weights : (trials,) array
         Ascending.
     errors : (trials,) array
-        Value of the data term on the readings held out, all folds together.
+        Value of the data term on the measurements held out, all folds together.
     """
 
     weight: float
@@ -53,11 +55,11 @@ class WeightChoice:
 def choose_weight(
     method: ProximalMethod, operator: LinearOperator, measurements: Array, run: int, seed: int = 0
 ) -> WeightChoice:
-    """Choose the weight at which readings left out of the recovery are predicted best (eight-fold
-    cross-validation).
+    """Choose the weight at which measurements left out of the recovery are predicted best
+    (eight-fold cross-validation).
 
     No noise level and no true picture are needed, which is why this is taken instead of the
-    discrepancy principle or SURE: what F(d) cannot explain (surfaces out of focus) is no noise of a
+    discrepancy principle or SURE: what F(d) cannot explain (surfaces out of focus) is not noise of a
     known strength, and generalised cross-validation takes it for signal. Trials go downhill from
     the first weight until the minimum is bracketed; a parabola in the weight's logarithm refines
     it.
@@ -67,14 +69,14 @@ def choose_weight(
     method : ProximalMethod
         Its own weight does not matter.
     operator : LinearOperator
-        Pictures (rows, columns) to readings (readings,).
-    measurements : (readings,) array
+        Pictures (rows, columns) to measurements (measurements,).
+    measurements : (measurements,) array
         Of one picture.
     run : int
-        Consecutive readings that are left out together: neighbours on a detector hardly differ, so
+        Consecutive measurements that are left out together: neighbours on a detector hardly differ, so
         that single ones would be predicted by their neighbours' errors.
     seed : int
-        Of the deal.
+        Of the assignment.
     """
     require_numpy("the choice of a prior's weight", measurements)
     held = assign_folds(measurements.size, run, seed)
@@ -93,8 +95,28 @@ def choose_weight(
 
 
 def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
-    """Deal runs of consecutive readings into folds; return (readings, folds), True where a reading
-    is left out.
+    """Assign runs of consecutive measurements to folds at random; True where a measurement is left
+    out.
+
+    Parameters
+    ----------
+    count : int
+        Number of measurements.
+    run : int
+        Consecutive measurements that stay together; shortened where there would be fewer runs than
+        `FOLD_COUNT`.
+    seed : int
+        Of the assignment.
+
+    Returns
+    -------
+    (count, folds) bool array
+        One column for each fold that is tried: `FOLD_COUNT`, or 1 from `SINGLE_FOLD_RUNS` runs on.
+
+    Raises
+    ------
+    InputError
+        There is a single measurement.
     """
     if -(-count // run) < FOLD_COUNT:
         run = max(1, count // FOLD_COUNT)

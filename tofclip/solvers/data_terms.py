@@ -1,4 +1,4 @@
-"""How badly a predicted measurement fits the readings."""
+"""How badly a predicted measurement fits the measurements."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ Mask = Array | None
 
 
 class DataTerm(ABC):
-    """A smooth function of the predicted readings whose gradient has Lipschitz constant 1, frame by
-    frame.
+    """A smooth function of the predicted measurements whose gradient has Lipschitz constant 1,
+    frame by frame.
 
-    Every one has a gradient of the form ``weights * (predicted - readings)``, so that a solver of
-    quadratic problems can treat it by iteratively reweighted least squares.
+    Every one has a gradient of the form ``weights * (predicted - measurements)``, so that a solver
+    of quadratic problems can treat it by iteratively reweighted least squares.
 
     Parameters
     ----------
-    measurements : (readings, frames) array
-    valid : (readings, frames) bool array, optional
-        False where a reading is saturated or dead: it is left out.
+    measurements : (measurements, frames) array
+    valid : (measurements, frames) bool array, optional
+        False where a measurement is saturated or dead: it is left out.
     """
 
     def __init__(self, measurements: Array, valid: Mask = None) -> None:
@@ -41,14 +41,14 @@ class DataTerm(ABC):
 
     @abstractmethod
     def value(self, predicted: Array) -> Array:
-        """Return the misfit of each frame, (frames,) float64, for `predicted` of shape (readings,
-        frames).
+        """Return the misfit of each frame, (frames,) float64, for `predicted` of shape
+        (measurements, frames).
         """
 
     @abstractmethod
     def weights(self, predicted: Array) -> Array:
-        """Return between 0 and 1 what each reading's residual counts at `predicted`, (readings,
-        frames).
+        """Return between 0 and 1 what each measurement's residual counts at `predicted`,
+        (measurements, frames).
         """
 
     def gradient(self, predicted: Array) -> Array:
@@ -63,12 +63,12 @@ class DataTermMaker(Protocol):
     """Makes the data term of a block of frames."""
 
     def __call__(self, measurements: Array, valid: Mask = None) -> DataTerm:
-        """Return the term for `measurements` (readings, frames), those not `valid` left out."""
+        """Return the term for `measurements` (measurements, frames), those not `valid` left out."""
         ...
 
 
 class LeastSquares(DataTerm):
-    """``1/2 |W (predicted - readings)|^2`` for each frame, W = 0 or 1: right for even, Gaussian
+    """``1/2 |W (predicted - measurements)|^2`` for each frame, W = 0 or 1: right for even, Gaussian
     errors.
     """
 
@@ -87,16 +87,17 @@ class LeastSquares(DataTerm):
 
 
 class Huber(DataTerm):
-    """Squares up to a threshold and straight lines beyond: a few wildly wrong readings do no harm.
+    """Squares up to a threshold and straight lines beyond: a few wildly wrong measurements do no
+    harm.
 
     P. J. Huber, Ann. Math. Stat. 35, 73 (1964).
 
     Parameters
     ----------
-    measurements : (readings, frames) array
-    valid : (readings, frames) bool array, optional
+    measurements : (measurements, frames) array
+    valid : (measurements, frames) bool array, optional
     threshold : float
-        In the unit of the readings; one to three times `estimate_robust_deviation` is usual.
+        In the unit of the measurements; one to three times `estimate_robust_deviation` is usual.
     """
 
     def __init__(self, measurements: Array, valid: Mask = None, *, threshold: float) -> None:
@@ -118,20 +119,20 @@ class Huber(DataTerm):
 
 
 class Poisson(DataTerm):
-    """The negative log-likelihood of photon counts, each residual in units of its own reading's
+    """The negative log-likelihood of photon counts, each residual in units of its own measurement's
     noise.
 
     Predicted and counted are both divided by a `deviation` of at least ``sqrt(count + 1)``
-    beforehand (weigh the operator's rows alike), so that no reading's curvature at its own count is
-    above 1. Below half the deviation's square the logarithm is continued by its parabola, whose
-    gradient stays Lipschitz; the whole is divided by the largest curvature.
+    beforehand (weigh the operator's rows alike), so that no measurement's curvature at its own
+    count is above 1. Below half the deviation's square the logarithm is continued by its parabola,
+    whose gradient stays Lipschitz; the whole is divided by the largest curvature.
 
     Parameters
     ----------
-    measurements : (readings, frames) array
+    measurements : (measurements, frames) array
         Counts over `deviation`.
-    valid : (readings, frames) bool array, optional
-    deviation : (readings,) array
+    valid : (measurements, frames) bool array, optional
+    deviation : (measurements,) array
     """
 
     CURVATURE = 4.0  # at the knee, where it is largest

@@ -42,13 +42,13 @@ class LinearInverse:
     def prepare(
         self, operator: LinearOperator, alive: NDArray[np.bool_] | None = None
     ) -> PreparedInverse:
-        """Invert the Gram matrix of the living readings.
+        """Invert the Gram matrix of the living measurements.
 
         Parameters
         ----------
         operator : SparseMatrix
-        alive : (readings,) bool array, optional
-            False for readings that are never to be trusted.
+        alive : (measurements,) bool array, optional
+            False for measurements that are never to be trusted.
         """
         import scipy.linalg
 
@@ -81,8 +81,30 @@ class LinearInverse:
     ) -> Result:
         """Recover one picture per column of `measurements`; see `Method`.
 
-        Readings that are bad in every frame are left out; a linear map cannot leave out a reading
-        of one frame only.
+        Measurements that are bad in every frame are left out; a linear map cannot leave out a
+        measurement of one frame only.
+
+        Parameters
+        ----------
+        operator : LinearOperator
+            Pictures (rows, columns) to measurements (measurements,).
+        measurements : (measurements, frames) array
+        valid : (measurements, frames) bool array, optional
+            False where a measurement must not be used.
+        progress : callable
+            Called with the number of frames just recovered.
+
+        Returns
+        -------
+        Result
+            Frames (frames, rows, columns), without iterations.
+
+        Raises
+        ------
+        ShapeError
+            `measurements` or `valid` do not fit the operator.
+        InputError
+            A measurement is NaN or infinite.
         """
         measurements = validate_measurements(operator, measurements, valid)
         started = time.perf_counter()
@@ -104,8 +126,8 @@ class PreparedInverse:
     Parameters
     ----------
     operator : LinearOperator
-    inverse_gram : (readings, readings) array
-        ``(A A' + mu I)^-1``, zero in the rows and columns of dead readings.
+    inverse_gram : (measurements, measurements) array
+        ``(A A' + mu I)^-1``, zero in the rows and columns of dead measurements.
     """
 
     operator: LinearOperator
@@ -120,7 +142,7 @@ class PreparedInverse:
 
         Parameters
         ----------
-        measurements : (readings, frames) array
+        measurements : (measurements, frames) array
         progress : callable
             Called with the number of frames just done.
         """
@@ -141,7 +163,7 @@ class PreparedInverse:
         return Result(frames)
 
     def _recover_on_device(self, measurements: Array, progress: Progress) -> Result:
-        """Recover as many frames at once as memory allows, where the readings are."""
+        """Recover as many frames at once as memory allows, where the measurements are."""
         batches = PortableBatches(self.operator, measurements)
 
         def project(piece: slice) -> None:
@@ -153,14 +175,14 @@ class PreparedInverse:
         return Result(batches.frames)
 
     def weights(self, measurements: NDArray[Any]) -> NDArray[Any]:
-        """Return ``(A A' + mu I)^-1 f``, (blocks, readings, LANES): the adjoint of each block is
-        `LANES` pictures.
+        """Return ``(A A' + mu I)^-1 f``, (blocks, measurements, LANES): the adjoint of each block
+        is `LANES` pictures.
 
         Frames beyond the last one are zero.
 
         Parameters
         ----------
-        measurements : (readings, frames) array, finite
+        measurements : (measurements, frames) array, finite
         """
         frames = measurements.shape[1]
         weights = np.zeros(
@@ -198,8 +220,30 @@ class Backprojection:
         valid: Mask = None,
         progress: Progress = ignore_progress,
     ) -> Result:
-        """Recover one picture per column of `measurements`; see `Method`. Bad readings count as
+        """Recover one picture per column of `measurements`; see `Method`. Bad measurements count as
         zero.
+
+        Parameters
+        ----------
+        operator : LinearOperator
+            Pictures (rows, columns) to measurements (measurements,).
+        measurements : (measurements, frames) array
+        valid : (measurements, frames) bool array, optional
+            Measurements that are False count as zero.
+        progress : callable
+            Called with the number of frames just recovered.
+
+        Returns
+        -------
+        Result
+            Frames (frames, rows, columns), without iterations.
+
+        Raises
+        ------
+        ShapeError
+            `measurements` or `valid` do not fit the operator.
+        InputError
+            A measurement is NaN or infinite.
         """
         measurements = validate_measurements(operator, measurements, valid)
         if valid is not None:

@@ -44,6 +44,22 @@ class Regulariser(Protocol):
         ``z = current + momentum * (current - previous)`` is the extrapolated point and `gradient`
         belongs to it. `previous` and `gradient` may be overwritten; the result may lie in their
         memory.
+
+        Parameters
+        ----------
+        current, previous : (rows, columns, lanes) array
+            The last two solutions.
+        momentum : (lanes,) array
+        gradient : (rows, columns, lanes) array
+            Of the data term at z.
+        step : float
+            Step size.
+
+        Returns
+        -------
+        picture : (rows, columns, lanes) array
+        penalty : (lanes,) float64 array
+            R of the picture.
         """
         ...
 
@@ -63,6 +79,24 @@ class NonnegativeSparsity:
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
     ) -> tuple[Array, Array]:
+        """Shift by ``step * weight`` and clip at zero; see `Regulariser`.
+
+        Parameters
+        ----------
+        current, previous : (rows, columns, lanes) array
+            The last two solutions; `previous` may be overwritten.
+        momentum : (lanes,) array
+        gradient : (rows, columns, lanes) array
+            May be overwritten.
+        step : float
+            Step size.
+
+        Returns
+        -------
+        picture : (rows, columns, lanes) array
+        penalty : (lanes,) float64 array
+            Weight times the picture's sum.
+        """
         loops = select_loops(current)
         picture, total = loops.prox_l1(
             current, previous, momentum, gradient, step, step * self.weight
@@ -96,6 +130,25 @@ class NonnegativeTotalVariation:
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
     ) -> tuple[Array, Array]:
+        """Sweep the dual `sweeps` times and return the picture that belongs to it; see
+        `Regulariser`.
+
+        Parameters
+        ----------
+        current, previous : (rows, columns, lanes) array
+            The last two solutions; `previous` may be overwritten.
+        momentum : (lanes,) array
+        gradient : (rows, columns, lanes) array
+            May be overwritten.
+        step : float
+            Step size.
+
+        Returns
+        -------
+        picture : (rows, columns, lanes) array
+        penalty : (lanes,) float64 array
+            Weight times total variation.
+        """
         loops = select_loops(current)
         noisy = loops.gradient_step(current, previous, momentum, gradient, step)
         picture, total, self._dual = loops.prox_tv(
@@ -118,7 +171,7 @@ class Fista:
     objective is refused and that frame's momentum starts anew (B. O'Donoghue, E. Candes, Found.
     Comput. Math. 15, 715 (2015)). ``A z`` at the extrapolated point is had from the last two ``A
     h`` by linearity, so a step costs one product each way. Everything stays where the data term's
-    readings are, and no step waits for a device.
+    measurements are, and no step waits for a device.
 
     Parameters
     ----------
@@ -197,9 +250,9 @@ class ProximalMethod(ABC):
     ----------
     weight : float
         Regularisation relative to the largest value of ``A'f`` over all frames. At 1 the sparsest
-        solution, zero, is reached; the scale of the readings does not matter.
+        solution, zero, is reached; the scale of the measurements does not matter.
     iterations : int
-        At most so many for each frame.
+        Maximum number for each frame.
     tolerance : float
         Relative change of a block's objective below which it is done; 0: never. What a block is
         depends on the arrays (`tofclip.solvers.loops`), and with it when its frames are done.
@@ -229,7 +282,31 @@ class ProximalMethod(ABC):
         valid: Mask = None,
         progress: Progress = ignore_progress,
     ) -> Result:
-        """Recover one picture per column of `measurements`; see `Method`."""
+        """Recover one picture per column of `measurements`; see `Method`.
+
+        Parameters
+        ----------
+        operator : LinearOperator
+            Pictures (rows, columns) to measurements (measurements,).
+        measurements : (measurements, frames) array
+        valid : (measurements, frames) bool array, optional
+            Measurements that are False are left out.
+        progress : callable
+            Called with the number of frame iterations just done.
+
+        Returns
+        -------
+        Result
+            Frames (frames, rows, columns) and the history of the objective.
+
+        Raises
+        ------
+        ShapeError
+            `measurements` or `valid` do not fit the operator.
+        InputError
+            A measurement is NaN or infinite, or the arrays are not NumPy's and the prior is not
+            portable.
+        """
         if not self.portable:
             require_numpy(f"recovery with the prior {type(self).__name__}", measurements)
         # Blocks share the cores already, and a lone picture's products are too small to share.
@@ -268,7 +345,7 @@ class ProximalMethod(ABC):
         """Take one step on a dark block and write it, so that compiled loops are there before the
         first thread comes.
 
-        The operator's matrix is brought to where the readings are, for the same reason.
+        The operator's matrix is brought to where the measurements are, for the same reason.
         """
         solver = Fista(
             operator, LeastSquares(dark), self._make_regulariser(1.0), step, dark.shape[1]

@@ -32,6 +32,18 @@ def shrink_nonnegative(current, previous, momentum, gradient, step, threshold, t
 
     Pictures are (rows, columns, lanes), `momentum` is (lanes,); `total` (lanes,) float64 gets the
     sum of the result.
+
+    Parameters
+    ----------
+    current : (rows, columns, lanes) array
+    previous : (rows, columns, lanes) array
+        Overwritten with the result.
+    momentum : (lanes,) array
+    gradient : (rows, columns, lanes) array
+    step, threshold : scalar of the arrays' dtype
+        Step size, and step size times weight.
+    total : (lanes,) float64 array
+        Overwritten with each lane's sum.
     """
     lanes = current.shape[2]
     partial = np.empty(lanes, current.dtype)
@@ -50,7 +62,16 @@ def shrink_nonnegative(current, previous, momentum, gradient, step, threshold, t
 
 @fast_njit
 def take_gradient_step(current, previous, momentum, gradient, step):
-    """``gradient = z - step * gradient`` with ``z = current + momentum * (current - previous)``."""
+    """``gradient = z - step * gradient`` with ``z = current + momentum * (current - previous)``.
+
+    Parameters
+    ----------
+    current, previous : (rows, columns, lanes) array
+    momentum : (lanes,) array
+    gradient : (rows, columns, lanes) array
+        Overwritten.
+    step : scalar of the arrays' dtype
+    """
     lanes = current.shape[2]
     for row in range(current.shape[0]):
         for column in range(current.shape[1]):
@@ -67,6 +88,12 @@ def copy_lanes_to_frames(block, frames):
 
     Tile by tile, so that both sides move whole cache lines: several times faster than a strided
     copy.
+
+    Parameters
+    ----------
+    block : (pixels, lanes) array
+    frames : (frames, pixels) array
+        Overwritten; not more frames than lanes.
     """
     pixels = block.shape[0]
     for first in range(0, pixels, TILE_PIXELS):
@@ -141,6 +168,14 @@ def update_peaks(tile_starts, columns, values, scales, block, highest):
 def restore_frames(candidate, current, rejected):
     """``candidate = current`` in the lanes where `rejected` is 1; it is 0 elsewhere. Arrays are
     (..., lanes).
+
+    Parameters
+    ----------
+    candidate : (rows, columns, lanes) array
+        Overwritten in rejected lanes.
+    current : (rows, columns, lanes) array
+    rejected : (lanes,) array of the pictures' dtype
+        1 or 0.
     """
     lanes = candidate.shape[2]
     for row in range(current.shape[0]):
@@ -207,7 +242,19 @@ def sweep_total_variation_dual(noisy, dual, weight, sweeps, result):
 
     The primal row below is made before a dual row changes, so that a sweep passes through memory
     once.
+
+    Parameters
+    ----------
+    noisy : (rows, columns, lanes) array
+    dual : (2, rows, columns, lanes) array
+        Vertical and horizontal; updated in place.
+    weight : scalar of the arrays' dtype
+        Above zero.
+    sweeps : int
+    result : (rows, columns, lanes) array
+        Overwritten; room for the primal picture.
     """
+    # a constant number of lanes lets the compiler unroll the innermost loop
     if noisy.shape[2] == LANES:
         _dual_sweeps(noisy, dual, weight, sweeps, result, LANES)
     else:
@@ -239,6 +286,16 @@ def _primal_block(noisy, dual, weight, result, total, lanes):
 def compute_total_variation_primal(noisy, dual, weight, result, total):
     """Make the picture that belongs to `dual`; `total` (lanes,) float64 gets its isotropic total
     variation.
+
+    Parameters
+    ----------
+    noisy : (rows, columns, lanes) array
+    dual : (2, rows, columns, lanes) array
+    weight : scalar of the arrays' dtype
+    result : (rows, columns, lanes) array
+        Overwritten with ``max(noisy + weight * div(dual), 0)``.
+    total : (lanes,) float64 array
+        Overwritten.
     """
     if noisy.shape[2] == LANES:
         _primal_block(noisy, dual, weight, result, total, LANES)
@@ -253,6 +310,17 @@ def compute_light_field_primal(noisy, dual, weight, angular, result):
 
     The last difference along every axis crosses the border and is always zero, so only the first
     needs care.
+
+    Parameters
+    ----------
+    noisy : (v, u, rows, columns, lanes) array
+    dual : (4, v, u, rows, columns, lanes) array
+        Along rows, columns, v and u.
+    weight : scalar of the arrays' dtype
+    angular : scalar of the arrays' dtype
+        How many times the differences between views count.
+    result : (v, u, rows, columns, lanes) array
+        Overwritten.
     """
     down, across, rows, columns, lanes = noisy.shape
     for v in range(down):
@@ -295,7 +363,17 @@ def _forward_differences(field, v, u, row, column, lane, angular):
 
 @fast_njit
 def update_light_field_dual(field, dual, step, angular):
-    """``dual = project(dual + step * grad(field))`` onto vectors of length at most 1."""
+    """``dual = project(dual + step * grad(field))`` onto vectors of length at most 1.
+
+    Parameters
+    ----------
+    field : (v, u, rows, columns, lanes) array
+    dual : (4, v, u, rows, columns, lanes) array
+        Updated in place.
+    step : scalar of the arrays' dtype
+    angular : scalar of the arrays' dtype
+        How many times the differences between views count.
+    """
     down, across, rows, columns, lanes = field.shape
     for v in range(down):
         for u in range(across):
@@ -316,7 +394,16 @@ def update_light_field_dual(field, dual, step, angular):
 
 @fast_njit
 def sum_light_field_variation(field, angular, total):
-    """Add the isotropic variation of each lane to `total` (lanes,), float64."""
+    """Add the isotropic variation of each lane to `total` (lanes,), float64.
+
+    Parameters
+    ----------
+    field : (v, u, rows, columns, lanes) array
+    angular : scalar of the arrays' dtype
+        How many times the differences between views count.
+    total : (lanes,) float64 array
+        Added to, in place.
+    """
     down, across, rows, columns, lanes = field.shape
     for v in range(down):
         for u in range(across):

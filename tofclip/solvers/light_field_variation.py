@@ -38,6 +38,29 @@ class NonnegativeLightFieldVariation:
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
     ) -> tuple[Array, Array]:
+        """Take a proximal gradient step on a block of light fields; see `Regulariser`.
+
+        Parameters
+        ----------
+        current, previous : (views, rows, columns, lanes) array
+            The last two solutions; `previous` is overwritten with the result.
+        momentum : (lanes,) array
+        gradient : (views, rows, columns, lanes) array
+            Overwritten.
+        step : float
+            Step size.
+
+        Returns
+        -------
+        picture : (views, rows, columns, lanes) array
+        penalty : (lanes,) float64 array
+            Weight times total variation.
+
+        Raises
+        ------
+        ShapeError
+            The number of views is not that of the grid.
+        """
         from tofclip.solvers import kernels
 
         views, rows, columns, lanes = current.shape
@@ -56,7 +79,12 @@ class NonnegativeLightFieldVariation:
         if weight > 0:
             kernels.compute_light_field_primal(noisy, self._dual, weight, angular, result)
             kernels.update_light_field_dual(
-                result, self._dual, 1 / (8 * weight * (1 + angular * angular)), angular
+                # 8 bounds the squared norm of the four-fold gradient for angular = 0 (Chambolle
+                # 2004); angular differences add at most 8 angular^2
+                result,
+                self._dual,
+                1 / (8 * weight * (1 + angular * angular)),
+                angular,
             )
         total = np.zeros(lanes)
         kernels.compute_light_field_primal(noisy, self._dual, weight, angular, result)

@@ -24,7 +24,7 @@ from tofclip.threads import LANES, run_blocks, split_blocks
 
 
 class Loops(Protocol):
-    """What a solver does to every pixel or reading of a block of frames.
+    """What a solver does to every pixel or measurement of a block of frames.
 
     Nothing waits for a device: what is returned may still be on its way.
     """
@@ -41,13 +41,46 @@ class Loops(Protocol):
         """Return ``max(z - step * gradient - threshold, 0)`` and its sum for each frame, float64.
 
         ``z = current + momentum * (current - previous)``. `previous` may be overwritten.
+
+        Parameters
+        ----------
+        current, previous : (..., columns, frames) array
+            The last two solutions.
+        momentum : (frames,) array
+            Weight of the extrapolation, 0 after a restart.
+        gradient : (..., columns, frames) array
+            Of the data term at z; may be overwritten.
+        step : float
+            Step size.
+        threshold : float
+            Step size times the prior's weight, in the unit of the solution.
+
+        Returns
+        -------
+        result : (..., columns, frames) array
+        total : (frames,) float64 array
         """
         ...
 
     def gradient_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
     ) -> Array:
-        """Return ``z - step * gradient``, z as in `prox_l1`; `gradient` may be overwritten."""
+        """Return ``z - step * gradient``, z as in `prox_l1`; `gradient` may be overwritten.
+
+        Parameters
+        ----------
+        current, previous : (..., columns, frames) array
+            The last two solutions.
+        momentum : (frames,) array
+        gradient : (..., columns, frames) array
+            Of the data term at z.
+        step : float
+            Step size.
+
+        Returns
+        -------
+        (..., columns, frames) array
+        """
         ...
 
     def prox_tv(
@@ -60,11 +93,30 @@ class Loops(Protocol):
         Chambolle, J. Math. Imaging Vis. 20, 89 (2004)), from `dual` on, (2, rows, columns, frames),
         or from zero. Frames are (rows, columns, frames); `dual` and `result`, which is like them,
         may be overwritten.
+
+        Parameters
+        ----------
+        noisy : (rows, columns, frames) array
+        dual : (2, rows, columns, frames) array, optional
+            Where the sweeps start; None is zero.
+        weight : float
+            Of the total variation, in the unit of the pictures.
+        sweeps : int
+            Projected-gradient sweeps.
+        result : (rows, columns, frames) array
+            Memory for the result.
+
+        Returns
+        -------
+        result : (rows, columns, frames) array
+        total : (frames,) float64 array
+            Isotropic total variation.
+        dual : (2, rows, columns, frames) array
         """
         ...
 
     def sum_squares(self, values: Array) -> Array:
-        """Return the sum of squares of each frame of (readings, frames) values, float64."""
+        """Return the sum of squares of each frame of (measurements, frames) values, float64."""
         ...
 
     def restore_frames(self, values: Array, before: Array, rejected: Array) -> Array:
@@ -72,6 +124,16 @@ class Loops(Protocol):
         `before`.
 
         `values` may be overwritten.
+
+        Parameters
+        ----------
+        values : (..., frames) array
+        before : (..., frames) array
+        rejected : (frames,) bool array
+
+        Returns
+        -------
+        (..., frames) array
         """
         ...
 
@@ -111,7 +173,26 @@ class CompiledLoops:
         step: float,
         threshold: float,
     ) -> tuple[Array, Sums]:
-        """Overwrite and return `previous`."""
+        """Overwrite and return `previous`.
+
+        Parameters
+        ----------
+        current, previous : (..., columns, frames) array
+            The last two solutions; `previous` is overwritten with the result.
+        momentum : (frames,) array
+        gradient : (..., columns, frames) array
+            Of the data term at the extrapolated point.
+        step : float
+            Step size.
+        threshold : float
+            Step size times the prior's weight.
+
+        Returns
+        -------
+        previous : (..., columns, frames) array
+        total : (frames,) float64 array
+            Sum of each frame's result.
+        """
         number, total = current.dtype.type, np.empty(current.shape[-1])
         # Every pixel is on its own: a block of volumes is one of tall pictures.
         now, before, slope = (_flatten_rows(array) for array in (current, previous, gradient))
@@ -123,7 +204,22 @@ class CompiledLoops:
     def gradient_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
     ) -> Array:
-        """Overwrite and return `gradient`."""
+        """Overwrite and return `gradient`.
+
+        Parameters
+        ----------
+        current, previous : (..., columns, frames) array
+            The last two solutions.
+        momentum : (frames,) array
+        gradient : (..., columns, frames) array
+            Overwritten with the result.
+        step : float
+
+        Returns
+        -------
+        (..., columns, frames) array
+            `gradient`.
+        """
         now, before, slope = (_flatten_rows(array) for array in (current, previous, gradient))
         self._kernels.take_gradient_step(now, before, momentum, slope, current.dtype.type(step))
         return gradient
@@ -131,7 +227,27 @@ class CompiledLoops:
     def prox_tv(
         self, noisy: Array, dual: Array | None, weight: float, sweeps: int, result: Array
     ) -> tuple[Array, Sums, Array]:
-        """Overwrite and return `result` and `dual`."""
+        """Overwrite and return `result` and `dual`.
+
+        Parameters
+        ----------
+        noisy : (rows, columns, frames) array
+        dual : (2, rows, columns, frames) array, optional
+            Overwritten; None starts from zero.
+        weight : float
+            Of the total variation; 0 only clips at zero.
+        sweeps : int
+            Projected-gradient sweeps on the dual.
+        result : (rows, columns, frames) array
+            Overwritten.
+
+        Returns
+        -------
+        result : (rows, columns, frames) array
+        total : (frames,) float64 array
+            Isotropic total variation of each frame.
+        dual : (2, rows, columns, frames) array
+        """
         if dual is None:
             dual = np.zeros((2, *noisy.shape), noisy.dtype)
         weight, total = noisy.dtype.type(weight), np.empty(noisy.shape[-1])
@@ -146,7 +262,20 @@ class CompiledLoops:
         return total
 
     def restore_frames(self, values: Array, before: Array, rejected: NDArray[np.bool_]) -> Array:
-        """Overwrite and return `values`; most often there is nothing to do."""
+        """Overwrite and return `values`; most often there is nothing to do.
+
+        Parameters
+        ----------
+        values : (..., columns, frames) array
+            Overwritten in the rejected frames.
+        before : (..., columns, frames) array
+        rejected : (frames,) bool array
+
+        Returns
+        -------
+        (..., columns, frames) array
+            `values`.
+        """
         if rejected.any():
             self._kernels.restore_frames(
                 _flatten_rows(values), _flatten_rows(before), rejected.astype(values.dtype)
@@ -173,7 +302,24 @@ class PortableLoops:
         step: float,
         threshold: float,
     ) -> tuple[Array, Array]:
-        """Leave all arrays but `gradient` as they are."""
+        """Leave all arrays but `gradient` as they are.
+
+        Parameters
+        ----------
+        current, previous : (..., columns, frames) array
+            The last two solutions.
+        momentum : (frames,) array
+        gradient : (..., columns, frames) array
+            Overwritten.
+        step : float
+        threshold : float
+            Step size times the prior's weight.
+
+        Returns
+        -------
+        result : (..., columns, frames) array
+        total : (frames,) float64 array
+        """
         xp = namespace(current)
         noisy = self.gradient_step(current, previous, momentum, gradient, step)
         noisy -= threshold
@@ -184,7 +330,22 @@ class PortableLoops:
     def gradient_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
     ) -> Array:
-        """Leave all arrays but `gradient` as they are."""
+        """Leave all arrays but `gradient` as they are.
+
+        Parameters
+        ----------
+        current, previous : (..., columns, frames) array
+            The last two solutions.
+        momentum : (frames,) array
+        gradient : (..., columns, frames) array
+            Overwritten with the result.
+        step : float
+
+        Returns
+        -------
+        (..., columns, frames) array
+            `gradient`.
+        """
         gradient *= -step
         gradient += current
         gradient += momentum * (current - previous)
@@ -193,12 +354,29 @@ class PortableLoops:
     def prox_tv(
         self, noisy: Array, dual: Array | None, weight: float, sweeps: int, result: Array
     ) -> tuple[Array, Array, Array]:
-        """Leave all arrays as they are."""
+        """Leave all arrays as they are.
+
+        Parameters
+        ----------
+        noisy : (rows, columns, frames) array
+        dual : (2, rows, columns, frames) array, optional
+        weight : float
+        sweeps : int
+        result : (rows, columns, frames) array
+            Not used: array libraries make their own memory.
+
+        Returns
+        -------
+        result : (rows, columns, frames) array
+        total : (frames,) float64 array
+        dual : (2, rows, columns, frames) array
+        """
         xp = namespace(noisy)
         if dual is None:
             dual = zeros((2, *noisy.shape), noisy)
         if weight > 0:
             for _ in range(sweeps):
+                # step 1 / 8: the squared norm of the gradient is at most 8 (Chambolle 2004)
                 dual = _project_to_unit_ball(
                     dual + _forward_differences(_primal_block(noisy, dual, weight)) / (8 * weight)
                 )
@@ -212,7 +390,18 @@ class PortableLoops:
         return xp.sum(values * values, axis=0, dtype=xp.float64)
 
     def restore_frames(self, values: Array, before: Array, rejected: Array) -> Array:
-        """Choose frame by frame, without asking the device whether there is anything to do."""
+        """Choose frame by frame, without asking the device whether there is anything to do.
+
+        Parameters
+        ----------
+        values : (..., frames) array
+        before : (..., frames) array
+        rejected : (frames,) bool array
+
+        Returns
+        -------
+        (..., frames) array
+        """
         return namespace(values).where(rejected, before, values)
 
 
@@ -250,7 +439,7 @@ def _project_to_unit_ball(dual: Array) -> Array:
 
 
 WORKING_BYTES = 1 << 31
-"""What a solver may take for the frames it works on at once, besides readings and result."""
+"""What a solver may take for the frames it works on at once, besides measurements and result."""
 
 WORKING_PICTURES = 16
 """Arrays of the frames' size that total variation, which needs most, has at once: solution, dual,
@@ -259,7 +448,7 @@ temporaries.
 
 
 class Batches(Protocol):
-    """A batch of readings, its results, and how they are cut up.
+    """A batch of measurements, its results, and how they are cut up.
 
     Attributes
     ----------
@@ -270,17 +459,37 @@ class Batches(Protocol):
     frames: Array
 
     def zero_measurements(self) -> Array:
-        """Return readings of zero, as few frames as a block may have."""
+        """Return measurements of zero, as few frames as a block may have."""
         ...
 
     def take_block(self, values: Array, piece: slice) -> Array:
-        """Return the columns `piece` of (readings, frames) values, perhaps with empty ones after
-        them.
+        """Return the columns `piece` of (measurements, frames) values, perhaps with empty ones
+        after them.
+
+        Parameters
+        ----------
+        values : (measurements, frames) array
+            Of the whole batch, or the mask that belongs to it.
+        piece : slice
+            Frames of the block.
+
+        Returns
+        -------
+        (measurements, frames of the block) array
+            May have more columns than the piece, zeros after the last frame.
         """
         ...
 
     def write_block(self, block: Array, piece: slice) -> None:
-        """Put a (rows, columns, frames of the block) block where its frames belong."""
+        """Put a (rows, columns, frames of the block) block where its frames belong.
+
+        Parameters
+        ----------
+        block : (rows, columns, frames of the block) array
+            Columns beyond the piece are left out.
+        piece : slice
+            Frames of `frames` that are overwritten.
+        """
         ...
 
     def for_each_piece(self, work: Callable[[slice], None]) -> None:
@@ -289,7 +498,21 @@ class Batches(Protocol):
 
 
 def make_batches(operator: LinearOperator, measurements: Array) -> Batches:
-    """Return how (readings, frames) readings are cut up for recovery with `operator`."""
+    """Return how the columns of (measurements, frames) values are cut up for recovery with
+    `operator`.
+
+    Parameters
+    ----------
+    operator : LinearOperator
+        Pictures (rows, columns) to measurements (measurements,); gives the shape and dtype of the
+        results.
+    measurements : (measurements, frames) array
+        Their library decides: compiled loops for NumPy, whole batches for others.
+
+    Returns
+    -------
+    Batches
+    """
     return (
         CompiledBatches(operator, measurements)
         if is_numpy(measurements)
@@ -298,7 +521,20 @@ def make_batches(operator: LinearOperator, measurements: Array) -> Batches:
 
 
 def frames_per_block(operator: LinearOperator, measurements: Array) -> int:
-    """Return how many frames a block has at most."""
+    """Return how many frames a block has at most.
+
+    Parameters
+    ----------
+    operator : LinearOperator
+        Its ``shape_in`` and dtype give the memory of one frame.
+    measurements : (measurements, frames) array
+        Only their library counts.
+
+    Returns
+    -------
+    int
+        `LANES` for NumPy arrays; for others as many frames as `WORKING_BYTES` hold, at least one.
+    """
     if is_numpy(measurements):
         return LANES
     return max(
@@ -322,11 +558,29 @@ class CompiledBatches:
         return self.take_block(self._measurements, slice(0, 0))
 
     def take_block(self, values: NDArray[Any], piece: slice) -> NDArray[Any]:
-        """Copy, with zeros after the last frame; a lone frame stays alone."""
+        """Copy, with zeros after the last frame; a lone frame stays alone.
+
+        Parameters
+        ----------
+        values : (measurements, frames) array
+        piece : slice
+            At most `LANES` frames.
+
+        Returns
+        -------
+        (measurements, LANES) array
+            A copy; (measurements, 1) where the batch has a single frame.
+        """
         return pad_block(values, piece)
 
     def write_block(self, block: NDArray[Any], piece: slice) -> None:
-        """Copy what is no filling."""
+        """Copy the block's frames without the zeros that fill it up.
+
+        Parameters
+        ----------
+        block : (rows, columns, LANES) array
+        piece : slice
+        """
         write_frames(block, self.frames, piece)
 
     def for_each_piece(self, work: Callable[[slice], None]) -> None:
@@ -346,11 +600,28 @@ class PortableBatches:
         return zeros((self._measurements.shape[0], 1), self._measurements)
 
     def take_block(self, values: Array, piece: slice) -> Array:
-        """Choose the columns."""
+        """Choose the columns.
+
+        Parameters
+        ----------
+        values : (measurements, frames) array
+        piece : slice
+
+        Returns
+        -------
+        (measurements, frames of the piece) array
+            A view.
+        """
         return values[:, piece]
 
     def write_block(self, block: Array, piece: slice) -> None:
-        """Copy with the frames as first axis."""
+        """Copy with the frames as first axis.
+
+        Parameters
+        ----------
+        block : (rows, columns, frames of the piece) array
+        piece : slice
+        """
         self.frames[piece, ...] = namespace(block).moveaxis(block, -1, 0)
 
     def for_each_piece(self, work: Callable[[slice], None]) -> None:
@@ -362,14 +633,37 @@ class PortableBatches:
 def pad_block(values: NDArray[Any], piece: slice) -> NDArray[Any]:
     """Copy the columns `piece` into a block of exactly `LANES` columns, zero beyond them; a lone
     frame stays alone.
+
+    Parameters
+    ----------
+    values : (measurements, frames) array
+    piece : slice
+        At most `LANES` frames.
+
+    Returns
+    -------
+    (measurements, LANES) array
+        Of the same dtype; (measurements, 1) where there is a single frame.
     """
+    # always the same width: the compiled loops unroll it, and results do not depend on how many
+    # frames share a block
     block = np.zeros((values.shape[0], LANES if values.shape[1] > 1 else 1), values.dtype)
     block[:, : piece.stop - piece.start] = values[:, piece]
     return block
 
 
 def write_frames(block: NDArray[Any], frames: NDArray[Any], piece: slice) -> None:
-    """Put a (rows, columns, lanes) block where its frames belong."""
+    """Put a (rows, columns, lanes) block where its frames belong.
+
+    Parameters
+    ----------
+    block : (rows, columns, lanes) array
+        Contiguous.
+    frames : (frames, rows, columns) array
+        Overwritten in `piece`.
+    piece : slice
+        Lanes beyond it are left out.
+    """
     from tofclip.solvers.kernels import copy_lanes_to_frames
 
     target = frames[piece].reshape(piece.stop - piece.start, -1)

@@ -38,7 +38,7 @@ class StoppingRule:
     Parameters
     ----------
     iterations : int
-        At most so many.
+        Maximum number.
     tolerance : float
         Stop as soon as the block's objective changes by less than this fraction in an iteration in
         which no frame's step was refused. 0 runs all iterations.
@@ -93,6 +93,22 @@ def iterate(
 
     A device is waited for once in an iteration if there is a tolerance, and not at all if there is
     none.
+
+    Parameters
+    ----------
+    solver : IterativeSolver
+        Advanced in place.
+    stopping : StoppingRule
+        Maximum number of iterations and the tolerance.
+    progress : callable
+        Called with the number of frame iterations just done; those that are saved are reported too.
+    frames : int
+        Number of frames that an iteration counts for.
+
+    Returns
+    -------
+    IterationHistory
+        Objective of the whole block before the first iteration and after each.
     """
     xp = namespace(solver.objective)
     objective = [xp.sum(solver.objective)]
@@ -101,6 +117,7 @@ def iterate(
         solver.step()
         objective.append(xp.sum(solver.objective))
         if stopping.tolerance > 0:
+            # a refused step changes nothing, which does not mean that the block has converged
             little = objective[-2] - objective[-1] < stopping.tolerance * objective[-1]
             converged = bool(little & ~xp.any(solver.rejected))
         if converged:
@@ -117,7 +134,7 @@ class Result:
     Parameters
     ----------
     frames : (frames, rows, columns) array
-        Where the readings were.
+        Where the measurements were.
     iterations : int
         Of the block that took most; 0 for direct methods.
     objective : (iterations + 1,) array
@@ -127,7 +144,7 @@ class Result:
         ``"converged"``, ``"iteration limit"`` or ``"direct method"``.
     setup_seconds : float
         Time spent on what depends on the operator only and on loading compiled loops, not on the
-        readings.
+        measurements.
     """
 
     frames: Array
@@ -140,7 +157,22 @@ class Result:
     def from_blocks(
         cls, frames: Array, histories: list[IterationHistory], setup_seconds: float = 0.0
     ) -> Result:
-        """Join the histories of all blocks."""
+        """Join the histories of all blocks.
+
+        Parameters
+        ----------
+        frames : (frames, rows, columns) array
+            Results of all blocks.
+        histories : list of IterationHistory
+            One for each block.
+        setup_seconds : float
+            Time before the first iteration.
+
+        Returns
+        -------
+        Result
+            Objectives are added up; a block that ended early counts with its last one.
+        """
         longest = max(history.iterations for history in histories)
         total = np.zeros(longest + 1)
         for history in histories:
@@ -153,7 +185,7 @@ class Result:
 
 
 class Method(Protocol):
-    """Anything that recovers pictures from readings.
+    """Anything that recovers pictures from measurements.
 
     Attributes
     ----------
@@ -177,10 +209,10 @@ class Method(Protocol):
         Parameters
         ----------
         operator : LinearOperator
-            Pictures (rows, columns) to readings (readings,).
-        measurements : (readings, frames) array
-        valid : (readings, frames) bool array, optional
-            False where a reading must not be trusted.
+            Pictures (rows, columns) to measurements (measurements,).
+        measurements : (measurements, frames) array
+        valid : (measurements, frames) bool array, optional
+            False where a measurement must not be trusted.
         progress : callable
             Called with the number of frame iterations just done.
         """
@@ -194,14 +226,23 @@ class Method(Protocol):
 def relative_residual(
     operator: LinearOperator, frames: Array, measurements: Array, valid: Mask = None
 ) -> float:
-    """``|A h - f| / |f|`` over all good readings of all frames.
+    """``|A h - f| / |f|`` over all good measurements of all frames.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    InputError
+        Every valid measurement is zero.
 
     Parameters
     ----------
     operator : LinearOperator
     frames : (frames, rows, columns) array
-    measurements : (readings, frames) array
-    valid : (readings, frames) bool array, optional
+    measurements : (measurements, frames) array
+    valid : (measurements, frames) bool array, optional
     """
     misfit = energy = 0.0
     xp = namespace(frames, measurements)
@@ -220,6 +261,25 @@ def relative_residual(
 def validate_measurements(operator: LinearOperator, measurements: Array, valid: Mask) -> Array:
     """Return `measurements` contiguous and in the operator's type, refusing wrong shapes, NaN and
     infinity.
+
+    Parameters
+    ----------
+    operator : LinearOperator
+        Pictures (rows, columns) to measurements (measurements,).
+    measurements : (measurements, frames) array
+    valid : (measurements, frames) bool array or None
+
+    Returns
+    -------
+    (measurements, frames) array
+        Contiguous, of the operator's dtype.
+
+    Raises
+    ------
+    ShapeError
+        The measurements do not fit the operator, or the mask not the measurements.
+    InputError
+        A measurement is NaN or infinite.
     """
     xp = namespace(measurements) if valid is None else namespace(measurements, valid)
     if measurements.ndim != 2 or measurements.shape[:1] != operator.shape_out:

@@ -28,7 +28,7 @@ class PlugAndPlay:
 
     ``x = argmin data(A h) + coupling / 2 |h - z|^2``, then ``z = denoise(x)``, a few times, from a
     variational method's result onwards; z is returned. S. Venkatakrishnan, C. Bouman, B. Wohlberg,
-    GlobalSIP 2013, 945. There is no objective that falls: the number of calls is what stops it. The
+    GlobalSIP 2013, 945. No objective falls: the number of calls is what stops it. The
     defaults were found on light fields whose model error (what is out of focus) is far larger than
     their noise; on those, `strength` from 0.08 to 0.12 and `coupling` from 0.1 to 0.3 differ by a
     tenth of the error.
@@ -67,7 +67,28 @@ class PlugAndPlay:
         valid: Mask = None,
         progress: Progress = ignore_progress,
     ) -> Result:
-        """Recover one picture per column of `measurements`; see `Method`."""
+        """Recover one picture per column of `measurements`; see `Method`.
+
+        Parameters
+        ----------
+        operator : LinearOperator
+            Pictures (rows, columns) to measurements (measurements,).
+        measurements : (measurements, frames) NumPy array
+        valid : (measurements, frames) bool array, optional
+            Measurements that are False are left out.
+        progress : callable
+            Called with the number of frame iterations and denoiser calls just done.
+
+        Returns
+        -------
+        Result
+            Frames (frames, rows, columns).
+
+        Raises
+        ------
+        InputError
+            The arrays are not NumPy's, or a measurement is NaN or infinite.
+        """
         require_numpy("recovery with a denoiser", measurements)
         started = self.start.recover(operator, measurements, valid, progress)
         coupling = self.coupling * estimate_squared_norm(operator, NORM_ITERATIONS)
@@ -140,7 +161,7 @@ def solve_data_step(
     Parameters
     ----------
     operator : LinearOperator
-        Pictures (rows, columns) to readings (readings,).
+        Pictures (rows, columns) to measurements (measurements,).
     misfit : DataTerm
         Of a single frame.
     anchor : (rows, columns) array

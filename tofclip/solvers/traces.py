@@ -1,7 +1,7 @@
 """The linear inverse pixel by pixel: a few pixels at all instants, instead of all pixels at a few
 instants.
 
-Whoever looks at one pixel's brightness over time, as the search for returns does, never needs the
+Code that looks at one pixel's brightness over time, as the search for returns does, never needs the
 transient cube: the dense part of the inverse, which is small, is worked out for the whole shot, and
 the sparse part for a few pixels at a time, whose traces stay in cache.
 """
@@ -22,7 +22,7 @@ from tofclip.solvers.direct import PreparedInverse
 PATCH_ROWS, PATCH_COLUMNS = (
     8,
     8,
-)  # the readings that such a patch looks at stay in the second-level cache
+)  # the measurements that such a patch looks at stay in the second-level cache
 
 
 def order_by_patch(image_shape: tuple[int, int]) -> NDArray[np.int64]:
@@ -55,7 +55,7 @@ class InverseTraces:
 
         Parameters
         ----------
-        take_block : (readings, LANES) contiguous array
+        block : (measurements, LANES) contiguous array
             In units of their noise.
 
         Returns
@@ -84,12 +84,13 @@ class InverseTraces:
 
         Parameters
         ----------
-        weights : (blocks, readings, LANES) array
-            `PreparedInverse.weights` of the shot's readings.
+        weights : (blocks, measurements, LANES) array
+            `PreparedInverse.weights` of the shot's measurements.
         piece : slice
-        traces : (pixels of the piece, time) contiguous array, of which the columns `frames` are overwritten
+        traces : (pixels of the piece, time) contiguous array
+            Its columns `frames` are overwritten.
         frames : slice
-            As many as the readings had.
+            Time bins; as many as the measurements have.
         """
         from tofclip.solvers.kernels import compute_traces
 

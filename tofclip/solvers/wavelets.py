@@ -39,6 +39,26 @@ class NonnegativeWavelets:
     def proximal_step(
         self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
     ) -> tuple[Array, Array]:
+        """Shrink the wavelet details at `SHIFT_COUNT` shifts and average; see `Regulariser`.
+
+        Parameters
+        ----------
+        current : (rows, columns, lanes) array
+        previous : (rows, columns, lanes) array
+            Overwritten with the result.
+        momentum : (lanes,) array
+        gradient : (rows, columns, lanes) array
+            Overwritten.
+        step : float
+            Step size.
+
+        Returns
+        -------
+        picture : (rows, columns, lanes) array
+            `previous`.
+        penalty : (lanes,) float64 array
+            Weight times the details' l1 norm, averaged over the shifts.
+        """
         from tofclip.solvers.kernels import take_gradient_step
 
         take_gradient_step(current, previous, momentum, gradient, current.dtype.type(step))

@@ -87,12 +87,28 @@ def filter_patch_groups(noisy, pilot, deviation, settings):
 
     `settings` is (side of a patch, stride, reach of the search, patches in a group); pictures are
     float32.
+
+    Parameters
+    ----------
+    noisy : (rows, columns) float32 array
+    pilot : (rows, columns) float32 array
+        A first estimate, in which similar patches are looked for and the filter's gain is found.
+    deviation : float32
+        Standard deviation of the noise, in the pictures' unit.
+    settings : (int, int, int, int)
+        Side of a patch and stride in pixels, reach of the search in pixels, patches in a group.
+
+    Returns
+    -------
+    (rows, columns) float32 array
+        Weighted average of the overlapping patches.
     """
     patch, stride, reach, wanted = settings
     rows, columns = noisy.shape
     total, weights = np.zeros_like(noisy), np.zeros_like(noisy)
     around = (2 * reach + 1) ** 2
     distances, corners = np.empty(around, np.float32), np.empty((around, 2), np.int64)
+    # a noise level of zero would make the gain's matrix singular
     variance = max(deviation * deviation, np.float32(1e-12))
     for step_row in range((rows - patch + stride - 1) // stride + 1):
         row = min(step_row * stride, rows - patch)
