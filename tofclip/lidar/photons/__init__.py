@@ -4,22 +4,28 @@ Two kinds of data have an estimator each. Recovered frames carry the nearly even
 inverse problem: `tofclip.lidar.depth` fits the pulse to them by least squares. The bins of a
 photon-counting detector are Poisson distributed: for them the log-matched filter and the weighted
 fit of this room reach the maximum likelihood. Peaks, overlapping returns and positions below a bin
-are found by the same compiled steps.
+are found by the same compiled steps. `PhotonDetector` takes every pixel alone, `estimate_surface`
+lets neighbours lend each other their photons.
 """
 
 from tofclip.lidar.photons.accuracy import Accuracy, measure_accuracy
 from tofclip.lidar.photons.detector import Arrivals, PhotonDetector
 from tofclip.lidar.photons.limits import compute_range_bound
+from tofclip.lidar.photons.photon_image import PhotonImage
 from tofclip.lidar.photons.pile_up import correct_pile_up
 from tofclip.lidar.photons.smoothing import Smoothness, locate_with_smoothness
+from tofclip.lidar.photons.surface import SurfaceImage, estimate_surface
 
 __all__ = [
     "Accuracy",
     "Arrivals",
     "PhotonDetector",
+    "PhotonImage",
     "Smoothness",
+    "SurfaceImage",
     "compute_range_bound",
     "correct_pile_up",
+    "estimate_surface",
     "locate_with_smoothness",
     "measure_accuracy",
 ]

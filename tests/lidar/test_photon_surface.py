@@ -1,0 +1,138 @@
+"""Surfaces from few photons: simulated scenes with known ranges, and a recorded face."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from tofclip.errors import InputError, ShapeError
+from tofclip.lidar import Pulse
+from tofclip.lidar.photons import PhotonImage, estimate_surface
+from tofclip.lidar.photons.response import measure_pulse_width
+from tofclip.units import SPEED_OF_LIGHT
+
+BIN = 80e-12
+FWHM = 400e-12
+BINS = 1024
+BIN_M = SPEED_OF_LIGHT / 2 * BIN
+
+
+def draw_scene(signal: float, background: float, seed: int = 0) -> tuple[PhotonImage, np.ndarray]:
+    """Photons of slopes, balls and thin poles, thrown one by one, and the surface in bins."""
+    noise = np.random.default_rng(seed)
+    rows, columns = 96, 128
+    y, x = np.mgrid[:rows, :columns]
+    surface = 560 + 0.3 * x + 0.1 * y
+    for middle_y, middle_x, radius, level in ((30, 40, 22, 330.0), (62, 88, 26, 420.0)):
+        near = np.hypot(y - middle_y, x - middle_x)
+        surface = np.where(near < radius, level + 0.2 * near + 6 * np.cos(y / 8), surface)
+    for column in (20, 64, 110):
+        surface = np.where((np.abs(x - column - 0.1 * y) < 3) & (y < 60), 220 + column, surface)
+    number = noise.poisson(signal, surface.size)
+    pixel = np.repeat(np.arange(surface.size), number)
+    time = surface.ravel()[pixel] + noise.normal(0, FWHM / BIN / 2.3548, pixel.size)
+    dark = np.repeat(np.arange(surface.size), noise.poisson(background, surface.size))
+    pixel = np.concatenate([pixel, dark])
+    time = np.rint(np.concatenate([time, noise.uniform(-0.5, BINS - 0.5, dark.size)]))
+    seen = (time >= 0) & (time < BINS)
+    return PhotonImage.from_events(pixel[seen], time[seen], (rows, columns), BIN, BINS), surface
+
+
+@pytest.fixture(scope="module")
+def dim() -> tuple[PhotonImage, np.ndarray]:
+    return draw_scene(2, 48)
+
+
+def compute_robust_z(error: np.ndarray, sigma: np.ndarray) -> float:
+    ratio = error / sigma
+    return float(1.4826 * np.median(np.abs(ratio - np.median(ratio))))
+
+
+def test_two_signal_photons_among_fifty_show_the_surface(dim) -> None:
+    photons, surface = dim
+    found = estimate_surface(photons, Pulse.gaussian(FWHM))
+    error = found.range / BIN_M - surface
+    assert np.mean(np.abs(error) <= 3) >= 0.94
+    assert 0.8 < compute_robust_z(error, found.range_sigma / BIN_M) < 1.5
+    assert found.settings["response"] == "given"
+    # Where one in ten is said to be wrong, as many are.
+    wrong, told = np.abs(error) > 3, found.outlier_probability
+    doubtful = (told > 0.05) & (told < 0.2)
+    assert doubtful.sum() > 100
+    assert 0.5 < wrong[doubtful].mean() / told[doubtful].mean() < 2
+    assert wrong[told < 0.05].mean() < 0.02
+
+
+def test_the_width_of_the_pulse_is_recognised(dim) -> None:
+    assert measure_pulse_width(dim[0]) == pytest.approx(FWHM, rel=0.25)
+    found = estimate_surface(dim[0])
+    assert found.pulse.fwhm == pytest.approx(FWHM, rel=0.2)
+    assert np.mean(np.abs(found.range / BIN_M - dim[1]) <= 3) >= 0.94
+
+
+def test_many_photons_place_the_surface_far_below_a_bin() -> None:
+    photons, surface = draw_scene(60, 5, seed=1)
+    found = estimate_surface(photons, Pulse.gaussian(FWHM), learn=False)
+    error = found.range / BIN_M - surface
+    assert np.mean(np.abs(error) <= 3) > 0.99
+    assert 1.4826 * np.median(np.abs(error)) < 0.15
+    assert 0.8 < compute_robust_z(error, found.range_sigma / BIN_M) < 1.3
+    assert np.median(found.intensity) == pytest.approx(60, rel=0.05)
+
+
+def test_a_wrong_width_gives_way_to_what_the_photons_show() -> None:
+    photons, surface = draw_scene(10, 10, seed=2)
+    found = estimate_surface(photons, Pulse.gaussian(4 * FWHM))
+    assert found.settings["response"] == "learnt"
+    assert found.pulse.fwhm == pytest.approx(FWHM, rel=0.2)
+    assert np.mean(np.abs(found.range / BIN_M - surface) <= 3) > 0.97
+
+
+def test_events_and_cubes_are_the_same_photons() -> None:
+    counts = np.random.default_rng(0).poisson(0.3, (4, 5, 16))
+    photons = PhotonImage.from_cube(counts, BIN)
+    np.testing.assert_array_equal(photons.histograms(slice(0, 20)), counts.reshape(20, 16))
+    pixel, bins = np.nonzero(counts.reshape(20, 16))
+    again = PhotonImage.from_events(
+        np.repeat(pixel, counts[counts > 0]), np.repeat(bins, counts[counts > 0]), (4, 5), BIN, 16
+    )
+    np.testing.assert_array_equal(again.histograms(slice(0, 20)), counts.reshape(20, 16))
+    assert photons.photons == counts.sum()
+    one, other = photons.split(0.25, 0)
+    assert one.photons + other.photons == counts.sum()
+    np.testing.assert_array_equal(
+        one.histograms(slice(0, 20)) + other.histograms(slice(0, 20)), counts.reshape(20, 16)
+    )
+
+
+def test_what_is_not_a_photon_image_is_refused() -> None:
+    with pytest.raises(ShapeError):
+        PhotonImage.from_cube(np.zeros((4, 5)), BIN)
+    with pytest.raises(InputError, match="negative"):
+        PhotonImage.from_cube(np.full((2, 2, 4), -1), BIN)
+    with pytest.raises(InputError, match="no pixel counted a photon"):
+        PhotonImage.from_cube(np.zeros((2, 2, 4)), BIN)
+    flat = np.random.default_rng(0).poisson(0.02, (20, 20, 400))
+    with pytest.raises(InputError, match="--pulse-ps"):
+        estimate_surface(PhotonImage.from_cube(flat, BIN))
+
+
+@pytest.mark.parametrize("pulse", [None, Pulse.gaussian(848e-12)], ids=["learnt", "nominal"])
+def test_a_recorded_face_is_as_its_long_exposure_shows(shared_data, pulse) -> None:
+    folder = shared_data / "photons"
+    if not folder.is_dir():
+        pytest.skip("no recorded photons")
+    cells = loadmat(folder / "shin2015_face.mat")["Ts"]
+    number = np.array([cell.size for cell in cells.ravel()])
+    times = np.concatenate([cell.ravel() for cell in cells.ravel()])
+    pixel = np.repeat(np.arange(number.size), number)
+    truth = loadmat(folder / "shin2015_face_truth.mat")["D_true"][:340, 3:343]
+    truth = np.array([[float(cell.item()) for cell in row] for row in truth])
+    head = truth < 3990  # what is further away has no true range
+    found = estimate_surface(PhotonImage.from_events(pixel, times, cells.shape, 8e-12), pulse)
+    error = found.range[head] - truth[head] * SPEED_OF_LIGHT / 2 * 8e-12
+    error -= np.median(error)
+    assert np.mean(np.abs(error) < 12e-3) >= 0.965
+    assert np.sqrt(np.mean(error**2)) <= 37e-3
+    assert 0.9 <= compute_robust_z(error, found.range_sigma[head]) <= 1.15

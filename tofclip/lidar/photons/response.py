@@ -1,0 +1,200 @@
+"""The response to a single return, learnt from the photons of a scene whose surfaces are unknown.
+
+Two photons of one surface in one pixel differ in time by what the response spreads them: the
+histogram of such differences is the response's autocorrelation, whatever the scene. It gives the
+width; the shape is what photons show around a surface that other photons found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from tofclip.errors import InputError
+from tofclip.lidar.photons.photon_image import FloatArray, PhotonImage
+from tofclip.lidar.pulse import Pulse
+
+MAX_LAG_FRACTION = 0.25
+"""Of the time axis: photons further apart than this are not of one pulse."""
+
+MIN_LAG_SIGNIFICANCE = 8.0
+"""Standard deviations by which pairs of photons must exceed those that meet by chance."""
+
+SAMPLES_PER_WIDTH = 24
+SMOOTHING_WIDTHS = 1 / 12
+EXTENT_WIDTHS = (-3.0, 9.0)
+"""Full widths before and after the surface in which the response is learnt: tails are long."""
+
+BACKGROUND_WIDTHS = (-8.0, -4.0)
+"""Full widths before the surface where only background is expected."""
+
+DENSITY_FLOOR = 1e-4
+"""Of the peak: no instant is impossible, so that no single photon decides."""
+
+
+@dataclass(frozen=True)
+class BinnedResponse:
+    """Density of a signal photon's time around its surface, as bins show it.
+
+    Parameters
+    ----------
+    pulse : Pulse
+        Shape of a return, bins included.
+    bin_width : float
+        s.
+    """
+
+    pulse: Pulse
+    bin_width: float
+
+    @classmethod
+    def from_pulse(cls, pulse: Pulse, bin_width: float) -> BinnedResponse:
+        """Spread a pulse over the bins in which it is counted."""
+        return cls(pulse.integrate_bins(bin_width), bin_width)
+
+    @property
+    def step(self) -> float:
+        """Time between two samples, in bins."""
+        return self.pulse.spacing / self.bin_width
+
+    @property
+    def start(self) -> float:
+        """Time of the first sample after the surface, in bins."""
+        return -self.pulse.origin * self.step
+
+    @property
+    def width(self) -> float:
+        """Full width at half maximum, in bins."""
+        return self.pulse.fwhm / self.bin_width
+
+    @cached_property
+    def density(self) -> FloatArray:
+        """Probability density of a photon's time at each sample, per bin."""
+        samples = np.maximum(self.pulse.samples, DENSITY_FLOOR)
+        density: FloatArray = samples / (samples.sum() * self.step)
+        return density
+
+    @cached_property
+    def log_slope(self) -> FloatArray:
+        """Minus the slope of the density's logarithm at each sample, per bin."""
+        slope: FloatArray = -np.gradient(np.log(self.density), self.step)
+        return slope
+
+    def coarse_shares(self, coarse: int) -> tuple[FloatArray, int]:
+        """Share of the photons in each coarse bin around the one that holds the surface.
+
+        Parameters
+        ----------
+        coarse : int
+            Bins in a coarse one.
+
+        Returns
+        -------
+        (n,) array, int
+            The shares, and the number of the first coarse bin relative to the surface's. The
+            surface may lie anywhere in its coarse bin.
+        """
+        times = self.start + self.step * np.arange(self.density.size)
+        inside = np.arange(8) / 8 + 1 / 16 - 0.5
+        position = times[:, np.newaxis] / coarse + inside
+        number = np.floor(position + 0.5).astype(np.int64)
+        first = int(number.min())
+        weight = np.repeat(self.density[:, np.newaxis], inside.size, axis=1)
+        shares = np.bincount((number - first).ravel(), weight.ravel()).astype(np.float64)
+        shares /= shares.sum()
+        kept = np.flatnonzero(shares > 1e-3 * shares.max())
+        return shares[kept[0] : kept[-1] + 1], first + int(kept[0])
+
+
+def measure_pulse_width(photons: PhotonImage) -> float:
+    """Estimate the full width at half maximum of the response from pairs of photons.
+
+    Parameters
+    ----------
+    photons : PhotonImage
+
+    Returns
+    -------
+    float
+        s; that of the Gaussian whose autocorrelation falls to half as soon.
+
+    Raises
+    ------
+    InputError
+        The pairs of photons of a pixel are not closer than chance makes them.
+    """
+    from tofclip.lidar.photons.surface_kernels import sum_pair_lags
+
+    number = max(8, int(MAX_LAG_FRACTION * photons.bins))
+    lags = np.zeros(number)
+    sum_pair_lags(photons.offsets, photons.bin, photons.count, lags)
+    lags[0] *= 2  # the others come with both signs
+    # Photons that meet by chance: the further apart, the fewer bins there are for both.
+    open_bins = photons.bins - np.arange(number)
+    chance = np.median((lags / open_bins)[number // 2 :].reshape(-1)) * open_bins
+    group = 1
+    while number // group >= 8:
+        pieces = number // group
+        pairs = lags[: pieces * group].reshape(pieces, group).sum(axis=1)
+        expected = chance[: pieces * group].reshape(pieces, group).sum(axis=1)
+        excess = pairs - expected
+        if excess[0] > MIN_LAG_SIGNIFICANCE * np.sqrt(expected[0] + pairs[0] + 1):
+            below = np.flatnonzero(excess < excess[0] / 2)
+            if below.size:
+                last = int(below[0])
+                part = (excess[last - 1] - excess[0] / 2) / (excess[last - 1] - excess[last])
+                half = (last - 1 + part + (0.5 if group > 1 else 0.0)) * group
+                return float(np.sqrt(2) * max(half, 0.5) * photons.bin_width)
+        group *= 2
+    raise InputError(
+        "no pulse stands out from the background in these photons; give its width with --pulse-ps"
+    )
+
+
+def learn_response(
+    residual_bins: NDArray[np.float64], count: NDArray[np.float32], width: float, bin_width: float
+) -> tuple[Pulse, float]:
+    """Estimate the shape of the response from the times of photons after their surface.
+
+    Parameters
+    ----------
+    residual_bins : (photons,) array
+        Time after the surface, which other photons found, in bins.
+    count : (photons,) array
+    width : float
+        Rough full width at half maximum, in bins.
+    bin_width : float
+        s.
+
+    Returns
+    -------
+    Pulse, float
+        The response, whose arrival is its highest point, and by how many bins later this is than
+        the arrival was before.
+
+    Raises
+    ------
+    InputError
+        There is no light around the surface.
+    """
+    step = width / SAMPLES_PER_WIDTH
+    first, last = (round(edge * SAMPLES_PER_WIDTH) for edge in EXTENT_WIDTHS)
+    early = [round(edge * SAMPLES_PER_WIDTH) for edge in BACKGROUND_WIDTHS]
+    number = np.rint(residual_bins / step).astype(np.int64)
+    known = (number >= early[0]) & (number <= last)
+    photons = np.bincount(number[known] - early[0], count[known], last - early[0] + 1)
+    level = float(np.mean(photons[: early[1] - early[0]]))
+    shape = gaussian_filter1d(photons, SMOOTHING_WIDTHS * SAMPLES_PER_WIDTH)[first - early[0] :]
+    shape = np.maximum(shape - level, 0.0)
+    if not shape.any():
+        raise InputError("there is no light around the surface to learn the pulse from")
+    peak = int(np.argmax(shape))
+    edge = max(1, min(peak, shape.size - 1 - peak))
+    before, here, after = shape[max(peak - 1, 0)], shape[peak], shape[min(peak + 1, shape.size - 1)]
+    bend = 2 * here - before - after
+    part = float((after - before) / (2 * bend)) if edge >= 1 and bend > 0 else 0.0
+    return Pulse(shape, step * bin_width, peak + part), (first + peak + part) * step
