@@ -4,7 +4,7 @@ An operator maps arrays of `shape_in` to arrays of `shape_out`. A batch is one e
 more; nothing is flattened or broadcast behind the caller's back.
 
 Every operator takes NumPy arrays. Those that are `portable` take the arrays of any library that
-follows the array API standard as well, such as CuPy's and PyTorch's on a graphics processor, and
+follows the array API standard as well, such as CuPy's and PyTorch's on a GPU, and
 answer in kind; the others refuse them.
 """
 

@@ -16,9 +16,9 @@ class SliceConvolution(LinearOperator):
 
     Along the sensor's direction the convolution is a product in Fourier space; across it, each of
     the picture's rows is weighed by its own row of the PSF and all are summed. So at every
-    frequency k the readings are a small matrix times the picture's column of the spectrum, ``L[k] =
-    G_k P_k`` (supplement Eq. 15 and 16). Its cost and memory, 8 bytes for each PSF, row and
-    frequency, do not depend on how large or how sparse the PSFs are.
+    frequency k the measurements are a small matrix times the picture's column of the spectrum,
+    ``L[k] = G_k P_k`` (supplement Eq. 15 and 16). Its cost and memory, 8 bytes for each PSF, row
+    and frequency, do not depend on how large or how sparse the PSFs are.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class SliceConvolution(LinearOperator):
 
     Notes
     -----
-    Readings are (lines * sensor_px,), PSF by PSF.
+    Measurements are (lines * sensor_px,), PSF by PSF.
     """
 
     def __init__(

@@ -27,7 +27,7 @@ class WeightedViews(LinearOperator):
 
     Notes
     -----
-    Light fields are (views, rows, columns); readings are (exposures * rows * columns,).
+    Light fields are (views, rows, columns); measurements are (exposures * rows * columns,).
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class MaskedViews(LinearOperator):
 
     Notes
     -----
-    Light fields are (views, rows, columns); readings are (rows * columns,).
+    Light fields are (views, rows, columns); measurements are (rows * columns,).
     """
 
     def __init__(self, codes: ArrayLike, dtype: DTypeLike = np.float32) -> None:

@@ -93,7 +93,25 @@ class PointSpreadConvolution(LinearOperator):
 def validate_point_spread(
     point_spread: ArrayLike, image_shape: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Return a PSF as float64, refusing what cannot be one for pictures of `image_shape`."""
+    """Return a point-spread function as float64 once it is known to fit pictures of `image_shape`.
+
+    Parameters
+    ----------
+    point_spread : (rows, columns) array_like
+    image_shape : (int, int)
+        Rows and columns of the picture.
+
+    Returns
+    -------
+    (rows, columns) float64 array
+
+    Raises
+    ------
+    ShapeError
+        It has not two dimensions, or is empty.
+    InputError
+        It is larger than the picture, holds NaN or infinity, or is zero everywhere.
+    """
     spread = np.asarray(point_spread, dtype=np.float64)
     if spread.ndim != 2 or 0 in spread.shape:
         raise ShapeError("a point-spread function", "(rows, columns)", spread.shape)
@@ -124,5 +142,23 @@ def alias_free_length(image: int, sensor: int, spread: int, first: int, centre: 
     Sensor pixels lie at first ... first + sensor - 1 of the picture's own pixels 0 ... image - 1;
     the PSF reaches from
     -centre to spread - 1 - centre.
+
+    Parameters
+    ----------
+    image : int
+        Pixels of the picture along the axis.
+    sensor : int
+        Pixels of the sensor.
+    spread : int
+        Pixels of the PSF.
+    first : int
+        The sensor's first pixel, counted in the picture's.
+    centre : int
+        The PSF's pixel that stands for no displacement.
+
+    Returns
+    -------
+    int
+        Pixels, as a circular convolution needs them.
     """
     return max(image, sensor, spread, first + sensor + centre, image - first + spread - 1 - centre)

@@ -163,6 +163,16 @@ def project_onto_lines(picture, starts, rightward, downward, lines):
     `starts`, `rightward` and `downward`, (lines,) int64, are the position of the first pixel and
     the steps from pixel to pixel in units of 2^-32 bins; every position and the next bin must lie
     on the line. Two lines at a time keep the processor busy while a sum is on its way to memory.
+
+    Parameters
+    ----------
+    picture : (rows, columns) array
+    starts : (lines,) int64 array
+        Fixed-point position of the first pixel on each line, 2^-32 bins.
+    rightward, downward : (lines,) int64 array
+        Steps to the next column and row, 2^-32 bins.
+    lines : (lines, bins, 2) array
+        Added to, in place.
     """
     step = picture.dtype.type(1 / (1 << FRACTION_BITS))
     pairs = starts.size // 2
@@ -190,6 +200,14 @@ def project_onto_lines(picture, starts, rightward, downward, lines):
 def back_project_lines(lines, starts, rightward, downward, picture):
     """The adjoint of `project_onto_lines` for lines (lines, bins) of one value a bin; overwrites
     `picture`.
+
+    Parameters
+    ----------
+    lines : (lines, bins) array
+    starts, rightward, downward : (lines,) int64 array
+        As for `project_onto_lines`.
+    picture : (rows, columns) array
+        Overwritten.
     """
     step = picture.dtype.type(1 / (1 << FRACTION_BITS))
     for row in range(picture.shape[0]):
@@ -201,6 +219,7 @@ def back_project_lines(lines, starts, rightward, downward, picture):
                 position = start + column * right
                 first = np.uint64(position >> FRACTION_BITS)
                 share = line.dtype.type(position & FRACTION_MASK) * step
+                # interpolation between two bins is the transpose of sharing light between them
                 picture[row, column] += line[first] + share * (
                     line[first + np.uint64(1)] - line[first]
                 )
@@ -212,6 +231,17 @@ def count_line_nonzeros(starts, rightward, downward, before, shape, counts):
 
     `counts` is (lines, detector pixels), zeros; the detector's first pixel is bin `before`, `shape`
     the picture's.
+
+    Parameters
+    ----------
+    starts, rightward, downward : (lines,) int64 array
+        As for `project_onto_lines`.
+    before : int
+        Bins in front of the detector's first pixel.
+    shape : (int, int)
+        Rows and columns of the picture.
+    counts : (lines, detector pixels) int array
+        Zeros; counted up in place.
     """
     for number in range(starts.size):
         for row in range(shape[0]):
@@ -231,6 +261,21 @@ def fill_line_nonzeros(starts, rightward, downward, before, shape, places, colum
 
     `places`, (lines, detector pixels), says where each row of the matrix begins in `columns` and
     `values`, and says afterwards where it ends.
+
+    Parameters
+    ----------
+    starts, rightward, downward : (lines,) int64 array
+        As for `project_onto_lines`.
+    before : int
+        Bins in front of the detector's first pixel.
+    shape : (int, int)
+        Rows and columns of the picture.
+    places : (lines, detector pixels) int array
+        Advanced in place.
+    columns : (nonzeros,) int array
+        Overwritten with raster numbers of pixels.
+    values : (nonzeros,) float array
+        Overwritten with weights from 0 to 1.
     """
     whole, step = values.dtype.type(1), values.dtype.type(1 / (1 << FRACTION_BITS))
     for number in range(starts.size):
@@ -251,7 +296,19 @@ def fill_line_nonzeros(starts, rightward, downward, before, shape, places, colum
 
 @fast_njit
 def count_tile_nonzeros(row_starts, indices, width, counts):
-    """Count a CSR matrix's nonzeros in each tile of `width` columns and row, (tiles, rows) zeros."""
+    """Count a CSR matrix's nonzeros in each tile of `width` columns and row, (tiles, rows) zeros.
+
+    Parameters
+    ----------
+    row_starts : (rows + 1,) int array
+        The matrix's ``indptr``.
+    indices : (nonzeros,) int array
+        Column of each nonzero.
+    width : int
+        Columns of a tile.
+    counts : (tiles, rows) int array
+        Zeros; counted up in place.
+    """
     for row in range(row_starts.size - 1):
         for entry in range(row_starts[row], row_starts[row + 1]):
             counts[indices[entry] // width, row] += 1
@@ -261,6 +318,19 @@ def count_tile_nonzeros(row_starts, indices, width, counts):
 def sort_into_tiles(row_starts, indices, data, width, places, columns, values):
     """Write a CSR matrix's nonzeros in the order of tile, row and column; `places` as in
     `fill_line_nonzeros`.
+
+    Parameters
+    ----------
+    row_starts : (rows + 1,) int array
+        The matrix's ``indptr``.
+    indices, data : (nonzeros,) array
+        Column and value of each nonzero.
+    width : int
+        Columns of a tile.
+    places : (tiles, rows) int array
+        Advanced in place.
+    columns, values : (nonzeros,) array
+        Overwritten.
     """
     for row in range(row_starts.size - 1):
         for entry in range(row_starts[row], row_starts[row + 1]):
@@ -303,6 +373,16 @@ def shift_linearly(block, down, right, below, beside, shifted):
 
     `down` and `right` are whole numbers, `below` and `beside` the shares of the next row and
     column, from 0 to 1.
+
+    Parameters
+    ----------
+    block : (rows, columns, lanes) array
+    down, right : int
+        Whole pixels.
+    below, beside : scalar of the block's dtype
+        Fractions of a pixel, from 0 to 1.
+    shifted : (rows, columns, lanes) array
+        Overwritten.
     """
     rows, columns, lanes = block.shape
     length, whole = columns * lanes, block.dtype.type(1)

@@ -1,5 +1,5 @@
-"""The cameras of compact light-field photography by name: which nonlocal readings each view of a
-light field gets.
+"""The cameras of compact light-field photography by name: which nonlocal measurements each view of
+a light field gets.
 """
 
 from __future__ import annotations

@@ -70,7 +70,18 @@ class CodedAperture:
     def trace_rays(
         self, v: Coordinates, u: Coordinates
     ) -> tuple[Coordinates, Coordinates, Coordinates]:
-        """Return the rays; see `ApertureElement`. View u looks through the mask at -u, as in Eq. 6."""
+        """Return the rays; see `ApertureElement`. View u looks through the mask at -u, as in Eq. 6.
+
+        Parameters
+        ----------
+        v, u : (rays, 1) and (1, rays) array
+            Pupil coordinates from -1 to 1.
+
+        Returns
+        -------
+        transmission, down_px, right_px : (rays, rays) array
+            The code's value, and no deflection.
+        """
         cells = [
             np.clip(((1 - place) / 2 * size).astype(int), 0, size - 1)
             for place, size in zip((v, u), self.code.shape, strict=True)
@@ -99,7 +110,19 @@ class CubicPhasePlate:
     def trace_rays(
         self, v: Coordinates, u: Coordinates
     ) -> tuple[Coordinates, Coordinates, Coordinates]:
-        """Return the rays; see `ApertureElement`."""
+        """Return the rays; see `ApertureElement`.
+
+        Parameters
+        ----------
+        v, u : (rays, 1) and (1, rays) array
+            Pupil coordinates from -1 to 1.
+
+        Returns
+        -------
+        transmission, down_px, right_px : (rays, rays) array
+            All light, and the deflection in pixels.
+        """
+        # 1/2 shifts the PSF as a whole, which lies about its own centre then
         down, right = np.broadcast_arrays(
             self.strength_px * (v**2 - 0.5), self.strength_px * (u**2 - 0.5)
         )
@@ -126,7 +149,18 @@ class Diffuser:
     def trace_rays(
         self, v: Coordinates, u: Coordinates
     ) -> tuple[Coordinates, Coordinates, Coordinates]:
-        """Return the rays; see `ApertureElement`."""
+        """Return the rays; see `ApertureElement`.
+
+        Parameters
+        ----------
+        v, u : (rays, 1) and (1, rays) array
+            Pupil coordinates from -1 to 1, increasing.
+
+        Returns
+        -------
+        transmission, down_px, right_px : (rays, rays) array
+            All light, and the phase's slopes in pixels.
+        """
         phase = self._phase
         down, right = phase(v.ravel(), u.ravel(), dx=1), phase(v.ravel(), u.ravel(), dy=1)
         return np.ones(down.shape), down, right

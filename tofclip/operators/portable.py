@@ -33,7 +33,19 @@ class Product(Protocol):
 
 
 def make_portable_product(matrix: scipy.sparse.csr_array, device: ComputeDevice) -> Product:
-    """Bring a CSR matrix to `device` and return the product with it there."""
+    """Bring a CSR matrix to `device` and return the product with it there.
+
+    Parameters
+    ----------
+    matrix : csr_array of shape (rows, columns)
+    device : ComputeDevice
+        Library and device of the arrays to come.
+
+    Returns
+    -------
+    Product
+        Takes (columns, frames) arrays on that device.
+    """
     kinds: dict[str, Callable[..., Product]] = {"torch": TorchProduct, "cupy": CupyProduct}
     return kinds.get(device.library, GatheredProduct)(matrix, device)
 

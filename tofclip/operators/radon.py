@@ -45,7 +45,7 @@ class RadonProjection(SparseMatrix):
 
     Notes
     -----
-    Readings are (angles * detector_px,), angle by angle. A lone picture is projected without a
+    Measurements are (angles * detector_px,), angle by angle. A lone picture is projected without a
     matrix.
     """
 

@@ -10,13 +10,13 @@ from tofclip.operators.base import Array, LinearOperator
 
 
 class _Sensor(LinearOperator):
-    """The readings of some pixels of a plane; the adjoint leaves the others dark.
+    """The measurements of some pixels of a plane; the adjoint leaves the others dark.
 
     Parameters
     ----------
     plane_shape : (int, int)
         Rows and columns of the light on the sensor's plane.
-    pixels : (readings,) int array
+    pixels : (measurements,) int array
         Flat numbers of the pixels that are read, without repeats.
     dtype : dtype
     """
@@ -85,7 +85,7 @@ class PitchedSensor(_Sensor):
             plane_shape, (rows[:, np.newaxis] * plane_shape[1] + columns).ravel(), dtype
         )
         self.grid_shape = (rows.size, columns.size)
-        """Rows and columns of the sensor: readings reshaped to it are a picture."""
+        """Rows and columns of the sensor: measurements reshaped to it are a picture."""
 
 
 class MaskedSensor(_Sensor):

@@ -23,7 +23,7 @@ class HadamardCodes(LinearOperator):
     ----------
     image_shape : (int, int)
     codes : int
-        Number of readings.
+        Number of measurements.
     seed : int
         Of the signs and the rows.
     dtype : dtype
@@ -89,7 +89,7 @@ class RandomCodes(LinearOperator):
     ----------
     image_shape : (int, int)
     codes : int
-        Number of readings.
+        Number of measurements.
     seed : int
     dtype : dtype
         float32 or float64.

@@ -94,7 +94,19 @@ class SparseMatrix(LinearOperator):
 
 
 def make_product(device: ComputeDevice, matrix: scipy.sparse.csr_array) -> Product:
-    """Set up the product with `matrix` for the arrays of a place."""
+    """Set up the product with `matrix` for the arrays of a device.
+
+    Parameters
+    ----------
+    device : ComputeDevice
+        Library and device of the arrays to come.
+    matrix : csr_array of shape (rows, columns)
+
+    Returns
+    -------
+    Product
+        Takes (columns, frames) arrays on that device.
+    """
     return (
         TiledProduct(matrix) if device.has_compiled_loops else make_portable_product(matrix, device)
     )

@@ -1,4 +1,4 @@
-"""Weighing down what all readings of a view have in common."""
+"""Weighing down what all measurements of a view have in common."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from tofclip.operators.base import Array, LinearOperator
 
 
 class MeanWeighting(LinearOperator):
-    """``W = I - (1 - w) 11' / m_k`` for each view's m_k readings: their mean counts w times;
+    """``W = I - (1 - w) 11' / m_k`` for each view's m_k measurements: their mean counts w times;
     self-adjoint.
 
     Codes of 0 and 1 all measure half the picture's sum, which swamps what tells them apart; apply W
-    to the readings and to the operator alike.
+    to the measurements and to the operator alike.
 
     Parameters
     ----------
     counts : sequence of int
-        m_k, readings of each view, in the order of the readings.
+        m_k, measurements of each view, in the order of the measurements.
     weight : float
         w, between 0 and 1.
     dtype : dtype

@@ -42,7 +42,19 @@ class Shape(ABC):
 
     @abstractmethod
     def intersect(self, origin: Array, directions: Array) -> Hits:
-        """Return where rays from (3,) `origin` along (rays, 3) `directions` first meet the surface."""
+        """Return where rays from (3,) `origin` along (rays, 3) `directions` first meet the surface.
+
+        Parameters
+        ----------
+        origin : (3,) array
+            Metres, in the shape's own coordinates.
+        directions : (rays, 3) array
+            Of any length; distances are counted in it.
+
+        Returns
+        -------
+        Hits
+        """
 
     @property
     @abstractmethod
@@ -69,7 +81,18 @@ class Rectangle(Shape):
         return np.array([self.width, self.height, 0.0]) / 2
 
     def intersect(self, origin: Array, directions: Array) -> Hits:
-        """Return where rays meet the plate, from either side."""
+        """Return where rays meet the plate, from either side.
+
+        Parameters
+        ----------
+        origin : (3,) array
+            Metres, in the plate's coordinates.
+        directions : (rays, 3) array
+
+        Returns
+        -------
+        Hits
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = -origin[2] / directions[:, 2]
             place = (origin[:2] + distance[:, np.newaxis] * directions[:, :2]) / (
@@ -101,8 +124,20 @@ class Sphere(Shape):
         return np.full(3, self.radius)
 
     def intersect(self, origin: Array, directions: Array) -> Hits:
-        """Return where rays from outside meet the ball."""
+        """Return where rays from outside meet the ball.
+
+        Parameters
+        ----------
+        origin : (3,) array
+            Metres from the centre; outside.
+        directions : (rays, 3) array
+
+        Returns
+        -------
+        Hits
+        """
         along, square = directions @ origin, np.einsum("ij,ij->i", directions, directions)
+        # roots of |origin + t direction|^2 = radius^2; the smaller one is the near side
         below_root = along**2 - square * (origin @ origin - self.radius**2)
         distance = (-along - np.sqrt(np.maximum(below_root, 0))) / square
         normal = (origin + distance[:, np.newaxis] * directions) / self.radius
@@ -132,7 +167,21 @@ class Box(Shape):
         return np.array([self.width, self.height, self.thickness]) / 2
 
     def intersect(self, origin: Array, directions: Array) -> Hits:
-        """Return where rays from outside meet the block."""
+        """Return where rays from outside meet the block.
+
+        A ray is inside the block where it is inside all three pairs of faces: between the last
+        entry and the first exit (slab method).
+
+        Parameters
+        ----------
+        origin : (3,) array
+            Metres from the centre; outside.
+        directions : (rays, 3) array
+
+        Returns
+        -------
+        Hits
+        """
         half = self.half_extent
         with np.errstate(divide="ignore", invalid="ignore"):
             slabs = np.sort(
@@ -217,7 +266,23 @@ class Specular(Lambertian):
     exponent: float = 200.0
 
     def radiance(self, place: Array, normal: Array, directions: Array, light: Array) -> Array:
-        """Return the light that goes back along rays; arguments as for a matt surface."""
+        """Return the light that goes back along rays; arguments as for a matt surface.
+
+        Parameters
+        ----------
+        place : (rays, 2) array
+            On the pattern, from 0 to 1.
+        normal : (rays, 3) array
+            Of length 1, towards the viewer.
+        directions : (rays, 3) array
+            From the viewer to the surface.
+        light : (3,) array
+            Of length 1, towards the lamp.
+
+        Returns
+        -------
+        (rays,) array
+        """
         matt = super().radiance(place, normal, directions, light)
         unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
         mirrored = unit - 2 * np.einsum("ij,ij->i", unit, normal)[:, np.newaxis] * normal
@@ -249,7 +314,19 @@ class Body:
     axes: Array = field(default_factory=lambda: np.eye(3))
 
     def intersect(self, origin: Array, directions: Array) -> Hits:
-        """Return where rays meet the body; holes of its pattern let them pass."""
+        """Return where rays meet the body; holes of its pattern let them pass.
+
+        Parameters
+        ----------
+        origin : (3,) array
+            Metres, in the scene's coordinates.
+        directions : (rays, 3) array
+
+        Returns
+        -------
+        Hits
+            Normals in the scene's coordinates.
+        """
         found = self.shape.intersect((origin - self.centre) @ self.axes, directions @ self.axes)
         solid = self.material.is_solid(found.pattern_position)
         return Hits(
@@ -261,6 +338,17 @@ class Body:
     def select_candidate_rays(self, origin: Array, directions: Array) -> Array:
         """Return the numbers of those rays, all forward, that may meet the body; most of a
         picture's do not.
+
+        Parameters
+        ----------
+        origin : (3,) array
+            Metres.
+        directions : (rays, 3) array
+            With positive z.
+
+        Returns
+        -------
+        (n,) int array
         """
         (x, y, z), (width, height, thickness) = (
             self.centre - origin,
@@ -268,6 +356,7 @@ class Body:
         )
         if z <= thickness:
             return np.arange(len(directions))
+        # slopes x / z under which the near face of the bounding box can still be seen
         beside, below = (
             (side + thickness * abs(off) / z) / (z - thickness)
             for side, off in ((width, x), (height, y))
@@ -278,7 +367,17 @@ class Body:
         )
 
     def shift(self, x: float, y: float, z: float = 0.0) -> Body:
-        """Return the body moved by metres."""
+        """Return the body moved by metres.
+
+        Parameters
+        ----------
+        x, y, z : float
+            Metres, right, down and away.
+
+        Returns
+        -------
+        Body
+        """
         return replace(self, centre=self.centre + np.array([x, y, z]))
 
     def flip(self) -> Body:

@@ -44,7 +44,18 @@ class GroundTruth:
 
     @classmethod
     def from_scene(cls, scene: Scene, instrument: Instrument) -> GroundTruth:
-        """Look at `scene` from the reference viewpoint."""
+        """Look at `scene` from the reference viewpoint.
+
+        Parameters
+        ----------
+        scene : Scene
+        instrument : Instrument
+            Its reference view, rays per pixel and detector.
+
+        Returns
+        -------
+        GroundTruth
+        """
         x, y = instrument.pixel_grid()
         hits = scene.trace(instrument.viewpoint(0.0), instrument.directions(x, y))
         plate, path, reflectance = (

@@ -56,7 +56,7 @@ class StreakDetector:
     def expose(
         self, signal: NDArray[np.float64], noise: np.random.Generator
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Draw one shot: readings in photons, and which of them saturated.
+        """Draw one shot: measurements in photons, and which of them saturated.
 
         Parameters
         ----------
@@ -121,6 +121,17 @@ class Instrument:
 
         A view's picture is laid so that a point at the focus distance appears at the same place in
         all views.
+
+        Parameters
+        ----------
+        x, y : (n,) float64 array
+            Picture points in pixels from the centre.
+        position : float
+            Of the view, in view steps.
+
+        Returns
+        -------
+        (n, 3) float64 array
         """
         focal = self.camera.focal_length_px
         aside = self.camera.lenslet_pitch * position / self.camera.focus_distance

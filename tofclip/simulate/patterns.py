@@ -34,13 +34,26 @@ def make_letter(name: str) -> list[Outline]:
 
 
 def cut_pattern(outlines: list[Outline], pattern: Pattern) -> Pattern:
-    """Keep of `pattern` what lies inside the outlines (even-odd rule); the rest becomes NaN."""
+    """Keep of `pattern` what lies inside the outlines (even-odd rule); the rest becomes NaN.
+
+    Parameters
+    ----------
+    outlines : list of outlines
+        Polygons over the unit square, x to the right, y down.
+    pattern : (rows, columns) array
+        Reflectance.
+
+    Returns
+    -------
+    (rows, columns) float32 array
+    """
     rows, columns = pattern.shape
     y, x = np.meshgrid(
         (np.arange(rows) + 0.5) / rows, (np.arange(columns) + 0.5) / columns, indexing="ij"
     )
     inside = np.zeros(pattern.shape, dtype=bool)
     for outline in outlines:
+        # even-odd: an outline within another one cuts a hole
         inside ^= _is_within(outline, x, y)
     return np.where(inside, pattern, np.nan).astype(np.float32)
 
@@ -51,21 +64,56 @@ def make_plain_pattern(reflectance: float) -> Pattern:
 
 
 def make_checkerboard(squares: int, dark: float, bright: float) -> Pattern:
-    """A board of `squares` x `squares` fields, bright in the upper left corner."""
+    """A board of `squares` x `squares` fields, bright in the upper left corner.
+
+    Parameters
+    ----------
+    squares : int
+        Fields on a side.
+    dark, bright : float
+        Reflectance, 0 to 1.
+
+    Returns
+    -------
+    (texels, texels) float32 array
+    """
     field = np.arange(TEXELS) * squares // TEXELS
     odd = (field[:, np.newaxis] + field) % 2 == 1
     return np.where(odd, dark, bright).astype(np.float32)
 
 
 def make_stripes(number: int, dark: float, bright: float) -> Pattern:
-    """Slanted stripes with smooth borders, `number` of them across the plate."""
+    """Slanted stripes with smooth borders, `number` of them across the plate.
+
+    Parameters
+    ----------
+    number : int
+    dark, bright : float
+        Reflectance, 0 to 1.
+
+    Returns
+    -------
+    (texels, texels) float32 array
+    """
     y, x = np.meshgrid(np.arange(TEXELS) / TEXELS, np.arange(TEXELS) / TEXELS, indexing="ij")
     wave = 0.5 + 0.5 * np.sin(2 * np.pi * number * (x + 0.5 * y))
     return (dark + (bright - dark) * wave).astype(np.float32)
 
 
 def make_rings(number: int, dark: float, bright: float) -> Pattern:
-    """A round plate with concentric rings; NaN outside the disc."""
+    """A round plate with concentric rings; NaN outside the disc.
+
+    Parameters
+    ----------
+    number : int
+        Rings from the centre to the rim.
+    dark, bright : float
+        Reflectance, 0 to 1; the centre is bright.
+
+    Returns
+    -------
+    (texels, texels) float32 array
+    """
     y, x = np.meshgrid(np.linspace(-1, 1, TEXELS), np.linspace(-1, 1, TEXELS), indexing="ij")
     radius = np.hypot(x, y)
     wave = 0.5 + 0.5 * np.cos(2 * np.pi * number * radius)
@@ -100,6 +148,23 @@ def make_text_pattern(
 def make_mottled_pattern(dark: float, bright: float, grains: int, seed: int) -> Pattern:
     """Smooth random blotches, about `grains` across the pattern, with every brightness from dark to
     bright.
+
+    Parameters
+    ----------
+    dark, bright : float
+        Reflectance, 0 to 1.
+    grains : int
+    seed : int
+        Of the pattern.
+
+    Returns
+    -------
+    (texels, texels) float32 array
+
+    Raises
+    ------
+    InputError
+        More grains than the pattern can show, or none.
     """
     if not 0 < grains < TEXT_TEXELS:
         raise InputError(
@@ -112,7 +177,9 @@ def make_mottled_pattern(dark: float, bright: float, grains: int, seed: int) -> 
         * TEXT_TEXELS
     )
     field = np.fft.irfft2(
-        spectrum * np.exp(-((frequency / grains) ** 2)), s=(TEXT_TEXELS, TEXT_TEXELS)
+        # white noise through a Gaussian low-pass whose width is the number of grains
+        spectrum * np.exp(-((frequency / grains) ** 2)),
+        s=(TEXT_TEXELS, TEXT_TEXELS),
     )
     share = (field - field.min()) / np.ptp(field)
     pattern: Pattern = (dark + (bright - dark) * share).astype(np.float32)

@@ -78,7 +78,18 @@ def cast_rays(bodies: Sequence[Body], origin: Array, directions: Array) -> First
 
 
 def look_up_reflectance(bodies: Sequence[Body], hits: FirstHits) -> Array:
-    """Return the pattern's value where each ray hits, (rays,) float64; 0 where it hits nothing."""
+    """Return the pattern's value where each ray hits, (rays,) float64; 0 where it hits nothing.
+
+    Parameters
+    ----------
+    bodies : sequence of Body
+    hits : FirstHits
+        Numbers of the bodies, and the places on their patterns.
+
+    Returns
+    -------
+    (rays,) float64 array
+    """
     found = np.zeros(hits.body.size)
     for number, one in enumerate(bodies):
         own = hits.body == number
@@ -134,7 +145,19 @@ def number_ray_pixels(image_shape: tuple[int, int], rays_per_side: int) -> NDArr
 
 
 def accumulate_cells(cell: NDArray[np.intp], amount: Array, shape: tuple[int, ...]) -> Array:
-    """Add each amount to its cell, numbered in raster order, of a float64 array of `shape`."""
+    """Add each amount to its cell, numbered in raster order, of a float64 array of `shape`.
+
+    Parameters
+    ----------
+    cell : (n,) int array
+    amount : (n,) array
+    shape : tuple of int
+        Of the result.
+
+    Returns
+    -------
+    float64 array of `shape`
+    """
     total: Any = np.bincount(cell.ravel(), amount.ravel(), minlength=int(np.prod(shape)))
     return np.asarray(total, dtype=np.float64).reshape(shape)
 

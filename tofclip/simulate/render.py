@@ -40,7 +40,20 @@ class RayBundle(NamedTuple):
 
 
 def cast_view_rays(scene: Scene, instrument: Instrument, position: float) -> RayBundle:
-    """Cast the rays of the view at `position` view steps; those that bring no light are left out."""
+    """Cast the rays of the view at `position` view steps; those that bring no light are left out.
+
+    Parameters
+    ----------
+    scene : Scene
+    instrument : Instrument
+    position : float
+        Of the view, in view steps.
+
+    Returns
+    -------
+    RayBundle
+        Picture point in pixels, time of flight in seconds and brightness of each ray.
+    """
     x, y = instrument.pixel_grid()
     hits = scene.trace(instrument.viewpoint(position), instrument.directions(x, y, position))
     bright = (hits.body != NO_BODY) & (hits.reflectance > 0)
@@ -49,6 +62,7 @@ def cast_view_rays(scene: Scene, instrument: Instrument, position: float) -> Ray
         x[bright],
         y[bright],
         2 * hits.path[bright] / SPEED_OF_LIGHT,
+        # light falls with the square of the distance, on the way back from a matt surface
         share * hits.reflectance[bright] / hits.distance[bright] ** 2,
     )
 
@@ -56,8 +70,23 @@ def cast_view_rays(scene: Scene, instrument: Instrument, position: float) -> Ray
 def render_streak(rays: RayBundle, view: int, instrument: Instrument) -> FloatArray:
     """Put one view's light on the streak image: (rows, columns), in the units of the rays'
     brightness.
+
+    Parameters
+    ----------
+    rays : RayBundle
+        Of the view, from `cast_view_rays`.
+    view : int
+        Number of the lenslet, counted from 0.
+    instrument : Instrument
+
+    Returns
+    -------
+    (rows, columns) float64 array
+        Time runs along the rows.
     """
     camera, detector = instrument.camera, instrument.detector
+    # a cylindrical lenslet turned by the angle images a point as a slanted line, which crosses the
+    # slit here
     slit = camera.centres_px[view] + rays.x - rays.y * np.tan(camera.angles[view])
     row = (rays.time + camera.time_zero) / detector.bin_width
     row, slit, stretch = _apply_sweep(camera, row, slit)

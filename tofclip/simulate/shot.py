@@ -24,7 +24,7 @@ class SimulatedShot:
     Parameters
     ----------
     streak : Streak
-        Readings in photons with noise, background and saturation; carries the true camera.
+        Measurements in photons with noise, background and saturation; carries the true camera.
     camera : Camera
         The true camera, with the gains and the sweep that made the picture.
     truth : Truth

@@ -22,7 +22,27 @@ AngleAssignment = tuple[tuple[int, ...], list[NDArray[np.float64]]]
 
 
 def count_lines(image_shape: tuple[int, int], detector_px: int, sampling_ratio: float) -> int:
-    """Return how many line detectors make up the sampling ratio, refusing none."""
+    """Return how many line detectors make up the sampling ratio.
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+        Rows and columns of a view's picture.
+    detector_px : int
+        Pixels of one line detector.
+    sampling_ratio : float
+        Measurements over pixels of one picture.
+
+    Returns
+    -------
+    int
+        At least 1.
+
+    Raises
+    ------
+    InputError
+        The ratio is too small for a single line.
+    """
     count = round(sampling_ratio * image_shape[0] * image_shape[1] / detector_px)
     if count < 1:
         raise InputError(

@@ -25,23 +25,23 @@ class LightFieldCamera(ABC):
     views : sequence of (float, float)
         (v, u) of every view.
     sampling_ratio : float
-        Readings over pixels of one picture.
+        Measurements over pixels of one picture.
     seed : int
         Of everything random.
 
     Attributes
     ----------
     used_views : tuple of int
-        Numbers of the views that get readings, in the order of the readings.
+        Numbers of the views that get measurements, in the order of the measurements.
     measurements : int
-        How many readings there are.
+        How many measurements there are.
     correlation_length : int
-        Consecutive readings on a detector whose errors are alike; 1 where each stands for itself.
+        Consecutive measurements on a detector whose errors are alike; 1 where each stands for itself.
 
     Raises
     ------
     InputError
-        So few readings are asked for that there would be none.
+        So few measurements are asked for that there would be none.
     """
 
     name: ClassVar[str]
@@ -59,8 +59,8 @@ class LightFieldCamera(ABC):
 
     @abstractmethod
     def _assign_measurements(self) -> tuple[int, ...]:
-        """Give readings to views and set `measurements`; return the numbers of the views that get
-        any.
+        """Give measurements to views and set `measurements`; return the numbers of the views that
+        get any.
         """
 
     @cached_property
@@ -75,17 +75,29 @@ class LightFieldCamera(ABC):
     @abstractmethod
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
         """Return F(d): from the picture refocused at `shear`, seen from `reference`, to the
-        readings (Eq. 21).
+        measurements (Eq. 21).
+
+        Parameters
+        ----------
+        shear : float
+            Pixels by which a point moves from one view to the next; stands for a depth.
+        reference : (float, float)
+            View (v, u) from which the picture is seen, in view steps.
+
+        Returns
+        -------
+        LinearOperator
+            (rows, columns) pictures to (measurements,) vectors.
         """
 
     def weighting(self) -> LinearOperator:
-        """Return the weights W that readings and model get in a recovery; 1 unless the camera has a
-        reason.
+        """Return the weights W that measurements and model get in a recovery; 1 unless the camera
+        has a reason.
         """
         return Identity((self.measurements,))
 
     def light_field_model(self) -> LinearOperator:
-        """Return the map from the used views' pictures, (views, rows, columns), to the readings
+        """Return the map from the used views' pictures, (views, rows, columns), to the measurements
         (Eq. 20).
         """
         return BlockDiagonal(self.encoders)

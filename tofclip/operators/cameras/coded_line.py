@@ -52,7 +52,19 @@ class CodedLineCamera(LightFieldCamera):
         return tuple(SliceConvolution(self.image_shape, spreads) for spreads in self._spreads)
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
-        """Return F(d): the lines of each view moved as its picture would be."""
+        """Return F(d): the lines of each view moved as its picture would be.
+
+        Parameters
+        ----------
+        shear : float
+            Pixels per view step.
+        reference : (float, float)
+            View (v, u) from which the picture is seen, in view steps.
+
+        Returns
+        -------
+        SliceConvolution
+        """
         moved: list[NDArray[np.float64]] = []
         for view, spreads in zip(self.used_views, self._spreads, strict=True):
             moved.append(

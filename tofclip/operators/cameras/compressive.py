@@ -45,10 +45,23 @@ class CompressiveCamera(LightFieldCamera):
 
     @abstractmethod
     def light_field_model(self) -> LinearOperator:
-        """Return the map from the views' pictures, (views, rows, columns), to the readings."""
+        """Return the map from the views' pictures, (views, rows, columns), to the measurements."""
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
-        """Return F(d): the light field's model after the shears."""
+        """Return F(d): the light field's model after the shears.
+
+        Parameters
+        ----------
+        shear : float
+            Pixels per view step.
+        reference : (float, float)
+            View (v, u) from which the picture is seen, in view steps.
+
+        Returns
+        -------
+        LinearOperator
+            (rows, columns) pictures to (measurements,) vectors.
+        """
         return self.light_field_model() @ ShearedViews(
             self.image_shape, self.views, shear, reference
         )

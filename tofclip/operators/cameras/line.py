@@ -53,7 +53,25 @@ class LineCamera(LightFieldCamera):
         return RadonProjection(self.image_shape, self.detector_px, angles, offsets_px)
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
-        """Return F(d) as one sparse matrix: a sheared view is one whose detector is offset."""
+        """Return F(d) as one sparse matrix: a sheared view is one whose detector is offset.
+
+        Parameters
+        ----------
+        shear : float
+            Pixels per view step.
+        reference : (float, float)
+            View (v, u) from which the picture is seen, in view steps.
+
+        Returns
+        -------
+        LinearOperator
+            (rows, columns) pictures to (measurements,) vectors.
+
+        Raises
+        ------
+        InputError
+            The shear moves a view by more than the detector's length.
+        """
         offsets = []
         for view, angles in zip(self.used_views, self.angles, strict=True):
             down, right = (
@@ -63,6 +81,8 @@ class LineCamera(LightFieldCamera):
                 raise InputError(
                     f"shear {shear} moves view {self.views[view]} out of the field; take a smaller one"
                 )
+            # the shift's component along the line's direction (cos, sin); the other one moves along
+            # the integral
             offsets.append(right * np.cos(angles) + down * np.sin(angles))
         return self._make_projection(np.concatenate(self.angles), np.concatenate(offsets))
 

@@ -53,15 +53,28 @@ class PointSpreadCamera(LightFieldCamera):
         return PointSpreadConvolution(self.image_shape, spread)
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
-        """Return F(d): one convolution with the depth's PSF, read by the sensor."""
+        """Return F(d): one convolution with the depth's PSF, read by the sensor.
+
+        Parameters
+        ----------
+        shear : float
+            Pixels per view step.
+        reference : (float, float)
+            View (v, u) from which the picture is seen, in view steps.
+
+        Returns
+        -------
+        LinearOperator
+            (rows, columns) pictures to (measurements,) vectors.
+        """
         views = [self.views[view] for view in self.used_views]
         return self.sensor @ self._make_convolution(
             shear_point_spreads(self._spreads, views, shear, reference).sum(axis=0)
         )
 
     def light_field_model(self) -> LinearOperator:
-        """Return the map from the used views' pictures to the readings: the sum of what each puts
-        on the sensor.
+        """Return the map from the used views' pictures to the measurements: the sum of what each
+        puts on the sensor.
         """
         return self.sensor @ Integration(
             [self._make_convolution(spread) for spread in self._spreads]
@@ -113,7 +126,7 @@ class MeasuredCamera:
     image_shape : (int, int)
     point_spreads : MeasuredPointSpreads
     sensor : LinearOperator, optional
-        From the light on the sensor's plane to the readings, any of `tofclip.operators.sensors`;
+        From the light on the sensor's plane to the measurements, any of `tofclip.operators.sensors`;
         its plane may be smaller than the picture. The default reads every pixel of a plane as large
         as the picture.
     """
@@ -128,7 +141,7 @@ class MeasuredCamera:
         self.sensor = DenseSensor(image_shape) if sensor is None else sensor
 
     def model(self, shear: float) -> LinearOperator:
-        """Return F(d): from the picture at `shear` to the readings."""
+        """Return F(d): from the picture at `shear` to the measurements."""
         plane = (self.sensor.shape_in[0], self.sensor.shape_in[1])
         spread = self.point_spreads.interpolate(shear)
         return self.sensor @ PointSpreadConvolution(
@@ -138,6 +151,17 @@ class MeasuredCamera:
 
 def make_sparse_sensor(image_shape: tuple[int, int], sampling_ratio: float) -> PitchedSensor:
     """Spread as many pixels evenly over the picture as the sampling ratio asks for.
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+        Rows and columns of a view's picture.
+    sampling_ratio : float
+        Sensor pixels over picture pixels, above 0 up to 1.
+
+    Returns
+    -------
+    PitchedSensor
 
     Raises
     ------
@@ -149,6 +173,7 @@ def make_sparse_sensor(image_shape: tuple[int, int], sampling_ratio: float) -> P
         raise InputError(
             f"one area sensor gives sampling ratios above 0 up to 1, not {sampling_ratio}"
         )
+    # the same pitch on both axes, as far as whole numbers of pixels allow
     kept_rows = min(max(round(rows * np.sqrt(sampling_ratio)), 1), rows)
     kept_columns = min(round(sampling_ratio * rows * columns / kept_rows), columns)
     if kept_columns < 1:

@@ -36,7 +36,19 @@ class SinglePixelCamera(LightFieldCamera):
         return tuple(HadamardCodes(self.image_shape, self.codes, int(seed)) for seed in seeds)
 
     def model(self, shear: float, reference: View = (0.0, 0.0)) -> LinearOperator:
-        """Return F(d): every view's codes after its shear, stacked."""
+        """Return F(d): every view's codes after its shear, stacked.
+
+        Parameters
+        ----------
+        shear : float
+            Pixels per view step.
+        reference : (float, float)
+            View (v, u) from which the picture is seen, in view steps.
+
+        Returns
+        -------
+        Stack
+        """
         return Stack(
             [
                 encoder @ LinearShear(self.image_shape, shear, self.views[view], reference)

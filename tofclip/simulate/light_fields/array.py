@@ -103,6 +103,17 @@ class CameraArray:
     def point(self, x: float, y: float, shear: float) -> NDArray[np.float64]:
         """The point (x, y, z) in metres that the reference view sees `x`, `y` pixels off its centre
         at a shear.
+
+        Parameters
+        ----------
+        x, y : float
+            Pixels off the centre, right and down.
+        shear : float
+            Pixels per view step.
+
+        Returns
+        -------
+        (3,) float64 array
         """
         depth = self.depth(shear)
         return np.array([x / self.focal_length_px * depth, y / self.focal_length_px * depth, depth])

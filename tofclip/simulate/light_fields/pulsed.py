@@ -96,7 +96,21 @@ class TimeAxis:
 
     @classmethod
     def for_ranges(cls, near: float, far: float, bin_width: float, pulse_fwhm: float) -> TimeAxis:
-        """Return a clock for surfaces from `near` to `far` metres away, lamps beside the views."""
+        """Return a time axis for surfaces from `near` to `far` metres away, lamps beside the views.
+
+        Parameters
+        ----------
+        near, far : float
+            Metres.
+        bin_width : float
+            Seconds.
+        pulse_fwhm : float
+            Full width at half maximum of the instrument's response, seconds.
+
+        Returns
+        -------
+        TimeAxis
+        """
         start = 2 * near / SPEED_OF_LIGHT
         return cls(
             start,
@@ -114,6 +128,17 @@ def render_flash(
     A surface of reflectance 1 that faces all lamps from the distance of the array's focus has
     brightness 1, summed over time. Memory beyond the result is about 1 kB for each ray of a view
     and thread.
+
+    Parameters
+    ----------
+    scene : PulsedScene
+        Bodies and lamps.
+    array : CameraArray
+    time_axis : TimeAxis
+
+    Returns
+    -------
+    (views, rows, columns, bins) float32 array
     """
     views = array.views
     pictures = np.empty((len(views), *array.image_shape, time_axis.bins), np.float32)
@@ -132,7 +157,20 @@ def render_flash(
 def render_flash_view(
     scene: PulsedScene, array: CameraArray, time_axis: TimeAxis, view: View
 ) -> Array:
-    """Return what the camera at (v, u) sees at every instant, (rows, columns, bins) float32."""
+    """Return what the camera at (v, u) sees in every time bin.
+
+    Parameters
+    ----------
+    scene : PulsedScene
+    array : CameraArray
+    time_axis : TimeAxis
+    view : (float, float)
+        View steps down and to the right.
+
+    Returns
+    -------
+    (rows, columns, bins) float32 array
+    """
     origin, directions = array.rays(view, array.samples)
     sight = cast_rays(scene.bodies, origin, directions)
     seen = np.flatnonzero(sight.body != NO_BODY)
@@ -149,5 +187,6 @@ def render_flash_view(
         path = np.linalg.norm(points[lit] - lamp, axis=1) + back[lit]
         position = (path / SPEED_OF_LIGHT - time_axis.start) / time_axis.bin_width
         total += bin_by_time(pixel[lit], position, light[lit], sigma, shape)
+    # so that a white surface that faces all lamps from the focus distance has brightness 1
     share = array.focus**2 / len(scene.lamps) / array.samples**2
     return (share * total).astype(np.float32).reshape(*array.image_shape, time_axis.bins)

@@ -60,7 +60,18 @@ class RenderedLightField:
 
 
 def render_light_field(scene: Scene, array: CameraArray) -> RenderedLightField:
-    """Render every view of an array; memory is about 200 bytes for each ray of one view and thread."""
+    """Render every view of an array; memory is about 200 bytes for each ray of one view and thread.
+
+    Parameters
+    ----------
+    scene : Scene
+    array : CameraArray
+
+    Returns
+    -------
+    RenderedLightField
+        Pictures (views, rows, columns) float32 and the reference view's map of shears.
+    """
     views = array.views
     pictures = np.empty((len(views), *array.image_shape), np.float32)
 
@@ -77,6 +88,17 @@ def render_light_field(scene: Scene, array: CameraArray) -> RenderedLightField:
 def render_view(scene: Scene, array: CameraArray, view: View) -> Array:
     """Return what the camera at (v, u) sees, (rows, columns) float32; fractions are cameras between
     the array's.
+
+    Parameters
+    ----------
+    scene : Scene
+    array : CameraArray
+    view : (float, float)
+        View steps down and to the right.
+
+    Returns
+    -------
+    (rows, columns) float32 array
     """
     origin, directions = array.rays(view, array.samples)
     _, brightness = _shade_rays(scene, origin, directions)
@@ -89,6 +111,18 @@ def render_view(scene: Scene, array: CameraArray, view: View) -> Array:
 def render_shear_map(scene: Scene, array: CameraArray, view: View = (0.0, 0.0)) -> Array:
     """Return the shear of what a view sees in the middle of each pixel, (rows, columns) float32;
     infinite: nothing.
+
+    Parameters
+    ----------
+    scene : Scene
+    array : CameraArray
+    view : (float, float)
+        View steps down and to the right.
+
+    Returns
+    -------
+    (rows, columns) float32 array
+        Pixels per view step.
     """
     origin, directions = array.rays(view, 1)
     distance, _ = _shade_rays(scene, origin, directions)

@@ -44,12 +44,44 @@ class _SceneBuilder:
         shear: float,
         material: Material,
     ) -> Body:
+        """Return a flat plate that faces the cameras.
+
+        Parameters
+        ----------
+        place : (float, float)
+            Pixels right and down of the centre of the reference view.
+        size : (float, float)
+            Width and height as the reference view sees them, pixels.
+        shear : float
+            Depth, as pixels per view step.
+        material : Material
+
+        Returns
+        -------
+        Body
+        """
         width, height = (self._length(side, shear) for side in size)
         return Body(Rectangle(width, height), material, self._point(place, shear))
 
     def ball(
         self, place: tuple[float, float], radius: float, shear: float, material: Material
     ) -> Body:
+        """Return a ball whose centre lies at a shear.
+
+        Parameters
+        ----------
+        place : (float, float)
+            Pixels right and down of the centre of the reference view.
+        radius : float
+            Pixels of the reference view.
+        shear : float
+            Depth, as pixels per view step.
+        material : Material
+
+        Returns
+        -------
+        Body
+        """
         return Body(Sphere(self._length(radius, shear)), material, self._point(place, shear))
 
     def block(
@@ -59,10 +91,38 @@ class _SceneBuilder:
         shear: float,
         material: Material,
     ) -> Body:
+        """Return a block as thick as it is wide.
+
+        Parameters
+        ----------
+        place : (float, float)
+            Pixels right and down of the centre of the reference view.
+        size : (float, float)
+            Width and height, pixels of the reference view.
+        shear : float
+            Depth, as pixels per view step.
+        material : Material
+
+        Returns
+        -------
+        Body
+        """
         width, height = (self._length(side, shear) for side in size)
         return Body(Box(width, height, width), material, self._point(place, shear))
 
     def backdrop(self, shear: float, material: Material) -> Body:
+        """Return a plate that fills every view.
+
+        Parameters
+        ----------
+        shear : float
+            Depth, as pixels per view step.
+        material : Material
+
+        Returns
+        -------
+        Body
+        """
         return self.plate((0, 0), (2.2 * DESIGN_WIDTH_PX,) * 2, shear, material)
 
     def _length(self, pixels: float, shear: float) -> float:
@@ -78,6 +138,16 @@ class _SceneBuilder:
 
 def make_scene(name: str, array: CameraArray) -> Scene:
     """Return a scene of `SCENES`, sized for a camera array.
+
+    Parameters
+    ----------
+    name : str
+        A key of `SCENES`.
+    array : CameraArray
+
+    Returns
+    -------
+    Scene
 
     Raises
     ------
