@@ -68,6 +68,19 @@ def make_focal_stack(
 
     Depth from focus and `FocalStack.all_in_focus` on a stack from another reference synthesise that
     viewpoint.
+
+    Parameters
+    ----------
+    light_field : LightField
+    shears : (depths,) array_like
+        Pixels per view step.
+    reference : (float, float)
+        Viewpoint (v, u) in view steps.
+
+    Returns
+    -------
+    FocalStack
+        Pictures (depths, rows, columns).
     """
     depths = np.asarray(shears, np.float64)
     pictures = [light_field.refocus(float(shear), reference) for shear in depths]

@@ -1,4 +1,4 @@
-"""Readings of a light-field camera: how they were made, how they are kept, and the problem that
+"""Measurements of a light-field camera: how they were made, how they are kept, and the problem that
 they pose.
 """
 
@@ -32,7 +32,7 @@ class CameraSetup:
     encoder : str
         A name in `tofclip.operators.light_field_camera.CAMERAS`.
     sampling_ratio : float
-        Readings over pixels of one picture.
+        Measurements over pixels of one picture.
     seed : int
     """
 
@@ -46,7 +46,24 @@ class CameraSetup:
             object.__setattr__(self, "encoder", EvenAngleLineCamera.name)
 
     def camera(self, image_shape: tuple[int, int], views: NDArray[np.float64]) -> LightFieldCamera:
-        """Build the camera; the same setup builds the same one again."""
+        """Build the camera; the same setup builds the same one again.
+
+        Parameters
+        ----------
+        image_shape : (int, int)
+            Rows and columns of a view's picture.
+        views : (views, 2) float64 array
+            View steps (v, u).
+
+        Returns
+        -------
+        LightFieldCamera
+
+        Raises
+        ------
+        InputError
+            There is no encoder of that name.
+        """
         if self.encoder not in CAMERAS:
             raise InputError(f"unknown encoder '{self.encoder}'; take one of {', '.join(CAMERAS)}")
         return CAMERAS[self.encoder](
@@ -56,11 +73,11 @@ class CameraSetup:
 
 @dataclass(frozen=True)
 class ClipMeasurement(Storable):
-    """Readings and the camera that made them.
+    """Measurements and the camera that made them.
 
     Parameters
     ----------
-    measurements : (readings,) float32 array
+    measurements : (measurements,) float32 array
     views : (views, 2) array
         (v, u) of every view.
     image_shape : (int, int)
@@ -89,12 +106,12 @@ class ClipMeasurement(Storable):
             raise InputError("every reading is zero; there is nothing to recover")
 
     def camera(self) -> LightFieldCamera:
-        """Build the camera that made the readings.
+        """Build the camera that made the measurements.
 
         Raises
         ------
         ShapeError
-            It makes another number of readings: the file is not from this setup.
+            It makes another number of measurements: the file is not from this setup.
         """
         camera = self.setup.camera(self.image_shape, self.views)
         if self.measurements.shape != (camera.measurements,):
@@ -104,12 +121,12 @@ class ClipMeasurement(Storable):
         return camera
 
     def counts(self) -> NDArray[Any]:
-        """Return the readings in photons, (readings,) float32.
+        """Return the measurements in photons, (measurements,) float32.
 
         Raises
         ------
         InputError
-            Nobody knows how many photons a reading stands for.
+            Nobody knows how many photons a measurement stands for.
         """
         if self.photons_per_unit <= 0:
             raise InputError(
@@ -120,7 +137,19 @@ class ClipMeasurement(Storable):
 
 
 def measure(light_field: LightField, setup: CameraSetup) -> ClipMeasurement:
-    """Encode the true views, each by its own A_k: no model of refocusing takes part."""
+    """Encode the true views, each by its own A_k: no model of refocusing takes part.
+
+    Parameters
+    ----------
+    light_field : LightField
+        Pictures (views, rows, columns).
+    setup : CameraSetup
+
+    Returns
+    -------
+    ClipMeasurement
+        Without noise.
+    """
     shape = (light_field.pictures.shape[1], light_field.pictures.shape[2])
     camera = setup.camera(shape, light_field.views)
     measurements = camera.light_field_model()(light_field.pictures[list(camera.used_views)])
@@ -130,7 +159,7 @@ def measure(light_field: LightField, setup: CameraSetup) -> ClipMeasurement:
 def corrupt_measurement(
     measurement: ClipMeasurement, photons: float | None, bad_fraction: float
 ) -> ClipMeasurement:
-    """Add photon noise, then set a share of all readings to 0 or to the largest, at random.
+    """Add photon noise, then set a share of all measurements to 0 or to the largest, at random.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Readings of a light-field camera at every instant, and the returns that follow each other in
+"""Measurements of a light-field camera at every instant, and the returns that follow each other in
 them.
 """
 
@@ -40,7 +40,7 @@ class Rig:
     lamps : (lamps, 3) array
         m; they flash together.
     setup : Setup
-        Which nonlocal readings the views get.
+        Which nonlocal measurements the views get.
     """
 
     array: CameraArray
@@ -83,18 +83,18 @@ class Return:
 
 @dataclass(frozen=True)
 class TimedMeasurements:
-    """Readings of every view at every instant.
+    """Measurements of every view at every instant.
 
     Parameters
     ----------
-    values : (readings, bins) float32 array
+    values : (measurements, bins) float32 array
     rig : Rig
     time_axis : Clock
 
     Raises
     ------
     ShapeError
-        The rig makes another number of readings, or the clock has other bins.
+        The rig makes another number of measurements, or the clock has other bins.
     """
 
     values: Array
@@ -108,7 +108,7 @@ class TimedMeasurements:
 
     @property
     def history(self) -> Array:
-        """All readings together at each instant, (bins,)."""
+        """All measurements together at each instant, (bins,)."""
         total: Array = self.values.sum(axis=0, dtype=np.float64)
         return total
 
@@ -142,7 +142,7 @@ class TimedMeasurements:
         )
 
     def sum_gate(self, bins: slice) -> Array:
-        """Return the readings summed over some instants, (readings,) float32."""
+        """Return the measurements summed over some instants, (measurements,) float32."""
         total: Array = self.values[:, bins].sum(axis=1)
         return total
 
@@ -153,7 +153,20 @@ class TimedMeasurements:
 
 
 def measure_views(pictures: Array, rig: Rig, time_axis: TimeAxis) -> TimedMeasurements:
-    """Measure true views, (views, rows, columns, bins), without noise."""
+    """Measure true views, (views, rows, columns, bins), without noise.
+
+    Parameters
+    ----------
+    pictures : (views, rows, columns, bins) float32 array
+    rig : Rig
+        Camera and geometry.
+    time_axis : TimeAxis
+        Of the bins.
+
+    Returns
+    -------
+    TimedMeasurements
+    """
     camera = rig.camera
     return TimedMeasurements(
         camera.light_field_model()(pictures[list(camera.used_views)]), rig, time_axis
@@ -161,8 +174,20 @@ def measure_views(pictures: Array, rig: Rig, time_axis: TimeAxis) -> TimedMeasur
 
 
 def add_poisson_noise(light: Array, photons_per_unit: float, random: np.random.Generator) -> Array:
-    """Return light as counted photons tell it, in the unit it came in: float32, Poisson
-    distributed.
+    """Return light as photon counts report it, in the unit it came in.
+
+    Parameters
+    ----------
+    light : float array
+        Any shape; what is below zero counts as zero.
+    photons_per_unit : float
+        Mean photons where `light` is 1.
+    random : numpy.random.Generator
+
+    Returns
+    -------
+    float32 array
+        Of the same shape.
     """
     photons = random.poisson(np.maximum(light, 0) * photons_per_unit)
     found: Array = (photons / photons_per_unit).astype(np.float32)

@@ -2,7 +2,7 @@
 
 The occluder's own return tells where it stands. So it is known which pixels of which view it
 covers, and which lamps it keeps from which place of the target; both go into the model F(d), and
-the recovery compares no reading with light that could not have come.
+the recovery compares no measurement with light that could not have come.
 """
 
 from __future__ import annotations

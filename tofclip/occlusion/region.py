@@ -78,7 +78,19 @@ class InactiveRegion:
         return seen
 
     def contains(self, across: ArrayLike, behind: ArrayLike) -> NDArray[Any]:
-        """Tell whether a point, as in `sees`, is hidden from the whole aperture."""
+        """Return whether a point is hidden from the whole aperture.
+
+        Parameters
+        ----------
+        across, behind : array_like
+            As in `sees`, metres.
+
+        Returns
+        -------
+        bool array
+        """
+        # a convex occluder on the axis hides a point from the whole aperture if it hides it from
+        # both ends
         left, right = (self.sees(end * self.baseline / 2, across, behind) for end in (-1, 1))
         hidden: NDArray[Any] = ~(left | right)
         return hidden

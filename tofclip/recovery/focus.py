@@ -63,7 +63,22 @@ class Focus(Protocol):
         measurement: Measurement,
         progress: Progress = ignore_progress,
     ) -> list[FrameSegment]:
-        """Cut the frames at `times` (s of flight) into pieces, in order and without gaps."""
+        """Cut the frames at `times` (s of flight) into pieces, in order and without gaps.
+
+        Parameters
+        ----------
+        camera : Camera
+        times : (frames,) float array
+            Times of flight, s.
+        measurement : Measurement
+            Of the same frames.
+        progress : callable
+            Called with the number of frame iterations just done.
+
+        Returns
+        -------
+        list of FrameSegment
+        """
         ...
 
     def work(self, frames: int) -> int:
@@ -94,7 +109,20 @@ class FixedFocus:
         measurement: Measurement,
         progress: Progress = ignore_progress,
     ) -> list[FrameSegment]:
-        """Return a single piece."""
+        """Return a single piece.
+
+        Parameters
+        ----------
+        camera : Camera
+        times : (frames,) float array
+            Times of flight, s.
+        measurement : Measurement
+        progress : callable
+
+        Returns
+        -------
+        list of FrameSegment
+        """
         return [FrameSegment(slice(0, times.size), self.shear)]
 
     def work(self, frames: int) -> int:
@@ -143,9 +171,24 @@ class DepthLockedFocus:
     ) -> list[FrameSegment]:
         """Cut where the shear has changed by twice the tolerance, or the light has become a third
         weaker.
+
+        Parameters
+        ----------
+        camera : Camera
+            Its parallax, ``shear_at``, and view positions.
+        times : (frames,) float array
+            Times of flight, s.
+        measurement : Measurement
+        progress : callable
+
+        Returns
+        -------
+        list of FrameSegment
+            Each with its mean shear and the mean of ``distance**-2``, which the light falls with.
         """
         distance = np.maximum(SPEED_OF_LIGHT * times / 2, MIN_RANGE_M)
         shears = camera.shear_at(distance)
+        # a piece reaches the tolerance to either side of its mean shear at the outermost view
         step = 2 * self.tolerance_px / np.abs(camera.view_positions).max(initial=1.0)
         number = np.floor((shears - shears[0]) / step).astype(np.int64)
         octave = np.floor(np.log(distance / distance[0]) / np.log(SEGMENT_RANGE_RATIO))
@@ -200,7 +243,22 @@ class SharpestFocus:
         measurement: Measurement,
         progress: Progress = ignore_progress,
     ) -> list[FrameSegment]:
-        """Try all shears on each gate."""
+        """Try all shears on each gate.
+
+        Parameters
+        ----------
+        camera : Camera
+        times : (frames,) float array
+            Times of flight, s.
+        measurement : Measurement
+            Of the same frames; it is recovered at every shear of the stack.
+        progress : callable
+            Called with the number of frame iterations just done.
+
+        Returns
+        -------
+        list of FrameSegment
+        """
         starts = range(0, times.size, GATE_BINS)
         gates = [slice(start, min(start + GATE_BINS, times.size)) for start in starts]
         shears = np.linspace(self.first, self.last, self.number)

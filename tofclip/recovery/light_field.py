@@ -1,5 +1,5 @@
-"""From the readings of a light-field camera to the picture at one depth, by names that a user can
-type.
+"""From the measurements of a light-field camera to the picture at one depth, by names that a user
+can type.
 """
 
 from __future__ import annotations
@@ -59,8 +59,10 @@ FINAL_THRESHOLD_DEVIATIONS = (
 HUBER_WEIGHT_FACTOR = 2.0
 """How much the weight is raised with Huber's term.
 
-Its prediction error is a sum of many small errors on the dark ground, which any weight predicts, and of edges cut off;
-on letters with 0 to 10 % bad readings the best weight is 1.5 to 2 times the one with the lowest error."""
+Its prediction error is a sum of many small errors on the dark ground, which any weight predicts,
+and of edges cut off; on letters with 0 to 10 % bad measurements the best weight is 1.5 to 2 times
+the one with the lowest error.
+"""
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ class ClipRecovery:
         Of the variational prior, relative to the largest value of A'f; chosen by cross-validation
         if not given.
     data_term : str
-        ``squares``; ``huber`` where some readings are wildly wrong; ``poisson`` the likelihood of
+        ``squares``; ``huber`` where some measurements are wildly wrong; ``poisson`` the likelihood of
         photon counts.
 
     Raises
@@ -129,7 +131,19 @@ class ClipRecovery:
             raise InputError(f"the prior's weight must be positive, got {self.weight}")
 
     def recover(self, measurement: ClipMeasurement, shear: float) -> ClipResult:
-        """Recover the picture refocused at `shear`, pixels per view step."""
+        """Recover the picture refocused at `shear`, pixels per view step.
+
+        Parameters
+        ----------
+        measurement : ClipMeasurement
+        shear : float
+            Pixels per view step.
+
+        Returns
+        -------
+        ClipResult
+            Picture (rows, columns), weight of the prior, and seconds of each step.
+        """
         begin = perf_counter()
         problem = self._make_problem(measurement, shear)
         ready = perf_counter()
@@ -197,9 +211,9 @@ def recover_light_field(
 ) -> LightField:
     """Recover every view instead of one picture (Eq. 20), by total variation over pixels and views.
 
-    Far more unknowns than readings: expect less than of the refocused picture, whose views agree.
-    Views without readings are filled in from their neighbours. Memory: about ten times the light
-    field.
+    Far more unknowns than measurements: expect less than of the refocused picture, whose views
+    agree. Views without measurements are filled in from their neighbours. Memory: about ten times
+    the light field.
 
     Parameters
     ----------
@@ -244,7 +258,7 @@ def _view_grid_shape(views: NDArray[np.float64]) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class _InverseProblem:
-    """Model and readings (readings, 1) weighted as the data term wants them."""
+    """Model and measurements (measurements, 1) weighted as the data term wants them."""
 
     model: LinearOperator
     measurements: NDArray[Any]

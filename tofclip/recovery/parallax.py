@@ -98,6 +98,20 @@ def split_gates_by_brightness(
 ) -> tuple[list[slice], FloatArray]:
     """Cut the frames into gates of equal brightness (root of the light); also their light's mean
     range, m.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    times : (frames,) float array
+        Times of flight, s.
+    number : int
+        Gates asked for; where light is concentrated there may be fewer.
+
+    Returns
+    -------
+    gates : list of slice
+    ranges : (gates,) float64 array
+        Metres.
     """
     light = np.maximum(
         (measurement.measurements * measurement.valid).sum(axis=0, dtype=np.float64), 0
@@ -107,6 +121,8 @@ def split_gates_by_brightness(
     cuts = np.unique(np.concatenate([[0], edges, [light.size]])).tolist()
     gates = [slice(first, last) for first, last in pairwise(cuts)]
     instants = [
-        np.average(times[gate], weights=light[gate] + np.finfo(np.float64).tiny) for gate in gates
+        # a gate without light has a mean time too
+        np.average(times[gate], weights=light[gate] + np.finfo(np.float64).tiny)
+        for gate in gates
     ]
     return gates, SPEED_OF_LIGHT * np.array(instants) / 2

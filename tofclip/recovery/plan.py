@@ -66,7 +66,7 @@ class RecoveryTask:
     focus : Focus
         At which shear each frame is recovered.
     device : Place
-        Where: readings are put there, and frames fetched from there. What precedes the recovery is
+        Where: measurements are put there, and frames fetched from there. What precedes the recovery is
         done in NumPy.
     """
 
@@ -180,7 +180,27 @@ def prepare_recovery(
     focus: Focus | None = None,
     device: str = "cpu",
 ) -> RecoveryTask:
-    """Check what `recover` needs before any work is done; arguments as there."""
+    """Check what `recover` needs before any work is done; arguments as there.
+
+    Parameters
+    ----------
+    streak : Streak
+    camera : Camera, optional
+        Instead of the one that the streak image carries.
+    method : str or Method
+    focus : Focus, optional
+    device : str
+        See `tofclip.arrays.parse_device`.
+
+    Returns
+    -------
+    RecoveryTask
+
+    Raises
+    ------
+    InputError
+        There is no camera, the shot has no time axis, or the focus does not fit the camera.
+    """
     camera = camera or streak.camera
     if camera is None:
         raise InputError(
@@ -196,7 +216,20 @@ def prepare_recovery(
 def fit_camera_to_shot(
     streak: Streak, camera: Camera, progress: Progress = ignore_progress
 ) -> Camera:
-    """Return `camera` with sweep, gains and centres found from the shot itself."""
+    """Return `camera` with sweep, gains and centres found from the shot itself.
+
+    Parameters
+    ----------
+    streak : Streak
+    camera : Camera
+        Where the search starts.
+    progress : callable
+        Called as the search for the views goes on.
+
+    Returns
+    -------
+    Camera
+    """
     skew = estimate_skew(streak.counts, camera)
     coarse = replace(camera, sweep=skew.sweep)
     return register_views(streak.counts, streak.saturated, coarse, progress).camera

@@ -83,7 +83,22 @@ def recover_segments(
 def compute_segments_residual(
     camera: Camera, frames: Array, measurement: Measurement, pieces: Sequence[FrameSegment]
 ) -> float:
-    """``|F h - f| / |f|`` over all good readings, each frame with its own operator."""
+    """``|F h - f| / |f|`` over all good measurements, each frame with its own operator.
+
+    Parameters
+    ----------
+    camera : Camera
+    frames : (frames, rows, columns) array
+        Recovered.
+    measurement : Measurement
+    pieces : sequence of FrameSegment
+        Without gaps; each has its shear.
+
+    Returns
+    -------
+    float
+        0 is a perfect fit.
+    """
     misfit = energy = 0.0
     for piece in pieces:
         part = _slice_measurement(measurement, piece)
@@ -108,12 +123,12 @@ def _slice_measurement(measurement: Measurement, piece: FrameSegment) -> Measure
 
 
 def _zero_invalid(part: Measurement) -> Array:
-    """The readings, zero where they are not good."""
+    """The measurements, zero where they are not good."""
     return namespace(part.measurements, part.valid).where(part.valid, part.measurements, 0.0)
 
 
 def _find_backprojection_peak(operator: LinearOperator, part: Measurement) -> float:
-    """Largest value of F'f over the good readings."""
+    """Largest value of F'f over the good measurements."""
     xp, measurements = namespace(part.measurements), _zero_invalid(part)
     pieces = split_blocks(measurements.shape[1], frames_per_block(operator, measurements))
     return max(float(xp.max(operator.adjoint(measurements[:, piece]))) for piece in pieces)

@@ -78,7 +78,7 @@ class PhotonDetector:
     false_alarm_rate : float
         Share of the histograms without a return in which one is announced, 0.001 or more.
     max_returns : int
-        At most so many returns of one histogram. Two are told apart when they are further apart
+        Maximum number returns of one histogram. Two are told apart when they are further apart
         than the pulse's support.
     min_photons : float
         The filter is the most powerful one for returns of so many photons; stronger ones pass it

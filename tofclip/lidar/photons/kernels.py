@@ -29,6 +29,20 @@ def find_best_score(counts, weights, first):
 
     ``score[j] = sum_w weights[w] * counts[j + first + w]``; photons are few, so each one adds to
     the bins it concerns.
+
+    Parameters
+    ----------
+    counts : (bins,) array
+        Photons.
+    weights : (width,) float array
+        Of the log-matched filter.
+    first : int
+        Bin of the first weight, counted from the return's.
+
+    Returns
+    -------
+    best score : float
+    bin : int
     """
     score = np.zeros(counts.size)
     for i in range(counts.size):
@@ -43,7 +57,19 @@ def find_best_score(counts, weights, first):
 
 @njit(nogil=True, cache=True)
 def find_best_scores(histograms, weights, first, best):
-    """Fill `best` with the largest response of each histogram."""
+    """Fill `best` with the largest response of each histogram.
+
+    Parameters
+    ----------
+    histograms : (n, bins) array
+        Photons.
+    weights : (width,) float array
+        Of the log-matched filter.
+    first : int
+        Bin of the first weight, counted from the return's.
+    best : (n,) float64 array
+        Overwritten.
+    """
     for row in range(histograms.shape[0]):
         best[row] = find_best_score(histograms[row], weights, first)[0]
 
@@ -52,6 +78,19 @@ def find_best_scores(histograms, weights, first, best):
 def simulate_best_scores(photons, bins, noise, weights, first, best):
     """Fill `best` with the best scores of histograms over which `photons` are thrown evenly by a
     random generator.
+
+    Parameters
+    ----------
+    photons : int
+        In each histogram.
+    bins : int
+    noise : numpy.random.Generator
+    weights : (width,) float array
+        Of the log-matched filter.
+    first : int
+        Bin of the first weight, counted from the return's.
+    best : (trials,) float64 array
+        Overwritten.
     """
     counts = np.zeros(bins)
     for trial in range(best.size):
@@ -142,7 +181,24 @@ def fit_histograms(histograms, peaks, numbers, curve, scale, times, found):
 
 @njit(nogil=True, cache=True)
 def estimate_background(trace, times, peaks, scale):
-    """Background photons of a bin, from the bins that no return reaches."""
+    """Background photons of a bin, from the bins that no return reaches.
+
+    Parameters
+    ----------
+    trace : (bins,) array
+        Photons.
+    times : (bins,) array
+        Seconds, increasing.
+    peaks : sequence of int
+        Bins of the returns.
+    scale : (4,) array or tuple
+        The pulse's; see `tofclip.lidar.fit.kernels`.
+
+    Returns
+    -------
+    float
+        Photons per bin, above zero.
+    """
     free = np.ones(trace.size, np.bool_)
     for peak in peaks:
         first, last = find_pulse_window(times, (peak, peak), times[peak], scale)
@@ -152,12 +208,34 @@ def estimate_background(trace, times, peaks, scale):
         if free[i]:
             photons += trace[i]
             bins += 1
+    # a background of exactly zero would make a single photon infinitely surprising
     return (photons + MIN_PHOTONS) / max(bins, 1.0)
 
 
 @njit(nogil=True, cache=True)
 def estimate_height(trace, times, background, curve, scale, peak):
-    """Height of a return from the photons around its bin; never less than half a photon's."""
+    """Height of a return from the photons around its bin; never less than half a photon's.
+
+    Parameters
+    ----------
+    trace : (bins,) array
+        Photons.
+    times : (bins,) array
+        Seconds, increasing.
+    background : float
+        Photons per bin.
+    curve : (samples, 2) array
+        Pulse and slope.
+    scale : (4,) array or tuple
+        The pulse's; see `tofclip.lidar.fit.kernels`.
+    peak : int
+        Bin of the return.
+
+    Returns
+    -------
+    float
+        Photons per bin at the pulse's peak.
+    """
     arrival = times[peak]
     first, last = find_pulse_window(times, (peak, peak), arrival, scale)
     area = excess = 0.0
@@ -169,7 +247,28 @@ def estimate_height(trace, times, background, curve, scale, peak):
 
 @njit(nogil=True, cache=True)
 def summarise_return(trace, times, background, curve, scale, estimate, k, found):
-    """Arrival, photons and the arrival's Cramer-Rao deviation at the estimate."""
+    """Write arrival, photons and the arrival's Cramer-Rao deviation at the estimate to `found`.
+
+    Parameters
+    ----------
+    trace : (bins,) array
+        Photons.
+    times : (bins,) array
+        Seconds, increasing.
+    background : float
+        Photons per bin.
+    curve : (samples, 2) array
+        Pulse and slope.
+    scale : (4,) array or tuple
+        The pulse's; see `tofclip.lidar.fit.kernels`.
+    estimate : (returns, 5) array
+        See `tofclip.lidar.fit.kernels.refine_returns`.
+    k : int
+        Number of the return.
+    found : (3,) float array
+        Overwritten: arrival in seconds, photons, standard deviation in seconds (infinite where the
+        fit says nothing).
+    """
     arrival, height = estimate[k, 0], estimate[k, 1]
     first, last = find_pulse_window(
         times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale
@@ -177,6 +276,7 @@ def summarise_return(trace, times, background, curve, scale, estimate, k, found)
     pp = pd = dd = total = 0.0
     for i in range(first, last):
         p, d = interpolate_pulse(times[i] - arrival, curve, scale)
+        # Poisson: a bin's variance is its expected count, which trace less residual is
         weight = 1 / (
             trace[i] - compute_residual(trace, times, background, curve, scale, estimate, i, -1)
         )
@@ -191,7 +291,19 @@ def summarise_return(trace, times, background, curve, scale, estimate, k, found)
 
 @njit(nogil=True, cache=True)
 def compute_scores(histograms, weights, first, score):
-    """Log-matched filter response of each histogram at each bin, (n, bins)."""
+    """Fill `score` with the log-matched filter's response of each histogram at each bin.
+
+    Parameters
+    ----------
+    histograms : (n, bins) array
+        Photons.
+    weights : (width,) float array
+        Of the filter.
+    first : int
+        Bin of the first weight, counted from the return's.
+    score : (n, bins) float array
+        Overwritten.
+    """
     score[:] = 0
     for row in range(histograms.shape[0]):
         for i in range(histograms.shape[1]):
@@ -209,6 +321,14 @@ def add_path_scores(score, slope_cost, jump_cost, total):
     From one step to the next a path may keep its bin for nothing, change by one bin at
     `slope_cost`, or by any number at `jump_cost`: the recursion of semi-global matching. `score`
     and `total` are (steps, lanes, bins).
+
+    Parameters
+    ----------
+    score : (steps, lanes, bins) array
+    slope_cost, jump_cost : float
+        In the score's unit, nats.
+    total : (steps, lanes, bins) array
+        Added to, in place.
     """
     path, before = np.empty(score.shape[2]), np.empty(score.shape[2])
     for lane in range(score.shape[1]):
@@ -221,6 +341,8 @@ def add_path_scores(score, slope_cost, jump_cost, total):
                     best = max(best, before[t - 1] - slope_cost)
                 if t + 1 < path.size:
                     best = max(best, before[t + 1] - slope_cost)
+                # the subtraction keeps the numbers small and changes no comparison (H.
+                # Hirschmueller, IEEE TPAMI 30, 328, 2008)
                 path[t] = score[step, lane, t] + best - highest
                 total[step, lane, t] += path[t]
             before[:] = path

@@ -92,7 +92,24 @@ def locate_with_smoothness(
 def find_surface(
     detector: PhotonDetector, cube: FloatArray, smoothness: Smoothness
 ) -> NDArray[np.int64]:
-    """Bin of each pixel's return on the most likely piecewise smooth surface, (rows, columns)."""
+    """Bin of each pixel's return on the most likely piecewise smooth surface, (rows, columns).
+
+    Semi-global matching along the four directions of rows and columns (H. Hirschmueller, IEEE TPAMI
+    30, 328, 2008).
+
+    Parameters
+    ----------
+    detector : PhotonDetector
+        Gives the filter's weights.
+    cube : (rows, columns, bins) float64 array
+        Photons.
+    smoothness : Smoothness
+        Costs of a slope and of a jump.
+
+    Returns
+    -------
+    (rows, columns) int64 array
+    """
     from tofclip.lidar.photons.kernels import add_path_scores, compute_scores
 
     filtering = detector.weights(max(float(cube.mean()), 1 / cube.size)), detector.first_offset
