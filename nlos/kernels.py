@@ -58,8 +58,18 @@ def sine_of_turns(turns):
 
 @compiled
 def shift_signals(signal, delay_bins):
-    """Read column p of `signal` (t, points) `late_bins[p]` bins later, linearly interpolated, 0
+    """Read column p of `signal` (t, points) `delay_bins[p]` bins later, linearly interpolated, 0
     outside the record.
+
+    Parameters
+    ----------
+    signal : (t, points) float32 array
+    delay_bins : (points,) array
+        Bins, fractions included.
+
+    Returns
+    -------
+    (t, points) float32 array
     """
     bins, points = signal.shape
     result = np.zeros_like(signal)
@@ -67,6 +77,7 @@ def shift_signals(signal, delay_bins):
         for p in range(points):
             position = i + delay_bins[p]
             if 0 <= position <= bins - 1:
+                # so that the record's last bin itself can be read
                 before = min(int(position), bins - 2)
                 weight = np.float32(position - before)
                 result[i, p] = signal[before, p] + weight * (

@@ -65,6 +65,15 @@ class LightCone:
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with
         ``.reason``.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        Support
         """
         return check_confocal_support(capture, grid)
 

@@ -51,6 +51,24 @@ class ConfocalScan:
     def of(cls, capture: Capture, grid: Grid) -> ConfocalScan:
         """Sort a capture onto its lattice, from distance 0 as far as any voxel of the grid is from
         any wall point.
+
+        Parameters
+        ----------
+        capture : Capture
+            Confocal, its wall points on a lattice of a plane.
+        grid : Grid
+            Says how far the signals are needed.
+
+        Returns
+        -------
+        ConfocalScan
+            Signals (y, x, t) float32; a bin is half as long as the capture's, because it counts
+            distance, not path.
+
+        Raises
+        ------
+        InputError
+            The wall points stand on no lattice.
         """
         wall = PlanarWall.of(capture.points, LATTICE_TOLERANCE)
         traces = _shift_to_distance_zero(capture, _count_useful_bins(capture, wall.plane, grid))
@@ -67,6 +85,16 @@ class ConfocalScan:
 def check_confocal_support(capture: Capture, grid: Grid) -> Support:
     """Check what both methods need: a confocal scan on a lattice of a plane, a grid close by, and
     memory.
+
+    Parameters
+    ----------
+    capture : Capture
+    grid : Grid
+
+    Returns
+    -------
+    Support
+        A condition; ``.reason`` says what is missing.
     """
     basic = check_numpy_support(
         "a light-cone transform or f-k migration", capture
@@ -94,11 +122,26 @@ def find_padded_length(count: int) -> int:
 def interpolate_axis(
     values: NDArray[np.float32], position: FloatArray, axis: int
 ) -> NDArray[np.float32]:
-    """Read an axis at fractional positions by linear interpolation; it is periodic."""
+    """Read an axis at fractional positions by linear interpolation; it is periodic.
+
+    Parameters
+    ----------
+    values : float32 array
+        Any shape.
+    position : (n,) float array
+        In steps of the axis.
+    axis : int
+
+    Returns
+    -------
+    float32 array
+        As `values`, with n places along the axis.
+    """
     below = np.floor(position).astype(np.intp)
     weight = (position - below).astype(np.float32)
     weight = weight.reshape([-1 if i == axis else 1 for i in range(values.ndim)])
     count = values.shape[axis]
+    # the lattice is padded, so that a period's seam lies outside the image
     lower, upper = (np.take(values, index % count, axis) for index in (below, below + 1))
     return np.asarray(lower + weight * (upper - lower))
 
@@ -106,7 +149,21 @@ def interpolate_axis(
 def resample_to_grid(
     values: NDArray[np.float32], scan: ConfocalScan, grid: Grid, depth_position: FloatArray
 ) -> NDArray[np.float32]:
-    """Read an image (y, x, depth) on the padded lattice at the voxels of a grid, shape (z, y, x)."""
+    """Read an image (y, x, depth) on the padded lattice at the voxels of a grid, shape (z, y, x).
+
+    Parameters
+    ----------
+    values : (y, x, depth) float32 array
+    scan : ConfocalScan
+        Its plane gives the lattice's first point and steps, m.
+    grid : Grid
+    depth_position : (z,) float array
+        The grid's planes in steps of the third axis.
+
+    Returns
+    -------
+    (z, y, x) float32 array
+    """
     image = interpolate_axis(values, depth_position, 2)
     row, column = (
         (wanted - axis[0]) / axis_step(axis)

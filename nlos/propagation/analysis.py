@@ -26,6 +26,17 @@ class PlaneWaveAnalysis(Protocol):
     ) -> NDArray[np.complex64]:
         """Analyse ``values * weights[m]`` up to an index along x, (terms, columns, rows); see
         `LatticeAnalysis`.
+
+        Parameters
+        ----------
+        values : (points,) complex64 array
+        weights : (terms, points) complex64 array
+        reach : int
+            Largest index along x.
+
+        Returns
+        -------
+        (terms, columns, rows) complex64 array
         """
         ...
 

@@ -27,6 +27,21 @@ def propagate_direct(
     frequencies) complex64.
 
     See `sum_spherical_waves`.
+
+    Parameters
+    ----------
+    points : (n, 3) float64 array
+        Wall points, m.
+    phasors : (n, frequencies) complex64 array
+    plane : Plane
+    wavenumbers : (frequencies,) float64 array
+        rad/m.
+    progress : callable
+        Called with the number of plane points times frequencies just done.
+
+    Returns
+    -------
+    (y, x, frequencies) complex64 array
     """
     return sum_spherical_waves(
         plane.points.reshape(-1, 3), points, phasors, wavenumbers, progress

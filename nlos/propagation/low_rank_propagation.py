@@ -73,7 +73,16 @@ class _Workspace:
     def propagate_group(
         self, number: int, phasors: NDArray[np.complex64], field: NDArray[np.complex64]
     ) -> None:
-        """Carry one group of frequencies."""
+        """Propagate one group of frequencies.
+
+        Parameters
+        ----------
+        number : int
+            Of the group.
+        phasors : (points, frequencies) complex64 array
+        field : (frequencies, y, x) complex64 array
+            Overwritten at the group's frequencies.
+        """
         plan = self.plan
         group, terms = plan.low_rank_transfer.groups[number], plan.low_rank_transfer.terms(number)
         values = np.ascontiguousarray(phasors[:, group].T)

@@ -206,6 +206,21 @@ def count_nodes(
 
     Enough for the phase, which runs through ``k * half`` about its middle (Jacobi-Anger expansion),
     and for the fall with distance, which is singular at distance 0.
+
+    Parameters
+    ----------
+    wavenumbers : (frequencies,) float64 array
+        rad/m, ascending.
+    strength : (frequencies,) float64 array
+        Relative amplitude of each frequency.
+    middle, half : float
+        Middle and half width of the range of distances, m.
+    error : float
+        Relative.
+
+    Returns
+    -------
+    int
     """
     from scipy.special import jv
 
@@ -215,6 +230,10 @@ def count_nodes(
     phases = half * np.maximum(carrier, wavenumbers[some] - carrier)
     orders = np.arange(4, 24 + int(1.5 * phases.max()))
     rest = 2 * np.abs(jv(orders, phases[:, np.newaxis])) * strength[some, np.newaxis]
+    # five beyond the last coefficient that counts: the expansion falls faster than exponentially
+    # from there
     phase = int(np.flatnonzero(rest.max(axis=0) > error).max(initial=-1)) + 5
+    # 1 / R is singular at R = 0: Chebyshev coefficients fall like exp(-n arccosh(middle / half))
+    # (Bernstein ellipse)
     fall = np.arccosh(middle / half)
     return max(phase, int(np.ceil(np.log(1 / error) / fall)) + 1)

@@ -84,10 +84,36 @@ def propagate_group(
     tolerance: float = 1e-2,
     progress: Progress = ignore_progress,
 ) -> PlaneField:
-    """Carry one exposure of a capture at a band's frequencies; see `propagate`.
+    """Propagate one illumination group of a capture at a band's frequencies; see `propagate`.
 
     Progress, which another library's arrays leave out, counts points of the plane times
     frequencies.
+
+    Parameters
+    ----------
+    capture : Capture
+    group : IlluminationGroup
+        Points of the capture that share a laser spot.
+    plane : Plane
+        In front of the wall.
+    band : Band
+        Wavenumbers, rad/m.
+    propagation : str
+        ``"time"`` for signals shifted in time; otherwise by frequency.
+    tolerance : float
+        Relative error of the quick ways.
+    progress : callable
+
+    Returns
+    -------
+    PlaneField
+        The field at the plane's points and the band's frequencies.
+
+    Raises
+    ------
+    InputError
+        The plane does not lie in front of the wall, or the arrays are not NumPy's and propagation
+        is in time.
     """
     require_propagation(propagation)
     points = capture.points[group.indices]

@@ -52,7 +52,23 @@ class ScatteredWallToPlanePlan(WallToPlanePlan):
         strength: FloatArray,
         tolerance: float,
     ) -> WallToPlanePlan:
-        """Return the passage from any wall points (n, 3), in the steps of the plane."""
+        """Return the plan for any wall points, in the steps of the plane.
+
+        Parameters
+        ----------
+        points : (n, 3) float64 array
+            Metres.
+        plane : Plane
+        waves : SphericalWaves
+        strength : (frequencies,) float64 array
+            Relative amplitude of each frequency.
+        tolerance : float
+            Relative error.
+
+        Returns
+        -------
+        WallToPlanePlan
+        """
         x, y = (
             low + step * np.arange(max(2, int(np.ceil((high - low) / step)) + 1))
             for low, high, step in zip(

@@ -80,7 +80,23 @@ class WallToPlanePlan:
         strength: FloatArray,
         tolerance: float,
     ) -> WallToPlanePlan | None:
-        """Return the passage from wall points (n, 3), or None if they stand above no lattice."""
+        """Return the plan for wall points, or None if they stand above no lattice.
+
+        Parameters
+        ----------
+        points : (n, 3) float64 array
+            Metres.
+        plane : Plane
+        waves : SphericalWaves
+        strength : (frequencies,) float64 array
+            Relative amplitude of each frequency.
+        tolerance : float
+            Relative error.
+
+        Returns
+        -------
+        WallToPlanePlan or None
+        """
         try:
             wall = WallLattice.of(points)
         except InputError:
@@ -235,6 +251,22 @@ def find_common_period(side: float, wall: float, plane: float, count: int) -> tu
 
     Whole numbers of both if there are such, so that Fourier transforms lead there and back; else of
     the wall's.
+
+    Parameters
+    ----------
+    side : float
+        Shortest period, m.
+    wall, plane : float
+        Steps, m.
+    count : int
+        Steps of the plane over which the misfit adds up.
+
+    Returns
+    -------
+    length : int
+        Steps of the wall, of a length that Fourier transforms like.
+    places : float
+        Steps of the plane.
     """
     shortest = find_fast_length(side / wall)
     length = shortest

@@ -71,6 +71,15 @@ class Refinement:
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with
         ``.reason``.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        Support
         """
         arrays = check_numpy_support("iterative refinement", capture)
         return (
@@ -81,7 +90,17 @@ class Refinement:
         )
 
     def lookups(self, capture: Capture, grid: Grid) -> int:
-        """Number of voxels in all iterations; what `progress` counts up to."""
+        """Number of voxels in all iterations; what `progress` counts up to.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        int
+        """
         return self.prior.work(grid.size)
 
     def reconstruct(

@@ -198,8 +198,27 @@ class _AxisTransform:
 
     @classmethod
     def of(cls, axis: FloatArray, origin: float, step: float, reach: int) -> _AxisTransform:
+        """Return the transform of an axis for the plane waves of index 0 to `reach`.
+
+        Parameters
+        ----------
+        axis : (points,) float64 array
+            Evenly spaced, m.
+        origin : float
+            Where all waves have phase 0, m.
+        step : float
+            Lateral wavenumber of index 1, rad/m.
+        reach : int
+            Largest index.
+
+        Returns
+        -------
+        _AxisTransform
+        """
         numbers = step * np.arange(reach + 1)
         half = (axis.size + 1) // 2
+        # about the middle a real point's wave and its mirror point's are conjugate: cosines and
+        # sines of half the points suffice
         phases = np.outer(numbers, (axis[::-1] - axis)[:half] / 2)
         turns = np.exp(-1j * numbers * ((axis[0] + axis[-1]) / 2 - origin))
         return cls(
@@ -211,11 +230,23 @@ class _AxisTransform:
     def project(self, values: NDArray[np.complex64], count: int) -> list[NDArray[np.complex64]]:
         """Sums of complex values (points, ...) with the first cosines and with the first sines,
         (count, ...).
+
+        Parameters
+        ----------
+        values : (points, ...) complex64 array
+        count : int
+            Number of waves, from index 0 on.
+
+        Returns
+        -------
+        list of two (count, ...) complex64 arrays
+            Cosine and sine sums.
         """
         half = self.cosines.shape[1]
         before, after = values[:half], values[::-1][:half]
         even, odd = after + before, after - before
         if len(values) % 2:
+            # the middle point of an odd number is its own mirror image and counts once
             even[-1] = before[-1]
         return [
             (waves[:count] @ part.reshape(half, -1).view(np.float32))

@@ -60,7 +60,20 @@ class LaserSource:
         return float(np.average(self.wavenumbers, weights=self.strength**2))
 
     def illuminate_plane(self, plan: DiffractionPlan, depth: float) -> Illumination:
-        """Split the illumination of the plane at one depth."""
+        """Split the illumination of the plane at one depth.
+
+        Parameters
+        ----------
+        plan : DiffractionPlan
+            Its grid and tolerance.
+        depth : float
+            z of the plane, m.
+
+        Returns
+        -------
+        Illumination
+            With ``span``, the smallest and largest distance of the spot from the plane's voxels, m.
+        """
         if self.laser is None:
             return build_constant_illumination(self.wavenumbers.size)
         y, x = (
@@ -170,7 +183,19 @@ class _Workspace:
     def image(
         self, spectrum: FloatParts, lights: list[Illumination], planes: slice, total: Field
     ) -> None:
-        """Add a few depth planes."""
+        """Add a few depth planes.
+
+        Parameters
+        ----------
+        spectrum : float32 array
+            Plane waves of the wall's field at all frequencies.
+        lights : list of Illumination
+            One for each plane.
+        planes : slice
+            Depths of the grid.
+        total : (z, y, x) complex64 array
+            Added to, in place.
+        """
         depths = self.plan.grid.z[planes]
         carried = self._propagate_terms(spectrum, lights, depths)
         for terms, light, depth, field in zip(carried, lights, depths, total[planes], strict=True):

@@ -70,11 +70,27 @@ def choose_inverse(
 
     Parameters are those of `InverseTransform`; a period that is no whole number of voxels leaves
     matrix products only.
+
+    Parameters
+    ----------
+    waves : (rows, columns) int arrays
+        Indices along y and x.
+    lattice : (float, float)
+        Voxels in a period along y and x.
+    wanted : (int, int)
+        Voxels wanted along y and x, from the origin on.
+    terms : int
+        Maximum number of spectra.
+
+    Returns
+    -------
+    InverseProduct or InverseTransform
     """
     rows, columns = (2 * int(np.max(index)) + 1 for index in waves)
     high, wide = (int(length) for length in lattice)
     if (high, wide) != lattice:
         return InverseProduct(waves, lattice, wanted, terms)
+    # real operations: 8 of a complex product and sum, 5 n log2 n of a Fourier transform
     products = 8 * columns * wanted[0] * (rows + wanted[1])
     transforms = 5 * (
         columns * lattice[0] * np.log2(lattice[0] + 1)

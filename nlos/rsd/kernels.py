@@ -80,6 +80,15 @@ def sample_waves(radius, distance, first, step, delay, continued, leading_zeros,
 def find_interpolation_weights(place, node, share):
     """Find the first of the `TAPS` nodes about every place, and their Lagrange weights (places,
     taps).
+
+    Parameters
+    ----------
+    place : (places,) float array
+        In steps of the nodes.
+    node : (places,) int array
+        Overwritten with the first node of each place.
+    share : (places, TAPS) float array
+        Overwritten with the weights.
     """
     for b in range(place.size):
         node[b] = int(place[b]) - TAPS // 2 + 1
@@ -263,6 +272,12 @@ def multiply_by_minus_i(number):
 def transpose(source, target):
     """Copy ``target[i, j] = source[j, i]``, in squares that stay in cache; quickest for complex64
     seen as float64.
+
+    Parameters
+    ----------
+    source : (columns, rows) array
+    target : (rows, columns) array
+        Overwritten.
     """
     rows, columns = target.shape
     for top in range(0, rows, TILE_SIDE):

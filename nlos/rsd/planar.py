@@ -72,9 +72,18 @@ class PlanarRSD(PhasorMethod):
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why.
 
-        True in a condition if it can; ``.reason`` tells why not. Needed are a planar, evenly
-        sampled wall at z = const, voxels evenly spaced along x and y and in front of the wall, few
-        laser spots, and memory.
+        Needed are a planar, evenly sampled wall at z = const, voxels evenly spaced along x and y
+        and in front of the wall, few laser spots, and memory.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        Support
+            True in a condition if it can; ``.reason`` says why not.
         """
         general = (
             check_common_support(capture, grid)
@@ -102,6 +111,23 @@ class PlanarRSD(PhasorMethod):
     ) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in
         the signal.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+        progress : callable
+            Called with the amount of work just done; see `reconstruct`.
+
+        Returns
+        -------
+        Volume
+            (z, y, x) complex64.
+
+        Raises
+        ------
+        InputError
+            `supports` says no.
         """
         self.supports(capture, grid).require()
         band = choose_unaliased_band(capture, grid, self.pulse)
@@ -165,12 +191,39 @@ def check_grid_support(grid: Grid) -> Support:
 
 
 def build_waves(group: IlluminationGroup, band: Band, continued: bool) -> SphericalWaves:
-    """Return the waves between wall and voxels in one exposure."""
+    """Return the waves between wall and voxels of one illumination group.
+
+    Parameters
+    ----------
+    group : IlluminationGroup
+        Its ``legs``: how many legs of the path run between wall and voxels, 2 for confocal
+        captures.
+    band : Band
+        Wavenumbers of the virtual pulse, rad/m.
+    continued : bool
+        False for point sources, True for a field known on a plane; see `SphericalWaves`.
+
+    Returns
+    -------
+    SphericalWaves
+    """
     k = group.legs * band.wavenumbers
     step = float(k[1] - k[0]) if k.size > 1 else 1.0
     return SphericalWaves(float(k[0]), step, k.size, continued)
 
 
 def build_source(group: IlluminationGroup, band: Band) -> LaserSource:
-    """Return what shines on the scene in one exposure."""
+    """Return what shines on the scene in one illumination group.
+
+    Parameters
+    ----------
+    group : IlluminationGroup
+        Its laser spot, m.
+    band : Band
+        Wavenumbers and weights of the virtual pulse.
+
+    Returns
+    -------
+    LaserSource
+    """
     return LaserSource(group.laser, band.wavenumbers, band.weights / band.weights.max())

@@ -136,6 +136,18 @@ class TransferFunction:
         A delay (path, k_0) turns every frequency by ``(k - k_0) * path`` besides. A negative
         distance undoes a positive one, as far as waves travel at all. `leading_zeros` zeros stand
         before the lowest frequency.
+
+        Parameters
+        ----------
+        distance : float
+            Metres.
+        delay : (2,) float64 array
+            Path in m and the wavenumber k_0 in rad/m.
+        leading_zeros : int
+
+        Returns
+        -------
+        (nodes, 2, leading_zeros + frequencies) float32 array
         """
         radii, _ = self._radii
         waves = np.zeros((radii.size, 2, leading_zeros + self.waves.count), np.float32)

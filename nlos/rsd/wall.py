@@ -41,6 +41,17 @@ class WallLattice:
         """Find the lattice that wall points (n, 3) stand above; they may be off it by a fraction of
         its step.
 
+        Parameters
+        ----------
+        points : (n, 3) float64 array
+            Metres.
+        evenness : float
+            How far off its place a point may be, in steps of the lattice.
+
+        Returns
+        -------
+        WallLattice
+
         Raises
         ------
         InputError
@@ -92,6 +103,17 @@ class PlanarWall:
     def of(cls, points: FloatArray, evenness: float = EVENNESS_TOLERANCE) -> PlanarWall:
         """Find the lattice that wall points (n, 3) stand on; they may be off it by a fraction of
         its step.
+
+        Parameters
+        ----------
+        points : (n, 3) float64 array
+            Metres.
+        evenness : float
+            How far off its place a point may be, in steps of the lattice.
+
+        Returns
+        -------
+        PlanarWall
 
         Raises
         ------

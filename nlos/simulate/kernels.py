@@ -16,8 +16,19 @@ there.
 
 @compiled
 def is_occluded(start, end, triangles):
-    """Whether a triangle crosses the way between two points (T. Moller, B. Trumbore, J. Graph.
+    """Whether a triangle crosses the path between two points (T. Moller, B. Trumbore, J. Graph.
     Tools 2, 21 (1997)).
+
+    Parameters
+    ----------
+    start, end : (3,) array
+        Metres.
+    triangles : (n, 3, 3) array
+        Corners; first axis triangles, last axis x, y, z.
+
+    Returns
+    -------
+    bool
     """
     dx, dy, dz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     near, far = min(start[2], end[2]), max(start[2], end[2])
@@ -32,6 +43,7 @@ def is_occluded(start, end, triangles):
         vx, vy, vz = triangles[i, 2, 0] - ax, triangles[i, 2, 1] - ay, triangles[i, 2, 2] - az
         px, py, pz = dy * vz - dz * vy, dz * vx - dx * vz, dx * vy - dy * vx
         determinant = ux * px + uy * py + uz * pz
+        # the path runs along the triangle's plane
         if determinant == 0:
             continue
         sx, sy, sz = start[0] - ax, start[1] - ay, start[2] - az
@@ -43,6 +55,7 @@ def is_occluded(start, end, triangles):
         if v < 0 or u + v > 1:
             continue
         along = (vx * qx + vy * qy + vz * qz) / determinant
+        # a facet must not hide itself: crossings at the very ends of the path are its own triangle
         if CONTACT_FRACTION < along < 1 - CONTACT_FRACTION:
             return True
     return False
@@ -50,7 +63,22 @@ def is_occluded(start, end, triangles):
 
 @compiled
 def cosine_to_normal(normal, from_point, to_point, distance):
-    """Cosine of the angle between a normal and a way, 0 behind the surface."""
+    """Cosine of the angle between a normal and a path, 0 behind the surface.
+
+    Parameters
+    ----------
+    normal : (3,) array
+        Of length 1.
+    from_point, to_point : (3,) array
+        Metres.
+    distance : float
+        Between the points, m.
+
+    Returns
+    -------
+    float
+        0 to 1.
+    """
     inner = 0.0
     for i in range(3):
         inner += normal[i] * (to_point[i] - from_point[i])
@@ -132,13 +160,42 @@ def add_facet_light(
 
 @compiled
 def distance_between(one, other):
-    """Distance of two points."""
+    """Distance of two points.
+
+    Parameters
+    ----------
+    one, other : (3,) array
+        Metres.
+
+    Returns
+    -------
+    float
+        Metres.
+    """
     return math.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)
 
 
 @compiled
 def evaluate_reflectance(material, position, laser, observer, to_laser, to_observer):
-    """Reflectance per steradian; see `nlos.simulate.materials.Material`."""
+    """Reflectance per steradian; see `nlos.simulate.materials.Material`.
+
+    Parameters
+    ----------
+    material : (3,) array
+        Diffuse fraction, retroreflected fraction, and the latter's standard deviation in rad; see
+        `nlos.simulate.materials.Material`.
+    position : (3,) array
+        The facet, m.
+    laser, observer : (3,) array
+        Wall points that light comes from and goes to, m.
+    to_laser, to_observer : float
+        Their distances from the facet, m.
+
+    Returns
+    -------
+    float
+        Per steradian.
+    """
     value = material[0] / math.pi
     if material[1] > 0:
         inner = 0.0

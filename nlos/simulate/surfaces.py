@@ -86,6 +86,22 @@ class Surface:
     def load(cls, path: str | Path, spacing: float, material: Material | None = None) -> Surface:
         """Read a mesh in m (PLY, OBJ, STL, VTP) by PyVista and cut it into facets; arguments as of
         `mesh`.
+
+        Parameters
+        ----------
+        path : str or Path
+        spacing : float
+            Side of the facets, m.
+        material : Material, optional
+
+        Returns
+        -------
+        Surface
+
+        Raises
+        ------
+        FileFormatError
+            The file is not a triangle mesh, or holds no triangle.
         """
         import pyvista
 
@@ -111,7 +127,22 @@ class Surface:
         spacing: float,
         material: Material | None = None,
     ) -> Surface:
-        """Build a rectangle that faces the wall, (width, height) in m about its centre (x, y, z)."""
+        """Build a rectangle that faces the wall, (width, height) in m about its centre (x, y, z).
+
+        Parameters
+        ----------
+        centre : (3,) array_like
+            Metres.
+        size : (float, float)
+            Width and height, m.
+        spacing : float
+            Side of the facets, m.
+        material : Material, optional
+
+        Returns
+        -------
+        Surface
+        """
         x, y = size[0] / 2, size[1] / 2
         # Counter-clockwise from the wall, which looks along +z with y down.
         corners = np.array([[-x, -y, 0], [-x, y, 0], [x, y, 0], [x, -y, 0]]) + np.asarray(
