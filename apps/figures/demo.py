@@ -37,6 +37,19 @@ def make_demo_figure(
 ) -> Figure:
     """Draw streak image, brightness and range as seen by the camera; top and side view in metres;
     range errors.
+
+    Parameters
+    ----------
+    streak : Streak
+    frames : Frames
+    returns : Returns
+    cloud : PointCloud
+    truth : GroundTruth
+        Of the simulated scene, for the range errors.
+
+    Returns
+    -------
+    Figure
     """
     figure = make_figure(12, 7.6)
     panels = figure.subplots(2, 3)

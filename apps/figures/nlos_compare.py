@@ -91,7 +91,21 @@ def make_comparison_figure(
 
 
 def draw_view(axes: Axes, volume: Volume, plane: PlaneAxes, truth: HiddenTruth | None) -> AxesImage:
-    """Draw the brightest voxel along the third axis, and the outline of what is hidden."""
+    """Draw the brightest voxel along the third axis, and the outline of what is hidden.
+
+    Parameters
+    ----------
+    axes : Axes
+    volume : Volume
+    plane : (str, str)
+        Names of the axes to the right and downwards.
+    truth : HiddenTruth, optional
+
+    Returns
+    -------
+    AxesImage
+        Brightness relative to the view's largest, 0 to 1.
+    """
     along = "zyx".index(next(name for name in "zyx" if name not in plane))
     picture = volume.magnitude.max(axis=along)
     right, down = (getattr(volume.grid, name) for name in plane)
@@ -105,7 +119,16 @@ def draw_view(axes: Axes, volume: Volume, plane: PlaneAxes, truth: HiddenTruth |
 
 
 def draw_outline(axes: Axes, truth: HiddenTruth, plane: PlaneAxes) -> None:
-    """Draw the border of everything hidden, seen along the third axis."""
+    """Draw the border of everything hidden, seen along the third axis.
+
+    Parameters
+    ----------
+    axes : Axes
+    truth : HiddenTruth
+        Positions, m.
+    plane : (str, str)
+        Names of the axes to the right and downwards.
+    """
     from scipy.ndimage import gaussian_filter
 
     places = truth.positions[:, ["xyz".index(name) for name in plane]]
@@ -116,6 +139,7 @@ def draw_outline(axes: Axes, truth: HiddenTruth, plane: PlaneAxes) -> None:
         np.arange(first, last + step, step) for first, last in zip(low, high, strict=True)
     )
     inside = _rasterise_outline(places, right, down, radius, round_ones=not truth.spacing)
+    # corners of facets are rounded off, so that the contour is not a staircase
     smooth = gaussian_filter(inside, truth.spacing * CORNER_SMOOTHING / step)
     axes.contour(right, down, smooth, [0.5], colors=LINE_COLOUR, linewidths=1.0)
 

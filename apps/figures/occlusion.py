@@ -122,7 +122,13 @@ def _draw_plan(axes: Axes, experiment: Experiment, probes: Sequence[ProbeResult]
 
 
 def draw_history(axes: Axes, experiment: Experiment) -> None:
-    """All light over time, with the gates of the returns."""
+    """Draw all light over time on a logarithmic scale, with the gates of the returns.
+
+    Parameters
+    ----------
+    axes : Axes
+    experiment : Experiment
+    """
     measurements = experiment.measurements
     times = measurements.time_axis.times / PICOSECOND
     history = np.maximum(measurements.history / measurements.history.max(), MIN_RELATIVE_LIGHT)

@@ -49,8 +49,14 @@ class FlashFrame(NamedTuple):
 def save_flash_film(experiment: Experiment, path: Path) -> None:
     """Write a GIF: light reaches the occluder, then what stands behind it.
 
-    Each return is shown at its own brightness; the recovered pictures light up as the measurements of
-    their gates do.
+    Each return is shown at its own brightness; the recovered pictures light up as the measurements
+    of their gates do.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    path : Path
+        Of the GIF.
     """
     figure, frames = _make_canvas(8, 3.2), _make_flash_frames(experiment)
     left, right, time = figure.subplots(1, 3, gridspec_kw=PANEL_LAYOUT)
@@ -74,6 +80,13 @@ def save_walk_film(experiment: Experiment, path: Path, advance: Callable[[int], 
     recovered again.
 
     Calls ``advance(1)`` after each of `WALK_STEPS`.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    path : Path
+        Of the GIF.
+    advance : callable
     """
     figure = _make_canvas(9.4, 2.9)
     names = ("one view, all its light", "one view, the second return", "ToF-CLIP", "truth")
@@ -90,6 +103,7 @@ def save_walk_film(experiment: Experiment, path: Path, advance: Callable[[int], 
         title = f"target {across / MILLIMETRE:+.0f} mm from the axis, {there.scene.behind / MILLIMETRE:.0f} mm behind"
         drawn.append(_render_image(figure, images, [one / brightest for one in pictures], title))
         advance(1)
+    # there and back again, without showing the ends twice
     _write_gif(path, [*drawn, *drawn[-2:0:-1]], [WALK_STEP_MS] * (2 * WALK_STEPS - 2))
 
 

@@ -18,7 +18,18 @@ MIN_SHEAR, MAX_SHEAR = -1.4, 0.8  # shears
 
 
 def make_reproduction_figure(title: str, outcome: Outcome) -> Figure:
-    """Draw the panels of an outcome, one line below the other."""
+    """Draw the panels of an outcome, one line below the other.
+
+    Parameters
+    ----------
+    title : str
+    outcome : Outcome
+        Its panels, line by line.
+
+    Returns
+    -------
+    Figure
+    """
     lines = outcome.panels
     columns = max(map(len, lines))
     figure = make_figure(PANEL_INCHES * columns, (PANEL_INCHES + 0.35) * len(lines) + 0.4)

@@ -28,6 +28,15 @@ DOTS_PER_INCH = 100
 def make_figure(width: float, height: float) -> Figure:
     """Make an empty figure, in inches. It draws with Agg: no display is needed and pyplot is left
     alone.
+
+    Parameters
+    ----------
+    width, height : float
+        Inches.
+
+    Returns
+    -------
+    Figure
     """
     from matplotlib.figure import Figure  # a third of a second that only a verb's pictures need
 
@@ -35,7 +44,14 @@ def make_figure(width: float, height: float) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure in the format that the name's ending says, whole or not at all."""
+    """Write a figure in the format that the name's ending says, whole or not at all.
+
+    Parameters
+    ----------
+    figure : Figure
+    path : Path
+        Its suffix names the format.
+    """
     with atomic_path(path) as temporary:
         figure.savefig(temporary)
 
@@ -64,7 +80,14 @@ def draw_image(
 
 
 def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
-    """Say what a picture shows and what its axes are."""
+    """Set the title of a picture and the labels of its axes.
+
+    Parameters
+    ----------
+    axes : Axes
+    title, x, y : str
+        With units.
+    """
     axes.set_title(title, fontsize=SMALL_FONT_PT + 2)
     axes.set_xlabel(x, fontsize=SMALL_FONT_PT)
     axes.set_ylabel(y, fontsize=SMALL_FONT_PT)
@@ -72,7 +95,16 @@ def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
 
 
 def add_colour_bar(axes: Axes, mapped: Any, meaning: str) -> None:
-    """Put a labelled colour scale beside a picture."""
+    """Put a labelled colour scale beside a picture.
+
+    Parameters
+    ----------
+    axes : Axes
+    mapped : ScalarMappable
+        What the picture was drawn with.
+    meaning : str
+        Label, with its unit.
+    """
     bar = axes.figure.colorbar(mapped, ax=axes, shrink=0.9)
     bar.set_label(meaning, fontsize=SMALL_FONT_PT)
     bar.ax.tick_params(labelsize=SMALL_FONT_PT)

@@ -1,8 +1,9 @@
 """The demonstration: one scene with an occluder, and three cameras that look at it.
 
-* Compact light-field photography with time of flight: a row of views, nonlocal readings at every
+* Compact light-field photography with time of flight: a row of views, nonlocal measurements at
+every
   instant.
-* A single view with as many pixels as the other has readings; it has time of flight too.
+* A single view with as many pixels as the other has measurements; it has time of flight too.
 * A conventional light-field camera: every pixel of every view, but no time of flight; it can only
   defocus the occluder.
 """
@@ -59,7 +60,7 @@ class ExperimentSettings:
     encoder : str
         A name of `tofclip.operators.light_field_camera.CAMERAS`.
     sampling_ratio : float
-        Readings over pixels of one picture.
+        Measurements over pixels of one picture.
     illumination : str
         ``diodes``: one beside each view; ``oblique``: one far to the side; ``co-located``: one
         beside the middle view, whose light the occluder keeps from everything that view cannot see.
@@ -106,7 +107,7 @@ class Experiment:
 
     @cached_property
     def rig(self) -> Rig:
-        """Views, lamps and readings."""
+        """Views, lamps and measurements."""
         near, far = self.scene.region.distance, self.scene.distance
         side = self.settings.side_px
         array = CameraArray(
@@ -182,13 +183,13 @@ class Experiment:
 
     @cached_property
     def separated(self) -> SeparatedImages:
-        """Occluder and target from the readings."""
+        """Occluder and target from the measurements."""
         return separate_occluder(self.measurements)
 
     @cached_property
     def single_view(self) -> Array:
-        """The target by the middle view alone, its pixels as many as the others' readings; occluder
-        gated away.
+        """The target by the middle view alone, its pixels as many as the others' measurements;
+        occluder gated away.
         """
         seen = self._render_middle_view(
             (*self.scene.target, *self.scene.occluder), self._single_array
@@ -209,7 +210,7 @@ class Experiment:
 
     @property
     def _single_array(self) -> CameraArray:
-        """A view with as many pixels as the rig has readings."""
+        """A view with as many pixels as the rig has measurements."""
         side = max(round(np.sqrt(self.rig.camera.measurements)), 1)
         focal_length_px = self.rig.array.focal_length_px * side / self.settings.side_px
         return replace(self.rig.array, image_shape=(side, side), focal_length_px=focal_length_px)

@@ -48,7 +48,7 @@ TARGET_PX = 20
 PULSE_FWHM_S = 10e-12  # the nearest target of all trials answers 25 ps after its occluder
 MAX_GATE_S = 80e-12
 PEAK_PHOTONS = 2000.0  # of the brightest reading, were there no occluder
-BACKGROUND_PHOTONS = 20.0  # photons of every reading that come at any time
+BACKGROUND_PHOTONS = 20.0  # photons of every measurement that come at any time
 SIGNIFICANCE_SIGMAS = 5.0  # standard deviations of the background
 MIN_VIEW_FRACTION = 0.5  # a view with less light than this share of the brightest view's is blocked
 
@@ -149,8 +149,8 @@ def _make_gate(rig: Rig, occluder: float, target: float) -> TimeAxis:
 
 
 def _recover_target(rig: Rig, light: Array, brightest: float, seed: int) -> tuple[Array, int]:
-    """Recover from noisy readings, blocked views left out; nothing where no view got significant
-    light.
+    """Recover from noisy measurements, blocked views left out; nothing where no view got
+    significant light.
     """
     camera, per_unit = rig.camera, PEAK_PHOTONS / brightest
     dark = BACKGROUND_PHOTONS / per_unit

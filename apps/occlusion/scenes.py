@@ -85,7 +85,19 @@ def make_occlusion_scene(name: str) -> OcclusionScene:
 
 
 def make_upright_bar(width: float, distance: float = OCCLUDER_DISTANCE_M) -> Body:
-    """Return a bar on the axis, so long that no view sees its ends."""
+    """Return a bar on the axis, so long that no view sees its ends.
+
+    Parameters
+    ----------
+    width : float
+        Metres.
+    distance : float
+        From the views, m.
+
+    Returns
+    -------
+    Body
+    """
     return _make_plate(width, 40 * width, make_plain_pattern(OCCLUDER_REFLECTANCE), z=distance)
 
 

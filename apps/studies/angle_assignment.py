@@ -17,6 +17,20 @@ ENCODERS = ("line", "line-even")
 def run_angle_assignment(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Recover with both ways of dealing; others' light fields too where they are at hand, as
     figures only.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
     """
     scenes = SCENES | {
         f"data:{name}": shear

@@ -24,7 +24,22 @@ CASES = [
 
 
 def run_area_sensors(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover scenes of three complexities from every n-th sensor pixel on either axis."""
+    """Recover scenes of three complexities from every n-th sensor pixel on either axis.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
+    """
     solved = solve_cases(CASES, library, seeds, advance)
     panels = []
     for first in range(0, len(solved), len(SPARSITIES)):

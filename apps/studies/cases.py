@@ -55,7 +55,7 @@ class Case:
     bad_fraction : float
     photons : float or None
     white_noise : float
-        Standard deviation relative to that of the readings.
+        Standard deviation relative to that of the measurements.
     data_term : str
         Of the recovery.
     """
@@ -108,6 +108,21 @@ def solve_cases(
     """Solve every case for every seed, cases on all cores; advances once for each case and seed.
 
     The prior's weight is chosen by cross-validation with the first seed, and kept for the others.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+    library : Library
+        Light fields by name.
+    seeds : int
+        Repeats with other cameras and noise.
+    advance : callable
+        Called with 1 after each case and seed.
+
+    Returns
+    -------
+    list of SolvedCase
+        In the order of the cases.
     """
     truths = {
         (case.scene, case.shear): library.light_field(case.scene).refocus(case.shear)
@@ -130,6 +145,17 @@ def solve_cases(
 def run_in_parallel(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
     """Run independent jobs on all cores, each on one; the first exception is raised and no further
     job started.
+
+    Parameters
+    ----------
+    work : callable
+        From a job to its result; called in threads.
+    jobs : sequence
+
+    Returns
+    -------
+    list
+        Results in the order of the jobs.
     """
     pool = ThreadPoolExecutor(min(thread_count(), max(len(jobs), 1)), thread_name_prefix="tofclip")
     try:
@@ -140,9 +166,22 @@ def run_in_parallel(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[
 
 
 def measure_case(case: Case, library: Library, seed: int) -> ClipMeasurement:
-    """Measure the true views as a case asks for."""
+    """Measure the true views as a case asks for.
+
+    Parameters
+    ----------
+    case : Case
+    library : Library
+    seed : int
+        Of camera and noise.
+
+    Returns
+    -------
+    ClipMeasurement
+    """
     setup = CameraSetup(case.encoder, case.sampling_ratio, seed)
     clean = measure(library.light_field(case.scene), setup)
+    # another stream of random numbers than the camera's, which starts from the same seed
     noise = np.random.default_rng([seed, 2]).standard_normal(clean.measurements.size, np.float32)
     noisy = clean.measurements + np.float32(case.white_noise) * clean.measurements.std() * noise
     return corrupt_measurement(replace(clean, measurements=noisy), case.photons, case.bad_fraction)

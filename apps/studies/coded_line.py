@@ -147,7 +147,22 @@ def sweep_rotation(
 
 
 def compute_psnr_db(estimate: NDArray[Any], truth: NDArray[Any]) -> float:
-    """Peak signal-to-noise ratio in dB, relative to the brightest pixel of the truth."""
+    """Peak signal-to-noise ratio in dB, relative to the brightest pixel of the truth.
+
+    Parameters
+    ----------
+    estimate, truth : (rows, columns) array
+
+    Returns
+    -------
+    float
+        dB.
+
+    Raises
+    ------
+    InputError
+        The estimate equals the truth.
+    """
     error = float(np.mean((estimate.astype(np.float64) - truth) ** 2))
     if error == 0:
         raise InputError("the estimate is the truth itself: its PSNR is infinite")

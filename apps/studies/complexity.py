@@ -34,7 +34,7 @@ class IterationCost:
         ``"light field"`` or ``"refocused picture"``.
     measurements, unknowns : int
     complexity : str
-        Of one iteration as the paper has it: N pixels on a side, n_a views on a side, m readings, r
+        Of one iteration as the paper has it: N pixels on a side, n_a views on a side, m measurements, r
         exposures, k operations of the prior for each unknown.
     seconds : float
         Of one whole iteration: model, prior and bookkeeping; the median of the repeats.
@@ -53,7 +53,7 @@ class IterationCost:
 
 @dataclass(frozen=True)
 class _Method:
-    """A camera and what is recovered from its readings."""
+    """A camera and what is recovered from its measurements."""
 
     name: str
     camera: LightFieldCamera

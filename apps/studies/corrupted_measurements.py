@@ -1,4 +1,4 @@
-"""Bad readings and few photons: Tables 5 and 6."""
+"""Bad measurements and few photons: Tables 5 and 6."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from apps.studies.library import Library
 from apps.studies.outcome import Advance, Outcome, Panel, Row, Study
 
 SHEARS = {"blocks": -0.6, "letters": -0.4, "printed-words": -0.3, "printed-letters": -0.3}
-TABLE5_PERCENT = {  # share of bad readings to the pictures' NMSE, per cent
+TABLE5_PERCENT = {  # share of bad measurements to the pictures' NMSE, per cent
     ("single-pixel", "printed-words"): {0.001: 1.54, 0.002: 2.08, 0.01: 11.24},
     ("single-pixel", "printed-letters"): {0.001: 4.50, 0.002: 4.7, 0.01: 6.5},
     ("line", "letters"): {0.01: 5.07, 0.05: 12.1, 0.1: 15.2},
@@ -24,8 +24,22 @@ TABLE6_PERCENT = {  # photons of the largest reading to NMSE, per cent
 
 
 def run_invalid_measurements(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Set a share of the readings to 0 or to the largest; recover with squares, and with Huber's
-    term.
+    """Set a share of the measurements to 0 or to the largest; recover with squares, and with
+    Huber's term.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
     """
     cases = [
         Case(
@@ -49,7 +63,22 @@ def run_invalid_measurements(library: Library, seeds: int, advance: Advance) -> 
 
 
 def run_few_photons(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Count photons, the largest reading so many."""
+    """Count photons, the largest reading so many.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
+    """
     cases = [
         Case(
             (CAMERA_NAMES[encoder], scene, str(photons)),

@@ -37,7 +37,7 @@ class DiffuserRecording:
     Raises
     ------
     ShapeError, InputError
-        PSF and readings are not of one shape, or nothing was recorded.
+        PSF and measurements are not of one shape, or nothing was recorded.
     """
 
     point_spread: NDArray[np.float64]
@@ -63,7 +63,7 @@ class DiffuserRecovery:
     pitch_px : int
         Every so manieth pixel of either axis was used.
     relative_residual : float
-        ``|A h - f| / |f|`` over the readings that were used.
+        ``|A h - f| / |f|`` over the measurements that were used.
     iterations : int
     seconds : float
     """
@@ -96,11 +96,24 @@ def read_diffuser_recording(path: str | Path) -> DiffuserRecording:
 
 def build_diffuser_model(recording: DiffuserRecording, pitch_px: int) -> LinearOperator:
     """Return the map from the scene, twice as high and wide as the sensor, to every n-th pixel's
-    readings.
+    measurements.
+
+    Parameters
+    ----------
+    recording : DiffuserRecording
+        Sensor image and measured point-spread function.
+    pitch_px : int
+        Sensor pixels from one used pixel to the next.
+
+    Returns
+    -------
+    LinearOperator
+        (2 rows, 2 columns) pictures to (measurements,) vectors.
     """
     rows, columns = recording.measurements.shape
     measured = MeasuredPointSpreads(recording.point_spread[np.newaxis], [0.0])
     sensor = PitchedSensor((rows, columns), (pitch_px, pitch_px))
+    # light from beside the sensor's field falls on it too
     return MeasuredCamera((2 * rows, 2 * columns), measured, sensor).model(0.0)
 
 

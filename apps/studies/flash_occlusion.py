@@ -23,6 +23,20 @@ RATIOS = (1.0, 0.5)
 def run_flash_occlusion(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Flash scenes behind occluders, gate, and recover with and without the model of what the
     occluder hides.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
     """
     side = min(library.array.image_shape)
     cases = [

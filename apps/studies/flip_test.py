@@ -40,7 +40,22 @@ CASES = [
 
 
 def run_flip_test(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover every edit of both scenes at three depths with both cameras."""
+    """Recover every edit of both scenes at three depths with both cameras.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
+    """
     solved = solve_cases(CASES, library, seeds, advance)
     panels = []
     for first in range(0, len(solved), len(EDITS)):

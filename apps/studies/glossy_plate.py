@@ -37,6 +37,20 @@ MATERIALS = {
 def run_glossy_plate(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Recover a plate of either kind from CLIP-1D at SR = 1; tell how even its light is, and the
     errors.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
     """
     rows, panels = [], []
     for name, material in MATERIALS.items():

@@ -33,7 +33,7 @@ SAMPLING_RATIOS = (0.1, 0.05)
 WAVELENGTH_M, CYCLES = 0.12, 5.0
 THRESHOLD = 0.15
 PEAK_FRACTION = 0.1
-"""Readings expected to be weaker than this share of the brightest one are never the largest."""
+"""Measurements expected to be weaker than this share of the brightest one are never the largest."""
 BISECTION_STEPS = 12
 DOCUMENT_MARK = "<!-- adjoint study -->"
 
@@ -97,7 +97,25 @@ def build_office_grid() -> Grid:
 
 
 def build_tomography(points: int, sampling_ratio: float) -> RadonProjection:
-    """Line projections of a picture at ``sampling_ratio * points`` angles, evenly over half a turn."""
+    """Line projections of a picture at ``sampling_ratio * points`` angles, evenly over half a turn.
+
+    Parameters
+    ----------
+    points : int
+        Wall points along a side.
+    sampling_ratio : float
+        Measurements over wall points.
+
+    Returns
+    -------
+    RadonProjection
+        (points, points) pictures to (angles * points,) vectors.
+
+    Raises
+    ------
+    InputError
+        The ratio is too small for a single angle.
+    """
     angles = round(sampling_ratio * points)
     if angles < 1:
         raise InputError(
@@ -112,8 +130,22 @@ def find_expected_peak(capture: Capture, largest_count: float, seed: int) -> flo
     """Expected counts in the brightest bin for which chance makes `largest_count` the largest count
     of all.
 
-    With millions of readings the largest count lies far above the largest expected one: 6 where
+    With millions of measurements the largest count lies far above the largest expected one: 6 where
     that is about 1.
+
+    Parameters
+    ----------
+    capture : Capture
+        Expected signal, of any scale.
+    largest_count : float
+        Counts.
+    seed : int
+        Of the Poisson noise.
+
+    Returns
+    -------
+    float
+        Counts, by bisection.
     """
     relative = (
         capture.signal[capture.signal > PEAK_FRACTION * capture.signal.max()] / capture.signal.max()
@@ -127,7 +159,18 @@ def find_expected_peak(capture: Capture, largest_count: float, seed: int) -> flo
 
 
 def correlate_views(one: Volume, other: Volume) -> float:
-    """Pearson correlation of two volumes' front views."""
+    """Pearson correlation of two volumes' front views.
+
+    Parameters
+    ----------
+    one, other : Volume
+        On grids of the same lateral shape.
+
+    Returns
+    -------
+    float
+        -1 to 1.
+    """
     first, second = (volume.maximum_projection().brightness.ravel() for volume in (one, other))
     return float(np.corrcoef(first, second)[0, 1])
 
@@ -186,6 +229,12 @@ def format_table(rows: Sequence[StudyRow]) -> str:
 
 def replace_between_marks(text: str, document: Path) -> None:
     """Replace what stands between the two marks of a document.
+
+    Parameters
+    ----------
+    text : str
+    document : Path
+        Rewritten whole.
 
     Raises
     ------

@@ -30,6 +30,20 @@ class TargetPosition(NamedTuple):
 def run_inactive_region(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Put small targets behind bars of several widths and at several distances, inside the region
     and beyond.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
     """
     places = [
         TargetPosition(width, distance, factor)

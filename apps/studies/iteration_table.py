@@ -10,7 +10,22 @@ SCENE, SHEAR = "letters", -0.4
 
 
 def run_iteration_table(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Time every method; the repeats stand in for seeds."""
+    """Time every method; the repeats stand in for seeds.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
+    """
     costs = measure_iteration_costs(library.light_field(SCENE), SHEAR, repeats=2 * seeds)
     advance(1)
     rows = tuple(

@@ -19,6 +19,20 @@ DISPLAY_THRESHOLD = 0.05  # of the brightest: where the picture is cut off
 def run_lensless_hand(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Recover the scene from every pixel, every second and every third on either axis; nothing here
     is random.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
     """
     recording = read_diffuser_recording(library.recording(RECORDING))
     recoveries = []

@@ -51,6 +51,20 @@ def compute_depth_accuracy(
 def run_light_field_processing(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Score depth from focus against the exact shears and a viewpoint against a camera rendered
     there.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
     """
     rows, panels = [], []
     for name in SCENES:

@@ -55,13 +55,26 @@ TABLE4_PERCENT = {  # refocused from the light field, direct; at each shear
 
 
 def recover_light_field(case: Case, library: Library, seed: int) -> LightField:
-    """Recover all views that got readings, with total variation over pixels and views."""
+    """Recover all views that got measurements, with total variation over pixels and views.
+
+    Parameters
+    ----------
+    case : Case
+    library : Library
+    seed : int
+        Of camera and noise.
+
+    Returns
+    -------
+    LightField
+        Pictures (views, rows, columns).
+    """
     measurement = measure_case(case, library, seed)
     camera, views = measurement.camera(), measurement.views
     weighting = camera.weighting()
     used = views[list(camera.used_views)]
     side = round(np.sqrt(len(used)))
-    # views without readings break the grid: then each view stands on its own
+    # views without measurements break the grid: then each view stands on its own
     grid, angular = (
         ((side, side), ANGULAR_WEIGHT) if len(used) == len(views) else ((1, len(used)), 0.0)
     )
@@ -75,6 +88,20 @@ def recover_light_field(case: Case, library: Library, seed: int) -> LightField:
 def run_table3(library: Library, seeds: int, advance: Advance) -> Outcome:
     """CLIP-0D of printed letters with 4 x 4 views: the whole light field, and pictures at four
     depths.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
     """
     wholes = [
         Case(
@@ -106,7 +133,22 @@ def run_table3(library: Library, seeds: int, advance: Advance) -> Outcome:
 
 
 def run_table4(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Pictures refocused from a recovered light field beside those recovered directly, at SR = 1."""
+    """Pictures refocused from a recovered light field beside those recovered directly, at SR = 1.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
+    """
     direct = [
         Case(
             (CAMERA_NAMES[encoder], scene, f"{shear:g}", DIRECT_LABEL),

@@ -25,7 +25,22 @@ MAX_ANGLES_RAD = {"upright": 0.0, "rotated": MAX_ANGLE_RAD}
 
 
 def run_line_rotation(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover letters through ten coded lines of several widths, with and without rotation."""
+    """Recover letters through ten coded lines of several widths, with and without rotation.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
+    """
     picture = _make_reference(library.light_field(SCENE))
     shape = (picture.shape[0], picture.shape[1])
 

@@ -28,6 +28,20 @@ CASES = [
 def run_occlusion(library: Library, seeds: int, advance: Advance) -> Outcome:
     """Recover what stands behind the occluder; shift-and-add is the truth, the bare target stands
     beside it.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields and recordings by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+        A row of figures for each case, and the pictures to show.
     """
     solved = solve_cases(CASES, library, seeds, advance)
     rows, panels = [one.row() for one in solved], []

@@ -59,6 +59,20 @@ class RepresentationTable:
     def evaluate(self, library: Library, seeds: int, advance: Advance) -> Outcome:
         """Recover at every depth and sampling ratio with both cameras; depth maps for the first
         seed.
+
+        Parameters
+        ----------
+        library : Library
+            Light fields and recordings by name.
+        seeds : int
+            Repeats with other random numbers.
+        advance : callable
+            Called with the number of steps just done.
+
+        Returns
+        -------
+        Outcome
+            A row of figures for each case, and the pictures to show.
         """
         solved = solve_cases(self.cases, library, seeds, advance)
         panels = [self._make_truth_panels(library, solved)]

@@ -43,7 +43,15 @@ class PlaybackClock:
         return int(self.position)
 
     def play(self, oldest: int, count: int) -> None:
-        """Run; from the oldest frame on where the last one is reached."""
+        """Run; from the oldest frame on where the last one is reached.
+
+        Parameters
+        ----------
+        oldest : int
+            First frame that still exists.
+        count : int
+            Number after the last frame.
+        """
         if self.frame >= count - 1:
             self.position = float(oldest)
         self.playing, self._last_tick_s = True, None
@@ -53,12 +61,30 @@ class PlaybackClock:
         self.playing = False
 
     def jump(self, frame: int, oldest: int, count: int) -> None:
-        """Go to a frame, or to the nearest that exists."""
+        """Go to a frame, or to the nearest that exists.
+
+        Parameters
+        ----------
+        frame : int
+        oldest : int
+            First frame that still exists.
+        count : int
+            Number after the last frame.
+        """
         self.position = float(min(max(frame, oldest), max(count - 1, oldest)))
         self._last_tick_s = None
 
     def step(self, frames: int, oldest: int, count: int) -> None:
-        """Pause, and move by a number of frames, back where it is negative."""
+        """Pause, and move by a number of frames, back where it is negative.
+
+        Parameters
+        ----------
+        frames : int
+        oldest : int
+            First frame that still exists.
+        count : int
+            Number after the last frame.
+        """
         self.pause()
         self.jump(self.frame + frames, oldest, count)
 
@@ -67,7 +93,22 @@ class PlaybackClock:
         self.speed = min(max(speed, MIN_SPEED), MAX_SPEED)
 
     def tick(self, now: float, oldest: int, count: int) -> int:
-        """Let time pass and return the frame that is due."""
+        """Let time pass and return the frame that is due.
+
+        Parameters
+        ----------
+        now : float
+            Seconds of a steady clock.
+        oldest : int
+            First frame that still exists.
+        count : int
+            Number after the last frame.
+
+        Returns
+        -------
+        int
+        """
+        # a clock of the machine may be set back
         passed = 0.0 if self._last_tick_s is None else max(0.0, now - self._last_tick_s)
         self._last_tick_s = now
         if self.playing and count > oldest:

@@ -54,7 +54,14 @@ class Controls:
         return self._appearance_panel.point_size
 
     def show(self, shown: DisplayedFrame, status: Status) -> None:
-        """Bring words and controls up to date with what is shown."""
+        """Bring texts and controls up to date with what is shown.
+
+        Parameters
+        ----------
+        shown : DisplayedFrame
+        status : Status
+            Its text as HTML.
+        """
         if self._status.content != status.html:
             self._status.content = status.html
         last = max(1, len(self._session.source) - 1)
@@ -141,9 +148,19 @@ class Controls:
 
 
 def bind_user_input(handle: Any, post: Post, act: Callable[[Any], None]) -> None:
-    """Have `act` called with a control's new value when a user, not this program, has changed it."""
+    """Have `act` called with a control's new value when a user, not this program, has changed it.
+
+    Parameters
+    ----------
+    handle : viser input handle
+    post : callable
+        Takes what is to be done by the viewer's own thread.
+    act : callable
+        Called with the new value.
+    """
 
     def changed(event: Any) -> None:
+        # events without a client come from this program's own changes
         if event.client is not None:
             value = event.target.value
             post(lambda: act(value))

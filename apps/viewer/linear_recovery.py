@@ -70,7 +70,7 @@ class LinearRecovery:
 
         Parameters
         ----------
-        readings, shear, gate
+        measurements, shear, gate
             As for `frames`.
         least_intensity : float
             Weaker returns are left out: a threshold relative to the gate would find noise in a dark one.
@@ -119,6 +119,17 @@ def find_min_intensity(whole: View) -> float:
 
 
 def select_brighter(view: View, intensity: float) -> View:
-    """Return the points with a minimum number of counts."""
+    """Return the points with a minimum number of counts.
+
+    Parameters
+    ----------
+    view : View
+    intensity : float
+        Counts.
+
+    Returns
+    -------
+    View
+    """
     kept = view.cloud.intensity >= intensity
     return View(select_points(view.cloud, kept), None if view.pixels is None else view.pixels[kept])

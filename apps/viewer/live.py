@@ -137,7 +137,25 @@ class LiveShotSource(ShotSource):
 
 
 def take_first(shots: Iterator[Streak], title: str) -> tuple[Streak, Iterator[Streak]]:
-    """Wait for the first shot."""
+    """Wait for the first shot.
+
+    Parameters
+    ----------
+    shots : iterator of Streak
+    title : str
+        Of the source, for the message.
+
+    Returns
+    -------
+    first : Streak
+    shots : iterator of Streak
+        Those after it.
+
+    Raises
+    ------
+    InputError
+        The source ended without a shot.
+    """
     for first in shots:
         return first, shots
     raise InputError(f"{title}: the source ended before it gave anything")

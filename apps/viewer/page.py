@@ -210,6 +210,12 @@ class Page:
 
 
 def move_camera(camera: Any, viewpoint: Viewpoint) -> None:
-    """Move a camera of the page, or the one that pages start with, to a viewpoint."""
+    """Move a camera of the page, or the one that pages start with, to a viewpoint.
+
+    Parameters
+    ----------
+    camera : viser camera handle
+    viewpoint : Viewpoint
+    """
     camera.position, camera.look_at = viewpoint.eye, viewpoint.target
     camera.fov = max(viewpoint.field_of_view, float(np.deg2rad(5.0)))

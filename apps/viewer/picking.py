@@ -99,7 +99,22 @@ def make_pick(
     pixel: tuple[int, int] | None = None,
     waveform: Waveform | None = None,
 ) -> Pick:
-    """Return what is known about point `number` of a cloud."""
+    """Return what is known about point `number` of a cloud.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    number : int
+        Of the point.
+    pixel : (int, int), optional
+        Row and column that the point comes from.
+    waveform : Waveform, optional
+        Of that pixel.
+
+    Returns
+    -------
+    Pick
+    """
     x, y, z = (float(value) for value in cloud.xyz[number])
     return Pick(
         (x, y, z),
@@ -114,5 +129,15 @@ def make_pick(
 
 
 def measure_distance(first: Pick, second: Pick) -> float:
-    """Distance of two points, m."""
+    """Distance of two points, m.
+
+    Parameters
+    ----------
+    first, second : Pick
+
+    Returns
+    -------
+    float
+        Metres.
+    """
     return float(np.linalg.norm(np.subtract(first.position, second.position)))

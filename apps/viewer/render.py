@@ -39,6 +39,19 @@ class Renderer(Protocol):
     ) -> Image:
         """Return a picture of `shape` rows and columns, (rows, columns, 3); points are `point_px`
         wide.
+
+        Parameters
+        ----------
+        shown : DisplayedFrame
+        viewpoint : Viewpoint
+        shape : (int, int)
+            Rows and columns.
+        point_px : int
+            Pixels.
+
+        Returns
+        -------
+        (rows, columns, 3) uint8 array
         """
         ...
 
@@ -54,6 +67,21 @@ class PyvistaRenderer:
     def draw(
         self, shown: DisplayedFrame, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int
     ) -> Image:
+        """Return a picture, drawn by VTK.
+
+        Parameters
+        ----------
+        shown : DisplayedFrame
+        viewpoint : Viewpoint
+        shape : (int, int)
+            Rows and columns.
+        point_px : int
+            Width of a point, pixels.
+
+        Returns
+        -------
+        (rows, columns, 3) uint8 array
+        """
         import pyvista
 
         if self._plotter is None:
@@ -76,11 +104,35 @@ class RasterRenderer:
     def draw(
         self, shown: DisplayedFrame, viewpoint: Viewpoint, shape: tuple[int, int], point_px: int
     ) -> Image:
+        """Return a picture, drawn by NumPy; surfaces appear as their points.
+
+        Parameters
+        ----------
+        shown : DisplayedFrame
+        viewpoint : Viewpoint
+        shape : (int, int)
+            Rows and columns.
+        point_px : int
+            Width of a point, pixels.
+
+        Returns
+        -------
+        (rows, columns, 3) uint8 array
+        """
         return rasterise_points(shown.cloud.xyz, shown.colours, viewpoint, shape, point_px)
 
 
 def add_to_plotter(plotter: Any, shown: DisplayedFrame, point_px: int) -> None:
-    """Put points, or the surface, into a pyvista plotter."""
+    """Put points, or the surface, into a pyvista plotter.
+
+    Parameters
+    ----------
+    plotter : pyvista.Plotter
+        What was shown before is removed.
+    shown : DisplayedFrame
+    point_px : int
+        Width of a point, pixels.
+    """
     import pyvista
 
     plotter.remove_actor("shown", render=False)

@@ -108,7 +108,16 @@ class SceneFigure:
 
 
 def save_picture(title: str, shown: DisplayedFrame, renderer: Renderer, out: Path) -> None:
-    """Write a picture of what is shown, whole or not at all."""
+    """Write a picture of what is shown, whole or not at all.
+
+    Parameters
+    ----------
+    title : str
+    shown : DisplayedFrame
+    renderer : Renderer
+    out : Path
+        Its suffix names the format.
+    """
     from apps.figures.style import save_figure
 
     save_figure(SceneFigure(title, shown, renderer).draw(shown), out)

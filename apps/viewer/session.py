@@ -143,6 +143,16 @@ class Session:
     def pick(self, origin: ArrayLike, direction: ArrayLike) -> Pick | None:
         """Choose the point that a ray hits, m; the last two choices are kept, and a miss forgets
         them.
+
+        Parameters
+        ----------
+        origin : (3,) array_like
+            Of the ray, m.
+        direction : (3,) array_like
+
+        Returns
+        -------
+        Pick or None
         """
         if self._displayed is None:
             return None

@@ -60,6 +60,19 @@ class ShotSource(Source):
         return self._views[number]
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
+        """Return streak image, intensity and depth of shot `number`; see `Source`.
+
+        Parameters
+        ----------
+        number : int
+        gate : Gate
+            Not used: a shot is shown as a whole.
+
+        Returns
+        -------
+        dict of (rows, columns) float32 arrays
+            Depth in m.
+        """
         measurements = self.measurements(number)
         bright = self.linear.frames(measurements, 0.0, self._find_bright_gate(measurements))
         return {
@@ -69,10 +82,36 @@ class ShotSource(Source):
         }
 
     def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform:
+        """Return the signal of a pixel over the whole shot; see `Source`.
+
+        Parameters
+        ----------
+        number : int
+        pixel : (int, int)
+            Row and column.
+
+        Returns
+        -------
+        Waveform
+        """
         frames = self.linear.frames(self.measurements(number), 0.0, self._full_gate)
         return Waveform(frames.times, frames.values[:, pixel[0], pixel[1]].copy())
 
     def refocus(self, number: int, shear: float, gate: Gate) -> View:
+        """Recover shot `number` at another shear; see `Source`.
+
+        Parameters
+        ----------
+        number : int
+        shear : float
+            Pixels per view step.
+        gate : Gate
+            Not used: the whole shot is recovered.
+
+        Returns
+        -------
+        View
+        """
         return self.linear.view(self.measurements(number), shear, self._full_gate)
 
     @property

@@ -74,7 +74,19 @@ def colour_brightness(picture: Picture) -> Image:
 
 
 def colour_depth(picture: Picture, scale: Scale) -> Image:
-    """Colour a picture of distances; NaN becomes a dark grey."""
+    """Colour a picture of distances; NaN becomes a dark grey.
+
+    Parameters
+    ----------
+    picture : (rows, columns) float array
+        Metres.
+    scale : Scale
+        Taken where it is one of ranges; else the colours run from the 1st to the 99th percentile.
+
+    Returns
+    -------
+    (rows, columns, 3) uint8 array
+    """
     image = np.empty((*picture.shape, 3), np.uint8)
     image[:] = EMPTY_COLOUR
     there = np.isfinite(picture)

@@ -162,15 +162,50 @@ class Source(abc.ABC):
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
         """Return pictures of frame `number`, or of a transient's gate, by name: "streak",
         "intensity", "depth" (m).
+
+        Parameters
+        ----------
+        number : int
+        gate : Gate
+
+        Returns
+        -------
+        dict of (rows, columns) float32 arrays
         """
         return {}
 
     def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform | None:
-        """Return the signal of a pixel (row, column) in frame `number`, None where it is not known."""
+        """Return the signal of a pixel (row, column) in frame `number`, None where it is not known.
+
+        Parameters
+        ----------
+        number : int
+        pixel : (int, int)
+
+        Returns
+        -------
+        Waveform or None
+        """
         return None
 
     def refocus(self, number: int, shear: float, gate: Gate) -> View:
-        """Recover the frames of a gate once more, at another shear, pixels per view step."""
+        """Recover the frames of a gate once more, at another shear, pixels per view step.
+
+        Parameters
+        ----------
+        number : int
+        shear : float
+        gate : Gate
+
+        Returns
+        -------
+        View
+
+        Raises
+        ------
+        InputError
+            The source holds no measurements.
+        """
         raise InputError(f"{self.title} holds no measurements, so it cannot be refocused")
 
     def surface(self) -> TriangleMesh | None:

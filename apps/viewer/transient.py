@@ -58,6 +58,19 @@ class TransientSource(Source):
         return self._full_view
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
+        """Return streak image, intensity in a gate and depth; see `Source`.
+
+        Parameters
+        ----------
+        number : int
+            Not used: the gate says which frames are shown.
+        gate : Gate
+
+        Returns
+        -------
+        dict of (rows, columns) float32 arrays
+            Depth in m.
+        """
         distance = np.maximum(self.frames.times[gate.frames], 0) * SPEED_OF_LIGHT / 2
         # As the intensity of a point, referred to 1 m: far objects would be lost beside near ones.
         light = np.tensordot((distance**2).astype(np.float32), self.frames.values[gate.frames], 1)
@@ -68,10 +81,37 @@ class TransientSource(Source):
         }
 
     def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform:
+        """Return the signal of a pixel; see `Source`.
+
+        Parameters
+        ----------
+        number : int
+            Not used: the signal runs through all frames.
+        pixel : (int, int)
+            Row and column.
+
+        Returns
+        -------
+        Waveform
+        """
         row, column = pixel
         return Waveform(self.frames.times, self.frames.values[:, row, column])
 
     def refocus(self, number: int, shear: float, gate: Gate) -> View:
+        """Recover the frames of a gate at another shear; see `Source`.
+
+        Parameters
+        ----------
+        number : int
+            Not used.
+        shear : float
+            Pixels per view step.
+        gate : Gate
+
+        Returns
+        -------
+        View
+        """
         return self._linear.view(
             self._measurements, shear, gate, find_min_intensity(self._full_view)
         )

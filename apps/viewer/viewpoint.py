@@ -55,6 +55,18 @@ class Viewpoint:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return row, column and depth (m) of points in a picture of `shape` pixels; NaN behind the
         eye.
+
+        Parameters
+        ----------
+        xyz : (n, 3) array
+            Metres.
+        shape : (int, int)
+            Rows and columns.
+
+        Returns
+        -------
+        row, column, depth : (n,) float64 array
+            Pixels, pixels and metres.
         """
         right, down, depth = self.axes @ (np.asarray(xyz, dtype=np.float64) - self.eye).T
         depth = np.where(depth > 0, depth, np.nan)

@@ -61,6 +61,20 @@ class VolumeSource(Source):
         return self._views[key]
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
+        """Return brightness and depth of the front view, or of slice `number`; see `Source`.
+
+        Parameters
+        ----------
+        number : int
+            Slice in z.
+        gate : Gate
+            Not used.
+
+        Returns
+        -------
+        dict of (rows, columns) float32 arrays
+            Depth in m, NaN where it is too dark.
+        """
         projection = self.volume.maximum_projection()
         bright = projection.brightness >= self.display_modes.threshold * self._magnitude.max()
         return {
