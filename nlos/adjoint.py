@@ -1,7 +1,7 @@
-"""From compressed readings of a wall to the hidden scene, with no iteration on the way (supplement
-Note 13).
+"""From compressed measurements of a wall to the hidden scene, with no iteration on the way
+(supplement Note 13).
 
-A CLIP camera reads the wall at every instant through an operator F with far fewer readings than
+A CLIP camera reads the wall at every instant through an operator F with far fewer measurements than
 wall points. For imaging around corners the wall is only an aperture, which bears artefacts: the
 adjoint F'f, in O(Nt N^2 m), is often enough.
 """
@@ -27,14 +27,14 @@ from tofclip.solvers import Backprojection, Method
 
 @dataclass(frozen=True, eq=False)
 class CompressedCapture:
-    """Readings ``f = F h`` of a wall's transient pictures h, one column per time bin.
+    """Measurements ``f = F h`` of a wall's transient pictures h, one column per time bin.
 
     Parameters
     ----------
-    measurements : (readings, t) array
+    measurements : (measurements, t) array
         Kept as float32.
     operator : LinearOperator
-        F, from pictures (rows, columns) to (readings,).
+        F, from pictures (rows, columns) to (measurements,).
     wall : (rows, columns, 3) array
         The wall point of every pixel, m; NaN where unknown.
     laser : (3,) or (rows, columns, 3) array
@@ -47,7 +47,7 @@ class CompressedCapture:
     Raises
     ------
     ShapeError, InputError
-        Readings, operator and wall disagree, or a reading is not finite.
+        Measurements, operator and wall disagree, or a measurement is not finite.
     """
 
     measurements: NDArray[np.float32]
@@ -77,6 +77,24 @@ class CompressedCapture:
     def of(cls, capture: Capture, operator: LinearOperator) -> CompressedCapture:
         """Read a capture (t, rows, columns) through an operator, as a CLIP camera does; masked wall
         points are dark.
+
+        Parameters
+        ----------
+        capture : Capture
+            Signal (t, rows, columns).
+        operator : LinearOperator
+            (rows, columns) pictures to (measurements,) vectors.
+
+        Returns
+        -------
+        CompressedCapture
+
+        Raises
+        ------
+        ShapeError
+            The signal's pictures do not fit the operator.
+        InputError
+            The signal is not a NumPy array.
         """
         if capture.signal.shape[1:] != operator.shape_in:
             raise ShapeError("signal", ("t", *operator.shape_in), capture.signal.shape)
@@ -106,8 +124,8 @@ class CompressedCapture:
 
 @dataclass(frozen=True)
 class AdjointImaging:
-    """Imaging straight from compressed readings: recover each instant, image, and cut off what is
-    weak.
+    """Imaging straight from compressed measurements: recover each instant, image, and cut off what
+    is weak.
 
     Memory for the recovered transients, besides what the solver needs.
 
@@ -132,7 +150,17 @@ class AdjointImaging:
             raise InputError(f"a threshold is a fraction between 0 and 1, got {self.threshold}")
 
     def supports(self, capture: CompressedCapture, grid: Grid) -> Support:
-        """Say whether the solver can image such a capture on `grid`, and if not, why."""
+        """Say whether the solver can image such a capture on `grid`, and if not, why.
+
+        Parameters
+        ----------
+        capture : CompressedCapture
+        grid : Grid
+
+        Returns
+        -------
+        Support
+        """
         blank = np.zeros((capture.measurements.shape[1], *capture.wall.shape[:-1]), np.float32)
         return self.solver.supports(
             Capture(blank, capture.wall, capture.laser, capture.bin_width, capture.start), grid
@@ -140,6 +168,16 @@ class AdjointImaging:
 
     def reconstruct(self, capture: CompressedCapture, grid: Grid) -> Volume:
         """Image the hidden scene.
+
+        Parameters
+        ----------
+        capture : CompressedCapture
+        grid : Grid
+
+        Returns
+        -------
+        Volume
+            Weak voxels are zero.
 
         Raises
         ------

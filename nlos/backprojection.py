@@ -96,6 +96,15 @@ class Backprojection(PhasorMethod):
 
         True in a condition if it can; ``.reason`` tells why not. Refused are a single wall point, a
         grid behind the wall, a volume above 8 GiB, and time bins too coarse for the wavelength.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        Support
         """
         try:
             Band(self.pulse, capture.axis)
@@ -104,7 +113,18 @@ class Backprojection(PhasorMethod):
         return check_common_support(capture, grid)
 
     def lookups(self, capture: Capture, grid: Grid) -> int:
-        """Number of look-ups that a reconstruction costs; what `progress` counts up to."""
+        """Number of look-ups that a reconstruction costs; what `progress` counts up to.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        int
+            Wall points times voxels.
+        """
         return len(capture.points) * grid.size
 
     def phasor_field(
@@ -112,6 +132,23 @@ class Backprojection(PhasorMethod):
     ) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in
         the signal.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+        progress : callable
+            Called with the number of look-ups just done.
+
+        Returns
+        -------
+        Volume
+            (z, y, x) complex64.
+
+        Raises
+        ------
+        InputError
+            `supports` says no.
         """
         self.supports(capture, grid).require()
         band = Band(self.pulse, capture.axis)
@@ -187,7 +224,15 @@ class _Batch:
     def add_to(
         self, field: NDArray[np.complex64], x: FloatArray, y: FloatArray, z: FloatArray
     ) -> None:
-        """Add what these wall points contribute to a brick of voxels."""
+        """Add what these wall points contribute to a brick of voxels.
+
+        Parameters
+        ----------
+        field : (z, y, x) complex64 array
+            Added to, in place.
+        x, y, z : float64 array
+            Axes of the brick, m.
+        """
         values = self.waveforms.values.view(np.float32)
         start, spacing = np.float32(self.waveforms.start), np.float32(self.waveforms.spacing)
         axes = (axis.astype(np.float32) for axis in (x, y, z))

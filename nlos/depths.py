@@ -57,6 +57,17 @@ class DepthPropagator:
     def transfer(self, depth: float, delay: FloatArray) -> Array:
         """Return what every wave (waves, frequencies) is multiplied by on its way to a depth; see
         `Transfer.evaluate`.
+
+        Parameters
+        ----------
+        depth : float
+            z, m.
+        delay : (2,) float64 array
+            Path in m and the wavenumber k_0 in rad/m.
+
+        Returns
+        -------
+        (waves, frequencies) complex array
         """
         nodes = self.plan.transfer.evaluate(depth - self.plan.plane.z, delay)
         matrix, turn = self._node_interpolation

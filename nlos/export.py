@@ -66,6 +66,16 @@ def extract_surface(volume: Volume, fraction: float) -> Mesh:
     """Draw the surface on which the magnitude is `fraction` (0..1) of the largest, by marching
     cubes.
 
+    Parameters
+    ----------
+    volume : Volume
+    fraction : float
+
+    Returns
+    -------
+    Mesh
+        Vertices in m, float32, and faces, int32.
+
     Raises
     ------
     InputError
@@ -92,6 +102,16 @@ def extract_points(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Positions (n, 3) in m, and magnitudes (n,), of the voxels with at least `fraction` (0..1) of
     the brightest.
+
+    Parameters
+    ----------
+    volume : Volume
+    fraction : float
+
+    Returns
+    -------
+    xyz : (n, 3) float32 array
+    magnitude : (n,) float32 array
     """
     z, y, x = np.nonzero(volume.threshold(fraction).magnitude)
     xyz = np.stack([volume.grid.x[x], volume.grid.y[y], volume.grid.z[z]], axis=-1).astype(
@@ -101,7 +121,21 @@ def extract_points(
 
 
 def export_volume(volume: Volume, path: str | Path, fraction: float) -> None:
-    """Do what `Volume.export_volume` describes."""
+    """Do what `Volume.export_volume` describes.
+
+    Parameters
+    ----------
+    volume : Volume
+    path : str or Path
+        Its suffix names the format.
+    fraction : float
+        Which voxels become points: those with at least this fraction of the brightest.
+
+    Raises
+    ------
+    InputError
+        There is no format of that suffix.
+    """
     suffix = Path(path).suffix.lower()
     if suffix in POINT_SUFFIXES:
         _write_points(volume, path, fraction)

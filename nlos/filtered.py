@@ -74,6 +74,15 @@ class FilteredBackprojection:
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with
         ``.reason``.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        Support
         """
         arrays = check_numpy_support("filtered back-projection", capture)
         if not arrays:
@@ -83,7 +92,18 @@ class FilteredBackprojection:
         return check_common_support(capture, grid)
 
     def lookups(self, capture: Capture, grid: Grid) -> int:
-        """Number of look-ups that a reconstruction costs; what `progress` counts up to."""
+        """Number of look-ups that a reconstruction costs; what `progress` counts up to.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        int
+            Wall points times voxels.
+        """
         return len(capture.points) * grid.size
 
     def reconstruct(

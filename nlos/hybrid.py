@@ -100,6 +100,15 @@ class Hybrid(PhasorMethod):
 
         True in a condition if it can; ``.reason`` tells why not. Needed are voxels evenly spaced
         along x and y, few laser spots, a virtual plane in front of the wall, and memory.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        Support
         """
         general = (
             check_common_support(capture, grid)
@@ -126,6 +135,23 @@ class Hybrid(PhasorMethod):
     ) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; linear within the
         tolerance.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+        progress : callable
+            Called with the number of voxels just done, once for each laser spot.
+
+        Returns
+        -------
+        Volume
+            (z, y, x) complex64.
+
+        Raises
+        ------
+        InputError
+            `supports` says no.
         """
         self.supports(capture, grid).require()
         band = choose_unaliased_band(capture, grid, self.pulse)
@@ -149,6 +175,7 @@ class Hybrid(PhasorMethod):
             ).values
             diffract_to_grid(
                 plan,
+                # the sum over points stands for the Rayleigh-Sommerfeld integral over the plane
                 on_plane * np.float32(np.prod(plan.plane.steps)),
                 build_source(group, band),
                 total,
@@ -172,13 +199,34 @@ class Hybrid(PhasorMethod):
         }
 
     def virtual_plane(self, capture: Capture, grid: Grid) -> Plane:
-        """Return the virtual plane of a capture's first laser spot."""
+        """Return the virtual plane of a capture's first laser spot.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        Plane
+        """
         return self.plans(capture, grid)[0][1].plane
 
     def plans(
         self, capture: Capture, grid: Grid
     ) -> list[tuple[IlluminationGroup, DiffractionPlan]]:
-        """Return every exposure, and its way from a virtual plane of its own to the grid."""
+        """Return every illumination group, and the plan from a virtual plane of its own to the
+        grid.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        list of (IlluminationGroup, DiffractionPlan)
+        """
         band = choose_unaliased_band(capture, grid, self.pulse)
         zones = STRICT_FRESNEL_ZONES if self.tolerance < STRICT_TOLERANCE else FRESNEL_ZONES
         plans = []

@@ -42,7 +42,18 @@ class IlluminationGroup:
         return 2 if self.laser is None else 1
 
     def compute_phasors(self, capture: Capture, band: Band) -> NDArray[np.complex64]:
-        """Return the phasors of the members, shape (n, frequencies)."""
+        """Return the phasors of the group's wall points.
+
+        Parameters
+        ----------
+        capture : Capture
+        band : Band
+            Frequencies of the virtual pulse.
+
+        Returns
+        -------
+        (n, frequencies) complex64 array
+        """
         traces = capture.traces()
         return np.asarray(
             band.compute_phasors(
@@ -83,6 +94,16 @@ def choose_unaliased_band(capture: Capture, grid: Grid, pulse: VirtualPulse) -> 
 
     Evenly spaced frequencies repeat a signal with their period; where the paths of the grid go
     beyond the record, the record is continued with silence.
+
+    Parameters
+    ----------
+    capture : Capture
+    grid : Grid
+    pulse : VirtualPulse
+
+    Returns
+    -------
+    Band
     """
     outward, back = find_leg_bounds(capture.lasers, grid), find_leg_bounds(capture.points, grid)
     return choose_band_for_paths(capture.axis, pulse, outward[0] + back[0], outward[1] + back[1])
@@ -93,6 +114,18 @@ def choose_band_for_paths(
 ) -> Band:
     """Return the pulse's band over a period in which paths from `shortest` to `longest` (m) meet
     the record once.
+
+    Parameters
+    ----------
+    axis : TimeAxis
+        Of the record.
+    pulse : VirtualPulse
+    shortest, longest : float
+        Metres.
+
+    Returns
+    -------
+    Band
     """
     tail = Band(pulse, axis).tail_bins * axis.spacing
     period = max(longest - (axis.start - tail), axis.paths[-1] + tail - shortest)
@@ -101,7 +134,19 @@ def choose_band_for_paths(
 
 
 def find_leg_bounds(ends: FloatArray, grid: Grid) -> tuple[float, float]:
-    """Bounds of the way between any of some points (n, 3) and any voxel, m."""
+    """Bounds of the distance between any of some points and any voxel.
+
+    Parameters
+    ----------
+    ends : (n, 3) float64 array
+        Metres.
+    grid : Grid
+
+    Returns
+    -------
+    (float, float)
+        Shortest and longest, m.
+    """
     axes = (grid.x, grid.y, grid.z)
     low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
     outside = np.maximum(np.maximum(low - ends, ends - high), 0)

@@ -81,13 +81,41 @@ class Reconstructor(Protocol):
     """One method of imaging a hidden scene."""
 
     def supports(self, capture: Capture, grid: Grid) -> Support:
-        """Say whether the method can image `capture` on `grid`, and if not, why."""
+        """Say whether the method can image `capture` on `grid`, and if not, why.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        Support
+        """
         ...
 
     def reconstruct(
         self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
     ) -> Volume:
-        """Image the hidden scene."""
+        """Image the hidden scene.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+        progress : callable
+            Called with the amount of work just done.
+
+        Returns
+        -------
+        Volume
+            Brightness (z, y, x).
+
+        Raises
+        ------
+        InputError
+            `supports` says no.
+        """
         ...
 
 
@@ -98,7 +126,25 @@ class PhasorMethod(ABC):
     def phasor_field(
         self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
     ) -> Volume:
-        """Return the complex sum whose magnitude `reconstruct` gives, complex64."""
+        """Return the complex sum whose magnitude `reconstruct` gives, complex64.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+        progress : callable
+            As for `reconstruct`.
+
+        Returns
+        -------
+        Volume
+            (z, y, x) complex64.
+
+        Raises
+        ------
+        InputError
+            `supports` says no.
+        """
 
     def reconstruct(
         self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
@@ -130,6 +176,15 @@ class PhasorMethod(ABC):
 def check_common_support(capture: Capture, grid: Grid) -> Support:
     """Check what no method can do without: several wall points, a grid that is not behind them, and
     memory.
+
+    Parameters
+    ----------
+    capture : Capture
+    grid : Grid
+
+    Returns
+    -------
+    Support
     """
     if len(capture.points) == 1:
         return Support("one wall point cannot locate anything: a capture needs several")
@@ -148,7 +203,17 @@ def check_common_support(capture: Capture, grid: Grid) -> Support:
 
 
 def check_numpy_support(what: str, capture: Capture) -> Support:
-    """Check that a method of compiled loops, `what` in the message, gets a NumPy array."""
+    """Check that a method of compiled loops, `what` in the message, gets a NumPy array.
+
+    Parameters
+    ----------
+    what : str
+    capture : Capture
+
+    Returns
+    -------
+    Support
+    """
     if is_numpy(capture.signal):
         return Support()
     return Support(

@@ -46,8 +46,19 @@ def plan_outgoing_diffraction(
 def compute_outgoing_field(
     method: DiffractionMethod, capture: Capture, plan: DiffractionPlan, band: Band
 ) -> NDArray[Any]:
-    """Return the field of every frequency on the plane where `plan` begins, (y, x, frequencies),
-    complex64.
+    """Return the field of every frequency on the plane where `plan` begins.
+
+    Parameters
+    ----------
+    method : PlanarRSD or Hybrid
+    capture : Capture
+        With a single illumination group.
+    plan : DiffractionPlan
+    band : Band
+
+    Returns
+    -------
+    (y, x, frequencies) complex64 array
     """
     (group,) = group_by_illumination(capture)
     if isinstance(method, PlanarRSD):

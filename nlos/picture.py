@@ -129,6 +129,15 @@ def compute_extent(
 ) -> tuple[float, float, float, float]:
     """Left, right, lower and upper edge of a picture with axes to the right and downwards, m, as
     matplotlib has it.
+
+    Parameters
+    ----------
+    right, down : (n,) float64 array
+        Centres of the pixels, m.
+
+    Returns
+    -------
+    (float, float, float, float)
     """
     return (*_find_edges(right), *_find_edges(down)[::-1])
 

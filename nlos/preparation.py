@@ -14,7 +14,17 @@ from tofclip.errors import InputError
 
 
 def crop_capture(capture: Capture, nearest: float, farthest: float) -> Capture:
-    """Keep the bins that hold paths from `find_nearest` to `farthest`, m.
+    """Keep the bins that hold paths from `nearest` to `farthest`.
+
+    Parameters
+    ----------
+    capture : Capture
+    nearest, farthest : float
+        Lengths of path, m.
+
+    Returns
+    -------
+    Capture
 
     Raises
     ------
@@ -36,6 +46,21 @@ def rebin_capture(capture: Capture, factor: int) -> Capture:
 
     Counts stay counts. Bins much finer than the wall's sampling carry noise and cost time: path per
     bin of about the distance of neighbouring wall points loses nothing.
+
+    Parameters
+    ----------
+    capture : Capture
+    factor : int
+
+    Returns
+    -------
+    Capture
+        Its bins are `factor` times wider.
+
+    Raises
+    ------
+    InputError
+        Fewer than two bins are left.
     """
     bins = capture.axis.bins // factor if factor >= 1 else 0
     if bins < 2:
@@ -55,10 +80,25 @@ def rebin_capture(capture: Capture, factor: int) -> Capture:
 
 
 def remove_first_bounce(capture: Capture, margin: float) -> Capture:
-    """Set to 0 what arrives straight from the laser spot, by way of no hidden thing.
+    """Set to 0 what arrives straight from the laser spot, without a hidden thing on its path.
 
-    That light reaches wall point r_p after the path ``|r_L - r_p|``; everything up to `margin` (m)
+    That light reaches wall point r_p after the path ``|r_L - r_p|``; everything up to `margin`
     later goes with it: the instrument's response and what the wall sends on.
+
+    Parameters
+    ----------
+    capture : Capture
+    margin : float
+        Length of path, m.
+
+    Returns
+    -------
+    Capture
+
+    Raises
+    ------
+    InputError
+        The margin is negative or not finite.
     """
     if not (np.isfinite(margin) and margin >= 0):
         raise InputError(f"the margin after the first bounce must be 0 m or more, got {margin}")

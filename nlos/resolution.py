@@ -87,6 +87,19 @@ def measure_point_spread(volume: Volume, point: Any | None = None) -> PeakWidths
 def measure_fwhm(axis: FloatArray, values: NDArray[Any], peak: int) -> float:
     """Full width at half of ``values[peak]``, by linear interpolation; NaN if one side does not
     fall so far.
+
+    Parameters
+    ----------
+    axis : (n,) float64 array
+        Metres, ascending.
+    values : (n,) array
+    peak : int
+        Place of the maximum.
+
+    Returns
+    -------
+    float
+        Metres.
     """
     level = HALF_MAXIMUM * float(values[peak])
     below = np.flatnonzero(values < level)

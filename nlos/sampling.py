@@ -22,6 +22,12 @@ def warn_of_aliasing(capture: Capture, band: Band) -> None:
 
     In a confocal scan the path grows on both legs from point to point, so that a quarter is the
     limit.
+
+    Parameters
+    ----------
+    capture : Capture
+    band : Band
+        Wavenumbers of the virtual pulse.
     """
     shortest = 2 * np.pi / float(band.wavenumbers[-1])
     confocal = len(capture.lasers) > 1 and np.array_equal(capture.lasers, capture.points)

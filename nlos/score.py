@@ -35,14 +35,28 @@ class PointScore:
 
 
 def score_points(volume: Volume, points: Any, radius: float = SCORE_RADIUS_M) -> PointScore:
-    """Compare the voxels within `radius` (m) of hidden points (n, 3), m, with all others.
+    """Compare the voxels near hidden points with all others.
 
     Unlike peak over mean it is not fooled by a bright spot in the wrong place.
 
+    Parameters
+    ----------
+    volume : Volume
+    points : (n, 3) array_like
+        Metres.
+    radius : float
+        What counts as near, m.
+
+    Returns
+    -------
+    PointScore
+
     Raises
     ------
-    ShapeError, InputError
-        The points are not (n, 3); no voxel, or every one, lies near a point; or the volume is dark.
+    ShapeError
+        The points are not (n, 3).
+    InputError
+        No voxel, or every one, lies near a point; or the volume is dark away from them.
     """
     from scipy.spatial import cKDTree
 
@@ -59,6 +73,7 @@ def score_points(volume: Volume, points: Any, radius: float = SCORE_RADIUS_M) ->
         raise InputError(
             "the volume is dark away from the hidden points: their contrast has no measure"
         )
+    # energy is the square of the brightness, which is the square of the field's magnitude
     energy = magnitude**4
     return PointScore(
         float(energy[near].sum() / energy.sum()),

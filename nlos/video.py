@@ -136,6 +136,15 @@ class TransientImaging:
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with
         ``.reason``.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        Support
         """
         arrays = check_numpy_support("imaging in time", capture)
         if not arrays:
@@ -192,6 +201,20 @@ class TransientImaging:
         y, x).
 
         Memory for no more than that; parameters and errors as of `video`.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+        times : (t,) array_like
+            Seconds after the flash.
+        progress : callable
+            As for `video`.
+
+        Returns
+        -------
+        TransientVideo
+            (t, y, x) float32.
         """
         from threading import Lock
 
@@ -200,6 +223,7 @@ class TransientImaging:
 
         def accumulate(_: int, some: slice, seen: NDArray[np.complex64]) -> None:
             brightness = np.abs(seen)
+            # depths are imaged by several threads, and each may be the brightest
             with joining:
                 np.maximum(values[some], brightness, out=values[some])
 

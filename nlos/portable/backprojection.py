@@ -94,6 +94,21 @@ class _Waveforms:
 
     @classmethod
     def of(cls, capture: Capture, points: slice, band: Band, analysis: BandTransform) -> _Waveforms:
+        """Return the waveforms of some wall points.
+
+        Parameters
+        ----------
+        capture : Capture
+        points : slice
+            Of its valid wall points.
+        band : Band
+        analysis : BandTransform
+            From signals to the band's phasors.
+
+        Returns
+        -------
+        _Waveforms
+        """
         library, (carriers, start, spacing) = ArrayLibrary(capture.device), band.carriers
         values = analysis.of(get_traces(capture, points)) @ library.put(carriers)
         first = band.sample_count * np.arange(values.shape[0])
@@ -120,7 +135,18 @@ class _VoxelRows:
         self.y, self.z = (library.put(axis.reshape(-1, 1, 1)) for axis in (y, z))
 
     def look_up(self, some: slice, waveforms: _Waveforms) -> Array:
-        """Return what some rows (rows, x) find in the waveforms."""
+        """Return what some rows (rows, x) find in the waveforms.
+
+        Parameters
+        ----------
+        some : slice
+            Of the rows.
+        waveforms : _Waveforms
+
+        Returns
+        -------
+        (rows, x) complex64 array
+        """
         xp, wall = self.library.xp, waveforms.wall
         y, z = self.y[some, ...], self.z[some, ...]
         squared = (

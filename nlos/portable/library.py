@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from tofclip.arrays import Array, ComputeDevice, namespace
 
 CPU_CHUNK_BYTES, GPU_CHUNK_BYTES = 8 << 20, 256 << 20
-"""Bytes of the largest array that is made at a time: on a processor, with its caches, and on a graphics processor, with
-its thousands of lanes."""
+"""Bytes of the largest array that is made at a time: on a processor, with its caches, and on a GPU,
+with its thousands of lanes.
+"""
 
 SINGLE_PRECISION_DTYPES = {"f": np.float32, "c": np.complex64}
 
@@ -60,7 +61,17 @@ class ArrayLibrary:
         return self.xp.exp(1j * self.xp.astype(angle, self.xp.complex64))
 
     def make_complex(self, real: Array, imaginary: Array) -> Array:
-        """Make complex numbers of real and imaginary parts."""
+        """Make complex numbers of real and imaginary parts.
+
+        Parameters
+        ----------
+        real, imaginary : array
+            Of one shape.
+
+        Returns
+        -------
+        complex64 array
+        """
         xp = self.xp
         return xp.astype(real, xp.complex64) + 1j * xp.astype(imaginary, xp.complex64)
 

@@ -71,6 +71,17 @@ class PreparedImaging:
     def reconstruct(self, capture: Capture, progress: Progress = ignore_progress) -> Volume:
         """Image a capture; the result is that of ``method.reconstruct(capture, grid)``.
 
+        Parameters
+        ----------
+        capture : Capture
+            Of the geometry that was prepared for.
+        progress : callable
+            As for the method's own.
+
+        Returns
+        -------
+        Volume
+
         Raises
         ------
         InputError
@@ -131,7 +142,17 @@ class PreparedField:
             self.settings["plane_z_m"] = plans[-1][1].plane.z
 
     def of(self, capture: Capture, progress: Progress = ignore_progress) -> Array:
-        """Return the field (z, y, x), complex64, where the capture's signal lives."""
+        """Return the field (z, y, x), complex64, where the capture's signal lives.
+
+        Parameters
+        ----------
+        capture : Capture
+        progress : callable
+
+        Returns
+        -------
+        (z, y, x) complex64 array
+        """
         total = self.library.zeros(self.grid.shape)
         for group_plan in self._group_plans:
             group_plan.diffraction.add(group_plan.propagate_to_plane(capture), total, progress)

@@ -30,7 +30,23 @@ FloatArray = NDArray[np.float64]
 def propagate_on_device(
     capture: Capture, group: IlluminationGroup, plane: Plane, band: Band, tolerance: float
 ) -> PlaneField:
-    """Carry one exposure of a capture onto a plane where its signal lives; see `nlos.propagate`."""
+    """Propagate one illumination group of a capture onto a plane where its signal lives; see
+    `nlos.propagate`.
+
+    Parameters
+    ----------
+    capture : Capture
+    group : IlluminationGroup
+    plane : Plane
+    band : Band
+        Wavenumbers, rad/m.
+    tolerance : float
+        Relative error.
+
+    Returns
+    -------
+    PlaneField
+    """
     waves, points = build_waves(group, band, continued=False), capture.points[group.indices]
     library = ArrayLibrary(capture.device)
     phasors = BandTransform(band, capture.axis.bins, library).of(get_group_traces(capture, group))

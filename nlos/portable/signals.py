@@ -44,14 +44,37 @@ class BandTransform:
 
 
 def get_group_traces(capture: Capture, group: IlluminationGroup) -> Array:
-    """Return the signals (points, t) of one exposure's members."""
+    """Return the signals of one illumination group.
+
+    Parameters
+    ----------
+    capture : Capture
+    group : IlluminationGroup
+
+    Returns
+    -------
+    (points, t) array
+        In the capture's own library.
+    """
     return ArrayLibrary.of(capture.signal).xp.permute_dims(
         _select_signals(capture, group.indices), (1, 0)
     )
 
 
 def get_traces(capture: Capture, some: slice) -> Array:
-    """Return the signals (points, t) of some valid wall points."""
+    """Return the signals (points, t) of some valid wall points.
+
+    Parameters
+    ----------
+    capture : Capture
+    some : slice
+        Of the valid wall points.
+
+    Returns
+    -------
+    (points, t) array
+        In the capture's own library.
+    """
     xp = ArrayLibrary.of(capture.signal).xp
     indices = np.arange(len(capture.points))[some]
     return xp.permute_dims(_select_signals(capture, indices), (1, 0))
@@ -60,6 +83,16 @@ def get_traces(capture: Capture, some: slice) -> Array:
 def arrange_on_lattice(values: Array, wall: WallLattice, library: ArrayLibrary) -> Array:
     """Put values (..., points) into their places on a lattice, (..., rows, columns); the others are
     0.
+
+    Parameters
+    ----------
+    values : (..., points) array
+    wall : WallLattice
+    library : ArrayLibrary
+
+    Returns
+    -------
+    (..., rows, columns) array
     """
     xp = library.xp
     if not wall.is_complete:
