@@ -3,7 +3,7 @@ get there and back.
 
 The compiled loops of this package work on NumPy arrays. Whatever is written with the functions of
 the array API standard (https://data-apis.org/array-api) works on the arrays of any library that
-follows it: CuPy and PyTorch on a graphics processor, PyTorch and array-api-strict on this one. What
+follows it: CuPy and PyTorch on a GPU, PyTorch and array-api-strict on this one. What
 accepts such arrays answers in the library and on the device of the one that came in; what has only
 compiled loops refuses them (`require_numpy`).
 """
@@ -27,7 +27,7 @@ Array = Any
 """An array of any library that follows the array API standard."""
 
 GRAPHICS_LIBRARIES = ("cupy", "torch")
-"""Those that can use a graphics processor, the preferred one first."""
+"""Those that can use a GPU, the preferred one first."""
 
 _NAMESPACES: dict[type, Any] = {}
 
@@ -96,6 +96,18 @@ def as_type(array: Array, dtype: DTypeLike) -> Array:
     has that type.
 
     NumPy's come back contiguous, as compiled loops need them.
+
+    Parameters
+    ----------
+    array : array
+        Of any library.
+    dtype : dtype
+        A NumPy type, or what names one.
+
+    Returns
+    -------
+    array
+        Of the same shape.
     """
     if is_numpy(array):
         return np.ascontiguousarray(array, dtype)
@@ -111,7 +123,18 @@ def native_device(array: Array) -> Any:
 
 
 def zeros(shape: tuple[int, ...], like: Array) -> Array:
-    """Return zeros of the type of `like`, where `like` is."""
+    """Return zeros of the type of `like`, where `like` is.
+
+    Parameters
+    ----------
+    shape : tuple of int
+    like : array
+        Gives dtype, library and device.
+
+    Returns
+    -------
+    array of `shape`
+    """
     if is_numpy(like):
         return np.zeros(shape, like.dtype)
     return namespace(like).zeros(shape, dtype=like.dtype, device=native_device(like))
@@ -120,6 +143,16 @@ def zeros(shape: tuple[int, ...], like: Array) -> Array:
 def scalar_like(value: float, like: Array) -> Array:
     """Return a number of the type of `like`, where `like` is: for functions that not every library
     has for Python's.
+
+    Parameters
+    ----------
+    value : float
+    like : array
+        Gives dtype, library and device.
+
+    Returns
+    -------
+    () array
     """
     return like.dtype.type(value) if is_numpy(like) else zeros((), like) + value
 
@@ -234,8 +267,8 @@ def parse_device(name: str) -> ComputeDevice:
     Parameters
     ----------
     name : str
-        ``cpu`` for NumPy and the compiled loops; ``cuda`` or ``cuda:1`` for a graphics processor,
-        through CuPy or else PyTorch; ``auto`` for a graphics processor where there is one, and
+        ``cpu`` for NumPy and the compiled loops; ``cuda`` or ``cuda:1`` for a GPU,
+        through CuPy or else PyTorch; ``auto`` for a GPU where there is one, and
         ``cpu`` where there is none; or a library with its own name of a device, such as
         ``torch:cpu`` or ``torch:xpu``.
 

@@ -42,6 +42,23 @@ def nmse(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
 def nmse_energy(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
     """Squared error relative to the energy of the truth: ``sum (h - g)^2 / sum g^2``; arguments as
     in `nmse`.
+
+    Parameters
+    ----------
+    estimate, truth : (rows, columns) array_like
+    border_px : int
+        Pixels left out on all sides.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    ShapeError
+        The shapes differ.
+    InputError
+        The border leaves nothing, or the truth is zero everywhere.
     """
     h, g = _crop_borders(estimate, truth, border_px)
     energy = float(np.sum(g**2))
@@ -55,6 +72,17 @@ def correlation_coefficient(estimate: ArrayLike, truth: ArrayLike, border_px: in
     even tone.
 
     Arguments as in `nmse`.
+
+    Parameters
+    ----------
+    estimate, truth : (rows, columns) array_like
+    border_px : int
+        Pixels left out on all sides.
+
+    Returns
+    -------
+    float
+        -1 to 1.
 
     Raises
     ------

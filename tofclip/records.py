@@ -192,11 +192,33 @@ class _Declaration(Protocol):
     """How one field of a dataclass is stored."""
 
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
-        """Put `value` of dataclass field `own_name` into the record."""
+        """Put `value` of dataclass field `own_name` into the record.
+
+        Parameters
+        ----------
+        own_name : str
+            Name of the dataclass field.
+        value : object
+        contents : _Contents
+            Added to, in place.
+        """
         ...
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
-        """Return the value that the record of a `kind` holds, or `MISSING` for the default."""
+        """Return the value that the record of a `kind` holds, or `MISSING` for the default.
+
+        Parameters
+        ----------
+        own_name : str
+            Name of the dataclass field.
+        record : Record
+        kind : type
+            The class that is read.
+
+        Returns
+        -------
+        object
+        """
         ...
 
 
@@ -230,6 +252,15 @@ class _StoredArray:
     optional: bool
 
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
+        """Store an array in its declared dtype, with its unit and axes; booleans as bytes.
+
+        Parameters
+        ----------
+        own_name : str
+        value : array or None
+        contents : _Contents
+            Added to, in place.
+        """
         if value is None and self.optional:
             return
         dtype = np.dtype(self.dtypes[0])
@@ -240,6 +271,18 @@ class _StoredArray:
         contents.fields[self.name or own_name] = Field(values, self.units, axes)
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
+        """Return the array, checked for dtype, dimensions and unit.
+
+        Parameters
+        ----------
+        own_name : str
+        record : Record
+        kind : type
+
+        Returns
+        -------
+        array, or `MISSING`
+        """
         name = self.name or own_name
         if self.optional and name not in record.fields:
             return MISSING
@@ -261,11 +304,37 @@ class _StoredValue:
     optional: bool
 
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
+        """Store one scalar, or several under a name each.
+
+        Parameters
+        ----------
+        own_name : str
+        value : scalar or tuple
+        contents : _Contents
+            Added to, in place.
+        """
         names = self.names or (own_name,)
         values = value if len(names) > 1 else (value,)
         contents.attributes.update(zip(names, values, strict=True))
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
+        """Return the scalar, or several as a tuple, in the declared type.
+
+        Parameters
+        ----------
+        own_name : str
+        record : Record
+        kind : type
+
+        Returns
+        -------
+        scalar, tuple or `MISSING`
+
+        Raises
+        ------
+        FileFormatError
+            An attribute is absent or of another type.
+        """
         names = self.names or (own_name,)
         if self.optional and names[0] not in record.attributes:
             return MISSING
@@ -285,9 +354,30 @@ class _StoredPart:
     part: type
 
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
+        """Store the fields of a part among those of the whole.
+
+        Parameters
+        ----------
+        own_name : str
+        value : dataclass
+        contents : _Contents
+            Added to, in place.
+        """
         _write_fields(value, contents)
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
+        """Return the part, from fields of the whole.
+
+        Parameters
+        ----------
+        own_name : str
+        record : Record
+        kind : type
+
+        Returns
+        -------
+        dataclass
+        """
         return _read_fields(self.part, record)
 
 
@@ -299,10 +389,31 @@ class _StoredChild:
     name: str
 
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
+        """Store an object as a record inside the record.
+
+        Parameters
+        ----------
+        own_name : str
+        value : Storable or None
+        contents : _Contents
+            Added to, in place.
+        """
         if value is not None or not self.optional:
             contents.children[self.name or own_name] = value.to_record()
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
+        """Return the object whose record lies inside the record.
+
+        Parameters
+        ----------
+        own_name : str
+        record : Record
+        kind : type
+
+        Returns
+        -------
+        object or None
+        """
         name = self.name or own_name
         if name not in record.children and self.optional:
             return None
@@ -313,17 +424,59 @@ class _StoredChild:
 
 class _StoredAttributes:
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
+        """Store a mapping as scalar attributes.
+
+        Parameters
+        ----------
+        own_name : str
+        value : mapping
+        contents : _Contents
+            Added to, in place.
+        """
         contents.attributes.update(value)
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
+        """Return all scalar attributes.
+
+        Parameters
+        ----------
+        own_name : str
+        record : Record
+        kind : type
+
+        Returns
+        -------
+        mapping
+        """
         return record.attributes
 
 
 class _StoredTexts:
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
+        """Store a mapping of texts as a record of its own.
+
+        Parameters
+        ----------
+        own_name : str
+        value : mapping of str to str
+        contents : _Contents
+            Added to, in place.
+        """
         contents.children[own_name] = Record(own_name, attributes=dict(value))
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
+        """Return the mapping of texts.
+
+        Parameters
+        ----------
+        own_name : str
+        record : Record
+        kind : type
+
+        Returns
+        -------
+        dict of str to str, or `MISSING`
+        """
         if own_name not in record.children:
             return MISSING
         return {name: str(text) for name, text in record.children[own_name].attributes.items()}
@@ -331,10 +484,31 @@ class _StoredTexts:
 
 class _StoredAttachments:
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
+        """Store records inside the record that no other field declares.
+
+        Parameters
+        ----------
+        own_name : str
+        value : mapping of str to Record
+        contents : _Contents
+            Added to, in place.
+        """
         # what other fields declare comes first, whatever their order
         contents.children = {**value, **contents.children}
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
+        """Return the records inside the record that no other field declares.
+
+        Parameters
+        ----------
+        own_name : str
+        record : Record
+        kind : type
+
+        Returns
+        -------
+        dict of str to Record
+        """
         declared = {
             (declaration.name if isinstance(declaration, _StoredChild) else "") or name
             for name, declaration in _declarations(kind).items()
@@ -345,15 +519,56 @@ class _StoredAttachments:
 
 class _StoredProvenance:
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
+        """Store where an object came from.
+
+        Parameters
+        ----------
+        own_name : str
+        value : mapping
+        contents : _Contents
+            Added to, in place.
+        """
         contents.provenance = value
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
+        """Return where the object came from.
+
+        Parameters
+        ----------
+        own_name : str
+        record : Record
+        kind : type
+
+        Returns
+        -------
+        mapping
+        """
         return record.provenance
 
 
 class _StoredOrigin:
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
+        """Store nothing: the file's own name is its origin.
+
+        Parameters
+        ----------
+        own_name : str
+        value : str
+        contents : _Contents
+        """
         pass
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
+        """Return the name of the file that the record came from.
+
+        Parameters
+        ----------
+        own_name : str
+        record : Record
+        kind : type
+
+        Returns
+        -------
+        str, or `MISSING`
+        """
         return record.origin or MISSING

@@ -91,6 +91,18 @@ class Record:
     def array(self, name: str, dtype: DTypeLike, dimensions: int, units: str = "") -> NDArray[Any]:
         """Return field `name` as a checked array.
 
+        Parameters
+        ----------
+        name : str
+        dtype : dtype
+            Type of the result; the stored one must convert to it.
+        dimensions : int
+        units : str
+
+        Returns
+        -------
+        contiguous array
+
         Raises
         ------
         FileFormatError
@@ -116,7 +128,22 @@ class Record:
         return np.ascontiguousarray(found.values, dtype=dtype)
 
     def attribute(self, name: str, default: Scalar | None = None) -> Scalar:
-        """Return scalar attribute `name`, or `default` if it is absent and a default is given."""
+        """Return scalar attribute `name`, or `default` if it is absent and a default is given.
+
+        Parameters
+        ----------
+        name : str
+        default : scalar, optional
+
+        Returns
+        -------
+        scalar
+
+        Raises
+        ------
+        FileFormatError
+            It is absent and there is no default.
+        """
         if name in self.attributes:
             return self.attributes[name]
         if default is None:
@@ -124,7 +151,22 @@ class Record:
         return default
 
     def child(self, name: str, kind: str) -> Record:
-        """Return the record that travels inside this one under `name`, refusing another kind."""
+        """Return the record that travels inside this one under `name`.
+
+        Parameters
+        ----------
+        name : str
+        kind : str
+
+        Returns
+        -------
+        Record
+
+        Raises
+        ------
+        FileFormatError
+            There is none of that kind.
+        """
         found = self.children.get(name)
         if found is None or found.kind != kind:
             raise FileFormatError(self.origin, f"{self.kind} record carries no {kind} '{name}'")
@@ -152,7 +194,18 @@ class Record:
 
 
 def write_record(record: Record, path: str | Path) -> None:
-    """Write a record to `path`, whole or not at all; see `Record.save`."""
+    """Write a record to `path`, whole or not at all; see `Record.save`.
+
+    Parameters
+    ----------
+    record : Record
+    path : str or Path
+
+    Raises
+    ------
+    StorageError
+        The file cannot be written.
+    """
     import h5py
 
     with atomic_path(path) as temporary:

@@ -133,7 +133,17 @@ def map_parallel(
 
 
 def split_blocks(total: int, size: int = LANES) -> Iterator[slice]:
-    """Cut ``range(total)`` into slices of at most `size`."""
+    """Cut ``range(total)`` into slices of at most `size`.
+
+    Parameters
+    ----------
+    total : int
+    size : int
+
+    Yields
+    ------
+    slice
+    """
     for start in range(0, total, size):
         yield slice(start, min(start + size, total))
 

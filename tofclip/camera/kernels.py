@@ -1,7 +1,7 @@
 """The compiled resampling of streak images.
 
 Pictures are (columns, rows) here: a view's sweep moves along the rows of the sensor, so that
-successive readings of one column lie side by side, before and after.
+successive measurements of one column lie side by side, before and after.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def sample_bilinear(counts, dark, raw_row, raw_column, delay, measurements):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def mark_valid(bad, raw_row, raw_column, delay, valid):
-    """Tell the readings that lie within the raw image and to which no bad pixel contributes.
+    """Tell the measurements that lie within the raw image and to which no bad pixel contributes.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""From a raw streak image to the readings that the forward operator predicts."""
+"""From a raw streak image to the measurements that the forward operator predicts."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ NO_LIGHT_MESSAGE = "nothing rises above the dark level; was there any light?"
 
 @dataclass(frozen=True)
 class Measurement:
-    """Rectified readings with the dark level taken off.
+    """Rectified measurements with the dark level taken off.
 
     Parameters
     ----------
     measurements : (columns, frames) float32 array
-        Slit readings, one column of the array for each instant. May be negative: noise about a dark
+        Slit measurements, one column of the array for each instant. May be negative: noise about a dark
         level is.
     valid : (columns, frames) bool array
         False where a sensor pixel was saturated or dead, or where the raw image ends.
@@ -56,13 +56,25 @@ def measure(
     CalibrationError
         The picture is not as wide as the camera's slit.
     InputError
-        Nothing remains above the dark level, or no reading can be trusted.
+        Nothing remains above the dark level, or no measurement can be trusted.
     """
     return Rectifier(camera, counts.shape[0]).measure(counts, saturated, dark)
 
 
 def require_width(counts: FloatImage, camera: Camera) -> None:
-    """Raise `CalibrationError` unless the picture is as wide as the camera's slit."""
+    """Raise `CalibrationError` unless the picture is as wide as the camera's slit.
+
+    Parameters
+    ----------
+    counts : (rows, columns) float32 array
+        Raw streak image.
+    camera : Camera
+
+    Raises
+    ------
+    CalibrationError
+        The image is not as wide as the camera's slit.
+    """
     if counts.shape[1] != camera.slit_width_px:
         raise CalibrationError(
             f"the streak image has {counts.shape[1]} columns but the camera's slit has {camera.slit_width_px}; "
@@ -73,7 +85,7 @@ def require_width(counts: FloatImage, camera: Camera) -> None:
 def estimate_dark_level(counts: FloatImage) -> float:
     """Median of the quietest rows, in counts.
 
-    Taken from whole rows, before or after the light came, so that it stays where the readings
+    Taken from whole rows, before or after the light came, so that it stays where the measurements
     scatter about it: the least value of a picture would turn noise into an offset.
     """
     row_sums = counts.sum(axis=1, dtype=np.float64)
@@ -82,8 +94,8 @@ def estimate_dark_level(counts: FloatImage) -> float:
 
 
 class Rectifier:
-    """Turns raw streak images of one camera into readings; holding one saves working out the sweep
-    for every shot.
+    """Turns raw streak images of one camera into measurements; holding one saves working out the
+    sweep for every shot.
 
     Parameters
     ----------
@@ -152,7 +164,7 @@ class Rectifier:
     def measurements(
         self, counts: FloatImage, dark: float | None = None, delay: float = 0.0
     ) -> FloatImage:
-        """Return the readings alone, for methods that cannot leave out single ones.
+        """Return the measurements alone, for methods that cannot leave out single ones.
 
         Parameters
         ----------
@@ -167,7 +179,7 @@ class Rectifier:
         Raises
         ------
         CalibrationError, InputError
-            As for `measure`, but for readings that cannot be trusted.
+            As for `measure`, but for measurements that cannot be trusted.
         """
         from tofclip.camera.kernels import sample_bilinear, sample_in_time
 

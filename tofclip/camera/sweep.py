@@ -27,6 +27,16 @@ class Sweep(Protocol):
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the raw (row, column) of rectified positions; arguments broadcast against each
         other.
+
+        Parameters
+        ----------
+        row, column : float array
+            Rectified, pixels.
+
+        Returns
+        -------
+        raw_row, raw_column : float array
+            Pixels, of the broadcast shape.
         """
         ...
 
@@ -69,6 +79,18 @@ class SkewSweep(Storable):
             raise CalibrationError(f"sweep centres must increase, got {self.centres_px}")
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the raw (row, column) of rectified positions; see `Sweep`.
+
+        Parameters
+        ----------
+        row, column : float array
+            Rectified, pixels.
+
+        Returns
+        -------
+        raw_row, raw_column : float array
+            Pixels, of the broadcast shape.
+        """
         offset = _interpolate_linearly(column, self.centres_px, self.offsets_bin)
         stretch = _interpolate_linearly(column, self.centres_px, self.stretches)
         raw_row, raw_column = np.broadcast_arrays(offset + (1.0 + stretch) * row, column)
@@ -109,6 +131,18 @@ class PolynomialSweep(Storable):
             raise CalibrationError("a polynomial sweep's scales must not be zero")
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the raw (row, column) of rectified positions; see `Sweep`.
+
+        Parameters
+        ----------
+        row, column : float array
+            Rectified, pixels.
+
+        Returns
+        -------
+        raw_row, raw_column : float array
+            Pixels, of the broadcast shape.
+        """
         x = (np.asarray(column) - self.rectified_origin[0]) / self.rectified_scale[0]
         y = (np.asarray(row) - self.rectified_origin[1]) / self.rectified_scale[1]
         u = _evaluate_quadratic(self.column_coefficients, x, y)
@@ -138,6 +172,18 @@ class ProjectiveSweep(Storable):
             raise ShapeError("projective sweep matrix", (3, 3), self.matrix.shape)
 
     def raw_position(self, row: FloatArray, column: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the raw (row, column) of rectified positions; see `Sweep`.
+
+        Parameters
+        ----------
+        row, column : float array
+            Rectified, pixels.
+
+        Returns
+        -------
+        raw_row, raw_column : float array
+            Pixels, of the broadcast shape.
+        """
         h = self.matrix
         weight = h[2, 0] * column + h[2, 1] * row + h[2, 2]
         raw_column = (h[0, 0] * column + h[0, 1] * row + h[0, 2]) / weight

@@ -109,6 +109,17 @@ def find_table(metadata: Mapping[str, str], axis: str) -> tuple[int, int] | None
     float32 entries.
 
     None where the axis has no table: it is linear, or has no unit at all.
+
+    Parameters
+    ----------
+    metadata : mapping of str to str
+        ``Section/Key`` to value.
+    axis : str
+        ``"X"`` or ``"Y"``.
+
+    Returns
+    -------
+    (int, int) or None
     """
     found = _TABLE.fullmatch(metadata.get(f"Scaling/Scaling{axis}ScalingFile", ""))
     return (int(found[1]), int(found[2])) if found else None
@@ -119,6 +130,19 @@ def find_saturated_pixels(
 ) -> NDArray[np.bool_] | None:
     """Mark the pixels that reached the sensor's limit; None for floating-point pictures, which have
     none.
+
+    Parameters
+    ----------
+    pixels : (rows, columns) array
+        Counts.
+    metadata : mapping of str to str
+        Gives the sensor's full scale.
+    path : str or Path
+        For the message.
+
+    Returns
+    -------
+    (rows, columns) bool array or None
 
     Raises
     ------

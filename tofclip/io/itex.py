@@ -95,7 +95,13 @@ def read_itex(path: str | Path) -> Streak:
 
 
 def write_itex(image: ItexImage, path: str | Path) -> None:
-    """Write an ITEX file, whole or not at all."""
+    """Write an ITEX file, whole or not at all.
+
+    Parameters
+    ----------
+    image : ItexImage
+    path : str or Path
+    """
     data = encode_itex(image)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)

@@ -47,7 +47,13 @@ def read_exr(path: Path) -> LightField:
 
 
 def write_exr(light_field: LightField, path: Path) -> None:
-    """Write one part for each view with a channel Y of float32."""
+    """Write one part for each view with a channel Y of float32.
+
+    Parameters
+    ----------
+    light_field : LightField
+    path : Path
+    """
     import OpenEXR
 
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}

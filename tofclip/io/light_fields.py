@@ -49,6 +49,11 @@ def write_light_field(light_field: LightField, path: str | Path) -> None:
     """Write a light field, whole or not at all, as ``.h5``, ``.hdf5`` or ``.exr`` (float32 values,
     ZIP compression).
 
+    Parameters
+    ----------
+    light_field : LightField
+    path : str or Path
+
     Raises
     ------
     InputError

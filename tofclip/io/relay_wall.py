@@ -98,6 +98,23 @@ class RelayWall:
 def read_relay_wall(archive: Archive, image_shape: tuple[int, int]) -> RelayWall:
     """Take the relay wall out of a LIFT archive; its window has the picture's middle pixel in its
     own middle.
+
+    Parameters
+    ----------
+    archive : Archive
+        A LIFT shot.
+    image_shape : (int, int)
+        Rows and columns of the recovered picture.
+
+    Returns
+    -------
+    RelayWall
+        Points (rows, columns, 3), m.
+
+    Raises
+    ------
+    FileFormatError
+        The wall does not fit into the picture, or has fewer than four points.
     """
     points = np.moveaxis(archive.array("wall_grid_m", 3, None, None), 0, -1).astype(np.float64)
     axis_px = (image_shape[0] // 2, image_shape[1] // 2)

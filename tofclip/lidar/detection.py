@@ -36,7 +36,7 @@ class Detection:
         Least intensity relative to the pixel's strongest return: leaves out echoes inside the
         instrument.
     max_returns : int
-        At most so many returns in a pixel, the strongest.
+        Maximum number returns in a pixel, the strongest.
 
     Raises
     ------

@@ -24,7 +24,19 @@ MAX_HEADER_BYTES = 1 << 16
 
 
 def write_table(path: str | Path, columns: Columns) -> None:
-    """Write columns to the format that the suffix of `path` names, whole or not at all."""
+    """Write columns to the format that the suffix of `path` names, whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+    columns : sequence of Column
+        With name, unit and (n,) values each.
+
+    Raises
+    ------
+    InputError
+        There is no format of that suffix.
+    """
     writer = _look_up_format(path)[0]
     with atomic_path(path) as temporary:
         writer(temporary, columns)

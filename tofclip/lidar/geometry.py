@@ -71,7 +71,25 @@ def distort_directions(
 def undistort_directions(
     right: NDArray[np.float64], down: NDArray[np.float64], coefficients: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Undo `distort_directions`, by a fixed-point iteration."""
+    """Undo `distort_directions`, by a fixed-point iteration.
+
+    Parameters
+    ----------
+    right, down : (n,) float64 array
+        Slopes x / z and y / z as the lens shows them.
+    coefficients : (5,) float64 array
+        As for `distort_directions`.
+
+    Returns
+    -------
+    right, down : (n,) float64 array
+        Slopes in front of the lens.
+
+    Raises
+    ------
+    CalibrationError
+        The iteration does not converge.
+    """
     x, y = right.copy(), down.copy()
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(MAX_ITERATIONS):

@@ -81,7 +81,32 @@ def find_returns(traces, pixels, times, bin_weights, filters, pulse, limits, fou
 
 @compiled
 def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, memory, found):
-    """Find the returns of one trace and return their number; `memory` is overwritten."""
+    """Find the returns of one trace and return their number; `memory` is overwritten.
+
+    Parameters
+    ----------
+    trace : (bins,) float32 array
+        Brightness.
+    times : (bins,) array
+        Seconds, increasing.
+    bin_weights : (bins,) array
+        1 for bins that count towards background and noise.
+    filters : (sharp, matched, gains)
+        See `tofclip.lidar.search`.
+    pulse : (curve, scale)
+        See `tofclip.lidar.fit.kernels`.
+    limits : (3,) floats
+        Least distance of two returns in s, least response over noise, and least strength relative
+        to the strongest return, both referred to one range.
+    memory : seven arrays
+        Overwritten.
+    found : (returns, 3) array
+        Overwritten: seconds, sum over the bins, standard deviation in seconds.
+
+    Returns
+    -------
+    int
+    """
     (sharp, matched, gains), (curve, scale) = filters, pulse
     score, maxima, bounds, free, peaks, estimate, profile = memory
     correlate_trace(trace, sharp, score)
@@ -93,6 +118,7 @@ def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, memory
     for k in range(number):
         j = int(peaks[k, 0])
         peaks[k, 1] = max(peaks[k, 1] - background * matched[j, -1], 0.0)
+        # light falls with the square of the range, so strengths are compared as if all stood at one
         needed = max(needed, PREFIT_THRESHOLD_FACTOR * limits[2] * peaks[k, 1] * times[j] ** 2)
     for k in range(number):
         j, strength = int(peaks[k, 0]), peaks[k, 1]
@@ -115,7 +141,16 @@ def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, memory
 
 @vectorised
 def correlate_trace(trace, filters, score):
-    """Filter a trace: ``score[j] = sum_w filters[w, j] * trace[j + w - width // 2]``."""
+    """Filter a trace: ``score[j] = sum_w filters[w, j] * trace[j + w - width // 2]``.
+
+    Parameters
+    ----------
+    trace : (bins,) float32 array
+    filters : (width, bins) float32 array
+        One filter for each bin; the width is a multiple of `WEIGHTS_PER_PASS`.
+    score : (bins,) float32 array
+        Overwritten.
+    """
     width, bins = filters.shape
     half = width // 2
     first, last = min(half, bins), max(bins - half + 1, min(half, bins))
@@ -149,7 +184,20 @@ def correlate_trace(trace, filters, score):
 
 @vectorised
 def compute_response(trace, matched, j):
-    """Response of the matched filter at bin j."""
+    """Response of the matched filter at bin j.
+
+    Parameters
+    ----------
+    trace : (bins,) float32 array
+    matched : (bins, width + 1) array
+        A filter for each bin; its sum is the last entry.
+    j : int
+        Bin.
+
+    Returns
+    -------
+    float
+    """
     width = matched.shape[1] - 1
     start = j - width // 2
     total = 0.0
@@ -162,6 +210,23 @@ def compute_response(trace, matched, j):
 def interpolate_peak_time(trace, times, matched, background, j, here):
     """Instant near bin j at which the response, `here` at the bin, is highest: by a parabola in its
     logarithm.
+
+    Parameters
+    ----------
+    trace, times : (bins,) array
+        Brightness, and seconds.
+    matched : (bins, width + 1) array
+        As for `compute_response`.
+    background : float
+    j : int
+        Bin of the highest response.
+    here : float
+        Response there, less that to the background.
+
+    Returns
+    -------
+    float
+        Seconds.
     """
     before = compute_response(trace, matched, j - 1) - background * matched[j - 1, -1]
     after = compute_response(trace, matched, j + 1) - background * matched[j + 1, -1]
@@ -187,6 +252,31 @@ def find_strongest_peaks(
     Background and noise are those of the bins that no peak claims. Peaks claim their surroundings
     from the strongest down, for as long as half of the bins stay free. `free` is equal to
     `bin_weights`, and again afterwards.
+
+    Parameters
+    ----------
+    trace, times : (bins,) array
+        Brightness, and seconds.
+    bin_weights : (bins,) array
+        1 for bins that count towards background and noise.
+    matched : (bins, width + 1) array
+        As for `compute_response`.
+    gains : (2,) floats
+        Gains of the sharp filter and of the matched one.
+    scale : (4,) array or tuple
+        Of the pulse.
+    limits : (3,) floats
+        As for `find_trace_returns`.
+    maxima, bounds : float32 array
+        Local maxima of the score, and the largest of each group; used up.
+    free : (bins,) array
+    peaks : (returns, 4) array
+        Overwritten.
+
+    Returns
+    -------
+    number : int
+    background, noise : float
     """
     total, square, bins = sum_moments(trace, bin_weights)
     left, number, needed, claiming = bins, 0, 0.0, True
@@ -237,6 +327,12 @@ def find_strongest_peaks(
 def copy_local_maxima(score, maxima):
     """Copy the inner local maxima above zero, and zero for all other scores; of a level top the
     last bin.
+
+    Parameters
+    ----------
+    score : (bins,) float32 array
+    maxima : (groups * BINS_PER_GROUP,) float32 array
+        Overwritten up to the last bin.
     """
     zero = np.float32(0)
     maxima[0] = maxima[score.size - 1] = zero
@@ -253,6 +349,15 @@ def update_group_maxima(maxima, first, last, bounds):
 
     Numbers from zero up keep their order when their bits are read as whole numbers, whose maximum
     is found in vectors.
+
+    Parameters
+    ----------
+    maxima : (groups * BINS_PER_GROUP,) float32 array
+        Not negative.
+    first, last : int
+        Groups.
+    bounds : (groups,) float32 array
+        Overwritten in these groups.
     """
     bits, highest_bits = maxima.view(np.int32), bounds.view(np.int32)
     for group in range(first, last):
@@ -264,7 +369,18 @@ def update_group_maxima(maxima, first, last, bounds):
 
 @vectorised
 def find_bin_in_group(maxima, group, value):
-    """Bin of the last maximum of a group that is as high as `value`, which has to be there."""
+    """Bin of the last maximum of a group that is as high as `value`, which has to be there.
+
+    Parameters
+    ----------
+    maxima : (groups * BINS_PER_GROUP,) float32 array
+    group : int
+    value : float32
+
+    Returns
+    -------
+    int
+    """
     place, here = 0, maxima[group * BINS_PER_GROUP : (group + 1) * BINS_PER_GROUP]
     for j in range(BINS_PER_GROUP):
         place = max(place, j if here[j] == value else 0)
@@ -273,7 +389,21 @@ def find_bin_in_group(maxima, group, value):
 
 @compiled
 def clear_maxima_around(best, times, distance, maxima, bounds):
-    """Take away the maxima nearer than `distance` to a bin, and that at the bin itself."""
+    """Take away the maxima nearer than `distance` to a bin, and that at the bin itself.
+
+    Parameters
+    ----------
+    best : int
+        Bin.
+    times : (bins,) array
+        Seconds.
+    distance : float
+        Seconds.
+    maxima : (groups * BINS_PER_GROUP,) float32 array
+        Set to zero around the bin.
+    bounds : (groups,) float32 array
+        Brought up to date.
+    """
     first = last = best
     while first > 0 and times[best] - times[first - 1] < distance:
         first -= 1
@@ -287,6 +417,15 @@ def clear_maxima_around(best, times, distance, maxima, bounds):
 def sum_moments(trace, bin_weights):
     """Sum, sum of squares and number of bins; float32 squares would drown a small noise on a high
     background.
+
+    Parameters
+    ----------
+    trace : (bins,) float32 array
+    bin_weights : (bins,) array
+
+    Returns
+    -------
+    three floats
     """
     total = square = bins = 0.0
     for i in range(trace.size):
@@ -299,8 +438,21 @@ def sum_moments(trace, bin_weights):
 
 @compiled
 def compute_mean_and_deviation(total, square, bins):
-    """Mean and standard deviation from sum, sum of squares and number."""
+    """Mean and standard deviation from sum, sum of squares and number.
+
+    Parameters
+    ----------
+    total, square : float
+        Sums of values and of squares.
+    bins : float
+        Number of values.
+
+    Returns
+    -------
+    (float, float)
+    """
     mean = total / bins
+    # rounding may leave the difference slightly below zero
     return mean, np.sqrt(max(square / bins - mean * mean, 0.0))
 
 

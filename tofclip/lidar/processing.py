@@ -62,7 +62,17 @@ class Alignment:
 
 
 def select_points(cloud: PointCloud, chosen: NDArray[Any]) -> PointCloud:
-    """Return some points of a cloud, by mask or by numbers."""
+    """Return some points of a cloud, by mask or by numbers.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    chosen : (points,) bool or (n,) int array
+
+    Returns
+    -------
+    PointCloud
+    """
     columns: dict[str, Any] = {name: getattr(cloud, name)[chosen] for name in PROPERTY_COLUMNS}
     return replace(cloud, xyz=cloud.xyz[chosen], **columns)
 
@@ -90,6 +100,21 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     """Return one point for each occupied cube of side `voxel`, m: means of its points.
 
     Confidences of independent points shrink with their number; the return number is the least.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    voxel : float
+        Metres.
+
+    Returns
+    -------
+    PointCloud
+
+    Raises
+    ------
+    InputError
+        The side is not a positive length.
     """
     if not (np.isfinite(voxel) and voxel > 0):
         raise InputError(f"the side of a voxel must be a positive length, got {voxel}")
@@ -108,6 +133,7 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     columns: dict[str, Any] = {
         name: mean(getattr(cloud, name)) for name in ("intensity", "range", "time")
     }
+    # the error of a mean of n independent points is the root of their mean variance over n
     columns["confidence"] = np.sqrt(mean(cloud.confidence.astype(np.float64) ** 2) / number)
     positions = np.stack([mean(axis) for axis in cloud.xyz.T], axis=-1).astype(np.float32)
     return replace(cloud, xyz=positions, return_number=first, **columns)
@@ -134,6 +160,22 @@ def remove_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float =
 def estimate_normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:
     """Return each point's surface normal, (n, 3), towards the camera, from a plane through its
     neighbours.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    neighbours : int
+        Points of the plane, at least 3.
+
+    Returns
+    -------
+    (n, 3) float64 array
+        Of length 1.
+
+    Raises
+    ------
+    InputError
+        There are fewer than three points or neighbours.
     """
     if len(cloud) < 3 or neighbours < 3:
         raise InputError("a normal needs at least three points and three neighbours")

@@ -50,7 +50,15 @@ class Traces(Protocol):
     """The bins that they hold."""
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
-        """Write the traces of ``pixels[piece]`` into (n, bins) contiguous memory."""
+        """Write the traces of ``pixels[piece]`` into (n, bins) contiguous memory.
+
+        Parameters
+        ----------
+        piece : slice
+            Of the pixels.
+        traces : (n, bins) float32 array
+            Overwritten.
+        """
         ...
 
 
@@ -68,7 +76,15 @@ class FrameTraces:
         self.bins = TraceBins.all_bins(frames.times.size)
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
-        """Write traces of neighbours in raster order."""
+        """Write traces of neighbours in raster order.
+
+        Parameters
+        ----------
+        piece : slice
+            Of the pixels.
+        traces : (n, bins) float32 array
+            Overwritten.
+        """
         from tofclip.solvers.kernels import copy_lanes_to_frames
 
         copy_lanes_to_frames(self._pictures[:, piece], traces)

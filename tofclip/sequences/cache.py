@@ -38,7 +38,18 @@ class CachingCamera(Camera):
     """
 
     def operator(self, shear: float = 0.0, dtype: DTypeLike = np.float32) -> LineProjection:
-        """Return F(d), see `Camera.operator`; the same object for the same arguments."""
+        """Return F(d), see `Camera.operator`; the same object for the same arguments.
+
+        Parameters
+        ----------
+        shear : float
+            Pixels per view step.
+        dtype : dtype
+
+        Returns
+        -------
+        LineProjection
+        """
         made: dict[tuple[float, str], LineProjection] = self.__dict__.setdefault("_made", {})
         key = float(shear), np.dtype(dtype).str
         found = made.get(key) or super().operator(shear, dtype)
@@ -95,7 +106,22 @@ class CachedInverse:
         valid: Array | None = None,
         progress: Progress = ignore_progress,
     ) -> Result:
-        """Recover one picture per column of `measurements`; see `LinearInverse.recover`."""
+        """Recover one picture per column of `measurements`; see `LinearInverse.recover`.
+
+        Parameters
+        ----------
+        operator : LinearOperator
+            Pictures (rows, columns) to measurements (measurements,).
+        measurements : (measurements, frames) array
+        valid : (measurements, frames) bool array, optional
+            Measurements that are False in every frame are left out.
+        progress : callable
+            Called with the number of frames just recovered.
+
+        Returns
+        -------
+        Result
+        """
         alive = (
             np.ones(operator.shape_out, bool)
             if valid is None

@@ -39,10 +39,21 @@ class CloudSettings:
     def make_cloud(self, frames: Frames, origin: str) -> tuple[PointCloud, Returns]:
         """Find each pixel's returns and place them in space.
 
+        Parameters
+        ----------
+        frames : Frames
+        origin : str
+            Whose frames they were, for the message.
+
+        Returns
+        -------
+        cloud : PointCloud
+        returns : Returns
+
         Raises
         ------
         InputError
-            There is none; `origin` says whose frames they were.
+            There is no return.
         """
         from tofclip.lidar.processing import downsample_cloud, remove_outliers
 
@@ -61,6 +72,18 @@ class CloudSettings:
     def jobs(self, frames: Mapping[str, Path], folder: Path, suffix: str) -> list[Job]:
         """Return one job for each file of frames, which writes its cloud into `folder`; see
         `Recovery.jobs`.
+
+        Parameters
+        ----------
+        frames : mapping of str to Path
+            Files by name.
+        folder : Path
+        suffix : str
+            Names the format of the clouds.
+
+        Returns
+        -------
+        list of Job
         """
         settings = {
             "verb": "cloud",
@@ -81,6 +104,21 @@ def write_cloud(clouds: CloudSettings, frames: Path, result: Path) -> int:
     number of points.
 
     Memory: the frames, and about as much again while returns are looked for.
+
+    Parameters
+    ----------
+    clouds : CloudSettings
+    frames : Path
+    result : Path
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    InputError
+        The frames hold no return.
     """
     cloud, returns = clouds.make_cloud(Frames.load(frames), str(frames))
     save_cloud(cloud, returns, result)
@@ -88,7 +126,14 @@ def write_cloud(clouds: CloudSettings, frames: Path, result: Path) -> int:
 
 
 def save_cloud(cloud: PointCloud, returns: Returns, path: Path) -> None:
-    """Write a cloud, or the depth picture of its returns where the name ends in .exr."""
+    """Write a cloud, or the depth picture of its returns where the name ends in .exr.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    returns : Returns
+    path : Path
+    """
     if path.suffix.lower() == DEPTH_IMAGE_SUFFIX:
         from tofclip.lidar.depth_exr import save_depth
 

@@ -74,7 +74,7 @@ class RangingPipeline:
     Notes
     -----
     Memory: a (columns, columns) matrix for each shear, and for a shot as much again as its
-    readings.
+    measurements.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class RangingPipeline:
         )
 
     def find_returns(self, measurements: NDArray[np.float32]) -> Returns:
-        """Find the returns in one shot's rectified readings, (columns, rows)."""
+        """Find the returns in one shot's rectified measurements, (columns, rows)."""
         return self.search(self.recover(measurements))
 
     def recover(self, measurements: NDArray[np.float32]) -> Traces:
@@ -156,7 +156,7 @@ class RangingPipeline:
         return self._search.find_returns(traces)
 
     def cloud(self, measurements: NDArray[np.float32]) -> PointCloud:
-        """Make the cloud of one shot's rectified readings, (columns, rows)."""
+        """Make the cloud of one shot's rectified measurements, (columns, rows)."""
         return point_cloud(self.find_returns(measurements))
 
 
@@ -177,6 +177,15 @@ class _ShotTraces:
                 )
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
+        """Write the traces of some pixels, recovered now; see `tofclip.lidar.traces.Traces`.
+
+        Parameters
+        ----------
+        piece : slice
+            Of the pixels.
+        traces : (n, bins) float32 array
+            Overwritten.
+        """
         for inverse, held, weights in self._parts:
             inverse.fill(weights, piece, traces, held)
 
@@ -220,6 +229,16 @@ class JitterEstimator:
 def compute_light_curve(streak: Streak, camera: Camera) -> FloatArray:
     """Sum of each raw row over the reference view's middle, where neighbouring views' skew does not
     matter.
+
+    Parameters
+    ----------
+    streak : Streak
+    camera : Camera
+
+    Returns
+    -------
+    (rows,) float64 array
+        Counts.
     """
     reference = int(np.argmin(np.abs(camera.view_positions)))
     half = camera.image_shape[1] // 4
@@ -245,7 +264,7 @@ def make_clouds(
         Each reads its shot when it is called, on the thread that works on it.
     pipeline : Ranger
     average : int
-        Shots whose readings are averaged.
+        Shots whose measurements are averaged.
     steady : bool
         Whether to find how late each shot comes against the first one, and take it off.
     first : int
@@ -308,7 +327,18 @@ def make_average_cloud(
 
 
 def build_cloud_path(folder: Path, number: int, suffix: str) -> Path:
-    """Return where cloud `number` of a sequence is kept."""
+    """Return where cloud `number` of a sequence is kept.
+
+    Parameters
+    ----------
+    folder : Path
+    number : int
+    suffix : str
+
+    Returns
+    -------
+    Path
+    """
     return folder / f"cloud_{number:06d}{suffix}"
 
 

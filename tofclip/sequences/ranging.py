@@ -67,6 +67,17 @@ class RangingSettings:
         The folder is made, and claimed for these settings
         (`tofclip.sequences.jobs.lock_output_folder`). What is prepared for all shots is kept there;
         a run that goes on uses it again.
+
+        Parameters
+        ----------
+        shots : mapping of str to Shot
+        folder : Path
+        suffix : str
+            Names the format of the clouds.
+
+        Returns
+        -------
+        list of Job
         """
         plan, readers = folder.resolve() / PLAN_NAME, list(shots.values())
         made = None if plan.exists() else self.plan(readers[0]())
@@ -111,7 +122,22 @@ def write_average_cloud(
     """Write the cloud of some shots; return its points and how many rows each shot was late.
 
     Operators and inverted matrices are made once in a process for each `version` (SHA-256) of the
-    plan. Memory: one shot, and twice as much again for its readings and what is recovered of them.
+    plan. Memory: one shot, and twice as much again for its measurements and what is recovered of
+    them.
+
+    Parameters
+    ----------
+    plan : Path
+    version : str
+        SHA-256 of the plan.
+    shots : tuple of Shot
+    result : Path
+
+    Returns
+    -------
+    points : int
+    delays : list of float
+        Rows by which each shot was late.
     """
     pipeline, jitter = _load_plan(plan, version)
     cloud, late = make_average_cloud(shots, pipeline, jitter)

@@ -82,6 +82,15 @@ class RecoverySettings:
 
         The folder is made, and claimed for these settings
         (`tofclip.sequences.jobs.lock_output_folder`).
+
+        Parameters
+        ----------
+        shots : mapping of str to Shot
+        folder : Path
+
+        Returns
+        -------
+        list of Job
         """
         lock_output_folder(
             folder, self.settings() | {"bin_width": next(iter(shots.values())).bin_width}
@@ -105,7 +114,7 @@ class RecoverySettings:
 
 
 def normalise_device(device: str) -> str | None:
-    """Return the device as a setting that results depend on; this processor is no news, as in
+    """Return the device as a setting that results depend on; the CPU is no news, as in
     folders of old.
     """
     return None if device == str(CPU) else device
@@ -114,7 +123,14 @@ def normalise_device(device: str) -> str | None:
 def recover_shot(recovery: RecoverySettings, shot: Shot, result: Path) -> None:
     """Read a shot, recover it, write its frames; operators are made once in a process.
 
-    Memory: the shot, its readings and mask, and the frames twice while they are written.
+    Memory: the shot, its measurements and mask, and the frames twice while they are written.
+
+    Parameters
+    ----------
+    recovery : RecoverySettings
+    shot : Shot
+        Called to read it.
+    result : Path
     """
     task = recovery.prepare_task(shot())
     if task.camera.sweep is not None:  # otherwise it is fitted to the shot, and another for each
@@ -126,7 +142,19 @@ def recover_shot(recovery: RecoverySettings, shot: Shot, result: Path) -> None:
 
 
 def add_provenance(frames: Frames, task: RecoveryTask, *inputs: Path) -> Frames:
-    """Return frames that tell how they came about."""
+    """Return frames with a record of how they came about.
+
+    Parameters
+    ----------
+    frames : Frames
+    task : RecoveryTask
+    *inputs : Path
+        Files whose checksums are recorded.
+
+    Returns
+    -------
+    Frames
+    """
     told = {
         "method": repr(task.method),
         "focus": str(task.focus),

@@ -55,7 +55,24 @@ class StreakStack:
         return self._shape[0]
 
     def read_shot(self, number: int, camera: Camera | None = None) -> Streak:
-        """Read one shot, from 0."""
+        """Read one shot, from 0.
+
+        Parameters
+        ----------
+        number : int
+        camera : Camera, optional
+
+        Returns
+        -------
+        Streak
+
+        Raises
+        ------
+        InputError
+            There is no shot of that number.
+        FileFormatError
+            The shot is damaged.
+        """
         import h5py
 
         if not 0 <= number < len(self):
@@ -75,6 +92,23 @@ class StreakStack:
 def save_stack(shots: Iterable[Streak], path: str | Path) -> int:
     """Write shots to one file, whole or not at all; return how many. All have the first one's shape
     and time axis.
+
+    Parameters
+    ----------
+    shots : iterable of Streak
+        Taken one at a time.
+    path : str or Path
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    ShapeError
+        A shot has another shape than the first.
+    InputError
+        There is no shot.
     """
     import h5py
 

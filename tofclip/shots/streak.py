@@ -30,7 +30,7 @@ class Streak(Storable):
     Parameters
     ----------
     counts : (rows, columns) array
-        Sensor readings, kept as float32. May hold negative values (background already subtracted).
+        Sensor measurements, kept as float32. May hold negative values (background already subtracted).
     row_times : (rows,) array or None
         Instant of each row, s, strictly increasing, not necessarily evenly. None where the file has
         no time axis.

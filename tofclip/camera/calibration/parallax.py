@@ -62,7 +62,7 @@ class FocusCurve:
     Parameters
     ----------
     agreement : (gates, shears) array
-        Energy of the readings over that of the residual; 0 for dark gates.
+        Energy of the measurements over that of the residual; 0 for dark gates.
     shears : (gates,) array
         Where each is highest, between the shears tried.
     weight : (gates,) array
@@ -150,7 +150,7 @@ def find_sharpest_shears(
     Parameters
     ----------
     measurement : Measurement
-        Rectified readings.
+        Rectified measurements.
     camera : Camera
     gates : sequence of slice
         Frames of each gate.

@@ -2,8 +2,8 @@
 residual.
 
 Recovering the pictures and registering the views to them alternate. Given the pictures, a view's
-readings change to first order with its time offset, time stretch, gain and slit centre, so that one
-small least-squares problem a view yields all four; a few rounds suffice because the coarse
+measurements change to first order with its time offset, time stretch, gain and slit centre, so that
+one small least-squares problem a view yields all four; a few rounds suffice because the coarse
 calibration is within a pixel.
 """
 
@@ -138,8 +138,8 @@ def _refine_camera(
 
 @dataclass(frozen=True)
 class _ViewResiduals:
-    """What a round knows: pictures, the misfit they leave, the readings' slope in time, all at the
-    chosen rows.
+    """What a round knows: pictures, the misfit they leave, the measurements' slope in time, all at
+    the chosen rows.
     """
 
     pictures: Array
@@ -154,6 +154,19 @@ class _ViewResiduals:
 
         A centre that has drifted far from its calibration is held back by a prior of
         `CENTRE_PRIOR_PX`.
+
+        Parameters
+        ----------
+        camera : Camera
+        view : int
+            Number of the view, from 0.
+        drift : float
+            How far the centre has moved from its calibration, px.
+
+        Returns
+        -------
+        (4,) float64 array
+            Offset in rows, stretch, relative gain and centre in px.
         """
         predicted = _make_view_projection(camera, view)(self.pictures)
         half = camera.image_shape[1] // 2
@@ -161,6 +174,8 @@ class _ViewResiduals:
         window = slice(max(0, middle - half), middle + half + 1)
         energy = np.sqrt(np.sum(predicted**2, axis=0, dtype=np.float64))
         weight = self.valid[window] / (
+            # bright columns count as much as dim ones; the floor keeps columns without light from
+            # counting at all
             energy + FLOOR_FRACTION * energy.max() + np.finfo(np.float64).tiny
         )
         slope, parallax = self.slope[window], np.gradient(predicted, axis=0)[window]

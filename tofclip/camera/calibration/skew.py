@@ -78,7 +78,25 @@ def estimate_skew(counts: NDArray[np.float32], camera: Camera) -> SkewEstimate:
 
 
 def sum_view_energies(counts: NDArray[np.float32], camera: Camera) -> FloatArray:
-    """Sum of each row over each view's part of the slit, above the dark level; (views, rows)."""
+    """Sum of each row over each view's part of the slit, above the dark level; (views, rows).
+
+    Parameters
+    ----------
+    counts : (rows, columns) float32 array
+        Raw streak image.
+    camera : Camera
+        Centres of the views, px.
+
+    Returns
+    -------
+    (views, rows) float64 array
+        Counts above the dark level.
+
+    Raises
+    ------
+    CalibrationError
+        The image is not as wide as the camera's slit.
+    """
     require_width(counts, camera)
     signal = counts - np.float32(estimate_dark_level(counts))
     half = min(camera.image_shape[1] // 2, _half_pitch_px(camera))

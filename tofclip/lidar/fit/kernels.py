@@ -28,6 +28,21 @@ inlined = njit(
 def find_pulse_window(times, near, arrival, scale):
     """First bin and the bin after the last one that a return at `arrival` reaches; `near` guesses
     them.
+
+    Parameters
+    ----------
+    times : (bins,) array
+        Seconds, increasing.
+    near : (int, int)
+        Guesses of the two bins.
+    arrival : float
+        Seconds.
+    scale : (4,) array or tuple
+        Samples per second, origin, first and last instant of the pulse.
+
+    Returns
+    -------
+    (int, int)
     """
     return find_first_bin(times, near[0], arrival + scale[2]), find_first_bin(
         times, near[1], arrival + scale[3]
@@ -36,7 +51,21 @@ def find_pulse_window(times, near, arrival, scale):
 
 @compiled
 def find_first_bin(times, near, instant):
-    """First bin at `instant` or later, step by step from a bin near it."""
+    """First bin at `instant` or later, step by step from a bin near it.
+
+    Parameters
+    ----------
+    times : (bins,) array
+        Seconds, increasing.
+    near : int
+        Where the search starts.
+    instant : float
+        Seconds.
+
+    Returns
+    -------
+    int
+    """
     while near > 0 and times[near - 1] >= instant:
         near -= 1
     while near < times.size and times[near] < instant:
@@ -48,6 +77,20 @@ def find_first_bin(times, near, instant):
 def interpolate_pulse(time, curve, scale):
     """Pulse and its slope at `time` after the arrival, by linear interpolation; zero outside the
     samples.
+
+    Parameters
+    ----------
+    time : float
+        Seconds after the arrival.
+    curve : (samples, 2) array
+        Pulse and slope.
+    scale : (4,) array or tuple
+        Samples per second, origin, first and last instant of the pulse.
+
+    Returns
+    -------
+    (float, float)
+        Pulse, and its slope per second.
     """
     position = time * scale[0] + scale[1]
     p = d = 0.0
@@ -61,7 +104,28 @@ def interpolate_pulse(time, curve, scale):
 
 @inlined
 def compute_residual(trace, times, background, curve, scale, estimate, i, without):
-    """Bin i less the background and all returns except number `without` (-1: less all of them)."""
+    """Bin i less the background and all returns except number `without` (-1: less all of them).
+
+    Parameters
+    ----------
+    trace, times : (bins,) array
+        Brightness, and seconds.
+    background : float
+    curve : (samples, 2) array
+        Pulse and slope.
+    scale : (4,) array or tuple
+        Of the pulse.
+    estimate : (returns, 5) array
+        See `refine_returns`.
+    i : int
+        Bin.
+    without : int
+        Return that is not taken off.
+
+    Returns
+    -------
+    float
+    """
     rest = trace[i] - background
     for k in range(estimate.shape[0]):
         if k != without:
@@ -82,6 +146,22 @@ def refine_returns(trace, times, background, curve, scale, estimate, variance, r
 
     `estimate` is (returns, 5): arrival, height, first bin and the bin after the last one that it
     reaches, or what is near them, and by how many bins it moved last, which is overwritten.
+
+    Parameters
+    ----------
+    trace, times : (bins,) array
+        Brightness, and seconds.
+    background : float
+    curve : (samples, 2) array
+        Pulse and slope.
+    scale : (4,) array or tuple
+        Of the pulse.
+    estimate : (returns, 5) array
+        Updated in place.
+    variance : (float, float)
+        Of a bin: constant, and per unit of the expected brightness.
+    rounds : int
+        Maximum number of steps for each return.
     """
     estimate[:, 4] = np.inf
     for _ in range(rounds):
@@ -103,6 +183,22 @@ def check_overlap(estimate, k, curve, scale):
     """Whether another return reaches return k, and the most that one of them moved.
 
     One reaches the other if it has light in bins that count for the other.
+
+    Parameters
+    ----------
+    estimate : (returns, 5) array
+    k : int
+        Number of the return.
+    curve : (samples, 2) array
+        Pulse and slope.
+    scale : (4,) array or tuple
+        Of the pulse.
+
+    Returns
+    -------
+    crowded : bool
+    moving : float
+        Bins.
     """
     before, after = (
         scale[1] / scale[0] + scale[3],
@@ -123,6 +219,27 @@ def sum_normal_equations(trace, times, background, curve, scale, estimate, k, cr
     dr; see `refine_returns`.
 
     The bins are entered in `estimate`. Only if it is `crowded` are the other returns taken off.
+
+    Parameters
+    ----------
+    trace, times : (bins,) array
+        Brightness, and seconds.
+    background : float
+    curve : (samples, 2) array
+        Pulse and slope.
+    scale : (4,) array or tuple
+        Of the pulse.
+    estimate : (returns, 5) array
+        Columns 2 and 3 of row k are overwritten.
+    k : int
+        Number of the return.
+    crowded : bool
+    variance : (float, float)
+        See `refine_returns`.
+
+    Returns
+    -------
+    five floats
     """
     arrival, height = estimate[k, 0], estimate[k, 1]
     first, last = find_pulse_window(
@@ -155,10 +272,20 @@ def sum_normal_equations(trace, times, background, curve, scale, estimate, k, cr
 def take_gauss_newton_step(times, sums, own):
     """Improve one return's arrival and height in place, and enter by how many bins it moved (at
     most one).
+
+    Parameters
+    ----------
+    times : (bins,) array
+        Seconds.
+    sums : five floats
+        From `sum_normal_equations`.
+    own : (5,) array
+        The return's row of the estimate, updated in place.
     """
     pp, pd, dd, pr, dr = sums
     determinant = pp * dd - pd * pd
     own[4] = 0.0
+    # fewer than two bins see the pulse: nothing to improve
     if determinant <= 0:
         return
     height = (dd * pr - pd * dr) / determinant
@@ -181,6 +308,28 @@ def measure_returns(trace, times, background, noise, curve, scale, estimate, lea
 
     It has to lie on the time axis and to respond, height times root of the pulse's energy, by more
     than `least`. `profile`, (bins, 3), is overwritten.
+
+    Parameters
+    ----------
+    trace, times : (bins,) array
+        Brightness, and seconds.
+    background, noise : float
+        Mean and standard deviation of the bins without a return.
+    curve : (samples, 2) array
+        Pulse and slope.
+    scale : (4,) array or tuple
+        Of the pulse.
+    estimate : (returns, 5) array
+    least : float
+        Response that a return must exceed.
+    profile : (bins, 3) array
+        Overwritten.
+    found : (returns, 3) array
+        Overwritten: seconds, sum over the bins, standard deviation in seconds.
+
+    Returns
+    -------
+    int
     """
     number = 0
     for k in range(estimate.shape[0]):

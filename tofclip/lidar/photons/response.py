@@ -53,7 +53,18 @@ class BinnedResponse:
 
     @classmethod
     def from_pulse(cls, pulse: Pulse, bin_width: float) -> BinnedResponse:
-        """Spread a pulse over the bins in which it is counted."""
+        """Spread a pulse over the bins in which it is counted.
+
+        Parameters
+        ----------
+        pulse : Pulse
+        bin_width : float
+            Seconds.
+
+        Returns
+        -------
+        BinnedResponse
+        """
         return cls(pulse.integrate_bins(bin_width), bin_width)
 
     @property

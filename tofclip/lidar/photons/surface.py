@@ -300,6 +300,18 @@ def choose_label_axis(photons: PhotonImage, scene: Scene) -> LabelAxis:
 def find_occupied_bins(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> NDArray[np.bool_]:
     """Coarse bins at which some tile of the picture is brighter than the background, and those
     around.
+
+    Parameters
+    ----------
+    photons : PhotonImage
+    scene : Scene
+        Response and background, photons per pixel and bin.
+    axis : LabelAxis
+        The coarse time axis.
+
+    Returns
+    -------
+    (coarse_bins,) bool array
     """
     rows, columns = photons.image_shape
     y, x = np.divmod(photons.pixel, columns)
@@ -510,7 +522,21 @@ def weigh_evidence(
 def judge_surface(
     test: PhotonImage, train: PhotonImage, scene: Scene, surface: FloatArray
 ) -> float:
-    """Mean log-likelihood of the photons that were held back; see `weigh_evidence`."""
+    """Mean log-likelihood of the photons that were held back; see `weigh_evidence`.
+
+    Parameters
+    ----------
+    test, train : PhotonImage
+        Photons held back, and those that the surface was found from.
+    scene : Scene
+    surface : (rows, columns) float64 array
+        Instants, bins.
+
+    Returns
+    -------
+    float
+        Nats per photon.
+    """
     return float(weigh_evidence(test, train, scene, surface).mean())
 
 

@@ -56,6 +56,25 @@ def extend_path(score, before, highest, slope_cost, jump_cost, path, total):
     ``path[t] = score[t] + max(before[t], before[t -+ 1] - slope_cost, highest - jump_cost) -
     highest``; Hirschmueller, IEEE Trans. Pattern Anal. 30, 328 (2008), Eq. 13, with likelihoods
     where he has costs. `path` is overwritten and added to `total`.
+
+    Parameters
+    ----------
+    score : (labels,) float32 array
+        Log-likelihood of each label at this pixel.
+    before : (labels,) float32 array
+        The path at the pixel before.
+    highest : float32
+        Its highest score.
+    slope_cost, jump_cost : float32
+        Nats.
+    path : (labels,) float32 array
+        Overwritten.
+    total : (labels,) float32 array
+        Added to, in place.
+
+    Returns
+    -------
+    float32
     """
     last = score.size - 1
     floor = highest - jump_cost
@@ -247,9 +266,22 @@ def fit_planes(surface, sums, reach, gate, slopes, rows, fitted):
 
 @compiled
 def sum_pair_lags(offsets, bin_time, count, lags):
-    """Histogram of the time between any two photons of a pixel, (lags,), in whole bins."""
+    """Add to `lags` the histogram of the time between any two photons of a pixel, in whole bins.
+
+    Parameters
+    ----------
+    offsets : (pixels + 1,) int array
+        Where each pixel's events begin.
+    bin_time : (events,) array
+        Bins.
+    count : (events,) array
+        Photons of each event.
+    lags : (lags,) float64 array
+        Added to, in place.
+    """
     for pixel in range(offsets.size - 1):
         for one in range(offsets[pixel], offsets[pixel + 1]):
+            # pairs within one event have lag 0
             lags[0] += count[one] * (count[one] - 1) / 2
             for other in range(one + 1, offsets[pixel + 1]):
                 lag = int(abs(bin_time[one] - bin_time[other]) + 0.5)

@@ -61,6 +61,16 @@ class PulseFitter:
     def refine(self, traces: Array, peaks: Peaks) -> FitState:
         """Return arrivals and heights that fit (bins, pixels) traces best, from those of the peaks
         on.
+
+        Parameters
+        ----------
+        traces : (bins, pixels) array
+        peaks : Peaks
+            Where the fit starts.
+
+        Returns
+        -------
+        FitState
         """
         from tofclip.lidar.fit.kernels import CONVERGENCE_STEP_BINS
         from tofclip.lidar.kernels import MAX_ITERATIONS
@@ -89,6 +99,19 @@ class PulseFitter:
 
         It has to lie on the time axis and to respond, height times root of the pulse's energy, by
         more than `least`.
+
+        Parameters
+        ----------
+        fit : FitState
+        noise : (pixels,) array
+            Standard deviation of a bin.
+        least : (pixels,) array
+            Response that a return must exceed.
+
+        Returns
+        -------
+        list of (proven, sum, deviation)
+            (pixels,) arrays for each return; seconds.
         """
         xp, times = namespace(noise), self._times.get(noise)
         told = []

@@ -77,6 +77,17 @@ class BackgroundLevel:
     def exclude(self, values: Array, free: Array, chosen: Array) -> BackgroundLevel:
         """Return the level of the `chosen` pixels less those of some values that were `free`,
         (bins, pixels) both.
+
+        Parameters
+        ----------
+        values : (bins, pixels) array
+            Less the offset.
+        free : (bins, pixels) bool array
+        chosen : (pixels,) bool array
+
+        Returns
+        -------
+        BackgroundLevel
         """
         xp = namespace(values)
         values, counted = values * xp.astype(free, values.dtype), xp.astype(free, xp.float64)

@@ -1,4 +1,4 @@
-"""The compiled look for light in readings summed over a pulse's length.
+"""The compiled look for light in measurements summed over a pulse's length.
 
 Sums are kept in blocks (blocks, columns, LANES) of instants side by side, as the operators take
 them.
@@ -16,7 +16,7 @@ vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 
 @vectorised
 def sum_boxes(measurements, starts, length, columns, sums):
-    """``sums[b, c, lane] = readings[c, starts[b, lane] : starts[b, lane] + length].sum()`` for the
+    """``sums[b, c, lane] = measurements[c, starts[b, lane] : starts[b, lane] + length].sum()`` for the
     columns given.
 
     Parameters
@@ -41,7 +41,14 @@ def sum_boxes(measurements, starts, length, columns, sums):
 
 @vectorised
 def compute_energies(sums, energy):
-    """Mean square of each instant's sums, (blocks, LANES); what is exactly zero was never measured."""
+    """Mean square of each instant's sums, (blocks, LANES); what is exactly zero was never measured.
+
+    Parameters
+    ----------
+    sums : (blocks, columns, LANES) float32 array
+    energy : (blocks, LANES) float32 array
+        Overwritten.
+    """
     for block in range(sums.shape[0]):
         total, number = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
         for column in range(sums.shape[1]):

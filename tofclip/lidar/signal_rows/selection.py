@@ -43,11 +43,11 @@ class RowBlock:
 class SignalRowFinder:
     """Tells the rows of a shot that hold light from those where only noise is.
 
-    Readings are summed over a pulse's length, once per pulse width, and each sum is brought to the
-    noise of its column. Back-projection, which is the matched filter of a lone pixel in even noise,
-    then says how far the brightest pixel of each instant stands out. Of noise alone the brightest
-    of 16 000 pixels stands out by 4.2, and by more than 1.2 times the usual limit of 5 in one
-    instant of three hundred: such instants are searched in vain.
+    Measurements are summed over a pulse's length, once per pulse width, and each sum is brought to
+    the noise of its column. Back-projection, which is the matched filter of a lone pixel in even
+    noise, then says how far the brightest pixel of each instant stands out. Of noise alone the
+    brightest of 16 000 pixels stands out by 4.2, and by more than 1.2 times the usual limit of 5 in
+    one instant of three hundred: such instants are searched in vain.
 
     What this leaves out is the faintest of lone pixels. The search judges a return by the inverse,
     in which a pixel stands out less than in the back-projection (in the seed paper's instrument
@@ -100,7 +100,7 @@ class SignalRowFinder:
 
         Notes
         -----
-        Memory: as much as the readings, divided by the rows of a pulse width.
+        Memory: as much as the measurements, divided by the rows of a pulse width.
         """
         lit = self._find_signal_bins(measurements)
         searched = self._mark_rows_near(lit, self._step // 2 + 1)

@@ -96,7 +96,18 @@ class Summary:
 
     @classmethod
     def from_reports(cls, reports: Iterable[Report], started: float) -> Summary:
-        """Sum up reports as they come; `started` is a reading of `time.perf_counter`."""
+        """Sum up reports as they come.
+
+        Parameters
+        ----------
+        reports : iterable of Report
+        started : float
+            Value of `time.perf_counter` when the first job began.
+
+        Returns
+        -------
+        Summary
+        """
         done, failures, processes, peak = 0, [], set(), 0
         for report in reports:
             if report.problem:
