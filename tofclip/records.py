@@ -556,7 +556,6 @@ class _StoredOrigin:
         value : str
         contents : _Contents
         """
-        pass
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
         """Return the name of the file that the record came from.
