@@ -82,6 +82,19 @@ class Codec(Protocol):
         """Decode whole records; `after_loss` says that some are missing right before them.
 
         ``len(decoded.records) + decoded.malformed == count(data)``.
+
+        Parameters
+        ----------
+        data : bytes-like
+            Whole records.
+        state : object
+            What the decoder remembers, from the call before or `start`.
+        after_loss : bool
+
+        Returns
+        -------
+        DecodeResult
+            Records, number of malformed ones, and the state for the next call.
         """
 
     def encode(self, records: Records) -> bytes:

@@ -101,7 +101,25 @@ class FrameCodec:
         return len(data) // self.frame_bytes
 
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
-        """Decode whole frames; `state` is the last one's number."""
+        """Decode whole frames; `state` is the last one's number.
+
+        Parameters
+        ----------
+        data : bytes-like
+            Whole frames.
+        state : int
+        after_loss : bool
+            Not needed: every frame carries its number.
+
+        Returns
+        -------
+        DecodeResult
+
+        Raises
+        ------
+        InputError
+            The bytes are not whole frames.
+        """
         words = as_bytes(data)
         if words.size % self.frame_bytes:
             raise InputError(
@@ -139,7 +157,17 @@ class FrameCodec:
         return frames.tobytes()
 
     def pack_frame(self, number: int, pixels: bytes) -> bytes:
-        """Return a frame's bytes from those of its pixels."""
+        """Return a frame's bytes from those of its pixels.
+
+        Parameters
+        ----------
+        number : int
+        pixels : bytes
+
+        Returns
+        -------
+        bytes
+        """
         return number.to_bytes(_NUMBER_DTYPE.itemsize, "little") + pixels
 
     def _unpack_pixels(self, data: ByteView) -> Any:

@@ -27,7 +27,15 @@ class Ledger:
         self._add(acquired=records, unread=records)
 
     def deliver(self, delivered: int, malformed: int) -> None:
-        """Move records that waited to those that were read."""
+        """Move records that waited to those that were read.
+
+        Parameters
+        ----------
+        delivered : int
+            Records that were sound.
+        malformed : int
+            Records that were not.
+        """
         self._add(unread=-delivered - malformed, delivered=delivered, malformed=malformed)
 
     def drop(self, records: int) -> None:

@@ -118,6 +118,15 @@ def discover() -> list[DiscoveredInstrument]:
 def build_codec(name: str, settings: Mapping[str, Scalar]) -> Codec:
     """Build the codec called `name` from the settings that it once gave.
 
+    Parameters
+    ----------
+    name : str
+    settings : mapping
+
+    Returns
+    -------
+    Codec
+
     Raises
     ------
     InputError

@@ -15,12 +15,21 @@ RETRY_INTERVAL_S = 0.1
 
 
 def retry_connect(connect: Callable[[], T], seconds: float) -> T:
-    """Return what `connect` returns, which is called again while nobody answers.
+    """Return what `connect` returns, which is called again while the instrument does not answer.
+
+    Parameters
+    ----------
+    connect : callable
+    seconds : float
+
+    Returns
+    -------
+    object
 
     Raises
     ------
     DeviceDisconnectedError
-        Nobody answered for `seconds`.
+        The instrument did not answer for `seconds`.
     """
     deadline = monotonic() + seconds
     while True:

@@ -52,7 +52,7 @@ class RingBuffer:
         Bytes.
     policy : {"block", "drop_oldest", "fail"}
         What happens when it is full: the writer waits (and the instrument's own memory fills up),
-        the oldest piece goes, or reading ends with `BufferOverflowError` after what is in the
+        the oldest piece goes, or measurement ends with `BufferOverflowError` after what is in the
         queue.
     ledger : Ledger
         Where arrivals and drops are entered.

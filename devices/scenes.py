@@ -121,7 +121,18 @@ def render_array_light() -> NDArray[np.float64]:
 
 
 def draw_exposure(light: LineLight, seed: int) -> Streak:
-    """Draw one exposure, without any instrument in between."""
+    """Draw one exposure, without any instrument in between.
+
+    Parameters
+    ----------
+    light : LineLight
+        Expected photons.
+    seed : int
+
+    Returns
+    -------
+    Streak
+    """
     counts = np.random.default_rng(seed).poisson(light.photons).astype(np.float32)
     return Streak(counts, light.row_times, camera=light.camera)
 

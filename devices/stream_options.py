@@ -24,7 +24,24 @@ def parse_buffer_settings(uri: Uri) -> BufferSettings:
 
 
 def parse_seconds(uri: Uri, name: str, default: float) -> float:
-    """Read a time to wait, within 0 and 600 s."""
+    """Read a time to wait, within 0 and 600 s.
+
+    Parameters
+    ----------
+    uri : Uri
+    name : str
+    default : float
+        Seconds.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    InputError
+        It is not a number, or outside 0 to 600 s.
+    """
     found = uri.value(name, float, default)
     if not 0 < found <= 600:
         raise InputError(f"'{uri.text}': {name} must be above 0 and at most 600")

@@ -57,13 +57,35 @@ class TcpLink:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, data: bytes, timeout: float) -> None:
-        """Send all of `data`."""
+        """Send all of `data`.
+
+        Parameters
+        ----------
+        data : bytes
+        timeout : float
+            Seconds.
+
+        Raises
+        ------
+        DeviceTimeoutError, DeviceDisconnectedError
+        """
         with self._translate_errors():
             self._socket.settimeout(timeout)
             self._socket.sendall(data)
 
     def read_available(self, limit: int, timeout: float) -> bytes:
         """Return what came, at least 1 and at most `limit` bytes.
+
+        Parameters
+        ----------
+        limit : int
+            Bytes.
+        timeout : float
+            Seconds.
+
+        Returns
+        -------
+        bytes
 
         Raises
         ------
@@ -76,6 +98,17 @@ class TcpLink:
     def read_exactly(self, length: int, limit: int, timeout: float) -> bytes:
         """Return `length` bytes, a length that came from the wire and is bounded before anything is
         held for it.
+
+        Parameters
+        ----------
+        length, limit : int
+            Bytes.
+        timeout : float
+            Seconds for all of it.
+
+        Returns
+        -------
+        bytes
 
         Raises
         ------
@@ -95,6 +128,18 @@ class TcpLink:
 
     def read_until(self, end: bytes, limit: int, timeout: float) -> bytes:
         """Return everything up to `end`, which is taken off.
+
+        Parameters
+        ----------
+        end : bytes
+        limit : int
+            Bytes.
+        timeout : float
+            Seconds for all of it.
+
+        Returns
+        -------
+        bytes
 
         Raises
         ------

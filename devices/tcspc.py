@@ -222,6 +222,18 @@ def _import_library(name: str) -> Any:
 
 
 def compute_photon_times(photons: Records, calibration: Record) -> NDArray[np.float64]:
-    """Return when each photon came, s after the laser's pulse: the beginning of its bin."""
+    """Return when each photon came, s after the laser's pulse: the beginning of its bin.
+
+    Parameters
+    ----------
+    photons : (n,) record array
+        With a field ``bin``.
+    calibration : Record
+        Gives the resolution, s.
+
+    Returns
+    -------
+    (n,) float64 array
+    """
     times: NDArray[np.float64] = photons["bin"] * float(calibration.attribute("resolution_s"))
     return times

@@ -95,6 +95,18 @@ class _ByteMeter:
             self._is_tapped, source.tap = True, self._tap
 
     def read(self, source: Source, timeout: float) -> Batch | None:
+        """Read a batch and count its bytes.
+
+        Parameters
+        ----------
+        source : Source
+        timeout : float
+            Seconds.
+
+        Returns
+        -------
+        Batch or None
+        """
         batch = source.read(timeout)
         if batch is not None and not self._is_tapped:
             self.bytes += batch.records.nbytes

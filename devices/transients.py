@@ -87,7 +87,23 @@ class AccumulationSettings:
 
     @classmethod
     def from_uri(cls, uri: Uri, bin_width: float | None) -> AccumulationSettings:
-        """Read the values of an address that say how to gather."""
+        """Read the values of an address that say how to gather.
+
+        Parameters
+        ----------
+        uri : Uri
+        bin_width : float, optional
+            Seconds.
+
+        Returns
+        -------
+        AccumulationSettings
+
+        Raises
+        ------
+        InputError
+            A value is not a number, or not positive.
+        """
         standard = cls()
         pixels = uri.value("pixels", _parse_integers, standard.pixels)
         found = cls(

@@ -70,6 +70,22 @@ class Uri:
     def value(self, name: str, kind: Callable[[str], T], default: T) -> T:
         """Return value `name` turned into a `kind` (``int``, ``float``, ``str``), `default` where
         it is not given.
+
+        Parameters
+        ----------
+        name : str
+        kind : callable
+            From a text to a value.
+        default : object
+
+        Returns
+        -------
+        object
+
+        Raises
+        ------
+        InputError
+            The value cannot be turned into a `kind`.
         """
         if name not in self.values:
             return default

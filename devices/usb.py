@@ -74,7 +74,18 @@ def system_backend() -> Any:
 
 
 def find_devices(identity: UsbIdentity, backend: Any) -> Iterator[usb.core.Device]:
-    """Yield every connected instrument of that kind."""
+    """Yield every connected instrument of that kind.
+
+    Parameters
+    ----------
+    identity : UsbIdentity
+    backend : object
+        Of pyusb.
+
+    Yields
+    ------
+    usb.core.Device
+    """
     import usb.core
 
     with translate_errors(identity):
@@ -84,8 +95,22 @@ def find_devices(identity: UsbIdentity, backend: Any) -> Iterator[usb.core.Devic
 
 
 def read_serial(device: usb.core.Device, identity: UsbIdentity) -> str:
-    """Return the serial number, empty where there is none; `DevicePermissionError` where it may not
-    be read.
+    """Return the serial number, empty where there is none.
+
+    Parameters
+    ----------
+    device : usb.core.Device
+    identity : UsbIdentity
+        For the message.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    DevicePermissionError
+        It may not be read.
     """
     with translate_errors(identity):
         return str(device.serial_number or "")
@@ -172,6 +197,19 @@ class UsbLink:
         """Fill `buffer` from a bulk endpoint and return how many bytes came; fewer than fit are no
         fault.
 
+        Parameters
+        ----------
+        endpoint : int
+            Address.
+        buffer : array of bytes
+            Overwritten.
+        timeout : float
+            Seconds.
+
+        Returns
+        -------
+        int
+
         Raises
         ------
         DeviceTimeoutError, DeviceStalledError, DeviceDisconnectedError, TransferOverflowError
@@ -182,6 +220,14 @@ class UsbLink:
 
     def write(self, endpoint: int, data: bytes, timeout: float) -> None:
         """Send all of `data` to a bulk endpoint.
+
+        Parameters
+        ----------
+        endpoint : int
+            Address.
+        data : bytes
+        timeout : float
+            Seconds.
 
         Raises
         ------

@@ -62,7 +62,18 @@ class Fault:
 
 
 def draw_fault_script(seed: int, transfers: int) -> tuple[Fault, ...]:
-    """Draw up to six faults of any kind, at most one per transfer, within the first `transfers`."""
+    """Draw up to six faults of any kind, at most one per transfer, within the first `transfers`.
+
+    Parameters
+    ----------
+    seed : int
+    transfers : int
+
+    Returns
+    -------
+    tuple of Fault
+        In the order of the transfers.
+    """
     rng = np.random.default_rng(seed)
     when = rng.permutation(transfers)[: rng.integers(0, 7)]
     return tuple(Fault(int(transfer), *_draw_fault(rng)) for transfer in sorted(when))

@@ -25,6 +25,17 @@ class TagStream(Protocol):
         good.
 
         Wraps of the counter are among them. How a stream is cut into calls does not change it.
+
+        Parameters
+        ----------
+        limit : int
+            Words.
+        last : int
+            Tick.
+
+        Returns
+        -------
+        (6 * words,) uint8 array
         """
 
 
@@ -61,6 +72,19 @@ class PoissonStream:
         self._now = np.zeros(1, np.int64)
 
     def next_words(self, limit: int, last: int) -> ByteView:
+        """Return the next words; see `TagStream`.
+
+        Parameters
+        ----------
+        limit : int
+            Words.
+        last : int
+            Tick.
+
+        Returns
+        -------
+        (6 * words,) uint8 array
+        """
         words = np.empty(limit * RECORD_BYTES, np.uint8)
         written = fill_poisson_words(
             self._state, self._now, self._scale, self._weights, last, words

@@ -140,6 +140,15 @@ class EmulatedTimeTagger(VirtualDevice):
         self._segment_bytes = self._reported = 0
 
     def receive(self, endpoint: int, data: bytes) -> None:
+        """Carry out a command of the host and queue its reply.
+
+        Parameters
+        ----------
+        endpoint : int
+            Address.
+        data : bytes
+            One command.
+        """
         if endpoint != COMMAND_ENDPOINT or len(data) != COMMAND.size or data[0] != MAGIC:
             raise make_usb_error(errno.EPIPE)
         _, what, number, value = COMMAND.unpack(data)
@@ -151,6 +160,23 @@ class EmulatedTimeTagger(VirtualDevice):
         self._replies.append(struct.pack("<I", self._registers[register] % (1 << 32)))
 
     def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
+        """Write a reply or time tags into `buffer`, with the faults that were ordered for this
+        transfer.
+
+        Parameters
+        ----------
+        endpoint : int
+            Address.
+        buffer : memoryview
+            Overwritten.
+        timeout : float
+            Seconds.
+
+        Returns
+        -------
+        int
+            Bytes.
+        """
         if endpoint == REPLY_ENDPOINT:
             return self._send_reply(buffer)
         fault = self._faults.get(self._transfers)

@@ -66,12 +66,32 @@ class VirtualDevice(abc.ABC):
 
     @abc.abstractmethod
     def receive(self, endpoint: int, data: bytes) -> None:
-        """Take what the host sends."""
+        """Take what the host sends.
+
+        Parameters
+        ----------
+        endpoint : int
+            Address.
+        data : bytes
+        """
 
     @abc.abstractmethod
     def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
         """Write what the host asks for into `buffer` and return how many bytes; raise
         `make_usb_error` for faults.
+
+        Parameters
+        ----------
+        endpoint : int
+            Address.
+        buffer : memoryview
+            Overwritten.
+        timeout : float
+            Seconds.
+
+        Returns
+        -------
+        int
         """
 
 
@@ -102,6 +122,19 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         )  # fmt: skip
 
     def get_configuration_descriptor(self, dev: VirtualDevice, config: int) -> SimpleNamespace:
+        """Describe the one configuration of a device, as pyusb reads it.
+
+        Parameters
+        ----------
+        dev : VirtualDevice
+        config : int
+            0.
+
+        Returns
+        -------
+        SimpleNamespace
+            Fields of the USB 2.0 configuration descriptor.
+        """
         _require_descriptor(config == 0)
         return SimpleNamespace(
             bLength=9, bDescriptorType=2, wTotalLength=18 + 7 * len(dev.endpoints), bNumInterfaces=1,
@@ -111,6 +144,19 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     def get_interface_descriptor(
         self, dev: VirtualDevice, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
+        """Describe the one interface of a device, as pyusb reads it.
+
+        Parameters
+        ----------
+        dev : VirtualDevice
+        intf, alt, config : int
+            Numbers of interface, alternate setting and configuration.
+
+        Returns
+        -------
+        SimpleNamespace
+            Fields of the USB 2.0 interface descriptor.
+        """
         _require_descriptor((intf, alt, config) == (INTERFACE_NUMBER, 0, 0))
         return SimpleNamespace(
             bLength=9, bDescriptorType=4, bInterfaceNumber=INTERFACE_NUMBER, bAlternateSetting=0,
@@ -121,6 +167,19 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     def get_endpoint_descriptor(
         self, dev: VirtualDevice, ep: int, intf: int, alt: int, config: int
     ) -> SimpleNamespace:
+        """Describe an endpoint of a device, as pyusb reads it.
+
+        Parameters
+        ----------
+        dev : VirtualDevice
+        ep, intf, alt, config : int
+            Numbers of endpoint, interface, alternate setting and configuration.
+
+        Returns
+        -------
+        SimpleNamespace
+            Fields of the USB 2.0 endpoint descriptor.
+        """
         _require_descriptor(
             ep < len(dev.endpoints) and (intf, alt, config) == (INTERFACE_NUMBER, 0, 0)
         )
@@ -143,18 +202,51 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         return 1
 
     def is_kernel_driver_active(self, dev_handle: VirtualDevice, intf: int) -> bool:
+        """Say that no kernel driver holds the interface.
+
+        Parameters
+        ----------
+        dev_handle : VirtualDevice
+        intf : int
+
+        Returns
+        -------
+        bool
+        """
         _require_plugged(dev_handle)
         return False
 
     def claim_interface(self, dev_handle: VirtualDevice, intf: int) -> None:
+        """Claim the interface, which fails while another process has it.
+
+        Parameters
+        ----------
+        dev_handle : VirtualDevice
+        intf : int
+        """
         _require_plugged(dev_handle)
         if dev_handle.is_claimed_elsewhere:
             raise make_usb_error(errno.EBUSY)
 
     def release_interface(self, dev_handle: VirtualDevice, intf: int) -> None:
+        """Give the interface back.
+
+        Parameters
+        ----------
+        dev_handle : VirtualDevice
+        intf : int
+        """
         _require_plugged(dev_handle)
 
     def clear_halt(self, dev_handle: VirtualDevice, ep: int) -> None:
+        """Let a stalled endpoint go on.
+
+        Parameters
+        ----------
+        dev_handle : VirtualDevice
+        ep : int
+            Address.
+        """
         _require_plugged(dev_handle)
         dev_handle.clear_halt(ep)
 
@@ -162,7 +254,23 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         self, dev_handle: VirtualDevice, bmRequestType: int, bRequest: int, wValue: int, wIndex: int, data: Any,
         timeout: int,
     ) -> int:  # fmt: skip
-        """Answer requests for string descriptors, the only control requests that pyusb needs here."""
+        """Answer requests for string descriptors, the only control requests that pyusb needs here.
+
+        Parameters
+        ----------
+        dev_handle : VirtualDevice
+        bmRequestType, bRequest, wValue, wIndex : int
+            The setup packet, USB 2.0, section 9.3.
+        data : array of bytes
+            Overwritten with the answer.
+        timeout : int
+            Milliseconds.
+
+        Returns
+        -------
+        int
+            Bytes of the answer.
+        """
         _require_plugged(dev_handle)
         number = wValue & 0xFF
         if (bRequest, wValue >> 8) != (GET_DESCRIPTOR, STRING) or number > len(dev_handle.strings):
@@ -180,6 +288,22 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     def bulk_write(
         self, dev_handle: VirtualDevice, ep: int, intf: int, data: array.array[int], timeout: int
     ) -> int:
+        """Hand what the host sends to the device.
+
+        Parameters
+        ----------
+        dev_handle : VirtualDevice
+        ep, intf : int
+            Address of the endpoint, number of the interface.
+        data : array of bytes
+        timeout : int
+            Milliseconds.
+
+        Returns
+        -------
+        int
+            Bytes.
+        """
         self._require_ready(dev_handle, ep)
         dev_handle.receive(ep, data.tobytes())
         return len(data)
@@ -187,6 +311,23 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
     def bulk_read(
         self, dev_handle: VirtualDevice, ep: int, intf: int, buff: array.array[int], timeout: int
     ) -> int:
+        """Have the device fill the host's buffer.
+
+        Parameters
+        ----------
+        dev_handle : VirtualDevice
+        ep, intf : int
+            Address of the endpoint, number of the interface.
+        buff : array of bytes
+            Overwritten.
+        timeout : int
+            Milliseconds.
+
+        Returns
+        -------
+        int
+            Bytes.
+        """
         self._require_ready(dev_handle, ep)
         return dev_handle.fill(ep, memoryview(buff), timeout / 1000)
 

@@ -131,6 +131,17 @@ class Accumulator:
 
         Hot pixels are marked in ``Streak.saturated``, so that recovery does not rely on them.
 
+        Parameters
+        ----------
+        camera : Camera, optional
+        source : str
+            What the streak image calls its source.
+
+        Returns
+        -------
+        Streak
+            Counts (bins, pixels) float32.
+
         Raises
         ------
         InputError

@@ -92,7 +92,21 @@ def add_stamps(stamps, clock_bins, codes, period, steps):
 
 @compiled
 def add_times(pixels, times, scale, shift, width, period, steps):
-    """Add photons of which pixel and time are known; ``position = times * scale + shift``."""
+    """Add photons of which pixel and time are known; ``position = times * scale + shift``.
+
+    Parameters
+    ----------
+    pixels : (photons,) int array
+    times : (photons,) array
+    scale, shift : float
+        Bins per unit of time, and bins.
+    width : float
+        Bins over which a photon is spread.
+    period : float
+        Bins of the laser's period.
+    steps : (pixels, bins + 2) float64 array
+        Added to, in place; the density's differences.
+    """
     density, per_period = 1.0 / width, 1.0 / period
     for photon in range(times.size):
         _add_photon(
@@ -104,7 +118,24 @@ def add_times(pixels, times, scale, shift, width, period, steps):
 def find_last_sync(ticks, channels, flags, ignored, sync, before, known):
     """Return the time of the last sync pulse before record `before`, `known` if there is none.
 
-    A record with one of the `ignored` flags tells of levels, not of edges.
+    A record with one of the `ignored` flags reports levels, not edges.
+
+    Parameters
+    ----------
+    ticks, channels, flags : (records,) int array
+    ignored : int
+        Bits of flags.
+    sync : int
+        Bit of the laser's channel.
+    before : int
+        Record.
+    known : int
+        Ticks.
+
+    Returns
+    -------
+    int
+        Ticks.
     """
     for record in range(before - 1, -1, -1):
         if channels[record] & sync and not flags[record] & ignored:

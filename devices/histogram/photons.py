@@ -101,6 +101,11 @@ class TagHistogram(Accumulator):
     def add(self, records: Records, after_gap: bool = False) -> None:
         """Add time tags, an array of `devices.timetag.codec.RECORD_DTYPE`; `after_gap`: some are
         missing before them.
+
+        Parameters
+        ----------
+        records : (n,) array of `devices.timetag.codec.RECORD_DTYPE`
+        after_gap : bool
         """
         if after_gap:
             self._known = -1

@@ -159,6 +159,18 @@ class LinoSpad2Codec:
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
         """Decode whole cycles; `state` is how many came before. Cycles that were lost are not
         counted.
+
+        Parameters
+        ----------
+        data : bytes-like
+            Whole cycles.
+        state : int
+        after_loss : bool
+            Not needed: cycles do not depend on each other.
+
+        Returns
+        -------
+        DecodeResult
         """
         cycles = self._view_cycles(data)
         kept, malformed = self._count_per_cycle(cycles)

@@ -210,6 +210,17 @@ def make_calibration_record(
 ) -> Record:
     """Return what turns time stamps into a scene: the board's tables, the laser's period, the
     camera.
+
+    Parameters
+    ----------
+    board : BoardCalibration
+    laser_period : float, optional
+        Seconds.
+    camera : Record, optional
+
+    Returns
+    -------
+    Record
     """
     record = board.to_record()
     attributes = {} if laser_period is None else {"laser_period_s": laser_period}

@@ -86,7 +86,25 @@ class BlockHeader:
         number: int = 0,
         recording: int = 0,
     ) -> BlockHeader:
-        """Describe a payload; the parameters are those of the class."""
+        """Describe a payload; the parameters are those of the class.
+
+        Parameters
+        ----------
+        kind : BlockKind
+        payload : bytes
+        time_ns : int
+            ns since 1970.
+        records : int
+        gap : Gap
+        number : int
+            Of the block.
+        recording : int
+            Of the recording, a random number.
+
+        Returns
+        -------
+        BlockHeader
+        """
         checksum = zlib.crc32(payload)
         return cls(kind, gap, time_ns, records, len(payload), checksum, number, recording)
 

@@ -145,7 +145,17 @@ class _Inspector:
         return Stats(found.records + found.malformed, found.records, malformed=found.malformed)
 
     def inspect(self, blocks: BlockReader, entry: Block | Damage) -> Piece | None:
-        """Enter a block into the findings; return its piece if it is a sound one."""
+        """Enter a block into the findings; return its piece if it is a sound one.
+
+        Parameters
+        ----------
+        blocks : BlockReader
+        entry : Block or Damage
+
+        Returns
+        -------
+        Piece or None
+        """
         if isinstance(entry, Damage):
             self._holes += 1
             self._count_damage(entry.length)

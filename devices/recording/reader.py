@@ -221,7 +221,23 @@ class Ending:
 
     @classmethod
     def from_json(cls, payload: bytes, path: Path) -> Ending:
-        """Read the payload of an END block; FileFormatError where it is something else."""
+        """Read the payload of an END block.
+
+        Parameters
+        ----------
+        payload : bytes
+        path : Path
+            For the message.
+
+        Returns
+        -------
+        Ending
+
+        Raises
+        ------
+        FileFormatError
+            It is something else.
+        """
         try:
             known = json.loads(payload)
             stats = {str(name): int(value) for name, value in known["stats"].items()}
@@ -293,8 +309,25 @@ class Recording:
 
 
 def read_at(file: int, position: int, length: int, path: Path) -> bytes:
-    """Read `length` bytes from `position` on, fewer at the end of the file; StorageError where the
-    disk fails.
+    """Read `length` bytes from `position` on, fewer at the end of the file.
+
+    Parameters
+    ----------
+    file : int
+        Descriptor.
+    position, length : int
+        Bytes.
+    path : Path
+        For the message.
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    StorageError
+        The disk fails.
     """
     pieces: list[bytes] = []
     while length > 0:
@@ -330,7 +363,18 @@ def read_head_if_recording(path: Path) -> Record | None:
 
 
 def parse_head(image: bytes, path: Path) -> Record:
-    """Read the record that the payload of a HEAD block, an HDF5 file, holds."""
+    """Read the record that the payload of a HEAD block, an HDF5 file, holds.
+
+    Parameters
+    ----------
+    image : bytes
+    path : Path
+        Of the recording.
+
+    Returns
+    -------
+    Record
+    """
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder, path.name)
         copy.write_bytes(image)
@@ -339,7 +383,23 @@ def parse_head(image: bytes, path: Path) -> Record:
 
 
 def build_codec_from_head(head: Record, path: Path) -> Codec:
-    """Build the codec that a recording's head names; FileFormatError where there is none such."""
+    """Build the codec that a recording's head names.
+
+    Parameters
+    ----------
+    head : Record
+    path : Path
+        For the message.
+
+    Returns
+    -------
+    Codec
+
+    Raises
+    ------
+    FileFormatError
+        The codec is unknown, or does not take its settings.
+    """
     try:
         settings = json.loads(str(head.attribute("codec_settings")))
         return build_codec(str(head.attribute("codec")), settings)

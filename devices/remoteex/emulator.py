@@ -57,7 +57,18 @@ class EmulatedLight:
 
     @classmethod
     def of(cls, light: LineLight, seed: int) -> EmulatedLight:
-        """Let a scene's light fall on the screen."""
+        """Let a scene's light fall on the screen.
+
+        Parameters
+        ----------
+        light : LineLight
+        seed : int
+            Of the photons.
+
+        Returns
+        -------
+        EmulatedLight
+        """
         return cls(light.photons, light.row_times, seed=seed)
 
 

@@ -173,7 +173,24 @@ class Answer:
 
 
 def parse_integer(text: str, what: str) -> int:
-    """Return a number that RemoteEx sent, refusing anything else."""
+    """Return a whole number that RemoteEx sent.
+
+    Parameters
+    ----------
+    text : str
+    what : str
+        What the number means, for the message.
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    ProtocolError
+        It is something else.
+    """
+    # Python would convert digits of any length, at a cost that grows with their square
     if not (text.isascii() and text.isdecimal() and len(text) < 16):
         raise ProtocolError(f"RemoteEx sent {text[:40]!r} as {what}, expected a whole number")
     return int(text)

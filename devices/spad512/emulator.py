@@ -72,9 +72,19 @@ class EmulatedSpadArray:
     def draw_frame(self, request: int, number: int, exposure: ExposureRequest) -> NDArray[np.uint8]:
         """Return the bytes of picture `number` of a request; the same numbers give the same
         picture.
+
+        Parameters
+        ----------
+        request, number : int
+        exposure : ExposureRequest
+
+        Returns
+        -------
+        (bytes,) uint8 array
         """
         light = self._photons[:, : exposure.width] * exposure.seconds
         drawn = np.random.default_rng([self._seed, request, number]).poisson(light)
+        # a pixel's counter stops at the largest number it can hold
         counts = np.minimum(drawn, 2**exposure.bits - 1)
         if exposure.bits == 1:
             return np.packbits(counts.astype(np.uint8), axis=1).ravel()

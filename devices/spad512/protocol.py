@@ -94,10 +94,20 @@ class ExposureRequest:
     def decode(cls, line: bytes, pile_up: bool = False) -> ExposureRequest:
         """Read a command, its end taken off.
 
+        Parameters
+        ----------
+        line : bytes
+        pile_up : bool
+            As in the class.
+
+        Returns
+        -------
+        ExposureRequest
+
         Raises
         ------
         ProtocolError
-            It is no such command.
+            It is not such a command.
         """
         found = _REQUEST.fullmatch(line)
         if found is None:

@@ -91,7 +91,25 @@ class TimeTagCodec:
         return len(data) // RECORD_BYTES
 
     def decode(self, data: ByteView, state: Any, after_loss: bool = False) -> DecodeResult:
-        """Decode whole records; `state` is a `CounterState`."""
+        """Decode whole records; `state` is a `CounterState`.
+
+        Parameters
+        ----------
+        data : bytes-like
+            Whole records.
+        state : CounterState
+        after_loss : bool
+            Records are missing right before these, so that the counter may have wrapped unseen.
+
+        Returns
+        -------
+        DecodeResult
+
+        Raises
+        ------
+        InputError
+            The bytes are not whole records.
+        """
         words = as_bytes(data)
         if words.size % RECORD_BYTES:
             raise InputError(

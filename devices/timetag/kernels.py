@@ -20,6 +20,17 @@ DELTA, WRAP, LOST = 1, 2, 4
 def decode_timetags(data, epoch, previous, after_loss, ticks, channels, flags):
     """Decode the 6-byte words in `data` (bytes) into three arrays; see `TimeTagCodec.decode`.
 
+    Parameters
+    ----------
+    data : (bytes,) uint8 array
+    epoch, previous : int
+        State of the counter.
+    after_loss : bool
+    ticks : (words,) int64 array
+        Overwritten.
+    channels, flags : (words,) array
+        Overwritten.
+
     Returns
     -------
     kept : int
@@ -61,7 +72,14 @@ def decode_timetags(data, epoch, previous, after_loss, ticks, channels, flags):
 
 @compiled
 def encode_timetags(ticks, channels, flags, data):
-    """Write records as 6-byte words, the highest byte first."""
+    """Write records as 6-byte words, the highest byte first.
+
+    Parameters
+    ----------
+    ticks, channels, flags : (records,) array
+    data : (6 * records,) uint8 array
+        Overwritten.
+    """
     for number in range(ticks.size):
         time = ticks[number] & TIME_MASK
         at = number * RECORD_BYTES

@@ -60,7 +60,14 @@ class TimeTagger:
         return self._exchange(_READ, register, 0)
 
     def write(self, register: Register, value: int) -> None:
-        """Set a register."""
+        """Set a register.
+
+        Parameters
+        ----------
+        register : Register
+        value : int
+            32 bits.
+        """
         self._exchange(_WRITE, register, value)
 
     def reset(self) -> None:
@@ -77,6 +84,12 @@ class TimeTagger:
     ) -> None:
         """Start the counter, then the registration, so that the first zero of the counter is not
         taken for a wrap.
+
+        Parameters
+        ----------
+        channels, delta : int
+            Bits of the channels whose edges are recorded as strobes, and whose levels.
+        capture : Capture
         """
         self.write(Register.STROBE, channels)
         self.write(Register.DELTA, delta)
