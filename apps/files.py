@@ -50,7 +50,22 @@ def require_writable(out: Path, *suffixes: str, inputs: tuple[Path, ...] = ()) -
 def build_provenance(
     settings: Mapping[str, Any], *inputs: Path, earlier: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Describe how a result came about, with what is known about its input's own past."""
+    """Describe how a result came about, with what is known about its input's own past.
+
+    Parameters
+    ----------
+    settings : mapping
+        Options by name.
+    *inputs : Path
+        Files whose checksums are recorded.
+    earlier : mapping, optional
+        Provenance of the input.
+
+    Returns
+    -------
+    dict
+        Plain values only, for JSON.
+    """
     described = collect_provenance(
         {name: _to_plain_value(value) for name, value in settings.items()}, *inputs
     )

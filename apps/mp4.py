@@ -61,7 +61,18 @@ class FilmWriter:
 
 @contextmanager
 def open_film(out: Path, rate: float) -> Iterator[FilmWriter]:
-    """Yield a film to add pictures to; the file appears whole or not at all."""
+    """Yield a film to add pictures to; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    out : Path
+    rate : float
+        Pictures per second.
+
+    Yields
+    ------
+    FilmWriter
+    """
     with atomic_path(out) as temporary:
         film = FilmWriter(temporary, rate)
         try:

@@ -24,6 +24,17 @@ def show_progress(title: str, total: int) -> Iterator[Advance]:
     The bar is drawn on standard error, and only on a terminal; inside another bar, or off the main
     thread as on a cluster's worker, there is none. After Ctrl-C the function raises in every thread
     that calls it, so that none goes on computing for nothing.
+
+    Parameters
+    ----------
+    title : str
+    total : int
+        Amount of work at which the bar is full.
+
+    Yields
+    ------
+    callable
+        Takes the amount of work just done.
     """
     with _watch_interrupt() as interrupted, _open_bar(title, total) as draw:
 

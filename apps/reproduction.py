@@ -30,7 +30,22 @@ seconds.
 def make_result(
     study: Study, outcome: Outcome, settings: Mapping[str, Any], command: str, seconds: float
 ) -> Result:
-    """Return what is kept of a finished study; plain values only."""
+    """Return what is kept of a finished study; plain values only.
+
+    Parameters
+    ----------
+    study : Study
+    outcome : Outcome
+    settings : mapping
+    command : str
+        That makes the study again.
+    seconds : float
+        That it took.
+
+    Returns
+    -------
+    dict
+    """
     rows = [asdict(row) | {"mean": row.mean, "spread": row.spread} for row in outcome.rows]
     return {
         "name": study.name,
@@ -47,7 +62,17 @@ def make_result(
 
 
 def load_result(path: Path, settings: Mapping[str, Any]) -> Result | None:
-    """Return the result in `path` if it is whole and was made with the same settings."""
+    """Return the result in `path` if it is whole and was made with the same settings.
+
+    Parameters
+    ----------
+    path : Path
+    settings : mapping
+
+    Returns
+    -------
+    dict or None
+    """
     try:
         found = json.loads(path.read_text("utf-8"))
         return found if found["settings"] == settings else None
@@ -56,7 +81,17 @@ def load_result(path: Path, settings: Mapping[str, Any]) -> Result | None:
 
 
 def write_result(result: Result, folder: Path) -> list[Path]:
-    """Write NAME.md, NAME.csv and, last, NAME.json, which marks the study as finished."""
+    """Write NAME.md, NAME.csv and, last, NAME.json, which marks the study as finished.
+
+    Parameters
+    ----------
+    result : dict
+    folder : Path
+
+    Returns
+    -------
+    list of Path
+    """
     name = result["name"]
     texts = {
         f"{name}.md": f"{render_section(result)}\n",
@@ -69,7 +104,17 @@ def write_result(result: Result, folder: Path) -> list[Path]:
 
 
 def write_page(results: Sequence[Result], folder: Path) -> Path:
-    """Write the page with the table and the picture of every study."""
+    """Write the page with the table and the picture of every study.
+
+    Parameters
+    ----------
+    results : sequence of dict
+    folder : Path
+
+    Returns
+    -------
+    Path
+    """
     head = (
         "# Tables and figures of the paper, made again\n\n"
         "Made by `tofclip reproduce`; do not edit. Ours is the mean over the seeds and its standard deviation; the "
@@ -86,6 +131,16 @@ def write_page(results: Sequence[Result], folder: Path) -> Path:
 def render_section(result: Result, beside: str = "") -> str:
     """Return a study's heading, command, table and picture in Markdown; pictures lie in the folder
     `beside`.
+
+    Parameters
+    ----------
+    result : dict
+    beside : str
+        Ends in a slash, or is empty.
+
+    Returns
+    -------
+    str
     """
     names = ", ".join([result["name"], *result["also"]])
     header = [*result["columns"], f"ours ({result['figure']})", "spread", "paper"]

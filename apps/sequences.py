@@ -55,6 +55,16 @@ def run_with_progress(
 def resolve_device(device: str, cluster: str | None) -> str:
     """Return which device a name stands for here; workers elsewhere look for it themselves.
 
+    Parameters
+    ----------
+    device : str
+    cluster : str, optional
+        Address of the cluster's scheduler.
+
+    Returns
+    -------
+    str
+
     Raises
     ------
     InputError, MissingDependencyError

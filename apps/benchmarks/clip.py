@@ -1,4 +1,4 @@
-"""Recovery of one picture of a light field from few readings, against the bare products of its
+"""Recovery of one picture of a light field from few measurements, against the bare products of its
 model.
 """
 
@@ -32,6 +32,17 @@ def make_light_field(side: int) -> LightField:
 def prepare_recovery(encoder: str, side: int) -> PreparedCase:
     """One picture by total variation at a given weight; the floor takes as many products as the
     recovery needed.
+
+    Parameters
+    ----------
+    encoder : str
+        A key of `CAMERAS`.
+    side : int
+        Pixels of the picture.
+
+    Returns
+    -------
+    PreparedCase
     """
     measurement = measure(make_light_field(side), CameraSetup(encoder, 0.5, 0))
     method = ClipRecovery(weight=PRIOR_WEIGHT)

@@ -23,6 +23,11 @@ BYTES_PER_MIB = 1 << 20
 def measure_case(case: Case, size: int) -> dict[str, Any]:
     """Return the figures of a case at one size.
 
+    Parameters
+    ----------
+    case : Case
+    size : int
+
     Returns
     -------
     dict
@@ -56,7 +61,19 @@ def measure_case(case: Case, size: int) -> dict[str, Any]:
 
 
 def time_repeats(action: Action, seconds: float) -> list[float]:
-    """Time an action again and again."""
+    """Time an action again and again.
+
+    Parameters
+    ----------
+    action : callable
+    seconds : float
+        Stop when the repeats took this long; from `MIN_REPEATS` to `MAX_REPEATS` of them.
+
+    Returns
+    -------
+    list of float
+        Seconds.
+    """
     found: list[float] = []
     while len(found) < MAX_REPEATS:
         began = time.perf_counter()

@@ -35,6 +35,20 @@ warnings.simplefilter("ignore", AliasingWarning)  # what is imaged does not matt
 def make_scene(count: int, relief: float) -> tuple[Capture, Grid, float]:
     """A capture of ``count ** 2`` points, a grid of ``count ** 3`` voxels, and a wavelength of four
     wall points.
+
+    Parameters
+    ----------
+    count : int
+        Points along a side.
+    relief : float
+        Depth of the wall's shape, m; 0: a plane.
+
+    Returns
+    -------
+    capture : Capture
+    grid : Grid
+    wavelength : float
+        Metres.
     """
     axis = np.linspace(-1, 1, count)
     x, y = np.meshgrid(axis, axis)
@@ -46,8 +60,20 @@ def make_scene(count: int, relief: float) -> tuple[Capture, Grid, float]:
 
 
 def make_transforms(side: int, number: int) -> tuple[Action, float]:
-    """Inverse transforms of the doubled plane, a hundredth of `number` or more, and which share of
-    it that is.
+    """Inverse transforms of the doubled plane, a hundredth of `number` or more, and which fraction
+    of it that is.
+
+    Parameters
+    ----------
+    side : int
+        Points along a side of the plane.
+    number : int
+        Transforms that the method needs.
+
+    Returns
+    -------
+    action : callable
+    fraction : float
     """
     threads = thread_count()
     each = max(1, number // (100 * threads))
@@ -100,6 +126,16 @@ def prepare_propagation(count: int) -> PreparedCase:
 def prepare_confocal(method: Reconstructor, count: int) -> PreparedCase:
     """A confocal scan of a planar wall; the floor is a transform of its doubled box, there and
     back.
+
+    Parameters
+    ----------
+    method : Reconstructor
+    count : int
+        Points along a side.
+
+    Returns
+    -------
+    PreparedCase
     """
     wall = build_relay_wall("planar", count)
     capture = Capture(
@@ -129,7 +165,18 @@ def make_exhaustive_capture(count: int) -> Capture:
 
 
 def prepare_backprojection(capture_of: Callable[[int], Capture], count: int) -> PreparedCase:
-    """Point by point; the floor copies a complex number for each look-up."""
+    """Point by point; the floor copies a complex number for each look-up.
+
+    Parameters
+    ----------
+    capture_of : callable
+        From the number of points along a side to a capture.
+    count : int
+
+    Returns
+    -------
+    PreparedCase
+    """
     capture, axis = capture_of(count), np.linspace(-1, 1, count)
     grid = Grid(axis, axis, np.linspace(0.6, 1.6, count // 4))
     method = Backprojection(0.6, CYCLES)

@@ -33,7 +33,19 @@ TABLE_COLUMNS = ("", "size", "threads", "time", "rate", "memory", "floor", "x fl
 
 
 def render_page(figures: Mapping[str, Any], command: str) -> str:
-    """Return the page of the figures that a run of `command` gave."""
+    """Return the page of the figures that a run of `command` gave.
+
+    Parameters
+    ----------
+    figures : mapping
+        ``machine`` and ``entries``.
+    command : str
+
+    Returns
+    -------
+    str
+        Markdown.
+    """
     parts = [
         PAGE_HEADER.format(command=command, machine=_format_machine(figures["machine"])).rstrip()
     ]

@@ -74,6 +74,17 @@ print("seconds", time.perf_counter() - start)
 def time_lensless(side: int, iterations: int) -> float:
     """Seconds of as many iterations of LenslessPiCam's FISTA on a picture of that size and one
     view.
+
+    Parameters
+    ----------
+    side : int
+        Pixels of the picture.
+    iterations : int
+
+    Returns
+    -------
+    float
+        Seconds.
     """
     random = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as folder:
@@ -84,7 +95,19 @@ def time_lensless(side: int, iterations: int) -> float:
 
 
 def time_astra(picture: NDArray[np.float32], angles: NDArray[np.float64]) -> float:
-    """Seconds of ASTRA's parallel projections of a picture, linear interpolation, processor."""
+    """Seconds of ASTRA's parallel projections of a picture, linear interpolation, processor.
+
+    Parameters
+    ----------
+    picture : (rows, columns) float32 array
+    angles : (angles,) float64 array
+        rad.
+
+    Returns
+    -------
+    float
+        Seconds.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "picture.npz"
         np.savez(path, picture=picture, angles=angles)
@@ -92,7 +115,21 @@ def time_astra(picture: NDArray[np.float32], angles: NDArray[np.float64]) -> flo
 
 
 def time_ytal(capture: Capture, grid: Grid, wavelength: float, cycles: float) -> float:
-    """Seconds of y-tal's phasor fields on the same arrays, its solve call alone."""
+    """Seconds of y-tal's phasor fields on the same arrays, its solve call alone.
+
+    Parameters
+    ----------
+    capture : Capture
+    grid : Grid
+    wavelength : float
+        Metres.
+    cycles : float
+
+    Returns
+    -------
+    float
+        Seconds.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "capture.npz"
         arrays: dict[str, Any] = {
@@ -107,11 +144,24 @@ def time_ytal(capture: Capture, grid: Grid, wavelength: float, cycles: float) ->
 
 
 def run_peer(script: str, name: str, *words: str) -> float:
-    """Run a script in the peers' Python and return the seconds that its last lines tell.
+    """Run a script in the peers' Python and return the seconds that its last lines report.
+
+    Parameters
+    ----------
+    script : str
+    name : str
+        Of the peer, for the message.
+    *words : str
+        The script's arguments.
+
+    Returns
+    -------
+    float
+        Seconds.
 
     Raises
     ------
-    AbsentPeerError
+    PeerUnavailableError
         No such Python was named, or the peer is not installed there or does not run.
     """
     python = os.environ.get(PEERS_VARIABLE)

@@ -32,26 +32,40 @@ def make_operator(side: int = PICTURE_SIDES_PX[-1]) -> LineProjection:
 
 
 def measurements(frames: int) -> NDArray[np.float32]:
-    """Positive readings with noise, (1344, frames); what they show does not change the work."""
+    """Positive measurements with noise, (1344, frames); what they show does not change the work."""
     return np.abs(np.random.default_rng(0).standard_normal((SLIT_WIDTH_PX, frames))).astype(
         np.float32
     )
 
 
 def run_products(projection: LineProjection, frames: int, iterations: int) -> None:
-    """So many products each way on every frame, in blocks on all threads, nothing else."""
+    """Multiply `iterations` times each way on every frame, in blocks on all threads, nothing else.
+
+    Parameters
+    ----------
+    projection : LineProjection
+    frames : int
+    iterations : int
+    """
 
     def work(piece: slice) -> None:
         block = np.ones((*projection.shape_in, LANES), np.float32)
         for _ in range(iterations):
             block = projection.adjoint(projection(block))
+            # so that the values neither overflow nor become subnormal, which would be slow
             block *= np.float32(1e-3)
 
     run_blocks(work, frames)
 
 
 def run_adjoints(projection: LineProjection, data: NDArray[np.float32]) -> None:
-    """One product with the transpose for every frame."""
+    """One product with the transpose for every frame.
+
+    Parameters
+    ----------
+    projection : LineProjection
+    data : (measurements, frames) float32 array
+    """
     block = np.ascontiguousarray(data[:, :LANES])
 
     def work(_: slice) -> None:
@@ -61,7 +75,13 @@ def run_adjoints(projection: LineProjection, data: NDArray[np.float32]) -> None:
 
 
 def run_dense_products(projection: LineProjection, data: NDArray[np.float32]) -> None:
-    """A product with a dense matrix and one with the sparse transpose for every frame."""
+    """A product with a dense matrix and one with the sparse transpose for every frame.
+
+    Parameters
+    ----------
+    projection : LineProjection
+    data : (measurements, frames) float32 array
+    """
     matrix = np.eye(SLIT_WIDTH_PX, dtype=np.float32)
     weights = np.empty_like(data)
 
@@ -77,7 +97,17 @@ def run_dense_products(projection: LineProjection, data: NDArray[np.float32]) ->
 
 
 def prepare_iterative(method: Method, frames: int) -> PreparedCase:
-    """A method that multiplies again and again."""
+    """A method that multiplies again and again.
+
+    Parameters
+    ----------
+    method : Method
+    frames : int
+
+    Returns
+    -------
+    PreparedCase
+    """
     projection, data = make_operator(), measurements(frames)
     return PreparedCase(
         lambda: method.recover(projection, data),

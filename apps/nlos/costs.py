@@ -31,6 +31,17 @@ def estimate_memory(imaging: Reconstructor, capture: Capture, grid: Grid) -> int
     capture not.
 
     Good to about a factor of two; `tofclip nlos compare` measures.
+
+    Parameters
+    ----------
+    imaging : Reconstructor
+    capture : Capture
+    grid : Grid
+
+    Returns
+    -------
+    int
+        Bytes.
     """
     volume = grid.size * (SUM_BYTES + MAGNITUDE_BYTES)
     if isinstance(imaging, LightCone | FKMigration):

@@ -91,7 +91,15 @@ def list_captures(folder: Path) -> list[Path]:
 
 
 def write_volume(volume: Volume, path: Path, fraction: float) -> None:
-    """Write a volume in the format that the suffix names."""
+    """Write a volume in the format that the suffix names.
+
+    Parameters
+    ----------
+    volume : Volume
+    path : Path
+    fraction : float
+        Which voxels become points: those with at least this fraction of the brightest.
+    """
     if path.suffix.lower() in RECORD_SUFFIXES:
         volume.save(path)
     else:
@@ -99,12 +107,35 @@ def write_volume(volume: Volume, path: Path, fraction: float) -> None:
 
 
 def add_provenance(volume: Volume, source: Path, settings: dict[str, object]) -> Volume:
-    """Tell in a volume's provenance which file it was made of, and how."""
+    """Record in a volume's provenance which file it was made of, and how.
+
+    Parameters
+    ----------
+    volume : Volume
+    source : Path
+    settings : dict
+
+    Returns
+    -------
+    Volume
+    """
     return replace(volume, provenance=build_provenance(settings, source, earlier=volume.provenance))
 
 
 def require_separate_folder(source: Path, out: Path) -> None:
-    """Refuse to write results of a folder into that folder, where they would be taken for captures."""
+    """Refuse to write results of a folder into that folder, where they would be taken for captures.
+
+    Parameters
+    ----------
+    source, out : Path
+
+    Raises
+    ------
+    StorageError
+        `out` is a file.
+    InputError
+        `out` is the folder of the captures.
+    """
     if out.exists() and not out.is_dir():
         raise StorageError(f"{out}: is a file; a folder of captures needs a folder for its results")
     if out.resolve() == source.resolve():

@@ -37,7 +37,17 @@ WAVELENGTH_DIGITS = 2
 
 
 def preprocess_capture(capture: Capture, settings: ImagingSettings) -> Capture:
-    """Blank the wall's own light and put bins together, as the settings tell."""
+    """Blank the wall's own light and put bins together, as the settings say.
+
+    Parameters
+    ----------
+    capture : Capture
+    settings : ImagingSettings
+
+    Returns
+    -------
+    Capture
+    """
     if settings.gate_m is not None:
         capture = remove_first_bounce(capture, settings.gate_m)
     return (
@@ -46,13 +56,26 @@ def preprocess_capture(capture: Capture, settings: ImagingSettings) -> Capture:
 
 
 def find_shortest_wavelength(capture: Capture, cycles: float) -> float:
-    """Carrier of the shortest virtual pulse of so many cycles whose whole band a capture carries,
+    """Carrier of the shortest virtual pulse of `cycles` cycles whose whole band a capture carries,
     m.
 
     The band's shortest wave is sampled twice along the wall (four times in a confocal scan, where
     the path grows on both legs) and twice along the record.
+
+    Parameters
+    ----------
+    capture : Capture
+    cycles : float
+        Of the pulse.
+
+    Returns
+    -------
+    float
+        Metres.
     """
     pulse = VirtualPulse(1.0, cycles)
+    # the wavenumber at which the pulse's Gaussian spectrum falls to `BAND_EDGE_LEVEL`, over the
+    # carrier's
     highest = 1 + math.sqrt(-2 * math.log(BAND_EDGE_LEVEL)) / (pulse.sigma * pulse.wavenumber)
     confocal = len(capture.lasers) > 1 and np.array_equal(capture.lasers, capture.points)
     across = find_sampling_step(capture) * (4 if confocal else 2)
@@ -81,7 +104,18 @@ class SamplingScales(NamedTuple):
 
 
 def find_scales(settings: ImagingSettings, capture: Capture) -> SamplingScales:
-    """Find the lengths that are not told."""
+    """Find the lengths that are not given.
+
+    Parameters
+    ----------
+    settings : ImagingSettings
+    capture : Capture
+
+    Returns
+    -------
+    SamplingScales
+        Wavelength, voxel and sigma, mm.
+    """
     wavelength, voxel, sigma = settings.wavelength_mm, settings.voxel_mm, settings.sigma_mm
     if wavelength is None:
         wavelength = _round_up(find_shortest_wavelength(capture, settings.cycles) / MILLIMETRE)
@@ -94,8 +128,21 @@ def find_scales(settings: ImagingSettings, capture: Capture) -> SamplingScales:
 
 
 def fill_box(settings: Imaging, capture: Capture, voxel: float) -> tuple[Imaging, Grid]:
-    """Fill the box that is told, or the space in front of the wall where it is not, with voxels of
+    """Fill the box that is given, or the space in front of the wall where it is not, with voxels of
     `voxel` m.
+
+    Parameters
+    ----------
+    settings : ImagingSettings
+    capture : Capture
+    voxel : float
+        Metres.
+
+    Returns
+    -------
+    settings : ImagingSettings
+        With the limits of the box.
+    grid : Grid
     """
     front = Grid.in_front_of(capture, voxel, settings.near_m, settings.far_m)
     x = _axis_limits(front.x) if settings.x_m is None else settings.x_m
@@ -114,6 +161,16 @@ def choose_grid(settings: Imaging, capture: Capture) -> tuple[Imaging, Grid]:
     later: lct and fk make up for the loss of light with distance, and would take the noise of the
     farthest depths for the brightest things. The settings that come back hold the box itself and
     find the same voxels once more.
+
+    Parameters
+    ----------
+    settings : ImagingSettings
+    capture : Capture
+
+    Returns
+    -------
+    settings : ImagingSettings
+    grid : Grid
     """
     scales = find_scales(settings, capture)
     voxel, coarse = scales.voxel_mm * MILLIMETRE, scales.wavelength_mm * MILLIMETRE / 2
@@ -132,6 +189,22 @@ def choose_grid(settings: Imaging, capture: Capture) -> tuple[Imaging, Grid]:
 def image_capture(title: str, imaging: Reconstructor, capture: Capture, grid: Grid) -> Volume:
     """Image the hidden scene under a progress bar that counts look-ups or voxels, whichever the
     method does.
+
+    Parameters
+    ----------
+    title : str
+    imaging : Reconstructor
+    capture : Capture
+    grid : Grid
+
+    Returns
+    -------
+    Volume
+
+    Raises
+    ------
+    InputError
+        The method cannot image the capture on the grid.
     """
     imaging.supports(capture, grid).require()
     lookups = getattr(imaging, "lookups", None)

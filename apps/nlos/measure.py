@@ -57,6 +57,18 @@ def measure_imaging(
     """Image the hidden scene, and measure time and memory.
 
     A few voxels are imaged first, so that loading the compiled loops is not counted.
+
+    Parameters
+    ----------
+    name : str
+    imaging : Reconstructor
+    capture : Capture
+    grid : Grid
+
+    Returns
+    -------
+    MeasuredVolume
+        Seconds, and bytes where the system reports them.
     """
     few = slice(WARM_UP_VOXELS)
     imaging.reconstruct(capture, Grid(grid.x[few], grid.y[few], grid.z[:1]))
@@ -109,10 +121,22 @@ def measure_sharpness(volume: Volume) -> float:
 
 
 def compare_with_truth(volume: Volume, truth: HiddenTruth) -> dict[str, Any]:
-    """Share of the energy near hidden things, and how much brighter voxels are there than
+    """Fraction of the energy near hidden things, and how much brighter voxels are there than
     elsewhere.
+
+    Parameters
+    ----------
+    volume : Volume
+    truth : HiddenTruth
+
+    Returns
+    -------
+    dict
+        ``energy_near_truth``, ``contrast_to_truth`` and ``truth_reach_m``, the distance that counts
+        as near.
     """
     axes = (volume.grid.x, volume.grid.y, volume.grid.z)
+    # coarse voxels may have no centre within the radius
     reach = max([TRUTH_RADIUS_M, *(float(axis[1] - axis[0]) for axis in axes if axis.size > 1)])
     near, magnitude = truth.mask_near(volume.grid, reach), volume.magnitude.astype(np.float64)
     energy = float(np.sum(magnitude**2))

@@ -104,7 +104,18 @@ def parse_method_names(text: str) -> tuple[str, ...]:
 
 
 def require_used_settings(settings: ImagingSettings, methods: Sequence[str]) -> None:
-    """Refuse a setting that none of the methods takes, since it would change nothing."""
+    """Refuse a setting that none of the methods takes, since it would change nothing.
+
+    Parameters
+    ----------
+    settings : ImagingSettings
+    methods : sequence of str
+
+    Raises
+    ------
+    InputError
+        There is such a setting.
+    """
     taken = {name for method in methods for name in METHODS[method][1]}
     for name in sorted(
         {name for _, names in METHODS.values() for name in names} - taken - set(PULSE_SETTINGS)
@@ -117,7 +128,18 @@ def require_used_settings(settings: ImagingSettings, methods: Sequence[str]) -> 
 
 
 def build_method(method: str, settings: ImagingSettings) -> Reconstructor:
-    """Build a method; what no setting tells is left to its class."""
+    """Build a method; what no setting says is left to its class.
+
+    Parameters
+    ----------
+    method : str
+        A key of `METHODS`.
+    settings : ImagingSettings
+
+    Returns
+    -------
+    Reconstructor
+    """
     class_name, names = METHODS[method]
     arguments = {}
     for name in names:
@@ -131,8 +153,17 @@ def build_method(method: str, settings: ImagingSettings) -> Reconstructor:
 
 
 def fill_in_defaults(settings: Imaging, methods: Sequence[str]) -> Imaging:
-    """Fill in what the methods' classes take where nothing is told, and leave out what none of them
-    takes.
+    """Fill in the defaults of the methods' classes where nothing is given, and leave out what none
+    of them takes.
+
+    Parameters
+    ----------
+    settings : ImagingSettings
+    methods : sequence of str
+
+    Returns
+    -------
+    ImagingSettings
     """
     kept: dict[str, Any] = {
         name: None for _, names in METHODS.values() for name in names if name not in PULSE_SETTINGS
@@ -147,6 +178,16 @@ def fill_in_defaults(settings: Imaging, methods: Sequence[str]) -> Imaging:
 def choose_quickest_method(settings: ImagingSettings, capture: Capture, grid: Grid) -> str:
     """Name the quickest method that takes a capture; where none does, the one that takes most,
     which says why.
+
+    Parameters
+    ----------
+    settings : ImagingSettings
+    capture : Capture
+    grid : Grid
+
+    Returns
+    -------
+    str
     """
     suits = (
         name for name in METHODS_BY_SPEED if build_method(name, settings).supports(capture, grid)
@@ -155,8 +196,18 @@ def choose_quickest_method(settings: ImagingSettings, capture: Capture, grid: Gr
 
 
 def choose_device(device: str, settings: ImagingSettings) -> ComputeDevice:
-    """Return the place that a name asks for; ``auto`` stays with the compiled loops where a method
+    """Return the device that a name asks for; ``auto`` stays with the compiled loops where a method
     has nothing else.
+
+    Parameters
+    ----------
+    device : str
+        See `tofclip.arrays.parse_device`.
+    settings : ImagingSettings
+
+    Returns
+    -------
+    ComputeDevice
     """
     named, refine = (getattr(settings, name, None) for name in ("method", "refine"))
     portable = named in (None, *PORTABLE_METHODS) and refine is None

@@ -48,7 +48,18 @@ Refining = TypeVar("Refining", bound=RefinementSettings)
 
 
 def require_valid_refinement(settings: RefinementSettings, method: str | None) -> None:
-    """Refuse a refinement that makes no sense, and settings of one that nobody asked for."""
+    """Refuse a refinement that makes no sense, and settings of one that is not asked for.
+
+    Parameters
+    ----------
+    settings : RefinementSettings
+    method : str, optional
+
+    Raises
+    ------
+    InputError
+        One of these is the case.
+    """
     if settings.refine is None:
         for name in ("iterations", "prior_weight"):
             if getattr(settings, name) is not None:
@@ -71,8 +82,18 @@ def require_valid_refinement(settings: RefinementSettings, method: str | None) -
 
 
 def build_refinement(settings: Refining, grid: Grid) -> tuple[Refining, Refinement]:
-    """Build the refinement that settings ask for on a grid; the settings come back with what nobody
-    told.
+    """Build the refinement that settings ask for on a grid; the settings come back with the
+    defaults filled in.
+
+    Parameters
+    ----------
+    settings : RefinementSettings
+    grid : Grid
+
+    Returns
+    -------
+    settings : RefinementSettings
+    refinement : Refinement
     """
     weight = DEFAULT_PRIOR_WEIGHT if settings.prior_weight is None else settings.prior_weight
     iterations = settings.iterations or DEFAULT_ITERATIONS

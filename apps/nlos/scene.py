@@ -130,7 +130,19 @@ def build_hidden_scene(settings: SceneSettings) -> tuple[HiddenScene | PointScen
 
 
 def find_nearest_wall_point(wall: FloatArray, place: tuple[float, float]) -> FloatArray:
-    """Return the wall point whose x and y are nearest to a place, m."""
+    """Return the wall point whose x and y are nearest to a place, m.
+
+    Parameters
+    ----------
+    wall : (..., 3) float64 array
+        Metres; NaN where there is no wall.
+    place : (float, float)
+        x and y, m.
+
+    Returns
+    -------
+    (3,) float64 array
+    """
     known = wall[np.isfinite(wall).all(axis=-1)]
     spot: FloatArray = known[np.argmin(np.linalg.norm(known[:, :2] - place, axis=1))]
     return spot
@@ -143,6 +155,26 @@ def choose_time_axis(
     response behind it.
 
     A sum of distances is largest at a corner of the box about what is hidden.
+
+    Parameters
+    ----------
+    wall : (..., 3) float64 array
+        Metres; NaN where there is no wall.
+    laser : (..., 3) float64 array
+        Metres.
+    hidden : (n, 3) float64 array
+        Metres.
+    bin_width, jitter : float
+        Seconds; the jitter is the response's standard deviation.
+
+    Returns
+    -------
+    TimeAxis
+
+    Raises
+    ------
+    InputError
+        The bin width is not positive.
     """
     if not (math.isfinite(bin_width) and bin_width > 0):
         raise InputError(

@@ -68,7 +68,23 @@ class HiddenTruth:
         )
 
     def mask_near(self, grid: Grid, reach: float) -> NDArray[np.bool_]:
-        """Voxels (z, y, x) whose centres lie within `reach` m of something hidden."""
+        """Voxels (z, y, x) whose centres lie within `reach` m of something hidden.
+
+        Parameters
+        ----------
+        grid : Grid
+        reach : float
+            Metres.
+
+        Returns
+        -------
+        (z, y, x) bool array
+
+        Raises
+        ------
+        InputError
+            The reach is not positive.
+        """
         if reach <= 0:
             raise InputError(f"the reach about hidden things must be positive, got {reach} m")
         z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
