@@ -35,6 +35,11 @@ def show_progress(title: str, total: int) -> Iterator[Advance]:
     ------
     callable
         Takes the amount of work just done.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        The callable raises it after Ctrl-C.
     """
     with _watch_interrupt() as interrupted, _open_bar(title, total) as draw:
 

@@ -41,6 +41,10 @@ def run_with_progress(
         Where; one after the other in this process by default.
     watch : callable, optional
         Called with each report.
+
+    Returns
+    -------
+    Summary
     """
     missing = select_unfinished(jobs)
     with show_progress(title, len(missing)) as advance:

@@ -61,6 +61,10 @@ def setting_field(
         The default in words, for the help.
     choices : iterable of str
         Names that shells offer to complete.
+
+    Returns
+    -------
+    dataclass field
     """
     option = {
         "metavar": metavar,

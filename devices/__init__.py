@@ -5,9 +5,9 @@
     with devices.open("sim+timetag://?seed=1") as source:
         for batch in source:
             batch.records      # NumPy structured array, one row per record
-    source.stats               # acquired = delivered + unread + dropped_host + lost_device +
-    malformed streak = devices.read_transient("sim+linospad2://?seed=1")     # photons or frames to
-    what tofclip.recover takes
+    source.stats               # acquired = delivered + unread + dropped_host + lost_device + malformed
+
+    streak = devices.read_transient("sim+linospad2://?seed=1")  # what tofclip.recover takes
 
 Which address opens which instrument is written down in `devices.registry`.
 """

@@ -57,6 +57,10 @@ def measure_throughput(
     watch : callable
         Called with the seconds that have passed, now and then.
 
+    Returns
+    -------
+    Throughput
+
     Raises
     ------
     InputError

@@ -203,6 +203,10 @@ def read_transients(address: str, bin_width: float | None = None) -> Iterator[St
     address, bin_width
         As for `read_transient`. Reading ends after ``seconds`` only where the address gives them.
 
+    Yields
+    ------
+    Streak
+
     Raises
     ------
     InputError, DeviceError

@@ -140,6 +140,15 @@ class Capture:
             Laser spots, m.
         bin_width, start, provenance
             As of `Capture`.
+
+        Returns
+        -------
+        Capture
+
+        Raises
+        ------
+        ShapeError
+            Wall or laser points have not three coordinates.
         """
         wall, laser = (
             _to_real_array(wall, np.float64, "wall"),

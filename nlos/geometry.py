@@ -63,6 +63,15 @@ class Grid:
             Distance of neighbouring centres, m, for all axes or for x, y and z. It is met exactly:
             where a side is no multiple of it, the voxels are centred in the box and the outer ones
             lie inside.
+
+        Returns
+        -------
+        Grid
+
+        Raises
+        ------
+        InputError
+            The voxel size is not positive.
         """
         sizes = np.broadcast_to(np.asarray(voxel, dtype=np.float64), (3,))
         if not np.all(np.isfinite(sizes) & (sizes > 0)):
@@ -87,6 +96,15 @@ class Grid:
             First and last z, m. They default to one voxel in front of the middle of the wall's
             relief, and to the depth that light reaches and returns from within the record, at most
             two wall widths.
+
+        Returns
+        -------
+        Grid
+
+        Raises
+        ------
+        InputError
+            The record ends before anything hidden could be seen.
         """
         low, high = capture.points.min(axis=0), capture.points.max(axis=0)
         width = float(max(high[0] - low[0], high[1] - low[1]))
@@ -117,6 +135,15 @@ class Grid:
             Distance of neighbouring voxel centres, m.
         fraction : float
             What counts as bright, relative to the brightest voxel.
+
+        Returns
+        -------
+        Grid
+
+        Raises
+        ------
+        InputError
+            The volume is dark everywhere.
         """
         indices = np.nonzero(volume.threshold(fraction).magnitude)
         if indices[0].size == 0:

@@ -32,6 +32,10 @@ def plan_outgoing_diffraction(
         Of one laser spot, or confocal.
     grid : Grid
     band : Band
+
+    Returns
+    -------
+    DiffractionPlan
     """
     (group,) = group_by_illumination(capture)
     if isinstance(method, PlanarRSD):

@@ -44,6 +44,11 @@ def save_picture(volume: Volume, path: str | Path) -> None:
     volume : Volume
     path : path-like
         Ends in .png, .pdf or .svg.
+
+    Raises
+    ------
+    InputError
+        The name has an ending of another format.
     """
     target = Path(path)
     if target.suffix.lower() not in PICTURE_SUFFIXES:

@@ -44,11 +44,10 @@ def compute_diffraction_limit(capture: Capture, point: Any, pulse: VirtualPulse)
     """Width of the image of a point that a noiseless, infinitely fast instrument would give.
 
     It is that of ``|sum_p d_p^-3 s(L_p(r) - L_p(r_0))|`` about the point r_0, with s the virtual
-    pulse, ``L_p(r) =
-    |r_L - r| + |r - r_p|`` and ``d_p = |r_0 - r_p|``: light falls with the square of the distance, and the way back
-    divides by it once more. For a small wall of width W at distance z and one laser this is 1.2 *
-    wavelength * z / W across, half of it for a confocal scan, and half the envelope's width in
-    depth.
+    pulse, ``L_p(r) = |r_L - r| + |r - r_p|`` and ``d_p = |r_0 - r_p|``: light falls with the square
+    of the distance, and the way back divides by it once more. For a small wall of width W at
+    distance z and one laser this is 1.2 * wavelength * z / W across, half of it for a confocal
+    scan, and half the envelope's width in depth.
 
     Parameters
     ----------
@@ -57,6 +56,16 @@ def compute_diffraction_limit(capture: Capture, point: Any, pulse: VirtualPulse)
     point : (3,) array
         m.
     pulse : VirtualPulse
+
+    Returns
+    -------
+    PeakWidths
+        Full widths at half maximum along x, y and z, m.
+
+    Raises
+    ------
+    InputError
+        The point has not three finite coordinates.
     """
     point = np.asarray(point, dtype=np.float64)
     if point.shape != (3,) or not np.all(np.isfinite(point)):
@@ -73,6 +82,11 @@ def measure_point_spread(volume: Volume, point: Any | None = None) -> PeakWidths
         A quarter of the width per voxel, or finer.
     point : (3,) array, optional
         The voxel nearest to it is taken for the peak; defaults to the brightest.
+
+    Returns
+    -------
+    PeakWidths
+        Full widths at half maximum along x, y and z, m.
     """
     z, y, x = volume.grid.find_nearest(volume.find_brightest() if point is None else point)
     magnitude = volume.magnitude

@@ -70,6 +70,13 @@ def unwarp_signal(
     Returns
     -------
     (t, ...) float32 array
+
+    Raises
+    ------
+    ShapeError
+        The wall does not fit the signal.
+    InputError
+        A position is not three finite numbers.
     """
     signal, wall = (
         np.asarray(to_numpy(signal), dtype=np.float32),
@@ -104,6 +111,15 @@ def remove_device_legs(capture: Capture, source: Any, camera: Any) -> Capture:
         camera.
     source, camera : (3,) array
         Position of the laser device and of the camera, m.
+
+    Returns
+    -------
+    Capture
+
+    Raises
+    ------
+    InputError
+        A position is not three finite numbers.
     """
     source, camera = np.asarray(source, dtype=np.float64), np.asarray(camera, dtype=np.float64)
     for name, place in (("source", source), ("camera", camera)):

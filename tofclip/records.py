@@ -107,6 +107,11 @@ def stored_array(
         Where the number of axes is free: from that number to their names.
     optional : bool
         Whether None is a value, and whether files without the array get the field's default.
+
+    Returns
+    -------
+    dict
+        Metadata for `dataclasses.field`.
     """
     kinds = dtype if isinstance(dtype, tuple) else (dtype,)
     return {_KEY: _StoredArray(units, axes, kinds, name, dimensions, name_axes, optional)}
@@ -125,6 +130,11 @@ def stored_value(
         ``float``, ``int``, ``str`` or ``bool``.
     optional : bool
         Whether files without the attribute get the field's default.
+
+    Returns
+    -------
+    dict
+        Metadata for `dataclasses.field`.
     """
     return {_KEY: _StoredValue(names, dtype, optional)}
 
@@ -149,6 +159,11 @@ def stored_child(
         Whether None is a value.
     name : str
         In the file; by default the dataclass field's.
+
+    Returns
+    -------
+    dict
+        Metadata for `dataclasses.field`.
     """
     return {_KEY: _StoredChild(read, kind, optional, name)}
 

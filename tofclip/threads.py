@@ -113,6 +113,11 @@ def map_parallel(
         Jobs that may be under way or done before their turn; it bounds the results in memory. By
         default one per thread.
 
+    Yields
+    ------
+    object
+        Result of each job.
+
     Examples
     --------
     >>> list(map_parallel(abs, [-1, 2, -3]))

@@ -61,6 +61,10 @@ def make_comparison_figure(
         What is written below each column: ``seconds``, ``peak_mib``, ``correlation`` and so on.
     truth : HiddenTruth or None
         Outlined where it is known.
+
+    Returns
+    -------
+    Figure
     """
     grid = next(iter(volumes.values())).grid
     across = float(np.subtract(*outer_edges(grid.x)[::-1]))

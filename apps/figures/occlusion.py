@@ -44,6 +44,10 @@ def make_occlusion_figure(experiment: Experiment, probes: Sequence[ProbeResult])
     experiment : Experiment
     probes : sequence of Probe
         Small targets on the axis, drawn with a tick or a cross.
+
+    Returns
+    -------
+    Figure
     """
     figure = make_figure(13, 7)
     figure.suptitle(_format_headline(experiment), fontsize=SMALL_FONT_PT + 5)

@@ -46,6 +46,10 @@ def make_scene_figure(
         Of these frames.
     objects : sequence of SeenObject
         Numbered in the top view; the four with most points are shown at their ranges.
+
+    Returns
+    -------
+    Figure
     """
     figure = make_figure(13, 7.5)
     axes = figure.subplots(2, 4)

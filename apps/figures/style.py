@@ -72,6 +72,10 @@ def draw_image(
         Outer edges in the axes' units; pixel numbers where absent.
     **look
         Further settings of ``imshow``.
+
+    Returns
+    -------
+    AxesImage
     """
     axes.set_facecolor(EMPTY_COLOUR)
     return axes.imshow(

@@ -102,6 +102,10 @@ def probe_target(
         Where the target stands, in lengths of the region behind the occluder.
     seed : int
         Of the line angles and the photons.
+
+    Returns
+    -------
+    ProbeResult
     """
     distance = region.distance + factor * region.length
     width = TARGET_WIDTH_FRACTION * region.width

@@ -126,6 +126,10 @@ def sweep_rotation(
         M, PSFs and 1D sensors.
     seeds : sequence of int
         Of the codes; both arms of a seed have the same codes.
+
+    Returns
+    -------
+    RotationSweep
     """
     shape = (picture.shape[0], picture.shape[1])
     found = [

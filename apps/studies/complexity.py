@@ -83,6 +83,10 @@ def measure_iteration_costs(
     repeats : int
         Iterations timed, after a first one that is not.
 
+    Returns
+    -------
+    list of IterationCost
+
     Notes
     -----
     Memory is about ten light fields in float32.

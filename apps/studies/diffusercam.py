@@ -129,6 +129,10 @@ def recover_diffuser_scene(
         1 for the full measurement.
     iterations : int
         About 16 ms each for a sensor of 300 x 400 pixels on one core.
+
+    Returns
+    -------
+    DiffuserRecovery
     """
     model = build_diffuser_model(recording, pitch_px)
     every_nth = recording.measurements[::pitch_px, ::pitch_px]

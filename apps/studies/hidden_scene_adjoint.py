@@ -186,6 +186,10 @@ def run_study(capture: Capture, grid: Grid, solver: Reconstructor, seed: int = 0
     solver : Reconstructor
     seed : int
         Of the photons.
+
+    Returns
+    -------
+    list of StudyRow
     """
     clean = solver.reconstruct(capture, grid)
     rows = []

@@ -65,6 +65,10 @@ def learn_dictionary(
     seed : int
         Of the patches that are looked at and of the learning.
 
+    Returns
+    -------
+    LightFieldDictionary
+
     Raises
     ------
     MissingDependencyError
@@ -126,6 +130,12 @@ def recover_with_dictionary(
     Returns
     -------
     (views, rows, columns) float32 array
+
+    Raises
+    ------
+    ShapeError
+        Mask codes, dictionary and exposure do not fit each other, or the exposure is smaller than a
+        patch.
 
     Notes
     -----

@@ -38,6 +38,11 @@ def compute_depth_accuracy(
         not count.
     step : float
         Between the shears of the focal stack.
+
+    Returns
+    -------
+    float
+        0 to 1.
     """
     slope = np.hypot(*np.gradient(picture))
     textured = slope > TEXTURE_THRESHOLD * np.quantile(slope, 0.99)

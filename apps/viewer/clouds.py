@@ -89,6 +89,10 @@ def make_cloud(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) 
         m.
     known : mapping of str to (n,) array, optional
         Columns by their names; ``"brightness"`` counts as intensity.
+
+    Returns
+    -------
+    PointCloud
     """
     known = known or {}
     distance = np.linalg.norm(xyz, axis=1)

@@ -156,6 +156,10 @@ def make_scale(cloud: PointCloud, colouring: Colouring) -> Scale:
     ----------
     cloud : PointCloud
     colouring : Colouring
+
+    Returns
+    -------
+    Scale
     """
     quantity = QUANTITIES[colouring.quantity]
     values = quantity.extract(cloud)
@@ -178,6 +182,10 @@ def colour_points(cloud: PointCloud, scale: Scale, brightest: float = 0.0) -> ND
     scale : Scale
     brightest : float
         Intensity that is drawn in full light, less of it darker; 0 for no shading.
+
+    Returns
+    -------
+    (n, 3) uint8 array
     """
     colours = scale.colours(QUANTITIES[scale.quantity].extract(cloud))
     if brightest <= 0 or scale.quantity == "intensity":

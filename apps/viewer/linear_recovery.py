@@ -57,6 +57,10 @@ class LinearRecovery:
         shear : float
             Pixels per view step.
         gate : Gate
+
+        Returns
+        -------
+        Frames
         """
         part = np.ascontiguousarray(measurements[:, gate.frames])
         found = self._prepare_inverse(shear).recover(part).frames
@@ -75,6 +79,10 @@ class LinearRecovery:
         least_intensity : float
             Weaker returns are left out: a threshold relative to the gate would find noise in a dark one.
             Counts, referred to 1 m.
+
+        Returns
+        -------
+        View
         """
         found = make_view(depth(self.frames(measurements, shear, self._widen_gate(gate))))
         return found if least_intensity <= 0 else select_brighter(found, least_intensity)

@@ -77,6 +77,10 @@ def find_point_on_ray(
         m.
     origin, direction : (3,) array
         Of the ray, in the same frame.
+
+    Returns
+    -------
+    int or None
     """
     along = np.asarray(direction, dtype=np.float64)
     away = xyz - np.asarray(origin, dtype=np.float64)

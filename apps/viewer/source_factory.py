@@ -61,6 +61,10 @@ def open_source(name: str, options: ShotOptions | None = None) -> Source:
         ``sim+linospad2://?seed=1``.
     options : Extras, optional
 
+    Returns
+    -------
+    Source
+
     Raises
     ------
     InputError, StorageError, FileFormatError, DeviceError

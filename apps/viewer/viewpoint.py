@@ -87,6 +87,10 @@ def place_viewpoint(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
         m.
     aspect : float
         Width of the picture over its height.
+
+    Returns
+    -------
+    Viewpoint
     """
     if len(xyz) == 0:
         return Viewpoint(np.array([0.0, 0.0, -1.0]), np.zeros(3))

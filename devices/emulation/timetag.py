@@ -148,6 +148,11 @@ class EmulatedTimeTagger(VirtualDevice):
             Address.
         data : bytes
             One command.
+
+        Raises
+        ------
+        usb.core.USBError
+            The command is not one that the instrument knows.
         """
         if endpoint != COMMAND_ENDPOINT or len(data) != COMMAND.size or data[0] != MAGIC:
             raise make_usb_error(errno.EPIPE)

@@ -223,6 +223,11 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         ----------
         dev_handle : VirtualDevice
         intf : int
+
+        Raises
+        ------
+        usb.core.USBError
+            Another process has it.
         """
         _require_plugged(dev_handle)
         if dev_handle.is_claimed_elsewhere:
@@ -270,6 +275,11 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         -------
         int
             Bytes of the answer.
+
+        Raises
+        ------
+        usb.core.USBError
+            It is another request, or there is no such string.
         """
         _require_plugged(dev_handle)
         number = wValue & 0xFF

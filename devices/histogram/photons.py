@@ -150,6 +150,13 @@ class TimeHistogram(Accumulator):
         pixels : (n,) int array
         times : (n,) array
             Beginning of the electronics' bin, s after the laser's pulse.
+
+        Raises
+        ------
+        ShapeError
+            Pixels and times differ in number.
+        InputError
+            There is no such pixel, or a time is not finite.
         """
         if pixels.ndim != 1 or pixels.shape != times.shape:
             raise ShapeError("pixels and times", "(photons,) both", (pixels.shape, times.shape))

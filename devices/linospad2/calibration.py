@@ -132,6 +132,10 @@ def load_calibration(
     hot_pixels : path-like, optional
         Text with one pixel number in each line.
 
+    Returns
+    -------
+    BoardCalibration
+
     Raises
     ------
     StorageError

@@ -162,6 +162,10 @@ def build_rebinning_matrix(source_edges: FloatArray, target_edges: FloatArray) -
     ----------
     source_edges, target_edges : (n + 1,) array
         Increasing; intervals of length 0 are allowed. Targets beyond the sources count as 0 there.
+
+    Returns
+    -------
+    (targets, sources) csr_array
     """
     from scipy.sparse import csr_array
 

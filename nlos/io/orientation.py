@@ -23,6 +23,10 @@ def rotate_to_scene(capture: Capture, towards_scene: NDArray[np.float64]) -> Cap
     capture : Capture
     towards_scene : (3,) array
         From the wall into the hidden scene; of any length but 0.
+
+    Returns
+    -------
+    Capture
     """
     turn = _build_rotation(towards_scene)
     laser, wall = capture.laser @ turn.T, capture.wall @ turn.T

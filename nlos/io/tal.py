@@ -57,6 +57,15 @@ def match_lasers_to_sensors(
         m.
     bin_width, start : float
         s and m.
+
+    Returns
+    -------
+    Capture
+
+    Raises
+    ------
+    FileFormatError
+        The signal's shape belongs neither to the wall points nor to the laser points.
     """
     sensors, lasers = sensor.shape[:-1], laser.shape[:-1]
     if signal.shape[1:] == sensors and laser.size == 3:

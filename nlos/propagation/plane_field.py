@@ -55,6 +55,10 @@ def choose_virtual_plane(
     z : float, optional
         Where, m. Defaults to the shortest wavelength, but 5 to 10 cm, in front of the foremost wall
         point.
+
+    Returns
+    -------
+    Plane
     """
     low, high = points.min(axis=0), points.max(axis=0)
     shortest, middle = (

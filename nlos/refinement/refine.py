@@ -38,6 +38,10 @@ def build_total_variation(
         What will be imaged on; evenly spaced.
     weight, iterations
         As of `tofclip.solvers.TotalVariation`.
+
+    Returns
+    -------
+    LightFieldVariation
     """
     across = axis_step(grid.x) if grid.x.size > 1 else 1.0
     along = axis_step(grid.z) if grid.z.size > 1 else across

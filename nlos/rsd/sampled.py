@@ -31,6 +31,16 @@ def diffract_by_convolution(
         Its voxels are as far from each other as the plane's points.
     waves : Waves
         Waves of points; one complex128 number per voxel and frequency has to fit into memory.
+
+    Returns
+    -------
+    (frequencies, z, y, x) complex128 array
+
+    Raises
+    ------
+    InputError
+        The voxels are not as far from each other as the points, or the waves are not those of
+        points.
     """
     from scipy.fft import fft2, ifft2
 

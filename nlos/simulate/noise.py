@@ -24,6 +24,16 @@ def add_poisson_noise(
         Expected counts of background, added to every bin.
     seed : int
         Of the random numbers; recorded in the provenance.
+
+    Returns
+    -------
+    Capture
+        Counts.
+
+    Raises
+    ------
+    InputError
+        The peak is not positive, the background negative, or the signal negative or dark.
     """
     if not (
         np.isfinite(peak_counts) and peak_counts > 0 and np.isfinite(background) and background >= 0

@@ -66,6 +66,11 @@ class PointScene:
         Returns
         -------
         Capture
+
+        Raises
+        ------
+        InputError
+            The jitter is not positive.
         """
         if not (np.isfinite(jitter) and jitter > 0):
             raise InputError(f"jitter must be a positive number of seconds, got {jitter}")

@@ -60,6 +60,18 @@ class Surface:
             enough.
         material : Material, optional
             Defaults to white Lambert.
+
+        Returns
+        -------
+        Surface
+
+        Raises
+        ------
+        ShapeError
+            Vertices are not (v, 3), or faces not (m, 3).
+        InputError
+            A face names a vertex that does not exist, a vertex is not finite, or the spacing is not
+            positive.
         """
         vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
@@ -168,6 +180,15 @@ class Surface:
             Side of a facet, m.
         material : Material, optional
             Defaults to white Lambert.
+
+        Returns
+        -------
+        Surface
+
+        Raises
+        ------
+        InputError
+            The letters have no facet at this spacing.
         """
         x, y = _rasterize_letters(text, height, spacing)
         if x.size == 0:

@@ -48,6 +48,11 @@ def build_relay_wall(name: str, points: int = 64, width: float = 2.0) -> FloatAr
     (rows, columns, 3) array
         m; x to the right, y down, z towards the hidden scene. Points in the gap between the plates
         are NaN.
+
+    Raises
+    ------
+    InputError
+        There is no such wall, too few points, or no width.
     """
     if name not in WALLS:
         raise InputError(f"no wall is called '{name}'; choose one of {', '.join(WALLS)}")

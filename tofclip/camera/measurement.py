@@ -51,6 +51,11 @@ def measure(
     dark : float, optional
         Dark level in counts; by default `estimate_dark_level` of the picture.
 
+    Returns
+    -------
+    Measurement
+        Measurements (slit pixels, rows) float32 and their mask.
+
     Raises
     ------
     CalibrationError
@@ -142,6 +147,11 @@ class Rectifier:
             Counts; by default `estimate_dark_level` of the picture.
         delay : float
             Rows by which this shot's light comes later than the camera's calibration says.
+
+        Returns
+        -------
+        Measurement
+            Measurements (slit pixels, rows) float32 and their mask.
 
         Raises
         ------

@@ -208,6 +208,11 @@ class Camera(Storable):
             -a/d``).
         dtype : dtype
             float32 or float64.
+
+        Returns
+        -------
+        LineProjection
+            (rows, columns) pictures to (slit pixels,) vectors.
         """
         return LineProjection(
             self.image_shape,

@@ -119,6 +119,10 @@ def decode_itex(data: bytes, path: str | Path = "ITEX picture") -> ItexImage:
     path : path-like
         Where they come from, for messages.
 
+    Returns
+    -------
+    ItexImage
+
     Raises
     ------
     FileFormatError

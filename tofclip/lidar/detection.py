@@ -76,6 +76,10 @@ class Detection:
             Its brightness with the fall-off with range undone.
         pulse_width : float
             Instants that differ by less than this, s, are the same.
+
+        Returns
+        -------
+        (n,) bool array
         """
         if pixel.size == 0:
             return np.zeros(0, dtype=bool)

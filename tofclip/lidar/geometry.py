@@ -58,6 +58,10 @@ def distort_directions(
     coefficients : (5,) array
         k1, k2, p1, p2, k3 of D. C. Brown, "Close-range camera calibration", Photogramm. Eng. 37,
         855 (1971).
+
+    Returns
+    -------
+    right, down : (n,) float64 array
     """
     k1, k2, p1, p2, k3 = coefficients
     square = right**2 + down**2

@@ -61,6 +61,15 @@ def find_objects(cloud: PointCloud, reach: float, min_points: int = 40) -> list[
     reach : float
     min_points : int
         Smaller groups are left out.
+
+    Returns
+    -------
+    list of DetectedObject
+
+    Raises
+    ------
+    InputError
+        The reach is not positive, or an object may have no point.
     """
     if not (np.isfinite(reach) and reach > 0) or min_points < 1:
         raise InputError("objects need a positive reach, and at least one point")

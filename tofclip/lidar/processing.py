@@ -86,6 +86,17 @@ def transform_cloud(cloud: PointCloud, pose: ArrayLike) -> PointCloud:
     cloud : PointCloud
     pose : (4, 4) array
         Extrinsics: rotation and translation (m) from the camera's frame to the other.
+
+    Returns
+    -------
+    PointCloud
+
+    Raises
+    ------
+    ShapeError
+        The pose is not (4, 4).
+    InputError
+        It has a scale or a mirror.
     """
     matrix = np.asarray(pose, dtype=np.float64)
     if matrix.shape != (4, 4):
@@ -148,6 +159,15 @@ def remove_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float =
     neighbours : int
     deviations : float
         Standard deviations above the mean from which a point counts as an outlier.
+
+    Returns
+    -------
+    PointCloud
+
+    Raises
+    ------
+    InputError
+        There is no neighbour to ask, or the number of deviations is not positive.
     """
     if neighbours < 1 or not deviations > 0:
         raise InputError("outliers need at least one neighbour and a positive number of deviations")
@@ -195,6 +215,16 @@ def fit_plane(cloud: PointCloud, reach: float, seed: int = 0) -> Plane:
     reach : float
         Points within so many metres lie on the plane.
     seed : int
+
+    Returns
+    -------
+    Plane
+        Its points lie at ``normal . x = distance``, m.
+
+    Raises
+    ------
+    InputError
+        There are fewer than three points, or the reach is not positive.
     """
     if len(cloud) < 3 or not reach > 0:
         raise InputError("a plane needs at least three points and a positive reach")
@@ -224,6 +254,17 @@ def align_clouds(
         Largest distance of points that may belong together, m.
     start : (4, 4) array, optional
         First guess of the pose.
+
+    Returns
+    -------
+    Alignment
+        Pose (4, 4) from source to target, fraction of matched points, and their root mean square
+        distance, m.
+
+    Raises
+    ------
+    InputError
+        A cloud has fewer than three points, or the reach is not positive.
     """
     if min(len(source), len(target)) < 3 or not reach > 0:
         raise InputError(

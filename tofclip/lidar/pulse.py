@@ -86,6 +86,10 @@ class Pulse:
         decay : float
             Time constant of the exponential, s.
 
+        Returns
+        -------
+        Pulse
+
         Raises
         ------
         InputError

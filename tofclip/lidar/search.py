@@ -90,6 +90,10 @@ class ReturnSearch:
         provenance : mapping, optional
             How they came about.
 
+        Returns
+        -------
+        tofclip.lidar.Returns
+
         Notes
         -----
         Memory: 128 traces a thread, and 100 bytes a pixel.
@@ -204,6 +208,11 @@ def depth(
         Takes the place of the camera inside `frames`.
     detection, pulse
         As for `ReturnSearch`.
+
+    Returns
+    -------
+    tofclip.lidar.Returns
+        Range in m, intensity, and the range's standard deviation in m.
 
     Raises
     ------

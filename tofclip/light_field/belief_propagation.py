@@ -39,6 +39,13 @@ def find_smooth_labels(
     -------
     (rows, columns) array of whole numbers
 
+    Raises
+    ------
+    ShapeError
+        The costs have not three dimensions.
+    InputError
+        A cost is not finite, or the smoothness is negative.
+
     Notes
     -----
     Memory is ten times that of `costs` in float32.

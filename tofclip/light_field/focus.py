@@ -136,6 +136,15 @@ def estimate_depth_from_focus(
     smoothness : float
         Price of two neighbours being one picture apart, relative to a textured pixel being out of
         focus.
+
+    Returns
+    -------
+    (rows, columns) int64 array
+
+    Raises
+    ------
+    InputError
+        The pictures have no texture.
     """
     from scipy.ndimage import gaussian_filter
 

@@ -168,6 +168,15 @@ def corrupt_measurement(
         Photons of the largest reading; None: no noise.
     bad_fraction : float
         Between 0 and 1.
+
+    Returns
+    -------
+    ClipMeasurement
+
+    Raises
+    ------
+    InputError
+        The fraction is outside 0 to 1, or the number of photons is not positive.
     """
     if not 0 <= bad_fraction <= 1:
         raise InputError(f"the share of bad readings must lie between 0 and 1, got {bad_fraction}")

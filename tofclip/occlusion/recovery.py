@@ -82,6 +82,11 @@ def build_occluded_model(
         Pixels that the occluder fills in the reference view.
     shears : (float, float)
         Of occluder and target, pixels per view step.
+
+    Returns
+    -------
+    LinearOperator
+        (rows, columns) pictures of the target to (measurements,) vectors.
     """
     near, far = shears
     camera, array = rig.camera, rig.array
@@ -109,6 +114,11 @@ def separate_occluder(
     measurements : TimedReadings
     weight : float
         Of total variation, relative to the largest value of A'f.
+
+    Returns
+    -------
+    SeparatedImages
+        Where there is a single return the target's pictures are zero.
 
     Raises
     ------

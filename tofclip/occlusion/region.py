@@ -71,6 +71,11 @@ class InactiveRegion:
             Of a view on the aperture, m from the axis.
         across, behind : arrays
             A point: m from the axis, and m behind the occluder. All three are broadcast.
+
+        Returns
+        -------
+        bool array
+            Of the broadcast shape.
         """
         behind = np.asarray(behind, np.float64)
         passed = np.asarray(across) * self.distance + np.asarray(place) * behind

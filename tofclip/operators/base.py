@@ -235,6 +235,10 @@ def estimate_squared_norm(operator: LinearOperator, iterations: int = 30, seed: 
     seed : int
         Of the random start.
 
+    Returns
+    -------
+    float
+
     Raises
     ------
     InputError

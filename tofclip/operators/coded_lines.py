@@ -109,6 +109,11 @@ def make_coded_line(
     -------
     (rows, columns) array
         Its sum is 1.
+
+    Raises
+    ------
+    InputError
+        The line is wider than the picture, or lies flat.
     """
     rows, columns = shape
     if not 1 <= width_px <= columns:

@@ -41,6 +41,11 @@ def recover_segments(
     progress : callable
         Called with the number of frame iterations just done.
 
+    Returns
+    -------
+    Result
+        Frames (frames, rows, columns).
+
     Notes
     -----
     Memory: the frames, and one operator at a time.

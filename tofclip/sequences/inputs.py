@@ -80,6 +80,10 @@ def list_shots(source: str | Path, bin_width: float | None = None) -> dict[str, 
     bin_width : float, optional
         Duration of a row, s; overrides time axes.
 
+    Returns
+    -------
+    dict of str to Shot
+
     Raises
     ------
     InputError, StorageError, FileFormatError

@@ -120,6 +120,10 @@ class RangingPipeline:
             Defaults to the one that the shot carries.
         focus : Focus
 
+        Returns
+        -------
+        RangingPipeline
+
         Raises
         ------
         MissingTimeAxisError, InputError, CalibrationError
@@ -269,6 +273,10 @@ def make_clouds(
         Whether to find how late each shot comes against the first one, and take it off.
     first : int
         Number of the first cloud wanted: a sequence that was interrupted goes on there.
+
+    Yields
+    ------
+    SequenceCloud
 
     Raises
     ------

@@ -25,6 +25,10 @@ def expand_sweep(
     values : mapping of str to sequence of str
         Values of ``method``, ``iterations``, ``weight`` and ``focus``.
 
+    Returns
+    -------
+    dict of str to RecoverySettings
+
     Raises
     ------
     InputError

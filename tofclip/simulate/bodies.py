@@ -244,6 +244,10 @@ class Lambertian:
             Of the surface, length 1; of the rays towards it, any length.
         light : (3,) array
             Towards the lamp, length 1.
+
+        Returns
+        -------
+        (points,) array
         """
         lit: Array = AMBIENT_FRACTION + (1 - AMBIENT_FRACTION) * np.maximum(normal @ light, 0)
         return self.reflectance(place) * lit

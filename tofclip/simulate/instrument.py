@@ -63,6 +63,12 @@ class StreakDetector:
         signal : (rows, columns) array
             Expected signal, photons.
         noise : numpy.random.Generator
+
+        Returns
+        -------
+        counts : float32 array
+            Photons, none above full scale.
+        saturated : bool array
         """
         photons = noise.poisson(signal + self.background_photons)
         saturated = photons >= self.full_scale_photons

@@ -133,6 +133,15 @@ def make_text_pattern(
         Reflectances; a paper of NaN leaves letters that are cut out.
     margin : float
         Share of the rectangle left free at each side.
+
+    Returns
+    -------
+    (rows, columns) float32 array
+
+    Raises
+    ------
+    InputError
+        A line has no letter.
     """
     lines = text.split("\n")
     if not all(line.strip() for line in lines):

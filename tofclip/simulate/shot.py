@@ -52,6 +52,11 @@ def simulate_shot(scene: Scene, instrument: Instrument, seed: int) -> SimulatedS
     seed : int
         Of the photon noise; the same seed gives the same shot.
 
+    Returns
+    -------
+    SimulatedShot
+        Streak image, camera, ground truth, and expected photons (rows, columns).
+
     Raises
     ------
     InputError

@@ -59,8 +59,8 @@ def choose_weight(
     (eight-fold cross-validation).
 
     No noise level and no true picture are needed, which is why this is taken instead of the
-    discrepancy principle or SURE: what F(d) cannot explain (surfaces out of focus) is not noise of a
-    known strength, and generalised cross-validation takes it for signal. Trials go downhill from
+    discrepancy principle or SURE: what F(d) cannot explain (surfaces out of focus) is not noise of
+    a known strength, and generalised cross-validation takes it for signal. Trials go downhill from
     the first weight until the minimum is bracketed; a parabola in the weight's logarithm refines
     it.
 
@@ -77,6 +77,15 @@ def choose_weight(
         that single ones would be predicted by their neighbours' errors.
     seed : int
         Of the assignment.
+
+    Returns
+    -------
+    WeightChoice
+
+    Raises
+    ------
+    InputError
+        There is a single measurement, or the arrays are not NumPy's.
     """
     require_numpy("the choice of a prior's weight", measurements)
     held = assign_folds(measurements.size, run, seed)

@@ -49,6 +49,15 @@ class LinearInverse:
         operator : SparseMatrix
         alive : (measurements,) bool array, optional
             False for measurements that are never to be trusted.
+
+        Returns
+        -------
+        PreparedInverse
+
+        Raises
+        ------
+        InputError
+            The operator is not a sparse matrix, or the damping is not positive.
         """
         import scipy.linalg
 
@@ -145,6 +154,11 @@ class PreparedInverse:
         measurements : (measurements, frames) array
         progress : callable
             Called with the number of frames just done.
+
+        Returns
+        -------
+        Result
+            Frames (frames, rows, columns).
         """
         measurements = validate_measurements(self.operator, measurements, None)
         if not is_numpy(measurements):

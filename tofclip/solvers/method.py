@@ -215,6 +215,11 @@ class Method(Protocol):
             False where a measurement must not be trusted.
         progress : callable
             Called with the number of frame iterations just done.
+
+        Returns
+        -------
+        Result
+            Frames (frames, rows, columns) and how they came about.
         """
         ...
 

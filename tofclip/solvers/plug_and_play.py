@@ -168,6 +168,10 @@ def solve_data_step(
     coupling : float
     iterations : int
         Of conjugate gradients; ten leave 1 % of the first gradient at the couplings in use.
+
+    Returns
+    -------
+    (rows, columns) array
     """
     predicted = operator(anchor)[:, np.newaxis]
     weights = misfit.weights(predicted)[:, 0]

@@ -88,6 +88,10 @@ def fit_parallax_to_shears(
         Metres.
     weight : (n,) array, optional
 
+    Returns
+    -------
+    Parallax
+
     Raises
     ------
     CalibrationError
@@ -119,6 +123,15 @@ def fit_parallax_to_centres(
         0-based slit columns of the views' optical axes.
     distances : (n,) array
         Metres.
+
+    Returns
+    -------
+    Parallax
+
+    Raises
+    ------
+    ShapeError
+        The centres are not (views, distances).
     """
     centres = np.asarray(centres_px, dtype=np.float64)
     if centres.ndim != 2 or centres.shape[0] != camera.views:
@@ -158,6 +171,15 @@ def find_sharpest_shears(
         Evenly spaced, pixels per view step.
     progress : callable
         Called with the number of frame iterations just done.
+
+    Returns
+    -------
+    FocusCurve
+
+    Raises
+    ------
+    InputError
+        There are fewer than two finite shears.
     """
     tried = np.asarray(shears, dtype=np.float64)
     if tried.ndim != 1 or tried.size < 2 or not np.all(np.isfinite(tried)):

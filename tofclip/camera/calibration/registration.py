@@ -65,6 +65,11 @@ def register_views(
         Coarse calibration: centres within about a pixel, skew within a few rows.
     progress : callable
         Called with the number of frame iterations just done.
+
+    Returns
+    -------
+    Registration
+        The best camera of all rounds, and the residual of each.
     """
     start, residuals, best = camera, [], (np.inf, camera)
     for last in [False] * ROUND_COUNT + [True]:

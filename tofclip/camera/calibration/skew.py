@@ -50,6 +50,11 @@ def estimate_skew(counts: NDArray[np.float32], camera: Camera) -> SkewEstimate:
     camera : Camera
         Its centres say where the views are; the view whose position is nearest 0 is the reference.
 
+    Returns
+    -------
+    SkewEstimate
+        Offsets in rows and stretches, and each view's correlation with the reference view.
+
     Raises
     ------
     CalibrationError

@@ -58,6 +58,10 @@ def measure_accuracy(
     seed : int
         Of the photons' chance and of the detector's, independent of each other.
 
+    Returns
+    -------
+    Accuracy
+
     Raises
     ------
     InputError
@@ -99,6 +103,11 @@ def draw_histograms(
     photons, background : float
         Expected photons of a return, and of the background in each bin.
     noise : numpy.random.Generator
+
+    Returns
+    -------
+    (n, bins) float64 array
+        Photons.
     """
     shape = detector.shape
     share = shape(detector.times - arrival[:, np.newaxis]) * detector.bin_width / shape.area

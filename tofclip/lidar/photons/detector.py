@@ -177,6 +177,11 @@ class PhotonDetector:
         seed : int
             Of the chance that decides scores exactly at the threshold.
 
+        Returns
+        -------
+        Arrivals
+            Range in m, photons, and the range's Cramer-Rao deviation in m.
+
         Raises
         ------
         ShapeError, InputError
@@ -239,6 +244,11 @@ class PhotonDetector:
             Bins of the returns.
         numbers : (n,) array
             How many of them there are.
+
+        Returns
+        -------
+        Arrivals
+            Range in m, photons, and the range's Cramer-Rao deviation in m.
         """
         from tofclip.lidar.photons.kernels import fit_histograms
 

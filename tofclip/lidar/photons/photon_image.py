@@ -70,6 +70,10 @@ class PhotonImage:
         bin_width : float
             Duration of a bin, s.
 
+        Returns
+        -------
+        PhotonImage
+
         Raises
         ------
         ShapeError, InputError
@@ -117,6 +121,10 @@ class PhotonImage:
             Duration of a bin, s.
         bins : int, optional
             Bins of the time axis; by default up to the latest photon.
+
+        Returns
+        -------
+        PhotonImage
 
         Raises
         ------

@@ -283,6 +283,10 @@ def choose_label_axis(photons: PhotonImage, scene: Scene) -> LabelAxis:
     ----------
     photons : PhotonImage
     scene : Scene
+
+    Returns
+    -------
+    LabelAxis
     """
     pixels = photons.offsets.size - 1
     coarse = max(1, round(scene.response.width / LABELS_PER_WIDTH))
@@ -341,6 +345,10 @@ def compute_scores(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> NDArr
     photons : PhotonImage
     scene : Scene
     axis : LabelAxis
+
+    Returns
+    -------
+    (pixels, labels) float32 array
     """
     shares, first = scene.response.coarse_shares(axis.coarse)
     odds = scene.count_signal(photons) * shares / (scene.background * axis.coarse)
@@ -615,6 +623,11 @@ def estimate_bias(fitted: FloatArray, nested: FloatArray, reach: int) -> FloatAr
         Fits of `reach` and of half of it; see `fit_surface`.
     reach : int
         In pixels.
+
+    Returns
+    -------
+    (rows, columns) float64 array
+        Bins squared.
     """
     apart = (fitted[..., 0] - nested[..., 0]) ** 2
     wide, narrow = fitted[..., 1] ** 2, nested[..., 1] ** 2

@@ -29,6 +29,10 @@ def run_jobs(
     on_report : callable, optional
         Called in this thread with the report of each job as it comes.
 
+    Returns
+    -------
+    Summary
+
     Notes
     -----
     A job whose worker dies (killed, out of memory, power failure) is given to another. One that

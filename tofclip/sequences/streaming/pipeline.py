@@ -62,6 +62,10 @@ def stream_clouds(
     policy : "block" or "drop_oldest"
         What happens when shots come faster than the clouds are taken; see `run_stages`.
 
+    Yields
+    ------
+    StreamedCloud
+
     Raises
     ------
     Whatever reading a shot or making its cloud raises, once the clouds before it have been yielded.

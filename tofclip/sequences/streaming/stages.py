@@ -78,6 +78,10 @@ def run_stages(
         ``"block"`` lets the source wait: nothing is lost of a file, and an instrument's own buffer
         fills up. ``"drop_oldest"`` keeps the latency low.
 
+    Yields
+    ------
+    StreamItem
+
     Raises
     ------
     Whatever the source or a stage raises, once everything before it has been yielded.

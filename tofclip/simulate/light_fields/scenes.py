@@ -167,6 +167,15 @@ def edit_scene(scene: Scene, edit: str) -> Scene:
     scene : Scene
     edit : str
         ``original``, ``shift``, ``flip`` or ``rotate``.
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    InputError
+        There is no such edit.
     """
     if edit not in EDITS:
         raise InputError(f"unknown edit '{edit}'; take one of {', '.join(EDITS)}")
