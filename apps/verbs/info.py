@@ -14,6 +14,7 @@ from apps.report import report, to_json_value
 from devices.recording.reader import read_head_if_recording
 from tofclip.errors import FileFormatError
 from tofclip.io import read_streak
+from tofclip.io.photons import describe_photons
 from tofclip.lidar import PointCloud
 from tofclip.storage import Record, translate_read_errors
 
@@ -35,11 +36,24 @@ def info(
 
     Example: tofclip info frames.h5
     """
-    found = to_json_value({"file": file, **_describe_record(_read_record(file))})
+    found = to_json_value({"file": file, **_describe_file(file)})
     if as_json:
         report(found, as_json)
     else:
         print("\n".join(_format_tree(found)))
+
+
+def _describe_file(file: Path) -> dict[str, Any]:
+    """Describe our own records and streak images by their values, counted photons by their
+    arrays.
+    """
+    try:
+        return _describe_record(_read_record(file))
+    except FileFormatError as refusal:
+        try:
+            return describe_photons(file)
+        except FileFormatError:
+            raise refusal from None
 
 
 def _read_record(file: Path) -> Record:

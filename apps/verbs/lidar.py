@@ -18,6 +18,7 @@ from apps.progress import show_progress
 from apps.report import report
 from apps.sequences import report_summary, run_with_progress
 from apps.verbs.cloud import require_format
+from apps.verbs.photons import photons
 from tofclip.camera import Camera
 from tofclip.camera.calibration.parallax import GATE_METHOD
 from tofclip.errors import InputError
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from tofclip.sequences.jobs import Report
 
 app = typer.Typer()
+app.command()(photons)
 
 
 @app.callback(invoke_without_command=True)

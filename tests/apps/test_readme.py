@@ -31,6 +31,14 @@ def write_light_field(path: Path) -> None:
     np.savez(path, lf=np.tile(card, (8, 8, 1, 1)), scale=1 / 65535, v=steps, u=steps)
 
 
+def write_photons(path: Path) -> None:
+    """A wall at bin 60, 5 signal photons a pixel."""
+    noise = np.random.default_rng(0)
+    cube = noise.poisson(0.05, (24, 32, 150))
+    cube[..., 57:64] += noise.poisson(0.7, (24, 32, 7))
+    np.save(path, cube.astype(np.uint8))
+
+
 def test_the_walk_through(
     run: Run, files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -41,9 +49,10 @@ def test_the_walk_through(
     shutil.copy(files / "streak.h5", tmp_path / "shot.tif")
     shutil.copy(files / "wall.h5", tmp_path / "wall.npz")
     write_light_field(tmp_path / "light_field.npz")
+    write_photons(tmp_path / "cube.npy")
     monkeypatch.chdir(tmp_path)
     walk = commands("tofclip ")
-    assert len(walk) == 19
+    assert len(walk) == 20
     for command in walk:
         outcome = run(*shlex.split(command)[1:])
         assert (outcome.status, outcome.err) == (0, ""), command
@@ -56,6 +65,7 @@ def test_the_walk_through(
         "run.h5",
         "photons.h5",
         "photons.ply",
+        "range.npz",
     } <= {path.name for path in tmp_path.iterdir()}
 
 

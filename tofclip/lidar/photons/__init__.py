@@ -14,7 +14,7 @@ from tofclip.lidar.photons.limits import compute_range_bound
 from tofclip.lidar.photons.photon_image import PhotonImage
 from tofclip.lidar.photons.pile_up import correct_pile_up
 from tofclip.lidar.photons.smoothing import Smoothness, locate_with_smoothness
-from tofclip.lidar.photons.surface import SurfaceImage, estimate_surface
+from tofclip.lidar.photons.surface import SurfaceImage, estimate_pixels, estimate_surface
 
 __all__ = [
     "Accuracy",
@@ -25,6 +25,7 @@ __all__ = [
     "SurfaceImage",
     "compute_range_bound",
     "correct_pile_up",
+    "estimate_pixels",
     "estimate_surface",
     "locate_with_smoothness",
     "measure_accuracy",

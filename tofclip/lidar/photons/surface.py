@@ -12,19 +12,23 @@ outlier come from the data: a part of the photons is held back, and what explain
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, uniform_filter, uniform_filter1d
 from scipy.optimize import minimize
 
+from tofclip.camera import Camera
 from tofclip.lidar.photons import surface_kernels as kernels
+from tofclip.lidar.photons.detector import PhotonDetector
 from tofclip.lidar.photons.photon_image import FloatArray, PhotonImage
 from tofclip.lidar.photons.response import BinnedResponse, learn_response, measure_pulse_width
 from tofclip.lidar.pulse import Pulse
-from tofclip.threads import run_blocks
+from tofclip.lidar.returns import Returns
+from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
 HELD_OUT_FRACTION = 0.25
@@ -63,7 +67,7 @@ MIN_TILE_SIGNIFICANCE = 5.0
 """Standard deviations above the background at which a tile of the picture says that some surface
 lies at an instant."""
 
-PIXELS_PER_BLOCK, ROWS_PER_BLOCK = 1 << 14, 16
+PIXELS_PER_BLOCK, ROWS_PER_BLOCK, DETECTED_PIXELS_PER_BLOCK = 1 << 14, 16, 1 << 10
 SIGNAL_POOL_PX = 5
 MIN_SIGNAL_PHOTONS = 0.05
 BACKGROUND_QUANTILE, BACKGROUND_GROUPS = 0.2, 64
@@ -104,6 +108,42 @@ class SurfaceImage:
     outlier_probability: FloatArray
     pulse: Pulse
     settings: dict[str, float | str]
+
+    def to_returns(
+        self, focal_length_px: float, provenance: Mapping[str, Any] | None = None
+    ) -> Returns:
+        """List the pixels with a range, as seen by a pinhole camera.
+
+        Parameters
+        ----------
+        focal_length_px : float
+            Distance of the pinhole from the picture, in pixels; the optical axis meets pixel
+            ``(rows // 2, columns // 2)``.
+        provenance : mapping, optional
+            How they came about.
+        """
+        rows, columns = self.range.shape
+        pinhole = Camera(
+            np.array([columns / 2]),
+            np.zeros(1),
+            (rows, columns),
+            columns,
+            pulse_fwhm=self.pulse.fwhm,
+            focal_length_px=focal_length_px,
+        )
+        y, x = np.nonzero(np.isfinite(self.range))
+        distance = self.range[y, x]
+        return Returns(
+            y=y.astype(np.int32),
+            x=x.astype(np.int32),
+            range=distance,
+            intensity=(self.intensity[y, x] * distance**2).astype(np.float32),
+            confidence=self.range_sigma[y, x].astype(np.float32),
+            return_number=np.ones(y.size, np.uint8),
+            time=2 * distance / SPEED_OF_LIGHT,
+            camera=pinhole,
+            provenance={} if provenance is None else provenance,
+        )
 
 
 @dataclass(frozen=True)
@@ -257,6 +297,57 @@ def estimate_surface(
             "jump_cost": slope_cost * JUMP_COST_RATIO,
             "reach_px": reach,
             "response_sigma_m": systematic * to_range,
+        },
+    )
+
+
+def estimate_pixels(
+    photons: PhotonImage, pulse: Pulse | None = None, false_alarm_rate: float = 0.01
+) -> SurfaceImage:
+    """Find the strongest return of every pixel by its own photons alone.
+
+    Parameters
+    ----------
+    photons : PhotonImage
+    pulse : Pulse, optional
+        Shape of a return; by default as wide as pairs of photons say.
+    false_alarm_rate : float
+        Share of the pixels without a return in which one is announced; see `PhotonDetector`.
+
+    Returns
+    -------
+    SurfaceImage
+        NaN where no return stands out. The probability of an outlier is that of a false alarm.
+
+    Raises
+    ------
+    InputError
+        No pulse is given and none can be recognised, or the time axis is shorter than two pulses.
+    """
+    shape = Pulse.gaussian(measure_pulse_width(photons)) if pulse is None else pulse
+    detector = PhotonDetector(shape, photons.bin_width, photons.bins, false_alarm_rate)
+    pixels = photons.offsets.size - 1
+    found = np.full((3, pixels), np.nan)
+    for piece in split_blocks(pixels, DETECTED_PIXELS_PER_BLOCK):
+        arrivals = detector.locate(photons.histograms(piece), seed=piece.start)
+        found[:, piece] = (
+            arrivals.range[:, 0],
+            arrivals.confidence[:, 0],
+            arrivals.photons[:, 0],
+        )
+    distance, sigma, signal = found.reshape(3, *photons.image_shape)
+    seen = np.isfinite(distance)
+    false_share = min(false_alarm_rate * pixels / max(int(seen.sum()), 1), 1.0)
+    return SurfaceImage(
+        range=distance,
+        range_sigma=sigma,
+        intensity=signal,
+        outlier_probability=np.where(seen, false_share, np.nan),
+        pulse=detector.shape,
+        settings={
+            "response": "learnt" if pulse is None else "given",
+            "pulse_fwhm_ps": detector.shape.fwhm * 1e12,
+            "false_alarm_rate": false_alarm_rate,
         },
     )
 

@@ -1,0 +1,201 @@
+"""`tofclip lidar photons`: counted photons of a picture to its ranges."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+
+from apps.figures.photons import make_range_figure
+from apps.figures.style import save_figure
+from apps.files import PICTURE_SUFFIXES, build_provenance, require_writable
+from apps.options import JsonOption
+from apps.report import report
+from apps.verbs.cloud import CLOUD_SUFFIXES, DEPTH_SUFFIX
+from tofclip.errors import InputError
+from tofclip.io.photons import read_photons
+from tofclip.lidar import Pulse, point_cloud, save_depth
+from tofclip.lidar.photons import SurfaceImage, estimate_pixels, estimate_surface
+from tofclip.storage import atomic_path
+from tofclip.units import NANOSECOND, PICOSECOND, SPEED_OF_LIGHT
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from typing import Any
+
+RANGE_IMAGE_SUFFIX = ".npz"
+DEFAULT_FIELD_OF_VIEW_DEG = 30.0
+
+
+def photons(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="Counted photons: .npy, .npz, .mat, HDF5, multi-page TIFF, .ptu or .sdt; a cube of counts, a list of "
+            "photon times for each pixel, or events x, y, time.",
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="FILE",
+            help="Ends in .npz for a range image, in .ply, .pcd, .csv, .las, .laz or .h5 for a point cloud, in .exr "
+            "for a depth picture, in .png, .pdf or .svg for a drawing.",
+        ),
+    ],
+    bin_width_ps: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PS",
+            help="Duration of a bin, or unit of the photon times.",
+            show_default="the file's",
+        ),
+    ] = None,
+    pulse_ps: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PS",
+            help="Full width at half maximum of the pulse; its shape is learnt if the photons show another one.",
+            show_default="learnt",
+        ),
+    ] = None,
+    pulse: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="NPY",
+            help="Measured response: its brightness in successive bins; its highest bin is the arrival.",
+            show_default="learnt",
+        ),
+    ] = None,
+    axes: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ORDER", help="Order of a cube's axes, e.g. tyx.", show_default="recognised"
+        ),
+    ] = None,
+    focal_length_px: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PX", help="Of the pinhole camera.", show_default="from the field of view"
+        ),
+    ] = None,
+    field_of_view_deg: Annotated[
+        float,
+        typer.Option(metavar="DEG", help="Width of the picture, in place of a focal length."),
+    ] = DEFAULT_FIELD_OF_VIEW_DEG,
+    time_zero_ns: Annotated[
+        float,
+        typer.Option(metavar="NS", help="When light of range 0 arrives, after the first bin."),
+    ] = 0.0,
+    single_pixel: Annotated[
+        bool, typer.Option("--single-pixel", help="Judge every pixel by its own photons alone.")
+    ] = False,
+    returns: Annotated[
+        int, typer.Option(metavar="N", help="Surfaces looked for in each pixel.")
+    ] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the surface that counted photons show, with the deviation of every range.
+
+    Pulse, background and how far neighbours help each other are found from the photons.
+
+    Example: tofclip lidar photons cube.npy --bin-width-ps 80 --pulse-ps 400 --out range.npz
+    """
+    started = time.perf_counter()
+    suffix = out.suffix.lower()
+    require_writable(
+        out, *CLOUD_SUFFIXES, DEPTH_SUFFIX, *PICTURE_SUFFIXES, inputs=_list_inputs(file, pulse)
+    )
+    if pulse is not None and pulse_ps is not None:
+        raise InputError("give the pulse's width (--pulse-ps) or its shape (--pulse), not both")
+    if returns < 1:
+        raise InputError(f"at least one return is looked for in a pixel, got --returns {returns}")
+    if not 0 < field_of_view_deg < 180 or (focal_length_px is not None and not focal_length_px > 0):
+        raise InputError("the focal length must be positive, the field of view within 0..180")
+    width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
+    image = read_photons(file, width, axes)
+    shape = _load_pulse(pulse, image.bin_width)
+    if pulse_ps is not None:
+        shape = Pulse.gaussian(pulse_ps * PICOSECOND)
+    found = (
+        estimate_pixels(image, shape)
+        if single_pixel
+        else estimate_surface(image, shape, learn=pulse is None)
+    )
+    shift = SPEED_OF_LIGHT / 2 * time_zero_ns * NANOSECOND
+    found = replace(found, range=found.range - shift)
+    columns = image.image_shape[1]
+    focal = focal_length_px or columns / 2 / np.tan(np.deg2rad(field_of_view_deg) / 2)
+    settings = {
+        "bin_width_ps": image.bin_width / PICOSECOND,
+        "bins": image.bins,
+        "image_shape": list(image.image_shape),
+        "focal_length_px": float(focal),
+        "time_zero_ns": time_zero_ns,
+        "single_pixel": single_pixel,
+        "returns": returns,
+        **found.settings,
+    }
+    past = build_provenance({"verb": "lidar photons", **settings}, *_list_inputs(file, pulse))
+    if suffix == RANGE_IMAGE_SUFFIX:
+        save_range_image(found, out)
+    elif suffix in PICTURE_SUFFIXES:
+        save_figure(make_range_figure(found), out)
+    elif suffix == DEPTH_SUFFIX:
+        save_depth(found.to_returns(float(focal), past), out)
+    else:
+        point_cloud(found.to_returns(float(focal), past)).save(out)
+    seen = np.isfinite(found.range)
+    report(_make_figures(found, seen, time.perf_counter() - started, settings), as_json, [out])
+
+
+def _list_inputs(file: Path, pulse: Path | None) -> tuple[Path, ...]:
+    return (file,) if pulse is None else (file, pulse)
+
+
+def _make_figures(
+    found: SurfaceImage, seen: np.ndarray[Any, Any], seconds: float, settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    return {
+        "pixels": seen.size,
+        "coverage": float(seen.mean()),
+        "returns": int(seen.sum()),
+        "outlier_share": float(found.outlier_probability[seen].mean()) if seen.any() else 0.0,
+        "seconds": seconds,
+        "settings": dict(settings),
+    }
+
+
+def _load_pulse(path: Path | None, bin_width: float) -> Pulse | None:
+    """Read a measured response, one value for each bin."""
+    if path is None:
+        return None
+    try:
+        samples = np.load(path, mmap_mode="r", allow_pickle=False)
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror or fault}") from fault
+    except Exception as fault:  # whatever the decoder stumbles over
+        raise InputError(f"{path}: is not a NumPy file with the pulse's bins") from fault
+    if samples.ndim != 1 or samples.dtype.kind not in "uif" or not 3 <= samples.size <= 1 << 20:
+        raise InputError(f"{path}: must hold one number for each bin, found {samples.shape}")
+    bright = np.asarray(samples, dtype=np.float64)
+    return Pulse(bright, bin_width, float(np.argmax(bright)))
+
+
+def save_range_image(found: SurfaceImage, path: Path) -> None:
+    """Write ranges, deviations, photons and outlier probabilities to an NPZ file, whole or not at
+    all.
+    """
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(
+            file,
+            range_m=found.range,
+            range_sigma_m=found.range_sigma,
+            intensity=found.intensity,
+            outlier_probability=found.outlier_probability,
+        )

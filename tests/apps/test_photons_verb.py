@@ -1,0 +1,96 @@
+"""`tofclip lidar photons`: from a file of counted photons to ranges, clouds and pictures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_instrument import Run
+
+from tofclip.lidar import PointCloud
+from tofclip.units import SPEED_OF_LIGHT
+
+BIN = 80e-12
+BIN_M = SPEED_OF_LIGHT / 2 * BIN
+KEYS = ["pixels", "coverage", "returns", "outlier_share", "seconds", "settings"]
+FIELDS = {"range_m", "range_sigma_m", "intensity", "outlier_probability"}
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """A ball before a wall, 6 signal photons a pixel and as many of the background."""
+    noise = np.random.default_rng(0)
+    y, x = np.mgrid[:40, :56]
+    surface = np.where(np.hypot(y - 20, x - 25) < 12, 60.0, 140 + 0.3 * x)
+    cube = noise.poisson(6 / 200, (40, 56, 200))
+    number = noise.poisson(6, surface.size)
+    pixel = np.repeat(np.arange(surface.size), number)
+    time = np.rint(surface.ravel()[pixel] + noise.normal(0, 2.1, pixel.size)).astype(int)
+    np.add.at(cube.reshape(-1, 200), (pixel, time), 1)
+    path = tmp_path_factory.mktemp("photons") / "ball.npy"
+    np.save(path, cube.astype(np.uint8))
+    return path, surface
+
+
+def test_a_range_image_with_deviations(run: Run, shot, tmp_path: Path) -> None:
+    path, surface = shot
+    out = tmp_path / "range.npz"
+    words = ["--bin-width-ps", "80", "--pulse-ps", "400", "--json"]
+    outcome = run("lidar", "photons", str(path), "--out", str(out), *words)
+    assert (outcome.status, outcome.err) == (0, "")
+    figures = json.loads(outcome.out)
+    assert list(figures) == KEYS
+    assert (figures["pixels"], figures["coverage"], figures["returns"]) == (2240, 1.0, 2240)
+    with np.load(out) as written:
+        assert set(written) == FIELDS
+        assert all(written[name].shape == (40, 56) for name in FIELDS)
+        assert np.mean(np.abs(written["range_m"] / BIN_M - surface) < 3) > 0.97
+        assert np.median(written["range_sigma_m"]) < BIN_M
+
+
+def test_clouds_pictures_and_single_pixels(run: Run, shot, tmp_path: Path) -> None:
+    path, surface = shot
+    for name in ("cloud.ply", "picture.png"):
+        outcome = run(
+            "lidar", "photons", str(path), "--out", str(tmp_path / name), "--bin-width-ps", "80"
+        )
+        assert (outcome.status, outcome.err) == (0, "")
+    cloud = PointCloud.load(tmp_path / "cloud.ply")
+    assert len(cloud) == surface.size
+    # The pixel in the middle looks straight ahead.
+    assert np.min(np.hypot(cloud.xyz[:, 0], cloud.xyz[:, 1])) < 1e-3
+    assert (tmp_path / "picture.png").stat().st_size > 1000
+    alone = tmp_path / "alone.npz"
+    words = ["--bin-width-ps", "80", "--pulse-ps", "400", "--single-pixel"]
+    assert run("lidar", "photons", str(path), "--out", str(alone), *words).status == 0
+    with np.load(alone) as written:
+        seen = np.isfinite(written["range_m"])
+        error = np.abs(written["range_m"] / BIN_M - surface)[seen]
+    assert 0.3 < seen.mean() < 1
+    assert np.mean(error < 5) > 0.95
+
+
+def test_what_is_missing_is_asked_for(run: Run, shot, tmp_path: Path) -> None:
+    path, _ = shot
+    out = str(tmp_path / "range.npz")
+    for words, needed in (
+        ([], "--bin-width-ps"),
+        (["--bin-width-ps", "80", "--axes", "abc"], "yxt"),
+        (["--bin-width-ps", "80", "--pulse-ps", "9", "--pulse", str(path)], "not both"),
+        (["--bin-width-ps", "80", "--pulse", str(path)], "one number for each bin"),
+        (["--bin-width-ps", "80", "--returns", "0"], "--returns"),
+    ):
+        outcome = run("lidar", "photons", str(path), "--out", out, *words)
+        assert outcome.status == 2
+        assert needed in outcome.err
+        assert outcome.err.count("\n") == 1
+
+
+def test_info_says_what_a_file_of_photons_holds(run: Run, shot) -> None:
+    outcome = run("info", str(shot[0]), "--json")
+    assert (outcome.status, outcome.err) == (0, "")
+    found = json.loads(outcome.out)
+    assert (found["kind"], found["layout"]) == ("photons", "cube")
+    assert found["arrays"] == {"array": "40 x 56 x 200 uint8"}

@@ -1,0 +1,214 @@
+"""Counted photons in every layout that is read, and files that claim more than they hold."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+import tifffile
+
+from tofclip.errors import FileFormatError, InputError, StorageError
+from tofclip.io.photons import describe_photons, read_photons
+
+BIN = 80e-12
+ROWS, COLUMNS, BINS = 6, 8, 40
+
+
+@pytest.fixture(scope="module")
+def counts() -> np.ndarray:
+    """A wall at bin 20 of a picture, on a weak background."""
+    noise = np.random.default_rng(0)
+    cube = noise.poisson(0.05, (ROWS, COLUMNS, BINS))
+    cube[..., 19:22] += noise.poisson(2, (ROWS, COLUMNS, 3))
+    return cube.astype(np.uint16)
+
+
+def write_cells(cube: np.ndarray) -> np.ndarray:
+    cells = np.empty(cube.shape[:2], dtype=object)
+    for y, x in np.ndindex(cells.shape):
+        cells[y, x] = np.repeat(np.arange(BINS), cube[y, x]).astype(np.uint16)[:, np.newaxis]
+    return cells
+
+
+def write_npy(path: Path, cube: np.ndarray) -> None:
+    np.save(path, cube)
+
+
+def write_npz(path: Path, cube: np.ndarray) -> None:
+    np.savez_compressed(path, counts=cube, bin_width_ps=80.0)
+
+
+def write_events(path: Path, cube: np.ndarray) -> None:
+    y, x, t = (np.repeat(part, cube[cube > 0]) for part in np.nonzero(cube))
+    np.savez(path, y=y, x=x, time=t * BIN, bin_width_s=BIN)
+
+
+def write_mat(path: Path, cube: np.ndarray) -> None:
+    scipy.io.savemat(path, {"cube": cube}, do_compression=True)
+
+
+def write_mat_cells(path: Path, cube: np.ndarray) -> None:
+    scipy.io.savemat(path, {"Ts": write_cells(cube)})
+
+
+def write_mat73_cells(path: Path, cube: np.ndarray) -> None:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        cells = write_cells(cube).T
+        references = np.empty(cells.shape, dtype=h5py.ref_dtype)
+        for place in np.ndindex(cells.shape):
+            made = file.create_dataset(f"#refs#/{place[0]}_{place[1]}", data=cells[place].T)
+            references[place] = made.ref
+        table = file.create_dataset("Ts", data=references, dtype=h5py.ref_dtype)
+        table.attrs["MATLAB_class"] = np.bytes_("cell")
+    with open(path, "r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file")
+
+
+def write_hdf5(path: Path, cube: np.ndarray) -> None:
+    with h5py.File(path, "w") as file:
+        made = file.create_dataset("shot/histogram", data=cube, compression="gzip")
+        made.attrs["bin_width_s"] = BIN
+
+
+def write_tiff(path: Path, cube: np.ndarray) -> None:
+    tifffile.imwrite(path, np.moveaxis(cube, 2, 0), photometric="minisblack")
+
+
+WRITERS = {
+    "a.npy": write_npy,
+    "a.npz": write_npz,
+    "events.npz": write_events,
+    "a.mat": write_mat,
+    "cells.mat": write_mat_cells,
+    "cells73.mat": write_mat73_cells,
+    "a.h5": write_hdf5,
+    "a.tif": write_tiff,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_layout_gives_the_same_photons(name, counts, tmp_path) -> None:
+    path = tmp_path / name
+    WRITERS[name](path, counts)
+    photons = read_photons(path, BIN)
+    assert photons.image_shape == (ROWS, COLUMNS)
+    assert photons.bin_width == BIN
+    found = photons.histograms(slice(0, ROWS * COLUMNS))
+    np.testing.assert_array_equal(found, counts.reshape(-1, BINS)[:, : photons.bins])
+    described = describe_photons(path)
+    assert described["kind"] == "photons"
+    assert described["layout"] in ("cube", "cells", "events")
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.h5", "events.npz"])
+def test_the_files_own_bin_width_is_recognised(name, counts, tmp_path) -> None:
+    WRITERS[name](tmp_path / name, counts)
+    assert read_photons(tmp_path / name).bin_width == pytest.approx(BIN)
+
+
+def test_without_a_bin_width_one_is_asked_for(counts, tmp_path) -> None:
+    np.save(tmp_path / "a.npy", counts)
+    with pytest.raises(InputError, match="--bin-width-ps"):
+        read_photons(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("axes", ["yxt", "tyx", "xyt", "ytx", "txy", "xty"])
+def test_axes_in_any_order(axes, counts, tmp_path) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, np.transpose(counts, ["yxt".index(axis) for axis in axes]))
+    photons = read_photons(path, BIN, axes)
+    np.testing.assert_array_equal(
+        photons.histograms(slice(0, ROWS * COLUMNS)), counts.reshape(-1, BINS)
+    )
+    if axes.index("y") < axes.index("x"):  # a mirrored picture cannot be recognised
+        assert read_photons(path, BIN).image_shape == (ROWS, COLUMNS)
+
+
+def test_time_is_recognised_by_its_peak_where_it_is_not_the_longest(tmp_path) -> None:
+    cube = np.full((30, 50, 20), 1)
+    cube[..., 7] = 50
+    np.save(tmp_path / "a.npy", np.moveaxis(cube, 2, 0))
+    assert read_photons(tmp_path / "a.npy", BIN).image_shape == (30, 50)
+    np.save(tmp_path / "flat.npy", np.ones((20, 20, 20), int))
+    with pytest.raises(InputError, match="--axes"):
+        read_photons(tmp_path / "flat.npy", BIN)
+    with pytest.raises(InputError, match="yxt"):
+        read_photons(tmp_path / "flat.npy", BIN, "yx")
+
+
+def refuse(path: Path, match: str) -> None:
+    with pytest.raises((FileFormatError, InputError), match=match):
+        read_photons(path, BIN)
+
+
+def test_what_has_no_suitable_layout_is_told_which_would_do(tmp_path) -> None:
+    np.save(tmp_path / "flat.npy", np.zeros((3, 4)))
+    refuse(tmp_path / "flat.npy", "cube of counts")
+    np.savez(tmp_path / "two.npz", a=np.ones((2, 3, 4)), b=np.ones((2, 3, 4)))
+    refuse(tmp_path / "two.npz", "several cubes")
+    np.save(tmp_path / "objects.npy", np.array([None, 1], dtype=object), allow_pickle=True)
+    refuse(tmp_path / "objects.npy", "cube of counts")
+    (tmp_path / "text.txt").write_text("no photons")
+    refuse(tmp_path / "text.txt", "cube of counts")
+    (tmp_path / "empty.npy").touch()
+    refuse(tmp_path / "empty.npy", "empty")
+    with pytest.raises(StorageError):
+        read_photons(tmp_path / "absent.npy", BIN)
+
+
+def make_npy_header(shape: tuple[int, ...]) -> bytes:
+    buffer = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        buffer, {"descr": "<u2", "fortran_order": False, "shape": shape}
+    )
+    return buffer.getvalue()
+
+
+def test_small_files_that_claim_terabytes_are_refused(tmp_path) -> None:
+    header = make_npy_header((1 << 14, 1 << 14, 1 << 12))
+    (tmp_path / "a.npy").write_bytes(header)
+    refuse(tmp_path / "a.npy", "claims")
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("counts.npy", header + bytes(1 << 20))
+    refuse(tmp_path / "a.npz", "claims")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("counts", (1 << 14, 1 << 14, 1 << 12), "u2", chunks=(64, 64, 64))
+    refuse(tmp_path / "a.h5", "claims")
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file.create_dataset("counts", (64, 64, 4096), "u2", chunks=(64, 64, 64))
+    refuse(tmp_path / "b.h5", "claims")
+
+
+def test_links_out_of_a_file_are_not_followed(counts, tmp_path) -> None:
+    write_hdf5(tmp_path / "a.h5", counts)
+    with h5py.File(tmp_path / "link.h5", "w") as file:
+        file["counts"] = h5py.ExternalLink("a.h5", "shot/histogram")
+        file["again"] = h5py.SoftLink("/counts")
+    refuse(tmp_path / "link.h5", "no photons")
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_damaged_files_are_refused_in_one_line(name, counts, tmp_path) -> None:
+    path = tmp_path / name
+    WRITERS[name](path, counts)
+    whole, noise = path.read_bytes(), np.random.default_rng(1)
+    lines: list[str] = []
+    for trial in range(60):
+        damaged = bytearray(whole)
+        if trial % 3:
+            for place in noise.integers(0, len(whole), 8):
+                damaged[place] = noise.integers(0, 256)
+        else:
+            del damaged[int(noise.integers(0, len(whole))) :]
+        path.write_bytes(damaged)
+        try:
+            read_photons(path, BIN, "yxt")
+        except (FileFormatError, InputError, StorageError) as fault:
+            lines.append(str(fault))
+    assert len(lines) > 10
+    assert not any("\n" in line for line in lines)

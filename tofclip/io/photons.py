@@ -1,0 +1,503 @@
+"""Read counted photons, whichever program wrote them: cubes of counts, lists of photon times for
+every pixel, and events.
+
+What a file holds is listed before a value is read, so that a damaged or malicious header costs no
+memory: a size is believed only if the file can hold it and if it stays below `MAX_ARRAY_BYTES`.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import FileFormatError, InputError, MissingDependencyError, TofclipError
+from tofclip.io.mat import list_mat_variables
+from tofclip.lidar.photons import PhotonImage
+from tofclip.storage import HDF5_SIGNATURE, format_error_line, translate_read_errors
+
+MAX_ARRAY_BYTES = 1 << 32
+"""4 GiB: an array that claims more is not read."""
+
+MAX_DEFLATE_RATIO = 1032
+"""No stream of zlib's grows by more."""
+
+MAX_SCALAR_BYTES = 1 << 10
+MIN_CONCENTRATION_RATIO = 1.3
+MIN_LENGTH_RATIO = 1.25
+MAX_SECONDS = 1e-3
+"""s; photon times that are all shorter and not whole are seconds, others are numbers of bins."""
+
+SUITABLE = (
+    "a cube of counts (y, x, t), a list of photon times for each pixel (cells (y, x)), or events "
+    "x, y, time would do"
+)
+CUBE_NAMES = ("counts", "histogram", "histograms", "cube", "photons", "spad", "data")
+TIME_NAMES = ("time", "t", "bin", "tof", "times")
+BIN_WIDTH_NAMES = {
+    "bin_width_s": 1.0,
+    "bin_width_ns": 1e-9,
+    "bin_width_ps": 1e-12,
+    "resolution_s": 1.0,
+    "resolution_ps": 1e-12,
+}
+PhotonReader = Callable[[Path], "PhotonFile"]
+
+
+@dataclass(frozen=True)
+class ArrayEntry:
+    """An array in a file that has not been read yet.
+
+    Parameters
+    ----------
+    name : str
+    shape : tuple of int
+    type : str
+        Of its values; ``cell`` for lists of different length.
+    load : callable
+        Reads the values.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    type: str
+    load: Callable[[], NDArray[Any]]
+
+    @property
+    def length(self) -> tuple[int, ...]:
+        """The shape without axes of length one."""
+        return tuple(n for n in self.shape if n != 1)
+
+
+@dataclass(frozen=True)
+class PhotonFile:
+    """What a file says it holds.
+
+    Parameters
+    ----------
+    arrays : sequence of ArrayEntry
+    bin_width : float or None
+        Duration of a bin, s, where the file says it.
+    axes : str
+        Order of the axes of a cube where the format says it.
+    """
+
+    arrays: Sequence[ArrayEntry]
+    bin_width: float | None = None
+    axes: str = ""
+
+
+def read_photons(
+    path: str | Path, bin_width: float | None = None, axes: str | None = None
+) -> PhotonImage:
+    """Read the photons that every pixel of a picture counted.
+
+    Parameters
+    ----------
+    path : path-like
+        ``.npy``; ``.npz``; ``.mat`` (version 5 and 7.3); HDF5; multi-page TIFF; ``.ptu`` and
+        ``.sdt`` images. A cube of counts with axes in any order, a cell array with the photon times
+        of each pixel, or one-dimensional arrays x, y and time.
+    bin_width : float, optional
+        Duration of a bin, or unit of the photon times, s; overrides the file's own.
+    axes : str, optional
+        Order of a cube's axes, such as ``"yxt"`` or ``"txy"``; by default the axis along which
+        light is most concentrated, or the longest, is time.
+
+    Returns
+    -------
+    PhotonImage
+
+    Raises
+    ------
+    StorageError
+        The file is absent or may not be read.
+    FileFormatError
+        It is damaged, claims more than it can hold, or has no suitable layout.
+    InputError
+        The bin width or the order of the axes is neither given nor recognised.
+    MissingDependencyError
+        The library for its format is not installed.
+    """
+    source = Path(path)
+    if axes is not None and sorted(axes) != ["t", "x", "y"]:
+        raise InputError(f"axes are an order of y, x and t such as yxt, got '{axes}'")
+    opened = open_photons(source)
+    width = opened.bin_width if bin_width is None else bin_width
+    if width is None:
+        raise InputError(f"{source}: does not say how long a bin lasts; give --bin-width-ps")
+    try:
+        return _read_layout(opened, source, width, axes)
+    except TofclipError:
+        raise
+    except Exception as fault:  # whatever the decoder stumbles over, it is the file that is damaged
+        raise FileFormatError(source, f"is damaged ({format_error_line(fault)})") from fault
+
+
+def describe_photons(path: str | Path) -> dict[str, Any]:
+    """Return what a file of photons holds, without reading its values.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Raises
+    ------
+    StorageError, FileFormatError
+        See `read_photons`.
+    """
+    opened = open_photons(Path(path))
+    layout = _find_layout(opened, Path(path))
+    found: dict[str, Any] = {"kind": "photons", "layout": layout[0]}
+    if opened.bin_width is not None:
+        found["bin_width_s"] = opened.bin_width
+    if opened.axes:
+        found["axes"] = opened.axes
+    found["arrays"] = {
+        entry.name: f"{' x '.join(map(str, entry.shape))} {entry.type}" for entry in opened.arrays
+    }
+    return found
+
+
+def open_photons(path: Path) -> PhotonFile:
+    """List the arrays of a file by the reader that its first bytes or its name ask for."""
+    with translate_read_errors(path), open(path, "rb") as file:
+        start = file.read(520)
+    if not start:
+        raise FileFormatError(path, "is empty")
+    reader = READERS_BY_SUFFIX.get(path.suffix.lower())
+    for signature, known in READERS_BY_SIGNATURE.items():
+        if start.startswith(signature):
+            reader = known
+    if start[512:520] == HDF5_SIGNATURE:
+        reader = _open_hdf5
+    if reader is None:
+        raise FileFormatError(
+            path, f"is not NPY, NPZ, MAT, HDF5, TIFF, PTU or SDT with photons; {SUITABLE}"
+        )
+    try:
+        return reader(path)
+    except TofclipError:
+        raise
+    except Exception as fault:  # whatever the decoder stumbles over, it is the file that is damaged
+        raise FileFormatError(path, f"is damaged ({format_error_line(fault)})") from fault
+
+
+def _find_layout(opened: PhotonFile, path: Path) -> tuple[str, list[ArrayEntry]]:
+    """Choose the arrays that hold the photons."""
+    cubes = [entry for entry in opened.arrays if len(entry.length) == 3 and entry.type != "cell"]
+    named = [entry for entry in cubes if entry.name.rpartition("/")[2].lower() in CUBE_NAMES]
+    cells = [entry for entry in opened.arrays if entry.type == "cell" and len(entry.shape) == 2]
+    if len(named) == 1 or len(cubes) == 1:
+        return "cube", [named[0] if len(named) == 1 else cubes[0]]
+    if not cubes and len(cells) == 1:
+        return "cells", cells
+    flat = {entry.name.lower(): entry for entry in opened.arrays if len(entry.length) == 1}
+    times = [flat[name] for name in TIME_NAMES if name in flat]
+    if not cubes and not cells and times and "x" in flat and "y" in flat:
+        return "events", [flat["y"], flat["x"], times[0]]
+    held = ", ".join(f"{entry.name} {entry.shape}" for entry in opened.arrays[:6]) or "no arrays"
+    problem = "several cubes of photons" if len(cubes) > 1 else "no photons"
+    raise FileFormatError(path, f"holds {problem} ({held}); {SUITABLE}")
+
+
+def _read_layout(opened: PhotonFile, path: Path, bin_width: float, axes: str | None) -> PhotonImage:
+    layout, arrays = _find_layout(opened, path)
+    if layout == "cube":
+        cube = np.squeeze(arrays[0].load())
+        if cube.dtype.kind not in "uifb":
+            raise FileFormatError(path, f"its cube holds {cube.dtype}, not counts; {SUITABLE}")
+        order = axes or opened.axes or recognise_axes(cube, path)
+        return PhotonImage.from_cube(
+            np.transpose(cube, [order.index(axis) for axis in "yxt"]), bin_width
+        )
+    if layout == "cells":
+        cells = arrays[0].load()
+        lists = [np.asarray(cell).ravel() for cell in cells.ravel()]
+        pixel = np.repeat(np.arange(len(lists)), [one.size for one in lists])
+        times = np.concatenate(lists) if pixel.size else np.zeros(0)
+        rows, columns = cells.shape
+    else:
+        y, x, times = (np.squeeze(entry.load()) for entry in arrays)
+        if not y.shape == x.shape == times.shape or min(y.min(), x.min()) < 0:
+            raise FileFormatError(path, "its x, y and time are not lists of the same events")
+        rows, columns = int(y.max()) + 1, int(x.max()) + 1
+        if rows * columns > MAX_ARRAY_BYTES // 64:
+            raise FileFormatError(path, f"claims a picture of {rows} x {columns} pixels")
+        pixel = y.astype(np.int64) * columns + x.astype(np.int64)
+    if times.dtype.kind not in "uif":
+        raise FileFormatError(path, f"its photon times are {times.dtype}, not numbers")
+    seconds = times.dtype.kind == "f" and times.size and 0 < np.max(times) < MAX_SECONDS
+    number = times / bin_width if seconds else times
+    if number.size and np.max(number) > MAX_ARRAY_BYTES // 64:
+        raise InputError(f"{path}: its photons come as late as bin {np.max(number):.3g}")
+    return PhotonImage.from_events(pixel, number, (rows, columns), bin_width)
+
+
+def recognise_axes(cube: NDArray[Any], path: Path) -> str:
+    """Say which axis of a cube is time: the one along which light is most concentrated, else the
+    longest.
+
+    Parameters
+    ----------
+    cube : three-dimensional array
+    path : Path
+        For the message.
+
+    Raises
+    ------
+    InputError
+        Neither tells.
+    """
+    concentration = []
+    for axis in range(3):
+        others = tuple(other for other in range(3) if other != axis)
+        profile = cube.sum(axis=others, dtype=np.float64)
+        total = profile.sum()
+        concentration.append(float(profile.size * (profile**2).sum() / max(total**2, 1e-300)))
+    by_light, by_length = np.argsort(concentration)[::-1], np.argsort(cube.shape)[::-1]
+    excess = [concentration[n] - 1 for n in by_light]
+    if (
+        concentration[by_light[0]] > MIN_CONCENTRATION_RATIO
+        and excess[0] > MIN_CONCENTRATION_RATIO * excess[1]
+    ):
+        time = int(by_light[0])
+    elif cube.shape[by_length[0]] > MIN_LENGTH_RATIO * cube.shape[by_length[1]]:
+        time = int(by_length[0])
+    else:
+        raise InputError(
+            f"{path}: its shape {cube.shape} does not say which axis is time; give --axes, e.g. yxt"
+        )
+    return {0: "tyx", 1: "ytx", 2: "yxt"}[time]
+
+
+def _require_size(path: Path, name: str, size: int, held: int) -> None:
+    """Refuse an array whose size in bytes the `held` bytes of its file cannot give."""
+    if size > MAX_ARRAY_BYTES:
+        raise FileFormatError(
+            path, f"'{name}' claims {size} bytes, more than the {MAX_ARRAY_BYTES} that are read"
+        )
+    if size > held:
+        raise FileFormatError(path, f"is truncated or damaged: '{name}' claims {size} bytes")
+
+
+def _open_npy(path: Path) -> PhotonFile:
+    with open(path, "rb") as file:
+        shape, dtype = _read_npy_header(file)
+        start = file.tell()
+    _require_size(path, "array", math.prod(shape) * dtype.itemsize, path.stat().st_size - start)
+
+    def load() -> NDArray[Any]:
+        return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+
+    return PhotonFile([ArrayEntry("array", shape, str(dtype), load)])
+
+
+def _read_npy_header(file: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    version = np.lib.format.read_magic(file)
+    read = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
+    shape, _, dtype = read(file)
+    if dtype.hasobject:
+        raise ValueError(f"Python objects in a NumPy file; {SUITABLE}")
+    return shape, dtype
+
+
+def _open_npz(path: Path) -> PhotonFile:
+    arrays, scalars = [], {}
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            if not entry.filename.endswith(".npy"):
+                continue
+            name = entry.filename[:-4]
+            with archive.open(entry) as file:
+                shape, dtype = _read_npy_header(file)
+                size = math.prod(shape) * dtype.itemsize
+                held = min(entry.file_size, MAX_DEFLATE_RATIO * entry.compress_size)
+                _require_size(path, name, size, held)
+                if not shape and dtype.kind in "uif" and size <= MAX_SCALAR_BYTES:
+                    scalars[name] = float(np.frombuffer(file.read(size), dtype)[0])
+
+            def load(entry: zipfile.ZipInfo = entry) -> NDArray[Any]:
+                with zipfile.ZipFile(path) as again, again.open(entry) as opened:
+                    return np.asarray(
+                        np.lib.format.read_array(io.BytesIO(opened.read()), allow_pickle=False)
+                    )
+
+            if shape:
+                arrays.append(ArrayEntry(name, shape, str(dtype), load))
+    return PhotonFile(arrays, _find_bin_width(scalars))
+
+
+def _find_bin_width(scalars: Mapping[str, Any]) -> float | None:
+    for name, unit in BIN_WIDTH_NAMES.items():
+        if name in scalars and np.size(scalars[name]) == 1:
+            value = float(np.asarray(scalars[name]).ravel()[0]) * unit
+            if math.isfinite(value) and value > 0:
+                return value
+    return None
+
+
+def _open_mat(path: Path) -> PhotonFile:
+    """Version 5; version 7.3 is HDF5."""
+    arrays, scalars = [], {}
+    for variable in list_mat_variables(path):
+        if variable.name in BIN_WIDTH_NAMES and math.prod(variable.shape) == 1:
+            scalars[variable.name] = variable.load()
+        else:
+            kind = "cell" if variable.is_cell else "number"
+            arrays.append(ArrayEntry(variable.name, variable.shape, kind, variable.load))
+    return PhotonFile(arrays, _find_bin_width(scalars))
+
+
+def _open_hdf5(path: Path) -> PhotonFile:
+    import h5py
+
+    arrays, scalars = [], {}
+    with h5py.File(path, "r") as file:
+        scalars.update(file.attrs)
+        for name, dataset in _iterate_datasets(file):
+            scalars.update(dataset.attrs)
+            is_cell = dataset.dtype.kind == "O" and dataset.attrs.get("MATLAB_class") == b"cell"
+            if dataset.size == 1 and dataset.dtype.kind in "uif":
+                scalars[name.rpartition("/")[2]] = dataset[()]
+            elif dataset.shape and (is_cell or dataset.dtype.kind in "uif"):
+                size = dataset.size * dataset.dtype.itemsize
+                held = dataset.id.get_storage_size()
+                _require_size(path, name, size, held * (MAX_DEFLATE_RATIO if dataset.chunks else 1))
+                # MATLAB counts its axes from the other end.
+                matlab = "MATLAB_class" in dataset.attrs
+                shape = dataset.shape[::-1] if matlab else dataset.shape
+                kind = "cell" if is_cell else str(dataset.dtype)
+                arrays.append(ArrayEntry(name, shape, kind, _make_hdf5_loader(path, name, matlab)))
+    return PhotonFile(arrays, _find_bin_width(scalars))
+
+
+def _iterate_datasets(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the datasets of a file that lie in it: links to elsewhere are not followed."""
+    import h5py
+
+    for name in group:
+        if name == "#refs#" or not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            continue
+        item = group[name]
+        if isinstance(item, h5py.Dataset):
+            if not item.external:
+                yield prefix + name, item
+        elif isinstance(item, h5py.Group) and prefix.count("/") < 8:
+            yield from _iterate_datasets(item, f"{prefix}{name}/")
+
+
+def _make_hdf5_loader(path: Path, name: str, matlab: bool) -> Callable[[], NDArray[Any]]:
+    def load() -> NDArray[Any]:
+        import h5py
+
+        with h5py.File(path, "r") as file:
+            values = file[name][()]
+            if values.dtype.kind == "O":
+                total, cells = 0, np.empty(values.shape, dtype=object)
+                for place in np.ndindex(values.shape):
+                    cell = file[values[place]]
+                    total += cell.size * cell.dtype.itemsize
+                    _require_size(path, name, total, path.stat().st_size * MAX_DEFLATE_RATIO)
+                    empty = bool(cell.attrs.get("MATLAB_empty", 0))
+                    cells[place] = np.zeros(0, np.uint8) if empty else cell[()]
+                values = cells
+            ordered: NDArray[Any] = values.T if matlab else values
+            return ordered
+
+    return load
+
+
+def _open_tiff(path: Path) -> PhotonFile:
+    import tifffile
+
+    with tifffile.TiffFile(path) as tiff:
+        series = tiff.series[0]
+        if len(series.shape) != 3 or series.dtype is None:
+            raise FileFormatError(
+                path, f"holds pictures of shape {series.shape}, not one page for each bin (t, y, x)"
+            )
+        packed = sum(sum(page.databytecounts) for page in series.pages if page is not None)
+        ratio = 1 if series.keyframe.compression == 1 else MAX_DEFLATE_RATIO
+        held = min(packed, path.stat().st_size) * ratio
+        _require_size(path, "pictures", math.prod(series.shape) * series.dtype.itemsize, held)
+        shape, kind = tuple(series.shape), str(series.dtype)
+
+    def load() -> NDArray[Any]:
+        with tifffile.TiffFile(path) as again:
+            return np.asarray(again.series[0].asarray())
+
+    return PhotonFile([ArrayEntry("pages", shape, kind, load)], axes="tyx")
+
+
+def _open_ptu(path: Path) -> PhotonFile:
+    """PicoQuant's images: markers make lines and frames; frames and channels are summed."""
+    ptufile = _import_library("ptufile")
+    with ptufile.PtuFile(path) as file:
+        if not file.is_image or not file.is_t3:
+            raise FileFormatError(
+                path,
+                "holds no image in T3 mode; tofclip recover reads lone pixels (file://run.ptu)",
+            )
+        _, rows, columns, _, bins = file.shape
+        _require_size(path, "image", rows * columns * bins * 4, MAX_ARRAY_BYTES)
+        width = float(file.tcspc_resolution)
+
+    def load() -> NDArray[Any]:
+        with ptufile.PtuFile(path) as again:
+            cube = again.decode_image(frame=-1, channel=-1, dtype=np.uint32)
+        summed: NDArray[Any] = np.asarray(cube).sum(axis=(0, 3), dtype=np.uint32)
+        return summed
+
+    return PhotonFile([ArrayEntry("image", (rows, columns, bins), "uint32", load)], width, "yxt")
+
+
+def _open_sdt(path: Path) -> PhotonFile:
+    """Becker & Hickl's images."""
+    sdtfile = _import_library("sdtfile")
+    _require_size(path, "image", path.stat().st_size, MAX_ARRAY_BYTES)
+    with sdtfile.SdtFile(path) as file:
+        blocks = [np.asarray(block) for block in file.data]
+        times = [np.asarray(axis) for axis in file.times]
+    images = [n for n, block in enumerate(blocks) if block.ndim == 3]
+    if not images:
+        raise FileFormatError(path, "holds no image, only single histograms; " + SUITABLE)
+    first = images[0]
+    image, width = blocks[first], float(times[first][1] - times[first][0])
+    entry = ArrayEntry("image", image.shape, str(image.dtype), lambda: image)
+    return PhotonFile([entry], width, "yxt")
+
+
+def _import_library(name: str) -> Any:
+    import importlib
+
+    try:
+        return importlib.import_module(name)
+    except ImportError as fault:
+        raise MissingDependencyError(
+            f"this file needs {name}: pip install 'tofclip[tcspc]'"
+        ) from fault
+
+
+READERS_BY_SIGNATURE: dict[bytes, PhotonReader] = {
+    b"\x93NUMPY": _open_npy,
+    b"PK\x03\x04": _open_npz,
+    b"MATLAB 5": _open_mat,
+    HDF5_SIGNATURE: _open_hdf5,
+    b"II*\0": _open_tiff,
+    b"MM\0*": _open_tiff,
+    b"II+\0": _open_tiff,
+    b"PQTTTR": _open_ptu,
+}
+READERS_BY_SUFFIX: dict[str, PhotonReader] = {".mat": _open_mat, ".sdt": _open_sdt}
