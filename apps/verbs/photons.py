@@ -125,10 +125,11 @@ def photons(
     found = (
         estimate_pixels(image, shape)
         if single_pixel
-        else estimate_surface(image, shape, learn=pulse is None)
+        else estimate_surface(image, shape, learn=pulse is None, max_returns=returns)
     )
     shift = SPEED_OF_LIGHT / 2 * time_zero_ns * NANOSECOND
-    found = replace(found, range=found.range - shift)
+    further = tuple(replace(layer, range=layer.range - shift) for layer in found.further)
+    found = replace(found, range=found.range - shift, further=further)
     columns = image.image_shape[1]
     focal = focal_length_px or columns / 2 / np.tan(np.deg2rad(field_of_view_deg) / 2)
     settings = {
@@ -164,7 +165,7 @@ def _make_figures(
     return {
         "pixels": seen.size,
         "coverage": float(seen.mean()),
-        "returns": int(seen.sum()),
+        "returns": sum(int(np.isfinite(one.range).sum()) for one in (found, *found.further)),
         "outlier_share": float(found.outlier_probability[seen].mean()) if seen.any() else 0.0,
         "seconds": seconds,
         "settings": dict(settings),

@@ -136,3 +136,30 @@ def test_a_recorded_face_is_as_its_long_exposure_shows(shared_data, pulse) -> No
     assert np.mean(np.abs(error) < 12e-3) >= 0.965
     assert np.sqrt(np.mean(error**2)) <= 37e-3
     assert 0.9 <= compute_robust_z(error, found.range_sigma[head]) <= 1.15
+
+
+def test_two_layers_are_both_found_and_none_twice() -> None:
+    noise = np.random.default_rng(4)
+    y, x = np.mgrid[:48, :64]
+    layers = (150 + 0.2 * x, np.where(np.hypot(y - 24, x - 30) < 14, 240 + 0.3 * y, 330.0))
+    pixels, times = [], []
+    for layer in layers:
+        pixel = np.repeat(np.arange(layer.size), noise.poisson(25, layer.size))
+        pixels.append(pixel)
+        times.append(layer.ravel()[pixel] + noise.normal(0, FWHM / BIN / 2.3548, pixel.size))
+    dark = np.repeat(np.arange(layers[0].size), noise.poisson(5, layers[0].size))
+    times.append(noise.uniform(0, 511, dark.size))
+    photons = PhotonImage.from_events(
+        np.concatenate([*pixels, dark]), np.rint(np.concatenate(times)), (48, 64), BIN, 512
+    )
+    found = estimate_surface(photons, Pulse.gaussian(FWHM), max_returns=3)
+    ranges = np.stack([one.range for one in (found, *found.further)]) / BIN_M
+    hits = [np.sum(np.abs(ranges - layer) < 3, axis=0) for layer in layers]
+    assert np.mean((hits[0] > 0) & (hits[1] > 0)) >= 0.85
+    assert np.mean((hits[0] > 1) | (hits[1] > 1)) <= 0.02
+    assert np.mean(np.isfinite(ranges).sum(axis=0) > 2) <= 0.02
+    returns = found.to_returns(60.0)
+    assert len(returns) == np.isfinite(ranges).sum()
+    assert returns.return_number.max() >= 2
+    one_pixel = (returns.y == 24) & (returns.x == 30)
+    assert np.all(np.diff(returns.range[one_pixel]) > 0)

@@ -13,13 +13,14 @@ outlier come from the data: a part of the photons is held back, and what explain
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, uniform_filter, uniform_filter1d
 from scipy.optimize import minimize
+from scipy.stats import poisson
 
 from tofclip.camera import Camera
 from tofclip.lidar.photons import surface_kernels as kernels
@@ -62,6 +63,13 @@ its free shape alone gains some hundred."""
 GATE_WIDTHS = 1.0
 """A neighbour whose surface is further off than this many widths of the response is another's."""
 
+MIN_EXPLAINED_DENSITY = 0.003
+"""Of the response's peak: photons where it is brighter belong to the surface."""
+
+MAX_OWN_CHANCE, MAX_POOLED_CHANCE = 0.02, 1e-4
+"""That the background alone shows as many photons at a further surface, in the pixel and in the
+nine pixels around it."""
+
 TILE_PX = 16
 MIN_TILE_SIGNIFICANCE = 5.0
 """Standard deviations above the background at which a tile of the picture says that some surface
@@ -100,6 +108,8 @@ class SurfaceImage:
         The response that was used, as bins show it.
     settings : mapping
         What was chosen from the data, by name.
+    further : tuple of SurfaceImage
+        Weaker returns of the same pixels, the strongest first; NaN where there is none.
     """
 
     range: FloatArray
@@ -108,6 +118,7 @@ class SurfaceImage:
     outlier_probability: FloatArray
     pulse: Pulse
     settings: dict[str, float | str]
+    further: tuple[SurfaceImage, ...] = ()
 
     def to_returns(
         self, focal_length_px: float, provenance: Mapping[str, Any] | None = None
@@ -131,16 +142,25 @@ class SurfaceImage:
             pulse_fwhm=self.pulse.fwhm,
             focal_length_px=focal_length_px,
         )
-        y, x = np.nonzero(np.isfinite(self.range))
-        distance = self.range[y, x]
+        layers = [self, *self.further]
+        distance = np.stack([layer.range for layer in layers], axis=2).reshape(-1, len(layers))
+        order = np.argsort(distance, axis=1)
+        pixel, nearness = np.nonzero(np.isfinite(np.take_along_axis(distance, order, axis=1)))
+        layer = order[pixel, nearness]
+        sigma, signal = (
+            np.stack([getattr(one, name) for one in layers], axis=2).reshape(distance.shape)
+            for name in ("range_sigma", "intensity")
+        )
+        found = distance[pixel, layer]
+        y, x = np.divmod(pixel, columns)
         return Returns(
             y=y.astype(np.int32),
             x=x.astype(np.int32),
-            range=distance,
-            intensity=(self.intensity[y, x] * distance**2).astype(np.float32),
-            confidence=self.range_sigma[y, x].astype(np.float32),
-            return_number=np.ones(y.size, np.uint8),
-            time=2 * distance / SPEED_OF_LIGHT,
+            range=found,
+            intensity=(signal[pixel, layer] * found**2).astype(np.float32),
+            confidence=sigma[pixel, layer].astype(np.float32),
+            return_number=(nearness + 1).astype(np.uint8),
+            time=2 * found / SPEED_OF_LIGHT,
             camera=pinhole,
             provenance={} if provenance is None else provenance,
         )
@@ -208,6 +228,7 @@ def estimate_surface(
     photons: PhotonImage,
     pulse: Pulse | None = None,
     learn: bool = True,
+    max_returns: int = 1,
     seed: int = 0,
     progress: Callable[[float], object] | None = None,
 ) -> SurfaceImage:
@@ -221,6 +242,8 @@ def estimate_surface(
     learn : bool
         Learn the shape from the photons, and use what was learnt if it explains the photons that
         are held back clearly better than `pulse`.
+    max_returns : int
+        Surfaces looked for in every pixel, one behind the other.
     seed : int
         Of the choice of the photons that are held back.
     progress : callable, optional
@@ -273,32 +296,138 @@ def estimate_surface(
     to_probability = calibrate_outliers(margin.ravel(), evidence)
     report(0.8)
 
-    volume = compute_scores(photons, scene, axis)
-    labels, margin = match_labels(volume, photons.image_shape, slope_cost)
-    del volume
-    nested = fit_surface(photons, scene, axis.to_bins(labels), max(reach // 2, 1))
-    fitted = fit_surface(photons, scene, nested[..., 0], reach)
     systematic = LEARNT_RESPONSE_SIGMA_WIDTHS * scene.response.width if learnt is not None else 0.0
-    # Where no photon is near, the label is all there is.
-    counted = np.minimum(fitted[..., 1], scene.response.width)
-    sigma = np.sqrt(counted**2 + estimate_bias(fitted, nested, reach) + systematic**2)
+    plan = SurfacePlan(axis, slope_cost, reach, systematic, to_probability)
     to_range = SPEED_OF_LIGHT / 2 * photons.bin_width
-    return SurfaceImage(
-        range=fitted[..., 0] * to_range,
-        range_sigma=sigma * to_range,
-        intensity=fitted[..., 2],
-        outlier_probability=to_probability(margin),
-        pulse=scene.response.pulse,
-        settings={
-            "response": "given" if learnt is None else "learnt",
-            "pulse_fwhm_ps": scene.response.pulse.fwhm * 1e12,
-            "background_photons_per_bin": scene.background,
-            "slope_cost": slope_cost,
-            "jump_cost": slope_cost * JUMP_COST_RATIO,
-            "reach_px": reach,
-            "response_sigma_m": systematic * to_range,
-        },
-    )
+    settings: dict[str, float | str] = {
+        "response": "given" if learnt is None else "learnt",
+        "pulse_fwhm_ps": scene.response.pulse.fwhm * 1e12,
+        "background_photons_per_bin": scene.background,
+        "slope_cost": slope_cost,
+        "jump_cost": slope_cost * JUMP_COST_RATIO,
+        "reach_px": reach,
+        "response_sigma_m": systematic * to_range,
+    }
+    layers = [plan.locate(photons, scene)]
+    rest = photons
+    for _ in range(1, max_returns):
+        rest = remove_return(rest, scene, layers[-1])
+        if not rest.bin.size:
+            break
+        layers.append(keep_significant(rest, scene, plan.locate(rest, scene)))
+    return combine_layers(layers, scene, to_range, settings)
+
+
+@dataclass(frozen=True)
+class SurfacePlan:
+    """How the surface of a picture's photons is located, all choices made.
+
+    Parameters
+    ----------
+    axis : LabelAxis
+    slope_cost : float
+        See `match_labels`.
+    reach : int
+        See `fit_surface`.
+    systematic : float
+        Standard deviation that no photons reduce, in bins.
+    to_probability : callable
+        See `calibrate_outliers`.
+    """
+
+    axis: LabelAxis
+    slope_cost: float
+    reach: int
+    systematic: float
+    to_probability: Callable[[NDArray[np.float32]], FloatArray]
+
+    def locate(self, photons: PhotonImage, scene: Scene) -> FloatArray:
+        """Find the strongest surface: (rows, columns, 4) array of instant and deviation in bins,
+        photons, and probability of an outlier.
+        """
+        volume = compute_scores(photons, scene, self.axis)
+        labels, margin = match_labels(volume, photons.image_shape, self.slope_cost)
+        del volume
+        nested = fit_surface(photons, scene, self.axis.to_bins(labels), max(self.reach // 2, 1))
+        fitted = fit_surface(photons, scene, nested[..., 0], self.reach)
+        # Where no photon is near, the label is all there is.
+        counted = np.minimum(fitted[..., 1], scene.response.width)
+        variance = counted**2 + estimate_bias(fitted, nested, self.reach) + self.systematic**2
+        doubt = self.to_probability(margin)
+        return np.stack([fitted[..., 0], np.sqrt(variance), fitted[..., 2], doubt], axis=-1)
+
+
+def remove_return(photons: PhotonImage, scene: Scene, layer: FloatArray) -> PhotonImage:
+    """Leave out the photons that a surface explains better than the background does.
+
+    Parameters
+    ----------
+    photons : PhotonImage
+    scene : Scene
+    layer : (rows, columns, 4) array
+        See `SurfacePlan.locate`.
+    """
+    response = scene.response
+    times = response.start + response.step * np.arange(response.density.size)
+    bright = response.density >= MIN_EXPLAINED_DENSITY * response.density.max()
+    first, last = times[bright][0], times[bright][-1]
+    late = photons.bin - layer[..., 0].ravel()[photons.pixel]
+    outside = ~((late >= first) & (late <= last))
+    return photons.select(photons.count * outside)
+
+
+def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> FloatArray:
+    """Drop a further surface where the background alone would explain its photons.
+
+    Parameters
+    ----------
+    photons : PhotonImage
+        Those that no nearer surface explains.
+    scene : Scene
+    layer : (rows, columns, 4) array
+        See `SurfacePlan.locate`.
+    """
+    reach = 0.5 * scene.response.width + 1
+    late = photons.bin - layer[..., 0].ravel()[photons.pixel]
+    seen = np.bincount(
+        photons.pixel, photons.count * (np.abs(late) <= reach), layer[..., 0].size
+    ).reshape(layer.shape[:2])
+    expected = scene.background * (2 * reach + 1)
+    pooled = uniform_filter(seen, 3, mode="nearest") * 9
+    own = poisson.sf(seen - 1, expected) < MAX_OWN_CHANCE
+    around = poisson.sf(np.rint(pooled) - 1, 9 * expected) < MAX_POOLED_CHANCE
+    return np.where((own & around)[..., np.newaxis], layer, np.nan)
+
+
+def combine_layers(
+    layers: list[FloatArray], scene: Scene, to_range: float, settings: dict[str, float | str]
+) -> SurfaceImage:
+    """Turn the returns found one after the other into images, each pixel's strongest first.
+
+    Parameters
+    ----------
+    layers : list of (rows, columns, 4) arrays
+        See `SurfacePlan.locate`.
+    scene : Scene
+    to_range : float
+        Metres in a bin.
+    settings : mapping
+    """
+    stack = np.stack(layers, axis=2)
+    order = np.argsort(-np.nan_to_num(stack[..., 2], nan=-1.0), axis=2, kind="stable")
+    stack = np.take_along_axis(stack, order[..., np.newaxis], axis=2)
+    images = [
+        SurfaceImage(
+            range=stack[:, :, k, 0] * to_range,
+            range_sigma=stack[:, :, k, 1] * to_range,
+            intensity=stack[:, :, k, 2],
+            outlier_probability=stack[:, :, k, 3],
+            pulse=scene.response.pulse,
+            settings=settings,
+        )
+        for k in range(len(layers))
+    ]
+    return replace(images[0], further=tuple(images[1:]))
 
 
 def estimate_pixels(
