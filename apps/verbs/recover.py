@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -101,6 +102,8 @@ def recover(
     """Recover every transient frame of a raw streak image, or of each one of a sequence.
 
     Where the camera's sweep is not known, skew, gains and centres are found from the shot itself.
+    frames_per_second is the pace of the iterations alone, frames_per_second_overall that of the
+    whole run, from reading the shot to writing the frames.
 
     Of a sequence, what is in the folder already is kept: started again, a run goes on where it
     stopped. Shots that cannot be recovered are listed at the end, and the exit status is 1.
@@ -175,17 +178,19 @@ def _recover_single(
     require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
     if cloud is not None:
         require_writable(cloud, *CLOUD_SUFFIXES, inputs=inputs)
+    started = time.perf_counter()
     task = recovery.prepare_task(_read_shot(*shot))
     with show_progress("recovering", task.work) as advance:
         frames = add_provenance(task.run(advance), task, *inputs)
     frames.save(out)
+    seconds = time.perf_counter() - started
     save_figure(make_preview_figure(task.streak, frames), preview)
     written = [out, preview]
     if cloud is not None:
         points, _ = CloudSettings(device=recovery.device).make_cloud(frames, "the recovered frames")
         points.save(cloud)
         written.append(cloud)
-    _report_frames(frames, as_json, written)
+    _report_frames(frames, seconds, as_json, written)
 
 
 def _is_address(name: str | Path) -> bool:
@@ -201,7 +206,8 @@ def _read_shot(streak: str, bin_width: float | None) -> Streak:
     return read_streak(streak, bin_width)
 
 
-def _report_frames(frames: Frames, as_json: bool, written: list[Path]) -> None:
+def _report_frames(frames: Frames, seconds: float, as_json: bool, written: list[Path]) -> None:
+    """Report a recovery that took `seconds` from reading the shot to writing the frames."""
     known = frames.figures
     report(
         {
@@ -211,7 +217,9 @@ def _report_frames(frames: Frames, as_json: bool, written: list[Path]) -> None:
             "iterations": known["iterations"],
             "relative_residual": known["relative_residual"],
             "seconds": known["seconds"],
+            # of the iterations alone, as for the next shot of a sequence, and of the whole run
             "frames_per_second": known["frames_per_second"],
+            "frames_per_second_overall": frames.values.shape[0] / seconds,
             "view_gains": frames.camera.gains,
             "time_shift_bins": compute_view_delays_bins(frames.camera),
             "stopped_because": known["stopped_because"],

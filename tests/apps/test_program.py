@@ -156,6 +156,40 @@ def test_ctrl_c_during_recovery_leaves_nothing_behind(files: Path, tmp_path: Pat
     assert list(tmp_path.iterdir()) == []
 
 
+def started_elsewhere(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run the installed program's entry point with a folder before all others on the path."""
+    environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+    return subprocess.run(
+        [sys.executable, "-m", "tofclip", *words],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=LONGEST_WAIT_S,
+        check=False,
+    )
+
+
+def test_ctrl_c_while_the_program_starts_shows_no_traceback(tmp_path: Path) -> None:
+    (tmp_path / "typer.py").write_text("raise KeyboardInterrupt\n")
+    done = started_elsewhere(tmp_path, "--version")
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "tofclip: interrupted\n"
+
+
+def test_ctrl_c_while_a_verb_is_imported_shows_no_traceback(tmp_path: Path) -> None:
+    (tmp_path / "h5py.py").write_text("raise KeyboardInterrupt\n")
+    done = started_elsewhere(tmp_path, "info", "absent.h5")
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (130, "", 1)
+
+
+def test_an_unrelated_package_called_apps_does_not_take_its_place(tmp_path: Path) -> None:
+    (tmp_path / "apps").mkdir()
+    (tmp_path / "apps" / "__init__.py").write_text("raise RuntimeError('not this one')\n")
+    done = started_elsewhere(tmp_path, "--version")
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{tofclip.__version__}\n", "")
+
+
 def wait_for(terminal: int, text: str) -> str:
     """Read from a terminal until `text` appears."""
     seen = ""

@@ -86,12 +86,15 @@ class TestRecover:
             "relative_residual",
             "seconds",
             "frames_per_second",
+            "frames_per_second_overall",
             "view_gains",
             "time_shift_bins",
             "stopped_because",
             "device",
         ]
         assert (found["frames"], found["image_shape"], found["method"]) == (ROWS, [32, 32], "tv")
+        assert found["frames_per_second"] > found["frames_per_second_overall"]
+        assert found["frames_per_second_overall"] < ROWS / found["seconds"]
         assert (len(found["view_gains"]), found["time_shift_bins"]) == (7, [0.0] * 7)
         # About 10 photons rms per reading of noise against some 300 of signal, and the prior's
         # bias.

@@ -1,0 +1,40 @@
+"""Start the console program `tofclip`; `python -m tofclip` does the same.
+
+This is in a package of its own name, so that an unrelated package called ``apps`` elsewhere on the
+path cannot take the program's place.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from pathlib import Path
+
+PROGRAM_PACKAGE = "apps"
+EXIT_INTERRUPTED = 130
+
+
+def main() -> int:
+    """Run the program and return its exit status; Ctrl-C ends it in one line even while it starts."""
+    try:
+        _put_own_packages_first()
+        status: int = importlib.import_module(f"{PROGRAM_PACKAGE}.cli").main()
+    except KeyboardInterrupt:
+        print("tofclip: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    return status
+
+
+def _put_own_packages_first() -> None:
+    """Search the folder of this package first if its neighbour would not be found otherwise."""
+    root = Path(__file__).resolve().parents[1]
+    found = importlib.util.find_spec(PROGRAM_PACKAGE)
+    own = root / PROGRAM_PACKAGE / "__init__.py"
+    if found is None or found.origin is None or Path(found.origin).resolve() != own:
+        sys.path.insert(0, str(root))
+        importlib.invalidate_caches()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
