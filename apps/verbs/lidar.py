@@ -93,7 +93,9 @@ def accuracy(
         else Pulse.exponentially_modified(width, decay_ps * PICOSECOND)
     )
     detector = PhotonDetector(pulse, bin_width_ps * PICOSECOND, bins, false_alarm_rate)
-    report(asdict(measure_accuracy(detector, photons, background, trials, seed)), as_json)
+    with show_progress("simulating", max(trials, 1)) as advance:
+        found = measure_accuracy(detector, photons, background, trials, seed, advance)
+    report(asdict(found), as_json)
 
 
 @app.command()

@@ -269,3 +269,29 @@ def test_demo_needs_a_folder_that_it_can_make(run: Run, tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("a file")
     assert_refused(run("demo", "--out", tmp_path / "taken"), "cannot be made")
     assert_refused(run("demo", "--out", tmp_path, "--seed", "-1"), "(see --help)")
+
+
+@pytest.mark.parametrize(
+    ("width", "reason"),
+    [
+        ("1e300", "longer than any sweep"),
+        ("20000", "333 times as long as the pulse (60 ps)"),
+        ("0.001", "shorter than the pulse"),
+    ],
+)
+def test_rows_that_do_not_go_with_the_pulse(
+    run: Run, files: Path, folder: Path, width: str, reason: str
+) -> None:
+    words = ["recover", files / "streak.h5", "--out", folder / "frames.h5"]
+    outcome = run(*words, "--bin-width-ps", width)
+    assert_refused(outcome, reason)
+    assert "--bin-width-ps" in outcome.err
+    assert list(folder.iterdir()) == []
+
+
+def test_a_time_zero_of_the_wrong_sign_is_named(run: Run, files: Path, folder: Path) -> None:
+    words = ["recover", files / "streak.h5", "--out", folder / "frames.h5", "--method", "linear"]
+    assert run(*words, "--time-zero-ns", "5").status == 0
+    outcome = run("cloud", folder / "frames.h5", "--out", folder / "cloud.ply")
+    assert_refused(outcome, "returns have negative ranges (-0.6")
+    assert "check the sign of --time-zero-ns" in outcome.err

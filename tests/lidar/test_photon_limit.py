@@ -304,3 +304,22 @@ def test_unusable_smoothness_is_refused(detector):
             Smoothness(*costs)
     with pytest.raises(ShapeError):
         locate_with_smoothness(detector, np.zeros((4, BINS)))
+
+
+def test_many_trials_are_simulated_in_batches(detector, monkeypatch):
+    """Memory does not grow with the number of trials, and every trial counts."""
+    whole = measure_accuracy(detector, 100, 0.1, trials=300, seed=3)
+    monkeypatch.setattr("tofclip.lidar.photons.accuracy.BINS_PER_BATCH", 128 * detector.bins)
+    done = []
+    largest = []
+    locate = type(detector).locate
+
+    def watched(self, histograms, seed=0):
+        largest.append(len(histograms))
+        return locate(self, histograms, seed)
+
+    monkeypatch.setattr(type(detector), "locate", watched)
+    pieces = measure_accuracy(detector, 100, 0.1, trials=300, seed=3, progress=done.append)
+    assert (done, max(largest)) == ([128, 128, 44], 128)
+    assert pieces.rms_m == pytest.approx(whole.rms_m, rel=0.3)
+    assert pieces.detection_rate == pytest.approx(whole.detection_rate, abs=0.05)

@@ -16,6 +16,7 @@ from tofclip.recovery.plan import (
     make_method,
     prepare_recovery,
     recover,
+    require_plausible_rows,
 )
 
 __all__ = [
@@ -33,4 +34,5 @@ __all__ = [
     "parse_focus",
     "prepare_recovery",
     "recover",
+    "require_plausible_rows",
 ]

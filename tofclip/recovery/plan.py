@@ -27,6 +27,10 @@ from tofclip.solvers import (
     ignore_progress,
 )
 from tofclip.storage import Scalar
+from tofclip.units import PICOSECOND
+
+MAX_ROW_PER_PULSE = 100.0
+"""Longest row, in widths of the pulse: beyond, the unit of one of them is wrong."""
 
 METHODS: dict[str, Callable[..., Method]] = {
     "tv": TotalVariation,
@@ -206,11 +210,41 @@ def prepare_recovery(
         raise InputError(
             f"{streak.source} carries no camera: give one (--camera camera.h5, made by calibrate)"
         )
-    _ = streak.times  # a missing axis is refused before minutes of work
+    require_plausible_rows(streak, camera)  # before minutes of work
     focus = DEFAULT_FOCUS if focus is None else focus
     focus.check_camera(camera)
     solver = make_method(method) if isinstance(method, str) else method
     return RecoveryTask(streak, camera, solver, focus, parse_device(device))
+
+
+def require_plausible_rows(streak: Streak, camera: Camera) -> None:
+    """Refuse a time axis whose rows do not go with the camera's pulse, as of a wrong unit.
+
+    Parameters
+    ----------
+    streak : Streak
+    camera : Camera
+
+    Raises
+    ------
+    MissingTimeAxisError
+        There is no time axis.
+    InputError
+        A row is far longer than the pulse, or all rows together are shorter than it.
+    """
+    times, pulse = streak.times, camera.pulse_fwhm
+    rows = times.size
+    width = (times[-1] - times[0]) / max(rows - 1, 1)
+    if width > MAX_ROW_PER_PULSE * pulse:
+        fault = f"is {width / pulse:.3g} times as long as the pulse"
+    elif 0 < width * rows < pulse:
+        fault = f"is so short that all {rows} rows are shorter than the pulse"
+    else:
+        return
+    raise InputError(
+        f"{streak.source}: a row of {width / PICOSECOND:.4g} ps {fault} ({pulse / PICOSECOND:.3g} ps); "
+        "check the unit of --bin-width-ps, or give the pulse to calibrate (--pulse-ps)"
+    )
 
 
 def fit_camera_to_shot(

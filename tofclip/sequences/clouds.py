@@ -14,6 +14,7 @@ from tofclip.sequences.inputs import make_result_paths
 from tofclip.sequences.jobs import Job, lock_output_folder
 from tofclip.sequences.recovering import normalise_device
 from tofclip.shots import Frames
+from tofclip.units import SPEED_OF_LIGHT
 
 DEPTH_IMAGE_SUFFIX = ".exr"
 
@@ -61,9 +62,7 @@ class CloudSettings:
         with device.activate():
             returns = depth(replace(frames, values=device.put(frames.values)))
         if len(returns) == 0:
-            raise InputError(
-                f"{origin}: no return stands out of the background, so there is no point to write"
-            )
+            raise InputError(f"{origin}: {_explain_empty_cloud(frames)}")
         cloud = replace(point_cloud(returns), provenance=frames.provenance)
         if self.drop_outliers:
             cloud = remove_outliers(cloud)
@@ -97,6 +96,21 @@ class CloudSettings:
             Job(name, paths[name], partial(write_cloud, self, file, paths[name]))
             for name, file in frames.items()
         ]
+
+
+def _explain_empty_cloud(frames: Frames) -> str:
+    """Return why no return with a positive range was found, in a few words."""
+    first, last = frames.times[0], frames.times[-1]
+    if first < 0:
+        # The same search with every time of flight positive shows whether the time zero is wrong.
+        later = depth(replace(frames, times=frames.times - first + (last - first)))
+        if len(later):
+            ranges = later.range - SPEED_OF_LIGHT * (last - 2 * first) / 2
+            return (
+                f"all {len(later)} returns have negative ranges ({ranges.min():.3g} to {ranges.max():.3g} m): "
+                "time zero is later than the light; check the sign of --time-zero-ns"
+            )
+    return "no return stands out of the background, so there is no point to write"
 
 
 def write_cloud(clouds: CloudSettings, frames: Path, result: Path) -> int:

@@ -22,6 +22,9 @@ from tofclip.records import (
 )
 from tofclip.storage import Record
 
+MAX_BIN_WIDTH_S = 1e-3
+"""s; the slowest sweeps of streak cameras last milliseconds in all."""
+
 
 @dataclass(frozen=True)
 class Streak(Storable):
@@ -117,6 +120,10 @@ class Streak(Storable):
         """Return the same picture with evenly spaced rows of `bin_width` seconds, the first at 0."""
         if not (np.isfinite(bin_width) and bin_width > 0):
             raise InputError(f"bin width must be a positive number of seconds, got {bin_width}")
+        if bin_width > MAX_BIN_WIDTH_S:
+            raise InputError(
+                f"a row of {bin_width:.3g} s is longer than any sweep; --bin-width-ps is in picoseconds"
+            )
         return replace(
             self, row_times=np.arange(self.counts.shape[0], dtype=np.float64) * float(bin_width)
         )

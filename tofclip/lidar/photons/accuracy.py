@@ -4,6 +4,7 @@ bound.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,9 @@ from tofclip.errors import InputError
 from tofclip.lidar.photons.detector import FloatArray, PhotonDetector
 from tofclip.lidar.photons.limits import compute_range_bound
 from tofclip.units import SPEED_OF_LIGHT
+
+BINS_PER_BATCH = 1 << 22
+"""Histogram bins that are held at a time: 32 MiB."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,12 @@ class Accuracy:
 
 
 def measure_accuracy(
-    detector: PhotonDetector, photons: float, background: float, trials: int = 2000, seed: int = 0
+    detector: PhotonDetector,
+    photons: float,
+    background: float,
+    trials: int = 2000,
+    seed: int = 0,
+    progress: Callable[[int], None] = lambda _: None,
 ) -> Accuracy:
     """Simulate histograms with and without a return, and locate it.
 
@@ -52,11 +61,17 @@ def measure_accuracy(
     photons : float
         Expected photons of the return, which arrives anywhere in the middle half of the histogram.
     background : float
-        Expected background photons in a bin; the detector is not told.
+        Expected background photons in a bin; the detector does not know it.
     trials : int
         Histograms with a return, and as many without.
     seed : int
         Of the photons' chance and of the detector's, independent of each other.
+    progress : callable
+        Called with the number of trials just done.
+
+    Returns
+    -------
+    Accuracy
 
     Returns
     -------
@@ -73,17 +88,28 @@ def measure_accuracy(
     present, absent, chance = (
         np.random.default_rng(one) for one in np.random.SeedSequence(seed).spawn(3)
     )
-    arrival = present.uniform(detector.bins / 4, 3 * detector.bins / 4, trials) * detector.bin_width
-    found = detector.locate(
-        draw_histograms(detector, arrival, photons, background, present), _draw_seed(chance)
-    )
-    false = detector.locate(
-        absent.poisson(background, (trials, detector.bins)), _draw_seed(chance)
-    ).detected[:, 0]
-    detected = found.detected[:, 0]
-    error = (found.range[:, 0] - SPEED_OF_LIGHT * arrival / 2)[detected]
-    rms = float(np.sqrt(np.mean(error**2))) if error.size else float("nan")
-    return Accuracy(rms, bound, rms / bound, float(detected.mean()), float(false.mean()))
+    # In batches: the memory does not depend on the number of trials.
+    batch = max(1, BINS_PER_BATCH // detector.bins)
+    detections = false_alarms = 0
+    squared_error = 0.0
+    for begin in range(0, trials, batch):
+        count = min(batch, trials - begin)
+        fractions = present.uniform(detector.bins / 4, 3 * detector.bins / 4, count)
+        arrival = fractions * detector.bin_width
+        found = detector.locate(
+            draw_histograms(detector, arrival, photons, background, present), _draw_seed(chance)
+        )
+        false = detector.locate(
+            absent.poisson(background, (count, detector.bins)), _draw_seed(chance)
+        )
+        detected = found.detected[:, 0]
+        error = (found.range[:, 0] - SPEED_OF_LIGHT * arrival / 2)[detected]
+        squared_error += float(np.sum(error**2))
+        detections += int(np.count_nonzero(detected))
+        false_alarms += int(np.count_nonzero(false.detected[:, 0]))
+        progress(count)
+    rms = float(np.sqrt(squared_error / detections)) if detections else float("nan")
+    return Accuracy(rms, bound, rms / bound, detections / trials, false_alarms / trials)
 
 
 def draw_histograms(
