@@ -25,6 +25,7 @@ from apps.help import (
 )
 from apps.lazy_verbs import VerbTable, make_lazy_group
 from tofclip import __version__
+from tofclip.dependencies import describe_missing_package
 from tofclip.errors import TofclipError
 
 COMPLETION_VARIABLE = "_TOFCLIP_COMPLETE"  # set by shells that ask how a command line may go on
@@ -167,6 +168,10 @@ def _report_error(fault: Exception) -> int:
         return EXIT_INPUT_ERROR
     if isinstance(fault, TofclipError):
         print(f"tofclip: error: {_one_line(str(fault))}", file=sys.stderr)
+        return EXIT_INPUT_ERROR
+    missing = describe_missing_package(fault) if isinstance(fault, ImportError) else None
+    if missing is not None:
+        print(f"tofclip: error: {_one_line(missing)}", file=sys.stderr)
         return EXIT_INPUT_ERROR
     kind = type(fault).__name__
     print(

@@ -11,8 +11,10 @@ import importlib.util
 import sys
 from pathlib import Path
 
+from tofclip.dependencies import describe_missing_package
+
 PROGRAM_PACKAGE = "apps"
-EXIT_INTERRUPTED = 130
+EXIT_MISSING, EXIT_INTERRUPTED = 2, 130
 
 
 def main() -> int:
@@ -20,6 +22,12 @@ def main() -> int:
     try:
         _put_own_packages_first()
         status: int = importlib.import_module(f"{PROGRAM_PACKAGE}.cli").main()
+    except ImportError as fault:  # typer and rich are needed before any verb
+        missing = describe_missing_package(fault)
+        if missing is None:
+            raise
+        print(f"tofclip: error: {missing}", file=sys.stderr)
+        return EXIT_MISSING
     except KeyboardInterrupt:
         print("tofclip: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.rsd.inverse import FFTW_FLAGS, PLANNING_LOCK
+from nlos.fourier_plans import FourierPlan, allocate_zeros, plan_transform
 from nlos.rsd.kernels import transpose
 from nlos.rsd.wall import WallLattice
-
-if TYPE_CHECKING:
-    import pyfftw
 
 COLUMN_STEP = 8
 """Plans for Fourier transforms of so many columns more."""
@@ -60,20 +57,17 @@ class LatticeAnalysis:
     """
 
     def __init__(self, wall: WallLattice, lattice: tuple[int, int], reach: int, terms: int) -> None:
-        import pyfftw
-
         high, wide = lattice
         self._wide, self._shape = wide, wall.shape
         rows, columns = wall.shape
         self._place = None if wall.is_complete else wall.row * columns + wall.column
         most = min(2 * self._count_columns(reach), wide)
         shapes = ((rows, wide), (rows, wide), (most, high), (terms * most, high))
-        arrays = [pyfftw.zeros_aligned(shape, np.complex64) for shape in shapes]
+        arrays = [allocate_zeros(shape) for shape in shapes]
         self._points, self._lines, self._middle = arrays[:3]
         self._spectra: NDArray[np.complex64] = arrays[3]
-        with PLANNING_LOCK:
-            self._along_x = pyfftw.FFTW(self._points, self._lines, axes=(1,), flags=FFTW_FLAGS)
-        self._along_y: dict[int, pyfftw.FFTW] = {}
+        self._along_x = plan_transform(self._points, self._lines, axis=1)
+        self._along_y: dict[int, FourierPlan] = {}
 
     def _count_columns(self, reach: int) -> int:
         """How many columns from index 0 on are transformed; as many before it, unless these are
@@ -133,11 +127,8 @@ class LatticeAnalysis:
             flat[self._place] = values * weight
             self._points[:, :columns] = flat.reshape(self._shape)
 
-    def _get_plan(self, columns: int) -> pyfftw.FFTW:
-        import pyfftw
-
+    def _get_plan(self, columns: int) -> FourierPlan:
         if columns not in self._along_y:
-            with PLANNING_LOCK:
-                arrays = self._middle[:columns], self._spectra[:columns]
-                self._along_y[columns] = pyfftw.FFTW(*arrays, axes=(1,), flags=FFTW_FLAGS)
+            arrays = self._middle[:columns], self._spectra[:columns]
+            self._along_y[columns] = plan_transform(*arrays, axis=1)
         return self._along_y[columns]

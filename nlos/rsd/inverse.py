@@ -4,25 +4,14 @@
 
 from __future__ import annotations
 
-import threading
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos.fourier_plans import FourierPlan, allocate_zeros, plan_transform
 from nlos.rsd.kernels import transpose
 from nlos.rsd.window import VECTOR_LENGTH
-
-if TYPE_CHECKING:
-    import pyfftw
-
-PLANNING_LOCK = threading.Lock()
-"""FFTW plans one transform at a time."""
-
-FFTW_FLAGS = ("FFTW_ESTIMATE",)
-"""Plans that are measured are no faster here, and differ from run to run, as the last bits of an
-image would.
-"""
 
 CACHE_BYTES = 1 << 19
 """Spectra that are transformed at a time: they stay in a core's second cache, and calls stay few."""
@@ -153,8 +142,6 @@ class InverseTransform:
     def __init__(
         self, waves: WaveIndices, lattice: tuple[int, int], wanted: tuple[int, int], terms: int
     ) -> None:
-        from pyfftw import zeros_aligned
-
         self._high, self._wide = high, wide = lattice
         reach = int(np.max(waves[1]))
         columns = min(2 * reach + 1, wide)
@@ -168,21 +155,15 @@ class InverseTransform:
             np.complex64
         )
         some = _count_per_batch(self.spare, terms)
-        self.spectra: NDArray[np.complex64] = zeros_aligned(
-            (some, self.spare + VECTOR_LENGTH), np.complex64
-        )
+        self.spectra: NDArray[np.complex64] = allocate_zeros((some, self.spare + VECTOR_LENGTH))
         self._columns = self.spectra[:, : self.spare].reshape(some, columns, _pad_to_vector(high))[
             ..., :high
         ]
-        self._lines = zeros_aligned((some, columns, _pad_to_vector(high)), np.complex64)[..., :high]
-        self._middle = zeros_aligned((some, wanted[0], _pad_to_vector(wide)), np.complex64)[
-            ..., :wide
-        ]
-        self._rows = zeros_aligned((terms, wanted[0], _pad_to_vector(wide)), np.complex64)[
-            ..., :wide
-        ]
+        self._lines = allocate_zeros((some, columns, _pad_to_vector(high)))[..., :high]
+        self._middle = allocate_zeros((some, wanted[0], _pad_to_vector(wide)))[..., :wide]
+        self._rows = allocate_zeros((terms, wanted[0], _pad_to_vector(wide)))[..., :wide]
         self.images: NDArray[np.complex64] = self._rows[..., : wanted[1]]
-        self._plans: dict[int, tuple[pyfftw.FFTW, pyfftw.FFTW]] = {}
+        self._plans: dict[int, tuple[FourierPlan, FourierPlan]] = {}
 
     def transform(self, terms: slice) -> None:
         """Turn the first spectra into the images of these terms."""
@@ -196,18 +177,13 @@ class InverseTransform:
         along_x.update_arrays(self._middle[:count], self._rows[terms])
         along_x.execute()
 
-    def _get_plans(self, count: int) -> tuple[pyfftw.FFTW, pyfftw.FFTW]:
-        import pyfftw
-
+    def _get_plans(self, count: int) -> tuple[FourierPlan, FourierPlan]:
         if count not in self._plans:
             arrays = (self._columns, self._lines), (self._middle, self._rows)
-            with PLANNING_LOCK:
-                y, x = (
-                    pyfftw.FFTW(
-                        a[:count], b[:count], direction="FFTW_BACKWARD", axes=(2,), flags=FFTW_FLAGS
-                    )
-                    for a, b in arrays
-                )
+            y, x = (
+                plan_transform(source[:count], target[:count], axis=2, inverse=True)
+                for source, target in arrays
+            )
             self._plans[count] = y, x
         return self._plans[count]
 

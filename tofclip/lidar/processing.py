@@ -301,5 +301,7 @@ def _import_open3d() -> Any:
     try:
         import open3d
     except (ImportError, OSError) as fault:
-        raise MissingDependencyError(f"Open3D does not load on this machine: {fault}") from fault
+        raise MissingDependencyError(
+            f"Open3D does not load on this machine ({fault}): pip install open3d"
+        ) from fault
     return open3d

@@ -1,0 +1,104 @@
+"""Fourier transforms between fixed buffers, unscaled in both directions: FFTW's plans, or scipy.fft
+where pyfftw is absent.
+
+pyfftw's wheel carries FFTW, which is under the GPL: a bundle that must not hold it can leave pyfftw
+out.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+try:
+    import pyfftw
+except ImportError:
+    pyfftw = None
+
+ComplexArray = NDArray[np.complex64]
+
+PLANNING_LOCK = threading.Lock()
+"""FFTW plans one transform at a time."""
+
+FFTW_FLAGS = ("FFTW_ESTIMATE",)
+"""Plans that are measured are no faster here, and differ from run to run, as the last bits of an
+image would.
+"""
+
+
+class FourierPlan(Protocol):
+    """A transform along one axis, from one buffer to another."""
+
+    def execute(self) -> None:
+        """Transform."""
+        ...
+
+    def update_arrays(self, source: ComplexArray, target: ComplexArray) -> None:
+        """Go on with other buffers of the same shapes and strides."""
+        ...
+
+
+class ScipyPlan:
+    """The same by scipy.fft, for one or both of the directions that FFTW has.
+
+    Parameters
+    ----------
+    source, target : complex64 array
+        Buffers of one shape.
+    axis : int
+    inverse : bool
+        ``exp(+1j ...)`` instead of ``exp(-1j ...)``; unscaled as well.
+    """
+
+    def __init__(
+        self, source: ComplexArray, target: ComplexArray, axis: int, inverse: bool
+    ) -> None:
+        self._source, self._target, self._axis, self._inverse = source, target, axis, inverse
+
+    def execute(self) -> None:
+        """Transform."""
+        if self._inverse:
+            self._target[...] = fft.ifft(self._source, axis=self._axis, norm="forward")
+        else:
+            self._target[...] = fft.fft(self._source, axis=self._axis)
+
+    def update_arrays(self, source: ComplexArray, target: ComplexArray) -> None:
+        """Go on with other buffers."""
+        self._source, self._target = source, target
+
+
+def allocate_zeros(shape: tuple[int, ...]) -> ComplexArray:
+    """Return zeros, complex64, aligned for vector instructions where FFTW is there."""
+    zeros: Any = np.zeros if pyfftw is None else pyfftw.zeros_aligned
+    return zeros(shape, np.complex64)  # type: ignore[no-any-return]
+
+
+def plan_transform(
+    source: ComplexArray, target: ComplexArray, axis: int, inverse: bool = False
+) -> FourierPlan:
+    """Plan a transform along one axis on one thread.
+
+    Parameters
+    ----------
+    source, target : complex64 array
+        Buffers of one shape.
+    axis : int
+    inverse : bool
+        ``exp(+1j ...)`` instead of ``exp(-1j ...)``; neither is scaled.
+
+    Returns
+    -------
+    FourierPlan
+    """
+    if pyfftw is None:
+        return ScipyPlan(source, target, axis, inverse)
+    direction = "FFTW_BACKWARD" if inverse else "FFTW_FORWARD"
+    with PLANNING_LOCK:
+        plan: FourierPlan = pyfftw.FFTW(
+            source, target, direction=direction, axes=(axis,), flags=FFTW_FLAGS
+        )
+    return plan

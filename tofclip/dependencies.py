@@ -1,0 +1,53 @@
+"""Packages of others by the names that they are imported and installed by, for messages about
+missing ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+
+OWN_PACKAGES = ("tofclip", "nlos", "devices", "apps")
+
+DISTRIBUTIONS: Mapping[str, str] = MappingProxyType(
+    {
+        "array_api_compat": "array-api-compat",
+        "cupy": "cupy-cuda12x",
+        "cv2": "opencv-python-headless",
+        "lazy_loader": "lazy-loader",
+        "libusb_package": "libusb-package",
+        "PIL": "pillow",
+        "pywt": "pywavelets",
+        "skimage": "scikit-image",
+        "sklearn": "scikit-learn",
+        "tomli_w": "tomli-w",
+        "usb": "pyusb",
+    }
+)
+"""What to install for a module whose distribution has another name."""
+
+
+def describe_missing_package(fault: ImportError) -> str | None:
+    """Return which package is missing and what to install, None where a module of ours is missing.
+
+    Parameters
+    ----------
+    fault : ImportError
+        As it was raised by an import.
+
+    Returns
+    -------
+    str or None
+
+    Examples
+    --------
+    >>> describe_missing_package(ModuleNotFoundError("No module named 'usb'", name="usb.core"))
+    "the package 'pyusb' is missing: pip install pyusb"
+    """
+    module = (fault.name or "").partition(".")[0]
+    if not module or module in OWN_PACKAGES:
+        return None
+    distribution = DISTRIBUTIONS.get(module, module)
+    if isinstance(fault, ModuleNotFoundError):
+        return f"the package '{distribution}' is missing: pip install {distribution}"
+    return f"the package '{distribution}' does not load on this machine: {fault}"
