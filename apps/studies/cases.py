@@ -182,6 +182,6 @@ def measure_case(case: Case, library: Library, seed: int) -> ClipMeasurement:
     setup = CameraSetup(case.encoder, case.sampling_ratio, seed)
     clean = measure(library.light_field(case.scene), setup)
     # another stream of random numbers than the camera's, which starts from the same seed
-    noise = np.random.default_rng([seed, 2]).standard_normal(clean.measurements.size, np.float32)
-    noisy = clean.measurements + np.float32(case.white_noise) * clean.measurements.std() * noise
-    return corrupt_measurement(replace(clean, measurements=noisy), case.photons, case.bad_fraction)
+    noise = np.random.default_rng([seed, 2]).standard_normal(clean.values.size, np.float32)
+    noisy = clean.values + np.float32(case.white_noise) * clean.values.std() * noise
+    return corrupt_measurement(replace(clean, values=noisy), case.photons, case.bad_fraction)

@@ -79,7 +79,7 @@ def recover_light_field(case: Case, library: Library, seed: int) -> LightField:
         ((side, side), ANGULAR_WEIGHT) if len(used) == len(views) else ((1, len(used)), 0.0)
     )
     method = LightFieldVariation(TV_WEIGHT, ITERATIONS, grid=grid, angular=angular)
-    measurements = weighting(measurement.measurements)[:, np.newaxis]
+    measurements = weighting(measurement.values)[:, np.newaxis]
     return LightField(
         method.recover(weighting @ camera.light_field_model(), measurements).frames[0], used
     )

@@ -94,7 +94,7 @@ def simulate(
     }
     replace(measurement, provenance=build_provenance(settings, light_field)).save(out)
     figures = {
-        "readings": measurement.measurements.size,
+        "readings": measurement.values.size,
         "image_shape": measurement.image_shape,
         **asdict(setup),
     }

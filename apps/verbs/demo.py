@@ -17,7 +17,7 @@ from apps.progress import show_progress
 from apps.report import report
 from tofclip.lidar import depth, point_cloud
 from tofclip.metrics import nmse
-from tofclip.recovery import prepare_recovery
+from tofclip.recovery import open_shot, plan_recovery
 from tofclip.simulate import (
     make_default_instrument,
     make_default_scene,
@@ -86,9 +86,9 @@ def _run_demo(seed: int) -> DemoRun:
     # shot.
     nominal = replace(shot.camera, sweep=None, gains=1.0 + 0 * shot.camera.gains)
     streak = replace(shot.streak, camera=nominal)
-    task = prepare_recovery(streak)
-    with show_progress("recovering", task.work) as advance:
-        frames = task.run(advance)
+    plan = plan_recovery(open_shot(streak))
+    with show_progress("recovering", plan.work) as advance:
+        frames = plan.run(advance)
     frames = replace(
         frames,
         provenance=build_provenance({"verb": "demo", "seed": seed}, earlier=frames.provenance),

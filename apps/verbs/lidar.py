@@ -19,14 +19,11 @@ from apps.report import report
 from apps.sequences import report_summary, run_with_progress
 from apps.verbs.cloud import require_format
 from apps.verbs.photons import photons
-from tofclip.camera import Camera
-from tofclip.camera.calibration.parallax import GATE_METHOD
 from tofclip.errors import InputError
-from tofclip.io import read_streak
 from tofclip.lidar import Pulse, depth, point_cloud
 from tofclip.lidar.objects import find_objects
 from tofclip.lidar.photons import PhotonDetector, measure_accuracy
-from tofclip.recovery import fit_parallax_to_shot, prepare_recovery
+from tofclip.recovery import count_parallax_work, fit_parallax_to_shot, open_shot
 from tofclip.sequences import RangingSettings, list_shots
 from tofclip.shots import Frames
 from tofclip.units import MILLIMETRE, NANOSECOND, PICOSECOND
@@ -127,17 +124,10 @@ def parallax(
     require_writable(
         out, *RECORD_SUFFIXES, inputs=(streak,) if camera is None else (streak, camera)
     )
-    task = prepare_recovery(read_streak(streak), None if camera is None else Camera.load(camera))
-    known = (
-        task.camera
-        if time_zero_ns is None
-        else task.camera.replace(time_zero=time_zero_ns * NANOSECOND)
-    )
-    rows = task.streak.counts.shape[0]
-    with show_progress(
-        "focusing", task.work - task.method.work(rows) + shears[2] * GATE_METHOD.work(rows)
-    ) as advance:
-        found = fit_parallax_to_shot(task.streak, known, gates, shears, advance)
+    zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
+    shot = open_shot(streak, camera, zero)
+    with show_progress("focusing", count_parallax_work(shot, shears)) as advance:
+        found = fit_parallax_to_shot(shot, gates, shears, advance)
     found.camera.save(out)
     figures = {
         "strength_px_m": found.parallax.strength,

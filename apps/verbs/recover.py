@@ -24,14 +24,19 @@ from apps.report import report
 from apps.sequences import report_summary, resolve_device, run_with_progress
 from apps.verbs.cloud import CLOUD_SUFFIXES as CLOUD_SUFFIXES
 from tofclip.errors import InputError
-from tofclip.io import read_streak
-from tofclip.recovery import compute_view_delays_bins
+from tofclip.recovery import (
+    compute_view_delays_bins,
+    make_method,
+    open_shot,
+    parse_focus,
+    plan_recovery,
+)
 from tofclip.sequences import CloudSettings, RecoverySettings, expand_sweep, is_sequence, list_shots
-from tofclip.sequences.recovering import add_provenance
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
-    from tofclip.shots import Frames, Streak
+    from tofclip.recovery import Shot
+    from tofclip.shots import Frames
 
 
 def recover(
@@ -112,16 +117,31 @@ def recover(
     """
     zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
-    recovery = RecoverySettings(method, iterations, None, focus, camera, zero, device)
-    used = resolve_device(device, cluster)
     if is_sequence(streak):
         _check_sequence_options(cloud, preview)
+        recovery = RecoverySettings(method, iterations, None, focus, camera, zero, device)
+        used = resolve_device(device, cluster)
         _recover_sequence(recovery, (streak, width), out, sweep or [], (cluster, used, as_json))
         return
     _check_single_options(streak, cluster, sweep)
-    _recover_single(
-        recovery, (streak, width), out, (preview or out.with_suffix(".png"), cloud), as_json
-    )
+    inputs = tuple(Path(name) for name in (streak, camera) if name and not _is_address(name))
+    preview = preview or out.with_suffix(".png")
+    _require_writable_results(inputs, out, preview, cloud)
+    solver, chosen_focus = make_method(method, iterations=iterations), parse_focus(focus)
+    started = time.perf_counter()
+    shot = _open_source(streak, camera, zero, width)
+    plan = plan_recovery(shot, solver, chosen_focus, device)
+    with show_progress("recovering", plan.work) as advance:
+        frames = plan.add_provenance(plan.run(advance), *inputs)
+    frames.save(out)
+    seconds = time.perf_counter() - started
+    save_figure(make_preview_figure(shot.streak, frames), preview)
+    written = [out, preview]
+    if cloud is not None:
+        points, _ = CloudSettings(device=device).make_cloud(frames, "the recovered frames")
+        points.save(cloud)
+        written.append(cloud)
+    _report_frames(frames, seconds, as_json, written)
 
 
 def _check_sequence_options(cloud: Path | None, preview: Path | None) -> None:
@@ -160,50 +180,28 @@ def _parse_sweep(text: str) -> tuple[str, list[str]]:
     return name, values.split(",")
 
 
-def _recover_single(
-    recovery: RecoverySettings,
-    shot: tuple[str, float | None],
-    out: Path,
-    further: tuple[Path, Path | None],
-    as_json: bool,
+def _require_writable_results(
+    inputs: tuple[Path, ...], out: Path, preview: Path, cloud: Path | None
 ) -> None:
-    """Recover one shot, with a picture of it and, where asked for, a cloud."""
-    preview, cloud = further
-    inputs = tuple(
-        Path(name)
-        for name in (shot[0], recovery.camera)
-        if name is not None and not _is_address(name)
-    )
     require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
     require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
     if cloud is not None:
         require_writable(cloud, *CLOUD_SUFFIXES, inputs=inputs)
-    started = time.perf_counter()
-    task = recovery.prepare_task(_read_shot(*shot))
-    with show_progress("recovering", task.work) as advance:
-        frames = add_provenance(task.run(advance), task, *inputs)
-    frames.save(out)
-    seconds = time.perf_counter() - started
-    save_figure(make_preview_figure(task.streak, frames), preview)
-    written = [out, preview]
-    if cloud is not None:
-        points, _ = CloudSettings(device=recovery.device).make_cloud(frames, "the recovered frames")
-        points.save(cloud)
-        written.append(cloud)
-    _report_frames(frames, seconds, as_json, written)
 
 
 def _is_address(name: str | Path) -> bool:
     return "://" in str(name)
 
 
-def _read_shot(streak: str, bin_width: float | None) -> Streak:
-    """Read a file, or a source until it ends."""
-    if _is_address(streak):
-        from devices.transients import read_transient
+def _open_source(
+    source: str, camera: Path | None, time_zero: float | None, bin_width: float | None
+) -> Shot:
+    """Open a file, or read an instrument until it ends."""
+    if not _is_address(source):
+        return open_shot(source, camera, time_zero, bin_width)
+    from devices.transients import read_transient
 
-        return read_transient(streak, bin_width)
-    return read_streak(streak, bin_width)
+    return open_shot(read_transient(source, bin_width), camera, time_zero)
 
 
 def _report_frames(frames: Frames, seconds: float, as_json: bool, written: list[Path]) -> None:

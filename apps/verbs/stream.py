@@ -16,7 +16,6 @@ import typer
 from apps.options import JsonOption, TimeZeroOption
 from apps.report import report
 from apps.verbs.cloud import require_format
-from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.recovery import SharpestFocus, parse_focus
 from tofclip.sequences import list_shots
@@ -124,10 +123,7 @@ def _make_ranger(
     chosen = parse_focus(focus)
     if isinstance(chosen, SharpestFocus):
         raise InputError("a stream has one focus for all shots: depth-locked or fixed:S")
-    known = first.camera if camera is None else Camera.load(camera)
-    if known is not None and time_zero is not None:
-        known = known.replace(time_zero=time_zero)
-    return RangingPipeline.for_shot(first, known, chosen)
+    return RangingPipeline.for_shot(first, camera, chosen, time_zero)
 
 
 def _prepend_shot(first: Streak, others: Iterator[Streak]) -> Iterator[Streak]:

@@ -50,7 +50,7 @@ class ShotSource(Source):
 
     def rectify(self, streak: Streak) -> Readings:
         """Take dark level and sweep off a shot."""
-        return self.rectifier.measure(streak.counts, streak.saturated).measurements
+        return self.rectifier.measure(streak.counts, streak.saturated).values
 
     def view(self, number: int) -> View:
         if number not in self._views:

@@ -21,14 +21,13 @@ from devices.transients import read_transient, read_transients
 from tofclip.camera import Camera, measure
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io import read_streak
-from tofclip.recovery import fit_camera_to_shot, prepare_recovery
+from tofclip.recovery import open_shot
 from tofclip.shots import Frames
 from tofclip.storage import HDF5_SIGNATURE, Record, translate_read_errors
 
 if TYPE_CHECKING:
     from apps.viewer.source import Source
-    from tofclip.shots import Streak
-    from tofclip.shots.stack import StreakStack
+    from tofclip.shots import Streak, StreakStack
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ def open_source(name: str, options: ShotOptions | None = None) -> Source:
 
 def _open_hdf5(path: Path, options: ShotOptions) -> Source:
     if _is_stack(path):
-        from tofclip.shots.stack import StreakStack
+        from tofclip.shots import StreakStack
 
         stack = StreakStack(path)
         return _open_shots(
@@ -133,8 +132,8 @@ def _open_shots(title: str, shots: Sequence[Callable[[], Streak]], options: Shot
     linear = LinearRecovery(camera, first.times - camera.time_zero)
     return TransientSource(
         title,
-        linear.frames(measured.measurements, 0.0, Gate(0, first.times.size)),
-        measured.measurements,
+        linear.frames(measured.values, 0.0, Gate(0, first.times.size)),
+        measured.values,
     )
 
 
@@ -148,12 +147,7 @@ def _open_instrument(address: str, options: ShotOptions) -> Source:
 
 def _find_camera(shot: Streak, options: ShotOptions) -> Camera:
     """The camera of a row of shots; a sweep that is not known is found from the first one."""
-    known = prepare_recovery(
-        shot, None if options.camera is None else Camera.load(options.camera), "linear"
-    ).camera
-    if options.time_zero is not None:
-        known = known.replace(time_zero=options.time_zero)
-    return known if known.sweep is not None else fit_camera_to_shot(shot, known)
+    return open_shot(shot, options.camera, options.time_zero).fit_camera().camera
 
 
 def _read_shot(path: Path, options: ShotOptions) -> Streak:

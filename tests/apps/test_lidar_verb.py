@@ -10,8 +10,7 @@ import numpy as np
 from small_instrument import Run
 
 from tofclip.camera import Camera, SkewSweep
-from tofclip.shots import Frames
-from tofclip.shots.stack import save_stack
+from tofclip.shots import Frames, save_stack
 from tofclip.simulate import (
     Instrument,
     Scene,

@@ -15,8 +15,7 @@ from apps.cli import main
 from devices.scenes import draw_exposure, simulate_line_light
 from devices.transients import read_transient, read_transients
 from tofclip.lidar import PointCloud
-from tofclip.shots import Streak
-from tofclip.shots.stack import save_stack
+from tofclip.shots import Streak, save_stack
 
 
 def shots(number: int) -> list[Streak]:

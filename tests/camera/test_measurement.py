@@ -36,7 +36,7 @@ def streak(dark: float = 100.0) -> np.ndarray:
 def test_the_dark_level_comes_off_and_time_becomes_the_last_axis():
     counts = streak()
     measured = measure(counts, None, camera())
-    np.testing.assert_allclose(measured.measurements, (counts - 100).T)
+    np.testing.assert_allclose(measured.values, (counts - 100).T)
     assert measured.valid.all()
 
 
@@ -47,14 +47,12 @@ def test_noise_about_the_dark_level_stays_centred():
     # sqrt(244) = 0.64, and choosing the quietest rows pulls it down by less than two standard
     # errors of a row's mean (2.0).
     assert estimate_dark_level(counts) == pytest.approx(100, abs=4)
-    assert measure(counts, None, camera()).measurements.min() < 0
+    assert measure(counts, None, camera()).values.min() < 0
 
 
 def test_a_given_dark_level_is_used():
     counts = streak()
-    np.testing.assert_allclose(
-        measure(counts, None, camera(), dark=90.0).measurements, (counts - 90).T
-    )
+    np.testing.assert_allclose(measure(counts, None, camera(), dark=90.0).values, (counts - 90).T)
 
 
 def test_a_skew_is_undone():
@@ -68,7 +66,7 @@ def test_a_skew_is_undone():
     inside = measured.valid
     # Linear interpolation of a Gaussian is off by at most max|f''| / 8 = 1 / (8 * 36).
     np.testing.assert_allclose(
-        measured.measurements[inside],
+        measured.values[inside],
         np.broadcast_to(expected, (WIDTH, ROWS))[inside],
         atol=1 / 288,
     )
@@ -116,9 +114,9 @@ def test_a_sweep_that_moves_light_across_columns_is_undone_bilinearly():
     )
     expected[:, 20] = 0
     # positions in float32 are good to 1e-5 pixels, times steps of 500 counts
-    np.testing.assert_allclose(found.measurements.T, expected, atol=0.02)
+    np.testing.assert_allclose(found.values.T, expected, atol=0.02)
     np.testing.assert_array_equal(
-        found.measurements, Rectifier(turned, ROWS).measurements(counts, delay=delay)
+        found.values, Rectifier(turned, ROWS).rectify(counts, delay=delay)
     )
     touched = map_coordinates(saturated.astype(float), [row, column], order=1, mode="nearest") > 0
     valid = inside & ~touched
@@ -130,10 +128,6 @@ def test_a_sweep_that_moves_light_across_columns_is_undone_bilinearly():
 def test_a_single_row_or_column_is_sampled_too():
     low = camera(sweep=SkewSweep(np.array([15.0]), np.array([0.0]), np.array([0.0])))
     counts = np.arange(WIDTH, dtype=np.float32)[np.newaxis]
-    np.testing.assert_array_equal(
-        measure(counts, None, low, dark=0.0).measurements[:, 0], counts[0]
-    )
+    np.testing.assert_array_equal(measure(counts, None, low, dark=0.0).values[:, 0], counts[0])
     narrow = Camera([0.0], [0.0], (1, 1), 1, sweep=ProjectiveSweep(np.diag([1.0, 1.0, 1.0])))
-    np.testing.assert_array_equal(
-        measure(counts.T, None, narrow, dark=0.0).measurements[0], counts[0]
-    )
+    np.testing.assert_array_equal(measure(counts.T, None, narrow, dark=0.0).values[0], counts[0])

@@ -158,7 +158,7 @@ def test_returns_are_those_of_all_rows(focus, monkeypatch):
         SCENE, Instrument(camera(), StreakDetector(ROWS, BIN, peak_photons=2000.0)), 0
     ).streak
     pipeline = RangingPipeline(camera(), made.times, focus=focus)
-    measurements = pipeline.rectifier.measure(made.counts).measurements
+    measurements = pipeline.rectifier.measure(made.counts).values
     some = pipeline.find_returns(measurements)
     monkeypatch.setattr(SignalRowFinder, "bins", lambda self, _: TraceBins.all_bins(self.rows))
     everything = pipeline.find_returns(measurements)
@@ -189,5 +189,5 @@ def test_frames_that_are_there_are_searched_everywhere():
     )
     frames = recover(made, camera(), method="linear")
     alone = depth(frames, detection=replace(Detection(), signal_to_noise=0.0))
-    found = pipeline.find_returns(pipeline.rectifier.measure(made.counts).measurements)
+    found = pipeline.find_returns(pipeline.rectifier.measure(made.counts).values)
     assert abs(len(found) - len(alone)) <= 2

@@ -50,7 +50,7 @@ def test_the_model_predicts_the_readings_of_the_true_views(encoder):
     """A whole-pixel shear is exact for codes; for lines the shifted detector splits pixels where a shifted picture
     does not, which on this scene of single pixels changes readings by up to a quarter."""
     camera = CameraSetup(encoder, 1.0, 3).camera(SHAPE, VIEWS)
-    measurements = measure(light_field(), CameraSetup(encoder, 1.0, 3)).measurements
+    measurements = measure(light_field(), CameraSetup(encoder, 1.0, 3)).values
     predicted = camera.model(SHEAR)(scene())
     bound = 1e-5 if encoder == "single-pixel" else 0.25
     assert np.linalg.norm(predicted - measurements) < bound * np.linalg.norm(measurements)
@@ -84,20 +84,20 @@ def test_a_measurement_survives_its_file(encoder, tmp_path):
     made = measure(light_field(), CameraSetup(encoder, 0.5, 7))
     made.save(tmp_path / "m.h5")
     back = ClipMeasurement.from_record(Record.load(tmp_path / "m.h5", "clip_measurement"))
-    np.testing.assert_array_equal(back.measurements, made.measurements)
+    np.testing.assert_array_equal(back.values, made.values)
     assert (back.setup, back.image_shape) == (made.setup, made.image_shape)
 
 
 def test_bad_readings_and_photons_are_as_many_as_asked():
     made = measure(light_field(), CameraSetup("line", 1.0, 0))
-    largest = made.measurements.max()
-    changed = corrupt_measurement(made, None, 0.1).measurements != made.measurements
-    assert 0 < changed.sum() <= round(0.1 * made.measurements.size)
-    noisy = corrupt_measurement(made, 1000, 0.0).measurements
+    largest = made.values.max()
+    changed = corrupt_measurement(made, None, 0.1).values != made.values
+    assert 0 < changed.sum() <= round(0.1 * made.values.size)
+    noisy = corrupt_measurement(made, 1000, 0.0).values
     # Poisson noise of the mean reading f: variance f * largest / photons; the bound is loose by a
     # factor of 1.3.
-    expected = np.sqrt(made.measurements.mean() * largest / 1000)
-    assert expected / 1.3 < np.std(noisy - made.measurements) < 1.3 * expected
+    expected = np.sqrt(made.values.mean() * largest / 1000)
+    assert expected / 1.3 < np.std(noisy - made.values) < 1.3 * expected
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_readings_of_another_camera_are_refused():
 
     made = measure(light_field(), CameraSetup("line", 1.0, 0))
     with pytest.raises(ShapeError):
-        replace(made, measurements=made.measurements[1:]).camera()
+        replace(made, values=made.values[1:]).camera()
 
 
 def test_a_light_field_file_is_read_and_a_wrong_one_refused(tmp_path):

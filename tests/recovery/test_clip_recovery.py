@@ -130,13 +130,11 @@ def test_single_pixel_readings_have_no_use_for_it(scene):
 def test_readings_that_are_none_are_refused(scene):
     measurement = measurements(scene)
     with pytest.raises(InputError, match="NaN"):
-        replace(measurement, measurements=np.full_like(measurement.measurements, np.nan))
+        replace(measurement, values=np.full_like(measurement.values, np.nan))
     with pytest.raises(InputError, match="every reading is zero"):
-        replace(measurement, measurements=np.zeros_like(measurement.measurements))
+        replace(measurement, values=np.zeros_like(measurement.values))
     with pytest.raises(ShapeError):
-        ClipRecovery().recover(
-            replace(measurement, measurements=measurement.measurements[:-1]), SHEAR
-        )
+        ClipRecovery().recover(replace(measurement, values=measurement.values[:-1]), SHEAR)
 
 
 def test_a_light_field_comes_back_view_by_view(scene):

@@ -18,6 +18,7 @@ from tofclip.recovery import (
     FixedFocus,
     SharpestFocus,
     fit_parallax_to_shot,
+    open_shot,
     parse_focus,
     recover,
 )
@@ -91,7 +92,7 @@ def locked(shot) -> Frames:
 def test_every_range_is_as_good_as_alone_and_the_ends_are_better_than_any_fixed_shear(shot, locked):
     made = shot.camera
     truth = render_true_frames(SCENE, instrument(made), shot.exposure).values
-    measurements = measure(shot.streak.counts, None, made).measurements
+    measurements = measure(shot.streak.counts, None, made).values
     shears = np.linspace(-2.0, 0.5, 11)
 
     def error(frames: np.ndarray, distance: float) -> float:
@@ -178,7 +179,7 @@ def test_a_stack_finds_the_shears_that_the_ranges_ask_for(shot):
 def test_the_parallax_is_found_from_the_shot(shot):
     unknown = shot.camera.replace(lenslet_pitch=0.0, focus_distance=np.inf)
     done = []
-    found = fit_parallax_to_shot(shot.streak, unknown, 5, (-2.4, 0.9, 6), done.append)
+    found = fit_parallax_to_shot(open_shot(shot.streak, unknown), 5, (-2.4, 0.9, 6), done.append)
     strength = FOCAL * 5e-3
     assert found.parallax.strength == pytest.approx(strength, rel=0.1)
     for distance in (0.5, 5.0):
@@ -212,6 +213,6 @@ def test_what_the_camera_does_not_know_is_said(shot):
     with pytest.raises(CalibrationError, match="lenslet pitch"):
         recover(shot.streak, shot.camera.replace(lenslet_pitch=0.0), focus=DepthLockedFocus())
     with pytest.raises(CalibrationError, match="time zero"):
-        fit_parallax_to_shot(shot.streak, shot.camera.replace(time_zero=1e-9), 5, (-1.0, 1.0, 3))
+        fit_parallax_to_shot(open_shot(shot.streak, shot.camera, time_zero=1e-9), 5, (-1.0, 1.0, 3))
     with pytest.raises(InputError, match="gates"):
-        fit_parallax_to_shot(shot.streak, shot.camera, 2, (-1.0, 1.0, 3))
+        fit_parallax_to_shot(open_shot(shot.streak, shot.camera), 2, (-1.0, 1.0, 3))

@@ -12,7 +12,7 @@ from tofclip import Frames, Streak, depth, recover
 from tofclip.camera import Camera, ProjectiveSweep, measure
 from tofclip.camera.calibration import estimate_skew, register_views
 from tofclip.errors import CalibrationError, InputError, MissingTimeAxisError
-from tofclip.recovery import compute_view_delays_bins, make_method, prepare_recovery
+from tofclip.recovery import compute_view_delays_bins, make_method, open_shot, plan_recovery
 from tofclip.simulate import (
     SimulatedShot,
     make_default_instrument,
@@ -97,9 +97,9 @@ def test_progress_adds_up(shot, uncalibrated):
     )
     for camera in (shot.camera, uncalibrated):
         done: list[int] = []
-        task = prepare_recovery(few_rows, camera, LinearInverse())
-        task.run(done.append)
-        assert 0 < sum(done) <= task.work
+        plan = plan_recovery(open_shot(few_rows, camera), LinearInverse())
+        plan.run(done.append)
+        assert 0 < sum(done) <= plan.work
 
 
 def test_a_method_can_be_named():
@@ -145,7 +145,7 @@ def test_the_measurement_of_the_true_frames_is_what_was_simulated(shot):
     light goes.
     """
     measured = measure(shot.signal, None, shot.camera, dark=0.0)
-    by_view = measured.measurements.sum(axis=1)
+    by_view = measured.values.sum(axis=1)
     edges = ((shot.camera.centres_px[1:] + shot.camera.centres_px[:-1]) / 2).astype(int)
     energy = np.array([part.sum() for part in np.split(by_view, edges)])
     np.testing.assert_allclose(

@@ -22,7 +22,7 @@ from tofclip.sequences.ranger import (
     compute_light_curve,
     make_clouds,
 )
-from tofclip.shots.stack import StreakStack, save_stack
+from tofclip.shots import StreakStack, save_stack
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.bodies import Body
 from tofclip.simulate.patterns import make_checkerboard
@@ -147,7 +147,7 @@ def test_a_rectifier_does_what_interpolation_does():
     expected = (1 - share) * streak.counts[top, columns] + share * streak.counts[top + 1, columns]
     # positions are float32: 1e-5 rows at the end of the picture, times the steepest slope
     np.testing.assert_allclose(
-        found.measurements.T, np.where(inside, expected, 0), atol=2e-5 * streak.counts.max()
+        found.values.T, np.where(inside, expected, 0), atol=2e-5 * streak.counts.max()
     )
     np.testing.assert_array_equal(found.valid.T, inside)
     with pytest.raises(ShapeError):

@@ -51,7 +51,7 @@ def test_recovery_on_workers_is_bit_for_bit_recovery_here_and_of_single_shots(
     for one, other, shot in zip(here, there, shots.values(), strict=True):
         frames = Frames.load(one.result)
         np.testing.assert_array_equal(Frames.load(other.result).values, frames.values)
-        alone = linear.prepare_task(shot()).run().values
+        alone = linear.plan(shot()).run().values
         # the linear algebra of a single shot may use several threads, which round differently:
         # float32
         np.testing.assert_allclose(frames.values, alone, atol=1e-5 * alone.max())
@@ -69,7 +69,7 @@ def test_kept_operators_change_nothing(recorded, method, tmp_path):
     assert run_jobs(jobs).failures == ()
     for job, shot in zip(jobs, shots.values(), strict=True):
         np.testing.assert_array_equal(
-            Frames.load(job.result).values, recovery.prepare_task(shot()).run().values
+            Frames.load(job.result).values, recovery.plan(shot()).run().values
         )
 
 
@@ -231,12 +231,12 @@ def test_kept_inverses_are_those_of_the_method(camera, streaks):
     measured = measure(streaks[0].counts, streaks[0].saturated, camera)
     method, operator = LinearInverse(), camera.operator()
     keeping = CachedInverse(method)
-    expected = method.recover(operator, measured.measurements, measured.valid).frames
+    expected = method.recover(operator, measured.values, measured.valid).frames
     for _ in range(2):
         np.testing.assert_array_equal(
-            keeping.recover(operator, measured.measurements, measured.valid).frames, expected
+            keeping.recover(operator, measured.values, measured.valid).frames, expected
         )
-    assert keeping.recover(operator, measured.measurements).setup_seconds == 0
+    assert keeping.recover(operator, measured.values).setup_seconds == 0
     assert keeping.work(7) == 7
 
 

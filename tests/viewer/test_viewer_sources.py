@@ -34,8 +34,7 @@ from apps.viewer.source import Gate, Source
 from apps.viewer.source_factory import ShotOptions, open_source
 from apps.viewer.volume import PROJECTION_MODE, SLICE_MODE, SURFACE_MODE
 from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError, StorageError
-from tofclip.shots import Streak
-from tofclip.shots.stack import save_stack
+from tofclip.shots import Streak, save_stack
 
 
 @pytest.fixture(scope="module")

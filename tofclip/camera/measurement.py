@@ -25,14 +25,14 @@ class Measurement:
 
     Parameters
     ----------
-    measurements : (columns, frames) float32 array
-        Slit measurements, one column of the array for each instant. May be negative: noise about a dark
-        level is.
+    values : (columns, frames) float32 array
+        Counts on the slit, one column of the array for each instant. May be negative: noise about a
+        dark level is.
     valid : (columns, frames) bool array
         False where a sensor pixel was saturated or dead, or where the raw image ends.
     """
 
-    measurements: FloatImage
+    values: FloatImage
     valid: Mask
 
 
@@ -166,12 +166,12 @@ class Rectifier:
             raise InputError(
                 "no reading can be trusted: every pixel is saturated, dead or outside the sweep"
             )
-        measurements = self.measurements(counts, dark, delay)
+        measurements = self.rectify(counts, dark, delay)
         if not np.any((measurements > 0) & valid):
             raise InputError(NO_LIGHT_MESSAGE)
         return Measurement(measurements, valid)
 
-    def measurements(
+    def rectify(
         self, counts: FloatImage, dark: float | None = None, delay: float = 0.0
     ) -> FloatImage:
         """Return the measurements alone, for methods that cannot leave out single ones.

@@ -77,7 +77,7 @@ class ClipMeasurement(Storable):
 
     Parameters
     ----------
-    measurements : (measurements,) float32 array
+    values : (measurements,) float32 array
     views : (views, 2) array
         (v, u) of every view.
     image_shape : (int, int)
@@ -90,7 +90,7 @@ class ClipMeasurement(Storable):
 
     RECORD_KIND = "clip_measurement"
 
-    measurements: NDArray[Any] = field(
+    values: NDArray[Any] = field(
         metadata=stored_array("", "reading", dtype=np.float32, name="readings")
     )
     views: NDArray[np.float64] = field(metadata=stored_array("", "view", "vu"))
@@ -100,9 +100,9 @@ class ClipMeasurement(Storable):
     provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
 
     def __post_init__(self) -> None:
-        if not np.all(np.isfinite(self.measurements)):
+        if not np.all(np.isfinite(self.values)):
             raise InputError("the readings hold NaN or infinity")
-        if not self.measurements.any():
+        if not self.values.any():
             raise InputError("every reading is zero; there is nothing to recover")
 
     def camera(self) -> LightFieldCamera:
@@ -114,9 +114,9 @@ class ClipMeasurement(Storable):
             It makes another number of measurements: the file is not from this setup.
         """
         camera = self.setup.camera(self.image_shape, self.views)
-        if self.measurements.shape != (camera.measurements,):
+        if self.values.shape != (camera.measurements,):
             raise ShapeError(
-                "the readings of this camera", (camera.measurements,), self.measurements.shape
+                "the readings of this camera", (camera.measurements,), self.values.shape
             )
         return camera
 
@@ -132,7 +132,7 @@ class ClipMeasurement(Storable):
             raise InputError(
                 "these readings do not say how many photons they stand for; take squares or huber"
             )
-        counted: NDArray[Any] = self.measurements * np.float32(self.photons_per_unit)
+        counted: NDArray[Any] = self.values * np.float32(self.photons_per_unit)
         return counted
 
 
@@ -183,7 +183,7 @@ def corrupt_measurement(
     if photons is not None and not (np.isfinite(photons) and photons > 0):
         raise InputError(f"the number of photons must be positive, got {photons}")
     random = np.random.default_rng([measurement.setup.seed, 1])
-    measurements = measurement.measurements.copy()
+    measurements = measurement.values.copy()
     largest = measurements.max()
     per_unit = 0.0 if photons is None else float(photons / largest)
     if photons is not None:
@@ -192,4 +192,4 @@ def corrupt_measurement(
         )
     bad = random.permutation(measurements.size)[: round(bad_fraction * measurements.size)]
     measurements[bad] = random.choice(np.array([0, largest], np.float32), bad.size)
-    return replace(measurement, measurements=measurements, photons_per_unit=per_unit)
+    return replace(measurement, values=measurements, photons_per_unit=per_unit)

@@ -8,13 +8,15 @@ from tofclip.recovery.focus import (
     SharpestFocus,
     parse_focus,
 )
-from tofclip.recovery.parallax import ShotParallax, fit_parallax_to_shot
+from tofclip.recovery.parallax import ShotParallax, count_parallax_work, fit_parallax_to_shot
 from tofclip.recovery.plan import (
-    RecoveryTask,
+    RecoveryPlan,
+    Shot,
     compute_view_delays_bins,
     fit_camera_to_shot,
     make_method,
-    prepare_recovery,
+    open_shot,
+    plan_recovery,
     recover,
     require_plausible_rows,
 )
@@ -24,15 +26,18 @@ __all__ = [
     "FixedFocus",
     "Focus",
     "FrameSegment",
-    "RecoveryTask",
+    "RecoveryPlan",
     "SharpestFocus",
+    "Shot",
     "ShotParallax",
     "compute_view_delays_bins",
+    "count_parallax_work",
     "fit_camera_to_shot",
     "fit_parallax_to_shot",
     "make_method",
+    "open_shot",
     "parse_focus",
-    "prepare_recovery",
+    "plan_recovery",
     "recover",
     "require_plausible_rows",
 ]

@@ -164,7 +164,7 @@ class ClipRecovery:
         camera = measurement.camera()
         model, weighting = camera.model(shear), camera.weighting()
         if self.data_term != "poisson":
-            measurements = weighting(measurement.measurements)[:, np.newaxis]
+            measurements = weighting(measurement.values)[:, np.newaxis]
             return _InverseProblem(
                 weighting @ model, measurements, camera.correlation_length, LeastSquares
             )
@@ -239,9 +239,9 @@ def recover_light_field(
         camera.weighting() @ camera.light_field_model() @ ViewSelection(shape, camera.used_views)
     )
     method = LightFieldVariation(weight, MAX_ITERATIONS, OBJECTIVE_TOLERANCE, grid=grid)
-    pictures = method.recover(
-        model, camera.weighting()(measurement.measurements)[:, np.newaxis]
-    ).frames[0]
+    pictures = method.recover(model, camera.weighting()(measurement.values)[:, np.newaxis]).frames[
+        0
+    ]
     return LightField(pictures, measurement.views)
 
 

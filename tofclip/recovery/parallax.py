@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from tofclip.camera import Camera, Measurement, measure
 from tofclip.camera.calibration.parallax import (
+    GATE_METHOD,
     FocusCurve,
     Parallax,
     find_sharpest_shears,
     fit_parallax_to_shears,
 )
+from tofclip.camera.calibration.registration import count_registration_iterations
 from tofclip.errors import CalibrationError, InputError
-from tofclip.recovery.plan import fit_camera_to_shot
-from tofclip.shots import Streak
+from tofclip.recovery.plan import Shot
 from tofclip.solvers import Progress, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -49,8 +50,7 @@ class ShotParallax:
 
 
 def fit_parallax_to_shot(
-    streak: Streak,
-    camera: Camera,
+    shot: Shot,
     gates: int,
     shears: tuple[float, float, int],
     progress: Progress = ignore_progress,
@@ -59,10 +59,9 @@ def fit_parallax_to_shot(
 
     Parameters
     ----------
-    streak : Streak
-        Of a scene at several ranges.
-    camera : Camera
-        With a true time zero. A sweep that is not known is estimated from the shot.
+    shot : Shot
+        Of a scene at several ranges, with a true time zero. A sweep that is not known is estimated
+        from the shot.
     gates : int
         Number of gates, of equal brightness.
     shears : (float, float, int)
@@ -84,10 +83,9 @@ def fit_parallax_to_shot(
     """
     if gates < MIN_GATES:
         raise InputError(f"a parallax needs {MIN_GATES} gates or more, got {gates}")
-    if camera.sweep is None:
-        camera = fit_camera_to_shot(streak, camera, progress)
-    measurement = measure(streak.counts, streak.saturated, camera)
-    times = streak.times - camera.time_zero
+    shot = shot.fit_camera(progress)
+    camera, times = shot.camera, shot.times
+    measurement = measure(shot.streak.counts, shot.streak.saturated, camera)
     if times[0] <= 0:
         raise CalibrationError(
             "light cannot come before time zero: give the camera's (--time-zero-ns)"
@@ -96,6 +94,13 @@ def fit_parallax_to_shot(
     curve = find_sharpest_shears(measurement, camera, cut, np.linspace(*shears), progress)
     found = fit_parallax_to_shears(curve.shears, distances, curve.weight)
     return ShotParallax(found.apply_to(camera), found, distances, curve)
+
+
+def count_parallax_work(shot: Shot, shears: tuple[float, float, int]) -> int:
+    """Return how many frame iterations `fit_parallax_to_shot` reports at most."""
+    rows = shot.streak.counts.shape[0]
+    fitting = count_registration_iterations() if shot.camera.sweep is None else 0
+    return fitting + shears[2] * GATE_METHOD.work(rows)
 
 
 def split_gates_by_brightness(
@@ -118,9 +123,7 @@ def split_gates_by_brightness(
     ranges : (gates,) float64 array
         Metres.
     """
-    light = np.maximum(
-        (measurement.measurements * measurement.valid).sum(axis=0, dtype=np.float64), 0
-    )
+    light = np.maximum((measurement.values * measurement.valid).sum(axis=0, dtype=np.float64), 0)
     share = np.cumsum(np.sqrt(light)) / np.sqrt(light).sum()
     edges = np.searchsorted(share, np.arange(1, number) / number) + 1
     cuts = np.unique(np.concatenate([[0], edges, [light.size]])).tolist()

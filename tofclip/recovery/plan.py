@@ -1,32 +1,45 @@
-"""From a streak image and a camera to transient frames: the main path, as a paragraph."""
+"""From a streak image and a camera to transient frames: a shot is opened, planned and run.
+
+The three steps, in this order: `open_shot` settles which camera took the shot and where its time
+zero lies, `plan_recovery` checks method, focus and device against it, and `RecoveryPlan.run` does
+the work. `recover` is the three in one call. docs/recovery_algorithm.md has the equations.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tofclip.arrays import CPU, ComputeDevice, parse_device, to_numpy
+from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_numpy, zeros
 from tofclip.camera import Camera, Measurement, measure
 from tofclip.camera.calibration.registration import count_registration_iterations, register_views
 from tofclip.camera.calibration.skew import estimate_skew
 from tofclip.errors import InputError
-from tofclip.recovery.focus import DEFAULT_FOCUS, Focus
-from tofclip.recovery.segments import compute_segments_residual, recover_segments
+from tofclip.io.streaks import read_streak
+from tofclip.operators import LinearOperator
+from tofclip.recovery.focus import DEFAULT_FOCUS, Focus, FrameSegment, parse_focus
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import (
     Backprojection,
     LinearInverse,
     Method,
     Progress,
+    ProximalMethod,
+    Result,
     Sparse,
     TotalVariation,
     ignore_progress,
+    relative_residual,
 )
-from tofclip.storage import Scalar
+from tofclip.solvers.loops import frames_per_block
+from tofclip.storage import Scalar, collect_provenance
+from tofclip.threads import split_blocks
 from tofclip.units import PICOSECOND
 
 MAX_ROW_PER_PULSE = 100.0
@@ -48,63 +61,173 @@ def make_method(name: str, **settings: Any) -> Method:
     name : str
         ``"tv"``, ``"l1"``, ``"linear"`` or ``"adjoint"``.
     **settings
-        Passed on, such as ``iterations`` and ``weight`` of the iterative methods.
+        Passed on, such as ``iterations`` and ``weight`` of the iterative methods; None stands for
+        the method's own.
+
+    Raises
+    ------
+    InputError
+        There is no such method, or it has no such setting.
+
+    Examples
+    --------
+    >>> make_method("tv", iterations=100, weight=None).iterations
+    100
     """
     if name not in METHODS:
         raise InputError(f"unknown method '{name}'; choose one of {', '.join(METHODS)}")
+    given = {setting: value for setting, value in settings.items() if value is not None}
     try:
-        return METHODS[name](**settings)
+        return METHODS[name](**given)
     except TypeError as fault:
-        raise InputError(f"method '{name}' does not take {', '.join(settings)}") from fault
+        raise InputError(f"method '{name}' does not take {', '.join(given)}") from fault
 
 
 @dataclass(frozen=True)
-class RecoveryTask:
-    """A recovery that is about to run, so that a progress bar can know its length.
+class Shot:
+    """A streak image together with what is known about the camera that took it.
 
     Parameters
     ----------
     streak : Streak
+        With a time axis.
     camera : Camera
-    method : Method
-    focus : Focus
-        At which shear each frame is recovered.
-    device : Place
-        Where: measurements are put there, and frames fetched from there. What precedes the recovery is
-        done in NumPy.
+        With the time zero that holds for this shot. Its sweep may be unknown; see `fit_camera`.
     """
 
     streak: Streak
     camera: Camera
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Time of flight of each row, (rows,), s: the camera's time zero is taken off."""
+        return self.streak.times - self.camera.time_zero
+
+    def fit_camera(self, progress: Progress = ignore_progress) -> Shot:
+        """Return this shot with a camera whose sweep is known, found from the shot if need be."""
+        if self.camera.sweep is not None:
+            return self
+        return replace(self, camera=fit_camera_to_shot(self.streak, self.camera, progress))
+
+
+def open_shot(
+    source: str | Path | Streak,
+    camera: str | Path | Camera | None = None,
+    time_zero: float | None = None,
+    bin_width: float | None = None,
+) -> Shot:
+    """Read a shot and settle which camera and which time zero belong to it.
+
+    Parameters
+    ----------
+    source : path-like or Streak
+        A file that `tofclip.read_streak` reads, or a streak image.
+    camera : path-like or Camera, optional
+        By default the one that the streak image carries.
+    time_zero : float, optional
+        Reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
+    bin_width : float, optional
+        Duration of a row, s; overrides the streak image's own time axis.
+
+    Returns
+    -------
+    Shot
+
+    Raises
+    ------
+    MissingTimeAxisError
+        Neither the streak image nor `bin_width` says how long a row lasts.
+    InputError
+        There is no camera.
+    StorageError, FileFormatError
+        A file cannot be read.
+
+    Examples
+    --------
+    >>> from tofclip.simulate.demo import simulate_demo  # doctest: +SKIP
+    >>> shot = open_shot("shot.h5", time_zero=-10.784e-9)  # doctest: +SKIP
+    """
+    if isinstance(source, Streak):
+        streak = source if bin_width is None else source.with_bin_width(bin_width)
+    else:
+        streak = read_streak(source, bin_width)
+    known = camera if camera is None or isinstance(camera, Camera) else Camera.load(camera)
+    known = known or streak.camera
+    if known is None:
+        raise InputError(
+            f"{streak.source} carries no camera: give one (--camera camera.h5, made by calibrate)"
+        )
+    require_plausible_rows(streak, known)
+    return Shot(streak, known if time_zero is None else known.replace(time_zero=time_zero))
+
+
+@dataclass(frozen=True)
+class RecoveryPlan:
+    """A recovery that was checked and can be run.
+
+    Parameters
+    ----------
+    shot : Shot
+    method : Method
+    focus : Focus
+        At which shear each frame is recovered.
+    device : ComputeDevice
+        Where the recovery runs: measurements are put there, and frames fetched from there. What
+        precedes the recovery is done in NumPy.
+    """
+
+    shot: Shot
     method: Method
-    focus: Focus = DEFAULT_FOCUS
-    device: ComputeDevice = CPU
+    focus: Focus
+    device: ComputeDevice
 
     @property
     def work(self) -> int:
         """Frame iterations that will be reported at most."""
-        frames = self.streak.counts.shape[0]
-        own = self.method.work(frames) + self.focus.work(frames)
-        return own + (count_registration_iterations() if self.camera.sweep is None else 0)
+        frames = self.shot.streak.counts.shape[0]
+        fitting = 0 if self.shot.camera.sweep is not None else count_registration_iterations()
+        return int(fitting + self.focus.work(frames) + self.method.work(frames))
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes that the arrays of the whole shot take: rectified measurements with their mask, and
+        frames.
+
+        The operator (16 bytes for each of ``views * rows * columns * 2`` entries) and a few blocks
+        of frames for each thread come on top.
+        """
+        rows, columns = self.shot.streak.counts.shape
+        height, width = self.shot.camera.image_shape
+        measured = rows * columns * (np.dtype(np.float32).itemsize + np.dtype(bool).itemsize)
+        return int(measured + rows * height * width * np.dtype(np.float32).itemsize)
 
     def run(self, progress: Progress = ignore_progress) -> Frames:
-        """Recover; see `recover`."""
+        """Recover every frame.
+
+        Parameters
+        ----------
+        progress : callable
+            Called with the number of frame iterations just done, `work` of them at most.
+
+        Returns
+        -------
+        Frames
+            As `recover` returns them.
+        """
         started = time.perf_counter()
-        camera = self.camera
-        if camera.sweep is None:
-            camera = fit_camera_to_shot(self.streak, camera, progress)
-        measurement = measure(self.streak.counts, self.streak.saturated, camera)
-        times = self.streak.times - camera.time_zero
+        shot = self.shot.fit_camera(progress)
+        streak, camera = shot.streak, shot.camera
+        measurement = measure(streak.counts, streak.saturated, camera)
         solving = time.perf_counter()
-        pieces = self.focus.plan_segments(camera, times, measurement, progress)
+        segments = self.focus.plan_segments(camera, shot.times, measurement, progress)
         with self.device.activate():
-            there = Measurement(
-                self.device.put(measurement.measurements), self.device.put(measurement.valid)
+            on_device = Measurement(
+                self.device.put(measurement.values), self.device.put(measurement.valid)
             )
-            result = recover_segments(self.method, camera, there, pieces, progress)
+            result = recover_segments(self.method, camera, on_device, segments, progress)
             values = to_numpy(result.frames)
             solved = time.perf_counter()
-            residual = compute_segments_residual(camera, result.frames, there, pieces)
+            residual = compute_segments_residual(camera, result.frames, on_device, segments)
         figures: dict[str, Scalar] = {
             "method": self.method.name,
             "focus": str(self.focus),
@@ -118,13 +241,72 @@ class RecoveryTask:
         }
         return Frames(
             values=values,
-            times=times,
+            times=shot.times,
             camera=camera,
-            shears=np.repeat([piece.shear for piece in pieces], [piece.size for piece in pieces]),
+            shears=np.repeat(
+                [segment.shear for segment in segments], [segment.size for segment in segments]
+            ),
             figures=figures,
-            attachments=self.streak.attachments,
-            provenance={**self.streak.provenance, "objective": result.objective.tolist()},
+            attachments=streak.attachments,
+            provenance={**streak.provenance, "objective": result.objective.tolist()},
         )
+
+    def add_provenance(self, frames: Frames, *inputs: str | Path) -> Frames:
+        """Return frames that say how they came about.
+
+        Parameters
+        ----------
+        frames : Frames
+            Of `run`.
+        *inputs : path-like
+            Files that the result depends on; their hashes are noted.
+        """
+        settings = {
+            "verb": "recover",
+            "method": repr(self.method),
+            "focus": str(self.focus),
+            "time_zero_s": self.shot.camera.time_zero,
+        }
+        past = collect_provenance(settings, *inputs) | {"earlier": dict(frames.provenance)}
+        return replace(frames, provenance=past)
+
+
+def plan_recovery(
+    shot: Shot,
+    method: str | Method = "tv",
+    focus: str | Focus = DEFAULT_FOCUS,
+    device: str = "cpu",
+) -> RecoveryPlan:
+    """Check, before any work is done, that a shot can be recovered as asked.
+
+    Parameters
+    ----------
+    shot : Shot
+        Of `open_shot`.
+    method : str or Method
+        A name that `make_method` knows, or a configured `tofclip.solvers` method.
+    focus : str or Focus
+        As `parse_focus` reads it, or `FixedFocus`, `DepthLockedFocus` or `SharpestFocus`.
+    device : str
+        See `tofclip.arrays.parse_device`.
+
+    Returns
+    -------
+    RecoveryPlan
+
+    Raises
+    ------
+    CalibrationError
+        The camera does not know enough for this focus.
+    InputError
+        There is no such method, focus or name of a device.
+    MissingDependencyError
+        There is no such device.
+    """
+    chosen = parse_focus(focus) if isinstance(focus, str) else focus
+    chosen.check_camera(shot.camera)
+    solver = make_method(method) if isinstance(method, str) else method
+    return RecoveryPlan(shot, solver, chosen, parse_device(device))
 
 
 def recover(
@@ -174,47 +356,8 @@ def recover(
     MissingDependencyError
         There is no such device.
     """
-    return prepare_recovery(streak, camera, method, focus, device).run(progress)
-
-
-def prepare_recovery(
-    streak: Streak,
-    camera: Camera | None = None,
-    method: str | Method = "tv",
-    focus: Focus | None = None,
-    device: str = "cpu",
-) -> RecoveryTask:
-    """Check what `recover` needs before any work is done; arguments as there.
-
-    Parameters
-    ----------
-    streak : Streak
-    camera : Camera, optional
-        Instead of the one that the streak image carries.
-    method : str or Method
-    focus : Focus, optional
-    device : str
-        See `tofclip.arrays.parse_device`.
-
-    Returns
-    -------
-    RecoveryTask
-
-    Raises
-    ------
-    InputError
-        There is no camera, the shot has no time axis, or the focus does not fit the camera.
-    """
-    camera = camera or streak.camera
-    if camera is None:
-        raise InputError(
-            f"{streak.source} carries no camera: give one (--camera camera.h5, made by calibrate)"
-        )
-    require_plausible_rows(streak, camera)  # before minutes of work
-    focus = DEFAULT_FOCUS if focus is None else focus
-    focus.check_camera(camera)
-    solver = make_method(method) if isinstance(method, str) else method
-    return RecoveryTask(streak, camera, solver, focus, parse_device(device))
+    shot = open_shot(streak, camera)
+    return plan_recovery(shot, method, focus or DEFAULT_FOCUS, device).run(progress)
 
 
 def require_plausible_rows(streak: Streak, camera: Camera) -> None:
@@ -267,6 +410,141 @@ def fit_camera_to_shot(
     skew = estimate_skew(streak.counts, camera)
     coarse = replace(camera, sweep=skew.sweep)
     return register_views(streak.counts, streak.saturated, coarse, progress).camera
+
+
+def recover_segments(
+    method: Method,
+    camera: Camera,
+    measurement: Measurement,
+    segments: Sequence[FrameSegment],
+    progress: Progress = ignore_progress,
+) -> Result:
+    """Recover all frames, each segment with the operator of its own shear.
+
+    A prior's weight is relative to the brightest of the frames it is given. For segments to be
+    treated alike, it is made relative to what a surface like the shot's brightest would send back
+    from each segment's range.
+
+    Parameters
+    ----------
+    method : Method
+    camera : Camera
+    measurement : Measurement
+        Its arrays may be of any library that the method takes; the frames are where they are.
+    segments : sequence of FrameSegment
+        All frames, in order.
+    progress : callable
+        Called with the number of frame iterations just done.
+
+    Returns
+    -------
+    Result
+        Frames (frames, rows, columns).
+
+    Notes
+    -----
+    Memory: the frames, and one operator at a time.
+    """
+    if len(segments) == 1:
+        operator = camera.operator(segments[0].shear)
+        return method.recover(operator, measurement.values, measurement.valid, progress)
+    peaks = np.array(
+        [
+            _find_backprojection_peak(
+                camera.operator(segment.shear), _slice_measurement(measurement, segment)
+            )
+            for segment in segments
+        ]
+    )
+    expected = np.array([segment.brightness for segment in segments])
+    scale = (np.maximum(peaks, 0) / expected).max() * expected
+    frames = zeros((measurement.values.shape[1], *camera.image_shape), measurement.values)
+    results = []
+    for segment, peak, bright in zip(segments, peaks, scale, strict=True):
+        if peak <= 0:
+            progress(method.work(segment.size))  # dark: nothing to recover
+            continue
+        part = _slice_measurement(measurement, segment)
+        weighted = (
+            replace(method, weight=method.weight * bright / peak)
+            if isinstance(method, ProximalMethod)
+            else method
+        )
+        result = weighted.recover(camera.operator(segment.shear), part.values, part.valid, progress)
+        frames[segment.frames, ...] = result.frames
+        results.append(replace(result, frames=frames[segment.frames, ...]))
+    return _join_results(frames, results)
+
+
+def compute_segments_residual(
+    camera: Camera, frames: Array, measurement: Measurement, segments: Sequence[FrameSegment]
+) -> float:
+    """Return ``|F h - f| / |f|`` over all valid measurements, each frame with its own operator.
+
+    Parameters
+    ----------
+    camera : Camera
+    frames : (frames, rows, columns) array
+        Recovered.
+    measurement : Measurement
+    segments : sequence of FrameSegment
+        Without gaps; each has its shear.
+
+    Returns
+    -------
+    float
+        0 is a perfect fit.
+    """
+    misfit = energy = 0.0
+    for segment in segments:
+        part = _slice_measurement(measurement, segment)
+        xp = namespace(part.values)
+        own = float(xp.sum(_zero_invalid(part) ** 2, dtype=xp.float64))
+        if own > 0:
+            operator = camera.operator(segment.shear)
+            misfit += (
+                own
+                * relative_residual(operator, frames[segment.frames, ...], part.values, part.valid)
+                ** 2
+            )
+            energy += own
+    return float(np.sqrt(misfit / energy))
+
+
+def _slice_measurement(measurement: Measurement, segment: FrameSegment) -> Measurement:
+    columns = segment.frames
+    return Measurement(measurement.values[:, columns], measurement.valid[:, columns])
+
+
+def _zero_invalid(part: Measurement) -> Array:
+    """Return the measurements, zero where they are not valid."""
+    return namespace(part.values, part.valid).where(part.valid, part.values, 0.0)
+
+
+def _find_backprojection_peak(operator: LinearOperator, part: Measurement) -> float:
+    """Return the largest value of F'f over the valid measurements."""
+    xp, measurements = namespace(part.values), _zero_invalid(part)
+    blocks = split_blocks(measurements.shape[1], frames_per_block(operator, measurements))
+    return max(float(xp.max(operator.adjoint(measurements[:, block]))) for block in blocks)
+
+
+def _join_results(frames: Array, results: list[Result]) -> Result:
+    """Join what is known about the segments; those that stopped early count with their last
+    objective.
+    """
+    longest = max(result.objective.size for result in results)
+    objective = np.zeros(longest)
+    for result in results:
+        if result.objective.size:
+            objective += np.pad(result.objective, (0, longest - result.objective.size), "edge")
+    reasons = {result.stop_reason for result in results}
+    return Result(
+        frames,
+        max(result.iterations for result in results),
+        objective,
+        "iteration limit" if "iteration limit" in reasons else results[0].stop_reason,
+        sum(result.setup_seconds for result in results),
+    )
 
 
 def compute_view_delays_bins(camera: Camera) -> list[float]:

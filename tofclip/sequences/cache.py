@@ -17,7 +17,7 @@ from numpy.typing import DTypeLike
 from tofclip.arrays import Array, namespace, to_numpy
 from tofclip.camera import Camera
 from tofclip.operators import LinearOperator
-from tofclip.operators.projection import LineProjection
+from tofclip.operators.sparse import LineProjection
 from tofclip.solvers import LinearInverse, Progress, Result, ignore_progress
 from tofclip.solvers.direct import PreparedInverse
 from tofclip.storage import Record

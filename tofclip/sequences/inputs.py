@@ -8,11 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from tofclip.errors import FileFormatError, InputError, StorageError
+from tofclip.errors import InputError, StorageError
 from tofclip.io import read_streak
 from tofclip.sequences.jobs.output_folder import SETTINGS_NAME
-from tofclip.shots import Streak
-from tofclip.shots.stack import StreakStack
+from tofclip.shots import Streak, StreakStack
 from tofclip.storage import HDF5_SIGNATURE
 
 
@@ -76,7 +75,7 @@ def list_shots(source: str | Path, bin_width: float | None = None) -> dict[str, 
     Parameters
     ----------
     source : path-like
-        Folder, glob pattern or HDF5 stack (`tofclip.shots.stack`).
+        Folder, glob pattern or HDF5 stack (`tofclip.shots`).
     bin_width : float, optional
         Duration of a row, s; overrides time axes.
 
@@ -159,9 +158,6 @@ def _is_stack(path: Path) -> bool:
     """Tell a stack from a single streak image: it has one more dimension."""
     try:
         with open(path, "rb") as file:
-            if file.read(len(HDF5_SIGNATURE)) != HDF5_SIGNATURE:
-                return False
-        StreakStack(path)
-    except (OSError, FileFormatError):
+            return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE and StreakStack.is_one(path)
+    except OSError:
         return False
-    return True

@@ -21,7 +21,7 @@ from tofclip.lidar.search import ReturnSearch
 from tofclip.lidar.signal_rows.selection import RowBlock, SignalRowFinder
 from tofclip.lidar.traces import TraceBins, Traces
 from tofclip.recovery.focus import DEFAULT_FOCUS, Focus
-from tofclip.recovery.plan import fit_camera_to_shot, prepare_recovery
+from tofclip.recovery.plan import open_shot
 from tofclip.shots import Streak
 from tofclip.solvers import LinearInverse
 from tofclip.solvers.traces import InverseTraces, order_by_patch
@@ -108,7 +108,11 @@ class RangingPipeline:
 
     @classmethod
     def for_shot(
-        cls, shot: Streak, camera: Camera | None = None, focus: Focus = DEFAULT_FOCUS
+        cls,
+        shot: Streak,
+        camera: Path | Camera | None = None,
+        focus: Focus = DEFAULT_FOCUS,
+        time_zero: float | None = None,
     ) -> RangingPipeline:
         """Prepare for shots like this one; a sweep that is not known is found from it.
 
@@ -116,9 +120,12 @@ class RangingPipeline:
         ----------
         shot : Streak
             With a time axis.
-        camera : Camera, optional
+        camera : Path or Camera, optional
             Defaults to the one that the shot carries.
         focus : Focus
+        time_zero : float, optional
+            Reading of the time axis at which light of range 0 would arrive, s; the camera's by
+            default.
 
         Returns
         -------
@@ -129,12 +136,9 @@ class RangingPipeline:
         MissingTimeAxisError, InputError, CalibrationError
             As for `tofclip.recover`.
         """
-        known = prepare_recovery(shot, camera, LinearInverse(), focus).camera
-        return cls(
-            known if known.sweep is not None else fit_camera_to_shot(shot, known),
-            shot.times,
-            focus=focus,
-        )
+        opened = open_shot(shot, camera, time_zero)
+        focus.check_camera(opened.camera)
+        return cls(opened.fit_camera().camera, shot.times, focus=focus)
 
     def find_returns(self, measurements: NDArray[np.float32]) -> Returns:
         """Find the returns in one shot's rectified measurements, (columns, rows)."""
@@ -325,7 +329,7 @@ def make_average_cloud(
         streak = shots[place]()
         if jitter is not None:
             late[place] = jitter.late_bin(compute_light_curve(streak, pipeline.camera))
-        return pipeline.rectifier.measurements(streak.counts, delay=float(late[place]))
+        return pipeline.rectifier.rectify(streak.counts, delay=float(late[place]))
 
     total = measurements(0)
     for place in range(1, len(shots)):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tofclip.camera import Camera
 from tofclip.errors import InputError
-from tofclip.recovery import SharpestFocus, fit_camera_to_shot, parse_focus, prepare_recovery
+from tofclip.recovery import SharpestFocus, open_shot, parse_focus
 from tofclip.sequences.inputs import Shot
 from tofclip.sequences.jobs import Job, lock_output_folder
 from tofclip.sequences.ranger import (
@@ -99,14 +99,7 @@ class RangingSettings:
         """Return what all shots share: camera, time axis, focus, and the first shot's light over
         time.
         """
-        task = prepare_recovery(
-            first, None if self.camera is None else Camera.load(self.camera), "linear"
-        )
-        known = (
-            task.camera if self.time_zero is None else task.camera.replace(time_zero=self.time_zero)
-        )
-        if known.sweep is None:
-            known = fit_camera_to_shot(first, known)
+        known = open_shot(first, self.camera, self.time_zero).fit_camera().camera
         parse_focus(self.focus).check_camera(known)
         light = compute_light_curve(first, known) if self.steady else np.empty(0)
         fields = {

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from tofclip.arrays import CPU
-from tofclip.camera import Camera
-from tofclip.recovery import RecoveryTask, make_method, parse_focus, prepare_recovery
+from tofclip.recovery import RecoveryPlan, make_method, open_shot, parse_focus, plan_recovery
 from tofclip.sequences.cache import CachedInverse, get_cached_camera
 from tofclip.sequences.inputs import Shot, make_result_paths
 from tofclip.sequences.jobs import Job, lock_output_folder
-from tofclip.shots import Frames, Streak
+from tofclip.shots import Streak
 from tofclip.solvers import LinearInverse, Method
-from tofclip.storage import collect_provenance, compute_sha256
+from tofclip.storage import compute_sha256
 
 FRAMES_SUFFIX = ".h5"
 
@@ -61,21 +60,12 @@ class RecoverySettings:
 
     def build_solver(self) -> Method:
         """Return the method with its settings."""
-        chosen = {"iterations": self.iterations, "weight": self.weight}
-        return make_method(
-            self.method, **{name: value for name, value in chosen.items() if value is not None}
-        )
+        return make_method(self.method, iterations=self.iterations, weight=self.weight)
 
-    def prepare_task(self, streak: Streak) -> RecoveryTask:
+    def plan(self, streak: Streak) -> RecoveryPlan:
         """Check a shot against the camera, before any work is done."""
-        known = None if self.camera is None else Camera.load(self.camera)
-        focus = parse_focus(self.focus)
-        task = prepare_recovery(streak, known, self.build_solver(), device=self.device)
-        camera = (
-            task.camera if self.time_zero is None else task.camera.replace(time_zero=self.time_zero)
-        )
-        focus.check_camera(camera)
-        return replace(task, camera=camera, focus=focus)
+        shot = open_shot(streak, self.camera, self.time_zero)
+        return plan_recovery(shot, self.build_solver(), self.focus, self.device)
 
     def jobs(self, shots: Mapping[str, Shot], folder: Path) -> list[Job]:
         """Return one job for each shot, which writes its frames into `folder`.
@@ -132,35 +122,11 @@ def recover_shot(recovery: RecoverySettings, shot: Shot, result: Path) -> None:
         Called to read it.
     result : Path
     """
-    task = recovery.prepare_task(shot())
-    if task.camera.sweep is not None:  # otherwise it is fitted to the shot, and another for each
+    plan = recovery.plan(shot())
+    if plan.shot.camera.sweep is not None:  # otherwise it is fitted to the shot, another for each
         method = (
-            CachedInverse(task.method) if isinstance(task.method, LinearInverse) else task.method
+            CachedInverse(plan.method) if isinstance(plan.method, LinearInverse) else plan.method
         )
-        task = replace(task, camera=get_cached_camera(task.camera), method=method)
-    add_provenance(task.run(), task).save(result)
-
-
-def add_provenance(frames: Frames, task: RecoveryTask, *inputs: Path) -> Frames:
-    """Return frames with a record of how they came about.
-
-    Parameters
-    ----------
-    frames : Frames
-    task : RecoveryTask
-    *inputs : Path
-        Files whose checksums are recorded.
-
-    Returns
-    -------
-    Frames
-    """
-    told = {
-        "method": repr(task.method),
-        "focus": str(task.focus),
-        "time_zero_s": task.camera.time_zero,
-    }
-    past = collect_provenance({"verb": "recover", **told}, *inputs) | {
-        "earlier": dict(frames.provenance)
-    }
-    return replace(frames, provenance=past)
+        known = replace(plan.shot, camera=get_cached_camera(plan.shot.camera))
+        plan = replace(plan, shot=known, method=method)
+    plan.add_provenance(plan.run()).save(result)

@@ -52,7 +52,7 @@ def test_white_noise_is_as_strong_as_asked(library):
         for n in (0.0, 0.1)
     )
     # 80 x 40 readings: the standard deviation of a standard deviation is 1.3 %
-    deviation = np.std(noisy.measurements - quiet.measurements) / np.std(quiet.measurements)
+    deviation = np.std(noisy.values - quiet.values) / np.std(quiet.values)
     assert deviation == pytest.approx(0.1, rel=0.06)
 
 

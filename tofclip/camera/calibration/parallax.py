@@ -188,7 +188,7 @@ def find_sharpest_shears(
     for column, shear in enumerate(tried):
         operator = camera.operator(float(shear))
         for row, gate in enumerate(gates):
-            measurements = np.ascontiguousarray(measurement.measurements[:, gate])
+            measurements = np.ascontiguousarray(measurement.values[:, gate])
             valid = np.ascontiguousarray(measurement.valid[:, gate])
             if operator.adjoint(measurements * valid).max() <= 0:
                 progress(GATE_METHOD.work(measurements.shape[1]))  # dark
@@ -196,7 +196,7 @@ def find_sharpest_shears(
             frames = GATE_METHOD.recover(operator, measurements, valid, progress).frames
             table[row, column] = relative_residual(operator, frames, measurements, valid) ** -2
     light = np.array(
-        [np.sum((measurement.measurements * measurement.valid)[:, gate].clip(0)) for gate in gates]
+        [np.sum((measurement.values * measurement.valid)[:, gate].clip(0)) for gate in gates]
     )
     return _fit_focus_curve(table, tried, light)
 

@@ -75,12 +75,10 @@ def register_views(
     for last in [False] * ROUND_COUNT + [True]:
         measurement = measure(counts, saturated, camera)
         chosen = _select_frames(measurement)
-        part = Measurement(measurement.measurements[:, chosen], measurement.valid[:, chosen])
+        part = Measurement(measurement.values[:, chosen], measurement.valid[:, chosen])
         operator = camera.operator()
-        pictures = REGISTRATION_METHOD.recover(
-            operator, part.measurements, part.valid, progress
-        ).frames
-        residuals.append(relative_residual(operator, pictures, part.measurements, part.valid))
+        pictures = REGISTRATION_METHOD.recover(operator, part.values, part.valid, progress).frames
+        residuals.append(relative_residual(operator, pictures, part.values, part.valid))
         best = min(best, (residuals[-1], camera), key=lambda pair: pair[0])
         if not last:
             camera = _refine_camera(camera, start, measurement, chosen, pictures)
@@ -97,7 +95,7 @@ def _select_frames(measurement: Measurement) -> NDArray[np.intp]:
     too.
     """
     brightness = np.sqrt(
-        np.maximum((measurement.measurements * measurement.valid).sum(axis=0, dtype=np.float64), 0)
+        np.maximum((measurement.values * measurement.valid).sum(axis=0, dtype=np.float64), 0)
     )
     share = np.cumsum(brightness) / brightness.sum()
     wanted = (np.arange(MAX_FRAMES) + 0.5) / MAX_FRAMES
@@ -120,8 +118,8 @@ def _refine_camera(
             "only a skew per view can be refined; this camera's sweep was measured as a whole"
         )
     blocks = np.ascontiguousarray(np.moveaxis(pictures, 0, -1))
-    misfit = measurement.measurements[:, chosen] - camera.operator()(blocks)
-    slope = np.gradient(measurement.measurements, axis=1)[:, chosen]
+    misfit = measurement.values[:, chosen] - camera.operator()(blocks)
+    slope = np.gradient(measurement.values, axis=1)[:, chosen]
     drift = camera.centres_px - start.centres_px
     evidence = _ViewResiduals(blocks, misfit, slope, measurement.valid[:, chosen], chosen)
     corrections = np.array(

@@ -101,7 +101,7 @@ def stream_clouds(
 def _make_cloud(shot: Streak, pipeline: RangingPipeline) -> tuple[PointCloud, dict[str, float]]:
     """Make the cloud of a shot; return it and what each step took, s."""
     steps: dict[str, Callable[[Any], Any]] = {
-        "rectify": lambda streak: pipeline.rectifier.measurements(streak.counts),
+        "rectify": lambda streak: pipeline.rectifier.rectify(streak.counts),
         "recover": pipeline.recover,
         "range": pipeline.search,
         "place": point_cloud,

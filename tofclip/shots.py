@@ -1,0 +1,336 @@
+"""Shots: the streak image that was measured, many of them in one file, and the frames recovered from
+one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.arrays import Array, namespace
+from tofclip.camera import Camera
+from tofclip.errors import FileFormatError, InputError, MissingTimeAxisError, ShapeError
+from tofclip.records import (
+    Storable,
+    stored_array,
+    stored_attachments,
+    stored_attributes,
+    stored_child,
+    stored_origin,
+    stored_provenance,
+    stored_texts,
+)
+from tofclip.storage import Record, Scalar, atomic_path, translate_read_errors
+
+__all__ = ["Frames", "Streak"]
+
+MAX_BIN_WIDTH_S = 1e-3
+"""s; the slowest sweeps of streak cameras last milliseconds in all."""
+
+
+@dataclass(frozen=True)
+class Streak(Storable):
+    """A streak image with whatever its file said about it.
+
+    Parameters
+    ----------
+    counts : (rows, columns) array
+        Sensor measurements, kept as float32. May hold negative values (background already subtracted).
+    row_times : (rows,) array or None
+        Instant of each row, s, strictly increasing, not necessarily evenly. None where the file has
+        no time axis.
+    saturated : (rows, columns) bool array or None
+        Pixels that reached the sensor's limit.
+    metadata : mapping of str to str
+        The file's own text, key by key.
+    camera : Camera or None
+        The camera that took it, where the file carries one.
+    attachments : mapping of str to Record
+        Further records that belong to the shot and travel on to its frames unchanged, such as a
+        relay wall.
+    source : str
+        Where it came from, for messages.
+    provenance : mapping
+        How it came about.
+
+    Raises
+    ------
+    InputError
+        Not a 2D array, empty, holding NaN or infinity, all zero, or with a time axis that does not
+        increase.
+    """
+
+    RECORD_KIND = "streak"
+
+    counts: NDArray[np.float32] = field(
+        metadata=stored_array("count", "time", "column", dtype=np.float32)
+    )
+    row_times: NDArray[np.float64] | None = field(
+        default=None, metadata=stored_array("s", "time", optional=True)
+    )
+    saturated: NDArray[np.bool_] | None = field(
+        default=None, metadata=stored_array("", "time", "column", dtype=bool, optional=True)
+    )
+    metadata: Mapping[str, str] = field(default_factory=dict, metadata=stored_texts())
+    camera: Camera | None = field(
+        default=None, metadata=stored_child(Camera.from_record, optional=True)
+    )
+    attachments: Mapping[str, Record] = field(default_factory=dict, metadata=stored_attachments())
+    source: str = field(default="streak image", metadata=stored_origin())
+    provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
+
+    def __post_init__(self) -> None:
+        with np.errstate(
+            over="ignore"
+        ):  # too large for float32 becomes infinite, which is refused below
+            counts = np.ascontiguousarray(self.counts, dtype=np.float32)
+        object.__setattr__(self, "counts", counts)
+        if counts.ndim != 2 or counts.size == 0:
+            raise ShapeError(f"{self.source}: a streak image", "(rows, columns)", counts.shape)
+        bad = counts.size - int(np.count_nonzero(np.isfinite(counts)))
+        if bad:
+            raise InputError(
+                f"{self.source}: {bad} pixels are NaN or infinite; replace them or mark them as saturated"
+            )
+        if not np.any(counts):
+            raise InputError(f"{self.source}: every pixel is zero; was the shutter closed?")
+        if self.saturated is not None and self.saturated.shape != counts.shape:
+            raise ShapeError("saturated", counts.shape, self.saturated.shape)
+        if self.row_times is not None:
+            object.__setattr__(self, "row_times", self._check_times(self.row_times))
+
+    def _check_times(self, times: Any) -> NDArray[np.float64]:
+        checked = np.asarray(times, dtype=np.float64)
+        if checked.shape != (self.counts.shape[0],):
+            raise ShapeError(
+                f"{self.source}: the time axis", (self.counts.shape[0],), checked.shape
+            )
+        if not np.all(np.isfinite(checked)) or np.any(np.diff(checked) <= 0):
+            raise InputError(f"{self.source}: the time axis must be finite and increase row by row")
+        return checked
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Instant of each row, s; raises `MissingTimeAxisError` where none is known."""
+        self.require_times()
+        return np.asarray(self.row_times)
+
+    def require_times(self) -> None:
+        """Raise `MissingTimeAxisError` where the instants of the rows are not known."""
+        if self.row_times is None:
+            raise MissingTimeAxisError(
+                f"{self.source} has no time axis: give the duration of a row (--bin-width-ps, or bin_width in seconds)"
+            )
+
+    def with_bin_width(self, bin_width: float) -> Streak:
+        """Return the same picture with evenly spaced rows of `bin_width` seconds, the first at 0."""
+        if not (np.isfinite(bin_width) and bin_width > 0):
+            raise InputError(f"bin width must be a positive number of seconds, got {bin_width}")
+        if bin_width > MAX_BIN_WIDTH_S:
+            raise InputError(
+                f"a row of {bin_width:.3g} s is longer than any sweep; --bin-width-ps is in picoseconds"
+            )
+        return replace(
+            self, row_times=np.arange(self.counts.shape[0], dtype=np.float64) * float(bin_width)
+        )
+
+
+class StreakStack:
+    """A sequence of streak images in an HDF5 file: dataset ``counts`` (shot, time, column),
+    ``row_times`` (time) in s.
+
+    Any program can write such a file. Only the shot that is asked for is in memory.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Raises
+    ------
+    FileFormatError, StorageError
+        No HDF5 file, or one without these datasets.
+    """
+
+    @staticmethod
+    def is_one(path: str | Path) -> bool:
+        """Say whether an HDF5 file holds a stack: dataset ``counts`` with one axis more than a
+        streak image.
+        """
+        import h5py
+
+        try:
+            with h5py.File(path, "r") as file:
+                counts = file.get("counts")
+                return isinstance(counts, h5py.Dataset) and counts.ndim == 3 and counts.size > 0
+        except (OSError, KeyError, RuntimeError):
+            return False
+
+    def __init__(self, path: str | Path) -> None:
+        import h5py
+
+        self.path = Path(path)
+        with translate_read_errors(path):
+            open(path, "rb").close()
+        try:
+            with h5py.File(path, "r") as file:
+                self._shape = tuple(int(n) for n in file["counts"].shape)
+                self.row_times: NDArray[np.float64] | None = (
+                    np.asarray(file["row_times"], dtype=np.float64) if "row_times" in file else None
+                )
+        except (OSError, KeyError, RuntimeError, AttributeError) as fault:
+            raise FileFormatError(
+                path, "is not a stack of streak images: it needs a dataset 'counts'"
+            ) from fault
+        if len(self._shape) != 3 or 0 in self._shape:
+            raise FileFormatError(
+                path, f"'counts' must be (shot, time, column), found {self._shape}"
+            )
+
+    def __len__(self) -> int:
+        return self._shape[0]
+
+    def read_shot(self, number: int, camera: Camera | None = None) -> Streak:
+        """Read one shot, from 0.
+
+        Parameters
+        ----------
+        number : int
+        camera : Camera, optional
+
+        Returns
+        -------
+        Streak
+
+        Raises
+        ------
+        InputError
+            There is no shot of that number.
+        FileFormatError
+            The shot is damaged.
+        """
+        import h5py
+
+        if not 0 <= number < len(self):
+            raise InputError(f"{self.path} holds shots 0..{len(self) - 1}, not {number}")
+        try:
+            with h5py.File(self.path, "r") as file:
+                counts = np.asarray(file["counts"][number], dtype=np.float32)
+        except (OSError, RuntimeError) as fault:
+            raise FileFormatError(self.path, f"shot {number} is damaged") from fault
+        return Streak(counts, self.row_times, camera=camera, source=f"{self.path} shot {number}")
+
+    def __iter__(self) -> Iterator[Streak]:
+        for number in range(len(self)):
+            yield self.read_shot(number)
+
+
+def save_stack(shots: Iterable[Streak], path: str | Path) -> int:
+    """Write shots to one file, whole or not at all; return how many. All have the first one's shape
+    and time axis.
+
+    Parameters
+    ----------
+    shots : iterable of Streak
+        Taken one at a time.
+    path : str or Path
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    ShapeError
+        A shot has another shape than the first.
+    InputError
+        There is no shot.
+    """
+    import h5py
+
+    number = 0
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        for shot in shots:
+            if number == 0:
+                shape = shot.counts.shape
+                options = {
+                    "maxshape": (None, *shape),
+                    "chunks": (1, *shape),
+                    "compression": "gzip",
+                    "shuffle": True,
+                }
+                stored = file.create_dataset("counts", (0, *shape), np.float32, **options)
+                if shot.row_times is not None:
+                    file.create_dataset("row_times", data=shot.row_times).attrs["units"] = "s"
+            if shot.counts.shape != shape:
+                raise ShapeError(f"shot {number} of a stack", shape, shot.counts.shape)
+            stored.resize(number + 1, axis=0)
+            stored[number] = shot.counts
+            number += 1
+        if number == 0:
+            raise InputError(f"{path}: there is no shot to write")
+    return number
+
+
+@dataclass(frozen=True)
+class Frames(Storable):
+    """A transient cube with its axes and the camera that saw it.
+
+    Parameters
+    ----------
+    values : (time, y, x) array
+        Brightness in counts, float32, y pointing down. Of any library: what is done with the frames
+        is done there, if it can be, and what can be done in NumPy only says so. Files hold NumPy's.
+    times : (time,) array
+        Time of flight of each frame, s, strictly increasing: the camera's time zero is already
+        taken off.
+    camera : Camera
+        The camera, with the gains and the sweep that were used for this shot.
+    figures : mapping
+        Scalars of the recovery, such as ``relative_residual``.
+    attachments : mapping of str to Record
+        What travelled along with the streak image.
+    provenance : mapping
+        How they came about.
+    shears : (time,) array, optional
+        Shear at which each frame was recovered, pixels per view step; 0 everywhere by default.
+    """
+
+    RECORD_KIND = "frames"
+
+    values: Array = field(metadata=stored_array("count", "time", "y", "x", dtype=np.float32))
+    times: NDArray[np.float64] = field(metadata=stored_array("s", "time"))
+    camera: Camera = field(metadata=stored_child(Camera.from_record, "camera"))
+    figures: Mapping[str, Scalar] = field(default_factory=dict, metadata=stored_attributes())
+    attachments: Mapping[str, Record] = field(default_factory=dict, metadata=stored_attachments())
+    provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
+    shears: NDArray[np.float64] = field(
+        default_factory=lambda: np.empty(0), metadata=stored_array("px", "time", optional=True)
+    )
+
+    def __post_init__(self) -> None:
+        times = np.asarray(self.times, dtype=np.float64)
+        object.__setattr__(self, "times", times)
+        expected = (times.size, *self.camera.image_shape)
+        if self.values.shape != expected:
+            raise ShapeError("frames", f"(time, y, x) = {expected}", tuple(self.values.shape))
+        if times.size == 0 or not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
+            raise InputError("frame times must be finite and increase")
+        shears = np.asarray(self.shears, dtype=np.float64)
+        object.__setattr__(self, "shears", shears if shears.size else np.zeros(times.size))
+        if self.shears.shape != times.shape or not np.all(np.isfinite(self.shears)):
+            raise ShapeError("the frames' shears", f"{times.shape}, finite", self.shears.shape)
+        xp = namespace(self.values)
+        if not xp.all(xp.isfinite(self.values)):
+            raise InputError("frames must not hold NaN or infinity")
+
+    @property
+    def bin_width(self) -> float:
+        """Mean time between frames, s."""
+        if self.times.size == 1:
+            raise InputError("a single frame has no bin width")
+        return float((self.times[-1] - self.times[0]) / (self.times.size - 1))
