@@ -39,7 +39,7 @@ from tofclip.solvers import (
     relative_residual,
 )
 from tofclip.solvers import direct as direct_module
-from tofclip.solvers import iteration as loop_module
+from tofclip.solvers import method as loop_module
 
 strict = pytest.importorskip("array_api_strict")
 OTHER_DEVICE = ComputeDevice("array_api_strict", strict.Device("device1"))
@@ -64,7 +64,7 @@ def fetched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         sizes.append(array.size)
         return brought_here(array)
 
-    for module in (loop_module, direct_module, lidar.portable.search):
+    for module in (loop_module, direct_module, lidar.search.array_api):
         monkeypatch.setattr(module, "to_numpy", fetch)
     return sizes
 

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from tofclip.arrays import CPU, Array, ComputeDevice, namespace, parse_device, to_numpy
 from tofclip.camera import Camera
 from tofclip.lidar import Detection
-from tofclip.lidar.portable import PortableTraces
 from tofclip.lidar.search import ReturnSearch
+from tofclip.lidar.search.array_api import ArrayTraces
 from tofclip.lidar.traces import FrameTraces
 from tofclip.shots import Frames
 from tofclip.solvers import LinearInverse, Sparse, TotalVariation
@@ -126,7 +126,7 @@ class Ranging:
         """Search frames (time, y, x)."""
         frames = Frames(values, self._times, self._camera)
         return self._search.find_returns(
-            FrameTraces(frames) if ComputeDevice.of(values) == CPU else PortableTraces(frames)
+            FrameTraces(frames) if ComputeDevice.of(values) == CPU else ArrayTraces(frames)
         ).range
 
 

@@ -13,6 +13,17 @@ from tofclip.errors import InputError
 FloatArray = NDArray[np.float64]
 
 SLOTS_PER_WIDTH = 4
+
+# Of the share of the strongest return that a candidate needs before the fit, which does not make up
+# for more than the rest.
+PREFIT_THRESHOLD_FACTOR = 0.7
+
+# Gauss-Newton from near the top has converged after two rounds; more are for returns that overlap.
+MAX_FIT_ROUNDS = 8
+
+# A return that moved by less is done: its next step would be smaller by far.
+CONVERGENCE_STEP_BINS = 5e-3
+
 SCENE_BRIGHTNESS_QUANTILE = (
     0.999  # the scene's brightness is that of its brightest pixels, but not of a single glint
 )

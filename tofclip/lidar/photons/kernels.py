@@ -1,7 +1,7 @@
 """The compiled search for returns in histograms of photons.
 
 Positions below a bin and overlapping returns are treated by the steps of
-`tofclip.lidar.fit.kernels`; here is what Poisson statistics add.
+`tofclip.lidar.pulse_fit`; here is what Poisson statistics add.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tofclip.lidar.fit.kernels import (
+from tofclip.lidar.pulse_fit import (
     compute_residual,
     find_pulse_window,
     interpolate_pulse,
@@ -122,7 +122,7 @@ def extract_strongest_returns(
     first : int
         Bin of the first weight relative to the return's.
     scale, times
-        As in `tofclip.lidar.fit.kernels`.
+        As in `tofclip.lidar.pulse_fit`.
     peaks : (n, most returns) int64 array, changed
     numbers : (n,) int64 array, changed
     """
@@ -150,7 +150,7 @@ def fit_histograms(histograms, peaks, numbers, curve, scale, times, found):
     peaks, numbers
         As `extract_strongest_returns` left them.
     curve, scale, times
-        As in `tofclip.lidar.fit.kernels`.
+        As in `tofclip.lidar.pulse_fit`.
     found : (n, most returns, 3) float64 array
         Overwritten with arrival, photons and standard deviation of the arrival where there is a
         return.
@@ -192,7 +192,7 @@ def estimate_background(trace, times, peaks, scale):
     peaks : sequence of int
         Bins of the returns.
     scale : (4,) array or tuple
-        The pulse's; see `tofclip.lidar.fit.kernels`.
+        The pulse's; see `tofclip.lidar.pulse_fit`.
 
     Returns
     -------
@@ -227,7 +227,7 @@ def estimate_height(trace, times, background, curve, scale, peak):
     curve : (samples, 2) array
         Pulse and slope.
     scale : (4,) array or tuple
-        The pulse's; see `tofclip.lidar.fit.kernels`.
+        The pulse's; see `tofclip.lidar.pulse_fit`.
     peak : int
         Bin of the return.
 
@@ -260,9 +260,9 @@ def summarise_return(trace, times, background, curve, scale, estimate, k, found)
     curve : (samples, 2) array
         Pulse and slope.
     scale : (4,) array or tuple
-        The pulse's; see `tofclip.lidar.fit.kernels`.
+        The pulse's; see `tofclip.lidar.pulse_fit`.
     estimate : (returns, 5) array
-        See `tofclip.lidar.fit.kernels.refine_returns`.
+        See `tofclip.lidar.pulse_fit.refine_returns`.
     k : int
         Number of the return.
     found : (3,) float array

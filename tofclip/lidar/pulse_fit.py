@@ -10,11 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from tofclip.lidar.detection import CONVERGENCE_STEP_BINS
+
 EVEN_VARIANCE = (
     1.0,
     0.0,
 )  # variance of a bin, as constant and factor of its expected brightness: the same everywhere
-CONVERGENCE_STEP_BINS = 5e-3  # the next step would be smaller by far
 
 # Without counts of the arrays' owners, which cost a lock for every array that is handed on; nothing
 # here allocates.

@@ -6,6 +6,23 @@ over pixels and bins and are nearly even in time. For such errors the least-squa
 is the maximum-likelihood estimate, so candidates are judged by the matched filter and refined by
 Gauss-Newton steps of that fit, below a bin. Histograms of counted photons are for
 `tofclip.lidar.photons`, whose estimator is the maximum-likelihood one there.
+
+The steps, for each pixel:
+
+1. Filter the trace with a pulse compressed to half its width, which still shows two returns where
+   the matched filter would merge them; its local maxima are the candidates.
+2. Take candidates from the strongest down (`find_strongest_peaks`). Each claims the bins that its
+   pulse reaches; background and noise are those of the bins that nothing claims.
+3. Keep those that the matched filter confirms against noise and the pixel's strongest return, and
+   place them below a bin (`interpolate_peak_time`).
+4. Fit arrival and height by Gauss-Newton steps on one return at a time, each against what the
+   others leave (`refine_returns`, `take_gauss_newton_step`).
+5. Measure what the fit confirms: sum over the bins and the arrival's standard deviation
+   (`measure_returns`, `estimate_sum_and_deviation`).
+
+They are carried out by one of two sets of inner loops, in which the same step has the same name:
+`tofclip.lidar.search.compiled` takes NumPy's traces one after the other, `.array_api` all pixels of
+an array of another library at once. `tests/lidar/test_search_backends.py` holds them together.
 """
 
 from __future__ import annotations
@@ -21,9 +38,9 @@ from tofclip.arrays import is_numpy
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.detection import Detection
-from tofclip.lidar.portable import PortableSearch, PortableTraces
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.returns import Returns
+from tofclip.lidar.search.array_api import ArraySearch, ArrayTraces
 from tofclip.lidar.traces import FrameTraces, Traces
 from tofclip.shots import Frames
 from tofclip.threads import run_blocks, split_blocks
@@ -80,13 +97,13 @@ class ReturnSearch:
         self.shears = np.zeros(times.size) if shears is None else shears
 
     def find_returns(
-        self, traces: Traces | PortableTraces, provenance: Mapping[str, Any] | None = None
+        self, traces: Traces | ArrayTraces, provenance: Mapping[str, Any] | None = None
     ) -> Returns:
         """Find the returns in the traces of all pixels.
 
         Parameters
         ----------
-        traces : Traces or PortableTraces
+        traces : Traces or ArrayTraces
         provenance : mapping, optional
             How they came about.
 
@@ -131,12 +148,12 @@ class ReturnSearch:
         )  # the responses of a peak's neighbours tell where its top is
 
     def _find_candidates(
-        self, traces: Traces | PortableTraces
+        self, traces: Traces | ArrayTraces
     ) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
         """Pixel number, instant, counts and deviation of every candidate, in raster and time order."""
-        if isinstance(traces, PortableTraces):
+        if isinstance(traces, ArrayTraces):
             return self._portable.find_candidates(traces.values)
-        from tofclip.lidar.kernels import find_returns
+        from tofclip.lidar.search.compiled import find_returns
 
         total, bins = traces.pixels.size, traces.bins
         sharp, matched, gains = self._filters
@@ -186,8 +203,8 @@ class ReturnSearch:
         )
 
     @cached_property
-    def _portable(self) -> PortableSearch:
-        return PortableSearch(self.times, self._raw_filters, self.pulse, self.detection)
+    def _portable(self) -> ArraySearch:
+        return ArraySearch(self.times, self._raw_filters, self.pulse, self.detection)
 
 
 def depth(
@@ -225,7 +242,7 @@ def depth(
             "frames", f"(time, y, x) with (y, x) = {camera.image_shape}", frames.values.shape
         )
     search = ReturnSearch(camera, frames.times, detection, pulse, frames.shears)
-    traces = FrameTraces(frames) if is_numpy(frames.values) else PortableTraces(frames)
+    traces = FrameTraces(frames) if is_numpy(frames.values) else ArrayTraces(frames)
     return search.find_returns(traces, frames.provenance)
 
 

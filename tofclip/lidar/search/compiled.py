@@ -1,7 +1,8 @@
-"""The compiled search for returns in one pixel's trace after another.
+"""The compiled search for returns: one pixel's trace after another.
 
-Every function is serial and holds no interpreter lock; `tofclip.lidar.search` shares the pixels
-between threads.
+The steps are those of `tofclip.lidar.search`, and functions that do the same have the same names in
+`tofclip.lidar.search.array_api`, where they take all pixels at once. Every function is serial and
+holds no interpreter lock; `tofclip.lidar.search` shares the pixels between threads.
 """
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tofclip.lidar.fit.kernels import (
+from tofclip.lidar.detection import MAX_FIT_ROUNDS, PREFIT_THRESHOLD_FACTOR
+from tofclip.lidar.pulse_fit import (
     EVEN_VARIANCE,
     compiled,
     find_pulse_window,
@@ -18,11 +20,6 @@ from tofclip.lidar.fit.kernels import (
     sort_rows,
 )
 
-MAX_ITERATIONS = (
-    8  # Gauss-Newton from near the top has converged after two; more for returns that overlap
-)
-# of the share of the strongest return that a candidate needs: the fit does not make up for so much
-PREFIT_THRESHOLD_FACTOR = 0.7
 BINS_PER_GROUP = 32  # bins of which the highest peak is kept
 WEIGHTS_PER_PASS = 4  # weights of a filter that are applied in one pass
 
@@ -130,7 +127,7 @@ def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, memory
             estimate[kept, 2], estimate[kept, 3] = peaks[k, 2], peaks[k, 3]
             kept += 1
     refine_returns(
-        trace, times, background, curve, scale, estimate[:kept], EVEN_VARIANCE, MAX_ITERATIONS
+        trace, times, background, curve, scale, estimate[:kept], EVEN_VARIANCE, MAX_FIT_ROUNDS
     )
     number = measure_returns(
         trace, times, background, noise, curve, scale, estimate[:kept], least, profile, found
