@@ -91,7 +91,7 @@ def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, memory
     filters : (sharp, matched, gains)
         See `tofclip.lidar.search`.
     pulse : (curve, scale)
-        See `tofclip.lidar.fit.kernels`.
+        See `tofclip.lidar.pulse_fit`.
     limits : (3,) floats
         Least distance of two returns in s, least response over noise, and least strength relative
         to the strongest return, both referred to one range.
