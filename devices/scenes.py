@@ -47,7 +47,7 @@ class LineLight:
         Middle of each row, s after the pulse.
     camera : Camera
         What a calibration would know of the camera.
-    truth : Truth
+    truth : GroundTruth
         What stands in front of it.
     """
 

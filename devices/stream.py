@@ -92,7 +92,7 @@ class StreamSource(DecodedSource):
     codec : Codec
     ledger : Ledger
         The one that the feed enters losses into.
-    buffering : Buffering
+    buffering : BufferSettings
     """
 
     def __init__(

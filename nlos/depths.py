@@ -30,7 +30,7 @@ class DepthPropagator:
 
     Parameters
     ----------
-    plan : Diffraction
+    plan : DiffractionPlan
     dtype : dtype
         complex64 or complex128; the transfer functions are those of single precision in either.
     """

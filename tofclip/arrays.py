@@ -164,6 +164,7 @@ def require_numpy(what: str, *arrays: Array) -> None:
     ----------
     what : str
         What works on NumPy arrays only, as the message's subject.
+    *arrays : array
 
     Raises
     ------

@@ -42,7 +42,7 @@ def make_occlusion_figure(experiment: Experiment, probes: Sequence[ProbeResult])
     Parameters
     ----------
     experiment : Experiment
-    probes : sequence of Probe
+    probes : sequence of ProbeResult
         Small targets on the axis, drawn with a tick or a cross.
 
     Returns

@@ -44,7 +44,7 @@ def make_scene_figure(
     frames : Frames
     cloud : PointCloud
         Of these frames.
-    objects : sequence of SeenObject
+    objects : sequence of DetectedObject
         Numbered in the top view; the four with most points are shown at their ranges.
 
     Returns

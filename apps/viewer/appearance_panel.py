@@ -33,7 +33,7 @@ class AppearancePanel:
     server : ViserServer
     session : Session
     post : callable
-    first : Shown
+    first : DisplayedFrame
         Its extent is that of the filters until they are narrowed.
     """
 

@@ -31,7 +31,7 @@ class Controls:
     session : Session
     post : callable
         Takes what is to be done by the thread that owns the session.
-    first : Shown
+    first : DisplayedFrame
     """
 
     def __init__(

@@ -39,7 +39,7 @@ class SceneFigure:
     Parameters
     ----------
     title : str
-    first : Shown
+    first : DisplayedFrame
         Says from where one looks.
     renderer : Renderer
     """

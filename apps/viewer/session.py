@@ -45,7 +45,7 @@ class DisplayedFrame:
     colours : (n, 3) uint8 array
     scale : Scale
     pixels : (n, 2) int array, optional
-    surface : Triangles, optional
+    surface : TriangleMesh, optional
         Drawn instead of the points.
     """
 

@@ -58,7 +58,7 @@ def open_source(name: str, options: ShotOptions | None = None) -> Source:
         Frames, cloud, volume, shot or stack of shots (HDF5); a cloud of another format; a raw
         streak image; a folder of clouds or of streak images; or an address such as
         ``sim+linospad2://?seed=1``.
-    options : Extras, optional
+    options : ShotOptions, optional
 
     Returns
     -------

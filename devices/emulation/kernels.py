@@ -43,7 +43,7 @@ def fill_poisson_words(state, now, scale, weights, last, words):
         Of all photons, the share of each channel, added up.
     last : int
         No record is later than this tick.
-    next_words : bytes
+    words : bytes
         Filled with as many records as fit.
 
     Returns

@@ -110,7 +110,7 @@ class EmulatedTimeTagger(VirtualDevice):
         Makes the light that falls on it from a moment at which its counter is reset; takes how
         often it was before.
     serial : str
-    setting : Setting
+    setting : EmulatorSettings
     faults : iterable of Fault
     """
 

@@ -45,7 +45,7 @@ MAX_TIMESTAMPS = 1 << 14
 """Time stamps per converter and cycle at most; the boards' memory ends far below."""
 
 STAMP_DTYPE = np.dtype([("cycle", "<u4"), ("code", "<u4"), ("pixel", "<u4")])
-"""`encode_cycle`: from 0. `code`: time since the cycle began, 140 for each 2500 ps. `pixel`: place
+"""`cycle`: from 0. `code`: time since the cycle began, 140 for each 2500 ps. `pixel`: place
 on the line, 0..255.
 """
 

@@ -103,7 +103,7 @@ class Answer:
 
     Parameters
     ----------
-    code : Code
+    code : AnswerCode
     name : str
         The command's, or what a message is about.
     arguments : tuple of str

@@ -54,7 +54,7 @@ class Spad512Feed:
     connect : callable
         Returns a new connection.
     ledger : Ledger
-    exposure : Exposure
+    exposure : ExposureRequest
     patience, reconnect : float
         Seconds to wait for an answer beyond the exposure, and for a server that went away.
     """

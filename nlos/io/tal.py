@@ -50,7 +50,7 @@ def match_lasers_to_sensors(
 
     Parameters
     ----------
-    fields : Fields
+    fields : NamedArrays
         For the error message.
     signal : (t, sensors...) or (t, lasers..., sensors...) array
     sensor, laser : (..., 3) array

@@ -69,7 +69,7 @@ class PortableDiffraction:
 
     Parameters
     ----------
-    plan : Diffraction
+    plan : DiffractionPlan
     source : Source
     library : Library
     """

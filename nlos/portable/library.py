@@ -25,7 +25,7 @@ class ArrayLibrary:
 
     Parameters
     ----------
-    device : Place
+    device : ComputeDevice
     """
 
     device: ComputeDevice

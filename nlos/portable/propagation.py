@@ -58,7 +58,7 @@ class PortablePropagation:
     """``sum_p P_k(r_p) * exp(1j * k * |r_v - r_p|) / |r_v - r_p|`` on a plane, within a tolerance.
 
     By Fourier matrices where the compiled loops take Fourier transforms, with the same terms of the
-    wall's relief (see `nlos.propagation.plan`), else by direct sums. The terms are chosen for the
+    wall's relief (see `nlos.propagation.wall_to_plane_plan`), else by direct sums. The terms are chosen for the
     spectrum of the first phasors that come; they stay for later ones, so that a sequence of like
     signals is planned once.
 
@@ -71,7 +71,7 @@ class PortablePropagation:
     points : (n, 3) array
         Wall points, m.
     plane : Plane
-    waves : Waves
+    waves : SphericalWaves
         From points.
     tolerance : float
         Relative error allowed.

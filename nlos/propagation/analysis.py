@@ -50,7 +50,7 @@ class LatticeAnalysis:
     wall : WallLattice
     lattice : (int, int)
         Places in a period along y and x; at least the wall's.
-    max_indices : int
+    reach : int
         Largest index along x.
     terms : int
         At most.
@@ -85,7 +85,7 @@ class LatticeAnalysis:
         ----------
         values : (points,) complex64 array
         weights : (terms, points) complex64 array
-        max_indices : int
+        reach : int
 
         Returns
         -------

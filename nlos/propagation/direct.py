@@ -64,7 +64,7 @@ def sum_spherical_waves(
     ----------
     targets, sources : (m, 3), (n, 3) array
         m.
-    compute_phasors : (n, frequencies) complex64 array
+    phasors : (n, frequencies) complex64 array
     wavenumbers : (frequencies,) array
         Evenly spaced, rad/m.
     progress : callable, optional

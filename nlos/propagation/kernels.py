@@ -41,7 +41,7 @@ def add_spherical_waves(sources, phasors, targets, first, step, sums):
     ----------
     sources : (n, 3) float32 array
         m.
-    compute_phasors : (n, 2 * frequencies) float32 array
+    phasors : (n, 2 * frequencies) float32 array
         Real and imaginary parts in turns; the number of frequencies is a multiple of
         `FREQUENCY_STEPS`.
     targets : (3 * LANES,) float32 array
@@ -171,7 +171,7 @@ def add_low_rank_terms(
         First node about every wave whose indices are not negative.
     weight : (columns, rows, taps) float32 array
         Weights of the nodes from it on.
-    max_indices : (some columns,) int64 array
+    reach : (some columns,) int64 array
         Largest index along y that counts in every column from 0 on.
     shift_x, shift_y : complex64 array
         Phases of all indices from the most negative on.

@@ -25,8 +25,8 @@ def propagate_low_rank(
 
     Parameters
     ----------
-    plan : Passage
-    compute_phasors : (n, frequencies) complex64 array
+    plan : WallToPlanePlan
+    phasors : (n, frequencies) complex64 array
     progress : callable, optional
         Called with the number of values just done.
 

@@ -49,7 +49,7 @@ def choose_virtual_plane(
     points : (n, 3) array
         Wall points, m.
     grid : Grid
-    waves : Waves
+    waves : SphericalWaves
     zones : float
         Room beside the straight ways, in radii of the first Fresnel zone.
     z : float, optional

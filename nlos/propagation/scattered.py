@@ -138,7 +138,7 @@ class ScatteredAnalysis:
         ----------
         values : (points,) complex64 array
         weights : (terms, points) complex64 array
-        max_indices : int
+        reach : int
 
         Returns
         -------

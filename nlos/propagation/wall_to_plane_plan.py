@@ -57,7 +57,7 @@ class WallToPlanePlan:
     wall : WallLattice
         Their places.
     plane : Plane
-    waves : Waves
+    waves : SphericalWaves
     strength : (frequencies,) array
         How strong the field is at each frequency; decides what may be neglected.
     tolerance : float

@@ -28,7 +28,7 @@ class IlluminatedDepthPropagator:
 
     Parameters
     ----------
-    plan : Diffraction
+    plan : DiffractionPlan
     source : Source
     dtype : dtype
         complex64 or complex128.

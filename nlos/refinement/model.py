@@ -42,9 +42,9 @@ class HiddenToWall(LinearOperator):
     ----------
     points : (n, 3) array
         Wall points, m.
-    plan : Diffraction
+    plan : DiffractionPlan
         From a virtual plane to the voxels.
-    group : Exposure
+    group : IlluminationGroup
     band : Band
     dtype : dtype
         float32 or float64.

@@ -29,7 +29,7 @@ class DiffractionPlan:
     plane : Plane
     grid : Grid
         x and y evenly spaced, z as you like.
-    waves : Waves
+    waves : SphericalWaves
     tolerance : float
         Relative error allowed.
     """

@@ -117,7 +117,7 @@ def diffract_to_grid(
 
     Parameters
     ----------
-    plan : Diffraction
+    plan : DiffractionPlan
     values : (y, x, frequencies) complex64 array
         On the way's plane.
     source : Source

@@ -112,7 +112,7 @@ def propagate_spectrum(spectrum, first, nodes, begin, offset, node_weights, coef
 
     Parameters
     ----------
-    spectrum : (groups, frequencies, 2, MIRRORED, LANES) float32 array
+    spectrum : (groups, frequencies, 2, MIRROR_IMAGES, LANES) float32 array
         Real and imaginary parts.
     first : (groups,) int64 array
         Frequency that each group starts at.
@@ -126,7 +126,7 @@ def propagate_spectrum(spectrum, first, nodes, begin, offset, node_weights, coef
         Interpolation weights.
     coefficients : (depths, m, frequencies) float32 array
         An even number of terms.
-    terms : (depths, m, groups, 2, MIRRORED, LANES) float32 array
+    terms : (depths, m, groups, 2, MIRROR_IMAGES, LANES) float32 array
         Overwritten.
     """
     groups, frequencies, count = spectrum.shape[0], spectrum.shape[1], coefficients.shape[1]
@@ -229,13 +229,13 @@ def assemble_groups(parts, row, column, along_y, along_x, share, counts, first, 
         Indices of the waves, not negative.
     along_y, along_x : (n,) complex64 array
         What waves of every index are multiplied by, those of negative ones by its conjugate.
-    share : (groups, MIRRORED, LANES) float32 array
+    share : (groups, MIRROR_IMAGES, LANES) float32 array
         What they are multiplied by besides.
     counts : (k,) int64 array
         Lanes of all groups that count at each frequency.
     first : int
         Where the frequencies begin in `spectrum`.
-    spectrum : (groups, frequencies, 2, MIRRORED, LANES) float32 array
+    spectrum : (groups, frequencies, 2, MIRROR_IMAGES, LANES) float32 array
         Written to.
     """
     for k in range(counts.size):
@@ -303,9 +303,9 @@ def scatter_terms(terms, cell, folded, spectra):
 
     Parameters
     ----------
-    terms : (m, groups, 2, MIRRORED, LANES) float32 array
+    terms : (m, groups, 2, MIRROR_IMAGES, LANES) float32 array
         Real and imaginary parts.
-    cell_indices : (groups, MIRRORED, LANES) int64 array
+    cell : (groups, MIRROR_IMAGES, LANES) int64 array
     folded : bool
         Waves may meet in one cell, and then add up.
     spectra : (m, cells) complex64 array

@@ -29,7 +29,7 @@ def diffract_by_convolution(
     plane : Plane
     grid : Grid
         Its voxels are as far from each other as the plane's points.
-    waves : Waves
+    waves : SphericalWaves
         Waves of points; one complex128 number per voxel and frequency has to fit into memory.
 
     Returns

@@ -66,7 +66,7 @@ class TransferFunction:
 
     Parameters
     ----------
-    waves : Waves
+    waves : SphericalWaves
     window : Window
     max_lateral_wavenumber : float
         Largest lateral wavenumber q wanted, rad/m.

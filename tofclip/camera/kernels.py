@@ -50,7 +50,14 @@ def sample_bilinear(counts, dark, raw_row, raw_column, delay, measurements):
     Parameters
     ----------
     counts : (raw columns, rows) float32 array
-    raw_row, raw_column, measurements : (some columns, rows) float32 array
+    dark : float
+        Level that is taken off, counts.
+    raw_row, raw_column : (some columns, rows) float32 array
+        Where each measurement lies in the raw image, pixels.
+    delay : float
+        Rows by which the light comes later than the sweep says.
+    measurements : (some columns, rows) float32 array
+        Overwritten.
     """
     columns, rows = counts.shape
     flat, zero, length = counts.reshape(counts.size), np.int32(0), np.int32(rows)
@@ -81,7 +88,7 @@ def mark_valid(bad, raw_row, raw_column, delay, valid):
     Parameters
     ----------
     bad : (rows, raw columns) bool array
-    raw_row, raw_column, late
+    raw_row, raw_column, delay
         As for `sample_bilinear`.
     valid : (some columns, rows) bool array, overwritten
     """

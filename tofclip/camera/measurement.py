@@ -178,7 +178,7 @@ class Rectifier:
 
         Parameters
         ----------
-        counts, dark, late
+        counts, dark, delay
             As for `measure`.
 
         Returns

@@ -166,7 +166,7 @@ def point_cloud(returns: Returns) -> PointCloud:
 
     Parameters
     ----------
-    find_returns : Returns
+    returns : Returns
         Radial distances with their camera.
     """
     directions = compute_ray_directions(returns.camera, *returns.line_of_sight_px)

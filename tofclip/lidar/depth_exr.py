@@ -20,7 +20,7 @@ def save_depth(returns: Returns, path: str | Path) -> None:
 
     Parameters
     ----------
-    find_returns : Returns
+    returns : Returns
     path : path-like
         Ends in ``.exr``.
     """

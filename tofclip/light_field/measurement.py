@@ -81,7 +81,7 @@ class ClipMeasurement(Storable):
     views : (views, 2) array
         (v, u) of every view.
     image_shape : (int, int)
-    setup : Setup
+    setup : CameraSetup
     photons_per_unit : float
         What a reading of 1 means in counted photons; 0: not known.
     provenance : mapping

@@ -39,7 +39,7 @@ class Rig:
     array : CameraArray
     lamps : (lamps, 3) array
         m; they flash together.
-    setup : Setup
+    setup : CameraSetup
         Which nonlocal measurements the views get.
     """
 
@@ -89,7 +89,7 @@ class TimedMeasurements:
     ----------
     values : (measurements, bins) float32 array
     rig : Rig
-    time_axis : Clock
+    time_axis : TimeAxis
 
     Raises
     ------

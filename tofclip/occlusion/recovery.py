@@ -111,7 +111,7 @@ def separate_occluder(
 
     Parameters
     ----------
-    measurements : TimedReadings
+    measurements : TimedMeasurements
     weight : float
         Of total variation, relative to the largest value of A'f.
 

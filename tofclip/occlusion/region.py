@@ -67,7 +67,7 @@ class InactiveRegion:
 
         Parameters
         ----------
-        position : array
+        place : array
             Of a view on the aperture, m from the axis.
         across, behind : arrays
             A point: m from the axis, and m behind the occluder. All three are broadcast.

@@ -204,7 +204,7 @@ def trace_view_point_spreads(
         aperture.
     shape : (int, int)
         Rows and columns of the PSFs; rays that land beyond are lost.
-    trace_rays : int
+    rays : int
         Along each side of a patch.
 
     Returns

@@ -56,7 +56,7 @@ class TorchProduct:
     Parameters
     ----------
     matrix : CSR matrix
-    device : Place
+    device : ComputeDevice
     """
 
     def __init__(self, matrix: scipy.sparse.csr_array, device: ComputeDevice) -> None:
@@ -85,7 +85,7 @@ class CupyProduct:
     Parameters
     ----------
     matrix : CSR matrix
-    device : Place
+    device : ComputeDevice
     """
 
     def __init__(self, matrix: scipy.sparse.csr_array, device: ComputeDevice) -> None:
@@ -108,7 +108,7 @@ class GatheredProduct:
     Parameters
     ----------
     matrix : CSR matrix
-    device : Place
+    device : ComputeDevice
     """
 
     def __init__(self, matrix: scipy.sparse.csr_array, device: ComputeDevice) -> None:

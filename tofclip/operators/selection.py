@@ -18,7 +18,7 @@ class ViewSelection(LinearOperator):
     ----------
     light_field_shape : (int, int, int)
         Views, rows, columns.
-    view_indices : sequence of int
+    kept : sequence of int
         Numbers of the views to keep, without repeats.
     dtype : dtype
         float32 or float64.

@@ -334,7 +334,7 @@ def recover(
     progress : callable
         Called with the number of frame iterations just done.
     focus : Focus, optional
-        `FixedFocus` (the default, at shear 0), `DepthLocked` or `SharpestFocus` of
+        `FixedFocus` (the default, at shear 0), `DepthLockedFocus` or `SharpestFocus` of
         `tofclip.recovery`.
     device : str
         ``"cpu"``, ``"cuda"``, ``"cuda:1"``, ``"auto"`` or a PyTorch device, see

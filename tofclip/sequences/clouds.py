@@ -70,7 +70,7 @@ class CloudSettings:
 
     def jobs(self, frames: Mapping[str, Path], folder: Path, suffix: str) -> list[Job]:
         """Return one job for each file of frames, which writes its cloud into `folder`; see
-        `Recovery.jobs`.
+        `RecoverySettings.jobs`.
 
         Parameters
         ----------

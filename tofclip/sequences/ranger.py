@@ -68,7 +68,7 @@ class RangingPipeline:
         Instant of each row, s.
     method : LinearInverse, optional
     focus : Focus, optional
-        One that needs no look at the shot: `FixedFocus` or `DepthLocked`.
+        One that needs no look at the shot: `FixedFocus` or `DepthLockedFocus`.
     detection : Detection, optional
 
     Notes
@@ -270,7 +270,7 @@ def make_clouds(
     ----------
     shots : sequence of callables
         Each reads its shot when it is called, on the thread that works on it.
-    pipeline : Ranger
+    pipeline : RangingPipeline
     average : int
         Shots whose measurements are averaged.
     steady : bool
@@ -313,8 +313,8 @@ def make_average_cloud(
     ----------
     shots : sequence of callables
         At least one; one is in memory at a time.
-    pipeline : Ranger
-    jitter : Jitter, optional
+    pipeline : RangingPipeline
+    jitter : JitterEstimator, optional
         None: the shots are taken as they come.
 
     Returns

@@ -20,7 +20,7 @@ def expand_sweep(
 
     Parameters
     ----------
-    recovery : Recovery
+    recovery : RecoverySettings
         Has the settings that are not swept.
     values : mapping of str to sequence of str
         Values of ``method``, ``iterations``, ``weight`` and ``focus``.

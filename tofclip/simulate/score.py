@@ -17,7 +17,7 @@ def score_returns(returns: Returns, truth: GroundTruth) -> dict[str, float]:
     Parameters
     ----------
     returns : Returns
-    truth : Truth
+    truth : GroundTruth
 
     Returns
     -------

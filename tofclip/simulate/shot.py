@@ -27,7 +27,7 @@ class SimulatedShot:
         Measurements in photons with noise, background and saturation; carries the true camera.
     camera : Camera
         The true camera, with the gains and the sweep that made the picture.
-    truth : Truth
+    truth : GroundTruth
         What the reference view sees.
     signal : (rows, columns) float32 array
         Expected signal of each streak pixel without background, photons.

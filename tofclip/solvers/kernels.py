@@ -113,7 +113,9 @@ def compute_traces(tile_starts, columns, values, weights, traces, span):
     tile_starts, columns, values
         See `tofclip.operators.sparse.Tiles`; a row for each trace.
     weights : (blocks, M's columns, LANES) array
-    traces : (M's rows, time) array, of which the columns from ``span[0]`` to below ``span[1]`` are overwritten
+    traces : (M's rows, time) array
+        Overwritten from column ``span[0]`` to below ``span[1]``.
+    span : (int, int)
     """
     part = np.empty((traces.shape[0], LANES), traces.dtype)
     for block in range(weights.shape[0]):
@@ -135,7 +137,7 @@ def update_peaks(tile_starts, columns, values, scales, block, highest):
     tile_starts, columns, values
         See `tofclip.operators.sparse.Tiles`.
     scales : (M's rows,) array
-    take_block : (M's columns, LANES) array
+    block : (M's columns, LANES) array
     highest : (LANES,) array
     """
     part = np.empty((4 * TILE_PIXELS, LANES), block.dtype)

@@ -117,7 +117,7 @@ def extract_strongest_returns(
         Added to the scores, to decide ties.
     level : (n,) int64 array
         Row of the table for each histogram; negative: nothing is sought.
-    kernel_table : (levels,), (levels, width) arrays
+    table : (levels,), (levels, width) arrays
         Threshold and filter weights.
     first : int
         Bin of the first weight relative to the return's.

@@ -172,6 +172,8 @@ def measure_events(offsets, bin_time, count, surface, table, start, step, bright
     table : (n, 2) float64 array
         Of the response, sampled from `start` by `step`: minus the slope of its logarithm, and its
         density over that of the background for one photon of signal.
+    start, step : float
+        Bins.
     brightness : (pixels,) float64 array
         Expected photons of the signal.
     sums : (pixels, 3) float64 array, overwritten
@@ -300,6 +302,8 @@ def sum_evidence(offsets, bin_time, count, surface, density, start, step, signal
     density : (n,) float64 array
         Density of the response over that of light spread over the whole axis, sampled from `start`
         by `step`.
+    start, step : float
+        Bins.
     signal : (pixels,) float64 array
         Share of the pixel's photons that are signal.
     evidence : (pixels,) float64 array, overwritten

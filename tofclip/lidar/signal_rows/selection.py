@@ -60,7 +60,7 @@ class SignalRowFinder:
 
     Parameters
     ----------
-    row_blocks : sequence of Place
+    places : sequence of RowBlock
         In order and without gaps.
     pulse_rows : float
         Full width at half maximum of a return, a symmetric one, in rows.

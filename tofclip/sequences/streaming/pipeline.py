@@ -55,7 +55,7 @@ def stream_clouds(
     ----------
     shots : iterable of Streak
         A file's, a folder's or an instrument's; it is read on a thread of its own.
-    pipeline : Ranger, optional
+    pipeline : RangingPipeline, optional
         By default one for the camera that the first shot carries.
     queue_size : int
         Shots that wait before each stage, at most.
