@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     import usb.core
 
 INTERFACE_NUMBER = 0
+VENDOR_REQUEST = 0x40
+"""Type of a control request of the maker's own, from host to device."""
+
 REPLUG_POLL_S = 0.05
 """Seconds between two looks for an instrument that was unplugged."""
 
@@ -242,6 +245,27 @@ class UsbLink:
                 f"USB device {self.identity} took only {sent} of {len(data)} bytes in time"
             )
 
+    def request(self, number: int, value: int, timeout: float) -> None:
+        """Send a vendor request without data to the instrument's firmware.
+
+        Parameters
+        ----------
+        number, value : int
+            The request (``bRequest``) and its ``wValue``.
+        timeout : float
+            Seconds.
+
+        Raises
+        ------
+        DeviceStalledError
+            The firmware does not know the request.
+        DeviceTimeoutError, DeviceDisconnectedError
+        """
+        with translate_errors(self.identity):
+            self._device.ctrl_transfer(
+                VENDOR_REQUEST, number, value, 0, None, _to_milliseconds(timeout)
+            )
+
     def reconnect(self, patience: float) -> None:
         """Wait until the instrument with this serial number is back, and claim it.
 
@@ -279,15 +303,19 @@ class UsbLink:
         ]
         fitting = [(device, number) for device, number in known if serial in ("", number)]
         if not fitting:
-            others = ", ".join(number for _, number in known) or "none"
+            others = ", ".join(number or "one without serial number" for _, number in known)
+            others = others or "none"
             wanted = f" with serial number {serial}" if serial else ""
             raise DeviceNotFoundError(
                 f"no USB device {self.identity}{wanted} is connected (connected: {others})"
             )
         if len(fitting) > 1:
-            numbers = ", ".join(number for _, number in fitting)
+            numbers = ", ".join(number for _, number in fitting if number)
+            advice = (
+                f"say which: {numbers}" if numbers else "none has a serial number; unplug others"
+            )
             raise DeviceNotFoundError(
-                f"several USB devices {self.identity} are connected; say which: {numbers}"
+                f"several USB devices {self.identity} are connected; {advice}"
             )
         return fitting[0]
 

@@ -36,6 +36,16 @@ class ByteQueue:
         self._length -= taken
         return taken
 
+    def truncate(self, length: int) -> None:
+        """Forget everything behind the first `length` bytes."""
+        while self._length > length:
+            piece = self._pieces.pop()
+            self._length -= len(piece)
+            if self._length < length:
+                kept = piece[: length - self._length]
+                self._pieces.append(kept)
+                self._length += len(kept)
+
     def clear(self) -> None:
         """Forget everything."""
         self._pieces.clear()

@@ -10,12 +10,23 @@ import numpy as np
 from tofclip.errors import InputError
 
 FaultKind = Literal[
-    "timeout", "stall", "unplug", "powerloss", "short", "overflow", "corrupt", "lost"
+    "timeout",
+    "stall",
+    "unplug",
+    "powerloss",
+    "short",
+    "overflow",
+    "corrupt",
+    "lost",
+    "reply_late",
+    "reply_lost",
+    "reply_stall",
 ]
 FAULT_KINDS: tuple[FaultKind, ...] = get_args(FaultKind)
+REPLY_FAULTS = ("reply_late", "reply_lost", "reply_stall")
 
 PERMANENT_ENUMERATIONS = 1_000_000
-"""Enumerations after which nobody looks any more."""
+"""Enumerations after which nothing looks any more."""
 
 
 @dataclass(frozen=True)
@@ -25,13 +36,16 @@ class Fault:
     Parameters
     ----------
     transfer : int
-        Number of the data transfer in which it happens, from 0.
+        Number of the data transfer in which it happens, from 0 since the instrument was first
+        started, without those by which old data is thrown away; or of the reply, from 0 since it
+        was switched on.
     kind : str
         ``timeout``: nothing comes. ``stall``: the endpoint halts, `amount` times in a row.
         ``unplug``: gone for `amount` enumerations, keeping its power; ``powerloss``: without.
         ``short``: only `amount` bytes come now. ``overflow``: the transfer is lost on the wire.
-        ``corrupt``: `amount` records are no records. ``lost``: `amount` records find the
-        instrument's memory full.
+        ``corrupt``: `amount` records cannot be. ``lost``: `amount` records find the instrument's
+        memory full. ``reply_late``: a reply comes only after the host has given up. ``reply_lost``:
+        it never comes. ``reply_stall``: its endpoint halts once.
     amount : int
     """
 
@@ -86,4 +100,6 @@ def _draw_fault(rng: np.random.Generator) -> tuple[FaultKind, int]:
         if kind == "stall" or often == 1:
             return kind, often
         return kind, PERMANENT_ENUMERATIONS
+    if kind in REPLY_FAULTS:
+        return kind, int(rng.integers(1, 4))
     return kind, int(rng.integers(0, 600))

@@ -1,23 +1,34 @@
-"""An emulated FX2 time tagger on the virtual USB, with faults to order. `devices.timetag` drives it
-unchanged.
+"""An emulated FX2 time tagger on the virtual USB, as unkind as the real one, with faults to order.
+`devices.timetag` drives it unchanged.
+
+Written from the gateware and the firmware (bgamari/timetag-fpga, bgamari/timetag-fx2), not from the
+driver::
+
+    photons -> memory of 2048 records -> USB chip: three packets -> host
+               held empty by CLEAR       unfinished packets wait
+
+When it is opened it is as a killed program left it: a reply that was never fetched waits, records
+of the last session are in the USB chip, and the register manager waits for the end of a command.
 """
 
 from __future__ import annotations
 
 import errno
 import struct
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from time import monotonic, sleep
 
+import numpy as np
 from usb.core import USBError
 
 from devices.codec import ByteView
 from devices.emulation.byte_queue import ByteQueue
-from devices.emulation.faults import Fault
-from devices.emulation.photons import MAX_TICK, TagStream
+from devices.emulation.faults import REPLY_FAULTS, Fault
+from devices.emulation.photons import MAX_TICK, PoissonStream, TagStream
 from devices.emulation.usb import PACKET_BYTES, VirtualDevice, make_usb_error
-from devices.timetag.codec import LOST, RECORD_BYTES
+from devices.timetag.codec import LOST, RECORD_BYTES, WRAP
 from devices.timetag.registers import (
     COMMAND_ENDPOINT,
     DATA_ENDPOINT,
@@ -29,11 +40,20 @@ from devices.timetag.registers import (
 )
 from tofclip.errors import InputError
 
-MAGIC, WRITE = 0xAA, 1
+MAGIC = 0xAA
 COMMAND = struct.Struct("<BBHI")
 CLOCK_HZ = 128_000_000
-VERSION = 1
+VERSION = 6
 SHORT_PACKET_BYTES = 510
+CHIP_PACKETS = 3
+MAX_REPLIES = 3
+"""Two in the USB chip, one in the register manager, which then hears no commands."""
+
+SET_SEND_WINDOW, FLUSH = 1, 2
+NO_SUCH_REGISTER = 0xFFFFFFFF
+BOARD_MEMORY_BYTES = 2048 * RECORD_BYTES
+"""What the gateware has: with the USB chip's packets, 3.4 ms at 680,000 records a second."""
+
 UNUSED_BITS = 0x1F
 MAX_BATCH_RECORDS = 1 << 14
 DARK_WAIT_S = 5e-3
@@ -55,7 +75,7 @@ class GroundTruth:
         Of these, were in the memory of an instrument that lost its power, and all of
         `lost_memory_full` before that.
     corrupted : int
-        Of these, were handed over as something that is no record.
+        Of these, were handed over as something that cannot be a record.
     """
 
     registered: int = 0
@@ -76,17 +96,34 @@ class EmulatorSettings:
     records : int
         Photons after which it is dark.
     packet_bytes : int
-        Size of a packet. 510, as of the public firmware: each is shorter than the endpoint's 512
-        and ends a transfer. 512: transfers are filled.
+        Size of a packet when it is switched on: 510 bytes, as of the public firmware, each of which
+        ends a transfer, or 512.
     memory_bytes : int
-        What fits into the instrument. Far more than into a real one, because it shares the
-        processor with the host, which is not always given its turn in time.
+        What fits into the instrument besides the USB chip. By default far more than into a real one
+        (`BOARD_MEMORY_BYTES`), because it shares the processor with the host, which is not always
+        given its turn in time.
+    clear_is_level : bool
+        Register CLEAR holds the memory empty until it is set to 0 again; otherwise any write clears
+        once.
+    holds_packets : bool
+        The USB chip sends a packet when it is full, or when told to; otherwise whenever asked.
+    flush_discards : bool
+        The request to flush throws an unfinished packet away; otherwise it sends it.
+    stale_replies, old_records, jammed_bytes : int
+        What a killed program left: replies that it never fetched, records in the USB chip and the
+        memory, and bytes of a command that was cut short.
     """
 
     is_paced: bool = False
     records: int = MAX_TICK
-    packet_bytes: int = PACKET_BYTES
+    packet_bytes: int = SHORT_PACKET_BYTES
     memory_bytes: int = 64 << 20
+    clear_is_level: bool = True
+    holds_packets: bool = True
+    flush_discards: bool = True
+    stale_replies: int = 1
+    old_records: int = 40
+    jammed_bytes: int = 3
 
     def __post_init__(self) -> None:
         if self.packet_bytes not in (SHORT_PACKET_BYTES, PACKET_BYTES):
@@ -127,42 +164,72 @@ class EmulatedTimeTagger(VirtualDevice):
             (COMMAND_ENDPOINT, DATA_ENDPOINT, REPLY_ENDPOINT),
         )
         self.truth = GroundTruth()
-        self._make_light, self.setting = light, setting
-        self._light, self._resets = light(0), 0
-        self._faults = {fault.transfer: fault for fault in faults}
+        self.setting = setting
+        self._make_light = light
+        self._light = light(0)
+        self._resets = 0
+        self._registered_before_reset = 0
+        self._faults = {one.transfer: one for one in faults if one.kind not in REPLY_FAULTS}
+        self._reply_faults = {one.transfer: one for one in faults if one.kind in REPLY_FAULTS}
+        self._has_started = False
         self._transfers = 0
-        self._stalls = self._records_to_corrupt = 0
+        self._replies_asked = 0
+        self._reply_delay = 0
+        self._stalls = 0
+        self._records_to_corrupt = 0
         self._registers = _make_registers()
-        self._memory = ByteQueue()
-        self._replies: list[bytes] = []
+        self._command = COMMAND.pack(MAGIC, 0, Register.VERSION, 0)[: setting.jammed_bytes]
+        self._replies = [b"\x2a\0\0\0"] * setting.stale_replies
+        self._stream = ByteQueue()  # what is in the memory and, before that, in the USB chip
+        self._window = setting.packet_bytes
+        self._unfinished: deque[int] = deque()  # sizes of packets that were finished by request
         self._started = monotonic()
         self._mark_lost = False
-        self._segment_bytes = self._reported = 0
+        self._segment_bytes = 0
+        self._reported = 0
+        self._leave_old_records()
 
     def receive(self, endpoint: int, data: bytes) -> None:
-        """Carry out a command of the host and queue its reply.
+        """Take a command of the host, byte by byte as the gateware does, and queue its reply; what is
+        not a command is passed over.
 
         Parameters
         ----------
         endpoint : int
             Address.
         data : bytes
-            One command.
 
         Raises
         ------
         usb.core.USBError
-            The command is not one that the instrument knows.
+            The endpoint is another.
         """
-        if endpoint != COMMAND_ENDPOINT or len(data) != COMMAND.size or data[0] != MAGIC:
+        if endpoint != COMMAND_ENDPOINT:
             raise make_usb_error(errno.EPIPE)
-        _, what, number, value = COMMAND.unpack(data)
-        if number not in set(Register):
+        if len(self._replies) >= MAX_REPLIES:
+            return  # swallowed
+        for byte in data:
+            if not self._command and byte != MAGIC:
+                continue
+            self._command += bytes([byte])
+            if len(self._command) == COMMAND.size:
+                self._execute(self._command)
+                self._command = b""
+                return  # what comes with it finds the register manager replying
+
+    def control(self, request: int, value: int) -> None:
+        chip, rest = self._unsent_bytes()
+        if request == SET_SEND_WINDOW:
+            self._unfinished.extend([self._window] * (chip // self._window))
+            self._unfinished.append(rest)
+            self._window = min(max(value, 1), PACKET_BYTES)
+        elif request == FLUSH and self.setting.flush_discards:
+            self._stream.truncate(len(self._stream) - rest)
+        elif request == FLUSH:
+            self._unfinished.extend([self._window] * (chip // self._window))
+            self._unfinished.append(rest)
+        else:
             raise make_usb_error(errno.EPIPE)
-        register = Register(number)
-        if what == WRITE:
-            self._write_register(register, value)
-        self._replies.append(struct.pack("<I", self._registers[register] % (1 << 32)))
 
     def fill(self, endpoint: int, buffer: memoryview, timeout: float) -> int:
         """Write a reply or time tags into `buffer`, with the faults that were ordered for this
@@ -184,6 +251,8 @@ class EmulatedTimeTagger(VirtualDevice):
         """
         if endpoint == REPLY_ENDPOINT:
             return self._send_reply(buffer)
+        if not self._has_started or self._is_held_empty:
+            return self._send_data(buffer, timeout)  # what comes is thrown away
         fault = self._faults.get(self._transfers)
         self._transfers += 1
         return (
@@ -194,13 +263,44 @@ class EmulatedTimeTagger(VirtualDevice):
 
     def clear_halt(self, endpoint: int) -> None:
         """End a stall, unless it is to come again."""
-        self._stalls -= 1
-        if self._stalls <= 0:
+        if endpoint == DATA_ENDPOINT:
+            self._stalls -= 1
+        if endpoint != DATA_ENDPOINT or self._stalls <= 0:
             super().clear_halt(endpoint)
+
+    def _leave_old_records(self) -> None:
+        """Leave what a session before this one did not read."""
+        old = PoissonStream(1e6, CLOCK_HZ, 12345).next_words(self.setting.old_records, MAX_TICK)
+        self._stream.append(old)
+
+    def _execute(self, command: bytes) -> None:
+        _, what, number, value = COMMAND.unpack(command)
+        answer = NO_SUCH_REGISTER
+        if number in set(Register):
+            register = Register(number)
+            if what & 1:
+                self._write_register(register, value)
+            answer = self._registers[register] % (1 << 32)
+        self._replies.append(struct.pack("<I", answer))
 
     def _send_reply(self, buffer: memoryview) -> int:
         if not self._replies:
             raise make_usb_error(errno.ETIMEDOUT)
+        if not self._reply_delay:
+            fault = self._reply_faults.pop(self._replies_asked, None)
+            self._replies_asked += 1
+            if fault is not None and fault.kind == "reply_stall":
+                self.halted.add(REPLY_ENDPOINT)
+                raise make_usb_error(errno.EPIPE)
+            if fault is not None and fault.kind == "reply_lost":
+                self._replies.pop(0)
+                raise make_usb_error(errno.ETIMEDOUT)
+            if fault is not None:
+                self._reply_delay = 1 + fault.amount
+        if self._reply_delay:
+            self._reply_delay -= 1
+            if self._reply_delay:
+                raise make_usb_error(errno.ETIMEDOUT)
         reply = self._replies.pop(0)
         buffer[: len(reply)] = reply
         return len(reply)
@@ -208,46 +308,79 @@ class EmulatedTimeTagger(VirtualDevice):
     def _write_register(self, register: Register, value: int) -> None:
         if register in (Register.VERSION, Register.CLOCK):
             return
-        if register in (Register.RECORDS, Register.LOST, Register.CLEAR):
+        is_level = register is Register.CLEAR and self.setting.clear_is_level
+        if register in (Register.RECORDS, Register.LOST, Register.CLEAR) and not is_level:
             value = 0
         if register is Register.RECORDS:
             self._reported = self._segment_bytes = 0
-        if register is Register.CLEAR:
+        if register is Register.CLEAR and (value & 1 or not is_level):
             self._clear_memory()
         if register is Register.CAPTURE:
-            self._switch_capture(Capture(value))
+            self._switch_capture(Capture(value & 7))
         self._registers[register] = value
 
     def _switch_capture(self, to: Capture) -> None:
         if Capture.REGISTER not in to:
             self._register_until_now()
-        if Capture.RESET in to and self.truth.registered:
+        elif not self._has_started and self._capture is Capture.OFF and Capture.COUNT in to:
+            self._store_zero()
+        if Capture.RESET in to and self.truth.registered > self._registered_before_reset:
+            self._registered_before_reset = self.truth.registered
             self._resets += 1
             self._light = self._make_light(self._resets)
         if Capture.COUNT in to and Capture.COUNT not in self._capture:
             self._started = monotonic()
+        self._has_started |= Capture.REGISTER in to
 
     @property
     def _capture(self) -> Capture:
-        return Capture(self._registers[Register.CAPTURE])
+        return Capture(self._registers[Register.CAPTURE] & 7)
+
+    def _store_zero(self) -> None:
+        """Registration that begins together with the counter sees the counter's zero as a wrap."""
+        self.truth.registered += 1
+        words = np.zeros(RECORD_BYTES, np.uint8)
+        words[0] = WRAP << 5
+        self._store(words)
+
+    def _unsent_bytes(self) -> tuple[int, int]:
+        """Return the bytes in the USB chip that belong to no packet which was finished by request,
+        and how many of them make no full packet.
+        """
+        chip = min(len(self._stream), CHIP_PACKETS * self._window)
+        unsent = max(0, chip - sum(self._unfinished))
+        return unsent, unsent % self._window
 
     def _clear_memory(self) -> None:
+        """Forget the memory. The USB chip keeps what it has, and the rest of a record of which it
+        has the beginning follows.
+        """
         self._reported += -(-self._segment_bytes // RECORD_BYTES)
         self._segment_bytes = 0
-        self._memory.clear()
+        chip = 0
+        if self.setting.holds_packets:
+            chip = min(len(self._stream), CHIP_PACKETS * self._window)
+        self._stream.truncate(chip + (len(self._stream) - chip) % RECORD_BYTES)
+        if not self._stream:
+            self._unfinished.clear()
 
-    def _register_until_now(self) -> None:
-        """Register what fell on the instrument up to now, where that depends on the time."""
+    def _register_until_now(self, in_flight: int = 0) -> None:
+        """Register what fell on the instrument up to now, where that depends on the time.
+
+        Parameters
+        ----------
+        in_flight : int
+            Bytes that a transfer under way takes besides what the instrument holds.
+        """
         if not self.setting.is_paced or Capture.REGISTER not in self._capture:
             return
         tick = int((monotonic() - self._started) * CLOCK_HZ)
+        capacity = self.setting.memory_bytes + CHIP_PACKETS * self._window + in_flight
         found = MAX_BATCH_RECORDS
         while found == MAX_BATCH_RECORDS:
             words = self._register_photons(MAX_BATCH_RECORDS, tick)
             found = len(words) // RECORD_BYTES
-            room = (
-                max(0, self.setting.memory_bytes - len(self._memory)) // RECORD_BYTES * RECORD_BYTES
-            )
+            room = max(0, capacity - len(self._stream)) // RECORD_BYTES * RECORD_BYTES
             self._store(words[:room])
             self._discard(words[room:])
 
@@ -269,8 +402,9 @@ class EmulatedTimeTagger(VirtualDevice):
         words[: garbled * RECORD_BYTES] |= UNUSED_BITS
         self.truth.corrupted += garbled
         self._records_to_corrupt = 0
-        self._memory.append(words)
         self._registers[Register.RECORDS] += len(words) // RECORD_BYTES
+        if not self._is_held_empty:
+            self._stream.append(words)
 
     def _discard(self, words: ByteView) -> None:
         lost = len(words) // RECORD_BYTES
@@ -278,36 +412,89 @@ class EmulatedTimeTagger(VirtualDevice):
         self._registers[Register.LOST] += lost
         self._mark_lost |= lost > 0
 
+    @property
+    def _is_held_empty(self) -> bool:
+        return self.setting.clear_is_level and bool(self._registers[Register.CLEAR] & 1)
+
     def _send_data(self, buffer: memoryview, timeout: float) -> int:
-        """Fill the host's buffer with whatever there is, waiting for it at most `timeout` seconds."""
-        packet = self.setting.packet_bytes
-        wanted = len(buffer) if packet == PACKET_BYTES else min(packet, len(buffer))
-        self._wait_for_bytes(wanted, timeout)
-        length = self._memory.read_into(buffer[:wanted])
-        if not length:
-            raise make_usb_error(errno.ETIMEDOUT)
-        self._segment_bytes += length
+        """Send packets until the host's buffer is full, a short one ends the transfer, or
+        `timeout` seconds have passed.
+        """
+        deadline = monotonic() + timeout
+        self._register_until_now()  # until now no transfer was under way
+        length = 0
+        while True:
+            taken, is_over = self._take_packets(buffer[length:])
+            length += taken
+            if is_over or length == len(buffer):
+                break
+            if not self._wait_for_photons(len(buffer) - length, deadline):
+                if not self.setting.holds_packets:
+                    length += self._stream.read_into(buffer[length:])
+                if not length:
+                    raise make_usb_error(errno.ETIMEDOUT)
+                break
+        if not self._is_held_empty:  # what is thrown away was not handed over
+            self._segment_bytes += length
         return length
 
-    def _wait_for_bytes(self, length: int, timeout: float) -> None:
-        """See to it that `length` bytes are there, if they come in time."""
-        if not self.setting.is_paced:
-            if Capture.REGISTER in self._capture:
-                self._store(
-                    self._register_photons(-(-max(0, length - len(self._memory)) // RECORD_BYTES))
-                )
-            if not len(self._memory):
-                sleep(min(timeout, DARK_WAIT_S))
-            return
-        deadline = monotonic() + timeout
-        self._register_until_now()
-        while (
-            len(self._memory) < length
-            and Capture.REGISTER in self._capture
-            and monotonic() < deadline
-        ):
-            sleep(POLL_INTERVAL_S)
-            self._register_until_now()
+    def _take_packets(self, buffer: memoryview) -> tuple[int, bool]:
+        """Move packets into the host's buffer; return their bytes, and whether the last was short
+        and ended the transfer.
+        """
+        taken = 0
+        while self._unfinished:
+            size = self._unfinished[0]
+            if size > len(buffer) - taken:
+                return taken, True
+            self._unfinished.popleft()
+            taken += self._stream.read_into(buffer[taken : taken + size])
+            if size < PACKET_BYTES:
+                return taken, True
+        if self._window == PACKET_BYTES:
+            whole = min(len(self._stream), len(buffer) - taken) // PACKET_BYTES * PACKET_BYTES
+            return taken + self._stream.read_into(buffer[taken : taken + whole]), False
+        if len(self._stream) < self._window:
+            return taken, False
+        size = min(self._window, len(buffer) - taken)
+        return taken + self._stream.read_into(buffer[taken : taken + size]), True
+
+    def _wait_for_photons(self, room: int, deadline: float) -> bool:
+        """Wait for more; False when nothing more comes in time."""
+        if self.setting.is_paced:
+            if Capture.REGISTER not in self._capture or monotonic() >= deadline:
+                return False
+            sleep(min(POLL_INTERVAL_S, max(deadline - monotonic(), 0)))
+            self._register_until_now(room)
+            return True
+        wanted = room if self._window == PACKET_BYTES else min(self._window, room)
+        before = len(self._stream)
+        if Capture.REGISTER in self._capture:
+            missing = max(wanted - len(self._stream), 1)
+            self._store(self._register_photons(-(-missing // RECORD_BYTES)))
+        if len(self._stream) > before:
+            return True
+        sleep(max(0.0, min(deadline - monotonic(), DARK_WAIT_S)))
+        return False
+
+    def _send_cut(self, buffer: memoryview, timeout: float) -> int:
+        """Fill a small buffer with the beginning of what there is."""
+        while len(self._stream) < len(buffer):
+            if not self._wait_for_photons(len(buffer), monotonic() + timeout):
+                break
+        length = self._stream.read_into(buffer)
+        rest = length
+        while rest and self._unfinished:
+            part = min(rest, self._unfinished[0])
+            self._unfinished[0] -= part
+            rest -= part
+            if not self._unfinished[0]:
+                self._unfinished.popleft()
+        if not length:
+            raise make_usb_error(errno.ETIMEDOUT)
+        if not self._is_held_empty:
+            self._segment_bytes += length
+        return length
 
     def _apply_fault(self, fault: Fault, buffer: memoryview, timeout: float) -> int:
         """Do what a fault orders: some are an exception, some a smaller or stranger transfer."""
@@ -317,10 +504,11 @@ class EmulatedTimeTagger(VirtualDevice):
             raise self._interrupt(fault)
         if fault.kind == "overflow":
             lost_on_the_wire = self._send_data(buffer, timeout)
-            self._segment_bytes -= lost_on_the_wire
+            if not self._is_held_empty:
+                self._segment_bytes -= lost_on_the_wire
             raise make_usb_error(errno.EOVERFLOW)
         if fault.kind == "short":
-            return self._send_data(buffer[: max(1, min(fault.amount, len(buffer)))], timeout)
+            return self._send_cut(buffer[: max(1, min(fault.amount, len(buffer)))], timeout)
         if fault.kind == "lost":
             self._discard(self._register_photons(fault.amount))
         else:
@@ -333,11 +521,18 @@ class EmulatedTimeTagger(VirtualDevice):
             self._stalls = fault.amount
             return make_usb_error(errno.EPIPE)
         if fault.kind == "powerloss":
-            self._clear_memory()
+            self._reported += -(-self._segment_bytes // RECORD_BYTES)
+            self._segment_bytes = 0
+            self._stream.clear()
+            self._unfinished.clear()
+            self._window = self.setting.packet_bytes
+            self._replies.clear()
+            self._command = b""
             self.truth.lost_power_off += (
                 self._registers[Register.RECORDS] + self._registers[Register.LOST] - self._reported
             )
             self._registers = _make_registers()
+            self._reported = 0
             self._mark_lost = False
         self.unplug(fault.amount)
         return make_usb_error(errno.ENODEV)

@@ -14,7 +14,7 @@ from typing import Any
 import usb.backend
 import usb.core
 
-from devices.usb import INTERFACE_NUMBER, UsbIdentity
+from devices.usb import INTERFACE_NUMBER, VENDOR_REQUEST, UsbIdentity
 
 BULK_TRANSFER = 2
 HIGH_SPEED = 3
@@ -63,6 +63,10 @@ class VirtualDevice(abc.ABC):
     def clear_halt(self, endpoint: int) -> None:
         """End an endpoint's stall."""
         self.halted.discard(endpoint)
+
+    def control(self, request: int, value: int) -> None:
+        """Do what a vendor request asks for; without an override it knows none, and stalls."""
+        raise make_usb_error(errno.EPIPE)
 
     @abc.abstractmethod
     def receive(self, endpoint: int, data: bytes) -> None:
@@ -259,7 +263,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         self, dev_handle: VirtualDevice, bmRequestType: int, bRequest: int, wValue: int, wIndex: int, data: Any,
         timeout: int,
     ) -> int:  # fmt: skip
-        """Answer requests for string descriptors, the only control requests that pyusb needs here.
+        """Answer requests for string descriptors and those of the maker's own.
 
         Parameters
         ----------
@@ -282,6 +286,9 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
             It is another request, or there is no such string.
         """
         _require_plugged(dev_handle)
+        if bmRequestType == VENDOR_REQUEST:
+            dev_handle.control(bRequest, wValue)
+            return 0
         number = wValue & 0xFF
         if (bRequest, wValue >> 8) != (GET_DESCRIPTOR, STRING) or number > len(dev_handle.strings):
             raise make_usb_error(errno.EPIPE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import contextlib
 from dataclasses import dataclass
 from time import monotonic
 
@@ -30,6 +31,15 @@ from tofclip.errors import (
 from tofclip.storage import Record, Scalar
 
 _COUNTER_MODULUS = 1 << 32
+
+MIN_CLOCK_HZ, MAX_CLOCK_HZ = 1_000_000, 1_000_000_000
+"""Whatever the gateware was built for, its clock is within these."""
+
+PACKET_INTERVAL_S = 0.015
+LATENCY_S = 0.02
+"""Seconds after which a transfer is ended, and a chip that holds part of a packet told to send."""
+
+FULL_STREAM_BYTES_PER_S = 500_000
 
 
 @dataclass(frozen=True)
@@ -72,31 +82,42 @@ class TimeTaggerFeed:
     what arrived, when it closes and after it was unplugged; an instrument that lost its power has
     forgotten them.
 
-    The public firmware commits packets of 510 bytes. Each of them ends a transfer, because it is
-    shorter than the endpoint's 512, whatever the transfer asked for.
+    The firmware makes packets of 510 bytes, each of which ends a transfer because it is shorter than
+    the endpoint's 512: 8,000 a second of a full stream, while the board holds no more than 3 ms.
+    Packets of 512 bytes do not end a transfer, and so the system goes on reading by itself. At low
+    rates, where a photon would wait for 84 others, packets are made small; see `SendWindow`.
     """
 
     def __init__(self, link: UsbLink, ledger: Ledger, acquisition: AcquisitionSettings) -> None:
-        self._link, self._ledger, self._acquisition = link, ledger, acquisition
+        self._link = link
+        self._ledger = ledger
+        self._acquisition = acquisition
         self._tagger = TimeTagger(link)
         self._buffer = array.array("B", bytes(acquisition.transfer_bytes))
         self._view = memoryview(self._buffer)
+        self._window = SendWindow()
         self._gap = Gap.NONE
         self._capture_mode = Capture.COUNT | Capture.REGISTER
         self._disconnected_at: float | None = None
         self._must_clear = False
-        self._records_received = self._bytes_since_gap = 0
-        self._version = self._tagger.read(Register.VERSION)
+        self._is_flushed = False
+        self._records_received = 0
+        self._bytes_since_gap = 0
         self._clock_hz = self._tagger.read(Register.CLOCK)
         if not self._clock_hz:
             raise ProtocolError(
                 "the time tagger says that its clock has 0 Hz; is its gateware loaded?"
             )
+        if not MIN_CLOCK_HZ <= self._clock_hz <= MAX_CLOCK_HZ:
+            raise ProtocolError(
+                f"the time tagger says that its clock has {self._clock_hz} Hz, which cannot be; "
+                "unplug it and plug it in again"
+            )
 
     @property
     def info(self) -> Info:
         details: dict[str, Scalar] = {
-            "version": self._version,
+            "version": self._tagger.version,
             "clock_hz": self._clock_hz,
             "usb": str(self._link.identity),
         }
@@ -108,21 +129,34 @@ class TimeTaggerFeed:
 
     def start(self) -> None:
         self._tagger.reset()
-        self._records_received = self._bytes_since_gap = 0
+        self._window.size = PACKET_BYTES
+        self._records_received = 0
+        self._bytes_since_gap = 0
         self._tagger.run(self._acquisition.channels, self._acquisition.delta, self._capture_mode)
 
     def pull(self, timeout: float) -> Transfer | None:
         while True:
+            begin = monotonic()
             try:
                 self._prepare_read(timeout)
-                length = self._link.read(DATA_ENDPOINT, self._buffer, timeout)
+                begin = monotonic()
+                wait = min(timeout, self._window.read_timeout)
+                length = self._link.read(DATA_ENDPOINT, self._buffer, wait)
             except TransferOverflowError:
                 self._must_clear = True
             except DeviceDisconnectedError as fault:
                 self._note_disconnect(fault)
+            except DeviceTimeoutError:
+                if self._disconnected_at is not None or not self._send_rest():
+                    raise
+                self._ledger.time_out()
             else:
+                self._set_window(self._window.choose(length, monotonic() - begin))
+                if not length:
+                    continue  # an empty packet: the chip was told to send, and had nothing
                 self._bytes_since_gap += length
-                gap, self._gap = self._gap, Gap.NONE
+                gap = self._gap
+                self._gap = Gap.NONE
                 return Transfer(self._view[:length], gap)
 
     def stop(self) -> None:
@@ -136,6 +170,28 @@ class TimeTaggerFeed:
         finally:
             self._link.close()
 
+    def _send_rest(self) -> bool:
+        """Get hold of records that wait for others in the chip; False where there are none left."""
+        if self._window.size > RECORD_BYTES:
+            return self._set_window(RECORD_BYTES)
+        if Capture.REGISTER in self._capture_mode or self._is_flushed:
+            return False
+        # The last resort, after everything was stopped: some firmware sends only on this request.
+        self._is_flushed = True
+        received = self._records_received + -(-self._bytes_since_gap // RECORD_BYTES)
+        with contextlib.suppress(DeviceDisconnectedError):  # the next transfer notices
+            return self._tagger.read(Register.RECORDS) != received and self._tagger.flush()
+        return False
+
+    def _set_window(self, size: int) -> bool:
+        """Set how many bytes make a packet; False where that cannot be set."""
+        if size == self._window.size:
+            return True
+        self._window.size = size
+        with contextlib.suppress(DeviceDisconnectedError):  # the next transfer notices
+            return self._tagger.set_send_window(size)
+        return False
+
     def _prepare_read(self, timeout: float) -> None:
         """Do what has to be done before reading can go on."""
         if self._disconnected_at is not None:
@@ -148,7 +204,8 @@ class TimeTaggerFeed:
         self._gap = max(self._gap, Gap.LOSS)
         self._end_segment()
         self._tagger.write(Register.CAPTURE, Capture.COUNT)
-        self._tagger.write(Register.CLEAR, 1)
+        self._tagger.clear_memory()
+        self._window.size = PACKET_BYTES
         self._tagger.write(Register.CAPTURE, self._capture_mode)
         self._must_clear = False
 
@@ -160,6 +217,7 @@ class TimeTaggerFeed:
             if self._reconnect_time_left > 0:
                 raise DeviceTimeoutError("the time tagger is unplugged") from fault
             raise
+        self._tagger.synchronize()
         if self._tagger.read(Register.CAPTURE) & Capture.COUNT:
             self._must_clear = True  # it kept its power and went on
         else:
@@ -199,3 +257,54 @@ class TimeTaggerFeed:
         """
         self._records_received += -(-self._bytes_since_gap // RECORD_BYTES)
         self._bytes_since_gap = 0
+
+
+class SendWindow:
+    """How many bytes make a packet, so that no record waits long and a full stream is not cut up.
+
+    The aim is one packet in `PACKET_INTERVAL_S`: the rate is measured while reading, over eight
+    transfers or that time. A rate for which 512 bytes come sooner is read in packets of 512 bytes,
+    which do not end a transfer.
+    """
+
+    def __init__(self) -> None:
+        self.size = PACKET_BYTES
+        """Bytes of a packet."""
+        self._bytes = 0
+        self._transfers = 0
+        self._seconds = 0.0
+        self._rate = 0.0
+
+    @property
+    def read_timeout(self) -> float:
+        """Seconds that one transfer may take: long for a full stream, which is not cut then, and
+        for packets of single records, which end a transfer at once.
+        """
+        is_full = self._rate > FULL_STREAM_BYTES_PER_S
+        return 10.0 if is_full or self.size == RECORD_BYTES else LATENCY_S
+
+    def choose(self, length: int, seconds: float) -> int:
+        """Return how many bytes should make a packet from now on.
+
+        Parameters
+        ----------
+        length : int
+            Bytes that the last transfer brought.
+        seconds : float
+            How long it took.
+        """
+        self._bytes += length
+        self._transfers += 1
+        self._seconds += seconds
+        if self._transfers < 8 and self._seconds < PACKET_INTERVAL_S:
+            return self.size
+        self._rate = self._bytes / max(self._seconds, 1e-6)
+        self._bytes = 0
+        self._transfers = 0
+        self._seconds = 0.0
+        wanted = self._rate * PACKET_INTERVAL_S
+        if wanted >= PACKET_BYTES:
+            return PACKET_BYTES
+        size = max(1, int(wanted / RECORD_BYTES)) * RECORD_BYTES
+        is_near = self.size / 2 <= size <= 2 * self.size and self.size < PACKET_BYTES
+        return self.size if is_near else size

@@ -5,6 +5,7 @@ odd answers.
 from __future__ import annotations
 
 import array
+import contextlib
 import errno
 import time
 
@@ -34,7 +35,6 @@ from devices.uri import Uri
 from devices.usb import UsbLink
 from tofclip.errors import (
     BufferOverflowError,
-    DeviceStalledError,
     DeviceTimeoutError,
     InputError,
     ProtocolError,
@@ -68,8 +68,8 @@ def test_what_it_says_of_itself() -> None:
     with devices.open(SMALL) as source:
         assert source.info.as_dict() == {
             "instrument": "FX2 time tagger",
-            "serial": "SIM3",
-            "version": 1,
+            "serial": "",  # as of the real ones
+            "version": 6,
             "clock_hz": CLOCK_HZ,
             "usb": "04b4:1004",
         }
@@ -196,12 +196,11 @@ def test_registers_answer_and_reset() -> None:
     assert registers.read(Register.CAPTURE) == Capture.OFF
 
 
-@pytest.mark.parametrize("command", ["", "aa0002", "ab00020000000000", "aa00630000000000"])
-def test_a_wrong_command_stalls_the_instrument(command: str) -> None:
-    _, bus = tagger()
+@pytest.mark.parametrize("command", ["", "aa0002", "ab00020000000000"])
+def test_a_wrong_command_is_not_answered(command: str) -> None:
+    _, bus = tagger(stale_replies=0, jammed_bytes=0)
     link = UsbLink(USB_IDENTITY, "", bus)
-    with pytest.raises(DeviceStalledError):
-        link.write(COMMAND_ENDPOINT, bytes.fromhex(command), 0.1)
+    link.write(COMMAND_ENDPOINT, bytes.fromhex(command), 0.1)
     buffer = array.array("B", bytes(8))
     with pytest.raises(DeviceTimeoutError):
         link.read(REPLY_ENDPOINT, buffer, 0.1)
@@ -253,6 +252,8 @@ def test_one_that_was_stopped_stays_so_whatever_happens(fault: Fault) -> None:
     feed.start()
     assert feed.pull(0.1) is not None
     feed.stop()
+    with contextlib.suppress(DeviceTimeoutError):
+        feed.pull(0.5)  # the rest of what was registered before
     with pytest.raises(DeviceTimeoutError):
         feed.pull(0.5)
     assert not TimeTagger(link).read(Register.CAPTURE) & Capture.REGISTER
@@ -298,6 +299,7 @@ def test_a_defect_in_the_thread_reaches_the_reader(monkeypatch: pytest.MonkeyPat
     def fail(*_: object) -> int:
         raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr(EmulatedTimeTagger, "_send_data", fail)
-    with devices.open(SMALL) as source, pytest.raises(ZeroDivisionError):
-        source.read()
+    with devices.open(SMALL) as source:
+        monkeypatch.setattr(EmulatedTimeTagger, "_send_data", fail)
+        with pytest.raises(ZeroDivisionError):
+            list(source)
