@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -249,7 +250,7 @@ def test_forbidden_places_are_named(
     def refuse(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("tempfile.mkstemp", refuse)
+    monkeypatch.setattr("os.open", refuse)
     with pytest.raises(
         StorageError, match=r"a\.h5: cannot be written: writing is not permitted there"
     ):
@@ -301,3 +302,40 @@ def test_provenance_names_the_inputs(tmp_path: Path) -> None:
     assert found["inputs"] == [{"name": "in.tif", "sha256": hashlib.sha256(b"pixels").hexdigest()}]
     assert found["software"].startswith("tofclip ")
     assert found["created"].endswith("+00:00")
+
+
+def test_files_get_the_permissions_of_any_new_file_and_the_umask_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "plain").touch()
+
+    def refuse(_: int) -> int:
+        raise AssertionError("the umask belongs to the whole process")
+
+    monkeypatch.setattr(os, "umask", refuse)
+    with atomic_path(tmp_path / "a.txt") as temporary:
+        temporary.write_text("text")
+    assert (tmp_path / "a.txt").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_contents_are_on_the_disk_before_the_name_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[str] = []
+    sync, rename = os.fsync, os.replace
+
+    def note_sync(handle: int) -> None:
+        is_folder = stat.S_ISDIR(os.fstat(handle).st_mode)
+        size = os.fstat(handle).st_size
+        steps.append("folder" if is_folder else f"{size} bytes")
+        sync(handle)
+
+    def note_rename(source: Path, target: Path) -> None:
+        steps.append("rename")
+        rename(source, target)
+
+    monkeypatch.setattr(os, "fsync", note_sync)
+    monkeypatch.setattr(os, "replace", note_rename)
+    with atomic_path(tmp_path / "a.txt") as temporary:
+        temporary.write_text("text")
+    assert steps == ["4 bytes", "rename", "folder"]

@@ -16,7 +16,7 @@ import hashlib
 import io
 import json
 import os
-import tempfile
+import secrets
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -362,21 +362,20 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name beside `path` and rename it to `path` when the block ends well.
 
     On any exception, Ctrl-C included, the temporary file is removed and `path` stays as it was.
-    Problems of the file system become `StorageError`.
+    Problems of the file system become `StorageError`. The contents are on the disk before the name
+    is: after a loss of power, a file that is there is complete.
     """
     target = Path(path)
     try:
-        handle, name = tempfile.mkstemp(
-            prefix=f".{target.name}.", suffix=target.suffix, dir=target.parent or "."
-        )
-        os.close(handle)
+        temporary = _create_temporary_file(target)
     except OSError as fault:
         raise StorageError(f"{target}: cannot be written: {_explain_os_error(fault)}") from fault
-    temporary = Path(name)
     try:
         yield temporary
-        os.chmod(temporary, 0o666 & ~_get_umask())
+        _flush_to_disk(temporary)
         os.replace(temporary, target)
+        with contextlib.suppress(OSError):  # not every system can flush a folder
+            _flush_to_disk(target.parent)
     except OSError as fault:
         if isinstance(fault, StorageError):
             raise
@@ -415,10 +414,25 @@ def translate_read_errors(path: str | Path) -> Iterator[None]:
         raise StorageError(f"{path}: reading is not permitted") from fault
 
 
-def _get_umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _create_temporary_file(target: Path) -> Path:
+    """Create an empty file beside `target`, with the permissions that any new file has.
+
+    `tempfile` would make it private, and asking for the process's umask means changing it, which
+    other threads that create files meanwhile would see.
+    """
+    while True:
+        path = target.with_name(f".{target.name}.{secrets.token_hex(4)}{target.suffix}")
+        with contextlib.suppress(FileExistsError):
+            os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+            return path
+
+
+def _flush_to_disk(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def _explain_os_error(fault: OSError) -> str:
