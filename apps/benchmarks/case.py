@@ -31,7 +31,11 @@ class PreparedCase:
     peers : mapping of str to callable
         The same by other programs, by their names.
     floor_fraction : float
-        Part of the floor that `floor` does, where all of it would take too long.
+        Part of the floor that `floor` does, where all of it would take too long; above 1 where it
+        does more.
+    figures : callable
+        What else is to be said of this size, by names that end in their unit: errors, latencies.
+        Called once, after the times were taken.
     """
 
     action: Action
@@ -39,6 +43,7 @@ class PreparedCase:
     amount: float
     peers: Mapping[str, Peer] = field(default_factory=dict)
     floor_fraction: float = 1.0
+    figures: Callable[[], Mapping[str, float]] = dict
 
 
 @dataclass(frozen=True)

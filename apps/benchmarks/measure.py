@@ -33,8 +33,8 @@ def measure_case(case: Case, size: int) -> dict[str, Any]:
     dict
         ``seconds`` (median, least and greatest of the repeats after one that warms up),
         ``per_second``, ``peak_mib`` of the process with its libraries and inputs, ``own_mib`` of
-        that only while the action ran, ``floor_seconds``, ``times_floor``, and ``peers``: seconds,
-        or why there are none.
+        that only while the action ran, ``floor_seconds``, ``times_floor``, ``peers``: seconds, or
+        why there are none, and ``figures``, where the case has more to say.
     """
     ready = case.prepare(size)
     before = measure_peak_memory_bytes()
@@ -44,6 +44,7 @@ def measure_case(case: Case, size: int) -> dict[str, Any]:
     ready.floor()
     floor = statistics.median(time_repeats(ready.floor, FLOOR_TIME_S)) / ready.floor_fraction
     median = statistics.median(seconds)
+    figures = dict(ready.figures())
     return {
         "seconds": {
             "median": median,
@@ -57,6 +58,7 @@ def measure_case(case: Case, size: int) -> dict[str, Any]:
         "floor_seconds": floor,
         "times_floor": median / floor,
         "peers": {name: _time_peer(peer) for name, peer in ready.peers.items()},
+        **({"figures": figures} if figures else {}),
     }
 
 

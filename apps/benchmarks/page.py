@@ -29,6 +29,16 @@ GROUP_TITLES = {
     "backprojection": "Around the corner: back-projection",
     "decode": "Instruments",
 }
+STUDY_TITLES = {
+    "camera": "Light-field cameras: one model each way",
+    "quality": "Quality of pictures of recorded light fields",
+    "accuracy": "Ranges from counted photons",
+    "device": "The same on another device",
+    "corner": "Around the corner: beyond lattices",
+    "sequence": "Many shots",
+    "driver": "Instruments, the whole path",
+    "viewer": "The viewer in a browser",
+}
 TABLE_COLUMNS = ("", "size", "threads", "time", "rate", "memory", "floor", "x floor", "growth")
 
 
@@ -49,7 +59,7 @@ def render_page(figures: Mapping[str, Any], command: str) -> str:
     parts = [
         PAGE_HEADER.format(command=command, machine=_format_machine(figures["machine"])).rstrip()
     ]
-    for group, title in GROUP_TITLES.items():
+    for group, title in {**GROUP_TITLES, **STUDY_TITLES}.items():
         entries = [
             entry for entry in figures["entries"] if entry["name"].partition("-")[0] == group
         ]
@@ -75,7 +85,8 @@ def _format_section(title: str, entries: Iterable[Mapping[str, Any]]) -> str:
     for entry in entries:
         lines.extend(_format_row(_format_cells(entry, run)) for run in entry["runs"])
         notes.append(
-            f"* {entry['title']}: sizes are {entry['size']}, the floor is {entry['floor']}.{_format_peers(entry)}"
+            f"* {entry['title']}: sizes are {entry['size']}, the floor is {entry['floor']}."
+            f"{_format_peers(entry)}{_format_figures(entry)}"
         )
     return "\n".join([f"## {title}", "", *lines, "", *notes])
 
@@ -127,6 +138,16 @@ def _format_peers(entry: Mapping[str, Any]) -> str:
     sentences += [
         f" Not compared: {reason}." for name, reason in absent.items() if name not in told
     ]
+    return "".join(sentences)
+
+
+def _format_figures(entry: Mapping[str, Any]) -> str:
+    """A sentence about each size that has more to say than its times."""
+    sentences = []
+    for run in entry["runs"]:
+        said = [f"{name} {value:.3g}" for name, value in run.get("figures", {}).items()]
+        if said:
+            sentences.append(f" At {run['size']}, threads {run['threads']}: {', '.join(said)}.")
     return "".join(sentences)
 
 

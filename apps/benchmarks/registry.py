@@ -1,33 +1,67 @@
-"""Every case, by name."""
+"""Every case, by name: those of the benchmark page, and the studies, which are run by name only."""
 
 from __future__ import annotations
 
-from apps.benchmarks import clip, instruments, lidar, recovery
-from apps.benchmarks import nlos as corner
+import importlib
+
+from apps.benchmarks import instruments, light_fields, nlos, ranging, recovery
 from apps.benchmarks.case import Case
 from tofclip.errors import InputError
 
 CASES: tuple[Case, ...] = (
     *recovery.CASES,
-    *clip.CASES,
-    *lidar.CASES,
-    *corner.CASES,
+    *light_fields.CASES,
+    *ranging.CASES,
+    *nlos.CASES,
     *instruments.CASES,
 )
+"""The page's cases: all of them take less than ten minutes."""
+
+STUDIES = {
+    "camera": "light_field_cameras",
+    "quality": "picture_quality",
+    "accuracy": "range_accuracy",
+    "device": "array_devices",
+    "corner": "nlos_studies",
+    "sequence": "sequences",
+    "driver": "drivers",
+    "viewer": "viewer",
+}
+"""Groups that need an extra program, recorded data, another device or much time, and their modules."""
 
 
 def find_cases(name: str) -> tuple[Case, ...]:
-    """Return the case of a name, those of a group, or every one for ``all``.
+    """Return the case of a name, those of a group, or the page's for ``all``.
 
     Raises
     ------
     InputError
-        Nothing has that name.
+        Nothing has that name, or a study needs a library that is not installed.
     """
-    found = tuple(case for case in CASES if name in ("all", case.name, case.group))
+    group = name.partition("-")[0]
+    cases = load_study(group) if group in STUDIES else CASES
+    found = tuple(case for case in cases if name in ("all", case.name, case.group))
     if not found:
-        groups = ", ".join(dict.fromkeys(case.group for case in CASES))
+        groups = ", ".join([*dict.fromkeys(case.group for case in CASES), *STUDIES])
         raise InputError(
             f"unknown benchmark '{name}'; take all, a group ({groups}) or one of a group, as recovery-l1"
         )
     return found
+
+
+def load_study(group: str) -> tuple[Case, ...]:
+    """Return the cases of a study.
+
+    Raises
+    ------
+    InputError
+        It needs a library that is not installed.
+    """
+    try:
+        module = importlib.import_module(f"apps.benchmarks.{STUDIES[group]}")
+    except ImportError as absence:
+        raise InputError(
+            f"the study '{group}' needs {absence.name}: pip install {absence.name}"
+        ) from absence
+    cases: tuple[Case, ...] = module.CASES
+    return cases

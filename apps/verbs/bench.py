@@ -26,7 +26,8 @@ def bench(
         typer.Argument(
             metavar="NAME",
             help="recovery, clip, depth, streaming, rsd, propagation, confocal, backprojection, decode, or one of a "
-            "group, as recovery-l1.",
+            "group, as recovery-l1. Studies, by name only: camera, quality, accuracy, device, corner, sequence, "
+            "driver, viewer.",
         ),
     ] = "all",
     page: Annotated[

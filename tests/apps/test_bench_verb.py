@@ -15,7 +15,7 @@ from apps.benchmarks import registry
 from apps.benchmarks.case import Case, PeerUnavailableError, PreparedCase
 from apps.benchmarks.machine import describe_machine
 from apps.benchmarks.measure import measure_case
-from apps.benchmarks.page import GROUP_TITLES, render_page
+from apps.benchmarks.page import GROUP_TITLES, STUDY_TITLES, render_page
 from apps.benchmarks.peers import run_peer
 from apps.benchmarks.run import run_cases
 from apps.verbs.bench import bench
@@ -185,3 +185,42 @@ def test_names() -> None:
     assert all(group in str(bench.__annotations__["name"]) for group in GROUP_TITLES)
     with pytest.raises(InputError, match="recovery, clip"):
         registry.find_cases("nothing")
+
+
+STUDY_SIZES = {"camera": 16, "accuracy": 100, "device": 16, "corner": 12, "driver": 1}
+"""Of the studies that need nothing but this program, sizes at which a case is over at once."""
+
+
+@pytest.mark.parametrize("group", STUDY_SIZES)
+def test_every_study_runs(group: str) -> None:
+    if group == "device":
+        pytest.importorskip("torch", reason="another device than NumPy's is needed")
+    for case in registry.find_cases(group):
+        if group == "accuracy" or case.name == "corner-large":
+            continue  # takes its full size whatever it is asked for
+        ready = case.prepare(STUDY_SIZES[group])
+        ready.action()
+        ready.floor()
+        assert all(np.isfinite(value) for value in ready.figures().values()), case.name
+
+
+def test_studies_have_a_place_on_the_page_and_are_run_by_name_only() -> None:
+    assert set(registry.STUDIES) == set(STUDY_TITLES)
+    assert not {case.group for case in registry.find_cases("all")} & set(registry.STUDIES)
+    assert all(group in str(bench.__annotations__["name"]) for group in registry.STUDIES)
+    for group in STUDY_SIZES:
+        assert {case.group for case in registry.find_cases(group)} == {group}
+
+
+def test_what_else_a_case_says_is_in_its_figures_and_on_the_page() -> None:
+    def prepare(size: int) -> PreparedCase:
+        return replace(made_up(size), figures=lambda: {"error_percent": 0.25})
+
+    found = measure_case(replace(MADE_UP, prepare=prepare), 1)
+    assert found["figures"] == {"error_percent": 0.25}
+    assert "figures" not in measure_case(MADE_UP, 1)
+    run = {"size": 1, "threads": 1, **found}
+    entry = {"name": "decode-x", "title": "x", "size": "MB", "unit": "MB", "floor": "a copy"}
+    entries = [{**entry, "runs": [run], "growth": None}]
+    text = render_page({"machine": describe_machine(), "entries": entries}, "tofclip bench")
+    assert "At 1, threads 1: error_percent 0.25." in text

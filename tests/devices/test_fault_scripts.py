@@ -1,7 +1,7 @@
 """Every record is accounted for, whatever goes wrong.
 
 The accounts are compared with what the emulator knows: they balance by construction, so balancing
-alone says nothing. `tests/benchmarks/instruments.py` runs a thousand of these.
+alone says nothing. `.ci/nightly` runs a thousand of these.
 """
 
 from __future__ import annotations

@@ -1,0 +1,157 @@
+"""Study: the viewer in a headless chromium on this machine, drawn by a software renderer.
+
+From handing a cloud over until the page answers that it has it, against the answer alone; and from
+opening a PLY file until all of it is drawn, against reading the file's bytes. Needs playwright and
+chromium.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import itertools
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from playwright.sync_api import sync_playwright
+
+from apps.benchmarks.case import Case, PreparedCase
+from apps.viewer.access_control import AccessControl
+from apps.viewer.clouds import make_cloud
+from apps.viewer.page import Page
+from apps.viewer.server import make_echo_request
+from apps.viewer.session import Session
+from apps.viewer.source import Source, View
+from apps.viewer.source_factory import open_source
+
+FLAGS = (
+    "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run "
+    "--disable-background-networking --disable-component-update --disable-sync"
+)
+WINDOW = {"width": 1100, "height": 640}
+FRAMES = 32
+PATIENCE_S = 60.0
+
+
+class MovingSheet(Source):
+    """A sheet of points that moves: every frame is another cloud."""
+
+    def __init__(self, points: int) -> None:
+        super().__init__("sheet", 60.0)
+        side = round(points**0.5)
+        x, y = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side))
+        self._views = [View(_bend_sheet(x, y, number)) for number in range(FRAMES)]
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def view(self, number: int) -> View:
+        return self._views[number]
+
+
+def _bend_sheet(x: Any, y: Any, number: int) -> Any:
+    z = 3 + 0.2 * np.sin(4 * x + 2 * np.pi * number / FRAMES) * np.cos(3 * y)
+    xyz = np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
+    return make_cloud(xyz, {"intensity": z.ravel()})
+
+
+def open_browser(stack: contextlib.ExitStack) -> Any:
+    """A browser that is closed with the stack."""
+    driver = stack.enter_context(sync_playwright())
+    browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS.split())
+    stack.callback(browser.close)
+    return browser
+
+
+def serve_page(source: Source) -> tuple[Page, Callable[[], None]]:
+    """A page that is served, and what waits until a browser has drawn all that was sent so far."""
+    page, answered = Page(Session(source), AccessControl()), threading.Event()
+    ask = make_echo_request(page.server, answered.set)
+
+    def wait() -> None:
+        answered.clear()
+        ask()
+        page.server.flush()
+        if not answered.wait(PATIENCE_S):
+            raise TimeoutError(f"the browser did not answer within {PATIENCE_S:g} s")
+
+    threading.Thread(target=page.run, daemon=True).start()
+    return page, wait
+
+
+def make_stack() -> contextlib.ExitStack:
+    """What is closed when the process ends."""
+    stack = contextlib.ExitStack()
+    atexit.register(stack.close)
+    return stack
+
+
+def prepare_frames(points: int) -> PreparedCase:
+    """Clouds of a moving sheet, one after the other, each when the one before is drawn."""
+    stack = make_stack()
+    tab = open_browser(stack).new_page(viewport=WINDOW)
+    page, wait = serve_page(MovingSheet(points))
+    stack.callback(page.close)
+    tab.goto(page.address)
+    tab.locator("#frame-number").wait_for(timeout=1e3 * PATIENCE_S)
+    wait()
+    numbers = itertools.cycle(range(FRAMES))
+
+    def show_frame() -> None:
+        number, sent = next(numbers), threading.Event()
+
+        def move() -> None:
+            page.session.jump(number)
+            sent.set()
+
+        page.post(move)
+        sent.wait(PATIENCE_S)
+        wait()
+
+    return PreparedCase(show_frame, wait, 1)
+
+
+def prepare_large_cloud(points: int) -> PreparedCase:
+    """A PLY file, from opening it to all of it drawn in a tab of its own."""
+    stack = make_stack()
+    path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "large.ply"
+    xyz = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (points, 3))
+    make_cloud(xyz.astype(np.float32)).save(path)
+    browser = open_browser(stack)
+
+    def show_file() -> None:
+        tab = browser.new_page(viewport=WINDOW)
+        page, wait = serve_page(open_source(str(path)))
+        tab.goto(page.address)
+        wait()
+        tab.close()
+        page.close()
+
+    return PreparedCase(show_file, path.read_bytes, 1)
+
+
+CASES = (
+    Case(
+        "viewer-frames",
+        "a moving cloud, frame after frame",
+        "points",
+        (15_625, 125_000),
+        "frames",
+        "a question and its answer",
+        prepare_frames,
+    ),
+    Case(
+        "viewer-file",
+        "a PLY file until it is drawn",
+        "points",
+        (100_000, 1_000_000),
+        "files",
+        "reading the file",
+        prepare_large_cloud,
+    ),
+)
