@@ -187,18 +187,16 @@ def test_names() -> None:
         registry.find_cases("nothing")
 
 
-STUDY_SIZES = {"camera": 16, "accuracy": 100, "device": 16, "corner": 12, "driver": 1}
-"""Of the studies that need nothing but this program, sizes at which a case is over at once."""
+STUDY_SIZES = {"camera": 16, "corner-time": 12, "corner-scattered": 12, "driver": 1}
+"""Sizes at which studies that need nothing but this program are over at once."""
 
 
-@pytest.mark.parametrize("group", STUDY_SIZES)
-def test_every_study_runs(group: str) -> None:
-    if group == "device":
+@pytest.mark.parametrize("name", [*STUDY_SIZES, "device-linear"])
+def test_every_study_runs(name: str) -> None:
+    if name == "device-linear":
         pytest.importorskip("torch", reason="another device than NumPy's is needed")
-    for case in registry.find_cases(group):
-        if group == "accuracy" or case.name == "corner-large":
-            continue  # takes its full size whatever it is asked for
-        ready = case.prepare(STUDY_SIZES[group])
+    for case in registry.find_cases(name):
+        ready = case.prepare(STUDY_SIZES.get(name, 16))
         ready.action()
         ready.floor()
         assert all(np.isfinite(value) for value in ready.figures().values()), case.name
@@ -208,7 +206,7 @@ def test_studies_have_a_place_on_the_page_and_are_run_by_name_only() -> None:
     assert set(registry.STUDIES) == set(STUDY_TITLES)
     assert not {case.group for case in registry.find_cases("all")} & set(registry.STUDIES)
     assert all(group in str(bench.__annotations__["name"]) for group in registry.STUDIES)
-    for group in STUDY_SIZES:
+    for group in ("camera", "quality", "accuracy", "device", "corner", "driver"):
         assert {case.group for case in registry.find_cases(group)} == {group}
 
 
