@@ -65,6 +65,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   devices            instruments and their recordings: list, info, test, verify, repair
   record             an instrument's bytes, to be replayed exactly
   convert            any readable streak image to this program's own HDF5
+  warm-up            compile everything now, so that no later run waits for it
   info               what a file holds
 
   tofclip VERB --help explains a verb. Exit status: 0 done, 1 some failed, 2 unusable input, 130 interrupted."""
@@ -85,6 +86,7 @@ VERBS: VerbTable = {
     "devices": "Streak cameras, SPAD sensors, time taggers and their recordings.",
     "record": "Record an instrument: its bytes as they come, with clock, accounts and calibration.",
     "convert": "Turn a streak image into this program's HDF5, with its time axis, camera, text and relay wall inside.",
+    "warm-up": "Run everything that is compiled on first use once, on small data.",
     "info": "Say what kind of thing a file holds: shapes, axes, units, text, and how it came about.",
 }
 """Each verb's module in `apps.verbs` and its line in the list of commands."""

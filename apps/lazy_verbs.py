@@ -16,7 +16,7 @@ from typer.core import TyperCommand, TyperGroup
 from apps.help import set_help_texts
 
 VerbTable = Mapping[str, str]
-"""The one-line help of each verb, by the name of the verb and of its module."""
+"""The one-line help of each verb, by its name; its module has _ for -."""
 
 Command = TyperCommand | TyperGroup
 
@@ -52,7 +52,7 @@ def make_lazy_group(package: str, verbs: VerbTable) -> type[TyperGroup]:
 
         def load_verb(self, name: str) -> Command:
             """Import a verb and return its command."""
-            return load_command(f"{package}.{name}", name)
+            return load_command(f"{package}.{name.replace('-', '_')}", name)
 
     return LazyGroup
 
@@ -76,7 +76,7 @@ def load_command(module: str, name: str) -> Command:
     is_group = hasattr(home, "app")
     app: typer.Typer = home.app if is_group else typer.Typer()
     if not is_group:
-        app.command(name)(getattr(home, name))
+        app.command(name)(getattr(home, module.rpartition(".")[2]))
     set_help_texts(app)
     group = typer.main.get_group(app)
     group.name = name

@@ -44,7 +44,7 @@ def test_the_list_of_commands_says_what_the_verbs_say(package: str) -> None:
     name = "apps.cli" if package == "apps" else package
     prefix = "apps.verbs" if package == "apps" else package
     for verb, line in importlib.import_module(name).VERBS.items():
-        text = load_command(f"{prefix}.{verb}", verb).help or ""
+        text = load_command(f"{prefix}.{verb.replace('-', '_')}", verb).help or ""
         assert line == " ".join(text.split("\n\n")[0].split()), f"{name}.VERBS: {verb}"
 
 
