@@ -151,25 +151,39 @@ def test_unusable_input_is_one_line(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_recording_is_not_overwritten_unless_asked(
+    run: Run, recording: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "run.h5"
+    path.write_bytes(recording.read_bytes())
+    before = path.read_bytes()
+    outcome = run("record", SIM, "--out", path, "--seconds", "0.1")
+    assert (outcome.status, path.read_bytes()) == (2, before)
+    assert "--overwrite" in outcome.err
+    assert run("record", SIM, "--out", path, "--seconds", "0.1", "--overwrite").status == 0
+    assert path.read_bytes() != before
+
+
 def test_an_input_is_not_overwritten(run: Run, recording: Path) -> None:
     outcome = run("record", f"file://{recording}", "--out", recording)
     assert outcome.status == 2
     assert "is an input too" in outcome.err
 
 
-def test_ctrl_c_leaves_a_whole_recording(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_leaves_a_whole_recording(tmp_path: Path, number: signal.Signals) -> None:
     path = tmp_path / "run.h5"
     command = [sys.executable, "-m", "apps", "record", SIM, "--out", str(path)]
     # A shell that puts the tests into the background has them ignore Ctrl-C, and children inherit
     # that.
-    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    heed = partial(signal.signal, number, signal.SIG_DFL)
     recorder = subprocess.Popen(
         command, cwd=ROOT, stderr=subprocess.PIPE, env=os.environ, preexec_fn=heed
     )
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and not (path.exists() and verify(path).records):
         time.sleep(0.05)
-    recorder.send_signal(signal.SIGINT)
+    recorder.send_signal(number)
     _, said = recorder.communicate(timeout=60)
     assert recorder.returncode == 130
     assert b"interrupted" in said
