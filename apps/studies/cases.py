@@ -1,19 +1,21 @@
-"""Cases of CLIP: measure the true views of a light field, recover the picture at one depth, score
-it.
+"""Cases of CLIP: light fields to look at, measured from their true views, recovered at one depth and
+scored.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.studies.library import Library
 from apps.studies.outcome import Advance, Panel, Row
+from tofclip.errors import InputError
+from tofclip.io.light_fields import read_light_field
+from tofclip.light_field import LightField
 from tofclip.light_field.measurement import (
     CameraSetup,
     ClipMeasurement,
@@ -22,7 +24,77 @@ from tofclip.light_field.measurement import (
 )
 from tofclip.metrics import nmse
 from tofclip.recovery.light_field import ClipRecovery
-from tofclip.threads import limit_blas_threads, thread_count
+from tofclip.simulate.light_fields import CameraArray, make_scene, render_light_field, render_view
+from tofclip.simulate.light_fields.scenes import EDITS, edit_scene, remove_occluder
+from tofclip.threads import map_parallel
+
+
+class Library:
+    """Light fields by name, each rendered or read once.
+
+    Parameters
+    ----------
+    data : Path, optional
+        Folder of recorded data, whose ``lightfields`` holds NPZ light fields.
+    array : CameraArray, optional
+        Cameras of the rendered ones; the paper's 8 x 8 views of 128 x 128 pixels unless given.
+    """
+
+    def __init__(self, data: Path | None = None, array: CameraArray | None = None) -> None:
+        self.data, self.array = data, array or CameraArray()
+        self._cache: dict[str, LightField] = {}
+
+    def light_field(self, name: str) -> LightField:
+        """Return the light field of a scene.
+
+        Parameters
+        ----------
+        name : str
+            A name of `tofclip.simulate.light_fields.SCENES`, ``NAME:EDIT`` with an edit of the flip
+            test, ``NAME:4x4`` for its middle sixteen views, ``NAME:flat`` for its reference view as
+            a poster at s = 0, or ``data:NAME`` for a recorded one.
+        """
+        if name not in self._cache:
+            self._cache[name] = self._make_light_field(name)
+        return self._cache[name]
+
+    def render_unoccluded(self, name: str) -> NDArray[Any]:
+        """Return what the reference view sees of an occlusion scene when its occluder is gone."""
+        return render_view(remove_occluder(make_scene(name, self.array)), self.array, (0.0, 0.0))
+
+    def has_recording(self, name: str) -> bool:
+        """Tell whether the folder of recorded data holds a file."""
+        return self.data is not None and (self.data / name).is_file()
+
+    def recording(self, name: str) -> Path:
+        """Return the path of a file of the folder of recorded data.
+
+        Raises
+        ------
+        InputError
+            No folder was given.
+        """
+        if self.data is None:
+            raise InputError(f"{name} is recorded data; name the folder that holds it by --data")
+        return self.data / name
+
+    def _make_light_field(self, name: str) -> LightField:
+        scene, _, variant = name.partition(":")
+        if scene == "data":
+            return read_light_field(self.recording(f"lightfields/{variant}.npz"))
+        if variant == "4x4":
+            whole = self.light_field(scene)
+            middle = np.all((whole.views >= -2) & (whole.views < 2), axis=1)
+            return LightField(whole.pictures[middle], whole.views[middle])
+        known = make_scene(scene, self.array)
+        if variant == "flat":
+            views = self.array.views
+            poster = render_view(known, self.array, (0.0, 0.0))
+            return LightField(np.broadcast_to(poster, (len(views), *poster.shape)), views)
+        return render_light_field(
+            edit_scene(known, variant) if variant in EDITS else known, self.array
+        ).light_field
+
 
 BORDER_PX = 12
 """Pixels that are not scored: views leave the picture there."""
@@ -33,9 +105,6 @@ CAMERA_NAMES = {
     "single-pixel": "CLIP-0D",
     "diffuser": "CLIP-2D",
 }
-
-Job = TypeVar("Job")
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -139,30 +208,7 @@ def solve_cases(
         percent = tuple(100 * nmse(recovered.picture, truth, BORDER_PX) for recovered in found)
         return SolvedCase(case, percent, found[0].picture, truth, found[0].weight)
 
-    return run_in_parallel(solve_case, cases)
-
-
-def run_in_parallel(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
-    """Run independent jobs on all cores, each on one; the first exception is raised and no further
-    job started.
-
-    Parameters
-    ----------
-    work : callable
-        From a job to its result; called in threads.
-    jobs : sequence
-
-    Returns
-    -------
-    list
-        Results in the order of the jobs.
-    """
-    pool = ThreadPoolExecutor(min(thread_count(), max(len(jobs), 1)), thread_name_prefix="tofclip")
-    try:
-        with limit_blas_threads():
-            return list(pool.map(work, jobs))
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    return list(map_parallel(solve_case, cases))
 
 
 def measure_case(case: Case, library: Library, seed: int) -> ClipMeasurement:

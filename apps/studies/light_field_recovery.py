@@ -16,16 +16,16 @@ from apps.studies.cases import (
     BORDER_PX,
     CAMERA_NAMES,
     Case,
+    Library,
     SolvedCase,
     measure_case,
-    run_in_parallel,
     solve_cases,
 )
-from apps.studies.library import Library
 from apps.studies.outcome import Advance, Outcome, Panel, Row, Study
 from tofclip.light_field import LightField
 from tofclip.metrics import nmse
 from tofclip.solvers.light_field_variation import LightFieldVariation
+from tofclip.threads import map_parallel
 
 TV_WEIGHT, ITERATIONS, ANGULAR_WEIGHT = (
     3e-3,
@@ -196,7 +196,7 @@ def _recover_light_fields(
     for case in cases:
         library.light_field(case.scene)
     jobs = [(case, seed) for case in cases for seed in range(seeds)]
-    found = run_in_parallel(partial(_recover_job, library, advance), jobs)
+    found = list(map_parallel(partial(_recover_job, library, advance), jobs))
     return [found[number * seeds : (number + 1) * seeds] for number in range(len(cases))]
 
 

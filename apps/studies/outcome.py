@@ -6,12 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.studies.library import Library
+if TYPE_CHECKING:
+    from apps.studies.cases import Library
 
 Advance = Callable[[int], None]
 

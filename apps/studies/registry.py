@@ -2,40 +2,31 @@
 
 from __future__ import annotations
 
-from apps.studies import angle_assignment as dealing_table
 from apps.studies import (
-    area_sensors,
-    flash_occlusion,
-    flip_test,
-    inactive_region,
-    iteration_table,
-    lensless_hand,
-    light_field_processing,
-    line_rotation,
+    coded_line,
+    diffuser,
+    iteration_costs,
+    light_field_properties,
+    light_field_recovery,
     occlusion,
+    refocused_pictures,
     representation,
 )
-from apps.studies import corrupted_measurements as spoilt_readings
-from apps.studies import glossy_plate as shiny_bodies
-from apps.studies import light_field_recovery as whole_light_fields
 from apps.studies.outcome import Study
 from tofclip.errors import InputError
 
 STUDIES: tuple[Study, ...] = (
-    iteration_table.STUDY,
-    flip_test.STUDY,
-    *whole_light_fields.STUDIES,
-    *spoilt_readings.STUDIES,
-    occlusion.STUDY,
-    flash_occlusion.STUDY,
-    inactive_region.STUDY,
+    iteration_costs.STUDY,
+    refocused_pictures.FLIP_STUDY,
+    *light_field_recovery.STUDIES,
+    *refocused_pictures.CORRUPTION_STUDIES,
+    *occlusion.STUDIES,
     *representation.STUDIES,
-    area_sensors.STUDY,
-    lensless_hand.STUDY,
-    line_rotation.STUDY,
-    shiny_bodies.STUDY,
-    light_field_processing.STUDY,
-    dealing_table.STUDY,
+    *diffuser.STUDIES,
+    coded_line.STUDY,
+    light_field_properties.GLOSSY_STUDY,
+    light_field_properties.FOCUS_STUDY,
+    refocused_pictures.ASSIGNMENT_STUDY,
 )
 
 

@@ -12,15 +12,15 @@ import numpy as np
 from apps.studies.cases import (
     CAMERA_NAMES,
     Case,
+    Library,
     SolvedCase,
     measure_case,
-    run_in_parallel,
     solve_cases,
 )
-from apps.studies.library import Library
 from apps.studies.outcome import Advance, Outcome, Panel, Study
 from tofclip.light_field import FocalStack, estimate_depth_from_focus, make_focal_stack
 from tofclip.recovery.light_field import ClipRecovery
+from tofclip.threads import map_parallel
 
 STACK_SHEARS = np.arange(-1.3, 0.61, 0.3)
 
@@ -103,7 +103,9 @@ def _make_panels(library: Library, line: list[SolvedCase]) -> tuple[Panel, ...]:
     case, recovery = line[0].case, ClipRecovery(weight=line[0].weight)
     measurement = measure_case(case, library, 0)
     shears = [float(shear) for shear in STACK_SHEARS]
-    pictures = run_in_parallel(lambda shear: recovery.recover(measurement, shear).picture, shears)
+    pictures = list(
+        map_parallel(lambda shear: recovery.recover(measurement, shear).picture, shears)
+    )
     refocused = tuple(
         one.panel(f"{CAMERA_NAMES[case.encoder]} SR = {case.sampling_ratio:g}") for one in line
     )

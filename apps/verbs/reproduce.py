@@ -18,7 +18,7 @@ from apps.progress import show_progress
 from apps.report import report
 from apps.reproduction import STUDY_FOLDER, load_result, make_result, write_page, write_result
 from apps.sequences import report_summary, run_with_progress
-from apps.studies.library import Library
+from apps.studies.cases import Library
 from apps.studies.registry import STUDIES, find_studies
 from tofclip import __version__
 from tofclip.errors import InputError

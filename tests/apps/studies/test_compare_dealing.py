@@ -24,7 +24,7 @@ def test_dealing_evenly_halves_the_error_on_the_letters(shared_data):
             [nmse(recovery.recover(each, -0.3).picture, truth, 12) for each in measured]
         )
 
-    at_random, evenly = errors("line"), errors("line-even")
+    at_random, evenly = errors("line"), errors("line-spread")
     assert evenly.max() < 0.045
     assert evenly.mean() < 0.6 * at_random.mean()
     assert evenly.std() < at_random.std()

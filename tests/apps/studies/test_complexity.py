@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apps.studies.complexity import measure_iteration_costs
+from apps.studies.iteration_costs import measure_iteration_costs
 from tofclip.light_field import LightField
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apps.studies.diffusercam import (
+from apps.studies.diffuser import (
     DiffuserRecording,
     build_diffuser_model,
     read_diffuser_recording,

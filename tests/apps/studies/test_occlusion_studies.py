@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from apps.studies import flash_occlusion, inactive_region
-from apps.studies.library import Library
+from apps.studies import occlusion
+from apps.studies.cases import Library
 from apps.studies.registry import find_studies
 from tofclip.simulate.light_fields import CameraArray
 
@@ -14,11 +14,11 @@ def test_the_sweep_recovers_what_the_formula_promises_and_nothing_else(monkeypat
     """The hardest corners: the return nearest to its occluder's, and the occluder nearly as wide as
     the baseline.
     """
-    monkeypatch.setattr(inactive_region, "WIDTHS_MM", (2.0, 14.0))
-    monkeypatch.setattr(inactive_region, "DISTANCES_MM", (30.0,))
-    monkeypatch.setattr(inactive_region, "DISPLAYED_BAR_MM", (2.0, 30.0))
+    monkeypatch.setattr(occlusion, "WIDTHS_MM", (2.0, 14.0))
+    monkeypatch.setattr(occlusion, "DISTANCES_MM", (30.0,))
+    monkeypatch.setattr(occlusion, "DISPLAYED_BAR_MM", (2.0, 30.0))
     steps: list[int] = []
-    outcome = inactive_region.run_inactive_region(Library(), 1, steps.append)
+    outcome = occlusion.run_inactive_region(Library(), 1, steps.append)
     assert sum(steps) == len(outcome.rows) == 6
     for row in outcome.rows:
         assert (row.mean >= 0.8) == (row.labels[-1] == "visible")
@@ -28,11 +28,11 @@ def test_the_sweep_recovers_what_the_formula_promises_and_nothing_else(monkeypat
 
 
 def test_knowing_the_occluder_is_what_makes_the_target_bright(monkeypatch):
-    monkeypatch.setattr(flash_occlusion, "SCENES", ("plate",))
-    monkeypatch.setattr(flash_occlusion, "RATIOS", (1.0,))
+    monkeypatch.setattr(occlusion, "FLASH_SCENES", ("plate",))
+    monkeypatch.setattr(occlusion, "FLASH_RATIOS", (1.0,))
     steps: list[int] = []
     small = Library(array=CameraArray((48, 48)))
-    outcome = flash_occlusion.run_flash_occlusion(small, 1, steps.append)
+    outcome = occlusion.run_flash_occlusion(small, 1, steps.append)
     assert sum(steps) == 2
     knowing, ignorant = outcome.rows[0], outcome.rows[1]
     assert knowing.mean < 0.5 * ignorant.mean

@@ -7,13 +7,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from apps.studies import angle_assignment as dealing_table
-from apps.studies import glossy_plate as shiny_bodies
-from apps.studies import light_field_processing
-from apps.studies import light_field_recovery as whole_light_fields
-from apps.studies.cases import BORDER_PX, Case, measure_case, solve_cases
-from apps.studies.library import Library
-from apps.studies.light_field_processing import compute_depth_accuracy
+from apps.studies import light_field_properties, light_field_recovery, refocused_pictures
+from apps.studies.cases import BORDER_PX, Case, Library, measure_case, solve_cases
+from apps.studies.light_field_properties import compute_depth_accuracy
 from apps.studies.outcome import Row
 from apps.studies.registry import STUDIES, find_studies
 from tofclip.errors import InputError
@@ -115,10 +111,10 @@ def test_every_study_can_be_called_by_its_tables_and_figures_names():
 
 
 def test_depth_and_viewpoints_of_true_light_fields_are_scored(monkeypatch):
-    monkeypatch.setattr(light_field_processing, "SCENES", ("letters", "blocks"))
+    monkeypatch.setattr(light_field_properties, "FOCUS_SCENES", ("letters", "blocks"))
     fine = Library(array=CameraArray((64, 64), 8, focal_length_px=80.0, view_step=0.025))
     steps: list[int] = []
-    outcome = light_field_processing.run_light_field_processing(fine, 1, steps.append)
+    outcome = light_field_properties.run_light_field_processing(fine, 1, steps.append)
     figures = {row.labels: row.mean for row in outcome.rows}
     assert sum(steps) == 2
     assert figures["letters", "right plane, % of textured pixels"] >= 95
@@ -161,7 +157,7 @@ def test_tables_have_a_row_for_each_case_and_count_their_steps(library, name, mo
 def test_a_light_field_recovered_from_many_readings_is_near_the_true_one(library):
     """As many readings as unknowns would be SR 16; at 8 total variation has little to fill in."""
     case = Case((), "letters", "line", 8.0, 0.0)
-    found = whole_light_fields.recover_light_field(case, library, 0)
+    found = light_field_recovery.recover_light_field(case, library, 0)
     truth = library.light_field("letters")
     np.testing.assert_array_equal(found.views, truth.views)
     assert nmse(found.pictures, truth.pictures, BORDER_PX) < 0.1
@@ -171,7 +167,7 @@ def test_a_glossy_plate_is_uneven_but_keeps_its_place():
     """84 % was measured for both, at full size: wider baselines for the picture's size spoil the
     recovery itself.
     """
-    outcome = shiny_bodies.run_glossy_plate(
+    outcome = light_field_properties.run_glossy_plate(
         Library(array=CameraArray(samples=1)), 1, lambda _: None
     )
     figures = {row.labels: row.mean for row in outcome.rows}
@@ -182,6 +178,6 @@ def test_a_glossy_plate_is_uneven_but_keeps_its_place():
 
 
 def test_dealing_takes_recorded_scenes_only_where_there_are_any(library, monkeypatch):
-    monkeypatch.setattr(dealing_table, "RATIOS", (1.0,))
-    outcome = dealing_table.run_angle_assignment(library, 1, lambda _: None)
+    monkeypatch.setattr(refocused_pictures, "ASSIGNMENT_RATIOS", (1.0,))
+    outcome = refocused_pictures.run_angle_assignment(library, 1, lambda _: None)
     assert {row.labels[0] for row in outcome.rows} == {"letters", "blocks"}
