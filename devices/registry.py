@@ -93,12 +93,24 @@ def open(uri: str) -> Source:  # noqa: A001 - the name users type: devices.open
         Its address: ``timetag://SERIAL``, ``sim+timetag://?seed=1``, ``file://PATH``; see `OPENERS`
         for all.
 
+    Returns
+    -------
+    Source
+
     Raises
     ------
     InputError
         The address is no address, or of no known kind.
     DeviceError
         The instrument cannot be reached.
+
+    Examples
+    --------
+    >>> import devices
+    >>> with devices.open("sim+timetag://?seed=1") as source:
+    ...     batch = source.read(timeout=5.0)
+    >>> len(batch.records) > 0
+    True
     """
     parsed = Uri.parse(uri)
     if parsed.scheme == "file":

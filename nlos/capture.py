@@ -149,6 +149,15 @@ class Capture:
         ------
         ShapeError
             Wall or laser points have not three coordinates.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> wall = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]])
+        >>> laser = np.array([[0.0, 0.1, 0.0], [0.0, 0.2, 0.0]])
+        >>> signal = np.ones((8, 2, 3), np.float32)
+        >>> len(Capture.exhaustive(signal, wall, laser, bin_width=10e-12).points)
+        6
         """
         wall, laser = (
             _to_real_array(wall, np.float64, "wall"),

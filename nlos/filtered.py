@@ -153,6 +153,7 @@ class FilteredBackprojection:
         total = np.zeros_like(values)
         for axis in (axis for axis in range(3) if sigmas[axis] > 0):
             order = [2 if i == axis else 0 for i in range(3)]
+            # sigma^2 takes the unit away, so that images at different sigmas compare
             total -= np.float32(sigmas[axis] ** 2) * gaussian_filter(
                 values, sigmas, order, mode="nearest", truncate=FILTER_TRUNCATION_SIGMAS
             )

@@ -72,6 +72,11 @@ class Grid:
         ------
         InputError
             The voxel size is not positive.
+
+        Examples
+        --------
+        >>> Grid.box((-0.4, 0.4), (-0.4, 0.4), (0.6, 1.0), voxel=0.05).shape
+        (9, 17, 17)
         """
         sizes = np.broadcast_to(np.asarray(voxel, dtype=np.float64), (3,))
         if not np.all(np.isfinite(sizes) & (sizes > 0)):

@@ -138,11 +138,13 @@ def _interpolate_crossing(
 def _compute_ideal_width(
     capture: Capture, point: FloatArray, axis: int, pulse: VirtualPulse
 ) -> float:
+    # every n-th point spans the same aperture
     some = slice(None, None, max(1, len(capture.points) // MAX_WALL_POINTS))
     wall = capture.points[some]
     lasers = capture.lasers if len(capture.lasers) == 1 else capture.lasers[some]
     distance = float(np.linalg.norm(wall - point, axis=1).mean())
     extent = float(np.ptp(wall, axis=0).max())
+    # the order of the diffraction limit, wavelength * distance / aperture
     narrow = pulse.wavelength * max(1.0, distance / max(extent, 1e-9))
     places = np.linspace(-PROFILE_EXTENT_WIDTHS, PROFILE_EXTENT_WIDTHS, PROFILE_SAMPLES) * narrow
     start = _compute_path_lengths(wall, lasers, point)

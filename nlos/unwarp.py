@@ -129,6 +129,7 @@ def remove_device_legs(capture: Capture, source: Any, camera: Any) -> Capture:
     legs = np.linalg.norm(capture.laser - source, axis=-1) + np.linalg.norm(
         capture.wall - camera, axis=-1
     )
+    # shifts from the shortest leg on cut off as little of the record as possible
     common = float(legs[capture.valid].min())
     delay_bins = np.nan_to_num((legs - common) / capture.axis.spacing, nan=capture.axis.bins + 1.0)
     flat = np.ascontiguousarray(capture.signal.reshape(capture.axis.bins, -1))

@@ -29,6 +29,11 @@ def nmse(estimate: ArrayLike, truth: ArrayLike, border_px: int = 0) -> float:
     ------
     ShapeError, InputError
         The shapes differ, the border leaves nothing, or the truth is constant.
+
+    Examples
+    --------
+    >>> nmse([[0.0, 1.0]], [[0.0, 2.0]])
+    0.5
     """
     h, g = _crop_borders(estimate, truth, border_px)
     spread = float(np.sum((g - g.mean()) ** 2))

@@ -84,6 +84,7 @@ class DiffractionPlan:
     def supports(self) -> Support:
         """Say whether the field's plane waves fit into memory."""
         y, x = self.plane_waves.period
+        # area of the circle of lateral wavenumbers over that of one plane wave, (2 pi)^2 / (y x)
         count = np.pi * float(self.plane_waves.lateral_limits[-1]) ** 2 * y * x / (2 * np.pi) ** 2
         size = count * self.waves.count * BYTES_PER_WAVE
         if size > MEMORY_LIMIT_BYTES:

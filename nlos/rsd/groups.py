@@ -109,6 +109,7 @@ class WaveGroups:
         """Where every group's frequencies begin, zeros included."""
         nearest = self._quadrant[2][:, 0]
         frequency = np.searchsorted(self.waves.lateral_limits, nearest) + self.leading_zeros
+        # whole steps, as the kernel takes them
         return frequency // FREQUENCY_STEPS * FREQUENCY_STEPS
 
     def interpolation(self, transfer: TransferFunction) -> Interpolation:

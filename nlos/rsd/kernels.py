@@ -65,6 +65,7 @@ def sample_waves(radius, distance, first, step, delay, continued, leading_zeros,
             complex(math.cos(phase), math.sin(phase)),
             complex(math.cos(turn), math.sin(turn)),
         )
+        # the first Rayleigh-Sommerfeld integral: z / (2 pi R^2) * (1 / R - 1j * k)
         steady, rising = 1 / path, 0.0
         if continued:
             rising = abs(distance) / (2 * math.pi * path**2)
@@ -73,6 +74,8 @@ def sample_waves(radius, distance, first, step, delay, continued, leading_zeros,
             value = wave * complex(steady, -direction * rising * (first + w * step))
             waves[i, 0, leading_zeros + w] = value.real
             waves[i, 1, leading_zeros + w] = value.imag
+            # one complex product a frequency instead of a sine and a cosine; double precision keeps
+            # the error below float32's
             wave *= factor
 
 

@@ -58,6 +58,20 @@ class PlanarRSD(PhasorMethod):
         Length of the pulse in wavelengths; see `nlos.band.VirtualPulse`.
     tolerance : float
         Relative error of the image that is allowed for the sake of speed, 1e-4 to 0.1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import nlos
+    >>> from nlos.simulate.points import PointScene
+    >>> from nlos.time_axis import TimeAxis
+    >>> x, y = np.meshgrid(np.linspace(-0.5, 0.5, 16), np.linspace(-0.5, 0.5, 16))
+    >>> wall, hidden = np.stack([x, y, 0 * x], axis=-1), PointScene([[0.1, -0.2, 0.8]])
+    >>> capture = hidden.simulate_capture(wall, np.zeros(3), TimeAxis(256, 40e-12), jitter=60e-12)
+    >>> grid = nlos.Grid.box((-0.4, 0.4), (-0.4, 0.4), (0.6, 1.0), voxel=0.1)
+    >>> volume = nlos.PlanarRSD(wavelength=0.28).reconstruct(capture, grid)
+    >>> volume.values.shape
+    (5, 9, 9)
     """
 
     wavelength: float

@@ -143,6 +143,7 @@ class PolynomialSweep(Storable):
         raw_row, raw_column : float array
             Pixels, of the broadcast shape.
         """
+        # normalised coordinates keep the quadratic terms of the order of 1
         x = (np.asarray(column) - self.rectified_origin[0]) / self.rectified_scale[0]
         y = (np.asarray(row) - self.rectified_origin[1]) / self.rectified_scale[1]
         u = _evaluate_quadratic(self.column_coefficients, x, y)
@@ -210,6 +211,7 @@ def _interpolate_linearly(
     """Piecewise linear interpolation whose end pieces go on beyond the outer knots."""
     if knots.size == 1:
         return np.full(np.shape(position), values[0])
+    # the outer pieces go on beyond the knots, where np.interp would hold the end values
     piece = np.clip(np.searchsorted(knots, position) - 1, 0, knots.size - 2)
     slope = np.diff(values) / np.diff(knots)
     extended: FloatArray = values[piece] + slope[piece] * (position - knots[piece])

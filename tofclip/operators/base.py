@@ -244,6 +244,7 @@ def estimate_squared_norm(operator: LinearOperator, iterations: int = 30, seed: 
     InputError
         The operator maps everything to zero.
     """
+    # a random start has a part along the largest eigenvector, whatever the operator
     x = np.random.default_rng(seed).random(operator.shape_in).astype(operator.dtype)
     value = 0.0
     for _ in range(iterations):

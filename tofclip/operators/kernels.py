@@ -129,6 +129,7 @@ def multiply_sparse_block(tile_starts, columns, values, block, result):
     result : (rows, LANES) C-contiguous array, overwritten
     """
     for tile in range(tile_starts.shape[0]):
+        # the first tile overwrites the result, the others add to it
         onto = tile > 0
         for row in range(tile_starts.shape[1] - 1):
             first, last = tile_starts[tile, row], tile_starts[tile, row + 1]
@@ -348,6 +349,7 @@ def transform_walsh_hadamard(values):
     count, columns = values.shape
     half = 1
     while 2 * half < count:
+        # two levels of the butterfly at once: half as many passes through memory
         for start in range(0, count, 4 * half):
             for row in range(start, start + half):
                 for column in range(columns):
@@ -358,6 +360,7 @@ def transform_walsh_hadamard(values):
                     values[row + 2 * half, column] = (a + b) - (c + d)
                     values[row + 3 * half, column] = (a - b) - (c - d)
         half *= 4
+    # an odd number of levels leaves one
     if half < count:
         for row in range(half):
             for column in range(columns):
@@ -392,6 +395,7 @@ def shift_linearly(block, down, right, below, beside, shifted):
         upper, lower = row - down, row - down - 1
         first = block[upper].reshape(length) if 0 <= upper < rows else black
         second = block[lower].reshape(length) if 0 <= lower < rows else black
+        # bilinear interpolation is separable: rows first, then columns
         for place in range(length):
             between[place] = (whole - below) * first[place] + below * second[place]
         target = shifted[row].reshape(length)

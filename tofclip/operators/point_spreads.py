@@ -214,6 +214,7 @@ def trace_view_point_spreads(
     """
     grid = np.asarray(views, dtype=np.float64)
     middle = (grid.max(axis=0) + grid.min(axis=0)) / 2
+    # every view looks through a part one view step wide, hence the + 1
     half = (np.ptp(grid, axis=0) + 1) / 2
     within = (np.arange(rays) + 0.5) / rays - 0.5
     spreads = np.empty((len(grid), *shape))
@@ -222,6 +223,7 @@ def trace_view_point_spreads(
             (place - centre + within) / size
             for place, centre, size in zip(view, middle, half, strict=True)
         )
+        # an open aperture passes light 1, all views together
         transmission, down, right = element.trace_rays(v[:, np.newaxis], u[np.newaxis, :])
         spread[:] = _accumulate_rays(transmission / (rays**2 * len(grid)), down, right, shape)
     return spreads
@@ -289,6 +291,7 @@ class MeasuredPointSpreads:
             raise InputError("two measured PSFs belong to the same shear; take the mean of both")
         order = np.argsort(depths)
         self.shears = depths[order]
+        # the same light at every depth, whatever the exposures were
         self.stack = (spreads / light[:, np.newaxis, np.newaxis])[order]
 
     def interpolate(self, shear: float) -> NDArray[np.float64]:

@@ -86,6 +86,7 @@ class RadonProjection(SparseMatrix):
             *paths,
             before,
             self.shape_in,
+            # where each row of the matrix begins
             (ends - counts.ravel()).reshape(counts.shape),
             columns,
             values,
@@ -108,8 +109,10 @@ class RadonProjection(SparseMatrix):
         across, along = (columns - 1) * right, (rows - 1) * down
         lowest = first + np.minimum(across, 0) + np.minimum(along, 0)
         highest = first + np.maximum(across, 0) + np.maximum(along, 0)
+        # one bin more on either side, because light is shared with the next bin
         before = max(0, -int(np.floor(lowest.min()))) + 1
         bins = before + max(self.detector_px, int(np.ceil(highest.max())) + 2)
+        # fixed-point positions: steps add up without rounding, and the bin is a shift of bits away
         fixed = [
             np.rint(values * 2.0**FRACTION_BITS).astype(np.int64)
             for values in (first + before, right, down)
@@ -123,6 +126,7 @@ class RadonProjection(SparseMatrix):
         lines = np.zeros((self.angles.size, bins, 2), self.dtype)
         project_onto_lines(picture, *paths, lines)
         seen = slice(before, before + self.detector_px)
+        # light for the next bin lies in column 1 of the bin before it
         shared = slice(before - 1, before + self.detector_px - 1)
         return (lines[:, seen, 0] + lines[:, shared, 1]).reshape(self.shape_out)
 

@@ -99,4 +99,6 @@ class FourierShear(_Shear):
 def _shift_spectrum(cycles_per_px: Array, shift_px: float) -> Array:
     """Spectrum of a shift. At the Nyquist frequency only its real part keeps a real picture real."""
     delay = np.exp(-2j * np.pi * cycles_per_px * shift_px)
+    # the Nyquist frequency stands for both signs: its real part alone keeps the picture real, and
+    # the shift back the adjoint
     return np.where(np.abs(cycles_per_px) == 0.5, delay.real, delay)

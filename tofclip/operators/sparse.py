@@ -71,6 +71,8 @@ class SparseMatrix(LinearOperator):
         return make_product(device, self.matrix)
 
     def _make_adjoint_product(self, device: ComputeDevice) -> Product:
+        # a transposed copy: products by rows write each result once, products by columns would
+        # scatter
         return make_product(device, self.matrix.T.tocsr())
 
     def _forward(self, block: Array) -> Array:
@@ -208,6 +210,7 @@ class TiledProduct:
 
         def work(piece: slice) -> None:
             lanes = piece.stop - piece.start
+            # the compiled product takes whole blocks only
             padded = np.zeros((block.shape[0], LANES), block.dtype)
             padded[:, :lanes] = block[:, piece]
             product = np.empty((rows, LANES), block.dtype)
@@ -239,6 +242,7 @@ class Tiles(NamedTuple):
         """Sort the nonzeros of `matrix` by tile, then row, then as they stand in the row."""
         from tofclip.operators.kernels import count_tile_nonzeros, sort_into_tiles
 
+        # as many columns as let their rows of the block stay in cache
         width = max(1, TILE_BYTES // (LANES * matrix.dtype.itemsize))
         per_row = np.zeros((-(-matrix.shape[1] // width), matrix.shape[0]), np.int64)
         count_tile_nonzeros(matrix.indptr, matrix.indices, width, per_row)
@@ -279,5 +283,6 @@ def split_between_bins(
     share = position - left
     nearest, weight = np.stack([left, left + 1]), np.stack([1.0 - share, share])
     entry = np.broadcast_to(np.arange(position.size).reshape(position.shape), nearest.shape)
+    # no explicit zeros, which every product would pay for
     seen = (nearest >= 0) & (nearest < bins) & (weight != 0)
     return entry[seen], nearest[seen], weight[seen]

@@ -355,6 +355,21 @@ def recover(
         There is no camera, no light, or no such method or name of a device.
     MissingDependencyError
         There is no such device.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import tofclip
+    >>> from tofclip.camera.sweep import SkewSweep
+    >>> centres, angles = np.array([20.0, 60.0, 100.0]), np.array([-0.4, 0.0, 0.4])
+    >>> sweep = SkewSweep(centres, np.zeros(3), np.zeros(3))
+    >>> camera = tofclip.Camera(centres, angles, (16, 16), 121, sweep=sweep)
+    >>> counts = np.zeros((40, 121), np.float32)
+    >>> counts[20] = camera.operator()(np.eye(16, dtype=np.float32))
+    >>> streak = tofclip.Streak(counts, row_times=np.arange(40) * 20e-12)
+    >>> frames = tofclip.recover(streak, camera, method="linear")
+    >>> frames.values.shape, int(frames.values.sum(axis=(1, 2)).argmax())
+    ((40, 16, 16), 20)
     """
     shot = open_shot(streak, camera)
     return plan_recovery(shot, method, focus or DEFAULT_FOCUS, device).run(progress)

@@ -156,6 +156,7 @@ class Poisson(DataTerm):
         loss += (
             1 - self._counts / self._knee
         ) * short + self._counts / self._knee**2 * short**2 / 2
+        # the value at predicted = counted, so that a perfect fit costs nothing
         best = self._counts - self._counts * xp.log(
             xp.maximum(self._counts, scalar_like(1e-30, self._counts))
         )
@@ -182,6 +183,7 @@ def estimate_robust_deviation(residual: Array) -> float:
     InputError
         More than half of the residual is zero: there is no scale to be had.
     """
+    # the median size of Gaussian numbers is 1 / 1.4826 of their standard deviation
     deviation = 1.4826 * float(np.median(np.abs(residual)))
     if not deviation > 0:
         raise InputError("most readings are met exactly; there is nothing to be robust against")

@@ -70,11 +70,13 @@ class LinearInverse:
         if alive is None:
             alive = np.ones(operator.shape_out, bool)
         mu = self.damping * estimate_squared_norm(operator, NORM_ITERATIONS)
+        # in float64: a Cholesky factor loses digits with the condition number
         seen = operator.matrix[alive].astype(np.float64)
         gram = (seen @ seen.T).toarray()
         gram[np.diag_indices_from(gram)] += mu
         inverse = np.zeros((alive.size, alive.size), operator.dtype)
         factor = scipy.linalg.cho_factor(gram, lower=True, overwrite_a=True)
+        # rows and columns of dead measurements stay zero, so that these add nothing
         inverse[np.ix_(alive, alive)] = scipy.linalg.cho_solve(factor, np.eye(gram.shape[0]))
         prepared = PreparedInverse(operator, inverse)
         # One dark block loads the compiled loops and the BLAS before the first shot needs them.
@@ -281,6 +283,7 @@ class Backprojection:
 def _fit_scale(operator: LinearOperator, measurements: Array) -> float:
     """The factor c that minimises ``|c A A'f - f|`` over the brightest block of frames."""
     xp = namespace(measurements)
+    # the brightest frames, in which signal outweighs noise
     brightest = xp.argsort(xp.sum(measurements * measurements, axis=0))[
         -min(LANES, measurements.shape[1]) :
     ]

@@ -217,8 +217,10 @@ class Fista:
     def step(self) -> None:
         """Advance every frame by one iteration."""
         xp, loops = namespace(self.current), select_loops(self.current)
+        # Beck and Teboulle, Eq. 4.2; the momentum is that of Eq. 4.3
         age = (1 + xp.sqrt(1 + 4 * self._age**2)) / 2
         momentum = xp.astype((self._age - 1) / age, self.current.dtype)
+        # A z by linearity, from products that are known already
         predicted = self.seen + momentum * (self.seen - self._seen_before)
         gradient = self.operator.adjoint(self.data_term.gradient(predicted))
         candidate, penalty = self.regulariser.proximal_step(
@@ -324,6 +326,8 @@ class ProximalMethod(ABC):
         batches = make_batches(operator, measurements)
         self._warm_up_loops(operator, step, batches.zero_measurements())
         setup_seconds = time.perf_counter() - started
+        # with max(A'f) as weight the l1 solution is zero: relative weights suit shots of any
+        # brightness
         weight = self.weight * _largest_back_projection(operator, batches, measurements, valid)
         histories: dict[int, IterationHistory] = {}
 

@@ -49,6 +49,8 @@ def shrink_nonnegative(current, previous, momentum, gradient, step, threshold, t
     partial = np.empty(lanes, current.dtype)
     total[:] = 0
     for row in range(current.shape[0]):
+        # the dtype of the pictures within a row, float64 across rows: quick, and exact enough to
+        # compare objectives
         partial[:] = 0
         for column in range(current.shape[1]):
             for lane in range(lanes):
@@ -140,6 +142,7 @@ def update_peaks(tile_starts, columns, values, scales, block, highest):
     block : (M's columns, LANES) array
     highest : (LANES,) array
     """
+    # 16 kB in float32, which stay in the first-level cache
     part = np.empty((4 * TILE_PIXELS, LANES), block.dtype)
     for first in range(0, scales.size, part.shape[0]):
         rows = min(part.shape[0], scales.size - first)
@@ -198,6 +201,7 @@ def _primal_row(row, noisy, dual, weight, result, lanes):
     difference across the border is), so only the first ones need care.
     """
     above = max(row - 1, 0)
+    # 0 or 1 as a factor: no branch inside the loops over columns and lanes
     has_above = noisy.dtype.type(row > 0)
     for column in range(noisy.shape[1]):
         left = max(column - 1, 0)
@@ -228,10 +232,12 @@ def _dual_row(row, picture, dual, step, lanes):
 @inline_njit
 def _dual_sweeps(noisy, dual, weight, sweeps, result, lanes):
     rows = noisy.shape[0]
+    # the squared norm of the gradient is at most 8 (Chambolle 2004)
     step = 1 / (8 * weight)
     for _ in range(sweeps):
         _primal_row(0, noisy, dual, weight, result, lanes)
         for row in range(rows):
+            # the next row is made from the old dual, before this row's dual changes
             if row + 1 < rows:
                 _primal_row(row + 1, noisy, dual, weight, result, lanes)
             _dual_row(row, result, dual, step, lanes)

@@ -176,6 +176,7 @@ class Result:
         longest = max(history.iterations for history in histories)
         total = np.zeros(longest + 1)
         for history in histories:
+            # a block that ended early keeps its last objective
             kept_on = np.full(longest - history.iterations, history.objective[-1])
             total += np.concatenate([history.objective, kept_on])
         converged = all(history.converged for history in histories)

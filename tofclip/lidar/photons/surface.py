@@ -492,6 +492,7 @@ def estimate_background(photons: PhotonImage) -> float:
     edges = np.linspace(0, photons.bins, groups + 1).astype(np.int64)
     level = np.add.reduceat(photons.time_profile, edges[:-1]) / np.diff(edges)
     pixels = photons.offsets.size - 1
+    # a low quantile: bins with a surface in them are brighter than the background
     quiet = float(np.quantile(level, BACKGROUND_QUANTILE))
     return max(quiet, MIN_BACKGROUND_PHOTONS / photons.bins) / pixels
 
@@ -518,6 +519,7 @@ def choose_label_axis(photons: PhotonImage, scene: Scene) -> LabelAxis:
             numbers = np.arange(total)
         if 2 * 4 * pixels * numbers.size <= MAX_VOLUME_BYTES:
             return LabelAxis(coarse, numbers, total)
+        # two float32 volumes, the scores and their sums, have to fit
         coarse *= 2
 
 
@@ -895,5 +897,6 @@ def calibrate_outliers(
 
 
 def _logistic(value: FloatArray) -> FloatArray:
+    # exp does not overflow, and at 40 the result is 0 or 1 within 1e-17
     result: FloatArray = 1 / (1 + np.exp(-np.clip(value, -40, 40)))
     return result

@@ -235,6 +235,18 @@ def depth(
     ------
     InputError
         Fewer than three frames, or a camera for another picture size.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import tofclip
+    >>> camera = tofclip.Camera([20.0], [0.0], (16, 16), 41, pulse_fwhm=60e-12)
+    >>> times = np.arange(100) * 10e-12
+    >>> cube = np.zeros((100, 16, 16), np.float32)
+    >>> cube[:, 3, 4] = np.exp(-0.5 * ((times - 400e-12) / 25.5e-12) ** 2)
+    >>> returns = tofclip.depth(tofclip.Frames(cube, times, camera))
+    >>> int(returns.y[0]), int(returns.x[0]), round(float(returns.range[0]), 4)
+    (3, 4, 0.06)
     """
     camera = frames.camera if camera is None else camera
     if camera.image_shape != frames.values.shape[1:]:

@@ -111,6 +111,7 @@ class AshokCamera(ApertureMaskCamera):
         others = (
             1 + np.random.default_rng(self.seed).permutation(self._order - 1)[: self.exposures - 1]
         )
+        # row 0 of the Hadamard matrix opens all cells; +-1 become open and closed
         open_cells: NDArray[np.float64] = (
             1 + hadamard(self._order)[np.append(0, others), : len(self.views)]
         ) / 2
