@@ -69,6 +69,7 @@ def group_by_illumination(capture: Capture) -> list[IlluminationGroup]:
     if len(capture.lasers) == 1:
         return [IlluminationGroup(capture.lasers[0], everyone)]
     if np.array_equal(capture.lasers, capture.points):
+        # confocal: out and back are one leg, run through twice
         return [IlluminationGroup(None, everyone)]
     spots, belonging = np.unique(capture.lasers, axis=0, return_inverse=True)
     return [
@@ -128,6 +129,7 @@ def choose_band_for_paths(
     Band
     """
     tail = Band(pulse, axis).tail_bins * axis.spacing
+    # no image of the record, a period earlier or later, may be reached by a path of the grid
     period = max(longest - (axis.start - tail), axis.paths[-1] + tail - shortest)
     bins = max(axis.bins, int(np.ceil(period / axis.spacing)) - 2 * Band(pulse, axis).tail_bins)
     return Band(pulse, TimeAxis(bins, axis.bin_width, axis.start))
@@ -149,6 +151,8 @@ def find_leg_bounds(ends: FloatArray, grid: Grid) -> tuple[float, float]:
     """
     axes = (grid.x, grid.y, grid.z)
     low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
+    # distance from a point to the box: zero along axes within it
     outside = np.maximum(np.maximum(low - ends, ends - high), 0)
+    # the farthest corner lies at the farther end of every axis
     across = np.maximum(np.abs(ends - low), np.abs(high - ends))
     return float(np.linalg.norm(outside, axis=1).min()), float(np.linalg.norm(across, axis=1).max())

@@ -34,6 +34,7 @@ half a turn.
 @inlined
 def cosine_of_turns(turns):
     """Cosine of an angle of -0.5 to 0.5 turns, to 1e-6."""
+    # Horner's rule in two halves, which the processor works on side by side
     u = turns * turns
     high = np.float32(COSINE_COEFFICIENTS[4]) + u * (
         np.float32(COSINE_COEFFICIENTS[5])
@@ -120,6 +121,7 @@ def add_backprojection(waveforms, start, spacing, wall, lasers, x, y, z, powers,
     )
     weighted = powers[0] != 0 or powers[1] != 0
     for p in range(wall.shape[0]):
+        # the outgoing leg is the same for all points that share a laser spot
         if p == 0 or (p < lasers.shape[0] and _points_differ(lasers[p], lasers[p - 1])):
             _compute_outward_samples(lasers[p], start, per_metre, x, y, z, outward)
         for iz in range(z.size):
@@ -179,6 +181,7 @@ def _find_samples(x, wall_x, across, outward, per_metre, last, sample, before, a
         index = np.int32(position)
         sample[ix] = np.int32(2) * index
         weight = np.float32(1) / distance
+        # linear interpolation, and the fall with distance that the wave has on its way back
         after[ix] = (position - np.float32(index)) * weight
         before[ix] = weight - after[ix]
 
@@ -186,6 +189,7 @@ def _find_samples(x, wall_x, across, outward, per_metre, last, sample, before, a
 @compiled
 def _raise_to_power(base, exponent):
     """Power of a number, quick for the exponents that occur most."""
+    # the usual exponents without a logarithm
     if exponent == 0:
         return np.float32(1)
     if exponent == 1:

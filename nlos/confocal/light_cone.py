@@ -105,6 +105,7 @@ class LightCone:
         self.supports(capture, grid).require()
         scan = ConfocalScan.of(capture, grid)
         bins = scan.signal.shape[2]
+        # one sample of u = z^2 for each bin, over the same range of depths
         squares = (bins * scan.spacing) ** 2 / bins
         values = self._deconvolve(scan, squares)
         depth_position = (grid.z - scan.plane.z) ** 2 / squares - 0.5
@@ -124,11 +125,13 @@ class LightCone:
 
         rows, columns, bins = scan.signal.shape
         shape = (find_padded_length(rows), find_padded_length(columns), find_padded_length(bins))
+        # edges of the bins in v = d^2; a bin is centred on its distance
         edges = (np.clip(np.arange(bins + 1) - 0.5, 0, None) * scan.spacing) ** 2
         matrix = build_rebinning_matrix(edges, squares * np.arange(bins + 1))
         over_squares = matrix @ scan.correct_falloff(self.falloff).reshape(-1, bins).T
         workers = thread_count()
         spectrum = rfft(over_squares.T.reshape(scan.signal.shape), shape[2], workers=workers)
+        # padded, so that the convolution does not wrap around
         spectrum = fft2(spectrum, shape[:2], axes=(0, 1), workers=workers)
         self._apply_wiener_filter(spectrum, _transform_paraboloid(scan, squares, shape))
         spectrum = ifft2(spectrum, axes=(0, 1), workers=workers, overwrite_x=True)
@@ -143,7 +146,9 @@ class LightCone:
         """Apply the Wiener filter in place; the kernel is even, so that a quarter of its spectrum
         is enough.
         """
+        # Wiener: the filter's gain falls where the kernel is weaker than the noise
         floor = np.float32(1 / self.signal_to_noise)
+        # the kernel is even in x and y, so that a quarter of its spectrum is kept
         row, column = (np.minimum(np.arange(n), n - np.arange(n)) for n in spectrum.shape[:2])
         kernel = kernel.conj() / (np.abs(kernel) ** 2 + floor)
 
@@ -169,6 +174,7 @@ def build_rebinning_matrix(source_edges: FloatArray, target_edges: FloatArray) -
     """
     from scipy.sparse import csr_array
 
+    # between two neighbouring edges both source and target are constant
     edges = np.unique(np.concatenate([source_edges, target_edges]))
     middles, lengths = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
     source, target = (
@@ -198,6 +204,7 @@ def _transform_paraboloid(
     )
     late = (y[:, np.newaxis] ** 2 + x**2) / squares
     whole = np.floor(late)
+    # an impulse between two samples is shared linearly
     weight = (late - whole)[..., np.newaxis]
     turn = np.exp(-2j * np.pi * np.arange(shape[2] // 2 + 1) / shape[2])
     # Impulses beyond the padded record would wrap around into it.
@@ -215,6 +222,7 @@ def _tabulate_powers(
     turn: NDArray[np.complex128], power: NDArray[np.intp], period: int
 ) -> NDArray[np.complex64]:
     """``turn[w] ** power`` from a table of one whole turn, shape (*power, w)."""
+    # powers of a root of unity repeat: a table is quicker than exponentials, and as exact
     table = np.exp(-2j * np.pi * np.arange(period) / period).astype(np.complex64)
     exponent = power[..., np.newaxis] * np.arange(turn.size)
     return np.asarray(table[exponent % period])

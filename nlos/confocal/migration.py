@@ -113,9 +113,12 @@ class FKMigration:
 
         rows, columns, bins = scan.signal.shape
         brightness = scan.correct_falloff(self.falloff)
+        # brightness is the square of a wave's amplitude; noise keeps its sign
         wave = np.copysign(np.sqrt(np.abs(brightness)), brightness)
         period, workers = find_padded_length(bins), thread_count()
         spectrum = rfft(wave, period, workers=workers)
+        # the record's middle becomes time zero, about which a spectrum varies slowest from
+        # frequency to frequency
         spectrum *= np.exp(2j * np.pi * (bins // 2) / period * np.arange(spectrum.shape[2])).astype(
             np.complex64
         )

@@ -99,6 +99,7 @@ class LatticeAnalysis:
             if columns < wide
             else (slice(0, wide),)
         )
+        # indices from -reach to reach only: they lie at both ends of a Fourier transform
         count = len(ends) * columns
         plan, middle = self._get_plan(count), self._middle[:count]
         # In one piece, whatever its size: compiled loops are quicker then.
@@ -108,6 +109,7 @@ class LatticeAnalysis:
             self._along_x.execute()
             for number, end in enumerate(ends):
                 turned = middle[number * columns : (number + 1) * columns, :rows]
+                # along y in contiguous memory: quicker than a transform with a stride
                 transpose(self._lines[:, end].view(np.float64), turned.view(np.float64))
             plan.update_arrays(middle, spectrum)
             plan.execute()

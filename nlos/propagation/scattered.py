@@ -126,6 +126,7 @@ class ScatteredAnalysis:
             np.asarray((phase + np.pi) % (2 * np.pi) - np.pi, np.float32)
             for phase in (along_x, along_y)
         ]
+        # float32 cannot give what is finer than some of its own steps
         self._tall, self._tolerance = tall, max(tolerance, 10 * float(np.finfo(np.float32).eps))
         self._plans: dict[tuple[int, int, int], finufft.Plan] = {}
 
@@ -145,6 +146,7 @@ class ScatteredAnalysis:
         (terms, columns, rows) complex64 array
             Columns and rows in the order of Fourier transforms, first 0 and last -1.
         """
+        # whole steps, so that neighbouring frequencies share a plan
         sizes = (
             2 * INDEX_STEP * (int(largest) // INDEX_STEP + 1)
             for largest in (reach + 1, (reach + 1) * self._tall + 1)

@@ -82,6 +82,7 @@ class LaserSource:
         )
         span = np.sqrt(np.array(y) ** 2 + np.array(x) ** 2 + (depth - self.laser[2]) ** 2)
         # One split serves all depths that differ by little: it takes as long as a small image.
+        # rounded up to a geometric series of half ranges, so that one split serves many depths
         half = HALF_RANGE_RATIO ** np.ceil(
             np.log(max(np.ptp(span) / 2, MIN_HALF_RANGE_M)) / np.log(HALF_RANGE_RATIO)
         )
@@ -140,6 +141,7 @@ def diffract_to_grid(
         run_blocks(light, len(lights), size=PLANES_PER_BLOCK)
         max_terms = max(light.coefficients.shape[1] for light in lights)
         interpolation = groups.interpolation(plan.transfer)
+        # both are computed here once: threads that ask first would each compute them
         _ = plan.transfer.bessel_matrix, groups.first_frequency
         spare: list[_Workspace] = []
 
@@ -172,9 +174,11 @@ class _Workspace:
             interpolation,
         )
         self.inverse = choose_inverse(groups.indices, plan.lattice, plan.grid.shape[1:], terms)
+        # repeated waves are sent to a spare cell that nothing reads
         self.cell_indices = np.where(
             groups.is_distinct, self.inverse.cell_indices, self.inverse.spare
         )
+        # where several waves fall into one cell they have to be added, not written
         self.folded = bool(np.bincount(self.inverse.cell_indices[groups.is_distinct]).max() > 1)
         self._term_buffer = np.empty(
             PLANES_PER_BLOCK * (terms + 1) * int(np.prod(groups.shape)), np.float32

@@ -53,6 +53,7 @@ class PlaneWaves:
             LATERAL_ROUNDING * np.rint(np.hypot(qy[:, np.newaxis], qx) / LATERAL_ROUNDING).ravel()
         )
         inside = np.flatnonzero(lateral <= self.lateral_limits[-1])
+        # from the longest lateral wave up: those within a frequency's limit are the first ones
         order = inside[np.argsort(lateral[inside], kind="stable")]
         return rows[order // columns.size], columns[order % columns.size], lateral[order]
 

@@ -63,6 +63,7 @@ class Window:
         Window
         """
         corner, along = float(np.hypot(*farthest)), max(farthest)
+        # beyond this distance the next period's image of a source would meet a target
         room = min(period - far for period, far in zip(periods, farthest, strict=True))
         reach = min(corner, room - MIN_EDGE_FRACTION * along)
         return cls(reach, min(room, reach + MAX_EDGE_FRACTION * along))
@@ -102,6 +103,7 @@ def find_min_periods(farthest: Sides) -> Sides:
 
 def find_fast_length(count: float) -> int:
     """Next length that Fourier transforms are quick at."""
+    # products of small factors, and of a vector's length
     lengths = (
         factor * 2 * VECTOR_LENGTH << power for factor in FFT_LENGTH_FACTORS for power in range(20)
     )

@@ -196,6 +196,7 @@ def evaluate_reflectance(material, position, laser, observer, to_laser, to_obser
     float
         Per steradian.
     """
+    # Lambert: even radiance, whose integral over the half space is the albedo
     value = material[0] / math.pi
     if material[1] > 0:
         inner = 0.0

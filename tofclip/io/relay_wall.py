@@ -71,6 +71,7 @@ class RelayWall:
         pixels, directions = self._sight_lines()
         low, high = 1.0, 1e5
         while high / low > 1 + 1e-6:
+            # a geometric grid, narrowed about its best value until both ends agree
             trials = np.geomspace(low, high, 33)
             best = int(np.argmax([_align_directions(f, pixels, directions)[0] for f in trials]))
             low, high = trials[max(best - 1, 0)], trials[min(best + 1, trials.size - 1)]

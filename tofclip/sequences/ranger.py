@@ -102,6 +102,7 @@ class RangingPipeline:
         ]
         shears = np.repeat([piece.shear for piece in pieces], [piece.size for piece in pieces])
         self._search = ReturnSearch(camera, self.times, detection, shears=shears)
+        # mean duration of a row: the sweep is nearly even
         row = float(self.times[-1] - self.times[0]) / (self.times.size - 1)
         limit, width = self._search.detection.signal_to_noise, self._search.pulse.fwhm / row
         self._lit = SignalRowFinder(self.places, width, limit, self._search.reach_bins)
@@ -212,6 +213,8 @@ class JitterEstimator:
     _spectrum: Any = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        # padded to twice the length: a circular correlation would compare the end with the
+        # beginning
         self._spectrum = np.conj(
             np.fft.rfft(_differentiate_root(self.reference), 2 * self.reference.size)
         )
@@ -226,6 +229,7 @@ class JitterEstimator:
         best = int(near.argmax())
         if best in (0, near.size - 1):
             return float(best - reach)
+        # a parabola through the maximum and its neighbours gives the fraction of a bin
         left, centre, right = near[best - 1 : best + 2]
         return (
             best
@@ -249,6 +253,7 @@ def compute_light_curve(streak: Streak, camera: Camera) -> FloatArray:
         Counts.
     """
     reference = int(np.argmin(np.abs(camera.view_positions)))
+    # the middle half of one view, which neighbours do not reach
     half = camera.image_shape[1] // 4
     middle = round(camera.centres_px[reference])
     return np.asarray(
@@ -333,6 +338,7 @@ def make_average_cloud(
 
     total = measurements(0)
     for place in range(1, len(shots)):
+        # rectified before they are averaged, because every shot has a delay of its own
         total += measurements(place)
     total /= len(shots)
     return pipeline.cloud(total), late

@@ -194,6 +194,7 @@ class PhotonImage:
             Independent of each other if the photons are Poisson distributed.
         """
         noise = np.random.default_rng(seed)
+        # binomial thinning of Poisson counts gives two independent Poisson counts
         second = noise.binomial(np.rint(self.count).astype(np.int64), fraction).astype(np.float32)
         return self.select(self.count - second), self.select(second)
 

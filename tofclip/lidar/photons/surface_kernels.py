@@ -120,6 +120,7 @@ def add_path_scores(score, slope_cost, jump_cost, total):
             beside_top = extend_path(
                 own, beside[x % 2], beside_top, slope_cost, jump_cost, beside[1 - x % 2], summed
             )
+            # the three directions from the row above; the row itself is the fourth
             for way in range(3):
                 u = x + way - 1
                 before, top = start, np.float32(0)
@@ -128,6 +129,7 @@ def add_path_scores(score, slope_cost, jump_cost, total):
                 here_top[way, x] = extend_path(
                     own, before, top, slope_cost, jump_cost, here[way, x], summed
                 )
+        # two rows in turn: only the row above is looked back at
         above, here = here, above
         above_top, here_top = here_top, above_top
 
@@ -148,6 +150,7 @@ def find_best_labels(score, total, extra_paths, apart, label, margin):
     for pixel in range(score.shape[0]):
         best, highest = 0, np.float32(-np.inf)
         for t in range(score.shape[1]):
+            # every path counted the pixel's own score: all but one are taken off
             value = total[pixel, t] - extra_paths * score[pixel, t]
             if value > highest:
                 best, highest = t, value
@@ -231,6 +234,7 @@ def fit_planes(surface, sums, reach, gate, slopes, rows, fitted):
                     if dx * dx + dy * dy > reach * reach + 0.5:
                         continue
                     later = surface[v, u] - surface[y, x]
+                    # pixels beyond a border belong to another surface
                     if abs(later - slope_x * dx - slope_y * dy) > gate:
                         continue
                     weight = sums[v, u, 1]
@@ -251,11 +255,14 @@ def fit_planes(surface, sums, reach, gate, slopes, rows, fitted):
             if w <= 0:
                 continue
             move, information = b / w, w
+            # a ridge on the slopes keeps the fit determined where pixels lie in a row
             wxx += SLOPE_RIDGE_FRACTION * w
             wyy += SLOPE_RIDGE_FRACTION * w
             determinant = wxx * wyy - wxy * wxy
             if pixels >= MIN_PLANE_PIXELS and determinant > 0:
                 xx, yy, xy = wyy / determinant, wxx / determinant, -wxy / determinant
+                # information on the middle that is left when the slopes are unknown too (Schur
+                # complement)
                 left = w - (wx * (xx * wx + xy * wy) + wy * (xy * wx + yy * wy))
                 if left > MIN_DETERMINED_FRACTION * w:
                     move = (b - (bx * (xx * wx + xy * wy) + by * (xy * wx + yy * wy))) / left
