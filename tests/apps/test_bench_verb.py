@@ -222,3 +222,21 @@ def test_what_else_a_case_says_is_in_its_figures_and_on_the_page() -> None:
     entries = [{**entry, "runs": [run], "growth": None}]
     text = render_page({"machine": describe_machine(), "entries": entries}, "tofclip bench")
     assert "At 1, threads 1: error_percent 0.25." in text
+
+
+def test_the_load_is_that_before_anything_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    events: list[str] = []
+
+    def describe() -> dict[str, float]:
+        events.append("load")
+        return {"load": 0.0}
+
+    def measure(*_: object) -> dict[str, object]:
+        events.append("case")
+        return {"problem": "made up"}
+
+    monkeypatch.setattr("apps.benchmarks.run.describe_machine", describe)
+    monkeypatch.setattr("apps.benchmarks.run._run_process", measure)
+    run_cases([MADE_UP], None, lambda _: None)
+    assert events[0] == "load"
+    assert events.count("case") >= 2

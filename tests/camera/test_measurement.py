@@ -131,3 +131,9 @@ def test_a_single_row_or_column_is_sampled_too():
     np.testing.assert_array_equal(measure(counts, None, low, dark=0.0).values[:, 0], counts[0])
     narrow = Camera([0.0], [0.0], (1, 1), 1, sweep=ProjectiveSweep(np.diag([1.0, 1.0, 1.0])))
     np.testing.assert_array_equal(measure(counts.T, None, narrow, dark=0.0).values[0], counts[0])
+
+
+def test_a_hot_column_does_not_raise_the_dark_level():
+    counts = np.full((ROWS, WIDTH), 100.0, np.float32)
+    counts[:, 7] = 60_000
+    assert estimate_dark_level(counts) == 100

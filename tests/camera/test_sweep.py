@@ -110,3 +110,18 @@ def test_numbers_that_describe_no_map_are_refused() -> None:
         PolynomialSweep(np.ones(6), np.ones(6), *np.zeros((4, 2)))
     with pytest.raises(ShapeError, match=r"\(3, 3\)"):
         ProjectiveSweep(np.eye(2))
+
+
+def test_a_skew_between_any_two_of_several_centres_is_theirs() -> None:
+    sweep = SkewSweep(
+        np.array([0.0, 10.0, 20.0, 40.0]), np.array([0.0, 5.0, -3.0, 1.0]), np.zeros(4)
+    )
+    columns = np.array([-2.0, 0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 50.0])
+    raw_row, _ = sweep.raw_position(np.zeros(9), columns)
+    assert raw_row == pytest.approx([-1.0, 0.0, 2.5, 5.0, 1.0, -3.0, -1.0, 1.0, 3.0])
+
+
+def test_a_homography_that_leans_along_time() -> None:
+    sweep = ProjectiveSweep(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.01, 1.0]]))
+    raw_row, raw_column = sweep.raw_position(np.array(50.0), np.array(30.0))
+    assert (float(raw_row), float(raw_column)) == pytest.approx((50 / 1.5, 30 / 1.5))

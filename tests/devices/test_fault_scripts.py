@@ -20,7 +20,7 @@ from devices.emulation.photons import MAX_TICK
 from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
 from tofclip.errors import DeviceDisconnectedError, DeviceStalledError, InputError
 
-SCRIPTS = 300
+SCRIPTS, NIGHTLY_SCRIPTS = 300, 1000
 AT_ONCE = 16
 
 
@@ -74,8 +74,12 @@ def are_among(some: NDArray[np.int64], known: NDArray[np.int64]) -> bool:
     return bool(np.all(known[np.searchsorted(known, some) % len(known)] == some))
 
 
-def test_random_faults() -> None:
-    seeds = range(SCRIPTS)
+@pytest.mark.parametrize(
+    "seeds",
+    [range(SCRIPTS), pytest.param(range(SCRIPTS, NIGHTLY_SCRIPTS), marks=pytest.mark.nightly)],
+    ids=["sample", "rest"],
+)
+def test_random_faults(seeds: range) -> None:
     scripts = [draw_fault_script(seed, TRANSFERS) for seed in seeds]
     with ThreadPoolExecutor(AT_ONCE) as pool:  # they wait most of the time
         outcomes = list(pool.map(run, scripts, seeds))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from devices.codec import as_bytes
 from devices.frames import FrameCodec
 from devices.registry import build_codec
+from devices.spad512.protocol import ExposureRequest
 from tofclip.errors import InputError
 
 
@@ -82,3 +83,14 @@ def test_frames_that_cannot_be_are_refused() -> None:
         codec.encode(two)
     with pytest.raises(InputError, match="whole number"):
         codec.decode(np.zeros(3, np.uint8), -1)
+
+
+@pytest.mark.parametrize(
+    ("bits", "pile_up", "stored"), [(4, False, 8), (8, False, 8), (8, True, 16), (12, False, 16)]
+)
+def test_pictures_of_more_than_eight_bits_take_two_bytes(
+    bits: int, pile_up: bool, stored: int
+) -> None:
+    """Corrected for pile-up, counts of 8 bits go beyond 255."""
+    request = ExposureRequest(bits=bits, pile_up=pile_up)
+    assert request.codec.bits == stored

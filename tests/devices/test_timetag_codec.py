@@ -178,3 +178,28 @@ def test_other_arrays_and_broken_words_are_refused() -> None:
         CODEC.encode(np.zeros(3))
     with pytest.raises(InputError, match="whole number"):
         CODEC.decode(as_bytes(b"12345"), CODEC.start)
+
+
+def words(*rows: tuple[int, int]) -> bytes:
+    """Words of channel 1 at the given counters, with the given flags."""
+    return b"".join((flags << 45 | 1 << 36 | counter).to_bytes(6, "big") for counter, flags in rows)
+
+
+@pytest.mark.parametrize(
+    ("rows", "after_loss", "expected"),
+    [
+        # A loss explains a wrap, but a small step back is not one.
+        ([(1000, 0), (900, LOST), (1100, 0)], False, [1000, 1100]),
+        ([(COUNTER_RANGE - 10, 0), (5, LOST)], False, [COUNTER_RANGE - 10, COUNTER_RANGE + 5]),
+        # A wrap without a step back has not happened.
+        ([(1000, 0), (1000, WRAP), (1100, 0)], False, [1000, 1100]),
+        # Only the first good word after a gap may have wrapped unseen.
+        ([(10, 0), (COUNTER_RANGE - 1, 0), (5, 0)], True, [10, COUNTER_RANGE - 1]),
+    ],
+)
+def test_only_what_may_have_wrapped_is_taken_for_a_wrap(
+    rows: list[tuple[int, int]], after_loss: bool, expected: list[int]
+) -> None:
+    found = CODEC.decode(words(*rows), CODEC.start, after_loss)
+    assert found.records["time_ticks"].tolist() == expected
+    assert found.malformed == len(rows) - len(expected)

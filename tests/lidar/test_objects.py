@@ -48,3 +48,13 @@ def test_nothing_and_nonsense():
     for reach, fewest in ((0.0, 1), (np.nan, 1), (0.1, 0)):
         with pytest.raises(InputError, match="positive reach"):
             find_objects(cloud(np.eye(3)), reach, fewest)
+
+
+def test_scatter_is_a_standard_deviation_that_strays_do_not_raise():
+    random = np.random.default_rng(0)
+    direction = random.normal([0, 0, 1], 0.02, (3000, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    distance = 2 + random.normal(0, 0.01, 3000)
+    distance[:60] += 0.08
+    (found,) = find_objects(cloud(direction * distance[:, np.newaxis]), reach=0.2)
+    assert found.scatter == pytest.approx(0.01, rel=0.1)

@@ -26,7 +26,7 @@ BIN = 20e-12
 FWHM = 60e-12
 BINS = 128
 SIGMA = FWHM / np.sqrt(8 * np.log(2))
-TRIALS = 2000
+TRIALS = 1000
 
 
 def metres(time: np.ndarray | float) -> np.ndarray | float:

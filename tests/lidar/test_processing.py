@@ -307,3 +307,14 @@ def test_depth_pictures_hold_metres_along_the_axis(tmp_path):
     )  # one row above the axis; the brighter return
     assert (seen["Y"][2, 4], seen["Y"][5, 1], seen["Y"][3, 3]) == (7, 2, 0)
     assert np.isinf(seen["Z"]).sum() == 6 * 9 - 3
+
+
+def test_the_mean_of_points_is_known_better_than_each():
+    cloud = cloud_of(np.full((4, 3), 0.5) + 1e-3 * np.eye(4, 3))
+    (confidence,) = downsample_cloud(cloud, 1.0).confidence
+    assert confidence == pytest.approx(0.5e-3)
+
+
+def test_a_mirror_is_not_a_pose():
+    with pytest.raises(InputError):
+        transform_cloud(cloud_of(np.eye(3)), np.diag([-1.0, 1.0, 1.0, 1.0]))

@@ -326,3 +326,15 @@ def test_a_step_of_the_fit_is_a_bin_at_most():
         take_gauss_newton_step(times, sums, own)
         assert own[0] == pytest.approx(times[10] - np.sign(slope_of_the_rest) * BIN, abs=1e-3 * BIN)
         assert (own[1], own[4]) == (5.0, pytest.approx(1.0))
+
+
+def test_an_echo_weaker_than_the_limit_of_its_pixel_is_left_out():
+    times = even_times(200)
+    strong = gaussian(times, np.full(50, START + 40 * BIN), 1000.0)
+    weak = gaussian(times, np.full(50, START + 140 * BIN), 100.0)
+    noise = np.random.default_rng(0).normal(0, 0.5, (200, 50))
+    frames = frames_of(strong + weak + noise, times)
+    for limit, returns in ((0.02, 2), (0.5, 1)):
+        found = depth(frames, detection=replace(EVERYTHING, min_pixel_fraction=limit))
+        assert np.count_nonzero(found.return_number == returns) == 50
+        assert found.return_number.max() == returns

@@ -307,3 +307,25 @@ def test_the_light_cone_transform_reads_depths_to_a_fraction_of_a_bin() -> None:
         bright = np.where(line > line.max() / 2, line, 0)
         errors.append(np.sum(bright * depths) / np.sum(bright) - depth)
     assert abs(np.mean(errors)) < 0.2 * axis.spacing / 2
+
+
+def test_the_filter_is_wiener_s() -> None:
+    random = np.random.default_rng(0)
+    quarter = random.standard_normal((3, 3, 4)) + 1j * random.standard_normal((3, 3, 4))
+    spectrum = np.ones((4, 4, 4), np.complex64)
+    LightCone(signal_to_noise=0.5)._apply_wiener_filter(spectrum, quarter.astype(np.complex64))
+    expected = quarter.conj() / (np.abs(quarter) ** 2 + 2)
+    np.testing.assert_allclose(spectrum[:3, :3], expected, rtol=1e-5)
+    np.testing.assert_allclose(spectrum[3, 3], expected[1, 1], rtol=1e-5)
+
+
+def test_migration_keeps_the_sign_of_signals_below_the_background() -> None:
+    """A wave of opposite signs on the two halves of the wall cancels in the middle."""
+    wall = wall_at()
+    wall[..., 0] -= X.mean()
+    capture = confocal([(0.0, Y[11], 0.6)], wall)
+    sides = np.sign(np.round(wall[..., 0], 9))
+    opposed = replace(capture, signal=capture.signal * sides)
+    grid = Grid([0.0], Y[11:12], np.linspace(0.5, 0.7, 11))
+    bright = FKMigration().reconstruct(capture, grid).values.max()
+    assert FKMigration().reconstruct(opposed, grid).values.max() < 0.01 * bright

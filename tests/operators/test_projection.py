@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.sparse
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tofclip.camera import Camera
-from tofclip.operators import LineProjection, estimate_squared_norm
+from tofclip.operators import LineProjection, SparseMatrix, estimate_squared_norm
 
 angles = st.floats(-1.0, 1.0)
 centres = st.floats(40.0, 60.0)
@@ -97,3 +98,10 @@ def test_squared_norm_refuses_a_blind_operator():
 
     with pytest.raises(InputError, match="to zero"):
         estimate_squared_norm(LineProjection((3, 3), 5, [200.0], [0.0], [1.0]))
+
+
+def test_squared_norm_of_a_matrix_with_both_signs():
+    """The largest eigenvector has entries of both signs, which a walk that drops them never finds."""
+    matrix = scipy.sparse.csr_array(np.array([[1.0, -0.9], [-0.9, 1.0]]))
+    found = estimate_squared_norm(SparseMatrix(matrix, (2,), (2,)), 200)
+    assert found == pytest.approx(1.9**2, rel=1e-3)

@@ -43,7 +43,10 @@ def measurements(scene: LightField, encoder: str = "line", ratio: float = 1.0) -
     return measure(scene, CameraSetup(encoder, ratio, 0))
 
 
-@pytest.mark.parametrize("prior", ["tv", "wavelet", "l1", "collaborative", "nlm"])
+@pytest.mark.parametrize(
+    "prior",
+    ["tv", "wavelet", "l1", "nlm", pytest.param("collaborative", marks=pytest.mark.nightly)],
+)
 def test_every_prior_recovers_the_picture(prior, scene, truth):
     found = ClipRecovery(prior).recover(measurements(scene), SHEAR)
     # l1 has nothing to do with a lit ground; it only fits the data
@@ -76,6 +79,7 @@ def test_huber_s_term_needs_no_one_to_say_which_readings_are_bad(scene, truth):
     assert nmse(robust.picture, truth, 4) < 0.4 * nmse(squares.picture, truth, 4)
 
 
+@pytest.mark.nightly
 def test_the_likelihood_of_photons_does_about_as_well_as_squares(scene, truth):
     """Mean over three seeds. The bound is loose: both are near what this many photons allow, each
     at times better.

@@ -19,6 +19,7 @@ from tofclip.solvers import (
     ignore_progress,
     iterate,
 )
+from tofclip.solvers.method import IterationHistory, Result
 from tofclip.threads import LANES
 
 
@@ -196,3 +197,37 @@ def test_a_refused_step_is_not_convergence():
 
 def _lanes(measurements: np.ndarray) -> np.ndarray:
     return np.tile(measurements[:, np.newaxis], (1, LANES))
+
+
+def test_after_a_refused_step_the_momentum_starts_anew():
+    """The step after it is a plain one from where the frame stands."""
+    operator = projection()
+    measurements = np.abs(np.random.default_rng(3).standard_normal((40, LANES)))
+    regulariser = NonnegativeSparsity(1e-3)
+    step_size = 1 / estimate_squared_norm(operator, 99)
+    solver = Fista(operator, LeastSquares(measurements), regulariser, step_size, LANES)
+    checked = 0
+    for _ in range(400):
+        solver.step()
+        refused = solver.rejected.copy()
+        if not refused.any():
+            continue
+        still = solver.current.copy()
+        gradient = operator.adjoint(operator(still) - measurements)
+        plain, _ = regulariser.proximal_step(still, still, np.zeros(LANES), gradient, step_size)
+        plain = np.array(plain)
+        solver.step()
+        stepped = refused & ~solver.rejected
+        difference = np.abs(solver.current - plain)[..., stepped]
+        assert np.all(difference <= 1e-9 * np.abs(plain).max())
+        checked += np.count_nonzero(stepped)
+    assert checked > 0
+
+
+def test_blocks_that_stopped_early_count_with_their_last_value():
+    histories = [
+        IterationHistory(np.array([10.0, 5.0]), True),
+        IterationHistory(np.array([8.0, 4.0, 2.0]), True),
+    ]
+    found = Result.from_blocks(np.zeros((2, 1, 1)), histories)
+    assert (found.objective.tolist(), found.iterations) == ([18, 9, 7], 2)

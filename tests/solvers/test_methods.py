@@ -165,3 +165,15 @@ def test_a_lone_picture_is_recovered_as_in_a_block(method):
     alone = method.recover(operator, measurements).frames[0]
     many = method.recover(operator, np.tile(measurements, 3)).frames
     np.testing.assert_allclose(alone, many[1], atol=1e-3 * alone.max())
+
+
+def test_a_measurement_that_is_invalid_in_one_frame_only_is_used_by_the_linear_inverse():
+    operator = LineProjection((6, 6), 20, [10.0], [0.3], [1.0], np.float64)
+    measurements = np.random.default_rng(0).random((20, 3))
+    valid = np.ones((20, 3), bool)
+    valid[9, 1] = False
+    method = LinearInverse()
+    expected = method.recover(operator, measurements).frames
+    np.testing.assert_array_equal(method.recover(operator, measurements, valid).frames, expected)
+    valid[9] = False
+    assert not np.allclose(method.recover(operator, measurements, valid).frames, expected)

@@ -40,6 +40,7 @@ def test_the_sensors_are_long_enough_for_all_light_of_rotated_lines():
     )  # 20 points to a row, and each line's light has the sum 1
 
 
+@pytest.mark.nightly
 def test_rotation_gains_four_decibels_on_the_letters(shared_data):
     """Acceptance at N_p = 1, M = 10: the mean of five seeds."""
     from tofclip.io.light_fields import read_light_field

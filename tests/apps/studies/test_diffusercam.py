@@ -24,6 +24,7 @@ def recoveries(hand) -> list:
     return [recover_diffuser_scene(hand, pitch) for pitch in (1, 2, 3)]
 
 
+@pytest.mark.nightly
 def test_the_hand_explains_the_readings(recoveries):
     """Acceptance: a relative residual below 1 % from the full and from two and three times fewer
     pixels an axis.

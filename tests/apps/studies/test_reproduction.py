@@ -86,6 +86,7 @@ def test_recorded_light_fields_join_where_their_folder_is_given(shared_data):
     assert known.light_field("data:render_letters").pictures.shape == (64, 128, 128)
 
 
+@pytest.mark.nightly
 def test_the_hand_needs_its_recording_and_explains_it(library, shared_data):
     (study,) = find_studies("fig4d")
     with pytest.raises(InputError, match="--data"):
@@ -163,6 +164,7 @@ def test_a_light_field_recovered_from_many_readings_is_near_the_true_one(library
     assert nmse(found.pictures, truth.pictures, BORDER_PX) < 0.1
 
 
+@pytest.mark.nightly
 def test_a_glossy_plate_is_uneven_but_keeps_its_place():
     """84 % was measured for both, at full size: wider baselines for the picture's size spoil the
     recovery itself.
