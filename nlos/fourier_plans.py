@@ -38,7 +38,12 @@ class FourierPlan(Protocol):
         ...
 
     def update_arrays(self, source: ComplexArray, target: ComplexArray) -> None:
-        """Go on with other buffers of the same shapes and strides."""
+        """Go on with other buffers of the same shapes and strides.
+
+        Parameters
+        ----------
+        source, target : complex64 array
+        """
         ...
 
 
@@ -67,7 +72,12 @@ class ScipyPlan:
             self._target[...] = fft.fft(self._source, axis=self._axis)
 
     def update_arrays(self, source: ComplexArray, target: ComplexArray) -> None:
-        """Go on with other buffers."""
+        """Go on with other buffers.
+
+        Parameters
+        ----------
+        source, target : complex64 array
+        """
         self._source, self._target = source, target
 
 

@@ -74,7 +74,21 @@ def wait_for(result: Array) -> Array:
 def compare_devices(
     work: Callable[[Any], Array], given: Any, moved: Any, amount: float
 ) -> PreparedCase:
-    """The work on the device against the same work by the compiled loops."""
+    """The work on the device against the same work by the compiled loops.
+
+    Parameters
+    ----------
+    work : callable
+        From the input to an array.
+    given, moved : object
+        The input for the compiled loops, and on the device.
+    amount : float
+        Of work, in the unit of the figures.
+
+    Returns
+    -------
+    PreparedCase
+    """
 
     def judge() -> dict[str, float]:
         expected, found = to_numpy(work(given)), to_numpy(work(moved))
@@ -89,7 +103,19 @@ def compare_devices(
 
 
 def prepare_recovery(method: str, side: int) -> PreparedCase:
-    """Frames from a shot's measurements."""
+    """Frames from a shot's measurements.
+
+    Parameters
+    ----------
+    method : str
+        ``l1``, ``tv`` or ``linear``.
+    side : int
+        Pixels of the picture.
+
+    Returns
+    -------
+    PreparedCase
+    """
     camera, measurements = make_shot(side)
     operator = camera.operator()
     inverse = LinearInverse().prepare(operator)
@@ -117,7 +143,22 @@ def prepare_ranging(side: int) -> PreparedCase:
 def prepare_imaging(
     make_method: Callable[[float], Reconstructor], shape: str, confocal: bool, side: int
 ) -> PreparedCase:
-    """A hidden volume from a simulated capture."""
+    """A hidden volume from a simulated capture.
+
+    Parameters
+    ----------
+    make_method : callable
+        From a wavelength in m to a method.
+    shape : str
+        A wall of `build_relay_wall`.
+    confocal : bool
+    side : int
+        Wall points along a side.
+
+    Returns
+    -------
+    PreparedCase
+    """
     warnings.simplefilter("ignore", AliasingWarning)
     wavelength = WALL_POINTS_PER_WAVELENGTH * WALL_WIDTH_M / (side - 1)
     wall = build_relay_wall(shape, side, WALL_WIDTH_M)

@@ -54,7 +54,19 @@ FLOORS = {
 
 
 def prepare_camera(name: str, side: int) -> PreparedCase:
-    """A weighted model and its adjoint on one picture; its set-up is timed beside."""
+    """A weighted model and its adjoint on one picture; its set-up is timed beside.
+
+    Parameters
+    ----------
+    name : str
+        A key of `CAMERAS`.
+    side : int
+        Pixels of the picture.
+
+    Returns
+    -------
+    PreparedCase
+    """
 
     def make_model() -> object:
         camera = CAMERAS[name]((side, side), VIEWS, SAMPLING_RATIO, 0)

@@ -75,6 +75,16 @@ QUALITY_CASES = (
 def prepare_quality(wanted: QualityCase, ratio_percent: int) -> PreparedCase:
     """A recovery with the weight that the search found, against the products it needs.
 
+    Parameters
+    ----------
+    wanted : QualityCase
+    ratio_percent : int
+        Sampling ratio.
+
+    Returns
+    -------
+    PreparedCase
+
     Raises
     ------
     InputError

@@ -44,7 +44,19 @@ def make_streaks(rows: int) -> list[Streak]:
 
 
 def bring_shots(streaks: list[Streak], shots: int, period_s: float) -> Iterator[Streak]:
-    """Bring a shot every `period_s` seconds."""
+    """Bring a shot every `period_s` seconds.
+
+    Parameters
+    ----------
+    streaks : list of Streak
+        Used in turn.
+    shots : int
+    period_s : float
+
+    Yields
+    ------
+    Streak
+    """
     began = time.perf_counter()
     for number in range(shots):
         time.sleep(max(0.0, began + number * period_s - time.perf_counter()))
@@ -52,7 +64,17 @@ def bring_shots(streaks: list[Streak], shots: int, period_s: float) -> Iterator[
 
 
 def prepare_stream(rows: int, shots: int) -> PreparedCase:
-    """Shots as fast as they are taken, then at three quarters of that rate."""
+    """Shots as fast as they are taken, then at three quarters of that rate.
+
+    Parameters
+    ----------
+    rows, shots : int
+        Rows of a streak image, and number of shots.
+
+    Returns
+    -------
+    PreparedCase
+    """
     streaks = make_streaks(rows)
     pipeline = RangingPipeline.for_shot(streaks[0])
 
@@ -93,7 +115,17 @@ def start_workers(number: int) -> Iterator[str]:
 
 
 def record_shots(folder: Path, number: int) -> Path:
-    """Simulate some shots, and link to them under as many names as asked for."""
+    """Simulate some shots, and link to them under as many names as asked for.
+
+    Parameters
+    ----------
+    folder : Path
+    number : int
+
+    Returns
+    -------
+    Path
+    """
     instrument, scene = make_instrument(CLUSTER_ROWS), make_default_scene()
     shots = folder / "shots"
     shots.mkdir()
@@ -108,7 +140,19 @@ def record_shots(folder: Path, number: int) -> Path:
 
 
 def make_clouds(shots: Path, out: Path, cluster: str | None) -> Summary:
-    """Make the clouds of all shots."""
+    """Make the clouds of all shots.
+
+    Parameters
+    ----------
+    shots, out : Path
+        Folders.
+    cluster : str, optional
+        See `tofclip.sequences.jobs.run_jobs`.
+
+    Returns
+    -------
+    Summary
+    """
     jobs = RangingSettings(shots.parent / "camera.h5").jobs(list_shots(shots), out, SUFFIX)
     return run_jobs(jobs, cluster)
 

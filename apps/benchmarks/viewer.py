@@ -63,6 +63,16 @@ def make_echo_request(server: Any, answered: Callable[[], None]) -> Callable[[],
     """Return a function that asks the page to answer once all that was sent so far is drawn.
 
     It reaches into viser's inner messages, which only a measurement may do.
+
+    Parameters
+    ----------
+    server : viser server
+    answered : callable
+        Called when the page has answered.
+
+    Returns
+    -------
+    callable
     """
     names = (f"tofclip-drawn-{number % 4}" for number in itertools.count())
 

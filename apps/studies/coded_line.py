@@ -190,7 +190,22 @@ def measure_arm(light_field: LightField, shear: float, seeds: int, arm: LineArm)
 
 
 def compute_psnr_db(estimate: NDArray[Any], truth: NDArray[Any]) -> float:
-    """Peak signal-to-noise ratio in dB, relative to the brightest pixel of the truth."""
+    """Peak signal-to-noise ratio in dB, relative to the brightest pixel of the truth.
+
+    Parameters
+    ----------
+    estimate, truth : (rows, columns) array
+
+    Returns
+    -------
+    float
+        dB.
+
+    Raises
+    ------
+    InputError
+        The estimate equals the truth.
+    """
     error = float(np.mean((estimate.astype(np.float64) - truth) ** 2))
     if error == 0:
         raise InputError("the estimate is the truth itself: its PSNR is infinite")
@@ -204,7 +219,21 @@ MAX_ANGLES_RAD = {"upright": 0.0, "rotated": MAX_ANGLE_RAD}
 
 
 def run_line_rotation(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover letters through ten coded lines of several widths, with and without rotation."""
+    """Recover letters through ten coded lines of several widths, with and without rotation.
+
+    Parameters
+    ----------
+    library : Library
+        Light fields by name.
+    seeds : int
+        Repeats with other random numbers.
+    advance : callable
+        Called with the number of steps just done.
+
+    Returns
+    -------
+    Outcome
+    """
     light_field = halve_pictures(select_views(library.light_field(SCENE), LINES))
     shear = SHEAR / 2  # a pixel is twice as wide
     arms = [
@@ -230,7 +259,17 @@ def run_line_rotation(library: Library, seeds: int, advance: Advance) -> Outcome
 
 
 def select_views(light_field: LightField, count: int) -> LightField:
-    """Return the `count` views nearest to the middle of the aperture."""
+    """Return the `count` views nearest to the middle of the aperture.
+
+    Parameters
+    ----------
+    light_field : LightField
+    count : int
+
+    Returns
+    -------
+    LightField
+    """
     nearest = np.argsort((light_field.views**2).sum(axis=1), kind="stable")[:count]
     return LightField(light_field.pictures[nearest], light_field.views[nearest])
 

@@ -218,6 +218,20 @@ class EmulatedTimeTagger(VirtualDevice):
                 return  # what comes with it finds the register manager replying
 
     def control(self, request: int, value: int) -> None:
+        """Set how many bytes make a packet, or send or discard what is unfinished.
+
+        Parameters
+        ----------
+        request : int
+            `SET_SEND_WINDOW` or `FLUSH`.
+        value : int
+            Bytes of a packet.
+
+        Raises
+        ------
+        usb.core.USBError
+            It is another request.
+        """
         chip, rest = self._unsent_bytes()
         if request == SET_SEND_WINDOW:
             self._unfinished.extend([self._window] * (chip // self._window))

@@ -65,7 +65,18 @@ class VirtualDevice(abc.ABC):
         self.halted.discard(endpoint)
 
     def control(self, request: int, value: int) -> None:
-        """Do what a vendor request asks for; without an override it knows none, and stalls."""
+        """Do what a vendor request asks for; without an override it knows none, and stalls.
+
+        Parameters
+        ----------
+        request, value : int
+            Of the setup packet.
+
+        Raises
+        ------
+        usb.core.USBError
+            Always, without an override.
+        """
         raise make_usb_error(errno.EPIPE)
 
     @abc.abstractmethod

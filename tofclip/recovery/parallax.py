@@ -97,7 +97,18 @@ def fit_parallax_to_shot(
 
 
 def count_parallax_work(shot: Shot, shears: tuple[float, float, int]) -> int:
-    """Return how many frame iterations `fit_parallax_to_shot` reports at most."""
+    """Return how many frame iterations `fit_parallax_to_shot` reports at most.
+
+    Parameters
+    ----------
+    shot : Shot
+    shears : (float, float, int)
+        First, last and number of shears.
+
+    Returns
+    -------
+    int
+    """
     rows = shot.streak.counts.shape[0]
     fitting = count_registration_iterations() if shot.camera.sweep is None else 0
     return fitting + shears[2] * GATE_METHOD.work(rows)

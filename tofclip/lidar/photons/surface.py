@@ -344,6 +344,16 @@ class SurfacePlan:
     def locate(self, photons: PhotonImage, scene: Scene) -> FloatArray:
         """Find the strongest surface: (rows, columns, 4) array of instant and deviation in bins,
         photons, and probability of an outlier.
+
+        Parameters
+        ----------
+        photons : PhotonImage
+        scene : Scene
+            Response and background.
+
+        Returns
+        -------
+        (rows, columns, 4) float64 array
         """
         volume = compute_scores(photons, scene, self.axis)
         labels, margin = match_labels(volume, photons.image_shape, self.slope_cost)
