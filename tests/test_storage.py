@@ -339,3 +339,66 @@ def test_contents_are_on_the_disk_before_the_name_is(
     with atomic_path(tmp_path / "a.txt") as temporary:
         temporary.write_text("text")
     assert steps == ["4 bytes", "rename", "folder"]
+
+
+def _open_to_edit(record: Record, path: Path) -> h5py.File:
+    record.save(path)
+    return h5py.File(path, "r+", libver=("v110", "v110"))
+
+
+@pytest.mark.parametrize("rows", [1 << 38, 1 << 30])
+def test_a_small_file_cannot_ask_for_terabytes(record: Record, rows: int, tmp_path: Path) -> None:
+    with _open_to_edit(record, tmp_path / "a.h5") as file:
+        file.create_dataset("huge", (rows,), np.float32, chunks=(1 << 20,), compression="gzip")
+        file["huge"].attrs["units"] = file["huge"].attrs["axes"] = ""
+    assert (tmp_path / "a.h5").stat().st_size < 20_000
+    with pytest.raises(FileFormatError, match=r"'huge' claims \d+ bytes"):
+        Record.load(tmp_path / "a.h5")
+
+
+def test_chunks_are_bounded_too(record: Record, tmp_path: Path) -> None:
+    with _open_to_edit(record, tmp_path / "a.h5") as file:
+        huge = file.create_dataset(
+            "huge", (4,), np.float32, chunks=(1 << 29,), maxshape=(None,), compression="gzip"
+        )
+        assert huge.chunks == (1 << 29,)
+    with pytest.raises(FileFormatError, match="'huge' claims"):
+        Record.load(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize("kind", ["soft", "external", "external data", "virtual", "cycle", "text"])
+def test_nothing_outside_the_file_is_followed(record: Record, kind: str, tmp_path: Path) -> None:
+    (tmp_path / "secret").write_bytes(bytes(80))
+    with h5py.File(tmp_path / "other.h5", "w") as other:
+        other["x"] = np.ones(3)
+    with _open_to_edit(record, tmp_path / "a.h5") as file:
+        if kind == "soft":
+            file["more"] = h5py.SoftLink("/counts")
+        elif kind == "external":
+            file["more"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "x")
+        elif kind == "external data":
+            place = [(str(tmp_path / "secret"), 0, 80)]
+            file.create_dataset("more", (10,), np.float64, external=place)
+        elif kind == "virtual":
+            layout = h5py.VirtualLayout((3,), np.float64)
+            layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "x", (3,))
+            file.create_virtual_dataset("more", layout)
+        elif kind == "cycle":
+            file["more"] = file["/"]
+        else:
+            file.create_dataset("more", data=["a", "b"], dtype=h5py.string_dtype())
+    with pytest.raises(FileFormatError, match=r"a\.h5: .*(link|other files|deep|fixed size)"):
+        Record.load(tmp_path / "a.h5")
+
+
+def test_what_does_not_fit_into_memory_is_said(
+    record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record.save(tmp_path / "a.h5")
+
+    def refuse(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", refuse)
+    with pytest.raises(StorageError, match="does not fit into this computer's memory"):
+        Record.load(tmp_path / "a.h5")

@@ -4,6 +4,7 @@ one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,7 +26,13 @@ from tofclip.records import (
     stored_provenance,
     stored_texts,
 )
-from tofclip.storage import Record, Scalar, atomic_path, translate_read_errors
+from tofclip.storage import (
+    Record,
+    Scalar,
+    atomic_path,
+    require_bounded_dataset,
+    translate_read_errors,
+)
 
 __all__ = ["Frames", "Streak"]
 
@@ -178,10 +185,14 @@ class StreakStack:
             open(path, "rb").close()
         try:
             with h5py.File(path, "r") as file:
-                self._shape = tuple(int(n) for n in file["counts"].shape)
+                counts = file["counts"]
+                self._shape = tuple(int(n) for n in counts.shape)
+                require_bounded_dataset(counts, path, at_once=math.prod(self._shape[1:]))
                 self.row_times: NDArray[np.float64] | None = (
                     np.asarray(file["row_times"], dtype=np.float64) if "row_times" in file else None
                 )
+        except FileFormatError:
+            raise
         except (OSError, KeyError, RuntimeError, AttributeError) as fault:
             raise FileFormatError(
                 path, "is not a stack of streak images: it needs a dataset 'counts'"

@@ -15,6 +15,7 @@ import errno
 import hashlib
 import io
 import json
+import math
 import os
 import secrets
 from collections.abc import Iterable, Iterator, Mapping
@@ -42,6 +43,14 @@ FORMAT_VERSION = 1
 LIBRARY_VERSIONS = ("v110", "v110")
 CUBE_CHUNK_SHAPE = (64, 32, 32)
 MIN_COMPRESSED_BYTES = 1 << 16
+
+MAX_ARRAY_BYTES = 1 << 35
+"""Largest array that is read from a file, 32 GiB."""
+MAX_CHUNK_BYTES = 1 << 26
+MAX_COMPRESSION = 1032
+"""Deflate makes at most so many bytes of one."""
+MAX_DEPTH = 16
+"""Of records within records."""
 
 
 @dataclass(frozen=True)
@@ -247,9 +256,13 @@ def _open_file(path: str | Path) -> Iterator[h5py.File]:
                 )
             yield file
     except (OSError, KeyError, RuntimeError) as fault:
+        if isinstance(fault, FileFormatError):
+            raise
         raise FileFormatError(
             path, f"is damaged or incomplete ({format_error_line(fault)})"
         ) from fault
+    except MemoryError as fault:
+        raise StorageError(f"{path}: does not fit into this computer's memory") from fault
 
 
 def _write_group(group: h5py.Group, record: Record) -> None:
@@ -293,27 +306,82 @@ def _storage_options(values: NDArray[Any]) -> dict[str, Any]:
     }
 
 
-def _read_group(group: h5py.Group, origin: str) -> Record:
+def _read_group(group: h5py.Group, origin: str, depth: int = 0) -> Record:
     import h5py
 
+    if depth > MAX_DEPTH:
+        raise FileFormatError(origin, f"has records in each other, more than {MAX_DEPTH} deep")
     fields: dict[str, Field] = {}
     children: dict[str, Record] = {}
-    for name, item in group.items():
+    for name in group:
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise FileFormatError(origin, f"'{name}' cannot be read: links are not followed")
+        item = group[name]
         if isinstance(item, h5py.Dataset):
             axes = _read_text(item, "axes")
+            require_bounded_dataset(item, origin)
             fields[name] = Field(
                 item[()], _read_text(item, "units"), tuple(axes.split(",")) if axes else ()
             )
         elif isinstance(item, h5py.Group):
-            children[name] = _read_group(item, origin)
+            children[name] = _read_group(item, origin, depth + 1)
         else:
             raise FileFormatError(origin, f"is damaged: '{name}' cannot be read")
+    _require_bounded_attributes(group, origin)
     attributes = {
         name.removeprefix("value."): _to_scalar(value)
         for name, value in group.attrs.items()
         if name.startswith("value.")
     }
     return Record(_read_text(group, "kind"), fields, attributes, children, origin=origin)
+
+
+def require_bounded_dataset(
+    dataset: h5py.Dataset, origin: str | Path, at_once: int | None = None
+) -> None:
+    """Refuse a dataset whose values are not in its own file, or claim more than the file can hold.
+
+    Checked before anything is allocated: a damaged or malicious file of a few kilobytes may claim
+    terabytes.
+
+    Parameters
+    ----------
+    dataset : h5py.Dataset
+    origin : path-like
+        The file that it is in.
+    at_once : int, optional
+        How many of its values are read at once; by default all.
+
+    Raises
+    ------
+    FileFormatError
+    """
+    name, dtype = dataset.name.lstrip("/"), dataset.dtype
+    if dataset.is_virtual or dataset.external:
+        raise FileFormatError(origin, f"'{name}' lies in other files, which are not read")
+    if dtype.hasobject or dataset.shape is None:
+        raise FileFormatError(origin, f"'{name}' does not hold numbers of a fixed size")
+    claimed = math.prod(dataset.shape) * dtype.itemsize
+    wanted = claimed if at_once is None else at_once * dtype.itemsize
+    chunk = math.prod(dataset.chunks or ()) * dtype.itemsize
+    stored = dataset.id.get_storage_size()
+    if wanted > MAX_ARRAY_BYTES or chunk > max(claimed, MAX_CHUNK_BYTES):
+        raise FileFormatError(
+            origin,
+            f"'{name}' claims {max(wanted, chunk)} bytes, more than the {MAX_ARRAY_BYTES} that are read",
+        )
+    if stored > os.path.getsize(origin) or claimed > MAX_COMPRESSION * stored:
+        raise FileFormatError(
+            origin, f"is damaged: '{name}' claims {claimed} bytes, which the file cannot hold"
+        )
+
+
+def _require_bounded_attributes(item: h5py.Group | h5py.Dataset, origin: str) -> None:
+    """Refuse attributes larger than the file that they are in."""
+    size = os.path.getsize(origin)
+    for name in item.attrs:
+        if item.attrs.get_id(name).get_storage_size() > size:
+            raise FileFormatError(origin, f"is damaged: attribute '{name}' is larger than the file")
 
 
 def _read_text(item: h5py.Group | h5py.Dataset, name: str) -> str:

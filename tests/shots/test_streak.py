@@ -95,3 +95,15 @@ def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
     Record("camera").save(tmp_path / "camera.h5")
     with pytest.raises(FileFormatError, match="holds a camera record, expected streak"):
         Streak.load(tmp_path / "camera.h5")
+
+
+def test_a_stack_that_claims_more_than_its_file_holds_is_refused(tmp_path):
+    import h5py
+
+    from tofclip.errors import FileFormatError
+    from tofclip.shots import StreakStack
+
+    with h5py.File(tmp_path / "stack.h5", "w") as file:
+        file.create_dataset("counts", (1 << 20, 1024, 1024), np.float32, chunks=(1, 64, 64))
+    with pytest.raises(FileFormatError, match="which the file cannot hold"):
+        StreakStack(tmp_path / "stack.h5")
