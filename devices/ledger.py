@@ -39,7 +39,7 @@ class Ledger:
         self._add(unread=-delivered - malformed, delivered=delivered, malformed=malformed)
 
     def drop(self, records: int) -> None:
-        """Move records that waited to those that nobody read in time."""
+        """Move records that waited to those that were not read in time."""
         self._add(unread=-records, dropped_host=records)
 
     def truncate(self, records: int = 1) -> None:

@@ -93,7 +93,7 @@ class LoopbackServer:
         self._connections.clear()
 
     def close(self) -> None:
-        """Serve nobody any more; closing twice is fine."""
+        """Stop serving; closing twice is fine."""
         self._closing.set()
         self._listener.close()
         self.close_connections()

@@ -100,7 +100,7 @@ def open(uri: str) -> Source:  # noqa: A001 - the name users type: devices.open
     Raises
     ------
     InputError
-        The address is no address, or of no known kind.
+        It is not an address, or of no known kind.
     DeviceError
         The instrument cannot be reached.
 

@@ -1,4 +1,4 @@
-"""The bounded buffer between the thread that empties an instrument and whoever reads its records."""
+"""The bounded buffer between the thread that empties an instrument and the reader of records."""
 
 from __future__ import annotations
 

@@ -15,13 +15,13 @@ class Stats:
     Parameters
     ----------
     acquired : int
-        What the instrument registered, as far as it told or sent.
+        What the instrument registered, as far as it reported or sent.
     delivered : int
         What `Source.read` returned.
     unread : int
         What arrived and still waits in this program's buffer.
     dropped_host : int
-        What arrived and was dropped because nobody read it in time.
+        What arrived and was dropped because it was not read in time.
     lost_device : int
         What the instrument registered but never handed over, or the wire swallowed.
     malformed : int

@@ -36,9 +36,9 @@ class TcpLink:
     Raises
     ------
     DeviceNotFoundError
-        Nobody answers there.
+        Nothing answers there.
     DeviceTimeoutError
-        Nobody answers in time.
+        Nothing answers in time.
     """
 
     def __init__(self, host: str, port: int, timeout: float) -> None:

@@ -49,7 +49,7 @@ ACCUMULATION_OPTIONS = (
     "pixels",
 )
 BIN_WIDTH_S = 20e-12
-"""Width of a histogram's bins where nobody gives another, s."""
+"""Width of a histogram's bins where no other is given, s."""
 
 PICOSECOND_S = 1e-12
 
@@ -271,7 +271,7 @@ def _accumulate_streak(
 
 
 def _read_batches(source: Source, seconds: float) -> Iterator[Batch]:
-    """Read until the end, or for so many seconds of a live source."""
+    """Read until the end, or for the given seconds of a live source."""
     deadline = monotonic() + seconds
     while not source.is_live or monotonic() < deadline:
         try:

@@ -138,7 +138,7 @@ class AdjointImaging:
     recovery : Method
         The adjoint, or another of `tofclip.solvers`.
     threshold : float
-        Voxels weaker than this share of the brightest become 0; 0 keeps all.
+        Voxels weaker than this fraction of the brightest become 0; 0 keeps all.
     """
 
     solver: Reconstructor

@@ -1,5 +1,5 @@
-"""Phasor-field back-projection: every wall point's filtered signal, smeared over the voxels that it
-may come from.
+"""Phasor-field back-projection: every wall point's filtered signal, back-projected over the voxels
+that it may come from.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ TABLE_BYTES = 32 << 20
 """Filtered signals held at a time."""
 
 SignalFilter = Callable[[NDArray[np.float32]], Waveforms]
-"""Turns signals (points, t) into what is smeared over the voxels."""
+"""Turns signals (points, t) into what is back-projected over the voxels."""
 
 BRICK_Z, BRICK_Y, BRICK_X = 8, 8, 128
 """Voxels treated together: few enough for the cache, rows along x long enough for vector registers, and at a batch of
@@ -94,7 +94,7 @@ class Backprojection(PhasorMethod):
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why.
 
-        True in a condition if it can; ``.reason`` tells why not. Refused are a single wall point, a
+        True in a condition if it can; ``.reason`` says why not. Refused are a single wall point, a
         grid behind the wall, a volume above 8 GiB, and time bins too coarse for the wavelength.
 
         Parameters

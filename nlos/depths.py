@@ -1,4 +1,5 @@
-"""Fields carried from a plane to a grid's depths at every frequency, each step beside its adjoint.
+"""Fields propagated from a plane to a grid's depths at every frequency, each step beside its
+adjoint.
 
 The same diffraction as `nlos.rsd.image_planes`, in plain matrix products of either precision: for
 what needs the way back (iterative refinement) or the frequencies apart from the laser's wave

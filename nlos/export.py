@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from nlos.volume import Volume
 
 FLAT_VOXEL_M = 1e-3
-"""m; thickness told of a volume that is a single voxel deep."""
+"""m; thickness given to a volume that is a single voxel deep."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,5 @@
-"""Filtered back-projection: the signals themselves are smeared, and a Laplacian sharpens what comes
-out.
+"""Filtered back-projection: the signals themselves are back-projected, and a Laplacian sharpens
+what comes out.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ class Grid:
             First and last voxel centre along each axis, m.
         voxel : float or (float, float, float)
             Distance of neighbouring centres, m, for all axes or for x, y and z. It is met exactly:
-            where a side is no multiple of it, the voxels are centred in the box and the outer ones
+            where a side is not a multiple of it, the voxels are centred in the box and the outer ones
             lie inside.
 
         Returns

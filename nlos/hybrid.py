@@ -55,7 +55,7 @@ class Hybrid(PhasorMethod):
     """The hybrid frequency-time solver: curved, disconnected and scattered walls at nearly the
     speed of planar ones.
 
-    What the wall recorded is carried onto a virtual plane, on which it is the field of the same
+    What the wall recorded is propagated onto a virtual plane, on which it is the field of the same
     outgoing waves; from there Rayleigh-Sommerfeld diffraction carries it to all depths, as
     `PlanarRSD` does. The image is that of `Backprojection`. Several laser spots add up; confocal
     scans run at doubled wavenumbers.
@@ -98,7 +98,7 @@ class Hybrid(PhasorMethod):
     def supports(self, capture: Capture, grid: Grid) -> Support:
         """Say whether `capture` can be imaged on `grid`, and if not, why.
 
-        True in a condition if it can; ``.reason`` tells why not. Needed are voxels evenly spaced
+        True in a condition if it can; ``.reason`` says why not. Needed are voxels evenly spaced
         along x and y, few laser spots, a virtual plane in front of the wall, and memory.
 
         Parameters
@@ -189,7 +189,7 @@ class Hybrid(PhasorMethod):
 
     @property
     def settings(self) -> dict[str, str | float]:
-        """What a volume tells of how it was imaged."""
+        """How a volume was imaged, for its provenance."""
         return {
             "method": "hybrid",
             "wavelength_m": self.wavelength,

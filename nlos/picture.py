@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
 DEPTH_THRESHOLD = 0.4
-"""The depth map shows columns whose brightest voxel has at least this share of the volume's
+"""The depth map shows columns whose brightest voxel has at least this fraction of the volume's
 brightest.
 """
 

@@ -18,7 +18,7 @@ PROFILE_SAMPLES = 401
 """Places along each axis at which the ideal image is computed."""
 
 PROFILE_EXTENT_WIDTHS = 4.0
-"""They extend so many times the width that a small aperture would have, to either side."""
+"""They extend this number of times the width that a small aperture would have, to either side."""
 
 HALF_MAXIMUM = 0.5
 MAX_WALL_POINTS = 4096

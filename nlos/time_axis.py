@@ -1,4 +1,4 @@
-"""The time axis of a capture, told as lengths of path."""
+"""The time axis of a capture, given as lengths of path."""
 
 from __future__ import annotations
 

@@ -148,7 +148,7 @@ class Volume:
             * ``.exr``: front view, channel Y, and its depth in m, channel Z;
             * ``.ply``, ``.pcd``, ``.csv``: bright voxels as points.
         fraction : float
-            Which voxels become points: those with at least this share of the brightest.
+            Which voxels become points: those with at least this fraction of the brightest.
 
         Raises
         ------

@@ -78,7 +78,7 @@ def to_numpy(array: Array) -> NDArray[Any]:
         array = array.detach().cpu()
     elif hasattr(array, "get") and not is_numpy(
         array
-    ):  # CuPy copies nothing from the device unless told to
+    ):  # CuPy copies nothing from the device unless asked to
         array = array.get()
     values: NDArray[Any] = np.asarray(array)
     return values

@@ -456,7 +456,7 @@ def remove_temporary_files(targets: Iterable[Path]) -> None:
     """Remove the temporary files of writers of `targets` that were killed before `atomic_path`
     could.
 
-    Only when nobody writes these targets any more: a writer whose temporary file is gone fails.
+    Only when these targets are not written any more: a writer whose temporary file is gone fails.
     """
     wanted: dict[Path, set[str]] = {}
     for target in targets:

@@ -59,7 +59,7 @@ class Case:
     size : str
         What its sizes count.
     sizes : tuple of int
-        Rising. Growth is from each to the next; threads and floor are told of the last.
+        Rising. Growth is from each to the next; threads and floor are reported for the last.
     unit : str
         What `PreparedCase.amount` counts.
     floor : str

@@ -41,7 +41,7 @@ def read_processor() -> str:
 
 
 def read_memory_gib() -> float | None:
-    """Return the memory of the machine; None where the system does not tell."""
+    """Return the memory of the machine; None where the system does not report it."""
     try:
         return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / (1 << 30), 1)
     except (AttributeError, ValueError, OSError):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ON_AXIS_POINT_PX, OFF_AXIS_POINT_PX = (0.0, 0.0), (25.0, 40.0)  # X, Y of two scene points, pixels
-NEAR_FRACTION, FAR_FRACTION = 0.35, 0.7  # when their light comes, as a share of the sweep
+NEAR_FRACTION, FAR_FRACTION = 0.35, 0.7  # when their light comes, as a fraction of the sweep
 FIRST_COLOUR, SECOND_COLOUR, SLIT_COLOUR, TEXT_COLOUR = "#2e6f95", "#d1495b", "#c9cdd2", "#20242c"
 HALF_LINE_PX = 70.0  # length of a drawn line above and below its middle, pixels
 

@@ -39,7 +39,7 @@ PANEL_ASPECT = 0.63
 """Of the panels that hold no image, relative to their width: that of an image."""
 
 LIT_THRESHOLD = 0.02
-"""The record is shown from where a row holds this share of its brightest bin."""
+"""The record is shown from where a row holds this fraction of its brightest bin."""
 
 
 def make_demo_figure(run: DemoRun) -> Figure:

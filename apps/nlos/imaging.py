@@ -1,4 +1,4 @@
-"""From a capture and what is told about its imaging to a volume: every open setting found, every
+"""From a capture and what is given about its imaging to a volume: every open setting found, every
 step under a bar.
 """
 

@@ -1,4 +1,4 @@
-"""A hidden scene before a relay wall, told by settings, and the capture that an instrument would
+"""A hidden scene before a relay wall, given by settings, and the capture that an instrument would
 make of it.
 """
 

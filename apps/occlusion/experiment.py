@@ -44,8 +44,8 @@ OBLIQUE_LAMP_M = (-55e-3, -25e-3, 0.0)
 ILLUMINATIONS = ("diodes", "oblique", "co-located")
 
 DEFAULT_PHOTONS = {"line": 2e3, "single-pixel": 1e6}
-"""Of the brightest reading: one of a single pixel gathers half the picture's light and tells little
-of it.
+"""Of the brightest measurement: one of a single pixel gathers half the picture's light and tells
+little of it.
 """
 
 
@@ -65,7 +65,7 @@ class ExperimentSettings:
         ``diodes``: one beside each view; ``oblique``: one far to the side; ``co-located``: one
         beside the middle view, whose light the occluder keeps from everything that view cannot see.
     photons : float
-        Of the brightest reading at its brightest instant.
+        Of the brightest measurement at its brightest instant.
     seed : int
 
     Raises

@@ -67,7 +67,7 @@ class OcclusionScene:
         return self.region.distance + self.behind
 
     def move_target(self, across: float) -> OcclusionScene:
-        """Return the scene with its target so many metres further right."""
+        """Return the scene with its target moved to the right, m."""
         return replace(self, target=tuple(body.shift(across, 0.0) for body in self.target))
 
 

@@ -33,7 +33,8 @@ SAMPLING_RATIOS = (0.1, 0.05)
 WAVELENGTH_M, CYCLES = 0.12, 5.0
 THRESHOLD = 0.15
 PEAK_FRACTION = 0.1
-"""Measurements expected to be weaker than this share of the brightest one are never the largest."""
+"""Measurements expected to be weaker than this fraction of the brightest one are never the largest.
+"""
 BISECTION_STEPS = 12
 DOCUMENT_MARK = "<!-- adjoint study -->"
 

@@ -152,7 +152,7 @@ MATERIALS = {
 
 
 def run_glossy_plate(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Recover a plate of either kind from CLIP-1D at SR = 1; tell how even its light is, and the
+    """Recover a plate of either kind from CLIP-1D at SR = 1; say how even its light is, and the
     errors.
 
     Parameters

@@ -88,13 +88,13 @@ FLIP_STUDY = Study(
 
 
 SHEARS = {"blocks": -0.6, "letters": -0.4, "printed-words": -0.3, "printed-letters": -0.3}
-TABLE5_PERCENT = {  # share of bad measurements to the pictures' NMSE, per cent
+TABLE5_PERCENT = {  # fraction of bad measurements to the pictures' NMSE, per cent
     ("single-pixel", "printed-words"): {0.001: 1.54, 0.002: 2.08, 0.01: 11.24},
     ("single-pixel", "printed-letters"): {0.001: 4.50, 0.002: 4.7, 0.01: 6.5},
     ("line", "letters"): {0.01: 5.07, 0.05: 12.1, 0.1: 15.2},
     ("line", "blocks"): {0.01: 1.68, 0.05: 6.05, 0.1: 9.38},
 }
-TABLE6_PERCENT = {  # photons of the largest reading to NMSE, per cent
+TABLE6_PERCENT = {  # photons of the largest measurement to NMSE, per cent
     ("line", "blocks"): {400: 7.30, 1000: 6.54, 4000: 5.92, 10000: 6.01},
     ("line", "letters"): {400: 2.85, 1000: 2.66, 4000: 2.55, 10000: 2.53},
     ("single-pixel", "blocks"): {400: 57.88, 1000: 40.62, 4000: 20.58, 10000: 14.95},
@@ -103,7 +103,7 @@ TABLE6_PERCENT = {  # photons of the largest reading to NMSE, per cent
 
 
 def run_invalid_measurements(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Set a share of the measurements to 0 or to the largest; recover with squares, and with
+    """Set a fraction of the measurements to 0 or to the largest; recover with squares, and with
     Huber's term.
 
     Parameters
@@ -142,7 +142,7 @@ def run_invalid_measurements(library: Library, seeds: int, advance: Advance) -> 
 
 
 def run_few_photons(library: Library, seeds: int, advance: Advance) -> Outcome:
-    """Count photons, the largest reading so many.
+    """Count photons; the largest measurement has the number given.
 
     Parameters
     ----------

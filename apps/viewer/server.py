@@ -87,7 +87,7 @@ def parse_loopback(host: str) -> str:
     Raises
     ------
     InputError
-        Other computers could reach it. viser lets in whoever reaches it, so ssh has to decide.
+        Other computers could reach it. viser lets in everyone who reaches it, so ssh has to decide.
     """
     if host == "localhost":
         return LOOPBACK

@@ -40,7 +40,7 @@ def fill_poisson_words(state, now, scale, weights, last, words):
         Of the exponential distribution of which the whole part is the number of ticks between two
         photons.
     weights : (4,) float64 array
-        Of all photons, the share of each channel, added up.
+        Of all photons, the fraction of each channel, added up.
     last : int
         No record is later than this tick.
     words : bytes

@@ -106,7 +106,7 @@ class EmulatorSettings:
         Register CLEAR holds the memory empty until it is set to 0 again; otherwise any write clears
         once.
     holds_packets : bool
-        The USB chip sends a packet when it is full, or when told to; otherwise whenever asked.
+        The USB chip sends a packet when it is full, or when asked to; otherwise whenever asked.
     flush_discards : bool
         The request to flush throws an unfinished packet away; otherwise it sends it.
     stale_replies, old_records, jammed_bytes : int

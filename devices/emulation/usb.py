@@ -57,7 +57,7 @@ class VirtualDevice(abc.ABC):
         return self.enumerations_until_replug <= 0
 
     def unplug(self, looks: float) -> None:
-        """Take it off the bus for so many enumerations."""
+        """Take it off the bus for a number of enumerations."""
         self.enumerations_until_replug = looks
 
     def clear_halt(self, endpoint: int) -> None:

@@ -152,7 +152,7 @@ def add_tags(ticks, channels, flags, ignored, sync, known, pixel_of, scale, shif
     ticks, channels, flags : (n,) array
         One bit of `channels` for each channel that saw an edge.
     ignored : int
-        Flags of records that tell of no edges.
+        Flags of records that report no edges.
     sync : int
         The sync's bit.
     known : int

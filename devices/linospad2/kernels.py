@@ -54,7 +54,7 @@ def decode_stamps(cycles, header, first_cycle, pixel_of, records):
 
     Every word is written to the next free row, and only a valid one moves on to the row behind it:
     no branch that the processor could guess wrong. It ends with the last row, behind which there
-    are no valid words.
+    are not valid words.
 
     Parameters
     ----------

@@ -64,7 +64,7 @@ def read_sidecar(recording: str | Path) -> Sidecar:
     StorageError
         There is no such file.
     FileFormatError
-        It is no TOML, lacks a key, has one too many, or a value of another kind.
+        It is not TOML, lacks a key, has one too many, or a value of another kind.
     """
     path = Path(recording).with_suffix(".toml")
     values = _check_keys(_parse_toml(path, recording), path)

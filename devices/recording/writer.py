@@ -95,7 +95,7 @@ class RecordingWriter:
         self._number = 0
         self._end = 0
         self._bytes_since_head = 0
-        # Times by a clock that nobody sets, so that a replay at the recording's pace never waits
+        # Times by a clock that is never set, so that a replay at the recording's pace never waits
         # for a day that did not pass.
         self._clock_offset_ns = time_ns() - monotonic_ns()
         self._checked_at = monotonic()

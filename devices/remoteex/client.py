@@ -54,7 +54,7 @@ class RemoteExClient:
     """A connection to HPD-TA or HiPic. Not for two threads at once.
 
     A command that found no answer in time may still be carried out, so it is never sent again:
-    whoever asks next first waits for the answer that is owed.
+    the next command first waits for the answer that is owed.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class RemoteExClient:
     Raises
     ------
     DeviceNotFoundError
-        Nobody answers there.
+        Nothing answers there.
     ProtocolError
         Somebody else answers there.
     """

@@ -50,7 +50,7 @@ class LiveSettings:
         Pictures that HPD-TA keeps for a client that is late.
     gain : int or None
         Of the micro-channel plate, set before the start; None leaves it as it is. It is 0 after the
-        stop in any case: an intensified tube that nobody watches must not age in strong light.
+        stop in any case: an intensified tube that is not watched must not age in strong light.
     timeout : float
         Seconds to wait for an answer.
     reconnect : float

@@ -159,8 +159,8 @@ class Spad512Feed:
         return Transfer(memoryview(self.codec.pack_frame(self._number - 1, pixels)), gap)
 
     def _fill_buffer(self, length: int, timeout: float) -> None:
-        """Wait until `length` bytes came, a length that was computed, not told; what came in time
-        is kept.
+        """Wait until `length` bytes came, a length that was computed, not reported; what came in
+        time is kept.
         """
         deadline = monotonic() + timeout
         while len(self._received) < length:

@@ -66,7 +66,7 @@ class CounterState(NamedTuple):
 class TimeTagCodec:
     """Bytes of the time tagger to records and back.
 
-    A record is malformed if an unused bit is set, if it tells of nothing (no channel, no wrap), or
+    A record is malformed if an unused bit is set, if it reports nothing (no channel, no wrap), or
     if the counter goes back although it has not wrapped. After a loss, a counter that went back by
     more than half its range has wrapped.
 

@@ -153,7 +153,7 @@ class TimeTaggerFeed:
             else:
                 self._set_window(self._window.choose(length, monotonic() - begin))
                 if not length:
-                    continue  # an empty packet: the chip was told to send, and had nothing
+                    continue  # an empty packet: the chip was asked to send, and had nothing
                 self._bytes_since_gap += length
                 gap = self._gap
                 self._gap = Gap.NONE
@@ -210,7 +210,7 @@ class TimeTaggerFeed:
         self._must_clear = False
 
     def _reconnect(self, timeout: float) -> None:
-        """Look for the unplugged instrument, but return in time for whoever wants to stop."""
+        """Look for the unplugged instrument, but return in time for a caller that wants to stop."""
         try:
             self._link.reconnect(min(timeout, self._reconnect_time_left))
         except DeviceDisconnectedError as fault:

@@ -70,7 +70,7 @@ def read_capture(path: str | Path) -> Capture:
     FileFormatError
         It is empty, truncated, damaged, or of none of these formats.
     InputError
-        What it holds is no usable capture.
+        What it holds is not a usable capture.
     """
     capture = read_streak_folder(path) if Path(path).is_dir() else _read_file(path)
     if capture.provenance:

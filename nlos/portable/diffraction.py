@@ -59,7 +59,7 @@ class _DepthBlock:
 
 
 class PortableDiffraction:
-    """Fields on one plane carried to all depths of a grid, where they meet the laser's wave.
+    """Fields on one plane propagated to all depths of a grid, where they meet the laser's wave.
 
     Holding one is the cache: the second field of the same geometry needs no planning. Transfer
     functions and illuminations of all depths are kept up to 1 GiB (50 MB for 128 depths, 120

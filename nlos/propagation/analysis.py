@@ -12,7 +12,7 @@ from nlos.rsd.kernels import transpose
 from nlos.rsd.wall import WallLattice
 
 COLUMN_STEP = 8
-"""Plans for Fourier transforms of so many columns more."""
+"""Columns from one plan for Fourier transforms to the next."""
 
 
 class PlaneWaveAnalysis(Protocol):

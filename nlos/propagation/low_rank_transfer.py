@@ -27,7 +27,7 @@ CARRIER_FRACTION = 0.4
 """Wavenumber along z, relative to the band's highest, about which the waves vary least with depth."""
 
 EIGENVALUE_CUTOFF = 1e-10
-"""Combinations of depths that hold less than this share of the wall points are none."""
+"""Combinations of depths that hold less than this fraction of the wall points are none."""
 
 
 @dataclass(frozen=True, eq=False)

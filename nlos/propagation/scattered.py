@@ -25,7 +25,7 @@ UPSAMPLING = 1.25
 """Of the transforms' own grids; half as slow as the usual 2 for as few points as walls have."""
 
 INDEX_STEP = 8
-"""Plans for so many indices along an axis more serve several frequencies."""
+"""Indices along an axis from one plan to the next: a plan serves several frequencies."""
 
 POINT_S, WAVE_S = 2.5e-8, 9e-9
 """Seconds on one core per term, roughly, for a wall point and for a plane wave."""

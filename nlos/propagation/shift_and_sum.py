@@ -24,7 +24,7 @@ def propagate_in_time(
     legs: int,
     progress: Progress = ignore_progress,
 ) -> NDArray[np.complex64]:
-    """Return the band's phasors of transients carried onto a plane bin by bin.
+    """Return the band's phasors of transients propagated onto a plane bin by bin.
 
     Every signal arrives on the plane earlier by its way there, interpolated linearly between bins:
     an error of some

@@ -120,8 +120,8 @@ class WallToPlanePlan:
         return TERM_S + LATTICE_POINT_S * float(np.prod(self.lattice))
 
     def analysis(self, terms: int) -> PlaneWaveAnalysis:
-        """Return what analyses a field on the wall, up to so many terms at once; not to be shared
-        between threads.
+        """Return what analyses a field on the wall, up to a number of terms at once; not to be
+        shared between threads.
         """
         return LatticeAnalysis(self.wall, self.lattice, self.max_indices[1], terms)
 

@@ -50,7 +50,7 @@ class WaveGroups:
     """Plane waves of neighbouring lateral wavenumbers, with those mirrored in the axes.
 
     A group is `LANES` waves whose indices are not negative, and their `MIRROR_IMAGES` images. Waves
-    on an axis are images of themselves; a share of 0 marks repeated ones, and those that fill up
+    on an axis are images of themselves; a fraction of 0 marks repeated ones, and those that fill up
     the last group.
 
     Parameters

@@ -22,7 +22,7 @@ Field = NDArray[np.complex64]
 FloatParts = NDArray[np.float32]
 
 PLANES_PER_BLOCK = 2
-"""Depths that a group of plane waves is carried to while its spectrum is in cache."""
+"""Depths that a group of plane waves is propagated to while its spectrum is in cache."""
 
 HALF_RANGE_RATIO, MIN_HALF_RANGE_M = 1.05, 1e-3
 """Half the range of distances from the laser spot to a plane is rounded up to a power of the first, and at least the
@@ -109,8 +109,8 @@ def diffract_to_grid(
     total: NDArray[np.complex64],
     progress: Progress = ignore_progress,
 ) -> None:
-    """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r, S_k the field carried there
-    from the plane.
+    """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r, S_k the field propagated
+    there from the plane.
 
     Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight
     imaging systems", Nat. Commun. 11, 1645 (2020); the illumination is split per depth, so that few

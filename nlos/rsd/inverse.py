@@ -57,7 +57,7 @@ def choose_inverse(
     """Choose the quicker way: few voxels of a long period by matrix products, many by Fourier
     transforms.
 
-    Parameters are those of `InverseTransform`; a period that is no whole number of voxels leaves
+    Parameters are those of `InverseTransform`; a period that is not a whole number of voxels leaves
     matrix products only.
 
     Parameters

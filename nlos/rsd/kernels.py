@@ -109,7 +109,7 @@ def propagate_spectrum(spectrum, first, nodes, begin, offset, node_weights, coef
     some depths.
 
     The transfer function depends on a wave's lateral wavenumber alone and is interpolated between
-    its nodes, once for waves mirrored in the axes. A group is carried to all depths while its
+    its nodes, once for waves mirrored in the axes. A group is propagated to all depths while its
     spectrum is in cache, and nothing between spectrum and terms leaves it. Frequencies come in
     steps of `FREQUENCY_STEPS`.
 

@@ -156,7 +156,7 @@ class PlanarRSD(PhasorMethod):
 
     @property
     def settings(self) -> dict[str, str | float]:
-        """What a volume tells of how it was imaged."""
+        """How a volume was imaged, for its provenance."""
         return {
             "method": "rsd",
             "wavelength_m": self.wavelength,

@@ -17,7 +17,7 @@ def add_poisson_noise(
     Parameters
     ----------
     capture : Capture
-        Expected signal, not negative; its largest reading maps to `peak_counts`.
+        Expected signal, not negative; its largest measurement maps to `peak_counts`.
     peak_counts : float
         Expected counts in the brightest bin, without background.
     background : float

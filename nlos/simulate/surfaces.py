@@ -121,9 +121,7 @@ class Surface:
             try:
                 mesh = pyvista.read(path).triangulate()
                 vertices, faces = np.asarray(mesh.points), np.asarray(mesh.regular_faces)
-            except (
-                Exception
-            ) as fault:  # whatever the decoder stumbles over, it is the file that is no mesh
+            except Exception as fault:  # whatever the decoder stumbles over, the file is not a mesh
                 raise FileFormatError(
                     path, f"is no triangle mesh ({format_error_line(fault)})"
                 ) from fault

@@ -142,7 +142,7 @@ class Rectifier:
         ----------
         counts : (rows, columns) array
         saturated : (rows, columns) bool array, optional
-            A reading is bad if any raw pixel that contributes to it is.
+            A measurement is bad if any raw pixel that contributes to it is.
         dark : float, optional
             Counts; by default `estimate_dark_level` of the picture.
         delay : float

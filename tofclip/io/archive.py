@@ -23,7 +23,7 @@ class Archive:
     Raises
     ------
     StorageError, FileFormatError
-        The file cannot be read, is truncated, or is no NumPy archive.
+        The file cannot be read, is truncated, or is not a NumPy archive.
     """
 
     def __init__(self, path: str | Path) -> None:

@@ -161,8 +161,8 @@ def find_saturated_pixels(
 
 
 def parse_full_scale(metadata: Mapping[str, str]) -> float:
-    """Return the largest reading that the camera can give, in counts; infinity where the text does
-    not say.
+    """Return the largest measurement that the camera can give, in counts; infinity where the text
+    does not say.
 
     A sum over several exposures exceeds the converter's range, so that it says nothing there.
     """

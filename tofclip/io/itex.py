@@ -126,7 +126,7 @@ def decode_itex(data: bytes, path: str | Path = "ITEX picture") -> ItexImage:
     Raises
     ------
     FileFormatError
-        They are no ITEX file, or less than the header and the text say.
+        They are not an ITEX file, or less than the header and the text say.
     """
     if len(data) < _HEADER.size or not data.startswith(SIGNATURE):
         raise FileFormatError(path, "has no ITEX header")

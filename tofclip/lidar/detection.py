@@ -47,7 +47,7 @@ class Detection:
         Least intensity relative to the pixel's strongest return: leaves out echoes inside the
         instrument.
     max_returns : int
-        Maximum number returns in a pixel, the strongest.
+        Maximum number of returns in a pixel, the strongest.
 
     Raises
     ------

@@ -213,7 +213,7 @@ def fit_plane(cloud: PointCloud, reach: float, seed: int = 0) -> Plane:
     ----------
     cloud : PointCloud
     reach : float
-        Points within so many metres lie on the plane.
+        Points within this distance, m, lie on the plane.
     seed : int
 
     Returns

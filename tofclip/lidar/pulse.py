@@ -14,7 +14,7 @@ EXTENT_FWHM = 2.0  # a Gaussian is 1.5e-5 of its peak there
 EXTENT_DECAYS = 11.0  # an exponential is 1.7e-5 of its start there
 FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
 SAMPLES_PER_BIN = 64  # of a pulse that was summed over bins
-SUPPORT_THRESHOLD = 0.01  # below this share of its peak a pulse says nothing about where it is
+SUPPORT_THRESHOLD = 0.01  # below this fraction of its peak a pulse says nothing about where it is
 
 Table = tuple[NDArray[np.float64], tuple[float, float, float, float]]
 
@@ -111,7 +111,7 @@ class Pulse:
         """Return the shape that bins of `bin_width`, s, show: its light summed from half a bin
         before to half after.
 
-        Sampled at the middles of bins it is, up to one factor, each bin's share of the light.
+        Sampled at the middles of bins it is, up to one factor, each bin's fraction of the light.
         """
         if not (np.isfinite(bin_width) and bin_width > 0):
             raise InputError(f"the width of a bin must be a positive time, got {bin_width}")

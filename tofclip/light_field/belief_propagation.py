@@ -15,7 +15,7 @@ Array = NDArray[Any]
 
 MAX_ITERATIONS = 40
 MAX_LABEL_STEP = 3
-"""Labels so many steps apart cost no more: depth may jump at an object's border."""
+"""Labels this number of steps apart cost no more: depth may jump at an object's border."""
 
 
 def find_smooth_labels(

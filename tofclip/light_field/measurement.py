@@ -83,7 +83,7 @@ class ClipMeasurement(Storable):
     image_shape : (int, int)
     setup : CameraSetup
     photons_per_unit : float
-        What a reading of 1 means in counted photons; 0: not known.
+        What a measurement of 1 means in counted photons; 0: not known.
     provenance : mapping
         How they came about.
     """
@@ -126,7 +126,7 @@ class ClipMeasurement(Storable):
         Raises
         ------
         InputError
-            Nobody knows how many photons a measurement stands for.
+            The number of photons of a measurement is not known.
         """
         if self.photons_per_unit <= 0:
             raise InputError(
@@ -159,13 +159,13 @@ def measure(light_field: LightField, setup: CameraSetup) -> ClipMeasurement:
 def corrupt_measurement(
     measurement: ClipMeasurement, photons: float | None, bad_fraction: float
 ) -> ClipMeasurement:
-    """Add photon noise, then set a share of all measurements to 0 or to the largest, at random.
+    """Add photon noise, then set a fraction of all measurements to 0 or to the largest, at random.
 
     Parameters
     ----------
     measurement : ClipMeasurement
     photons : float or None
-        Photons of the largest reading; None: no noise.
+        Photons of the largest measurement; None: no noise.
     bad_fraction : float
         Between 0 and 1.
 

@@ -101,7 +101,7 @@ def make_coded_line(
         N_p, cells of the code in each row.
     angle : float
         Of the line from the vertical, rad; each row's cells are moved by ``row * tan(angle)``
-        columns, and shared between two columns where that is no whole number.
+        columns, and shared between two columns where that is not a whole number.
     random : numpy Generator
         Of the code.
 

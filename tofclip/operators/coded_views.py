@@ -21,7 +21,7 @@ class WeightedViews(LinearOperator):
     ----------
     image_shape : (int, int)
     weights : (exposures, views) array
-        w, what share of each view's light an exposure's mask lets pass.
+        w, what fraction of each view's light an exposure's mask lets pass.
     dtype : dtype
         float32 or float64.
 

@@ -37,8 +37,8 @@ class ApertureElement(Protocol):
     def trace_rays(
         self, v: Coordinates, u: Coordinates
     ) -> tuple[Coordinates, Coordinates, Coordinates]:
-        """Return what share of each ray passes, and by how many pixels it is deflected down and to
-        the right.
+        """Return what fraction of each ray passes, and by how many pixels it is deflected down and
+        to the right.
 
         Parameters
         ----------

@@ -63,7 +63,7 @@ class PitchedSensor(_Sensor):
     ----------
     plane_shape : (int, int)
     pitch_px : (float, float)
-        Distance from row to row and from column to column, at least 1. A pitch that is no whole
+        Distance from row to row and from column to column, at least 1. A pitch that is not a whole
         number reads the pixels nearest below the true places.
     offset_px : (float, float)
         First row and column that are read.

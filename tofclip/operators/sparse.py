@@ -277,7 +277,7 @@ def split_between_bins(
     Returns
     -------
     entry, bin, weight : (nonzeros,) arrays
-        Flat index into `position`, the bin, and the share of the light that it gets.
+        Flat index into `position`, the bin, and the fraction of the light that it gets.
     """
     left = np.floor(position).astype(np.int64)
     share = position - left

@@ -1,4 +1,4 @@
-"""At which shear each frame is recovered: one for all, the one that its time of flight tells, or
+"""At which shear each frame is recovered: one for all, the one that its time of flight says, or
 the sharpest.
 """
 
@@ -132,7 +132,7 @@ class FixedFocus:
 
 @dataclass(frozen=True)
 class DepthLockedFocus:
-    """Every frame at the shear of the range that its time of flight tells, s(c t / 2).
+    """Every frame at the shear of the range that its time of flight says, s(c t / 2).
 
     Frames whose shears put no view further off the slit than the tolerance share an operator. The
     light of a frame is expected to fall off as 1/range^2, and the prior's weight with it.

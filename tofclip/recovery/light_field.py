@@ -230,7 +230,7 @@ def recover_light_field(
     Raises
     ------
     InputError
-        The views are no complete grid, row by row.
+        The views are not a complete grid, row by row.
     """
     camera = measurement.camera()
     grid = _view_grid_shape(measurement.views)

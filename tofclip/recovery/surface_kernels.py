@@ -1,8 +1,9 @@
 """The compiled products of the surface model: amplitudes to a raw streak image, and back.
 
 Light of one surface point falls, in each view, on a few columns and on the rows of its pulse; its
-share of a reading is the product of a share along the slit and one along time. Both are kept for
-each point and view, (points, views, ...), so that neither the matrix nor its transpose is stored.
+fraction of a measurement is the product of a share along the slit and one along time. Both are kept
+for each point and view, (points, views, ...), so that neither the matrix nor its transpose is
+stored.
 """
 
 from __future__ import annotations

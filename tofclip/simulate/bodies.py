@@ -231,7 +231,7 @@ class Lambertian:
         return found
 
     def is_solid(self, place: Array) -> Array:
-        """Tell where there is no hole."""
+        """Return where there is no hole."""
         return np.isfinite(self.reflectance(place))
 
     def radiance(self, place: Array, normal: Array, directions: Array, light: Array) -> Array:

@@ -23,10 +23,10 @@ def score_returns(returns: Returns, truth: GroundTruth) -> dict[str, float]:
     -------
     dict
         ``median_depth_error_m``: median absolute range error of the target pixels that have a
-        return; ``share_within_one_bin``: share of all target pixels whose return is within ``c *
+        return; ``share_within_one_bin``: fraction of all target pixels whose return is within ``c *
         bin_width / 2`` of the truth, so that a missing return counts against it;
-        ``share_with_return``: share of the target pixels that have a return;
-        ``false_return_share``: share of all returns that lie more than a pixel away from anything
+        ``share_with_return``: fraction of the target pixels that have a return;
+        ``false_return_share``: fraction of all returns that lie more than a pixel away from anything
         in the scene; ``bin_m``: ``c * bin_width / 2``.
 
     Raises

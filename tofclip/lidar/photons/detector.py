@@ -25,7 +25,7 @@ HISTOGRAMS_PER_BATCH = 2000
 DENSE_PHOTONS_PER_BIN = (
     8  # with more photons a bin, drawing the bins is quicker than throwing the photons
 )
-MAX_EXACT_PHOTONS = 40  # up to so many photons every number has a threshold of its own
+MAX_EXACT_PHOTONS = 40  # up to this number of photons every one has a threshold of its own
 PHOTON_LEVEL_RATIO = 1.03  # beyond, numbers that differ by less share one
 PULSE_CUTOFF = 1e-4  # of its peak: what a pulse brings beyond it is not worth the bins
 HISTOGRAMS_PER_BLOCK = 256
@@ -78,10 +78,10 @@ class PhotonDetector:
     false_alarm_rate : float
         Share of the histograms without a return in which one is announced, 0.001 or more.
     max_returns : int
-        Maximum number returns of one histogram. Two are told apart when they are further apart
+        Maximum number of returns of one histogram. Two are separated when they are further apart
         than the pulse's support.
     min_photons : float
-        The filter is the most powerful one for returns of so many photons; stronger ones pass it
+        The filter is the most powerful one for returns of this number of photons; stronger ones pass it
         anyway.
 
     Raises
@@ -139,7 +139,9 @@ class PhotonDetector:
         return int(self._offsets[0])
 
     def weights(self, background: float) -> FloatArray:
-        """Log-matched filter for the weakest return on a background of so many photons a bin."""
+        """Log-matched filter for the weakest return on a background of a given number of photons
+        per bin.
+        """
         share = self.shape(self._offsets * self.bin_width) * self.bin_width / self.shape.area
         return np.log1p(self.min_photons * share / background)
 
@@ -148,7 +150,9 @@ class PhotonDetector:
         return {}
 
     def threshold(self, photons: int) -> float:
-        """Least score of a return in a histogram of so many photons, by simulation; remembered."""
+        """Least score of a return in a histogram of a given number of photons, by simulation;
+        remembered.
+        """
         from tofclip.lidar.photons.kernels import find_best_scores, simulate_best_scores
 
         if photons not in self._threshold_cache:
@@ -228,7 +232,9 @@ class PhotonDetector:
         return peaks, numbers
 
     def _build_table(self, levels: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
-        """Thresholds and filters for so many photons in a histogram; an empty one has none to pass."""
+        """Thresholds and filters for a given number of photons in a histogram; an empty one has
+        none to pass.
+        """
         thresholds = np.array([self.threshold(int(n)) if n else np.inf for n in levels])
         return thresholds, np.array([self.weights(max(n, 1) / self.bins) for n in levels])
 

@@ -359,7 +359,7 @@ def pool_neighbours(counts, label, reach, apart, pooled, contributors):
     label : (rows, columns) int64 array
         Bin of the return.
     reach : int
-        Neighbours up to so many pixels away.
+        Neighbours up to this number of pixels away.
     apart : int
         Neighbours whose bins differ by more for each pixel of distance lie on another surface.
     pooled : (rows, columns, bins) float64 array, overwritten

@@ -215,7 +215,7 @@ class Scene:
     background: float
 
     def scale(self, fraction: float) -> Scene:
-        """Return what remains with a share of the photons."""
+        """Return what remains with a fraction of the photons."""
         return Scene(self.response, self.background * fraction)
 
     def count_signal(self, photons: PhotonImage) -> float:
@@ -247,7 +247,7 @@ def estimate_surface(
     seed : int
         Of the choice of the photons that are held back.
     progress : callable, optional
-        Called with the share of the work that is done.
+        Called with the fraction of the work that is done.
 
     Returns
     -------

@@ -1,7 +1,7 @@
 """The search for returns: from each pixel's brightness over time to when light came back, how much,
 and how surely.
 
-A recovered frame is no photon count: it went through an inverse problem, whose errors are spread
+A recovered frame is not a photon count: it went through an inverse problem, whose errors are spread
 over pixels and bins and are nearly even in time. For such errors the least-squares fit of the pulse
 is the maximum-likelihood estimate, so candidates are judged by the matched filter and refined by
 Gauss-Newton steps of that fit, below a bin. Histograms of counted photons are for
@@ -68,7 +68,7 @@ class ReturnSearch:
         What counts as a return.
     pulse : Pulse, optional
         Shape of a single return; by default a Gaussian as wide as ``camera.pulse_fwhm``. Two
-        returns of similar strength are told apart from 1.3 widths on.
+        returns of similar strength are separated from 1.3 widths on.
     shears : (time,) array, optional
         Shear at which each frame is recovered, pixels per view step; 0 by default.
 

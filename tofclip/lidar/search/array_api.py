@@ -282,7 +282,7 @@ class PeakSearch:
         """Yield bin and score of each trace's highest maximum, then of the highest that keeps its
         distance, and so on.
 
-        The first and the last bin are no maxima, for whatever rises towards them has its maximum
+        The first and the last bin are not maxima, for whatever rises towards them has its maximum
         outside.
         """
         xp = namespace(traces)

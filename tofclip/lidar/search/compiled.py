@@ -51,7 +51,7 @@ def find_returns(traces, pixels, times, bin_weights, filters, pulse, limits, fou
     pulse : tuple
         See `Pulse.kernel_table`.
     limits : (float, float, float)
-        Smallest distance between two returns, s, smallest signal-to-noise, and smallest share of
+        Smallest distance between two returns, s, smallest signal-to-noise, and smallest fraction of
         the strongest return, with the fall-off with range undone.
     found : (all pixels, most returns, 3) float64 array, overwritten where `pixels` says
         Instant, sum of the fitted pulse over the bins, standard deviation of the instant; nearest
@@ -457,7 +457,7 @@ def compute_mean_and_deviation(total, square, bins):
 def find_highest(values):
     """Return where the first of the highest values stands."""
     place, highest = 0, values[0]
-    for other in range(1, values.size):  # without a branch, whose way nobody could foretell
+    for other in range(1, values.size):  # without a branch, which could not be predicted
         higher = values[other] > highest
         place, highest = other if higher else place, values[other] if higher else highest
     return place

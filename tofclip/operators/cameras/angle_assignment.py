@@ -11,11 +11,14 @@ from tofclip.errors import InputError
 from tofclip.operators.shear import View
 
 CORRELATION_LENGTH_PX = 12
-"""Neighbours on a line detector whose errors are alike: what is out of focus is some ten pixels wide.
+"""Neighbours on a line detector whose errors are alike: what is out of focus is some ten pixels
+wide.
 
-A weight chosen by leaving out so many together comes nearer to the best one than by leaving out single pixels, which
-their neighbours betray, or whole lines, which nothing else measures (letters at SR 1 and 0.5: 1.6 and 3.0 % NMSE with
-angles dealt evenly, against 4.0 and 4.0 % from whole lines)."""
+A weight chosen by leaving out this number together comes nearer to the best one than by leaving out
+single pixels, which their neighbours betray, or whole lines, which nothing else measures (letters
+at SR 1 and 0.5: 1.6 and 3.0 % NMSE with angles dealt evenly, against 4.0 and 4.0 % from whole
+lines).
+"""
 
 AngleAssignment = tuple[tuple[int, ...], list[NDArray[np.float64]]]
 """Numbers of the views that get any directions, and each one's own."""
@@ -77,12 +80,12 @@ def assign_evenly(
 ) -> AngleAssignment:
     """Deal so that neighbouring directions look from places spread evenly over the aperture.
 
-    A surface out of focus moves along a detector of direction a by its own share of ``t = u cos(a)
-    + v sin(a)``. In the picture that refocusing makes it is blurred over all t; a detector sees it
-    at one. Where neighbouring directions, which measure much the same, have values of t that
-    together stand for all of them, the surface is blurred as it should be instead of being torn
-    into streaks. So the views are ranked by t for each direction, and each direction gets the one
-    nearest to its place in a cycle of places spread evenly, alternately on either side of the
+    A surface out of focus moves along a detector of direction a by its own fraction of ``t = u
+    cos(a) + v sin(a)``. In the picture that refocusing makes it is blurred over all t; a detector
+    sees it at one. Where neighbouring directions, which measure much the same, have values of t
+    that together stand for all of them, the surface is blurred as it should be instead of being
+    torn into streaks. So the views are ranked by t for each direction, and each direction gets the
+    one nearest to its place in a cycle of places spread evenly, alternately on either side of the
     middle; no view gets two directions more than another. Which views that are is an assignment
     problem.
 

@@ -72,7 +72,7 @@ class ApertureMaskCamera(CompressiveCamera):
 
     @abstractmethod
     def weights(self) -> NDArray[np.float64]:
-        """Return the share of each view's light that each mask lets pass, (exposures, views)."""
+        """Return the fraction of each view's light that each mask lets pass, (exposures, views)."""
 
     def _build_encoders(self) -> tuple[LinearOperator, ...]:
         sensor, even = DenseSensor(self.image_shape), np.ones(self.image_shape)

@@ -70,7 +70,7 @@ class JobPool:
         return self._slots
 
     def _collect_report(self, future: Future[Any], job: Job) -> Report | None:
-        """Return a job's own report, or tell what kept it from making one."""
+        """Return a job's own report, or say what kept it from making one."""
         from distributed import KilledWorker
 
         try:

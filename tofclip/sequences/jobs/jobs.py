@@ -1,4 +1,4 @@
-"""A job, how it is attempted, and what is told about many of them."""
+"""A job, how it is attempted, and what is reported about many of them."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Report:
     process : str
         Which process did it; empty where none did.
     peak_bytes : int
-        Most memory that this process has held so far; 0 where the system does not tell.
+        Most memory that this process has held so far; 0 where the system does not report it.
     """
 
     name: str
@@ -128,7 +128,7 @@ def select_unfinished(jobs: Iterable[Job]) -> list[Job]:
 
 
 def run_job(job: Job) -> Report:
-    """Do a job unless its result is there; whatever goes wrong is told in the report, so that the
+    """Do a job unless its result is there; whatever goes wrong is reported, so that the
     others go on.
 
     The libraries of linear algebra get one thread: with more, they round differently, and jobs
@@ -149,7 +149,7 @@ def run_job(job: Job) -> Report:
 
 
 def measure_peak_memory_bytes() -> int:
-    """Most memory that this process has held so far; 0 where the system does not tell."""
+    """Most memory that this process has held so far; 0 where the system does not report it."""
     try:
         import resource
     except ImportError:  # Windows

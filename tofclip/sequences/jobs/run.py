@@ -16,7 +16,8 @@ def run_jobs(
     cluster: str | None = None,
     on_report: Callable[[Report], object] | None = None,
 ) -> Summary:
-    """Attempt every job once; one that fails is told in the summary and stops none of the others.
+    """Attempt every job once; one that fails is reported in the summary and stops none of the
+    others.
 
     Parameters
     ----------

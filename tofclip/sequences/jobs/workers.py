@@ -30,7 +30,7 @@ def connect_workers(where: str) -> Iterator[Client]:
     Parameters
     ----------
     where : str
-        ``local``: one worker for each core of this machine; ``local:N``: so many, which share the
+        ``local``: one worker for each core of this machine; ``local:N``: N workers, which share the
         cores; ``tcp://HOST:PORT`` or ``tls://HOST:PORT``: a scheduler (``dask scheduler``), whose
         workers (``dask worker``) have this version of this program and see the files under the same
         names.
@@ -82,7 +82,7 @@ def _start_local_cluster(distributed: Any, number: int) -> Iterator[Client]:
                 n_workers=number,
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address="127.0.0.1:0",  # nobody else may look
+                dashboard_address="127.0.0.1:0",  # no one else may look
                 silence_logs=logging.CRITICAL,
                 env={THREADS_VARIABLE: threads},
             )
@@ -142,7 +142,7 @@ def _shield_children_from_interrupt() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _silence_log() -> Iterator[None]:
-    """Keep the library's log off the screen: what matters is told in the summary."""
+    """Keep the library's log off the screen: what matters is in the summary."""
     logger = logging.getLogger("distributed")
     before = logger.level
     logger.setLevel(logging.CRITICAL)

@@ -9,7 +9,7 @@ from typing import Generic, Literal, TypeVar
 from tofclip.errors import InputError
 
 Policy = Literal["block", "drop_oldest"]
-"""What happens to a full channel: whoever puts waits, or what has waited longest is dropped."""
+"""What happens to a full channel: the producer waits, or what has waited longest is dropped."""
 
 POLICIES: tuple[Policy, ...] = ("block", "drop_oldest")
 
@@ -17,7 +17,7 @@ Entry = TypeVar("Entry")
 
 
 class ChannelClosedError(Exception):
-    """Nobody takes entries any more."""
+    """No consumer takes entries any more."""
 
 
 class Channel(Generic[Entry]):

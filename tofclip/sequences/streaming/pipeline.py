@@ -27,7 +27,7 @@ class StreamedCloud:
     shot : int
         Number of its shot in the source, from 0; what was dropped has been counted.
     seconds : mapping
-        What each stage took: ``"read"`` (the source, which is no latency), ``"wait"`` (until its
+        What each stage took: ``"read"`` (the source, which is not latency), ``"wait"`` (until its
         turn came), ``"rectify"``, ``"recover"``, ``"range"`` and ``"place"``.
     latency : float
         Time from when the shot was there until its cloud was handed out, s.

@@ -42,7 +42,7 @@ class StreamItem:
         What the last stage made of it.
     seconds : dict
         Time that each stage took, by name; also ``"read"``, which the source took to bring it and
-        which is no latency, and ``"wait"``, spent between stages.
+        which is not latency, and ``"wait"``, spent between stages.
     """
 
     number: int

@@ -46,7 +46,7 @@ class PulsedScene:
     Raises
     ------
     InputError, ShapeError
-        There is no body, or the lamps are no list of places.
+        There is no body, or the lamps are not a list of places.
     """
 
     bodies: tuple[Body, ...]
