@@ -239,6 +239,7 @@ class _Batch:
         # A brick of its own, because a contiguous array lets one compiled version serve every piece
         # of a volume.
         brick = np.zeros(field.shape, np.complex64)
+        # the loop divides by the distance already
         powers = np.array([1 - self.weighting.falloff, self.weighting.obliquity], np.float32)
         add_backprojection(values, start, spacing, self.wall, self.lasers, *axes, powers, brick)
         field += brick
@@ -246,6 +247,7 @@ class _Batch:
 
 def _add_batch(batch: _Batch, grid: Grid, total: NDArray[np.complex64], progress: Progress) -> None:
     """Add a batch of wall points to the whole volume, brick by brick, on all threads."""
+    # bricks, not planes: the paths of neighbouring voxels look up neighbouring samples
     bricks = list(
         itertools.product(
             split_blocks(grid.z.size, BRICK_Z),

@@ -97,6 +97,7 @@ class LowRankTransfer:
             half,
             INTERPOLATION_ERROR_FRACTION * self.tolerance,
         )
+        # Chebyshev nodes: interpolation between them is close to the best polynomial's
         return middle + half * np.cos(np.pi * (np.arange(count) + 0.5) / count)
 
     @property
@@ -118,10 +119,13 @@ class LowRankTransfer:
             2 / count
         )
         at_nodes[0] /= 2
+        # Lagrange polynomials of the nodes, at the points' distances
         weights = np.polynomial.chebyshev.chebvander(places, count - 1) @ at_nodes
+        # orthogonal combinations: distances where no point lies get no term of their own
         values, vectors = np.linalg.eigh(weights.T @ weights / len(weights))
         kept = values > EIGENVALUE_CUTOFF * values[-1]
         root = np.sqrt(values[kept])
+        # a carrier wave is taken off, so that less phase is left to interpolate
         from_nodes = (
             vectors[:, kept]
             * root
@@ -138,6 +142,7 @@ class LowRankTransfer:
         samples = np.empty(
             (self.nodes.size, self.transfer.nodes.size, self.lateral_limits.size), np.complex64
         )
+        # computed once here, before threads ask for it
         _ = self.transfer.bessel_matrix
 
         def sample(some: slice) -> None:
@@ -154,6 +159,7 @@ class LowRankTransfer:
         """Energies, increasing, and combinations of `_distance_basis` (n, n) that carry them."""
         # The nodes are closer than energies need.
         lateral = np.maximum(self.transfer.nodes[:: int(NODE_OVERSAMPLING)], 0)[:, np.newaxis]
+        # a ring of lateral wavenumbers holds waves in proportion to its radius
         weights = np.sqrt(lateral * (lateral <= self.lateral_limits[group])) * self.strength[group]
         weighted = self._transfer_table[:, :: int(NODE_OVERSAMPLING), group] * weights.astype(
             np.float32
@@ -175,6 +181,7 @@ class LowRankTransfer:
         run_blocks(decompose, len(self.groups), size=1)
         every = np.sort(np.concatenate([values for values, _ in energies]))
         allowed = (TERMS_ERROR_FRACTION * self.tolerance) ** 2 * every.sum()
+        # the weakest term kept: all below it hold the allowed energy, over all groups together
         weakest = every[np.searchsorted(np.cumsum(every), allowed)]
         return [vectors[:, values >= min(weakest, values[-1])] for values, vectors in energies]
 

@@ -66,6 +66,8 @@ class HiddenToWall(LinearOperator):
             plan, build_source(group, band), self._complex_dtype
         )
         area = float(np.prod(plan.plane.steps))
+        # sqrt(G_k) of the class's formula, and the area that a point of the virtual plane stands
+        # for
         self._strength = (np.sqrt(band.weights) * area).astype(self.dtype)
 
     def _forward(self, block: Array) -> Array:
@@ -75,6 +77,7 @@ class HiddenToWall(LinearOperator):
         return self._apply_per_frame(self._to_volume, block)
 
     def _to_phasors(self, volume: Array) -> Array:
+        # the adjoint of a wave that runs out is one that runs in: conjugate, propagate, conjugate
         waves = self._depths.to_plane(volume).reshape(-1, self.wavenumbers.size).conj()
         phasors = propagate_spherical_waves(
             self.plane.points.reshape(-1, 3), waves, self.points, self.wavenumbers
@@ -85,6 +88,7 @@ class HiddenToWall(LinearOperator):
         phasors = (
             measurements.view(self._complex_dtype).reshape(len(self.points), -1) * self._strength
         )
+        # the same sum with points and plane exchanged: a wave from r to s is one from s to r
         waves = propagate_spherical_waves(
             self.points, phasors, self.plane.points.reshape(-1, 3), self.wavenumbers
         )
@@ -158,6 +162,7 @@ class WallModel:
         strength = np.sqrt(self._band.weights)
         parts = []
         for group, group_capture in self._groups:
+            # L^2, or L^3 if confocal, as the class explains
             path_weight = (self.capture.axis.paths ** (group.legs + 1)).astype(np.float32)
             phasors = np.ascontiguousarray(
                 self._band.compute_phasors(group_capture.traces() * path_weight) / strength,
@@ -171,6 +176,7 @@ class WallModel:
     ) -> LinearOperator:
         plan = plan_outgoing_diffraction(self.hybrid, group_capture, self.grid, self._band)
         bare = HiddenToWall(group_capture.points, plan, group, self._band, dtype)
+        # volumes are divided by the mean laser distance, but each group has its own
         return bare @ Diagonal(self.laser_distance / self._compute_laser_distance(group), dtype)
 
     def _compute_laser_distance(self, group: IlluminationGroup) -> FloatArray:
@@ -182,6 +188,7 @@ class WallModel:
 
 def _select_group(capture: Capture, group: IlluminationGroup) -> Capture:
     """Return what one exposure recorded as a capture of its own."""
+    # the group becomes a capture of its own, confocal ones with a spot for each point
     points = capture.points[group.indices]
     laser = points if group.laser is None else group.laser
     signal = np.ascontiguousarray(capture.traces()[group.indices].T)

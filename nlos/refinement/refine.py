@@ -45,6 +45,7 @@ def build_total_variation(
     """
     across = axis_step(grid.x) if grid.x.size > 1 else 1.0
     along = axis_step(grid.z) if grid.z.size > 1 else across
+    # depths take the place of views; differences along z count by their distance in metres
     return LightFieldVariation(weight, iterations, grid=(grid.z.size, 1), angular=across / along)
 
 
@@ -143,6 +144,7 @@ class Refinement:
             "iterations": result.iterations,
             "stopped_because": result.stop_reason,
         }
+        # the solver's unknown is the albedo over the laser's distance
         albedo = (result.frames[0] * model.laser_distance).astype(np.float32)
         return Volume(albedo, grid, {**capture.provenance, "imaging": settings})
 

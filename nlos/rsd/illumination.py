@@ -73,6 +73,7 @@ def split_illumination(
     """
     # Even and odd functions are known by their values at the positive half of the nodes.
     angles = np.pi * (np.arange(CHEBYSHEV_NODES // 2) + 0.5) / CHEBYSHEV_NODES
+    # cos is the even and sin the odd part of exp(1j * phase)
     phase = np.outer(np.cos(angles), half * detuning)
     kept = [_find_leading_functions(wave(phase), strength, tolerance) for wave in (np.cos, np.sin)]
     table = np.concatenate(
@@ -107,6 +108,7 @@ def _build_continuation_matrix(odd: int) -> FloatArray:
     series.
     """
     angles = np.pi * (np.arange(CHEBYSHEV_NODES // 2) + 0.5) / CHEBYSHEV_NODES
+    # even functions have Chebyshev polynomials of even order only, odd ones of odd order
     orders = 2 * np.arange(len(angles)) + odd
     series = (2 / len(angles)) * np.cos(np.outer(orders, angles))
     if not odd:

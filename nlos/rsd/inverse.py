@@ -116,6 +116,7 @@ class InverseProduct:
     def transform(self, terms: slice) -> None:
         """Turn the first spectra into the images of these terms."""
         for spectrum, image in zip(self.spectra, self.images[terms], strict=False):
+            # the transform is separable: y first, for every index along x
             half = spectrum[: self.spare].reshape(self._shape) @ self._along_y
             np.matmul(half.T, self._along_x, out=image)
 
@@ -170,6 +171,7 @@ class InverseTransform:
         count = terms.stop - terms.start
         along_y, along_x = self._get_plans(count)
         along_y.execute()
+        # only the rows that voxels lie in are transformed along x
         wanted, columns = self._middle.shape[1], self._lines.shape[1]
         lines, middles = self._lines.view(np.float64), self._middle.view(np.float64)
         for line, middle in zip(lines[:count], middles, strict=False):
@@ -189,6 +191,7 @@ class InverseTransform:
 
 
 def _count_per_batch(cells: int, terms: int) -> int:
+    # spectra that stay in cache between the two transforms
     return max(1, min(terms, CACHE_BYTES // (8 * cells)))
 
 

@@ -102,6 +102,7 @@ class TransferFunction:
         smaller radii.
         """
         fastest = self.waves.max_wavenumber + self.max_lateral_wavenumber
+        # the fastest phase along the radius is that of wave and Bessel function together
         h = min(2 * np.pi / (fastest * RADII_PER_PERIOD), self.min_distance)
         t = np.arange(-8.0, self.window.outer_radius / h + 1)
         radii = h * np.logaddexp(0, t)
@@ -116,6 +117,7 @@ class TransferFunction:
         ramp = (radii - self.window.inner_radius) / (
             self.window.outer_radius - self.window.inner_radius
         )
+        # erfc has a spectrum that falls like a Gaussian: little ringing at the window's edge
         falling = np.where(ramp <= 1, erfc(WINDOW_STEEPNESS * (2 * ramp - 1)) / 2, 0)
         return np.asarray(j0(np.outer(self.nodes, radii)) * (weights * falling), np.float32)
 
@@ -161,6 +163,7 @@ class TransferFunction:
             leading_zeros,
             waves,
         )
+        # the Hankel transform as one matrix product for all frequencies
         flat = self.bessel_matrix @ waves.reshape(radii.size, -1)
         nodes: NDArray[np.float32] = flat.reshape(-1, *waves.shape[1:])
         return nodes

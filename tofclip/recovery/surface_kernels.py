@@ -37,10 +37,13 @@ def split_over_time(row, sigma, first, shares, slopes):
             below, density = 0.0, 0.0
             for edge in range(reach + 1):
                 z = (start + edge - 0.5 - middle) / width
+                # the Gaussian's integral up to the edge; its difference over a bin is the bin's
+                # fraction
                 upto = 0.5 * (1.0 + math.erf(z * 0.7071067811865476))
                 here = math.exp(-0.5 * z * z) * 0.3989422804014327 / width
                 if edge > 0:
                     shares[point, view, edge - 1] = upto - below
+                    # derivative of that fraction with the arrival time
                     slopes[point, view, edge - 1] = density - here
                 below = upto
                 density = here
@@ -66,6 +69,7 @@ def split_over_slit(position, tangent, subrows, first, shares):
     reach = shares.shape[2]
     for point in range(position.shape[0]):
         for view in range(position.shape[1]):
+            # a row of the picture is projected to tan(angle) slit pixels
             spread = abs(tangent[view])
             start = int(np.floor(position[point, view] - 0.5 * spread))
             first[point, view] = start
@@ -94,6 +98,7 @@ def add_light(amplitude, gains, first_row, time_shares, first_column, slit_share
     """
     rows, columns = image.shape
     for point in range(amplitude.size):
+        # most points of a volume are dark
         if amplitude[point] == 0:
             continue
         for view in range(gains.size):
