@@ -145,6 +145,8 @@ class Band:
         """Length of the Fourier transform, bins."""
         from scipy.fft import next_fast_len
 
+        # the record and the pulse's tails on both sides, so that it does not wrap around into
+        # itself
         return int(next_fast_len(self.axis.bins + 2 * self.tail_bins, real=True))
 
     @cached_property
@@ -152,6 +154,7 @@ class Band:
         """Indices of the band's frequencies in the transform, without 0 and without the Nyquist
         frequency.
         """
+        # without zero frequency and Nyquist's, which have no phase
         indices = np.arange(1, (self.period_bins + 1) // 2)
         return indices[
             self.pulse.spectrum(indices * self._fundamental_wavenumber) >= BAND_EDGE_LEVEL
@@ -173,6 +176,7 @@ class Band:
         Scaled so that a signal ``cos(k * L)`` of the carrier gives phasors that add up to ``exp(1j
         * k * L)``.
         """
+        # 2 / n: positive frequencies stand for both signs of a real signal
         return self.pulse.spectrum(self.wavenumbers) * (2 / self.period_bins)
 
     def compute_phasors(self, traces: NDArray[Any]) -> NDArray[Any]:
@@ -220,6 +224,7 @@ class Band:
         """
         phases = np.outer(self.axis.spacing * np.arange(BLOCK_BINS), self.wavenumbers)
         waves = np.exp(-1j * phases)
+        # within a block all waves of the band are combinations of a few shapes
         shapes, strengths, _ = np.linalg.svd(
             np.concatenate([waves.real, waves.imag], axis=1), full_matrices=False
         )

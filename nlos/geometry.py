@@ -117,6 +117,7 @@ class Grid:
         if near is None:
             near = middle + voxel
         if far is None:
+            # light of the longest path has turned back at half of it at the latest
             far = middle + min(float(capture.axis.paths[-1]) / 2, MAX_DEPTH_WALL_WIDTHS * width)
         if far < near:
             raise InputError(

@@ -71,6 +71,7 @@ class Plane:
 
 def axis_step(axis: FloatArray) -> float:
     """Distance of neighbouring entries of an evenly spaced axis."""
+    # from end to end, where rounding of single points matters least
     return float(axis[-1] - axis[0]) / (axis.size - 1)
 
 

@@ -143,6 +143,7 @@ class PortableDiffraction:
             + planes.axial_distance
         )
         start, per_metre = planes.table_position
+        # linear interpolation in the table of illumination functions
         place = xp.clip(start + longer * per_metre, 0.0, None)
         samples = planes.table.shape[0] // planes.axial_distance.shape[0]
         before = xp.clip(xp.astype(place, xp.int64), None, samples - 2)
@@ -200,6 +201,8 @@ class PortableDiffraction:
         ahead = np.abs(depths - (0.0 if self.source.laser is None else self.source.laser[2]))
         spans = np.array([light.span for light in lights])
         per_metre = (len(lights[0].table) - 1) / np.maximum(spans[:, 1] - spans[:, 0], 1e-12)
+        # whole turns are taken off in double precision, before single precision would lose the
+        # fraction
         turns = remove_whole_turns(self.source.centre_wavenumber / (2 * np.pi) * ahead)
         ends = (ahead, turns, (ahead - spans[:, 0]) * per_metre, per_metre)
         far, turned, start, scale = (put(values[:, np.newaxis, np.newaxis]) for values in ends)
@@ -277,5 +280,6 @@ def _stack_illuminations(
     for i, light in enumerate(lights):
         count = light.coefficients.shape[1]
         coefficients[i, :, :count], table[i, :, :count] = light.coefficients, light.table
+        # odd functions carry a factor 1j
         coefficients[i, :, light.even : count] *= 1j
     return coefficients, table.reshape(-1, max_terms)

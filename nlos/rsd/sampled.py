@@ -49,6 +49,7 @@ def diffract_by_convolution(
         raise InputError(
             "the sampled wave is that of points, at voxels as far from each other as the points"
         )
+    # linear convolution: a period as long as both together
     lattice = tuple(a + b - 1 for a, b in zip(plane.shape, grid.shape[1:], strict=True))
     spectrum = fft2(values.astype(np.complex128), lattice, axes=(0, 1))
     wavenumbers = waves.first + waves.step * np.arange(waves.count)
@@ -65,5 +66,6 @@ def diffract_by_convolution(
         kernel = np.exp(1j * path[..., np.newaxis] * wavenumbers) / path[..., np.newaxis]
         full = ifft2(spectrum * fft2(kernel, axes=(0, 1)), axes=(0, 1))
         rows, columns = plane.shape
+        # offsets before the first voxel belong to the lattice, not to the grid
         field[:, i] = np.moveaxis(full[rows - 1 :, columns - 1 :], -1, 0)
     return field

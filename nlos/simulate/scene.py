@@ -81,6 +81,7 @@ class HiddenScene:
         )
         normals = compute_wall_normals(wall)[dark.valid]
         if len(dark.lasers) == 1:
+            # the laser spot lies on the wall: it has the normal of the wall point next to it
             nearest = int(np.argmin(np.linalg.norm(dark.points - dark.laser, axis=1)))
             laser_normals = normals[nearest : nearest + 1]
         else:
@@ -110,6 +111,7 @@ class HiddenScene:
             seen = gaussian_filter1d(
                 bins, sigma / fine, axis=1, mode="constant", truncate=RESPONSE_SIGMAS
             )
+            # fine bins, blurred by the response, are added up to the record's
             whole = seen.reshape(len(bins), -1, BIN_OVERSAMPLING).sum(axis=2)
             traces[some] = whole[:, margin : margin + axis.bins]
 

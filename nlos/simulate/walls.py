@@ -80,6 +80,7 @@ def compute_wall_normals(wall: FloatArray) -> FloatArray:
     down, right = np.gradient(wall, axis=(0, 1))
     found = np.cross(right, down)
     found /= np.linalg.norm(found, axis=-1, keepdims=True)
+    # normals point into the scene, towards +z
     return np.where(np.isfinite(found), found * np.sign(found[..., 2:]), normals)
 
 

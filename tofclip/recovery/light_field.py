@@ -192,6 +192,7 @@ class ClipRecovery:
             method = _make_robust(method, problem)
         if self.weight is not None:
             return method
+        # neighbours on a detector are left out together, or they would predict each other
         weight = choose_weight(
             method, problem.model, problem.measurements[:, 0], problem.correlation_length
         ).weight
@@ -268,6 +269,7 @@ class _InverseProblem:
 
 def _make_robust(method: ProximalMethod, problem: _InverseProblem) -> ProximalMethod:
     """Return the method with Huber's term, its threshold from the errors that a narrow one leaves."""
+    # least squares first; then Huber's term, whose threshold follows the errors it leaves
     looking = method
     for _ in range(THRESHOLD_PASSES):
         seen = looking.recover(problem.model, problem.measurements).frames[0]

@@ -135,6 +135,7 @@ def split_gates_by_brightness(
         Metres.
     """
     light = np.maximum((measurement.values * measurement.valid).sum(axis=0, dtype=np.float64), 0)
+    # the root, so that a bright near surface does not take all gates
     share = np.cumsum(np.sqrt(light)) / np.sqrt(light).sum()
     edges = np.searchsorted(share, np.arange(1, number) / number) + 1
     cuts = np.unique(np.concatenate([[0], edges, [light.size]])).tolist()

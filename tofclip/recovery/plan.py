@@ -227,6 +227,7 @@ class RecoveryPlan:
             result = recover_segments(self.method, camera, on_device, segments, progress)
             values = to_numpy(result.frames)
             solved = time.perf_counter()
+            # measured with the frames where they were recovered: nothing is fetched twice
             residual = compute_segments_residual(camera, result.frames, on_device, segments)
         figures: dict[str, Scalar] = {
             "method": self.method.name,
@@ -423,6 +424,7 @@ def fit_camera_to_shot(
     Camera
     """
     skew = estimate_skew(streak.counts, camera)
+    # registration refines a skew that is right to a few rows, which the energy curves give
     coarse = replace(camera, sweep=skew.sweep)
     return register_views(streak.counts, streak.saturated, coarse, progress).camera
 
@@ -472,6 +474,7 @@ def recover_segments(
         ]
     )
     expected = np.array([segment.brightness for segment in segments])
+    # the shot's brightest surface, as each segment's range would show it
     scale = (np.maximum(peaks, 0) / expected).max() * expected
     frames = zeros((measurement.values.shape[1], *camera.image_shape), measurement.values)
     results = []
@@ -481,6 +484,7 @@ def recover_segments(
             continue
         part = _slice_measurement(measurement, segment)
         weighted = (
+            # a prior's weight is relative to the brightest frame of what the solver is given
             replace(method, weight=method.weight * bright / peak)
             if isinstance(method, ProximalMethod)
             else method
@@ -551,6 +555,7 @@ def _join_results(frames: Array, results: list[Result]) -> Result:
     objective = np.zeros(longest)
     for result in results:
         if result.objective.size:
+            # a segment that ended early keeps its last objective
             objective += np.pad(result.objective, (0, longest - result.objective.size), "edge")
     reasons = {result.stop_reason for result in results}
     return Result(

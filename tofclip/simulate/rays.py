@@ -70,6 +70,7 @@ def cast_rays(bodies: Sequence[Body], origin: Array, directions: Array) -> First
     for index, body in enumerate(bodies):
         rays = body.select_candidate_rays(origin, directions)
         found = body.intersect(origin, directions[rays])
+        # the nearest body so far wins, as in a depth buffer
         closer = found.distance < nearest[rays]
         seen = rays[closer]
         nearest[seen], number[seen] = found.distance[closer], index
@@ -116,10 +117,12 @@ def compute_irradiance(bodies: Sequence[Body], lamp: Array, points: Array, norma
     """
     rays = points - lamp
     distance = np.linalg.norm(rays, axis=1)
+    # Lambert's cosine; surfaces that face away from the lamp get nothing
     facing = -np.einsum("ij,ij->i", rays, normal) / distance
     candidates = np.flatnonzero(facing > 0)
     nearest = cast_rays(bodies, lamp, rays[candidates]).distance
     light = np.zeros(len(points))
+    # rays end at the points: a hit at 1 is the surface itself, a nearer one a shadow
     lit = candidates[nearest > 1 - SHADOW_MARGIN]
     light[lit] = facing[lit] / distance[lit] ** 2
     return light

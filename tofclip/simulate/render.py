@@ -114,6 +114,7 @@ def _apply_sweep(
     if camera.sweep is None:
         return row, slit, np.ones_like(row)
     raw_row, raw_column = camera.sweep.raw_position(row, slit)
+    # raw rows for one rectified row, which lengthen the pulse as well
     stretch = (
         camera.sweep.raw_position(row + 0.5, slit)[0]
         - camera.sweep.raw_position(row - 0.5, slit)[0]

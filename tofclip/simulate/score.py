@@ -42,6 +42,7 @@ def score_returns(returns: Returns, truth: GroundTruth) -> dict[str, float]:
     if not found.any():
         raise InputError("no target pixel of the truth has a return")
     bin_m = SPEED_OF_LIGHT * truth.bin_width / 2
+    # a return beside a border may belong to either side
     near_anything = binary_dilation(np.isfinite(truth.range), np.ones((3, 3)))
     return {
         "median_depth_error_m": float(np.median(error[found])),

@@ -140,6 +140,7 @@ class CameraArray:
             _sample_positions(count, samples) * self.focus / self.focal_length_px
             for count in (rows, columns)
         )
+        # all views' pictures agree on the plane in focus: rays of one pixel meet there
         at_focus = np.stack(np.broadcast_arrays(x, y[:, np.newaxis], self.focus), axis=-1)
         return origin, at_focus.reshape(-1, 3) - origin
 
