@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.geometry import FloatArray, Grid
-from nlos.method import Reconstructor, Support
+from nlos.method import Method, Plan
 from nlos.volume import Volume
 from tofclip.arrays import require_numpy
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator
-from tofclip.solvers import Backprojection, Method
+from tofclip.solvers import Backprojection
+from tofclip.solvers import Method as Recovery
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ class CompressedCapture:
             raise ShapeError("wall", (*self.operator.shape_in, 3), wall.shape)
         if not np.all(np.isfinite(measurements)):
             raise InputError("readings must not hold NaN or infinity; set bad ones to 0")
-        object.__setattr__(self, "readings", np.ascontiguousarray(measurements))
+        object.__setattr__(self, "measurements", np.ascontiguousarray(measurements))
         object.__setattr__(self, "wall", wall)
 
     @classmethod
@@ -104,7 +105,7 @@ class CompressedCapture:
         place = (capture.wall, capture.laser, capture.bin_width, capture.start)
         return cls(measurements, operator, *place, capture.provenance)
 
-    def recover_transients(self, method: Method | None = None) -> Capture:
+    def recover_transients(self, method: Recovery | None = None) -> Capture:
         """Recover the wall's transients.
 
         Parameters
@@ -133,7 +134,7 @@ class AdjointImaging:
 
     Parameters
     ----------
-    solver : Reconstructor
+    solver : Method
         Any method of this package.
     recovery : Method
         The adjoint, or another of `tofclip.solvers`.
@@ -141,28 +142,29 @@ class AdjointImaging:
         Voxels weaker than this fraction of the brightest become 0; 0 keeps all.
     """
 
-    solver: Reconstructor
-    recovery: Method = field(default_factory=Backprojection)
+    solver: Method
+    recovery: Recovery = field(default_factory=Backprojection)
     threshold: float = 0.3
 
     def __post_init__(self) -> None:
         if not 0 <= self.threshold <= 1:
             raise InputError(f"a threshold is a fraction between 0 and 1, got {self.threshold}")
 
-    def supports(self, capture: CompressedCapture, grid: Grid) -> Support:
-        """Say whether the solver can image such a capture on `grid`, and if not, why.
+    def plan(self, capture: CompressedCapture, grid: Grid) -> Plan:
+        """Make the solver ready for transients recovered from such measurements.
 
         Parameters
         ----------
         capture : CompressedCapture
         grid : Grid
 
-        Returns
-        -------
-        Support
+        Raises
+        ------
+        InputError
+            The solver cannot image such a capture on the grid.
         """
         blank = np.zeros((capture.measurements.shape[1], *capture.wall.shape[:-1]), np.float32)
-        return self.solver.supports(
+        return self.solver.plan(
             Capture(blank, capture.wall, capture.laser, capture.bin_width, capture.start), grid
         )
 
@@ -182,8 +184,8 @@ class AdjointImaging:
         Raises
         ------
         InputError
-            `supports` says no.
+            The solver cannot image such a capture on the grid.
         """
-        self.supports(capture, grid).require()
-        volume = self.solver.reconstruct(capture.recover_transients(self.recovery), grid)
+        plan = self.plan(capture, grid)
+        volume = plan.image(capture.recover_transients(self.recovery))
         return volume.threshold(self.threshold)

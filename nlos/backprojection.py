@@ -5,8 +5,9 @@ that it may come from.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +16,15 @@ from nlos.band import Band, VirtualPulse, Waveforms
 from nlos.capture import Capture
 from nlos.geometry import FloatArray, Grid
 from nlos.kernels import add_backprojection
-from nlos.method import PhasorMethod, Progress, Support, check_common_support, ignore_progress
+from nlos.method import VOXEL_BYTES, PhasorMethod, PhasorPlan, Progress, require_imageable
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
 from tofclip.arrays import is_numpy
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks, split_blocks
 
-TABLE_BYTES = 32 << 20
-"""Filtered signals held at a time."""
+TABLE_BYTES, TABLE_COPIES = 32 << 20, 2
+"""Filtered signals held at a time; and how often, while they are filtered."""
 
 SignalFilter = Callable[[NDArray[np.float32]], Waveforms]
 """Turns signals (points, t) into what is back-projected over the voxels."""
@@ -91,87 +92,91 @@ class Backprojection(PhasorMethod):
     def __post_init__(self) -> None:
         object.__setattr__(self, "pulse", VirtualPulse(self.wavelength, self.cycles))
 
-    def supports(self, capture: Capture, grid: Grid) -> Support:
-        """Say whether `capture` can be imaged on `grid`, and if not, why.
-
-        True in a condition if it can; ``.reason`` says why not. Refused are a single wall point, a
-        grid behind the wall, a volume above 8 GiB, and time bins too coarse for the wavelength.
+    def plan(self, capture: Capture, grid: Grid) -> BackprojectionPlan:
+        """Make the method ready for captures like `capture` on `grid`.
 
         Parameters
         ----------
         capture : Capture
+            Of several wall points; any wall and lasers.
         grid : Grid
+            Not behind the wall.
 
         Returns
         -------
-        Support
-        """
-        try:
-            Band(self.pulse, capture.axis)
-        except InputError as problem:
-            return Support(str(problem))
-        return check_common_support(capture, grid)
-
-    def lookups(self, capture: Capture, grid: Grid) -> int:
-        """Number of look-ups that a reconstruction costs; what `progress` counts up to.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-
-        Returns
-        -------
-        int
-            Wall points times voxels.
-        """
-        return len(capture.points) * grid.size
-
-    def phasor_field(
-        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
-    ) -> Volume:
-        """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in
-        the signal.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-        progress : callable
-            Called with the number of look-ups just done.
-
-        Returns
-        -------
-        Volume
-            (z, y, x) complex64.
+        BackprojectionPlan
 
         Raises
         ------
         InputError
-            `supports` says no.
+            A single wall point, a grid behind the wall, a volume above 8 GiB, or time bins too
+            coarse for the wavelength.
         """
-        self.supports(capture, grid).require()
         band = Band(self.pulse, capture.axis)
-        warn_of_aliasing(capture, band)
+        require_imageable(capture, grid)
         settings = {
             "method": "backprojection",
             "wavelength_m": self.wavelength,
             "cycles": self.cycles,
         }
-        history = {**capture.provenance, "imaging": settings}
+        return BackprojectionPlan(capture, grid, band, self.weighting, settings)
+
+
+class BackprojectionPlan(PhasorPlan):
+    """Back-projection with a virtual pulse, ready for captures of one geometry.
+
+    Parameters
+    ----------
+    capture : Capture
+    grid : Grid
+    band : Band
+    weighting : Weighting
+    settings : mapping
+        What a volume reports of how it was imaged.
+    """
+
+    def __init__(
+        self,
+        capture: Capture,
+        grid: Grid,
+        band: Band,
+        weighting: Weighting,
+        settings: Mapping[str, Any],
+    ) -> None:
+        super().__init__(capture, grid)
+        self.band, self.weighting, self.settings = band, weighting, dict(settings)
+        self._points = len(capture.points)
+        self._warned = False
+
+    @property
+    def cost(self) -> int:
+        """Look-ups: one per voxel and wall point."""
+        return self._points * self.grid.size
+
+    @property
+    def memory_bytes(self) -> int:
+        return self.grid.size * VOXEL_BYTES + TABLE_COPIES * TABLE_BYTES
+
+    def _field(self, capture: Capture, progress: Progress) -> Volume:
+        if not self._warned:
+            warn_of_aliasing(capture, self.band)
+            self._warned = True
+        history = {**capture.provenance, "imaging": self.settings}
         if not is_numpy(capture.signal):
             from nlos.portable.backprojection import backproject_on_device
 
-            return Volume(
-                backproject_on_device(capture, grid, band, self.weighting, progress), grid, history
-            )
+            values = backproject_on_device(capture, self.grid, self.band, self.weighting, progress)
+            return Volume(values, self.grid, history)
+        band = self.band
 
         def apply_filter(traces: NDArray[np.float32]) -> Waveforms:
             return band.waveforms(band.compute_phasors(traces))
 
         count = max(1, TABLE_BYTES // (band.sample_count * np.dtype(np.complex64).itemsize))
-        total = backproject_signals(capture, grid, apply_filter, count, self.weighting, progress)
-        return Volume(total, grid, history)
+        total = backproject_signals(
+            capture, self.grid, apply_filter, count, self.weighting, progress
+        )
+        return Volume(total, self.grid, history)
 
 
 def backproject_signals(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.time_axis import TimeAxis
+from nlos.capture import TimeAxis
 from tofclip.errors import InputError
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 

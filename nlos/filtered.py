@@ -9,16 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.backprojection import TABLE_BYTES, Weighting, backproject_signals
+from nlos.backprojection import TABLE_BYTES, TABLE_COPIES, Weighting, backproject_signals
 from nlos.band import Waveforms
 from nlos.capture import Capture
 from nlos.geometry import Grid
 from nlos.method import (
+    VOXEL_BYTES,
+    Method,
+    Plan,
     Progress,
-    Support,
-    check_common_support,
-    check_numpy_support,
-    ignore_progress,
+    require_imageable,
+    require_numpy_signal,
 )
 from nlos.plane import axis_step, is_evenly_spaced
 from nlos.volume import Volume
@@ -34,12 +35,15 @@ it.
 """
 
 
+LAPLACIAN_COPIES = 4
+"""Volumes in float32 that are held beside the sum while it is sharpened."""
+
 UNIFORM_WEIGHTING = Weighting(falloff=0.0)
 """All voxels alike: the signals' own scale."""
 
 
 @dataclass(frozen=True)
-class FilteredBackprojection:
+class FilteredBackprojection(Method):
     """Point-wise back-projection of the measured signals, then a Laplacian, for every wall and
     laser.
 
@@ -71,90 +75,87 @@ class FilteredBackprojection:
                 f"sigma of the Laplacian must be a positive number of metres, got {self.sigma}"
             )
 
-    def supports(self, capture: Capture, grid: Grid) -> Support:
-        """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with
-        ``.reason``.
+    def plan(self, capture: Capture, grid: Grid) -> FilteredBackprojectionPlan:
+        """Make the method ready for captures like `capture` on `grid`.
 
         Parameters
         ----------
         capture : Capture
+            A NumPy array; any wall and lasers.
         grid : Grid
+            Evenly spaced, not behind the wall.
 
         Returns
         -------
-        Support
-        """
-        arrays = check_numpy_support("filtered back-projection", capture)
-        if not arrays:
-            return arrays
-        if not all(is_evenly_spaced(axis) for axis in (grid.x, grid.y, grid.z)):
-            return Support("the Laplacian needs evenly spaced voxels along x, y and z")
-        return check_common_support(capture, grid)
-
-    def lookups(self, capture: Capture, grid: Grid) -> int:
-        """Number of look-ups that a reconstruction costs; what `progress` counts up to.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-
-        Returns
-        -------
-        int
-            Wall points times voxels.
-        """
-        return len(capture.points) * grid.size
-
-    def reconstruct(
-        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
-    ) -> Volume:
-        """Image the hidden scene.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-            Evenly spaced.
-        progress : callable, optional
-            Called with the number of look-ups just done.
-
-        Returns
-        -------
-        Volume
-            Float32, not negative.
+        FilteredBackprojectionPlan
 
         Raises
         ------
         InputError
-            `supports` says no.
+            The method cannot image such a capture on the grid.
         """
-        self.supports(capture, grid).require()
+        require_numpy_signal("filtered back-projection", capture)
+        if not all(is_evenly_spaced(axis) for axis in (grid.x, grid.y, grid.z)):
+            raise InputError("the Laplacian needs evenly spaced voxels along x, y and z")
+        require_imageable(capture, grid)
+        return FilteredBackprojectionPlan(capture, grid, self)
+
+
+class FilteredBackprojectionPlan(Plan):
+    """Filtered back-projection, ready for captures of one geometry.
+
+    Parameters
+    ----------
+    capture : Capture
+    grid : Grid
+    method : FilteredBackprojection
+    """
+
+    def __init__(self, capture: Capture, grid: Grid, method: FilteredBackprojection) -> None:
+        super().__init__(capture, grid)
+        self.method = method
+        self._points, self._bins = len(capture.points), capture.axis.bins
+
+    @property
+    def cost(self) -> int:
+        """Look-ups: one per voxel and wall point."""
+        return self._points * self.grid.size
+
+    @property
+    def memory_bytes(self) -> int:
+        signals = min(TABLE_BYTES, 8 * self._points * self._bins)
+        return self.grid.size * (VOXEL_BYTES + 4 * LAPLACIAN_COPIES) + TABLE_COPIES * signals
+
+    def _image(self, capture: Capture, progress: Progress) -> Volume:
+        spacing = capture.axis.spacing
 
         def pad_signals(traces: NDArray[np.float32]) -> Waveforms:
             values = np.pad(traces, ((0, 0), PADDING_SAMPLES)).astype(np.complex64)
-            return Waveforms(values, capture.start - capture.axis.spacing, capture.axis.spacing)
+            return Waveforms(values, capture.start - spacing, spacing)
 
-        count = max(1, TABLE_BYTES // (8 * (capture.axis.bins + sum(PADDING_SAMPLES))))
+        count = max(1, TABLE_BYTES // (8 * (self._bins + sum(PADDING_SAMPLES))))
         total = np.ascontiguousarray(
-            backproject_signals(capture, grid, pad_signals, count, self.weighting, progress).real
+            backproject_signals(
+                capture, self.grid, pad_signals, count, self.method.weighting, progress
+            ).real
         )
-        sharpened = self._apply_laplacian(total, grid)
-        settings = {"method": "filtered backprojection", "sigma_m": self.sigma}
-        return Volume(np.maximum(sharpened, 0), grid, {**capture.provenance, "imaging": settings})
+        sharpened = _apply_laplacian(total, self.grid, self.method.sigma)
+        settings = {"method": "filtered backprojection", "sigma_m": self.method.sigma}
+        return Volume(
+            np.maximum(sharpened, 0), self.grid, {**capture.provenance, "imaging": settings}
+        )
 
-    def _apply_laplacian(self, values: NDArray[np.float32], grid: Grid) -> NDArray[np.float32]:
-        from scipy.ndimage import gaussian_filter
 
-        sigmas = [
-            self.sigma / axis_step(axis) if axis.size > 1 else 0.0
-            for axis in (grid.z, grid.y, grid.x)
-        ]
-        total = np.zeros_like(values)
-        for axis in (axis for axis in range(3) if sigmas[axis] > 0):
-            order = [2 if i == axis else 0 for i in range(3)]
-            # sigma^2 takes the unit away, so that images at different sigmas compare
-            total -= np.float32(sigmas[axis] ** 2) * gaussian_filter(
-                values, sigmas, order, mode="nearest", truncate=FILTER_TRUNCATION_SIGMAS
-            )
-        return total
+def _apply_laplacian(values: NDArray[np.float32], grid: Grid, sigma: float) -> NDArray[np.float32]:
+    from scipy.ndimage import gaussian_filter
+
+    sigmas = [
+        sigma / axis_step(axis) if axis.size > 1 else 0.0 for axis in (grid.z, grid.y, grid.x)
+    ]
+    total = np.zeros_like(values)
+    for axis in (axis for axis in range(3) if sigmas[axis] > 0):
+        order = [2 if i == axis else 0 for i in range(3)]
+        total -= np.float32(sigmas[axis] ** 2) * gaussian_filter(
+            values, sigmas, order, mode="nearest", truncate=FILTER_TRUNCATION_SIGMAS
+        )
+    return total

@@ -6,33 +6,29 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from nlos.band import VirtualPulse
+from nlos.backends import Backend, choose_backend
+from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
 from nlos.geometry import Grid
 from nlos.illumination_groups import (
     IlluminationGroup,
-    check_illumination_support,
+    build_waves,
     choose_unaliased_band,
     group_by_illumination,
+    require_few_spots,
 )
-from nlos.method import (
-    PhasorMethod,
-    Progress,
-    SubProgress,
-    Support,
-    check_common_support,
-    check_numpy_support,
-    ignore_progress,
+from nlos.method import PhasorMethod, Progress, require_imageable
+from nlos.plane import choose_virtual_plane
+from nlos.propagation.propagate import (
+    Propagation,
+    plan_wall_to_plane,
+    require_propagation,
+    require_tolerance,
 )
-from nlos.plane import Plane
-from nlos.propagation.plane_field import choose_virtual_plane
-from nlos.propagation.propagate import Propagation, propagate_group, require_propagation
 from nlos.rsd.diffraction import DiffractionPlan
-from nlos.rsd.image_planes import diffract_to_grid
-from nlos.rsd.planar import build_source, build_waves, check_grid_support, require_tolerance
-from nlos.sampling import warn_of_aliasing
-from nlos.volume import Volume
-from tofclip.arrays import is_numpy
+from nlos.rsd.planar import require_even_grid
+from nlos.wave_plan import GroupPlan, WavePlan
+from tofclip.arrays import Array
 from tofclip.errors import InputError
 
 FRESNEL_ZONES, STRICT_FRESNEL_ZONES = 2.0, 4.0
@@ -95,101 +91,91 @@ class Hybrid(PhasorMethod):
         require_tolerance(self.tolerance)
         require_propagation(self.propagation)
 
-    def supports(self, capture: Capture, grid: Grid) -> Support:
-        """Say whether `capture` can be imaged on `grid`, and if not, why.
-
-        True in a condition if it can; ``.reason`` says why not. Needed are voxels evenly spaced
-        along x and y, few laser spots, a virtual plane in front of the wall, and memory.
+    def plan(self, capture: Capture, grid: Grid) -> WavePlan:
+        """Make the method ready for captures like `capture` on `grid`.
 
         Parameters
         ----------
         capture : Capture
+            Of few laser spots.
         grid : Grid
+            Evenly spaced along x and y.
 
         Returns
         -------
-        Support
-        """
-        general = (
-            check_common_support(capture, grid)
-            and check_grid_support(grid)
-            and check_illumination_support(capture)
-        )
-        if self.propagation == "time":
-            general = general and check_numpy_support("propagation in time", capture)
-        if not general:
-            return general
-        foremost = float(capture.points[:, 2].max())
-        if self.plane_z is not None and self.plane_z <= foremost:
-            return Support(
-                f"the virtual plane must lie in front of the wall, which reaches up to z = {foremost:.4g} m"
-            )
-        try:
-            plans = [plan for _, plan in self.plans(capture, grid)]
-        except InputError as problem:
-            return Support(str(problem))
-        return plans[0].supports()
-
-    def phasor_field(
-        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
-    ) -> Volume:
-        """Return the complex sum whose magnitude `reconstruct` gives, complex64; linear within the
-        tolerance.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-        progress : callable
-            Called with the number of voxels just done, once for each laser spot.
-
-        Returns
-        -------
-        Volume
-            (z, y, x) complex64.
+        WavePlan
 
         Raises
         ------
         InputError
-            `supports` says no.
+            The method cannot image such a capture on the grid, or not within memory, or the virtual
+            plane would not stand in front of the wall.
         """
-        self.supports(capture, grid).require()
+        require_imageable(capture, grid)
+        require_even_grid(grid)
         band = choose_unaliased_band(capture, grid, self.pulse)
-        warn_of_aliasing(capture, band)
-        if not is_numpy(capture.signal):
-            from nlos.portable.prepared import PreparedField
+        backend = choose_backend(capture, band)
+        groups = self.plan_groups(capture, grid, band, backend)
+        settings = {**self.settings, "plane_z_m": groups[-1].plane_to_depths.plane.z}
+        return WavePlan(capture, grid, band, backend, groups, settings)
 
-            prepared = PreparedField(self, capture, grid)
-            total = prepared.of(capture, progress)
-            return Volume(total, grid, {**capture.provenance, "imaging": prepared.settings})
-        total = np.zeros(grid.shape, np.complex64)
-        wall_to_plane_work = int(WALL_TO_PLANE_TIME_FRACTIONS[self.propagation] * grid.size)
-        for group, plan in self.plans(capture, grid):
-            wall_progress = SubProgress(
-                progress, int(np.prod(plan.plane.shape)) * plan.waves.count, wall_to_plane_work
+    def plan_groups(
+        self, capture: Capture, grid: Grid, band: Band, backend: Backend
+    ) -> list[GroupPlan]:
+        """Return the road of every illumination group to the voxels, at a band's frequencies.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+        band : Band
+        backend : Backend
+
+        Raises
+        ------
+        InputError
+            The virtual plane would not stand in front of the wall, or memory does not suffice.
+        """
+        groups = group_by_illumination(capture)
+        require_few_spots(capture, groups)
+        foremost = float(capture.points[:, 2].max())
+        if self.plane_z is not None and self.plane_z <= foremost:
+            raise InputError(
+                f"the virtual plane must lie in front of the wall, which reaches up to z = {foremost:.4g} m"
             )
-            depth_progress = SubProgress(progress, grid.size, grid.size - wall_to_plane_work)
-            tolerance = WALL_TO_PLANE_ERROR_FRACTION * self.tolerance
-            on_plane = propagate_group(
-                capture, group, plan.plane, band, self.propagation, tolerance, wall_progress
-            ).values
-            diffract_to_grid(
-                plan,
-                # the sum over points stands for the Rayleigh-Sommerfeld integral over the plane
-                on_plane * np.float32(np.prod(plan.plane.steps)),
-                build_source(group, band),
-                total,
-                depth_progress,
-            )
-        return Volume(
-            total,
-            grid,
-            {**capture.provenance, "imaging": {**self.settings, "plane_z_m": plan.plane.z}},
+        return [self._plan_group(capture, group, grid, band, backend) for group in groups]
+
+    def _plan_group(
+        self,
+        capture: Capture,
+        group: IlluminationGroup,
+        grid: Grid,
+        band: Band,
+        backend: Backend,
+    ) -> GroupPlan:
+        zones = STRICT_FRESNEL_ZONES if self.tolerance < STRICT_TOLERANCE else FRESNEL_ZONES
+        waves = build_waves(group, band, continued=True)
+        plane = choose_virtual_plane(
+            capture.points[group.indices], grid, waves, zones, self.plane_z
         )
+        plane_to_depths = DiffractionPlan(plane, grid, waves, self.tolerance)
+        plane_to_depths.require_memory()
+        tolerance = WALL_TO_PLANE_ERROR_FRACTION * self.tolerance
+        propagate = plan_wall_to_plane(
+            capture, group, plane, band, backend, self.propagation, tolerance
+        )
+        # The Rayleigh-Sommerfeld integral over the plane, as a sum over its points.
+        area = float(np.float32(np.prod(plane.steps)))
+
+        def wall_to_plane(one: Capture, progress: Progress) -> Array:
+            return propagate(one, progress) * area
+
+        fraction = WALL_TO_PLANE_TIME_FRACTIONS[self.propagation]
+        return GroupPlan(group, wall_to_plane, plane_to_depths, fraction)
 
     @property
     def settings(self) -> dict[str, str | float]:
-        """How a volume was imaged, for its provenance."""
+        """What a volume reports of how it was imaged."""
         return {
             "method": "hybrid",
             "wavelength_m": self.wavelength,
@@ -197,42 +183,3 @@ class Hybrid(PhasorMethod):
             "propagation": self.propagation,
             "tolerance": self.tolerance,
         }
-
-    def virtual_plane(self, capture: Capture, grid: Grid) -> Plane:
-        """Return the virtual plane of a capture's first laser spot.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-
-        Returns
-        -------
-        Plane
-        """
-        return self.plans(capture, grid)[0][1].plane
-
-    def plans(
-        self, capture: Capture, grid: Grid
-    ) -> list[tuple[IlluminationGroup, DiffractionPlan]]:
-        """Return every illumination group, and the plan from a virtual plane of its own to the
-        grid.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-
-        Returns
-        -------
-        list of (IlluminationGroup, DiffractionPlan)
-        """
-        band = choose_unaliased_band(capture, grid, self.pulse)
-        zones = STRICT_FRESNEL_ZONES if self.tolerance < STRICT_TOLERANCE else FRESNEL_ZONES
-        plans = []
-        for group in group_by_illumination(capture):
-            waves = build_waves(group, band, continued=True)
-            points = capture.points[group.indices]
-            plane = choose_virtual_plane(points, grid, waves, zones, self.plane_z)
-            plans.append((group, DiffractionPlan(plane, grid, waves, self.tolerance)))
-        return plans

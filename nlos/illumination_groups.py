@@ -4,16 +4,18 @@ the record.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nlos.band import Band, VirtualPulse
-from nlos.capture import Capture
+from nlos.capture import Capture, TimeAxis
 from nlos.geometry import Grid
-from nlos.method import Support
-from nlos.time_axis import TimeAxis
+from nlos.rsd.image_planes import LaserSource
+from nlos.rsd.transfer import SphericalWaves
+from tofclip.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
@@ -63,13 +65,17 @@ class IlluminationGroup:
         )
 
 
+def is_confocal(capture: Capture) -> bool:
+    """Whether every wall point is its own laser spot."""
+    return len(capture.lasers) > 1 and np.array_equal(capture.lasers, capture.points)
+
+
 def group_by_illumination(capture: Capture) -> list[IlluminationGroup]:
     """Sort the valid wall points of a capture by laser spot."""
     everyone = np.arange(len(capture.points))
     if len(capture.lasers) == 1:
         return [IlluminationGroup(capture.lasers[0], everyone)]
-    if np.array_equal(capture.lasers, capture.points):
-        # confocal: out and back are one leg, run through twice
+    if is_confocal(capture):
         return [IlluminationGroup(None, everyone)]
     spots, belonging = np.unique(capture.lasers, axis=0, return_inverse=True)
     return [
@@ -78,15 +84,33 @@ def group_by_illumination(capture: Capture) -> list[IlluminationGroup]:
     ]
 
 
-def check_illumination_support(capture: Capture) -> Support:
-    """Check that each laser spot lit enough for a field of its own."""
-    count = len(group_by_illumination(capture))
-    if count * MIN_POINTS_PER_SPOT > len(capture.points):
-        return Support(
-            f"{count} laser spots for {len(capture.points)} wall points: a field per spot needs at least "
+def require_few_spots(capture: Capture, groups: Sequence[IlluminationGroup]) -> None:
+    """Refuse a capture whose laser spots each lit too few points for a field of their own."""
+    if len(groups) * MIN_POINTS_PER_SPOT > len(capture.points):
+        raise InputError(
+            f"{len(groups)} laser spots for {len(capture.points)} wall points: a field per spot needs at least "
             f"{MIN_POINTS_PER_SPOT} points each; image such pairs by back-projection"
         )
-    return Support()
+
+
+def build_waves(group: IlluminationGroup, band: Band, continued: bool) -> SphericalWaves:
+    """Return the waves between wall and voxels in one illumination group.
+
+    Parameters
+    ----------
+    group : IlluminationGroup
+    band : Band
+    continued : bool
+        Whether they go on from a plane, or start at points; see `SphericalWaves`.
+    """
+    k = group.legs * band.wavenumbers
+    step = float(k[1] - k[0]) if k.size > 1 else 1.0
+    return SphericalWaves(float(k[0]), step, k.size, continued)
+
+
+def build_source(group: IlluminationGroup, band: Band) -> LaserSource:
+    """Return what shines on the scene in one illumination group."""
+    return LaserSource(group.laser, band.wavenumbers, band.weights / band.weights.max())
 
 
 def choose_unaliased_band(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Band:

@@ -1,17 +1,22 @@
-"""What every reconstruction method offers, and how it says that it cannot treat an input."""
+"""What every imaging method offers: a plan for captures of one geometry, and images from it.
+
+`Method.plan` validates once, and raises `InputError` with the reason where a method cannot image a
+capture. The plan knows its cost and memory, and images any number of captures that differ in their
+signals only, such as those of a moving scene.
+"""
 
 from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+
+import numpy as np
 
 from nlos.capture import Capture
 from nlos.geometry import Grid
 from nlos.volume import Volume
-from tofclip.arrays import ComputeDevice, is_numpy
+from tofclip.arrays import is_numpy
 from tofclip.errors import InputError
 
 Progress = Callable[[int], None]
@@ -56,167 +61,185 @@ class SubProgress:
         self._progress(increment)
 
 
-@dataclass(frozen=True)
-class Support:
-    """Whether a method can treat an input: true if there is no reason against it.
+class Plan(ABC):
+    """A method made ready for captures of one geometry on one grid.
 
     Parameters
     ----------
-    reason : str
-        Why not, as one clause that says what to do; empty if it can.
+    capture : Capture
+        One of them; wall, laser, time axis and device are what counts.
+    grid : Grid
+
+    Attributes
+    ----------
+    grid : Grid
     """
 
-    reason: str = ""
+    def __init__(self, capture: Capture, grid: Grid) -> None:
+        self.grid = grid
+        self._wall, self._laser = capture.wall, capture.laser
+        self._axis, self._device = capture.axis, capture.device
 
-    def __bool__(self) -> bool:
-        return not self.reason
+    @property
+    def cost(self) -> int:
+        """What `image` reports as progress in all: look-ups, or voxels once per laser spot."""
+        return self.grid.size
 
-    def require(self) -> None:
-        """Raise the reason, if there is one, as `InputError`."""
-        if self.reason:
-            raise InputError(self.reason)
-
-
-class Reconstructor(Protocol):
-    """One method of imaging a hidden scene."""
-
-    def supports(self, capture: Capture, grid: Grid) -> Support:
-        """Say whether the method can image `capture` on `grid`, and if not, why.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-
-        Returns
-        -------
-        Support
+    @property
+    @abstractmethod
+    def memory_bytes(self) -> int:
+        """Most bytes that the arrays of an image hold at a time, the volume included and the
+        capture not; an estimate, good to about a factor of two.
         """
-        ...
 
-    def reconstruct(
-        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
-    ) -> Volume:
+    def image(self, capture: Capture, progress: Progress = ignore_progress) -> Volume:
         """Image the hidden scene.
 
         Parameters
         ----------
         capture : Capture
-        grid : Grid
-        progress : callable
-            Called with the amount of work just done.
+            Of the geometry that was planned for.
+        progress : callable, optional
+            Called with a part of `cost` whenever so much is done.
 
         Returns
         -------
         Volume
-            Brightness (z, y, x).
+            Brightness, real and not negative, float32.
 
         Raises
         ------
         InputError
-            `supports` says no.
+            Wall, laser, time axis or device differ from those that were planned for.
         """
-        ...
-
-
-class PhasorMethod(ABC):
-    """A method whose image is the magnitude of a complex field."""
+        self.require_same_geometry(capture)
+        return self._image(capture, progress)
 
     @abstractmethod
-    def phasor_field(
-        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
-    ) -> Volume:
-        """Return the complex sum whose magnitude `reconstruct` gives, complex64.
+    def _image(self, capture: Capture, progress: Progress) -> Volume:
+        """Image a capture whose geometry is that of the plan."""
+
+    def require_same_geometry(self, capture: Capture) -> None:
+        """Refuse a capture that was not planned for."""
+        for name, planned in (("wall", self._wall), ("laser", self._laser)):
+            found = getattr(capture, name)
+            if found is not planned and not np.array_equal(found, planned, equal_nan=True):
+                raise InputError(
+                    f"the {name} is not that of the capture that this imaging was planned for"
+                )
+        if capture.axis != self._axis:
+            raise InputError(f"planned for {self._axis}, got a capture of {capture.axis}")
+        if capture.device != self._device:
+            raise InputError(f"planned for signals on {self._device}, got one on {capture.device}")
+
+
+class PhasorPlan(Plan):
+    """A plan whose image is the magnitude of a complex field."""
+
+    def field(self, capture: Capture, progress: Progress = ignore_progress) -> Volume:
+        """Return the complex sum whose magnitude `image` gives, complex64; linear in the signal.
+
+        Parameters and errors are those of `image`.
+        """
+        self.require_same_geometry(capture)
+        return self._field(capture, progress)
+
+    @abstractmethod
+    def _field(self, capture: Capture, progress: Progress) -> Volume:
+        """Return the complex field of a capture whose geometry is that of the plan."""
+
+    def _image(self, capture: Capture, progress: Progress) -> Volume:
+        field = self._field(capture, progress)
+        return Volume(abs(field.values), field.grid, field.provenance)
+
+
+class Method(ABC):
+    """One way of imaging a hidden scene."""
+
+    @abstractmethod
+    def plan(self, capture: Capture, grid: Grid) -> Plan:
+        """Make the method ready for captures like `capture` on `grid`.
 
         Parameters
         ----------
         capture : Capture
+            Wall, laser, time axis and device are what counts.
         grid : Grid
-        progress : callable
-            As for `reconstruct`.
 
         Returns
         -------
-        Volume
-            (z, y, x) complex64.
+        Plan
 
         Raises
         ------
         InputError
-            `supports` says no.
+            The method cannot image such a capture on the grid; the message says why.
         """
 
     def reconstruct(
         self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
     ) -> Volume:
-        """Image the hidden scene.
+        """Image the hidden scene: ``plan(capture, grid).image(capture, progress)``.
 
         Parameters
         ----------
         capture : Capture
         grid : Grid
         progress : callable, optional
-            Called with the number of look-ups just done, or of voxels, once for every laser spot;
-            see the method.
+            Called with a part of the plan's `cost` whenever so much is done.
 
         Returns
         -------
         Volume
-            Brightness I(r), float32.
+            Brightness I(r), real and not negative, float32.
 
         Raises
         ------
         InputError
-            `supports` says no.
+            The method cannot image such a capture on the grid.
         """
-        field = self.phasor_field(capture, grid, progress)
-        return Volume(abs(field.values), grid, field.provenance)
+        return self.plan(capture, grid).image(capture, progress)
 
 
-def check_common_support(capture: Capture, grid: Grid) -> Support:
-    """Check what no method can do without: several wall points, a grid that is not behind them, and
-    memory.
+class PhasorMethod(Method):
+    """A method whose image is the magnitude of a complex field."""
 
-    Parameters
-    ----------
-    capture : Capture
-    grid : Grid
+    @abstractmethod
+    def plan(self, capture: Capture, grid: Grid) -> PhasorPlan:
+        """Make the method ready for captures like `capture` on `grid`; see `Method.plan`."""
 
-    Returns
-    -------
-    Support
+    def phasor_field(
+        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
+    ) -> Volume:
+        """Return the complex sum whose magnitude `reconstruct` gives, complex64; linear in the
+        signal within the method's tolerance.
+        """
+        return self.plan(capture, grid).field(capture, progress)
+
+
+def require_imageable(capture: Capture, grid: Grid) -> None:
+    """Refuse what no method can image: a single wall point, a grid behind the wall, or a volume
+    larger than `MEMORY_LIMIT_BYTES`.
     """
     if len(capture.points) == 1:
-        return Support("one wall point cannot locate anything: a capture needs several")
+        raise InputError("one wall point cannot locate anything: a capture needs several")
     hindmost = float(capture.points[:, 2].min())
     if grid.z[0] < hindmost:
-        return Support(
+        raise InputError(
             f"the grid begins at z = {grid.z[0]:.4g} m, behind the hindmost wall point at {hindmost:.4g} m: the hidden "
             "scene lies at larger z than the wall (if yours faces -z, negate x and z of all coordinates)"
         )
     if grid.size * VOXEL_BYTES > MEMORY_LIMIT_BYTES:
-        return Support(
+        raise InputError(
             f"{grid.size} voxels need {grid.size * VOXEL_BYTES / 2**30:.1f} GiB, more than the "
             f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: use larger voxels or a smaller box"
         )
-    return Support()
 
 
-def check_numpy_support(what: str, capture: Capture) -> Support:
-    """Check that a method of compiled loops, `what` in the message, gets a NumPy array.
-
-    Parameters
-    ----------
-    what : str
-    capture : Capture
-
-    Returns
-    -------
-    Support
-    """
-    if is_numpy(capture.signal):
-        return Support()
-    return Support(
-        f"{what} works on NumPy arrays only, and this capture's signal is on {ComputeDevice.of(capture.signal)}: "
-        "bring it back by capture.on(Place()) or --device cpu, or use rsd, hybrid or backprojection"
-    )
+def require_numpy_signal(what: str, capture: Capture) -> None:
+    """Refuse a signal on another device for a method of compiled loops, `what` in the message."""
+    if not is_numpy(capture.signal):
+        raise InputError(
+            f"{what} works on NumPy arrays only, and this capture's signal is on {capture.device}: "
+            "bring it back by capture.on(ComputeDevice()) or --device cpu, or use rsd, hybrid or backprojection"
+        )

@@ -79,8 +79,8 @@ def rebin_capture(capture: Capture, factor: int) -> Capture:
     )
 
 
-def remove_first_bounce(capture: Capture, margin: float) -> Capture:
-    """Set to 0 what arrives straight from the laser spot, without a hidden thing on its path.
+def remove_first_bounce(capture: Capture, margin: float, ramp: float = 0.0) -> Capture:
+    """Set to 0 what arrives straight from the laser spot, by way of no hidden thing.
 
     That light reaches wall point r_p after the path ``|r_L - r_p|``; everything up to `margin`
     later goes with it: the instrument's response and what the wall sends on.
@@ -89,23 +89,82 @@ def remove_first_bounce(capture: Capture, margin: float) -> Capture:
     ----------
     capture : Capture
     margin : float
-        Length of path, m.
-
-    Returns
-    -------
-    Capture
+        m of path, 0 or more.
+    ramp : float
+        m of path over which signals then rise to their whole strength, as a raised cosine; a sharp
+        edge would show as a plane at half the margin.
 
     Raises
     ------
     InputError
-        The margin is negative or not finite.
+        A length is negative or not finite.
     """
-    if not (np.isfinite(margin) and margin >= 0):
-        raise InputError(f"the margin after the first bounce must be 0 m or more, got {margin}")
+    for name, value in (("margin after the first bounce", margin), ("ramp after it", ramp)):
+        if not (np.isfinite(value) and value >= 0):
+            raise InputError(f"the {name} must be 0 m or more, got {value}")
     direct = np.linalg.norm(capture.wall - capture.laser, axis=-1)
     paths = capture.axis.paths.reshape(-1, *[1] * direct.ndim)
-    early = capture.device.put(paths <= direct + margin)
+    late = paths - (direct + margin)
+    early = capture.device.put(late <= 0)
     signal = namespace(capture.signal).where(early, 0.0, capture.signal)
+    if ramp > 0:
+        rising = (1 - np.cos(np.pi * np.clip(np.nan_to_num(late) / ramp, 0, 1))) / 2
+        signal = signal * capture.device.put(rising.astype(np.float32))
+    return Capture(
+        signal, capture.wall, capture.laser, capture.bin_width, capture.start, capture.provenance
+    )
+
+
+def flip_capture(capture: Capture, axis: str) -> Capture:
+    """Mirror a capture's coordinates, and with them the picture.
+
+    Parameters
+    ----------
+    capture : Capture
+    axis : {"x", "y"}
+        Its coordinates change sign.
+
+    Raises
+    ------
+    InputError
+        Another axis.
+    """
+    if axis not in ("x", "y"):
+        raise InputError(f"a capture is mirrored along x or y, not along '{axis}'")
+    sign = np.ones(3)
+    sign["xy".index(axis)] = -1.0
+    return Capture(
+        capture.signal,
+        capture.wall * sign,
+        capture.laser * sign,
+        capture.bin_width,
+        capture.start,
+        capture.provenance,
+    )
+
+
+def fade_record_end(capture: Capture, length: float) -> Capture:
+    """Let signals fade out towards the end of the record, as a raised cosine.
+
+    Where light still comes when the record ends, its end would show as a plane.
+
+    Parameters
+    ----------
+    capture : Capture
+    length : float
+        m of path before the end.
+
+    Raises
+    ------
+    InputError
+        The length is not positive.
+    """
+    if not (np.isfinite(length) and length > 0):
+        raise InputError(f"the record's end must fade over more than 0 m, got {length}")
+    paths = capture.axis.paths
+    weight = (1 - np.cos(np.pi * np.clip((paths[-1] - paths) / length, 0, 1))) / 2
+    shape = (-1, *[1] * (capture.wall.ndim - 1))
+    signal = capture.signal * capture.device.put(weight.reshape(shape).astype(np.float32))
     return Capture(
         signal, capture.wall, capture.laser, capture.bin_width, capture.start, capture.provenance
     )

@@ -9,6 +9,7 @@ import numpy as np
 
 from nlos.band import Band
 from nlos.capture import Capture
+from nlos.illumination_groups import is_confocal
 
 PACKAGE = __name__.partition(".")[0]
 
@@ -30,8 +31,7 @@ def warn_of_aliasing(capture: Capture, band: Band) -> None:
         Wavenumbers of the virtual pulse.
     """
     shortest = 2 * np.pi / float(band.wavenumbers[-1])
-    confocal = len(capture.lasers) > 1 and np.array_equal(capture.lasers, capture.points)
-    finest = shortest / 4 if confocal else shortest / 2
+    finest = shortest / 4 if is_confocal(capture) else shortest / 2
     # A wall drawn exactly at the limit must not be warned of for a rounding error.
     if np.isfinite(capture.spacing) and capture.spacing > finest * (1 + 1e-6):
         warnings.warn(

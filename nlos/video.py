@@ -10,17 +10,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nlos.backends import choose_backend
 from nlos.band import Band
 from nlos.capture import Capture
 from nlos.depths import DepthPropagator
 from nlos.geometry import FloatArray, Grid
 from nlos.hybrid import Hybrid
 from nlos.illumination_groups import choose_band_for_paths, find_leg_bounds, group_by_illumination
-from nlos.method import MEMORY_LIMIT_BYTES, Progress, Support, check_numpy_support, ignore_progress
-from nlos.outgoing_field import compute_outgoing_field, plan_outgoing_diffraction
-from nlos.rsd.planar import PlanarRSD
+from nlos.method import (
+    MEMORY_LIMIT_BYTES,
+    Progress,
+    ignore_progress,
+    require_imageable,
+    require_numpy_signal,
+)
+from nlos.rsd.planar import PlanarRSD, require_even_grid
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
+from nlos.wave_plan import GroupPlan
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Field, Record
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
@@ -133,28 +140,18 @@ class TransientImaging:
 
     method: PlanarRSD | Hybrid
 
-    def supports(self, capture: Capture, grid: Grid) -> Support:
-        """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with
-        ``.reason``.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-
-        Returns
-        -------
-        Support
-        """
-        arrays = check_numpy_support("imaging in time", capture)
-        if not arrays:
-            return arrays
+    def _plan_group(self, capture: Capture, grid: Grid, band: Band) -> GroupPlan:
+        """Return the road of the one laser spot's light to the voxels; see `PlanarRSD.plan`."""
+        require_numpy_signal("imaging in time", capture)
         spots = group_by_illumination(capture)
         if len(spots) > 1 or spots[0].laser is None:
-            return Support(
+            raise InputError(
                 "pictures in time need one laser spot, whose flash passes through the scene; a scan of spots has none"
             )
-        return self.method.supports(capture, grid)
+        require_imageable(capture, grid)
+        require_even_grid(grid)
+        (group,) = self.method.plan_groups(capture, grid, band, choose_backend(capture, band))
+        return group
 
     def video(
         self, capture: Capture, grid: Grid, times: ArrayLike, progress: Progress = ignore_progress
@@ -178,7 +175,7 @@ class TransientImaging:
         Raises
         ------
         InputError
-            `supports` says no, or the video is larger than 8 GiB.
+            The method cannot image such a capture on the grid, or the video is larger than 8 GiB.
         """
         instants = _validate_times(times)
         if 4 * instants.size * grid.size > MEMORY_LIMIT_BYTES:
@@ -260,7 +257,8 @@ class TransientImaging:
         Raises
         ------
         InputError
-            `supports` says no, or the gate does not open before it closes.
+            The method cannot image such a capture on the grid, or the gate does not open before it
+            closes.
         """
         if not (np.isfinite(opens) and np.isfinite(closes) and opens < closes):
             raise InputError(f"a gate must open before it closes, got {opens} and {closes} s")
@@ -286,12 +284,11 @@ class TransientImaging:
         progress: Progress,
     ) -> None:
         """Hand the field of every depth to `use`, some instants at a time; depths run side by side."""
-        self.supports(capture, grid).require()
         band = self._choose_band(capture, grid, instants)
+        group = self._plan_group(capture, grid, band)
         warn_of_aliasing(capture, band)
-        plan = plan_outgoing_diffraction(self.method, capture, grid, band)
-        depths = DepthPropagator(plan)
-        spectrum = depths.to_waves(compute_outgoing_field(self.method, capture, plan, band))
+        depths = DepthPropagator(group.plane_to_depths)
+        spectrum = depths.to_waves(group.wall_to_plane(capture, ignore_progress))
         turns = np.exp(1j * SPEED_OF_LIGHT * np.outer(band.wavenumbers, instants)).astype(
             np.complex64
         )

@@ -32,13 +32,16 @@ NAMES = {
         "Grid",
         "Hybrid",
         "LightCone",
+        "Method",
+        "Plan",
         "PlanarRSD",
-        "PreparedImaging",
         "Refinement",
+        "Settings",
         "TransientImaging",
         "TransientVideo",
         "Volume",
         "propagate",
+        "settings_for",
     ],
 }
 HEAVY = {"h5py", "matplotlib", "numba", "numpy", "open3d", "pyvista", "scipy", "tifffile"}

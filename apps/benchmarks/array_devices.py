@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from apps.benchmarks.case import Case, PreparedCase
 from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD
-from nlos.method import Reconstructor
+from nlos.capture import TimeAxis
+from nlos.method import Method
 from nlos.sampling import AliasingWarning
 from nlos.simulate import PointScene, build_relay_wall
-from nlos.time_axis import TimeAxis
 from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_numpy
 from tofclip.camera import Camera
 from tofclip.lidar import depth
@@ -141,7 +141,7 @@ def prepare_ranging(side: int) -> PreparedCase:
 
 
 def prepare_imaging(
-    make_method: Callable[[float], Reconstructor], shape: str, confocal: bool, side: int
+    make_method: Callable[[float], Method], shape: str, confocal: bool, side: int
 ) -> PreparedCase:
     """A hidden volume from a simulated capture.
 

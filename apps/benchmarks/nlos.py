@@ -14,11 +14,11 @@ from apps.benchmarks.case import Action, Case, PreparedCase
 from apps.benchmarks.peers import time_ytal
 from nlos import Backprojection, Capture, FKMigration, Grid, Hybrid, LightCone, PlanarRSD, propagate
 from nlos.band import Band, VirtualPulse
-from nlos.method import Reconstructor
+from nlos.capture import TimeAxis
+from nlos.method import Method
 from nlos.plane import Plane
 from nlos.sampling import AliasingWarning
 from nlos.simulate import PointScene, build_relay_wall
-from nlos.time_axis import TimeAxis
 from tofclip.threads import run_blocks, thread_count
 
 CYCLES = 4.24
@@ -123,13 +123,13 @@ def prepare_propagation(count: int) -> PreparedCase:
     return PreparedCase(lambda: propagate(capture, plane, pulse), floor, 1, floor_fraction=share)
 
 
-def prepare_confocal(method: Reconstructor, count: int) -> PreparedCase:
+def prepare_confocal(method: Method, count: int) -> PreparedCase:
     """A confocal scan of a planar wall; the floor is a transform of its doubled box, there and
     back.
 
     Parameters
     ----------
-    method : Reconstructor
+    method : Method
     count : int
         Points along a side.
 
@@ -180,7 +180,7 @@ def prepare_backprojection(capture_of: Callable[[int], Capture], count: int) -> 
     capture, axis = capture_of(count), np.linspace(-1, 1, count)
     grid = Grid(axis, axis, np.linspace(0.6, 1.6, count // 4))
     method = Backprojection(0.6, CYCLES)
-    lookups = method.lookups(capture, grid)
+    lookups = method.plan(capture, grid).cost
     source = np.ones(min(COPY_BYTES // 8, lookups), np.complex64)
     target = np.empty_like(source)
 

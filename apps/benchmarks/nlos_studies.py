@@ -8,9 +8,9 @@ from apps.benchmarks.case import Case, PreparedCase
 from apps.benchmarks.nlos import CYCLES, HIDDEN_POINTS_M, LASER_M, RELIEF_M, make_scene
 from nlos import Capture, Grid, Hybrid, PlanarRSD, propagate
 from nlos.band import VirtualPulse
+from nlos.capture import TimeAxis
 from nlos.plane import Plane
 from nlos.simulate import PointScene
-from nlos.time_axis import TimeAxis
 
 STRICT_TOLERANCE = 1e-4  # one that only direct sums keep
 ROWS_IN_TIME = 2

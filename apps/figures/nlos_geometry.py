@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from apps.figures.style import make_figure, save_figure
+from nlos.capture import TimeAxis
 from nlos.simulate import HiddenScene, Surface, build_relay_wall
-from nlos.time_axis import TimeAxis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,8 +16,7 @@ from nlos import Grid
 
 if TYPE_CHECKING:
     from apps.nlos.truth import HiddenTruth
-    from nlos import Capture, Volume
-    from nlos.method import Reconstructor
+    from nlos import Capture, Grid, Method, Volume
 
 WARM_UP_VOXELS = 8
 TRUTH_RADIUS_M = 0.04
@@ -51,9 +50,7 @@ class MeasuredVolume:
         }
 
 
-def measure_imaging(
-    name: str, imaging: Reconstructor, capture: Capture, grid: Grid
-) -> MeasuredVolume:
+def measure_imaging(name: str, imaging: Method, capture: Capture, grid: Grid) -> MeasuredVolume:
     """Image the hidden scene, and measure time and memory.
 
     A few voxels are imaged first, so that loading the compiled loops is not counted.
@@ -61,7 +58,7 @@ def measure_imaging(
     Parameters
     ----------
     name : str
-    imaging : Reconstructor
+    imaging : Method
     capture : Capture
     grid : Grid
 
@@ -74,7 +71,7 @@ def measure_imaging(
     imaging.reconstruct(capture, Grid(grid.x[few], grid.y[few], grid.z[:1]))
     before = _reset_peak_memory()
     started = time.perf_counter()
-    volume = image_capture(name, imaging, capture, grid)
+    volume = image_capture(name, imaging.plan(capture, grid), capture)
     seconds = time.perf_counter() - started
     peak = _read_process_memory("VmHWM")
     return MeasuredVolume(

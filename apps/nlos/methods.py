@@ -1,6 +1,4 @@
-"""The methods of imaging around corners by name: how they are built from settings, and what they
-need.
-"""
+"""Settings of imaging around corners as the command line has them, and as the library does."""
 
 from __future__ import annotations
 
@@ -8,33 +6,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import nlos
 from apps.settings import setting_field
-from tofclip.arrays import ComputeDevice, parse_device
 from tofclip.errors import InputError
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
-    from nlos import Capture, Grid
-    from nlos.method import Reconstructor
+    from nlos import Settings
+    from tofclip.arrays import ComputeDevice
 
+
+from typing import TYPE_CHECKING, cast
+
+if TYPE_CHECKING:
+    from nlos import Grid, Hybrid, Refinement, Settings
+
+
+METHODS = ("rsd", "hybrid", "backprojection", "filtered-backprojection", "lct", "fk")
 PULSE_SETTINGS = ("wavelength_mm", "cycles")
-
-METHODS = {
-    "rsd": ("PlanarRSD", (*PULSE_SETTINGS, "tolerance")),
-    "hybrid": ("Hybrid", (*PULSE_SETTINGS, "tolerance")),
-    "backprojection": ("Backprojection", PULSE_SETTINGS),
-    "filtered-backprojection": ("FilteredBackprojection", ("sigma_mm",)),
-    "lct": ("LightCone", ("signal_to_noise", "falloff")),
-    "fk": ("FKMigration", ("falloff",)),
-}
-"""Class in `nlos`, and the settings that it takes."""
-
-METHODS_BY_SPEED = ("rsd", "hybrid", "backprojection")
-"""They give the same picture; the later one takes more walls and lasers, and more time."""
-
-PORTABLE_METHODS = METHODS_BY_SPEED
+PORTABLE_METHODS = ("rsd", "hybrid", "backprojection")
 """They compute wherever the signal is; the others have compiled loops only."""
+
+LENGTHS_IN_MM = ("wavelength", "voxel", "sigma")
 
 
 @dataclass(frozen=True)
@@ -44,14 +36,18 @@ class ImagingSettings:
     wavelength_mm: float | None = setting_field(
         "MM",
         "Carrier of the virtual pulse.",
-        shown="the shortest that wall points and time bins carry",
+        shown="the shortest that wall points and time bins carry, and that stands out of the noise",
     )
     cycles: float = setting_field("N", "Length of the virtual pulse in wavelengths.", 3.0)
     voxel_mm: float | None = setting_field(
-        "MM", "Distance of neighbouring voxels.", shown="an eighth of the wavelength"
+        "MM",
+        "Distance of neighbouring voxels.",
+        shown="an eighth of the wavelength; lct, fk: half the path of a bin",
     )
     near_m: float | None = setting_field(
-        "M", "First depth.", shown="one voxel beyond the middle of the wall's relief"
+        "M",
+        "First depth.",
+        shown="one voxel beyond the middle of the wall's relief, and of the gate",
     )
     far_m: float | None = setting_field(
         "M", "Last depth.", shown="as far as the record reaches, at most two wall widths"
@@ -65,12 +61,25 @@ class ImagingSettings:
         "Fill all of that box with voxels, not only the part that coarse ones find bright.",
         False,
     )
+    flip: str | None = setting_field(
+        "AXIS", "Mirror the picture along x or y.", shown="no", choices=("x", "y")
+    )
     gate_m: float | None = setting_field(
         "M",
         "Blank what arrives up to so much path after the wall's own light.",
-        shown="nothing is blanked",
+        shown="until it has faded, where the record holds it",
     )
-    bins_together: int = setting_field("N", "Time bins added up to one before imaging.", 1)
+    gate_ramp_m: float | None = setting_field(
+        "M", "Signals rise over so much path after the gate.", shown="a quarter of a gate found"
+    )
+    fade_m: float | None = setting_field(
+        "M",
+        "Signals fade out over so much path before the record ends.",
+        shown="a tenth of the record, where light still comes then",
+    )
+    bins_together: int | None = setting_field(
+        "N", "Time bins added up to one before imaging.", shown="while a wavelength keeps 16"
+    )
     tolerance: float | None = setting_field(
         "SHARE", "Error allowed for the sake of speed: rsd, hybrid.", shown="0.01"
     )
@@ -104,111 +113,200 @@ def parse_method_names(text: str) -> tuple[str, ...]:
 
 
 def require_used_settings(settings: ImagingSettings, methods: Sequence[str]) -> None:
-    """Refuse a setting that none of the methods takes, since it would change nothing.
-
-    Parameters
-    ----------
-    settings : ImagingSettings
-    methods : sequence of str
-
-    Raises
-    ------
-    InputError
-        There is such a setting.
-    """
-    taken = {name for method in methods for name in METHODS[method][1]}
+    """Refuse a setting that none of the methods takes, since it would change nothing."""
+    by_method = {name: _list_settings(name) for name in METHODS}
+    taken = {name for method in methods for name in by_method[method]}
     for name in sorted(
-        {name for _, names in METHODS.values() for name in names} - taken - set(PULSE_SETTINGS)
+        {name for names in by_method.values() for name in names} - taken - set(PULSE_SETTINGS)
     ):
         if getattr(settings, name) is not None:
-            by = ", ".join(method for method, (_, names) in METHODS.items() if name in names)
+            by = ", ".join(method for method, names in by_method.items() if name in names)
             raise InputError(
                 f"{name} is a setting of {by} and changes nothing for {', '.join(methods)}; leave it out"
             )
 
 
-def build_method(method: str, settings: ImagingSettings) -> Reconstructor:
-    """Build a method; what no setting says is left to its class.
-
-    Parameters
-    ----------
-    method : str
-        A key of `METHODS`.
-    settings : ImagingSettings
-
-    Returns
-    -------
-    Reconstructor
-    """
-    class_name, names = METHODS[method]
-    arguments = {}
-    for name in names:
-        value = getattr(settings, name)
-        if value is not None:
-            arguments[name.removesuffix("_mm")] = (
-                value * MILLIMETRE if name.endswith("_mm") else value
-            )
-    made: Reconstructor = getattr(nlos, class_name)(**arguments)
-    return made
+def require_valid_settings(settings: ImagingSettings, methods: Sequence[str]) -> None:
+    """Refuse settings that no capture could make sense of, before any is read."""
+    require_used_settings(settings, methods)
+    if settings.flip not in (None, "x", "y"):
+        raise InputError(f"flip is x or y, got '{settings.flip}'")
+    given = to_library(settings)
+    if given.wavelength is None:
+        given = replace(given, wavelength=1.0)
+    for name in methods:
+        given.make_method(name)
 
 
-def fill_in_defaults(settings: Imaging, methods: Sequence[str]) -> Imaging:
-    """Fill in the defaults of the methods' classes where nothing is given, and leave out what none
-    of them takes.
+def to_library(settings: ImagingSettings) -> Settings:
+    """Return the settings in the library's units; None stays to be found."""
+    from nlos.settings import Settings
 
-    Parameters
-    ----------
-    settings : ImagingSettings
-    methods : sequence of str
+    lengths: dict[str, Any] = {
+        name: None if (value := getattr(settings, f"{name}_mm")) is None else value * MILLIMETRE
+        for name in LENGTHS_IN_MM
+    }
+    names = ("cycles", "bins_together", "everywhere", "tolerance", "falloff", "signal_to_noise")
+    others: dict[str, Any] = {name: getattr(settings, name) for name in names}
+    return Settings(
+        flip=settings.flip,
+        gate=settings.gate_m,
+        gate_ramp=settings.gate_ramp_m,
+        fade=settings.fade_m,
+        x=settings.x_m,
+        y=settings.y_m,
+        near=settings.near_m,
+        far=settings.far_m,
+        method=getattr(settings, "method", None),
+        **lengths,
+        **others,
+    )
 
-    Returns
-    -------
-    ImagingSettings
+
+def from_library(settings: Imaging, found: Settings, methods: Sequence[str]) -> Imaging:
+    """Return the command line's settings with what was found, and what the methods' classes take
+    where nothing is given; what none of the methods takes is left out.
     """
     kept: dict[str, Any] = {
-        name: None for _, names in METHODS.values() for name in names if name not in PULSE_SETTINGS
+        name: None
+        for method in METHODS
+        for name in _list_settings(method)
+        if name not in PULSE_SETTINGS
     }
     for method in methods:
-        made = build_method(method, settings)
-        for name in METHODS[method][1]:
-            kept[name] = getattr(settings, name) if name.endswith("_mm") else getattr(made, name)
+        made = found.make_method(method)
+        for name in _list_settings(method):
+            bare = name.removesuffix("_mm")
+            value = getattr(found, bare) if bare in LENGTHS_IN_MM else getattr(made, name)
+            kept[name] = value / MILLIMETRE if bare in LENGTHS_IN_MM else value
+    x, y, (near, far) = found.box
+    kept |= {
+        "gate_m": found.gate,
+        "gate_ramp_m": found.gate_ramp,
+        "fade_m": found.fade,
+        "bins_together": found.bins_together,
+        "wavelength_mm": _to_mm(found.wavelength),
+        "voxel_mm": _to_mm(found.voxel),
+        "x_m": x,
+        "y_m": y,
+        "near_m": near,
+        "far_m": far,
+        "everywhere": found.everywhere,
+    }
+    # What was given stays to the last bit.
+    for name in ("wavelength_mm", "voxel_mm", "sigma_mm"):
+        if getattr(settings, name) is not None and kept[name] is not None:
+            kept[name] = getattr(settings, name)
     return replace(settings, **kept)
-
-
-def choose_quickest_method(settings: ImagingSettings, capture: Capture, grid: Grid) -> str:
-    """Name the quickest method that takes a capture; where none does, the one that takes most,
-    which says why.
-
-    Parameters
-    ----------
-    settings : ImagingSettings
-    capture : Capture
-    grid : Grid
-
-    Returns
-    -------
-    str
-    """
-    suits = (
-        name for name in METHODS_BY_SPEED if build_method(name, settings).supports(capture, grid)
-    )
-    return next(suits, METHODS_BY_SPEED[-1])
 
 
 def choose_device(device: str, settings: ImagingSettings) -> ComputeDevice:
     """Return the device that a name asks for; ``auto`` stays with the compiled loops where a method
     has nothing else.
-
-    Parameters
-    ----------
-    device : str
-        See `tofclip.arrays.parse_device`.
-    settings : ImagingSettings
-
-    Returns
-    -------
-    ComputeDevice
     """
+    from tofclip.arrays import ComputeDevice, parse_device
+
     named, refine = (getattr(settings, name, None) for name in ("method", "refine"))
     portable = named in (None, *PORTABLE_METHODS) and refine is None
     return ComputeDevice() if device == "auto" and not portable else parse_device(device)
+
+
+def _list_settings(method: str) -> tuple[str, ...]:
+    """Names of the command line's settings that a method takes."""
+    from nlos.settings import METHOD_CLASSES
+
+    return tuple(
+        f"{name}_mm" if name in LENGTHS_IN_MM else name for name in METHOD_CLASSES[method][1]
+    )
+
+
+def _to_mm(length: float | None) -> float | None:
+    """Return a length in mm, without the rounding errors of the change of unit."""
+    return None if length is None else float(f"{length / MILLIMETRE:.12g}")
+
+
+PRIORS = ("l1", "tv")
+REFINED_METHOD = "hybrid"
+"""The method that is iterated."""
+
+DEFAULT_ITERATIONS, DEFAULT_PRIOR_WEIGHT = 60, 2e-2
+
+
+@dataclass(frozen=True)
+class RefinementSettings(ImagingSettings):
+    """Whether and how an image is refined; None is left to `nlos.Refinement`."""
+
+    refine: str | None = setting_field(
+        "NAME",
+        "Iterate the hybrid's image: l1 for few bright things, tv for even surfaces.",
+        shown="no",
+        choices=PRIORS,
+    )
+    iterations: int | None = setting_field(
+        "N",
+        "With --refine: steps at most; each costs some four images.",
+        shown=str(DEFAULT_ITERATIONS),
+    )
+    prior_weight: float | None = setting_field(
+        "SHARE",
+        "With --refine: how much the prior counts, of the weight that leaves nothing.",
+        shown=str(DEFAULT_PRIOR_WEIGHT),
+    )
+
+
+Refining = TypeVar("Refining", bound=RefinementSettings)
+
+
+def require_valid_refinement(settings: RefinementSettings, method: str | None) -> None:
+    """Refuse a refinement that makes no sense, and settings of one that nobody asked for."""
+    if settings.refine is None:
+        for name in ("iterations", "prior_weight"):
+            if getattr(settings, name) is not None:
+                raise InputError(
+                    f"{name} is a setting of --refine; tell --refine {' or '.join(PRIORS)} as well"
+                )
+        return
+    if settings.refine not in PRIORS:
+        raise InputError(f"unknown prior '{settings.refine}'; refine by {' or '.join(PRIORS)}")
+    if method not in (None, REFINED_METHOD):
+        raise InputError(
+            f"--refine iterates the {REFINED_METHOD} method, not {method}; leave --method out"
+        )
+    if settings.iterations is not None and settings.iterations < 1:
+        raise InputError(f"iterations must be 1 or more, got {settings.iterations}")
+    if settings.prior_weight is not None and not 0 <= settings.prior_weight < 1:
+        raise InputError(
+            f"prior_weight is a share from 0 to less than 1, got {settings.prior_weight}"
+        )
+
+
+def build_refinement(
+    settings: Refining, imaging: Settings, grid: Grid
+) -> tuple[Refining, Refinement]:
+    """Build the refinement that settings ask for.
+
+    Parameters
+    ----------
+    settings : RefinementSettings
+    imaging : Settings
+        Of the hybrid that is iterated.
+    grid : Grid
+
+    Returns
+    -------
+    RefinementSettings, Refinement
+        The settings come back with what was not given.
+    """
+    from nlos import Refinement
+    from nlos.refinement.refine import build_total_variation
+    from tofclip.solvers import Sparse
+
+    weight = DEFAULT_PRIOR_WEIGHT if settings.prior_weight is None else settings.prior_weight
+    iterations = settings.iterations or DEFAULT_ITERATIONS
+    prior = (
+        build_total_variation(grid, weight, iterations)
+        if settings.refine == "tv"
+        else Sparse(weight, iterations)
+    )
+    hybrid = cast("Hybrid", imaging.make_method(REFINED_METHOD))
+    return replace(settings, prior_weight=weight, iterations=iterations), Refinement(hybrid, prior)

@@ -14,6 +14,7 @@ import numpy as np
 
 from apps.nlos.truth import HiddenTruth
 from apps.settings import setting_field
+from nlos.capture import TimeAxis
 from nlos.simulate import (
     HiddenScene,
     Lambert,
@@ -24,13 +25,14 @@ from nlos.simulate import (
     add_poisson_noise,
     build_relay_wall,
 )
-from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
 from tofclip.units import MILLIMETRE, PICOSECOND, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
     from nlos import Capture
+    from nlos.capture import TimeAxis
     from nlos.geometry import FloatArray
+    from nlos.simulate import HiddenScene, PointScene, Surface
 
 SCANS = ("single", "confocal")
 WALLS = ("planar", "cylinder", "wavy", "relief", "plates")
@@ -156,20 +158,10 @@ def choose_time_axis(
 
     A sum of distances is largest at a corner of the box about what is hidden.
 
-    Parameters
-    ----------
-    wall : (..., 3) float64 array
-        Metres; NaN where there is no wall.
-    laser : (..., 3) float64 array
-        Metres.
-    hidden : (n, 3) float64 array
-        Metres.
-    bin_width, jitter : float
-        Seconds; the jitter is the response's standard deviation.
+    import numpy as np
 
-    Returns
-    -------
-    TimeAxis
+    from nlos.capture import TimeAxis
+    from tofclip.units import SPEED_OF_LIGHT
 
     Raises
     ------

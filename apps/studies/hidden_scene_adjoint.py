@@ -15,12 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from nlos.adjoint import AdjointImaging, CompressedCapture
-from nlos.capture import Capture
+from nlos.capture import Capture, TimeAxis
 from nlos.geometry import Grid
-from nlos.method import Reconstructor
+from nlos.method import Method
 from nlos.rsd.planar import PlanarRSD
 from nlos.simulate import HiddenScene, Lambert, Surface, add_poisson_noise, build_relay_wall
-from nlos.time_axis import TimeAxis
 from nlos.volume import Volume
 from tofclip.errors import InputError
 from tofclip.operators import RadonProjection
@@ -176,7 +175,7 @@ def correlate_views(one: Volume, other: Volume) -> float:
     return float(np.corrcoef(first, second)[0, 1])
 
 
-def run_study(capture: Capture, grid: Grid, solver: Reconstructor, seed: int = 0) -> list[StudyRow]:
+def run_study(capture: Capture, grid: Grid, solver: Method, seed: int = 0) -> list[StudyRow]:
     """Image a noiseless capture at every exposure and sampling ratio.
 
     Parameters
@@ -184,7 +183,7 @@ def run_study(capture: Capture, grid: Grid, solver: Reconstructor, seed: int = 0
     capture : Capture
         Of rows and as many columns.
     grid : Grid
-    solver : Reconstructor
+    solver : Method
     seed : int
         Of the photons.
 

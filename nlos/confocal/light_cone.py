@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.confocal.scan import (
+    ConfocalPlan,
     ConfocalScan,
-    check_confocal_support,
     find_padded_length,
     resample_to_grid,
 )
 from nlos.geometry import FloatArray, Grid
-from nlos.method import Progress, Support, ignore_progress
-from nlos.volume import Volume
+from nlos.method import Method
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks, thread_count
 
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class LightCone:
+class LightCone(Method):
     """Confocal imaging by the light-cone transform.
 
     With u = z^2 and v = d^2, d half the path, the hyperboloid of a hidden point is ``v = u + x^2 +
@@ -62,48 +61,35 @@ class LightCone:
         if not (np.isfinite(self.falloff) and self.falloff >= 0):
             raise InputError(f"falloff must be a power of 0 or more, got {self.falloff}")
 
-    def supports(self, capture: Capture, grid: Grid) -> Support:
-        """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with
-        ``.reason``.
+    def plan(self, capture: Capture, grid: Grid) -> ConfocalPlan:
+        """Make the method ready for captures like `capture` on `grid`.
 
         Parameters
         ----------
         capture : Capture
-        grid : Grid
-
-        Returns
-        -------
-        Support
-        """
-        return check_confocal_support(capture, grid)
-
-    def reconstruct(
-        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
-    ) -> Volume:
-        """Image the hidden scene.
-
-        Parameters
-        ----------
-        capture : Capture
-            Without the light that the wall returns at once; see
-            `nlos.preparation.remove_first_bounce`.
+            A confocal scan of a lattice on a plane z = const, without the light that the wall
+            returns at once; see `nlos.preparation.remove_first_bounce`.
         grid : Grid
             Up to half a wall beyond the wall's edges; read by linear interpolation.
-        progress : callable, optional
-            Called with the number of voxels when all are done.
 
         Returns
         -------
-        Volume
-            Albedo up to one factor, float32, not negative.
+        ConfocalPlan
 
         Raises
         ------
         InputError
-            `supports` says no.
+            The method cannot image such a capture on the grid, or not within memory.
         """
-        self.supports(capture, grid).require()
-        scan = ConfocalScan.of(capture, grid)
+        settings = {
+            "method": "lightcone",
+            "signal_to_noise": self.signal_to_noise,
+            "falloff": self.falloff,
+        }
+        return ConfocalPlan(capture, grid, self._compute, settings)
+
+    def _compute(self, scan: ConfocalScan, grid: Grid) -> NDArray[np.float32]:
+        """Return the image (z, y, x) of a scan on a grid."""
         bins = scan.signal.shape[2]
         # one sample of u = z^2 for each bin, over the same range of depths
         squares = (bins * scan.spacing) ** 2 / bins
@@ -111,13 +97,7 @@ class LightCone:
         depth_position = (grid.z - scan.plane.z) ** 2 / squares - 0.5
         # Depths between the wall and the first sample read the first.
         image = resample_to_grid(values, scan, grid, np.clip(depth_position, 0, bins - 1))
-        progress(grid.size)
-        settings = {
-            "method": "lightcone",
-            "signal_to_noise": self.signal_to_noise,
-            "falloff": self.falloff,
-        }
-        return Volume(np.maximum(image, 0), grid, {**capture.provenance, "imaging": settings})
+        return np.maximum(image, 0)
 
     def _deconvolve(self, scan: ConfocalScan, squares: float) -> NDArray[np.float32]:
         """Return the image on the padded lattice over samples of u that are `squares` (m^2) apart."""

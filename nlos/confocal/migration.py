@@ -10,21 +10,20 @@ from numpy.typing import NDArray
 from nlos.capture import Capture
 from nlos.confocal.kernels import migrate_row
 from nlos.confocal.scan import (
+    ConfocalPlan,
     ConfocalScan,
-    check_confocal_support,
     find_padded_length,
     resample_to_grid,
 )
 from nlos.geometry import Grid
-from nlos.method import Progress, Support, ignore_progress
+from nlos.method import Method
 from nlos.plane import axis_step
-from nlos.volume import Volume
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks, thread_count
 
 
 @dataclass(frozen=True)
-class FKMigration:
+class FKMigration(Method):
     """Confocal imaging by f-k (Stolt) migration.
 
     The signals are taken for a wave that all hidden points sent out at once and that travelled to
@@ -55,55 +54,35 @@ class FKMigration:
         if not (np.isfinite(self.falloff) and self.falloff >= 0):
             raise InputError(f"falloff must be a power of 0 or more, got {self.falloff}")
 
-    def supports(self, capture: Capture, grid: Grid) -> Support:
-        """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with
-        ``.reason``.
+    def plan(self, capture: Capture, grid: Grid) -> ConfocalPlan:
+        """Make the method ready for captures like `capture` on `grid`.
 
         Parameters
         ----------
         capture : Capture
-        grid : Grid
-
-        Returns
-        -------
-        Support
-        """
-        return check_confocal_support(capture, grid)
-
-    def reconstruct(
-        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
-    ) -> Volume:
-        """Image the hidden scene.
-
-        Parameters
-        ----------
-        capture : Capture
-            Without the light that the wall returns at once; see
-            `nlos.preparation.remove_first_bounce`.
+            A confocal scan of a lattice on a plane z = const, without the light that the wall
+            returns at once; see `nlos.preparation.remove_first_bounce`.
         grid : Grid
             Up to half a wall beyond the wall's edges; read by linear interpolation.
-        progress : callable, optional
-            Called with the number of voxels when all are done.
 
         Returns
         -------
-        Volume
-            Energy of the wave, float32.
+        ConfocalPlan
 
         Raises
         ------
         InputError
-            `supports` says no.
+            The method cannot image such a capture on the grid, or not within memory.
         """
-        self.supports(capture, grid).require()
-        scan = ConfocalScan.of(capture, grid)
+        settings = {"method": "fk", "falloff": self.falloff}
+        return ConfocalPlan(capture, grid, self._compute, settings)
+
+    def _compute(self, scan: ConfocalScan, grid: Grid) -> NDArray[np.float32]:
+        """Return the image (z, y, x) of a scan on a grid."""
         energy = _compute_energy(
             _migrate_spectrum(self._compute_spectrum(scan), scan), scan.signal.shape[2]
         )
-        image = resample_to_grid(energy, scan, grid, (grid.z - scan.plane.z) / scan.spacing)
-        progress(grid.size)
-        settings = {"method": "fk", "falloff": self.falloff}
-        return Volume(image, grid, {**capture.provenance, "imaging": settings})
+        return resample_to_grid(energy, scan, grid, (grid.z - scan.plane.z) / scan.spacing)
 
     def _compute_spectrum(self, scan: ConfocalScan) -> NDArray[np.complex64]:
         """Spectrum (ky, kx, frequency >= 0) of the wave's amplitude; its middle in time stands at

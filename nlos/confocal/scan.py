@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +12,10 @@ from numpy.typing import NDArray
 from nlos.capture import Capture
 from nlos.geometry import FloatArray, Grid
 from nlos.kernels import shift_signals
-from nlos.method import Support, check_common_support, check_numpy_support
+from nlos.method import VOXEL_BYTES, Plan, Progress, require_imageable, require_numpy_signal
 from nlos.plane import Plane, axis_step
 from nlos.rsd.wall import PlanarWall
+from nlos.volume import Volume
 from tofclip.errors import InputError
 
 LATTICE_TOLERANCE = 0.02
@@ -72,7 +75,7 @@ class ConfocalScan:
         """
         wall = PlanarWall.of(capture.points, LATTICE_TOLERANCE)
         traces = _shift_to_distance_zero(capture, _count_useful_bins(capture, wall.plane, grid))
-        return cls(wall.field(traces), wall.plane, capture.axis.spacing / 2)
+        return cls(wall.lattice.place(traces), wall.plane, capture.axis.spacing / 2)
 
     def correct_falloff(self, falloff: float) -> NDArray[np.float32]:
         """Undo the loss of brightness with distance d by the factor d^falloff; the farthest bin
@@ -82,34 +85,53 @@ class ConfocalScan:
         return np.asarray(self.signal * relative**falloff, dtype=np.float32)
 
 
-def check_confocal_support(capture: Capture, grid: Grid) -> Support:
-    """Check what both methods need: a confocal scan on a lattice of a plane, a grid close by, and
-    memory.
+class ConfocalPlan(Plan):
+    """Imaging by transforms of the whole scan at once, ready for captures of one geometry.
 
     Parameters
     ----------
     capture : Capture
+        A confocal scan of a lattice on a plane z = const.
     grid : Grid
+        Up to half a wall beyond the wall's edges.
+    compute : callable
+        From a scan and the grid to the values (z, y, x).
+    settings : mapping
+        What a volume reports of how it was imaged.
 
-    Returns
-    -------
-    Support
-        A condition; ``.reason`` says what is missing.
+    Raises
+    ------
+    InputError
+        There is no such lattice, the grid reaches too far, or memory does not suffice.
     """
-    basic = check_numpy_support(
-        "a light-cone transform or f-k migration", capture
-    ) and check_common_support(capture, grid)
-    if not basic:
-        return basic
-    try:
-        plane = PlanarWall.of(capture.points, LATTICE_TOLERANCE).plane
-    except InputError as problem:
-        return Support(f"a lattice of points on a plane is needed: {problem}")
-    return Support(
-        _find_laser_problem(capture, plane)
-        or _find_extent_problem(plane, grid)
-        or _find_memory_problem(capture, plane)
-    )
+
+    def __init__(
+        self,
+        capture: Capture,
+        grid: Grid,
+        compute: Callable[[ConfocalScan, Grid], NDArray[np.float32]],
+        settings: Mapping[str, Any],
+    ) -> None:
+        require_numpy_signal("a light-cone transform or f-k migration", capture)
+        require_imageable(capture, grid)
+        try:
+            wall = PlanarWall.of(capture.points, LATTICE_TOLERANCE)
+        except InputError as problem:
+            raise InputError(f"a lattice of points on a plane is needed: {problem}") from problem
+        super().__init__(capture, grid)
+        _require_confocal(capture, wall.plane)
+        _require_extent(wall.plane, grid)
+        self._memory_bytes = _require_memory(capture, wall.plane) + grid.size * VOXEL_BYTES
+        self._compute, self.settings = compute, dict(settings)
+
+    @property
+    def memory_bytes(self) -> int:
+        return self._memory_bytes
+
+    def _image(self, capture: Capture, progress: Progress) -> Volume:
+        image = self._compute(ConfocalScan.of(capture, self.grid), self.grid)
+        progress(self.grid.size)
+        return Volume(image, self.grid, {**capture.provenance, "imaging": self.settings})
 
 
 def find_padded_length(count: int) -> int:
@@ -174,40 +196,41 @@ def resample_to_grid(
     )
 
 
-def _find_laser_problem(capture: Capture, plane: Plane) -> str:
+def _require_confocal(capture: Capture, plane: Plane) -> None:
     if len(capture.lasers) != len(capture.points):
-        return "a confocal scan is needed, where every wall point is its own laser spot; use another method"
+        raise InputError(
+            "a confocal scan is needed, where every wall point is its own laser spot; use another method"
+        )
     apart = float(np.abs(capture.lasers - capture.points).max())
     if apart > LATTICE_TOLERANCE * min(plane.steps):
-        return (
+        raise InputError(
             f"a confocal scan is needed, but lasers are up to {apart:.3g} m from their wall points; "
             "use another method"
         )
-    return ""
 
 
-def _find_extent_problem(plane: Plane, grid: Grid) -> str:
+def _require_extent(plane: Plane, grid: Grid) -> None:
     for name, axis, wanted in (("x", plane.x, grid.x), ("y", plane.y, grid.y)):
         margin = (axis[-1] - axis[0]) / 2
         low, high = axis[0] - margin, axis[-1] + margin
         if wanted[0] < low or wanted[-1] > high:
-            return (
+            raise InputError(
                 f"the grid's {name} runs from {wanted[0]:.3g} to {wanted[-1]:.3g} m, but this method sees only from "
                 f"{low:.3g} to {high:.3g} m, half a wall beyond the wall"
             )
-    return ""
 
 
-def _find_memory_problem(capture: Capture, plane: Plane) -> str:
+def _require_memory(capture: Capture, plane: Plane) -> int:
+    """Return what the transforms take, bytes; refuse more than `MEMORY_LIMIT_BYTES`."""
     places = plane.x.size * plane.y.size
     bins = capture.axis.bins + max(0, int(capture.start / capture.axis.spacing))
     needed = 8 * places * bins * BYTES_PER_SAMPLE
-    if needed <= MEMORY_LIMIT_BYTES:
-        return ""
-    return (
-        f"{places} wall points with {bins} bins need {needed / 2**30:.1f} GiB, more than the "
-        f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: put time bins together or leave wall points out"
-    )
+    if needed > MEMORY_LIMIT_BYTES:
+        raise InputError(
+            f"{places} wall points with {bins} bins need {needed / 2**30:.1f} GiB, more than the "
+            f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: put time bins together or leave wall points out"
+        )
+    return needed
 
 
 def _count_useful_bins(capture: Capture, plane: Plane, grid: Grid) -> int:

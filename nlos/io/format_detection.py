@@ -7,16 +7,43 @@ from dataclasses import replace
 from pathlib import Path
 
 from nlos.capture import Capture
-from nlos.io.archives import read_lift_archive, read_numpy_archive
+from nlos.io.archives import (
+    read_curvelet_data,
+    read_general_data,
+    read_lift_archive,
+    read_numpy_archive,
+    read_surface_optimisation_data,
+)
 from nlos.io.fields import NamedArrays, is_matlab, read_hdf5, read_matlab
-from nlos.io.native import read_native
 from nlos.io.renderings import read_streak_folder
 from nlos.io.stanford import read_light_cone_data, read_migration_data
 from nlos.io.tal import read_tal
 from nlos.io.wisconsin import read_phasor_field_data, read_rectified_data
 from nlos.io.zaragoza import read_zaragoza
 from tofclip.errors import FileFormatError
-from tofclip.storage import HDF5_SIGNATURE, collect_provenance, translate_read_errors
+from tofclip.storage import HDF5_SIGNATURE, Record, collect_provenance, translate_read_errors
+
+
+def read_native(path: str | Path) -> Capture | None:
+    """Read a capture, or take one out of recovered frames; None if the HDF5 file is not one of
+    ours.
+    """
+    import h5py
+
+    from tofclip.shots import Frames
+
+    try:
+        with h5py.File(path, "r") as file:
+            own = "format" in file.attrs
+    except OSError as fault:
+        raise FileFormatError(path, "is a truncated or damaged HDF5 file") from fault
+    if not own:
+        return None
+    record = Record.load(path, "capture", "frames")
+    if record.kind == "capture":
+        return Capture.from_record(record)
+    return Capture.from_frames(Frames.from_record(record))
+
 
 ZIP_SIGNATURE = b"PK\x03\x04"
 
@@ -24,7 +51,8 @@ Reader = Callable[[NamedArrays], Capture]
 
 # A file is known by the names of its fields; the first format whose fields are all there is taken.
 ARCHIVE_FORMATS: Mapping[tuple[str, ...], Reader] = {
-    ("H", "wall_xyz", "laser_xyz", "delta_t_s", "t_start_m"): read_numpy_archive,
+    ("H", "wall_xyz", "laser_xyz", "delta_t_s"): read_numpy_archive,
+    ("H", "wall_xyz", "laser_xyz", "delta_t_m"): read_numpy_archive,
 }
 HDF5_FORMATS: Mapping[tuple[str, ...], Reader] = {
     ("H", "H_format", "sensor_grid_xyz", "laser_grid_xyz"): read_tal,
@@ -34,7 +62,10 @@ MATLAB_FORMATS: Mapping[tuple[str, ...], Reader] = {
     ("rect_data", "ts", "sampling_spacing"): read_rectified_data,
     ("rect_data", "width"): read_light_cone_data,
     ("dataset.data", "dataset.laserPos", "dataset.cameraPos"): read_phasor_field_data,
+    ("transient", "lighting"): read_surface_optimisation_data,
+    ("sub_Sig",): read_curvelet_data,
     ("meas",): read_migration_data,
+    ("data",): read_general_data,
 }
 
 
@@ -44,10 +75,11 @@ def read_capture(path: str | Path) -> Capture:
     The format is recognised by content:
 
     * our own HDF5: captures, and recovered frames that carry a relay wall;
-    * NumPy archives with ``H``, ``wall_xyz``, ``laser_xyz``, ``delta_t_s`` and ``t_start_m``;
+    * NumPy archives with ``H``, ``wall_xyz``, ``laser_xyz``, and ``delta_t_s`` or ``delta_t_m``;
     * LIFT archives (Feng and Gao 2021), whose frames are recovered by the linear inverse;
     * HDF5 of y-tal, and of the Zaragoza NLOS data set;
-    * .mat files, of any version, of O'Toole 2018, Lindell 2019, Liu 2019 and Liu 2020;
+    * .mat files, of any version, of O'Toole 2018, Lindell 2019, Tsai 2019, Liu 2019, Liu 2020 and
+      Liu 2023;
     * a folder with one EXR streak image per wall row, and a ``geometry.toml``.
 
     Captures come back with the ways to and from the device taken off. The light that the wall
@@ -105,4 +137,8 @@ def _read_fields(fields: NamedArrays, formats: Mapping[tuple[str, ...], Reader])
             return read(fields)
     known = "; or ".join(", ".join(names) for names in formats)
     found = ", ".join(sorted(fields.names)[:8]) or "nothing"
-    raise FileFormatError(fields.path, f"holds {found}, but a capture needs the fields {known}")
+    raise FileFormatError(
+        fields.path,
+        f"holds {found}, but a capture needs the fields {known}; "
+        "docs/own_wall.md shows how to write one",
+    )

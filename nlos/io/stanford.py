@@ -2,13 +2,14 @@
 
 * Light-cone transform (O'Toole, Lindell, Wetzstein, Nature 555, 338, 2018): ``rect_data`` (x, y, t)
   with the light's way to the wall taken off, in bins of 4 ps, and ``width``, half the side of the
-  wall in m; as ``cnlos_reconstruction.m`` of that paper's code takes them.
+  wall in m; as ``cnlos_reconstruction.m`` of that paper's code takes them. x falls along the first
+  axis: that code reverses x before it shows a volume, and only so their letter S reads as an S.
 * f-k migration (Lindell, Wetzstein, O'Toole, ACM Trans. Graph. 38, 116, 2019): ``meas`` (y, x, t)
   in bins of 32 ps on a wall of 2 m x 2 m, and in a file beside it ``tofgrid`` (y, x), the arrival
   of the wall's own light in ps; as ``demo.m`` and ``cnlos_reconstruction.m`` of
   https://github.com/computational-imaging/nlos-fk take them.
 
-Whether x or y run as in a photograph neither says.
+Whether x or y run as in a photograph f-k migration's data set does not say.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ def read_light_cone_data(fields: NamedArrays) -> Capture:
     """Read a scene of the light-cone transform's data set."""
     counts = fields.array("rect_data", None, None, None)
     wall = np.swapaxes(_build_wall(counts.shape[1], counts.shape[0], fields.number("width")), 0, 1)
+    wall = wall[::-1]
     return Capture(np.moveaxis(counts, 2, 0), wall, wall, LIGHT_CONE_BIN_WIDTH_S)
 
 

@@ -68,6 +68,8 @@ def match_lasers_to_sensors(
         The signal's shape belongs neither to the wall points nor to the laser points.
     """
     sensors, lasers = sensor.shape[:-1], laser.shape[:-1]
+    if not signal.ndim:
+        raise FileFormatError(fields.path, "holds a signal without a time axis")
     if signal.shape[1:] == sensors and laser.size == 3:
         return Capture(signal, sensor, laser.reshape(3), bin_width, start)
     if signal.shape[1:] == sensors == lasers:

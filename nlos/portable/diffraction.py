@@ -15,8 +15,7 @@ from nlos.depths import DepthPropagator
 from nlos.method import Progress, ignore_progress
 from nlos.portable.library import ArrayLibrary, remove_whole_turns
 from nlos.rsd.diffraction import DiffractionPlan
-from nlos.rsd.illumination import Illumination
-from nlos.rsd.image_planes import LaserSource
+from nlos.rsd.image_planes import Illumination, LaserSource
 from nlos.rsd.kernels import TAPS
 from tofclip.arrays import Array
 from tofclip.threads import run_blocks, split_blocks
@@ -81,7 +80,7 @@ class PortableDiffraction:
 
     def add(self, values: Array, total: Array, progress: Progress = ignore_progress) -> None:
         """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r; see
-        `nlos.rsd.image_planes.diffract_to_grid`.
+        `nlos.rsd.image_planes.CompiledDiffraction`.
 
         Parameters
         ----------

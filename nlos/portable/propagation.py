@@ -8,50 +8,19 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.band import Band
-from nlos.capture import Capture
-from nlos.illumination_groups import IlluminationGroup
+from nlos.method import Progress, ignore_progress
 from nlos.plane import Plane
 from nlos.portable.library import ArrayLibrary
-from nlos.portable.signals import BandTransform, arrange_on_lattice, get_group_traces
+from nlos.portable.signals import arrange_on_lattice
+from nlos.propagation.compiled import STRENGTH_POINTS, estimate_strength
 from nlos.propagation.kernels import MIN_DISTANCE_M
-from nlos.propagation.plane_field import PlaneField
-from nlos.propagation.propagate import STRENGTH_POINTS, estimate_strength
 from nlos.propagation.wall_to_plane_plan import WallToPlanePlan
 from nlos.rsd.kernels import TAPS
-from nlos.rsd.planar import build_waves
 from nlos.rsd.transfer import SphericalWaves
 from tofclip.arrays import Array, to_numpy
 from tofclip.threads import split_blocks
 
 FloatArray = NDArray[np.float64]
-
-
-def propagate_on_device(
-    capture: Capture, group: IlluminationGroup, plane: Plane, band: Band, tolerance: float
-) -> PlaneField:
-    """Propagate one illumination group of a capture onto a plane where its signal lives; see
-    `nlos.propagate`.
-
-    Parameters
-    ----------
-    capture : Capture
-    group : IlluminationGroup
-    plane : Plane
-    band : Band
-        Wavenumbers, rad/m.
-    tolerance : float
-        Relative error.
-
-    Returns
-    -------
-    PlaneField
-    """
-    waves, points = build_waves(group, band, continued=False), capture.points[group.indices]
-    library = ArrayLibrary(capture.device)
-    phasors = BandTransform(band, capture.axis.bins, library).of(get_group_traces(capture, group))
-    field = PortablePropagation(points, plane, waves, tolerance, library).field(phasors)
-    return PlaneField(field, plane, group.legs * band.wavenumbers)
 
 
 class PortablePropagation:
@@ -90,11 +59,16 @@ class PortablePropagation:
         self.library = library
         self._propagator: _LowRankPropagator | _DirectPropagator | None = None
 
-    def field(self, phasors: Array) -> Array:
-        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies), complex64."""
+    def field(self, phasors: Array, progress: Progress = ignore_progress) -> Array:
+        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies), complex64.
+
+        Progress counts points of the plane times frequencies, all at once.
+        """
         if self._propagator is None:
             self._propagator = self._choose_propagator(phasors)
-        return self._propagator.field(phasors)
+        field = self._propagator.field(phasors)
+        progress(field.shape[0] * field.shape[1] * field.shape[2])
+        return field
 
     def _choose_propagator(self, phasors: Array) -> _LowRankPropagator | _DirectPropagator:
         some = np.arange(0, phasors.shape[0], phasors.shape[0] // STRENGTH_POINTS + 1)

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from nlos.backends import Backend, choose_backend
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
-from nlos.illumination_groups import IlluminationGroup, group_by_illumination
-from nlos.method import Progress, ignore_progress
-from nlos.plane import Plane
-from nlos.propagation.direct import propagate_direct
-from nlos.propagation.low_rank_propagation import propagate_low_rank
-from nlos.propagation.plane_field import PlaneField
-from nlos.propagation.scattered import ScatteredWallToPlanePlan, has_finufft
+from nlos.illumination_groups import IlluminationGroup, build_waves, group_by_illumination
+from nlos.method import Progress, ignore_progress, require_numpy_signal
+from nlos.plane import Plane, PlaneField
 from nlos.propagation.shift_and_sum import propagate_in_time
-from nlos.propagation.wall_to_plane_plan import WallToPlanePlan
-from nlos.rsd.planar import build_waves, require_tolerance
-from tofclip.arrays import is_numpy, require_numpy
+from tofclip.arrays import Array
 from tofclip.errors import InputError
 
 Propagation = Literal["spectral", "time"]
 
-STRENGTH_POINTS = 1024
-"""Enough wall points to tell the strength of a frequency from."""
+WallToPlane = Callable[[Capture, Progress], Array]
+"""Carries what a capture's wall points recorded to a plane: the field (y, x, frequencies) there."""
 
 
 def propagate(
@@ -70,102 +65,80 @@ def propagate(
             f"{len(groups)} laser spots make as many fields: propagate the wall points of one at a time"
         )
     require_tolerance(tolerance)
-    return propagate_group(
-        capture, groups[0], plane, Band(pulse, capture.axis), propagation, tolerance
+    require_propagation(propagation)
+    group, band = groups[0], Band(pulse, capture.axis)
+    wall_to_plane = plan_wall_to_plane(
+        capture, group, plane, band, choose_backend(capture, band), propagation, tolerance
     )
+    wavenumbers = group.legs * band.wavenumbers
+    return PlaneField(wall_to_plane(capture, ignore_progress), plane, wavenumbers)
 
 
-def propagate_group(
+def plan_wall_to_plane(
     capture: Capture,
     group: IlluminationGroup,
     plane: Plane,
     band: Band,
-    propagation: Propagation,
+    backend: Backend,
+    propagation: Propagation = "spectral",
     tolerance: float = 1e-2,
-    progress: Progress = ignore_progress,
-) -> PlaneField:
-    """Propagate one illumination group of a capture at a band's frequencies; see `propagate`.
-
-    Progress, which another library's arrays leave out, counts points of the plane times
-    frequencies.
+) -> WallToPlane:
+    """Return what carries one illumination group of such captures onto a plane; see `propagate`.
 
     Parameters
     ----------
     capture : Capture
+        For its wall points, and the device of its signal.
     group : IlluminationGroup
-        Points of the capture that share a laser spot.
     plane : Plane
-        In front of the wall.
     band : Band
-        Wavenumbers, rad/m.
-    propagation : str
-        ``"time"`` for signals shifted in time; otherwise by frequency.
+    backend : Backend
+    propagation : {"spectral", "time"}
     tolerance : float
-        Relative error of the quick ways.
-    progress : callable
 
     Returns
     -------
-    PlaneField
-        The field at the plane's points and the band's frequencies.
+    callable
+        From a capture and a progress, which counts points of the plane times frequencies, to the
+        field (y, x, frequencies).
 
     Raises
     ------
     InputError
-        The plane does not lie in front of the wall, or the arrays are not NumPy's and propagation
-        is in time.
+        The plane is not in front of the wall, or "time" for a signal that is not NumPy's.
     """
-    require_propagation(propagation)
     points = capture.points[group.indices]
     foremost = float(points[:, 2].max())
     if plane.z <= foremost:
         raise InputError(
             f"the plane at z = {plane.z:.4g} m must lie in front of the wall, which reaches up to {foremost:.4g} m"
         )
-    wavenumbers = group.legs * band.wavenumbers
     if propagation == "time":
-        require_numpy("propagation in time", capture.signal)
-        traces = np.ascontiguousarray(capture.traces()[group.indices])
-        return PlaneField(
-            propagate_in_time(points, traces, plane, band, group.legs, progress), plane, wavenumbers
-        )
-    if not is_numpy(capture.signal):
-        from nlos.portable.propagation import propagate_on_device
+        require_numpy_signal("propagation in time", capture)
 
-        return propagate_on_device(capture, group, plane, band, tolerance)
-    phasors = group.compute_phasors(capture, band)
-    wall_and_plane = (
-        points,
-        plane,
-        build_waves(group, band, continued=False),
-        estimate_strength(phasors),
-        tolerance,
-    )
-    plan = WallToPlanePlan.of(*wall_and_plane)
-    if plan is None and has_finufft():
-        plan = ScatteredWallToPlanePlan.of(*wall_and_plane)
-    if plan is not None and plan.is_faster_than_direct:
-        return PlaneField(propagate_low_rank(plan, phasors, progress), plane, wavenumbers)
-    return PlaneField(
-        propagate_direct(points, phasors, plane, wavenumbers, progress), plane, wavenumbers
-    )
+        def shift_and_sum(one: Capture, progress: Progress) -> Array:
+            traces = np.ascontiguousarray(one.traces()[group.indices])
+            return propagate_in_time(points, traces, plane, band, group.legs, progress)
 
+        return shift_and_sum
+    waves = build_waves(group, band, continued=False)
+    propagated = backend.propagate_phasors(points, plane, waves, tolerance)
 
-def estimate_strength(phasors: NDArray[np.complex64]) -> NDArray[np.float64]:
-    """Estimate how strong phasors (points, frequencies) are at each frequency, relative to the
-    strongest.
-    """
-    some = np.abs(phasors[:: len(phasors) // STRENGTH_POINTS + 1])
-    energy = np.mean(some.astype(np.float64) ** 2, axis=0)
-    relative: NDArray[np.float64] = (
-        np.sqrt(energy / energy.max()) if energy.any() else np.ones(energy.size)
-    )
-    return relative
+    def propagate_spectrum(one: Capture, progress: Progress) -> Array:
+        return propagated.field(backend.compute_phasors(one, group), progress)
+
+    return propagate_spectrum
 
 
 def require_propagation(propagation: str) -> None:
-    """Refuse a word that names no way of propagating."""
+    """Refuse a word that is not a propagation from wall to plane."""
     if propagation not in get_args(Propagation):
         raise InputError(
             f"propagation must be one of {', '.join(get_args(Propagation))}, got '{propagation}'"
         )
+
+
+def require_tolerance(tolerance: float) -> None:
+    """Refuse a tolerance that makes no sense or cannot be met in single precision."""
+    if not 1e-4 <= tolerance <= 0.1:
+        raise InputError(f"the tolerance must lie between 1e-4 and 0.1, got {tolerance}")

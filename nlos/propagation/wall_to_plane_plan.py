@@ -13,9 +13,15 @@ from numpy.typing import NDArray
 from nlos.plane import Plane, axis_step
 from nlos.propagation.analysis import LatticeAnalysis, PlaneWaveAnalysis
 from nlos.propagation.low_rank_transfer import LowRankTransfer
-from nlos.rsd.transfer import SphericalWaves, TransferFunction
+from nlos.rsd.transfer import (
+    SphericalWaves,
+    TransferFunction,
+    Window,
+    find_fast_length,
+    find_max_offsets,
+    find_min_periods,
+)
 from nlos.rsd.wall import WallLattice
-from nlos.rsd.window import Window, find_fast_length, find_max_offsets, find_min_periods
 from tofclip.errors import InputError
 
 FloatArray = NDArray[np.float64]

@@ -13,13 +13,11 @@ from numpy.typing import DTypeLike, NDArray
 from nlos.band import Band
 from nlos.capture import Capture
 from nlos.geometry import Grid
-from nlos.hybrid import Hybrid
-from nlos.illumination_groups import IlluminationGroup, choose_unaliased_band, group_by_illumination
-from nlos.outgoing_field import plan_outgoing_diffraction
+from nlos.illumination_groups import IlluminationGroup, build_source
 from nlos.refinement.illuminated_depths import IlluminatedDepthPropagator
 from nlos.refinement.spherical import propagate_spherical_waves
 from nlos.rsd.diffraction import DiffractionPlan
-from nlos.rsd.planar import build_source
+from nlos.wave_plan import GroupPlan, WavePlan
 from tofclip.operators import Diagonal, LinearOperator, Stack
 from tofclip.threads import limit_blas_threads
 
@@ -115,25 +113,23 @@ class WallModel:
 
     Parameters
     ----------
-    hybrid : Hybrid
+    plan : WavePlan
+        Of the hybrid.
     capture : Capture
-    grid : Grid
+        Of the plan's geometry.
     """
 
-    hybrid: Hybrid
+    plan: WavePlan
     capture: Capture
-    grid: Grid
 
-    @cached_property
+    @property
+    def grid(self) -> Grid:
+        """The voxels of the hidden volume."""
+        return self.plan.grid
+
+    @property
     def _band(self) -> Band:
-        return choose_unaliased_band(self.capture, self.grid, self.hybrid.pulse)
-
-    @cached_property
-    def _groups(self) -> list[tuple[IlluminationGroup, Capture]]:
-        return [
-            (group, _select_group(self.capture, group))
-            for group in group_by_illumination(self.capture)
-        ]
+        return self.plan.band
 
     @cached_property
     def laser_distance(self) -> FloatArray:
@@ -141,19 +137,14 @@ class WallModel:
         scan.
         """
         return np.asarray(
-            np.mean([self._compute_laser_distance(group) for group, _ in self._groups], axis=0)
+            np.mean([self._compute_laser_distance(one.group) for one in self.plan.groups], axis=0)
         )
 
     def operator(self, dtype: DTypeLike = np.float32) -> LinearOperator:
         """Return the operator from volumes (z, y, x), albedo divided by `laser_distance`, to
         `measurements`.
         """
-        return Stack(
-            [
-                self._build_group_operator(group, group_capture, dtype)
-                for group, group_capture in self._groups
-            ]
-        )
+        return Stack([self._build_group_operator(one, dtype) for one in self.plan.groups])
 
     def measurements(self) -> Array:
         """Return the phasors divided by ``sqrt(G_k)``, as the operator gives them, shape (n, 1),
@@ -161,35 +152,23 @@ class WallModel:
         """
         strength = np.sqrt(self._band.weights)
         parts = []
-        for group, group_capture in self._groups:
-            # L^2, or L^3 if confocal, as the class explains
+        traces = self.capture.traces()
+        for group in (one.group for one in self.plan.groups):
             path_weight = (self.capture.axis.paths ** (group.legs + 1)).astype(np.float32)
             phasors = np.ascontiguousarray(
-                self._band.compute_phasors(group_capture.traces() * path_weight) / strength,
+                self._band.compute_phasors(traces[group.indices] * path_weight) / strength,
                 np.complex64,
             )
             parts.append(phasors.view(np.float32).ravel())
         return np.concatenate(parts)[:, np.newaxis]
 
-    def _build_group_operator(
-        self, group: IlluminationGroup, group_capture: Capture, dtype: DTypeLike
-    ) -> LinearOperator:
-        plan = plan_outgoing_diffraction(self.hybrid, group_capture, self.grid, self._band)
-        bare = HiddenToWall(group_capture.points, plan, group, self._band, dtype)
-        # volumes are divided by the mean laser distance, but each group has its own
-        return bare @ Diagonal(self.laser_distance / self._compute_laser_distance(group), dtype)
+    def _build_group_operator(self, one: GroupPlan, dtype: DTypeLike) -> LinearOperator:
+        points = self.capture.points[one.group.indices]
+        bare = HiddenToWall(points, one.plane_to_depths, one.group, self._band, dtype)
+        return bare @ Diagonal(self.laser_distance / self._compute_laser_distance(one.group), dtype)
 
     def _compute_laser_distance(self, group: IlluminationGroup) -> FloatArray:
         if group.laser is None:
             return np.ones(self.grid.shape)
         z, y, x = np.meshgrid(self.grid.z, self.grid.y, self.grid.x, indexing="ij")
         return np.asarray(np.linalg.norm(np.stack([x, y, z], axis=-1) - group.laser, axis=-1))
-
-
-def _select_group(capture: Capture, group: IlluminationGroup) -> Capture:
-    """Return what one exposure recorded as a capture of its own."""
-    # the group becomes a capture of its own, confocal ones with a spot for each point
-    points = capture.points[group.indices]
-    laser = points if group.laser is None else group.laser
-    signal = np.ascontiguousarray(capture.traces()[group.indices].T)
-    return Capture(signal, points, laser, capture.bin_width, capture.start, capture.provenance)

@@ -9,13 +9,15 @@ import numpy as np
 from nlos.capture import Capture
 from nlos.geometry import Grid
 from nlos.hybrid import Hybrid
-from nlos.illumination_groups import choose_unaliased_band
-from nlos.method import MEMORY_LIMIT_BYTES, Progress, Support, check_numpy_support, ignore_progress
+from nlos.method import MEMORY_LIMIT_BYTES, Method, Plan, Progress, require_numpy_signal
 from nlos.plane import axis_step
 from nlos.refinement.model import WallModel
 from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
-from tofclip.solvers import Method, Sparse
+from nlos.wave_plan import WavePlan
+from tofclip.errors import InputError
+from tofclip.solvers import Method as Prior
+from tofclip.solvers import Sparse
 from tofclip.solvers.light_field_variation import LightFieldVariation
 
 SOLVER_VOLUMES = 12
@@ -50,7 +52,7 @@ def build_total_variation(
 
 
 @dataclass(frozen=True)
-class Refinement:
+class Refinement(Method):
     """The hidden albedo that explains a capture best, among those that a prior prefers.
 
     Minimises ``1/2 |A h - f|^2 + prior(h)`` over h >= 0 by FISTA, with f the wall's phasors and A
@@ -65,106 +67,102 @@ class Refinement:
     ----------
     hybrid : Hybrid
         Its wavelength, cycles, tolerance and virtual plane.
-    prior : Method
+    prior : tofclip.solvers.Method
         A proximal method of `tofclip.solvers`; `Sparse` is l1, `build_total_variation` total
         variation.
     """
 
     hybrid: Hybrid
-    prior: Method = field(default_factory=lambda: Sparse(weight=2e-2, iterations=60))
+    prior: Prior = field(default_factory=lambda: Sparse(weight=2e-2, iterations=60))
 
-    def supports(self, capture: Capture, grid: Grid) -> Support:
-        """Say whether `capture` can be imaged on `grid`, and if not, why: a condition, with
-        ``.reason``.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-
-        Returns
-        -------
-        Support
-        """
-        arrays = check_numpy_support("iterative refinement", capture)
-        return (
-            arrays
-            and self.hybrid.supports(capture, grid)
-            and self._check_depth_support(grid)
-            and _check_size_support(grid)
-        )
-
-    def lookups(self, capture: Capture, grid: Grid) -> int:
-        """Number of voxels in all iterations; what `progress` counts up to.
+    def plan(self, capture: Capture, grid: Grid) -> RefinementPlan:
+        """Make the refinement ready for captures like `capture` on `grid`.
 
         Parameters
         ----------
         capture : Capture
+            A NumPy array, of few laser spots.
         grid : Grid
+            Evenly spaced along x and y; at least `MIN_VOXELS_PER_WAVELENGTH` voxels per wavelength
+            in depth.
 
         Returns
         -------
-        int
-        """
-        return self.prior.work(grid.size)
-
-    def reconstruct(
-        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
-    ) -> Volume:
-        """Image the hidden scene.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-        progress : callable, optional
-            Called with the number of voxels after every iteration.
-
-        Returns
-        -------
-        Volume
-            Albedo up to one factor, float32, not negative.
+        RefinementPlan
 
         Raises
         ------
         InputError
-            `supports` says no.
+            The hybrid cannot image such a capture on the grid, the voxels are too coarse in depth,
+            or memory does not suffice.
         """
-        self.supports(capture, grid).require()
-        warn_of_aliasing(capture, choose_unaliased_band(capture, grid, self.hybrid.pulse))
-        model = WallModel(self.hybrid, capture, grid)
-        result = self.prior.recover(
-            model.operator(), model.measurements(), progress=lambda done: progress(done * grid.size)
+        require_numpy_signal("iterative refinement", capture)
+        hybrid = self.hybrid.plan(capture, grid)
+        _require_fine_depths(grid, self.hybrid.wavelength)
+        _require_memory(grid)
+        return RefinementPlan(capture, grid, self, hybrid)
+
+
+class RefinementPlan(Plan):
+    """An iterative refinement, ready for captures of one geometry.
+
+    Parameters
+    ----------
+    capture : Capture
+    grid : Grid
+    method : Refinement
+    hybrid : WavePlan
+        The plan of the image that is iterated.
+    """
+
+    def __init__(self, capture: Capture, grid: Grid, method: Refinement, hybrid: WavePlan) -> None:
+        super().__init__(capture, grid)
+        self.method, self.hybrid = method, hybrid
+
+    @property
+    def cost(self) -> int:
+        """Voxels in all iterations."""
+        return self.method.prior.work(self.grid.size)
+
+    @property
+    def memory_bytes(self) -> int:
+        return self.hybrid.memory_bytes + 4 * SOLVER_VOLUMES * self.grid.size
+
+    def _image(self, capture: Capture, progress: Progress) -> Volume:
+        warn_of_aliasing(capture, self.hybrid.band)
+        model = WallModel(self.hybrid, capture)
+        prior, size = self.method.prior, self.grid.size
+        result = prior.recover(
+            model.operator(), model.measurements(), progress=lambda done: progress(done * size)
         )
         settings = {
             "method": "refinement",
-            "wavelength_m": self.hybrid.wavelength,
-            "cycles": self.hybrid.cycles,
-            "prior": self.prior.name,
+            "wavelength_m": self.method.hybrid.wavelength,
+            "cycles": self.method.hybrid.cycles,
+            "prior": prior.name,
             "iterations": result.iterations,
             "stopped_because": result.stop_reason,
         }
         # the solver's unknown is the albedo over the laser's distance
         albedo = (result.frames[0] * model.laser_distance).astype(np.float32)
-        return Volume(albedo, grid, {**capture.provenance, "imaging": settings})
-
-    def _check_depth_support(self, grid: Grid) -> Support:
-        coarsest = float(np.diff(grid.z).max()) if grid.z.size > 1 else 0.0
-        allowed = self.hybrid.wavelength / MIN_VOXELS_PER_WAVELENGTH
-        # Voxels drawn exactly at the limit must not be refused for a rounding error.
-        if coarsest > allowed * (1 + 1e-6):
-            return Support(
-                f"voxels {coarsest:.3g} m apart in depth are too coarse to refine with waves of "
-                f"{self.hybrid.wavelength:.3g} m: use at most {allowed:.3g} m"
-            )
-        return Support()
+        return Volume(albedo, self.grid, {**capture.provenance, "imaging": settings})
 
 
-def _check_size_support(grid: Grid) -> Support:
+def _require_fine_depths(grid: Grid, wavelength: float) -> None:
+    coarsest = float(np.diff(grid.z).max()) if grid.z.size > 1 else 0.0
+    allowed = wavelength / MIN_VOXELS_PER_WAVELENGTH
+    # Voxels drawn exactly at the limit must not be refused for a rounding error.
+    if coarsest > allowed * (1 + 1e-6):
+        raise InputError(
+            f"voxels {coarsest:.3g} m apart in depth are too coarse to refine with waves of "
+            f"{wavelength:.3g} m: use at most {allowed:.3g} m"
+        )
+
+
+def _require_memory(grid: Grid) -> None:
     needed = 4 * SOLVER_VOLUMES * grid.size
     if needed > MEMORY_LIMIT_BYTES:
-        return Support(
+        raise InputError(
             f"{grid.size} voxels need {needed / 2**30:.1f} GiB to refine, more than the {MEMORY_LIMIT_BYTES >> 30} GiB "
             "allowed: use larger voxels or a smaller box"
         )
-    return Support()

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.propagation.direct import sum_spherical_waves
+from nlos.propagation.compiled import sum_spherical_waves
 from tofclip.threads import split_blocks
 
 Array = NDArray[Any]

@@ -1,5 +1,5 @@
-"""The way of a field from one plane to the voxels of many: window, lattice, plane waves and
-transfer functions.
+"""From a plane to the voxels of many depths: a periodic lattice, its plane waves, and the plan of
+them all.
 """
 
 from __future__ import annotations
@@ -8,13 +8,84 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nlos.geometry import Grid
-from nlos.method import MEMORY_LIMIT_BYTES, Support
+from nlos.method import MEMORY_LIMIT_BYTES
 from nlos.plane import Plane, axis_step
-from nlos.rsd.spectrum import PlaneWaves
-from nlos.rsd.transfer import SphericalWaves, TransferFunction
-from nlos.rsd.window import Window, find_fast_length, find_max_offsets, find_min_periods
+from nlos.rsd.transfer import (
+    SphericalWaves,
+    TransferFunction,
+    Window,
+    find_fast_length,
+    find_max_offsets,
+    find_min_periods,
+)
+from tofclip.errors import InputError
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+LATERAL_ROUNDING = 1e-9
+"""Lateral wavenumbers nearer to each other are one, rad/m."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneWaves:
+    """The plane waves of a periodic lattice that carry anything, ordered by lateral wavenumber.
+
+    Parameters
+    ----------
+    period : (float, float)
+        Of the lattice in space along y and x, m.
+    lateral_limits : (frequencies,) array
+        Largest lateral wavenumber that counts at each frequency, rad/m; increasing.
+    """
+
+    period: tuple[float, float]
+    lateral_limits: FloatArray
+
+    @property
+    def max_indices(self) -> tuple[int, int]:
+        """Largest index along y and x."""
+        return self.max_indices_within(float(self.lateral_limits[-1]))
+
+    def max_indices_within(self, lateral: float) -> tuple[int, int]:
+        """Largest index along y and x up to a lateral wavenumber."""
+        y, x = (int((lateral + LATERAL_ROUNDING) * side / (2 * np.pi)) for side in self.period)
+        return y, x
+
+    @cached_property
+    def _sorted_waves(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """Indices along y and x, and lateral wavenumbers."""
+        rows, columns = (np.arange(-n, n + 1) for n in self.max_indices)
+        qy, qx = (
+            2 * np.pi / side * index
+            for side, index in zip(self.period, (rows, columns), strict=True)
+        )
+        # Rounded, so that waves mirrored in an axis or in the diagonal are equal.
+        lateral = (
+            LATERAL_ROUNDING * np.rint(np.hypot(qy[:, np.newaxis], qx) / LATERAL_ROUNDING).ravel()
+        )
+        inside = np.flatnonzero(lateral <= self.lateral_limits[-1])
+        order = inside[np.argsort(lateral[inside], kind="stable")]
+        return rows[order // columns.size], columns[order % columns.size], lateral[order]
+
+    @property
+    def row(self) -> IntArray:
+        """Index along y of every wave."""
+        return self._sorted_waves[0]
+
+    @property
+    def column(self) -> IntArray:
+        """Index along x of every wave."""
+        return self._sorted_waves[1]
+
+    @property
+    def lateral_wavenumbers(self) -> FloatArray:
+        """Lateral wavenumber of every wave, rad/m."""
+        return self._sorted_waves[2]
+
 
 BYTES_PER_WAVE = 8
 """A complex64 phasor of a plane wave at one frequency."""
@@ -81,18 +152,21 @@ class DiffractionPlan:
             self._periods, self.waves.wavenumbers + self._window.spectral_spread(self.tolerance)
         )
 
-    def supports(self) -> Support:
-        """Say whether the field's plane waves fit into memory."""
+    @property
+    def plane_wave_count(self) -> float:
+        """How many plane waves there are, roughly: what a circle of wavenumbers holds."""
         y, x = self.plane_waves.period
-        # area of the circle of lateral wavenumbers over that of one plane wave, (2 pi)^2 / (y x)
-        count = np.pi * float(self.plane_waves.lateral_limits[-1]) ** 2 * y * x / (2 * np.pi) ** 2
+        return float(np.pi * self.plane_waves.lateral_limits[-1] ** 2 * y * x / (2 * np.pi) ** 2)
+
+    def require_memory(self) -> None:
+        """Refuse a field whose plane waves do not fit into memory."""
+        count = self.plane_wave_count
         size = count * self.waves.count * BYTES_PER_WAVE
         if size > MEMORY_LIMIT_BYTES:
-            return Support(
+            raise InputError(
                 f"{count:.3g} plane waves at {self.waves.count} frequencies need {size / 2**30:.1f} GiB, more than the "
                 f"{MEMORY_LIMIT_BYTES >> 30} GiB allowed: use a longer wavelength or a smaller grid"
             )
-        return Support()
 
     @cached_property
     def transfer(self) -> TransferFunction:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.plane import Plane
+from nlos.rsd.diffraction import PlaneWaves
 from nlos.rsd.kernels import (
     FREQUENCY_STEPS,
     LANES,
@@ -17,7 +18,6 @@ from nlos.rsd.kernels import (
     TAPS,
     assemble_groups,
 )
-from nlos.rsd.spectrum import PlaneWaves
 from nlos.rsd.transfer import TransferFunction
 from tofclip.threads import run_blocks
 

@@ -1,9 +1,13 @@
-"""Carrying plane waves to every depth, where they meet the laser's wave."""
+"""Plane waves carried to every depth, where they meet the laser's wave.
+
+The laser's wave on a depth plane is a short sum over its frequencies' common part, so that few
+inverse transforms per depth replace one per frequency.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +16,115 @@ from nlos.kernels import add_illuminated_terms
 from nlos.method import Progress, ignore_progress
 from nlos.rsd.diffraction import DiffractionPlan
 from nlos.rsd.groups import Interpolation, WaveGroups
-from nlos.rsd.illumination import Illumination, build_constant_illumination, split_illumination
 from nlos.rsd.inverse import choose_inverse
 from nlos.rsd.kernels import propagate_spectrum, scatter_terms
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 
+CHEBYSHEV_NODES = 64
+"""Chebyshev nodes over the distances on a plane; enough for a band that turns by 25 periods across
+them.
+"""
+
+TABLE_SAMPLES = 512
+"""Samples of a distance function; linear interpolation between them errs by 1e-4 at 6 periods."""
+
 FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Illumination:
+    """``exp(1j * (k - k_0) * (R - middle)) ~ sum_m b_m(k) * f_m(R)``, the odd functions f times 1j.
+
+    The even and the odd part in R are each split by their own eigenvectors, which keeps everything
+    real and takes some two thirds of the terms of a Chebyshev expansion.
+
+    Parameters
+    ----------
+    coefficients : (frequencies, m) float32 array
+        b, even functions first.
+    even : int
+        How many functions are even.
+    table : (samples, m) float32 array
+        f over `span`.
+    span : (2,) float64 array
+        Smallest and largest R, m; `split_illumination` has it about 0.
+    """
+
+    coefficients: NDArray[np.float32]
+    even: int
+    table: NDArray[np.float32]
+    span: FloatArray
+
+
+def build_constant_illumination(frequencies: int) -> Illumination:
+    """No illumination wave: all frequencies simply add up."""
+    return Illumination(
+        np.ones((frequencies, 1), np.float32), 1, np.ones((2, 1), np.float32), np.zeros(2)
+    )
+
+
+def split_illumination(
+    detuning: FloatArray, strength: FloatArray, half: float, tolerance: float
+) -> Illumination:
+    """Split the illumination of distances from ``-half`` to ``half`` about a middle one.
+
+    Parameters
+    ----------
+    detuning : (frequencies,) array
+        ``k - k_0``, rad/m.
+    strength : (frequencies,) array
+        How much each frequency counts.
+    half : float
+        m.
+    tolerance : float
+        Root mean square error allowed, relative.
+    """
+    # Even and odd functions are known by their values at the positive half of the nodes.
+    angles = np.pi * (np.arange(CHEBYSHEV_NODES // 2) + 0.5) / CHEBYSHEV_NODES
+    phase = np.outer(np.cos(angles), half * detuning)
+    kept = [_find_leading_functions(wave(phase), strength, tolerance) for wave in (np.cos, np.sin)]
+    table = np.concatenate(
+        [_build_continuation_matrix(odd) @ values for odd, (values, _) in enumerate(kept)], axis=1
+    )
+    coefficients = np.concatenate([b for _, b in kept], axis=1)
+    span = np.array([-half, half])
+    return Illumination(
+        coefficients.astype(np.float32), kept[0][1].shape[1], table.astype(np.float32), span
+    )
+
+
+def _find_leading_functions(
+    wave: FloatArray, strength: FloatArray, tolerance: float
+) -> tuple[FloatArray, FloatArray]:
+    """Fewest orthonormal functions (nodes, m), and their coefficients (frequencies, m), that make
+    up `wave`.
+    """
+    weighted = wave * strength
+    values, vectors = np.linalg.eigh(weighted @ weighted.T)
+    # eigh sorts upwards; of both parts together, half the squared strength times the nodes is the
+    # whole.
+    allowed = tolerance**2 * np.sum(strength**2) * len(wave) / 2
+    dropped = int(np.count_nonzero(np.cumsum(np.maximum(values, 0)) < allowed))
+    functions = vectors[:, dropped:]
+    return functions, wave.T @ functions
+
+
+@cache
+def _build_continuation_matrix(odd: int) -> FloatArray:
+    """Matrix that continues a function from its Chebyshev nodes to all samples by its Chebyshev
+    series.
+    """
+    angles = np.pi * (np.arange(CHEBYSHEV_NODES // 2) + 0.5) / CHEBYSHEV_NODES
+    orders = 2 * np.arange(len(angles)) + odd
+    series = (2 / len(angles)) * np.cos(np.outer(orders, angles))
+    if not odd:
+        series[0] /= 2
+    continued: FloatArray = (
+        np.cos(np.outer(np.arccos(np.linspace(-1, 1, TABLE_SAMPLES)), orders)) @ series
+    )
+    return continued
+
+
 Field = NDArray[np.complex64]
 FloatParts = NDArray[np.float32]
 
@@ -102,15 +209,11 @@ class LaserSource:
         return {}
 
 
-def diffract_to_grid(
-    plan: DiffractionPlan,
-    values: NDArray[np.complex64],
-    source: LaserSource,
-    total: NDArray[np.complex64],
-    progress: Progress = ignore_progress,
-) -> None:
-    """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r, S_k the field propagated
-    there from the plane.
+class CompiledDiffraction:
+    """Fields on one plane carried to all depths of a grid, where they meet the laser's wave.
+
+    The counterpart of `nlos.portable.diffraction.PortableDiffraction`. Holding one is the cache:
+    illuminations, transforms and each thread's memory stay for the next field.
 
     Liu, Bauer, Velten, "Phasor field diffraction based reconstruction for fast non-line-of-sight
     imaging systems", Nat. Commun. 11, 1645 (2020); the illumination is split per depth, so that few
@@ -119,41 +222,72 @@ def diffract_to_grid(
     Parameters
     ----------
     plan : DiffractionPlan
-    values : (y, x, frequencies) complex64 array
-        On the way's plane.
-    source : Source
-    total : (z, y, x) complex64 array
-        Added to.
-    progress : callable, optional
-        Called with the number of voxels just done.
+    source : LaserSource
     """
-    with limit_blas_threads():
-        groups = WaveGroups(plan.plane_waves)
-        spectrum = groups.to_plane_waves(
-            values, plan.plane, (float(plan.grid.y[0]), float(plan.grid.x[0]))
-        )
-        lights = [build_constant_illumination(1)] * plan.grid.z.size
 
-        def light(planes: slice) -> None:
-            for i in range(planes.start, planes.stop):
-                lights[i] = source.illuminate_plane(plan, float(plan.grid.z[i]))
+    def __init__(self, plan: DiffractionPlan, source: LaserSource) -> None:
+        self.plan, self.source = plan, source
+        self.groups = WaveGroups(plan.plane_waves)
+        self.table_bytes = 0
+        self._spare: list[_Workspace] = []
 
-        run_blocks(light, len(lights), size=PLANES_PER_BLOCK)
-        max_terms = max(light.coefficients.shape[1] for light in lights)
-        interpolation = groups.interpolation(plan.transfer)
-        # both are computed here once: threads that ask first would each compute them
-        _ = plan.transfer.bessel_matrix, groups.first_frequency
-        spare: list[_Workspace] = []
+    def add(
+        self,
+        values: NDArray[np.complex64],
+        total: NDArray[np.complex64],
+        progress: Progress = ignore_progress,
+    ) -> None:
+        """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r, S_k the field carried
+        there from the plane.
 
-        def process_block(planes: slice) -> None:
-            workspace = (
-                spare.pop() if spare else _Workspace(plan, source, groups, interpolation, max_terms)
+        Parameters
+        ----------
+        values : (y, x, frequencies) complex64 array
+            On the plan's plane.
+        total : (z, y, x) complex64 array
+            Added to.
+        progress : callable, optional
+            Called with the number of voxels just done.
+        """
+        plan = self.plan
+        with limit_blas_threads():
+            spectrum = self.groups.to_plane_waves(
+                values, plan.plane, (float(plan.grid.y[0]), float(plan.grid.x[0]))
             )
-            workspace.image(spectrum, lights[planes], planes, total)
-            spare.append(workspace)
-            progress(total[planes].size)
+            # What threads share is made before they start.
+            self.table_bytes = self.table_bytes or plan.transfer.tabulate()
+            lights, interpolation = self._lights, self._interpolation
 
-        run_blocks(process_block, len(lights), size=PLANES_PER_BLOCK)
+            def process_block(planes: slice) -> None:
+                workspace = (
+                    self._spare.pop() if self._spare else self._make_workspace(interpolation)
+                )
+                workspace.image(spectrum, lights[planes], planes, total)
+                self._spare.append(workspace)
+                progress(total[planes].size)
+
+            run_blocks(process_block, len(lights), size=PLANES_PER_BLOCK)
+
+    @cached_property
+    def _lights(self) -> list[Illumination]:
+        """The illumination of every depth."""
+        depths = self.plan.grid.z
+        lights = [build_constant_illumination(1)] * depths.size
+
+        def split(planes: slice) -> None:
+            for i in range(planes.start, planes.stop):
+                lights[i] = self.source.illuminate_plane(self.plan, float(depths[i]))
+
+        run_blocks(split, len(lights), size=PLANES_PER_BLOCK)
+        return lights
+
+    @cached_property
+    def _interpolation(self) -> Interpolation:
+        return self.groups.interpolation(self.plan.transfer)
+
+    def _make_workspace(self, interpolation: Interpolation) -> _Workspace:
+        max_terms = max(light.coefficients.shape[1] for light in self._lights)
+        return _Workspace(self.plan, self.source, self.groups, interpolation, max_terms)
 
 
 class _Workspace:

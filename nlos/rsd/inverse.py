@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nlos.fourier_plans import FourierPlan, allocate_zeros, plan_transform
 from nlos.rsd.kernels import transpose
-from nlos.rsd.window import VECTOR_LENGTH
+from nlos.rsd.transfer import VECTOR_LENGTH
 
 CACHE_BYTES = 1 << 19
 """Spectra that are transformed at a time: they stay in a core's second cache, and calls stay few."""

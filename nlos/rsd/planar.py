@@ -6,27 +6,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
+from nlos.backends import Backend, choose_backend
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
 from nlos.geometry import Grid
 from nlos.illumination_groups import (
     IlluminationGroup,
-    check_illumination_support,
+    build_waves,
     choose_unaliased_band,
     group_by_illumination,
+    require_few_spots,
 )
-from nlos.method import PhasorMethod, Progress, Support, check_common_support, ignore_progress
-from nlos.plane import Plane, is_evenly_spaced
+from nlos.method import PhasorMethod, Progress, require_imageable
+from nlos.plane import is_evenly_spaced
+from nlos.propagation.propagate import require_tolerance
 from nlos.rsd.diffraction import DiffractionPlan
-from nlos.rsd.image_planes import LaserSource, diffract_to_grid
-from nlos.rsd.transfer import SphericalWaves
 from nlos.rsd.wall import PlanarWall
-from nlos.sampling import warn_of_aliasing
-from nlos.volume import Volume
-from tofclip.arrays import is_numpy
+from nlos.wave_plan import GroupPlan, WavePlan
+from tofclip.arrays import Array
 from tofclip.errors import InputError
 
 
@@ -83,80 +80,56 @@ class PlanarRSD(PhasorMethod):
         object.__setattr__(self, "pulse", VirtualPulse(self.wavelength, self.cycles))
         require_tolerance(self.tolerance)
 
-    def supports(self, capture: Capture, grid: Grid) -> Support:
-        """Say whether `capture` can be imaged on `grid`, and if not, why.
-
-        Needed are a planar, evenly sampled wall at z = const, voxels evenly spaced along x and y
-        and in front of the wall, few laser spots, and memory.
+    def plan(self, capture: Capture, grid: Grid) -> WavePlan:
+        """Make the method ready for captures like `capture` on `grid`.
 
         Parameters
         ----------
         capture : Capture
+            Of a planar, evenly sampled wall at z = const and few laser spots.
         grid : Grid
+            In front of the wall, evenly spaced along x and y.
 
         Returns
         -------
-        Support
-            True in a condition if it can; ``.reason`` says why not.
-        """
-        general = (
-            check_common_support(capture, grid)
-            and check_grid_support(grid)
-            and check_illumination_support(capture)
-        )
-        if not general:
-            return general
-        try:
-            band = choose_unaliased_band(capture, grid, self.pulse)
-            walls = [
-                PlanarWall.of(capture.points[group.indices])
-                for group in group_by_illumination(capture)
-            ]
-        except InputError as problem:
-            return Support(str(problem))
-        if grid.z[0] <= walls[0].plane.z:
-            return Support(
-                f"the grid must begin in front of the wall, which is at z = {walls[0].plane.z:.4g} m"
-            )
-        return self._plan(walls[0].plane, grid, band, group_by_illumination(capture)[0]).supports()
-
-    def phasor_field(
-        self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
-    ) -> Volume:
-        """Return the complex sum whose magnitude `reconstruct` gives, complex64; it is linear in
-        the signal.
-
-        Parameters
-        ----------
-        capture : Capture
-        grid : Grid
-        progress : callable
-            Called with the amount of work just done; see `reconstruct`.
-
-        Returns
-        -------
-        Volume
-            (z, y, x) complex64.
+        WavePlan
 
         Raises
         ------
         InputError
-            `supports` says no.
+            The method cannot image such a capture on the grid, or not within memory.
         """
-        self.supports(capture, grid).require()
+        require_imageable(capture, grid)
+        require_even_grid(grid)
         band = choose_unaliased_band(capture, grid, self.pulse)
-        warn_of_aliasing(capture, band)
-        if is_numpy(capture.signal):
-            total = self._diffract_compiled(capture, grid, band, progress)
-        else:
-            from nlos.portable.prepared import PreparedField
+        backend = choose_backend(capture, band)
+        groups = self.plan_groups(capture, grid, band, backend)
+        return WavePlan(capture, grid, band, backend, groups, self.settings)
 
-            total = PreparedField(self, capture, grid).of(capture, progress)
-        return Volume(total, grid, {**capture.provenance, "imaging": self.settings})
+    def plan_groups(
+        self, capture: Capture, grid: Grid, band: Band, backend: Backend
+    ) -> list[GroupPlan]:
+        """Return the road of every illumination group to the voxels, at a band's frequencies.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+        band : Band
+        backend : Backend
+
+        Raises
+        ------
+        InputError
+            The wall is not planar or not evenly sampled, or the grid does not lie in front of it.
+        """
+        groups = group_by_illumination(capture)
+        require_few_spots(capture, groups)
+        return [self._plan_group(capture, group, grid, band, backend) for group in groups]
 
     @property
     def settings(self) -> dict[str, str | float]:
-        """How a volume was imaged, for its provenance."""
+        """What a volume reports of how it was imaged."""
         return {
             "method": "rsd",
             "wavelength_m": self.wavelength,
@@ -164,80 +137,33 @@ class PlanarRSD(PhasorMethod):
             "tolerance": self.tolerance,
         }
 
-    def _diffract_compiled(
-        self, capture: Capture, grid: Grid, band: Band, progress: Progress
-    ) -> NDArray[np.complex64]:
-        total = np.zeros(grid.shape, np.complex64)
-        for group in group_by_illumination(capture):
-            wall = PlanarWall.of(capture.points[group.indices])
-            values = wall.field(group.compute_phasors(capture, band))
-            diffract_to_grid(
-                self._plan(wall.plane, grid, band, group),
-                values,
-                build_source(group, band),
-                total,
-                progress,
+    def _plan_group(
+        self,
+        capture: Capture,
+        group: IlluminationGroup,
+        grid: Grid,
+        band: Band,
+        backend: Backend,
+    ) -> GroupPlan:
+        wall = PlanarWall.of(capture.points[group.indices])
+        if grid.z[0] <= wall.plane.z:
+            raise InputError(
+                f"the grid must begin in front of the wall, which is at z = {wall.plane.z:.4g} m"
             )
-        return total
+        waves = build_waves(group, band, continued=False)
+        plane_to_depths = DiffractionPlan(wall.plane, grid, waves, self.tolerance)
+        plane_to_depths.require_memory()
 
-    def _plan(
-        self, plane: Plane, grid: Grid, band: Band, group: IlluminationGroup
-    ) -> DiffractionPlan:
-        return DiffractionPlan(
-            plane, grid, build_waves(group, band, continued=False), self.tolerance
-        )
+        def place_phasors(one: Capture, progress: Progress) -> Array:
+            return backend.place_on_lattice(backend.compute_phasors(one, group), wall.lattice)
 
-
-def require_tolerance(tolerance: float) -> None:
-    """Refuse a tolerance that makes no sense or cannot be met in single precision."""
-    if not 1e-4 <= tolerance <= 0.1:
-        raise InputError(f"the tolerance must lie between 1e-4 and 0.1, got {tolerance}")
+        return GroupPlan(group, place_phasors, plane_to_depths)
 
 
-def check_grid_support(grid: Grid) -> Support:
-    """Check that Fourier transforms can reach the voxels."""
+def require_even_grid(grid: Grid) -> None:
+    """Refuse voxels that Fourier transforms cannot reach."""
     for name in ("x", "y"):
         if not is_evenly_spaced(getattr(grid, name)):
-            return Support(
+            raise InputError(
                 f"the voxels are not evenly spaced along {name}: Fourier transforms need them to be"
             )
-    return Support()
-
-
-def build_waves(group: IlluminationGroup, band: Band, continued: bool) -> SphericalWaves:
-    """Return the waves between wall and voxels of one illumination group.
-
-    Parameters
-    ----------
-    group : IlluminationGroup
-        Its ``legs``: how many legs of the path run between wall and voxels, 2 for confocal
-        captures.
-    band : Band
-        Wavenumbers of the virtual pulse, rad/m.
-    continued : bool
-        False for point sources, True for a field known on a plane; see `SphericalWaves`.
-
-    Returns
-    -------
-    SphericalWaves
-    """
-    k = group.legs * band.wavenumbers
-    step = float(k[1] - k[0]) if k.size > 1 else 1.0
-    return SphericalWaves(float(k[0]), step, k.size, continued)
-
-
-def build_source(group: IlluminationGroup, band: Band) -> LaserSource:
-    """Return what shines on the scene in one illumination group.
-
-    Parameters
-    ----------
-    group : IlluminationGroup
-        Its laser spot, m.
-    band : Band
-        Wavenumbers and weights of the virtual pulse.
-
-    Returns
-    -------
-    LaserSource
-    """
-    return LaserSource(group.laser, band.wavenumbers, band.weights / band.weights.max())

@@ -85,6 +85,16 @@ class WallLattice:
         occupants[self.row * self.x.size + self.column] = np.arange(self.row.size)
         return occupants
 
+    def place(self, samples: NDArray[Any]) -> NDArray[Any]:
+        """Put phasors (points, frequencies), or signals (points, t), into their places, shape (y,
+        x, ...); places without a point are 0.
+        """
+        if self.is_complete:
+            return samples.reshape(*self.shape, -1)
+        values = np.zeros((*self.shape, samples.shape[1]), samples.dtype)
+        values[self.row, self.column] = samples
+        return values
+
 
 @dataclass(frozen=True, eq=False)
 class PlanarWall:
@@ -129,16 +139,6 @@ class PlanarWall:
                 "its signals onto one"
             )
         return cls(plane, lattice)
-
-    def field(self, samples: NDArray[Any]) -> NDArray[Any]:
-        """Put phasors (points, frequencies), or signals (points, t), into their places, shape (y,
-        x, ...).
-        """
-        if self.lattice.is_complete:
-            return samples.reshape(*self.plane.shape, -1)
-        values = np.zeros((*self.plane.shape, samples.shape[1]), samples.dtype)
-        values[self.lattice.row, self.lattice.column] = samples
-        return values
 
 
 def _fit_lattice_axis(

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.capture import Capture
-from nlos.time_axis import TimeAxis
+from nlos.capture import Capture, TimeAxis
 from tofclip.errors import InputError, ShapeError
 from tofclip.units import SPEED_OF_LIGHT
 

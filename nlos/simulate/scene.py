@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.capture import Capture
+from nlos.capture import Capture, TimeAxis
 from nlos.simulate.kernels import add_facet_light
 from nlos.simulate.surfaces import FloatArray, Surface
 from nlos.simulate.walls import compute_wall_normals
-from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
 from tofclip.threads import run_blocks
 from tofclip.units import SPEED_OF_LIGHT

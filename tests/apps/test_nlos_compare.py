@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -63,14 +62,18 @@ def test_memory_is_that_of_the_method() -> None:
     class Greedy:
         """Takes 64 MiB for a moment."""
 
-        def supports(self, *_: object) -> Any:
-            from nlos.method import Support
+        cost = 1
 
-            return Support()
+        def plan(self, _: Capture, grid: Grid) -> Greedy:
+            self.grid = grid
+            return self
 
-        def reconstruct(self, capture: Capture, grid: Grid, *_: object) -> Volume:
+        def reconstruct(self, capture: Capture, grid: Grid) -> Volume:
+            return self.plan(capture, grid).image(capture)
+
+        def image(self, *_: object) -> Volume:
             taken = np.ones(64 << 17)
-            return Volume(np.full(grid.shape, taken.mean(), np.float32), grid)
+            return Volume(np.full(self.grid.shape, taken.mean(), np.float32), self.grid)
 
     capture = Capture(np.zeros((4, 2)), np.array([[0.0, 0, 0], [1, 0, 0]]), np.zeros(3), 1e-11)
     found = measure_imaging("greedy", Greedy(), capture, Grid([0.0], [0.0], [1.0]))

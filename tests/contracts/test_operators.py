@@ -193,7 +193,7 @@ def hidden_to_wall(laser: object, dtype: type) -> LinearOperator:
     wall[1, 3] = np.nan
     capture = Capture(np.ones((20, 3, 5)), wall, wall if laser is None else laser, 200e-12)
     grid = Grid.box((-0.25, 0.2), (-0.1, 0.2), (0.5, 0.7), (0.15, 0.15, 0.1))
-    return WallModel(Hybrid(0.8, 4), capture, grid).operator(dtype)
+    return WallModel(Hybrid(0.8, 4).plan(capture, grid), capture).operator(dtype)
 
 
 def hidden_to_lit_wall(dtype: type) -> LinearOperator:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.time_axis import TimeAxis
+from nlos.capture import TimeAxis
 
 AXIS = TimeAxis(bins=256, bin_width=16e-12, start=0.4)
 JITTER = 20e-12

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos import Capture
+from nlos.capture import TimeAxis
 from nlos.simulate import PointScene
-from nlos.time_axis import TimeAxis
 
 SPOT = np.array([0.1, 0.05, 0.02])
 POINTS = np.array([[0.3, -0.2, 1.0], [-0.5, 0.4, 0.9], [0.1, 0.6, 1.4], [-0.6, -0.6, 1.1]])

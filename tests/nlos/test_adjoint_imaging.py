@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import find_refusal
 
 import apps.studies.hidden_scene_adjoint as study_module
 from apps.studies.hidden_scene_adjoint import (
@@ -15,8 +16,8 @@ from apps.studies.hidden_scene_adjoint import (
 )
 from nlos import Backprojection, Capture, Grid, PlanarRSD
 from nlos.adjoint import AdjointImaging, CompressedCapture
+from nlos.capture import TimeAxis
 from nlos.simulate import PointScene, build_relay_wall
-from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import SparseMatrix
 from tofclip.solvers import LinearInverse
@@ -85,7 +86,7 @@ def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(InputError, match="no projection"):
         build_tomography(24, 0.01)
     behind = Grid(GRID.x, GRID.y, GRID.z - 2)
-    assert "behind" in AdjointImaging(SOLVER).supports(fitting, behind).reason
+    assert "behind" in find_refusal(AdjointImaging(SOLVER), fitting, behind)
     with pytest.raises(InputError, match="behind"):
         AdjointImaging(SOLVER).reconstruct(fitting, behind)
 

@@ -4,18 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from exact_phasor_field import compute_exact_phasor_field
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import find_refusal
 from relay_walls import AXIS, HIDDEN, JITTER, curved_wall, lasers_for, planar_wall
 
 import nlos.backprojection
 from nlos import Backprojection, Capture, Grid
 from nlos.backprojection import Weighting
 from nlos.band import Band
-from nlos.exact import compute_exact_phasor_field
-from nlos.method import Support
+from nlos.capture import TimeAxis
 from nlos.simulate import PointScene
-from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
 
 # The walls here are coarser than the shortest of the pulse's waves wants; see test_sampling.py.
@@ -167,7 +167,7 @@ def test_voxels_on_the_wall_stay_finite(capture: Capture) -> None:
 def test_progress_counts_all_lookups_and_may_interrupt(capture: Capture) -> None:
     done: list[int] = []
     METHOD.reconstruct(capture, GRID, done.append)
-    assert sum(done) == METHOD.lookups(capture, GRID) == 17 * 21 * GRID.size
+    assert sum(done) == METHOD.plan(capture, GRID).cost == 17 * 21 * GRID.size
 
     def interrupt(_: int) -> None:
         raise KeyboardInterrupt
@@ -187,9 +187,7 @@ def test_the_volume_remembers_how_it_was_made(capture: Capture) -> None:
 
 
 def test_support_is_true_or_says_why_not(capture: Capture) -> None:
-    assert METHOD.supports(capture, GRID)
-    assert METHOD.supports(capture, GRID).reason == ""
-    Support().require()
+    assert find_refusal(METHOD, capture, GRID) == ""
 
 
 @pytest.mark.parametrize(
@@ -212,16 +210,14 @@ def test_support_is_true_or_says_why_not(capture: Capture) -> None:
 def test_what_cannot_be_imaged_is_refused(
     method: Backprojection, grid: Grid, reason: str, capture: Capture
 ) -> None:
-    support = method.supports(capture, grid)
-    assert not support
-    assert reason in support.reason
+    assert reason in find_refusal(method, capture, grid)
     with pytest.raises(InputError, match=reason):
         method.reconstruct(capture, grid)
 
 
 def test_one_wall_point_is_refused() -> None:
     lonely = Capture(np.ones(9), [0.0, 0.0, 0.0], [0.1, 0.0, 0.0], 16e-12)
-    assert "one wall point" in METHOD.supports(lonely, GRID).reason
+    assert "one wall point" in find_refusal(METHOD, lonely, GRID)
     with pytest.raises(InputError, match="one wall point"):
         compute_exact_phasor_field(lonely, GRID, METHOD.pulse)
 

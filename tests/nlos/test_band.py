@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nlos.band import Band, VirtualPulse
-from nlos.time_axis import TimeAxis
+from nlos.capture import TimeAxis
 from tofclip.errors import InputError
 
 AXIS = TimeAxis(bins=300, bin_width=16e-12, start=0.7)

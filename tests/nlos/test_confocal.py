@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import find_refusal
 
 from nlos import Capture, FKMigration, Grid, LightCone
+from nlos.capture import TimeAxis
 from nlos.confocal.light_cone import build_rebinning_matrix
 from nlos.preparation import rebin_capture, remove_first_bounce
 from nlos.simulate import PointScene
-from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
 
 # Odd and unequal sizes; path per bin about the wall's step.
@@ -130,28 +131,28 @@ def test_half_a_wall_beyond_the_wall_is_seen_and_no_more(method: LightCone | FKM
     volume = method.reconstruct(confocal([outside]), around(outside))
     # Seen from one side only, the point is smeared along the ray.
     assert volume.find_brightest() == pytest.approx(outside, abs=0.06)
-    support = method.supports(confocal([HIDDEN]), Grid.box((-1.2, 0), (-0.4, 0.4), (0.4, 0.8), 0.1))
-    assert "half a wall beyond" in support.reason
+    wide = Grid.box((-1.2, 0), (-0.4, 0.4), (0.4, 0.8), 0.1)
+    reason = find_refusal(method, confocal([HIDDEN]), wide)
+    assert "half a wall beyond" in reason
 
 
 @named
 def test_what_is_no_confocal_lattice_is_refused(method: LightCone | FKMigration) -> None:
     capture, grid = confocal([HIDDEN]), around(HIDDEN)
-    assert method.supports(capture, grid)
+    assert not find_refusal(method, capture, grid)
     curved = wall_at()
     curved[..., 2] = 0.1 * curved[..., 0] ** 2
     uneven = wall_at()
     uneven[:, 3] += [0.02, 0, 0]
     for wall in (curved, uneven, np.zeros_like(curved)):
-        assert "lattice" in method.supports(replace(capture, wall=wall, laser=wall), grid).reason
+        assert "lattice" in find_refusal(method, replace(capture, wall=wall, laser=wall), grid)
     for laser in (wall_at()[0, 0], wall_at()[::-1]):
         other = replace(capture, laser=laser)
-        assert "confocal scan is needed" in method.supports(other, grid).reason
+        assert "confocal scan is needed" in find_refusal(method, other, grid)
         with pytest.raises(InputError, match="confocal"):
             method.reconstruct(other, grid)
-    assert (
-        "behind the hindmost"
-        in method.supports(capture, Grid.box((0, 1), (0, 1), (-1, 1), 0.1)).reason
+    assert "behind the hindmost" in find_refusal(
+        method, capture, Grid.box((0, 1), (0, 1), (-1, 1), 0.1)
     )
 
 
@@ -163,9 +164,8 @@ def test_ten_gigabytes_are_refused_before_they_are_allocated(
     wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
     # Broadcast in the test only; a record that starts 200 m late has as many empty bins before it.
     capture = Capture(np.zeros((2, 80, 80)), wall, wall, 32e-12, start=200.0)
-    assert (
-        "GiB allowed"
-        in method.supports(capture, Grid.box((0, 0.1), (0, 0.1), (0.5, 0.6), 0.1)).reason
+    assert "GiB allowed" in find_refusal(
+        method, capture, Grid.box((0, 0.1), (0, 0.1), (0.5, 0.6), 0.1)
     )
 
 
@@ -241,7 +241,7 @@ def test_two_signals_of_one_place_are_refused(method: LightCone | FKMigration) -
     wall = wall_at().reshape(-1, 3)
     wall[1] = wall[0]
     capture = Capture(np.zeros((AXIS.bins, len(wall))), wall, wall, AXIS.bin_width)
-    assert "two wall points stand in one place" in method.supports(capture, around(HIDDEN)).reason
+    assert "two wall points stand in one place" in find_refusal(method, capture, around(HIDDEN))
 
 
 @pytest.fixture(scope="module")

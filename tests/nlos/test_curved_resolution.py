@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from nlos import Grid, Hybrid
+from nlos.capture import TimeAxis
 from nlos.resolution import PeakWidths, compute_diffraction_limit, measure_fwhm
 from nlos.simulate import PointScene, build_relay_wall
-from nlos.time_axis import TimeAxis
 
 METHOD = Hybrid(0.125, 4.24)
 LASER = [0.1, 0.05, 0.0]

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nlos import Capture, Grid, Volume
-from nlos.time_axis import TimeAxis
+from nlos.capture import TimeAxis
 from tofclip.errors import InputError, ShapeError
 from tofclip.units import SPEED_OF_LIGHT
 

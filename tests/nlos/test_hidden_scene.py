@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nlos import Backprojection, Capture, Grid
+from nlos.capture import TimeAxis
 from nlos.simulate import (
     HiddenScene,
     Lambert,
@@ -18,7 +19,6 @@ from nlos.simulate import (
 )
 from nlos.simulate.kernels import is_occluded
 from nlos.simulate.walls import compute_wall_normals
-from nlos.time_axis import TimeAxis
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
 from tofclip.units import SPEED_OF_LIGHT
 

@@ -9,14 +9,12 @@ import pytest
 from scene_shapes import SHAPES, shaped_wall
 
 from nlos.band import Band, VirtualPulse
+from nlos.capture import TimeAxis
 from nlos.plane import Plane
-from nlos.propagation.direct import propagate_direct
-from nlos.propagation.low_rank_propagation import propagate_low_rank
-from nlos.propagation.propagate import estimate_strength
+from nlos.propagation.compiled import estimate_strength, propagate_direct, propagate_low_rank
 from nlos.propagation.wall_to_plane_plan import WallToPlanePlan, find_common_period
+from nlos.rsd.diffraction import find_fast_length
 from nlos.rsd.transfer import SphericalWaves
-from nlos.rsd.window import find_fast_length
-from nlos.time_axis import TimeAxis
 
 BAND = Band(VirtualPulse(0.25, 4.24), TimeAxis(512, 32e-12))
 K = BAND.wavenumbers

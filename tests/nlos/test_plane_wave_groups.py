@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import nlos.rsd.inverse
 from nlos.plane import Plane
+from nlos.rsd.diffraction import PlaneWaves
 from nlos.rsd.groups import WaveGroups
 from nlos.rsd.inverse import choose_inverse
 from nlos.rsd.kernels import (
@@ -21,9 +22,7 @@ from nlos.rsd.kernels import (
     scatter_terms,
     transpose,
 )
-from nlos.rsd.spectrum import PlaneWaves
-from nlos.rsd.transfer import SphericalWaves, TransferFunction
-from nlos.rsd.window import Window
+from nlos.rsd.transfer import SphericalWaves, TransferFunction, Window
 
 PLANE = Plane(np.linspace(-0.4, 0.5, 12), np.linspace(-0.3, 0.6, 11), 0.0)
 WAVES = SphericalWaves(40.0, 1.5, 13, continued=False)  # 13 frequencies: not a multiple of STEPS

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nlos.capture import TimeAxis
 from nlos.simulate import PointScene
-from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError, ShapeError
 from tofclip.units import SPEED_OF_LIGHT
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD, Volume
+from nlos.capture import TimeAxis
 from nlos.score import score_points
 from nlos.simulate import PointScene, build_relay_wall
-from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError, ShapeError
 
 POINTS = np.array(

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from portable_libraries import LIBRARIES, find_device, relative_error
+from refusals import find_refusal
 from scene_shapes import shaped_capture, shaped_wall
 
-from nlos import Capture, Grid, Hybrid, PreparedImaging, propagate
+from nlos import Capture, Grid, Hybrid, propagate
 from nlos.portable.library import ArrayLibrary
 from nlos.propagation.wall_to_plane_plan import WallToPlanePlan
 from tofclip.arrays import ComputeDevice, to_numpy
@@ -66,7 +67,7 @@ def test_direct_sums_give_the_field_of_the_compiled_loops(
 
 def test_the_field_on_a_plane_is_that_of_the_compiled_loops(by_transforms: None) -> None:
     capture = scene("cylinder")
-    plane = METHOD.virtual_plane(capture, GRID)
+    plane = METHOD.plan(capture, GRID).plane
     # A lattice that suits the plane no better than the wall.
     uneven = replace(plane, x=plane.x * 1.01)
     for tolerance in (1e-2, 1e-3):
@@ -84,7 +85,7 @@ def test_little_memory_means_smaller_pieces(
     by_transforms: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     capture = scene("wavy").on(find_device("array_api_strict"))
-    plane = METHOD.virtual_plane(capture, GRID)
+    plane = METHOD.plan(capture, GRID).plane
     whole = propagate(capture, plane, METHOD.pulse).values
     monkeypatch.setattr(ArrayLibrary, "chunk_bytes", 1 << 16)
     assert relative_error(propagate(capture, plane, METHOD.pulse).values, to_numpy(whole)) < 1e-6
@@ -109,10 +110,10 @@ def test_walls_of_many_laser_spots_and_many_captures(
     )
     other = replace(first, signal=first.signal[:, ::-1])
     device = find_device("torch")
-    prepared = PreparedImaging(METHOD, first.on(device), GRID)
+    plan = METHOD.plan(first.on(device), GRID)
     for one in (first, other):
         expected = METHOD.reconstruct(one, GRID)
-        found = prepared.reconstruct(one.on(device))
+        found = plan.image(one.on(device))
         assert relative_error(found.magnitude, expected.magnitude) < AGREEMENT
         assert found.provenance == expected.provenance
 
@@ -120,7 +121,7 @@ def test_walls_of_many_laser_spots_and_many_captures(
 def test_propagation_in_time_is_for_numpy() -> None:
     capture = scene("cylinder").on(find_device("torch"))
     method = replace(METHOD, propagation="time")
-    assert "propagation in time works on NumPy arrays only" in method.supports(capture, GRID).reason
+    assert "propagation in time works on NumPy arrays only" in find_refusal(method, capture, GRID)
     with pytest.raises(InputError, match="propagation in time works on NumPy arrays"):
-        propagate(capture, METHOD.virtual_plane(capture, GRID), METHOD.pulse, "time")
-    assert method.supports(capture.on(ComputeDevice()), GRID)
+        propagate(capture, METHOD.plan(capture, GRID).plane, METHOD.pulse, "time")
+    assert not find_refusal(method, capture.on(ComputeDevice()), GRID)

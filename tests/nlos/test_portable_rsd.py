@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from portable_libraries import LIBRARIES, find_device, relative_error
+from refusals import find_refusal
 from relay_walls import AXIS, HIDDEN, JITTER, planar_wall
 
 import nlos.portable.diffraction
@@ -18,14 +19,13 @@ from nlos import (
     Hybrid,
     LightCone,
     PlanarRSD,
-    PreparedImaging,
     Refinement,
     TransientImaging,
     Volume,
 )
+from nlos.capture import TimeAxis
 from nlos.portable.library import ArrayLibrary
 from nlos.simulate import PointScene
-from nlos.time_axis import TimeAxis
 from tofclip.arrays import ComputeDevice
 from tofclip.errors import InputError
 
@@ -124,40 +124,37 @@ def test_depths_may_be_treated_one_by_one_and_planned_anew(
     monkeypatch.setattr(ArrayLibrary, "chunk_bytes", 1)
     monkeypatch.setattr(nlos.portable.diffraction, "MAX_CACHE_BYTES", kept)
     counted: list[int] = []
-    prepared = PreparedImaging(METHOD, capture, GRID)
+    plan = METHOD.plan(capture, GRID)
     for _ in range(2):
-        assert (
-            relative_error(prepared.reconstruct(capture, counted.append).magnitude, whole.magnitude)
-            < 1e-6
-        )
+        assert relative_error(plan.image(capture, counted.append).magnitude, whole.magnitude) < 1e-6
     assert counted == [GRID.size // 5] * 10  # every depth alone, twice
 
 
 @pytest.mark.parametrize("library", [*LIBRARIES, "numpy"])
-def test_what_is_prepared_images_many_captures(library: str) -> None:
+def test_what_is_planned_images_many_captures(library: str) -> None:
     first = scene("single")
     other = replace(first, signal=np.random.default_rng(3).normal(size=first.signal.shape))
     device = ComputeDevice() if library == "numpy" else find_device(library)
-    prepared = PreparedImaging(METHOD, first.on(device), GRID)
+    plan = METHOD.plan(first.on(device), GRID)
     for one in (first, other, first):
-        found = prepared.reconstruct(one.on(device))
+        found = plan.image(one.on(device))
         assert relative_error(found.magnitude, METHOD.reconstruct(one, GRID).magnitude) < AGREEMENT
         assert found.provenance["imaging"] == METHOD.settings
 
 
-def test_what_is_prepared_refuses_other_captures() -> None:
+def test_what_is_planned_refuses_other_captures() -> None:
     capture = scene("single").on(find_device("torch"))
-    prepared = PreparedImaging(METHOD, capture, GRID)
+    plan = METHOD.plan(capture, GRID)
     for other, reason in (
         (replace(capture, wall=capture.wall + 0.01), "the wall is not"),
         (replace(capture, laser=capture.laser + 0.01), "the laser is not"),
-        (replace(capture, start=0.41), "prepared for TimeAxis"),
-        (capture.on(ComputeDevice()), "prepared for signals on torch:cpu, got one on cpu"),
+        (replace(capture, start=0.41), "planned for TimeAxis"),
+        (capture.on(ComputeDevice()), "planned for signals on torch:cpu, got one on cpu"),
     ):
         with pytest.raises(InputError, match=reason):
-            prepared.reconstruct(other)
+            plan.image(other)
     with pytest.raises(InputError, match="behind the hindmost"):
-        PreparedImaging(METHOD, capture, Grid(GRID.x, GRID.y, [-1.0]))
+        METHOD.plan(capture, Grid(GRID.x, GRID.y, [-1.0]))
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
@@ -189,12 +186,13 @@ def test_methods_of_compiled_loops_refuse_in_one_line() -> None:
         ("confocal", FKMigration()),
         ("single", FilteredBackprojection()),
         ("single", Refinement(Hybrid(0.125))),
-        ("single", TransientImaging(METHOD)),
     ):
         capture = scene(laser).on(find_device("torch"))
-        reason = method.supports(capture, GRID).reason
+        reason = find_refusal(method, capture, GRID)
         assert "NumPy arrays only, and this capture's signal is on torch:cpu" in reason
         assert "\n" not in reason
+    with pytest.raises(InputError, match="NumPy arrays only"):
+        TransientImaging(METHOD).image_gate(capture, GRID, 1e-9, 2e-9)
     with pytest.raises(InputError, match="works on NumPy arrays"):
         capture.traces()
 

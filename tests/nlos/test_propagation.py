@@ -8,11 +8,10 @@ from scene_shapes import SHAPES, SPOT, shaped_capture, shaped_wall
 
 from nlos import Capture, Grid, propagate
 from nlos.band import Band, VirtualPulse
-from nlos.plane import Plane
-from nlos.propagation.plane_field import choose_virtual_plane
+from nlos.capture import TimeAxis
+from nlos.plane import Plane, choose_virtual_plane
 from nlos.rsd.transfer import SphericalWaves
 from nlos.simulate import PointScene
-from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
 
 PULSE = VirtualPulse(0.25, 4.24)

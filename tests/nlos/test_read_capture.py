@@ -14,10 +14,10 @@ import scipy.io
 from relay_walls import HIDDEN, JITTER, planar_wall
 
 from nlos import Backprojection, Capture, Grid
+from nlos.capture import TimeAxis
 from nlos.io import read_capture
 from nlos.io.orientation import rotate_to_scene
 from nlos.simulate import PointScene
-from nlos.time_axis import TimeAxis
 from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -275,7 +275,8 @@ versions = pytest.mark.parametrize("version", ["5", "7.3"])
 
 @versions
 def test_light_cone_data(version: str, tmp_path: Path) -> None:
-    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 11), np.linspace(-0.5, 0.5, 11), indexing="ij")
+    # x falls along the first axis, as the authors' own script shows it.
+    x, y = np.meshgrid(np.linspace(0.5, -0.5, 11), np.linspace(-0.5, 0.5, 11), indexing="ij")
     wall = np.stack([x, y, np.zeros_like(x)], axis=-1)
     expected = simulated(wall, wall, TimeAxis(1800, 4e-12))
     rect_data = np.moveaxis(expected.signal, 0, 2)
@@ -304,6 +305,54 @@ def test_migration_data(version: str, beside: bool, tmp_path: Path) -> None:
     assert found.signal[:300] == pytest.approx(expected.signal, rel=1e-4, abs=1e-6)
     assert np.array_equal(found.laser, found.wall)
     shows_the_point(found)
+
+
+def test_surface_optimisation_data(tmp_path: Path) -> None:
+    points = WALL.reshape(-1, 3)
+    expected = simulated(points, points, TimeAxis(1500, 1.2e-3 / SPEED_OF_LIGHT))
+    write_matlab(tmp_path / "a.mat", "5", transient=expected.signal.T, lighting=points)
+    found = read_capture(tmp_path / "a.mat")
+    same(found, expected)
+    shows_the_point(found)
+
+
+def test_pairs_with_their_points_beside(tmp_path: Path) -> None:
+    points = WALL.reshape(-1, 3)
+    lasers = points[::-1]
+    expected = simulated(lasers, points, TimeAxis(300, 32e-12))
+    write_matlab(tmp_path / "sub_Sig.mat", "5", sub_Sig=expected.signal.T)
+    with pytest.raises(FileFormatError, match=r"sub_Sig.*C_d\.mat.*docs/own_wall\.md"):
+        read_capture(tmp_path / "sub_Sig.mat")
+    write_matlab(tmp_path / "C_i.mat", "5", C_i=lasers)
+    write_matlab(tmp_path / "C_d.mat", "5", C_d=points)
+    same(read_capture(tmp_path / "sub_Sig.mat"), expected)
+
+
+def test_general_pairs(tmp_path: Path) -> None:
+    lasers = WALL[::-1]
+    expected = simulated(lasers, WALL, TimeAxis(300, 32e-12))
+    write_matlab(tmp_path / "data_one.mat", "5", data=np.moveaxis(expected.signal, 0, 2))
+    with pytest.raises(FileFormatError, match=r"setup\.mat.*docs/own_wall\.md"):
+        read_capture(tmp_path / "data_one.mat")
+    write_matlab(tmp_path / "setup.mat", "5", laserpoints=lasers, detectpoints=WALL)
+    same(read_capture(tmp_path / "data_one.mat"), expected)
+
+
+def test_archives_with_paths_lasers_and_time_last(tmp_path: Path) -> None:
+    expected = simulated()
+    fields = {"H": expected.signal, "wall_xyz": WALL, "laser_xyz": SPOT}
+    np.savez(tmp_path / "a.npz", **fields, delta_t_m=AXIS.spacing, t_start_m=AXIS.start)
+    same(read_capture(tmp_path / "a.npz"), expected)
+    lasers = np.array([SPOT, np.add(SPOT, [0.1, 0, 0])])
+    several = np.stack([expected.signal, 2 * expected.signal], axis=1)
+    np.savez(
+        tmp_path / "b.npz", H=several, wall_xyz=WALL, laser_xyz=lasers, delta_t_s=AXIS.bin_width
+    )
+    assert read_capture(tmp_path / "b.npz").signal.shape == several.shape
+    last = np.moveaxis(expected.signal, 0, -1)
+    np.savez(tmp_path / "c.npz", H=last, wall_xyz=WALL, laser_xyz=SPOT, delta_t_s=AXIS.bin_width)
+    with pytest.raises(FileFormatError, match="ends with time; put time first"):
+        read_capture(tmp_path / "c.npz")
 
 
 def test_migration_data_without_its_arrival_times(tmp_path: Path) -> None:

@@ -5,15 +5,16 @@ from functools import cache
 
 import numpy as np
 import pytest
+from refusals import find_refusal
 from relay_walls import curved_wall, planar_wall
 
 from nlos import Capture, Grid, Hybrid, Refinement, Volume
+from nlos.capture import TimeAxis
 from nlos.illumination_groups import choose_unaliased_band
 from nlos.refinement.model import WallModel
 from nlos.refinement.refine import build_total_variation
 from nlos.refinement.spherical import propagate_spherical_waves
 from nlos.simulate import HiddenScene, PointScene, Surface, add_poisson_noise
-from nlos.time_axis import TimeAxis
 from tofclip.errors import InputError
 from tofclip.solvers import Sparse
 
@@ -104,7 +105,7 @@ def test_an_even_surface_is_smooth_with_sharp_borders_under_total_variation() ->
 @pytest.mark.parametrize("laser", ["single", "confocal"])
 def test_the_adjoint_of_the_readings_is_the_real_part_of_the_hybrids_field(laser: str) -> None:
     capture = seen(laser)
-    model = WallModel(HYBRID, capture, GRID)
+    model = WallModel(HYBRID.plan(capture, GRID), capture)
     gain = capture.axis.paths ** (3 if laser == "confocal" else 2)
     brightened = replace(capture, signal=capture.signal * gain[:, None, None])
     expected = HYBRID.phasor_field(brightened, GRID).values.real
@@ -124,7 +125,11 @@ def test_a_voxels_phasors_are_those_of_the_formula() -> None:
         back, outward = np.linalg.norm(capture.points - voxel, axis=1), np.linalg.norm(SPOT - voxel)
         phases = np.exp(-1j * np.outer(outward + back, band.wavenumbers))
         expected = expected + np.sqrt(band.weights) * phases / back[:, None]
-    found = WallModel(hybrid, capture, GRID).operator(np.float64)(volume).view(np.complex128)
+    found = (
+        WallModel(hybrid.plan(capture, GRID), capture)
+        .operator(np.float64)(volume)
+        .view(np.complex128)
+    )
     # Cutting the virtual plane off costs single phasors, most at the band's weak edges, a few per
     # cent.
     assert np.linalg.norm(found - expected.ravel()) < 5e-2 * np.linalg.norm(expected)
@@ -157,7 +162,7 @@ def test_progress_counts_every_voxel_in_every_iteration() -> None:
 def test_what_cannot_be_refined_is_refused() -> None:
     capture, refinement = seen("single"), Refinement(HYBRID)
     coarse = Grid(GRID.x, GRID.y, np.arange(0.5, 1.0, 0.06))
-    assert refinement.supports(capture, GRID)
+    assert not find_refusal(refinement, capture, GRID)
     for grid, reason in (
         (coarse, "voxels 0.06 m apart in depth are too coarse"),
         (Grid(GRID.x, GRID.y, GRID.z - 1), "behind the hindmost wall point"),

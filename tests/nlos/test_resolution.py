@@ -10,9 +10,8 @@ from relay_walls import planar_wall
 from scipy.optimize import brentq
 
 from nlos import Grid, PlanarRSD
-from nlos.resolution import compute_diffraction_limit, measure_fwhm
+from nlos.capture import TimeAxis
 from nlos.simulate import PointScene
-from nlos.time_axis import TimeAxis
 
 WAVELENGTH, CYCLES, SIDE = 0.08, 6.0, 1.0
 METHOD = PlanarRSD(WAVELENGTH, CYCLES, 1e-3)

@@ -8,11 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scene_shapes import shaped_capture
 
-import nlos.hybrid
 from nlos import Grid, Hybrid
 from nlos.method import SubProgress
 from nlos.propagation.wall_to_plane_plan import WallToPlanePlan
-from nlos.rsd.diffraction import DiffractionPlan
+from nlos.rsd.image_planes import CompiledDiffraction
 
 GRID = Grid(np.linspace(-0.5, 0.5, 9), np.linspace(-0.5, 0.5, 7), [0.7, 0.9, 1.0])
 pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")
@@ -41,13 +40,13 @@ def test_the_way_to_the_plane_has_its_share(
     """
     done: list[int] = []
     before: list[tuple[int, int]] = []
-    diffract = nlos.hybrid.diffract_to_grid
+    add = CompiledDiffraction.add
 
-    def noticed(plan: DiffractionPlan, values: np.ndarray, *rest: object) -> None:
+    def noticed(diffraction: CompiledDiffraction, values: np.ndarray, *rest: object) -> None:
         before.append((len(done), sum(done)))
-        diffract(plan, values, *rest)  # type: ignore[arg-type]
+        add(diffraction, values, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(nlos.hybrid, "diffract_to_grid", noticed)
+    monkeypatch.setattr(CompiledDiffraction, "add", noticed)
     monkeypatch.setattr(WallToPlanePlan, "is_faster_than_direct", quicker)
     Hybrid(0.25, 4.24, propagation).reconstruct(shaped_capture("wavy", 17), GRID, done.append)
     ((reports, voxels),) = before
@@ -59,7 +58,7 @@ def test_the_way_to_the_plane_has_its_share(
 def test_an_interruption_comes_through_on_the_way_to_the_plane(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(nlos.hybrid, "diffract_to_grid", None)  # is not reached
+    monkeypatch.setattr(CompiledDiffraction, "add", None)  # is not reached
 
     def stop(_: int) -> None:
         raise KeyboardInterrupt

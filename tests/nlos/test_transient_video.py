@@ -10,9 +10,9 @@ from relay_walls import curved_wall, planar_wall
 
 import nlos.video
 from nlos import Capture, Grid, Hybrid, PlanarRSD, TransientImaging
+from nlos.capture import TimeAxis
 from nlos.method import MEMORY_LIMIT_BYTES
 from nlos.simulate import PointScene
-from nlos.time_axis import TimeAxis
 from nlos.video import TransientVideo
 from tofclip.errors import InputError, ShapeError
 from tofclip.units import SPEED_OF_LIGHT

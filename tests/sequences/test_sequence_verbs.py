@@ -18,8 +18,8 @@ import pytest
 import tofclip
 from apps.cli import main
 from nlos import Volume
+from nlos.capture import TimeAxis
 from nlos.simulate import PointScene
-from nlos.time_axis import TimeAxis
 from tofclip import Frames
 
 pytestmark = pytest.mark.xdist_group("cluster")  # one cluster for all of them

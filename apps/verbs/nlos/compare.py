@@ -9,46 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.figures.nlos_compare import make_comparison_figure
-from apps.figures.style import save_figure as save_figure
-from apps.files import PICTURE_SUFFIXES, make_folder, require_writable
-from apps.nlos.files import add_provenance
-from apps.nlos.imaging import (
-    choose_grid,
-    fill_box,
-    find_scales,
-    preprocess_capture,
-    warnings_to_stderr,
-)
-from apps.nlos.measure import compare_with_truth, measure_imaging, measure_sharpness
-from apps.nlos.methods import (
-    METHODS,
-    ImagingSettings,
-    build_method,
-    fill_in_defaults,
-    parse_method_names,
-    require_used_settings,
-)
-from apps.nlos.truth import HiddenTruth
+from apps.nlos.methods import METHODS, ImagingSettings
 from apps.options import JsonOption
-from apps.report import report
-from apps.settings import (
-    SettingsOption,
-    add_setting_flags,
-    load_settings,
-    save_settings,
-    setting_field,
-    settings_to_dict,
-)
-from apps.studies.hidden_scene_adjoint import correlate_views
-from nlos.io import read_capture
-from tofclip.errors import InputError
-from tofclip.units import MILLIMETRE
+from apps.settings import SettingsOption, add_setting_flags, setting_field
 
 if TYPE_CHECKING:
+    from apps.nlos.imaging import PreparedImaging
     from apps.nlos.measure import MeasuredVolume
+    from apps.nlos.truth import HiddenTruth
     from nlos import Capture, Grid
-    from nlos.method import Reconstructor
 
 SETTINGS_HEADING = "tofclip nlos compare CAPTURE --settings THIS --out PICTURE"
 
@@ -93,14 +62,22 @@ def compare(
 
     Example: tofclip nlos compare capture.h5 --methods hybrid,backprojection --out compare.png
     """
+    from apps.figures.nlos_compare import make_comparison_figure
+    from apps.figures.style import save_figure as save_figure
+    from apps.nlos.imaging import warnings_to_stderr
+    from apps.nlos.truth import HiddenTruth
+    from apps.settings import load_settings, save_settings
+    from nlos.io import read_capture
+
     wanted = load_settings(CompareSettings, settings, flags)
     written = [out, out.with_suffix(".toml")]
     _require_writable(written, volumes, (source,) if settings is None else (source, settings))
     _check_settings(wanted)
-    capture, truth = preprocess_capture(read_capture(source), wanted), HiddenTruth.load(source)
+    capture, truth = read_capture(source), HiddenTruth.load(source)
     with warnings_to_stderr():
-        found, grid, methods, left_out = _choose_methods(wanted, capture)
-        runs = _measure_methods(methods, capture, grid)
+        prepared, left_out = _choose_methods(wanted, capture)
+        runs = _measure_methods(prepared)
+    found, grid = prepared.shown, prepared.grid
     figures = _collect_metrics(runs, truth)
     save_figure(
         make_comparison_figure({name: run.volume for name, run in runs.items()}, figures, truth),
@@ -115,6 +92,8 @@ def compare(
 def _require_writable(
     pictures: Sequence[Path], volumes: Path | None, inputs: tuple[Path, ...]
 ) -> None:
+    from apps.files import PICTURE_SUFFIXES, make_folder, require_writable
+
     picture, settings = pictures
     require_writable(picture, *PICTURE_SUFFIXES, inputs=inputs)
     require_writable(settings, inputs=inputs)
@@ -123,43 +102,47 @@ def _require_writable(
 
 
 def _check_settings(settings: CompareSettings) -> None:
-    names = tuple(METHODS) if settings.methods is None else parse_method_names(settings.methods)
-    require_used_settings(settings, names)
-    for name in names:
-        build_method(
-            name,
-            settings
-            if settings.wavelength_mm is not None
-            else replace(settings, wavelength_mm=1.0),
-        )
+    from apps.nlos.methods import parse_method_names, require_valid_settings
+
+    names = METHODS if settings.methods is None else parse_method_names(settings.methods)
+    require_valid_settings(settings, names)
 
 
 def _choose_methods(
     wanted: CompareSettings, capture: Capture
-) -> tuple[CompareSettings, Grid, dict[str, Reconstructor], dict[str, str]]:
-    """Choose methods and voxels; of methods that nobody named, those that do not suit are left out,
-    with the reason.
+) -> tuple[PreparedImaging[CompareSettings], dict[str, str]]:
+    """Choose methods and voxels; of methods that were not named, those that do not suit are left
+    out, with the reason.
     """
-    scales = find_scales(wanted, capture)
-    found = replace(wanted, **scales._asdict())
-    _, whole = fill_box(found, capture, scales.voxel_mm * MILLIMETRE)
-    names = tuple(METHODS) if found.methods is None else parse_method_names(found.methods)
-    support = {name: build_method(name, found).supports(capture, whole) for name in names}
-    left_out = {name: one.reason for name, one in support.items() if not one}
-    if left_out and (found.methods is not None or len(left_out) == len(names)):
+    from apps.nlos.imaging import prepare_imaging
+    from apps.nlos.methods import from_library, parse_method_names
+    from tofclip.errors import InputError
+
+    names = METHODS if wanted.methods is None else parse_method_names(wanted.methods)
+    # The voxels are those of the virtual pulse, for all methods alike.
+    prepared = prepare_imaging(capture, wanted)
+    left_out = {}
+    for name in names:
+        try:
+            prepared.settings.make_method(name).plan(prepared.capture, prepared.grid)
+        except InputError as refused:
+            left_out[name] = str(refused)
+    if left_out and (wanted.methods is not None or len(left_out) == len(names)):
         name, reason = next(iter(left_out.items()))
         raise InputError(f"{name} does not suit this capture: {reason}")
     chosen = [name for name in names if name not in left_out]
-    found = replace(fill_in_defaults(found, chosen), methods=",".join(chosen))
-    found, grid = choose_grid(found, capture)
-    return found, grid, {name: build_method(name, found) for name in chosen}, left_out
+    shown = from_library(prepared.shown, prepared.settings, chosen)
+    return replace(prepared, shown=replace(shown, methods=",".join(chosen))), left_out
 
 
-def _measure_methods(
-    methods: Mapping[str, Reconstructor], capture: Capture, grid: Grid
-) -> dict[str, MeasuredVolume]:
+def _measure_methods(prepared: PreparedImaging[CompareSettings]) -> dict[str, MeasuredVolume]:
+    from apps.nlos.measure import measure_imaging
+
     return {
-        name: measure_imaging(name, imaging, capture, grid) for name, imaging in methods.items()
+        name: measure_imaging(
+            name, prepared.settings.make_method(name), prepared.capture, prepared.grid
+        )
+        for name in (prepared.shown.methods or "").split(",")
     }
 
 
@@ -167,6 +150,9 @@ def _collect_metrics(
     runs: Mapping[str, MeasuredVolume], truth: HiddenTruth | None
 ) -> dict[str, dict[str, Any]]:
     """Figures of every method; the first is the reference."""
+    from apps.nlos.measure import compare_with_truth, measure_sharpness
+    from apps.studies.hidden_scene_adjoint import correlate_views
+
     reference = next(iter(runs.values())).volume
     return {
         name: {
@@ -183,6 +169,9 @@ def _save_volumes(
     runs: Mapping[str, MeasuredVolume], folder: Path, source: Path, settings: CompareSettings
 ) -> Iterator[Path]:
     """Write each method's volume, and name the files."""
+    from apps.nlos.files import add_provenance
+    from apps.settings import settings_to_dict
+
     for name, run in runs.items():
         path = folder / f"{name}.h5"
         add_provenance(
@@ -200,6 +189,8 @@ def _report_comparison(
     as_json: bool,
     written: Sequence[Path],
 ) -> None:
+    from apps.report import report
+
     if as_json:
         report({"voxels": grid.shape, "methods": figures, "left_out": left_out}, as_json)
         return

@@ -22,8 +22,8 @@ from apps.options import JsonOption
 from apps.report import report
 from apps.studies.hidden_scene_adjoint import correlate_views
 from nlos import Backprojection, Grid, Hybrid
+from nlos.capture import TimeAxis
 from nlos.simulate import HiddenScene, Lambert, Surface, add_poisson_noise, build_relay_wall
-from nlos.time_axis import TimeAxis
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -123,6 +123,9 @@ def _run_demo(seed: int) -> DemoRun:
 
 
 def _simulate_capture(seed: int) -> tuple[Capture, HiddenTruth]:
+
+    from apps.nlos.truth import HiddenTruth
+
     surfaces = [
         Surface.letters(text, (x, 0.0, z), LETTER_HEIGHT_M, FACET_M, Lambert(albedo))
         for text, x, z, albedo in LETTERS

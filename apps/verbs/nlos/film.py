@@ -7,45 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
-from apps.files import build_provenance, require_writable
-from apps.mp4 import import_opencv, open_film
-from apps.nlos.imaging import (
-    choose_grid,
-    fill_box,
-    find_scales,
-    preprocess_capture,
-    warnings_to_stderr,
-)
-from apps.nlos.methods import (
-    ImagingSettings,
-    build_method,
-    fill_in_defaults,
-    parse_method_names,
-    require_used_settings,
-)
+from apps.nlos.methods import ImagingSettings
 from apps.options import JsonOption
-from apps.progress import show_progress
-from apps.report import report
-from apps.settings import (
-    SettingsOption,
-    add_setting_flags,
-    load_settings,
-    save_settings,
-    setting_field,
-    settings_to_dict,
-)
-from nlos import TransientImaging
-from nlos.film import render_frames
-from nlos.illumination_groups import find_leg_bounds
-from nlos.io import read_capture
-from tofclip.errors import InputError
-from tofclip.units import MILLIMETRE, SPEED_OF_LIGHT
+from apps.settings import SettingsOption, add_setting_flags, setting_field
 
 if TYPE_CHECKING:
-    from nlos import Capture, Grid, TransientVideo
+    from nlos import Capture, Grid, TransientImaging, TransientVideo
     from nlos.geometry import FloatArray
 
 FILM_METHODS = ("rsd", "hybrid")
@@ -109,11 +78,16 @@ def film(
 
     Example: tofclip nlos film capture.h5 --out flash.gif
     """
+    from apps.nlos.imaging import warnings_to_stderr
+    from apps.report import report
+    from apps.settings import load_settings, save_settings
+    from nlos.io import read_capture
+
     wanted = load_settings(FilmSettings, settings, flags)
     beside = out.with_suffix(".toml")
     _require_writable(out, beside, (source,) if settings is None else (source, settings))
     _check_settings(wanted, out)
-    capture = preprocess_capture(read_capture(source), wanted)
+    capture = read_capture(source)
     started = time.perf_counter()
     with warnings_to_stderr():
         found, video = _make_video(capture, wanted)
@@ -134,23 +108,22 @@ def film(
 
 
 def _require_writable(out: Path, beside: Path, inputs: tuple[Path, ...]) -> None:
+    from apps.files import require_writable
+
     require_writable(out, *FILM_SUFFIXES, inputs=inputs)
     require_writable(beside, inputs=inputs)
 
 
 def _check_settings(settings: FilmSettings, out: Path) -> None:
     """Refuse what no capture could be filmed by, before any is read."""
+    from apps.mp4 import import_opencv
+    from apps.nlos.methods import parse_method_names, require_valid_settings
+    from tofclip.errors import InputError
+
     names = FILM_METHODS if settings.method is None else parse_method_names(settings.method)
     if not set(names) <= set(FILM_METHODS):
         raise InputError(f"films are made by {' or '.join(FILM_METHODS)}, not by {settings.method}")
-    require_used_settings(settings, names)
-    for name in names:
-        build_method(
-            name,
-            settings
-            if settings.wavelength_mm is not None
-            else replace(settings, wavelength_mm=1.0),
-        )
+    require_valid_settings(settings, names)
     if settings.instants < 1:
         raise InputError(f"a film needs at least one instant, got {settings.instants}")
     if settings.every_depth and out.suffix.lower() != ".h5":
@@ -162,34 +135,34 @@ def _check_settings(settings: FilmSettings, out: Path) -> None:
 
 
 def _make_video(capture: Capture, wanted: FilmSettings) -> tuple[FilmSettings, TransientVideo]:
-    """Find what is not told, and film the capture."""
-    found = replace(wanted, **find_scales(wanted, capture)._asdict())
-    method = found.method or _choose_method(found, capture)
-    found = replace(fill_in_defaults(found, [method]), method=method)
-    imaging = TransientImaging(build_method(method, found))  # type: ignore[arg-type]
-    found, grid = choose_grid(found, capture)
-    imaging.supports(capture, grid).require()
+    """Find what is not given, and film the capture."""
+    from apps.nlos.imaging import prepare_imaging
+    from apps.progress import show_progress
+    from nlos import TransientImaging
+
+    prepared = prepare_imaging(capture, wanted)
+    capture, grid, settings = prepared.capture, prepared.grid, prepared.settings
+    method = settings.method
+    if method not in FILM_METHODS:  # back-projection is the quickest that remains
+        method = FILM_METHODS[-1]
+    imaging = TransientImaging(settings.make_method(method))  # type: ignore[arg-type]
+    found = replace(prepared.shown, method=method, tolerance=imaging.method.tolerance)
     found, times = _choose_instants(found, capture, grid, imaging)
     take = imaging.video if found.every_depth else imaging.front_views
     with show_progress("filming", grid.size) as advance:
         return found, take(capture, grid, times, advance)
 
 
-def _choose_method(settings: FilmSettings, capture: Capture) -> str:
-    """Name the quickest of the two methods that takes a capture; where none does, the one that says
-    why.
-    """
-    _, grid = fill_box(settings, capture, (settings.voxel_mm or 0.0) * MILLIMETRE)
-    return next(
-        (name for name in FILM_METHODS if build_method(name, settings).supports(capture, grid)),
-        FILM_METHODS[-1],
-    )
-
-
 def _choose_instants(
     settings: FilmSettings, capture: Capture, grid: Grid, imaging: TransientImaging
 ) -> tuple[FilmSettings, FloatArray]:
     """Return evenly spaced instants, s, and the settings with the first and the last of them."""
+    import numpy as np
+
+    from nlos.illumination_groups import find_leg_bounds
+    from tofclip.errors import InputError
+    from tofclip.units import SPEED_OF_LIGHT
+
     nearest, farthest = find_leg_bounds(capture.lasers, grid)
     room = MARGIN_SIGMAS * imaging.method.pulse.sigma
     first, last = (
@@ -206,12 +179,18 @@ def _choose_instants(
 def _build_video_provenance(
     video: TransientVideo, source: Path, found: FilmSettings
 ) -> dict[str, Any]:
+    from apps.files import build_provenance
+    from apps.settings import settings_to_dict
+
     return build_provenance(
         {"verb": "nlos film", **settings_to_dict(found)}, source, earlier=video.provenance
     )
 
 
 def _write_video(video: TransientVideo, out: Path) -> None:
+    from apps.mp4 import open_film
+    from nlos.film import render_frames
+
     if out.suffix.lower() == ".h5":
         video.save(out)
     elif out.suffix.lower() == ".gif":

@@ -2,35 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos.costs import estimate_memory
-from apps.nlos.imaging import (
-    fill_box,
-    find_sampling_step,
-    find_scales,
-    find_shortest_wavelength,
-    preprocess_capture,
-)
-from apps.nlos.methods import METHODS, ImagingSettings, build_method
-from apps.nlos.truth import HiddenTruth
+from apps.nlos.methods import METHODS, ImagingSettings
 from apps.options import JsonOption
-from apps.report import report
-from apps.settings import SettingsOption, add_setting_flags, load_settings
-from nlos.band import VirtualPulse
-from nlos.illumination_groups import group_by_illumination
-from nlos.io import read_capture
-from nlos.resolution import compute_diffraction_limit
-from nlos.rsd.wall import PlanarWall
-from tofclip.errors import InputError
-from tofclip.units import MILLIMETRE, PICOSECOND
+from apps.settings import SettingsOption, add_setting_flags
 
 if TYPE_CHECKING:
-    from nlos import Capture, Grid
+    from nlos import Capture, Grid, Method
+
+EMPTY_KEYS = {"reasons", "gate_found"}
+"""Fields of the library's settings that are found, never given."""
 
 MAX_BLUR_FRACTION = 0.5
 """A wavelength is usable while a point's image is narrower than this share of the wall."""
@@ -59,26 +44,37 @@ def info(
 
     Example: tofclip nlos info capture.h5
     """
+    from apps.nlos.methods import from_library, to_library
+    from apps.nlos.truth import HiddenTruth
+    from apps.report import report
+    from apps.settings import load_settings
+    from nlos.io import read_capture
+    from nlos.settings import settings_for
+
     wanted = load_settings(ImagingSettings, settings, flags)
-    capture = preprocess_capture(read_capture(source), wanted)
-    scales = find_scales(wanted, capture)
-    found, grid = fill_box(
-        replace(wanted, **scales._asdict()), capture, scales.voxel_mm * MILLIMETRE
-    )
+    recorded = read_capture(source)
+    given = to_library(wanted).to_dict()
+    chosen = settings_for(recorded, **{key: given[key] for key in given.keys() - EMPTY_KEYS})
+    capture, grid = chosen.prepare(recorded), chosen.grid()
+    found = from_library(wanted, chosen, [chosen.method or ""])
     figures = {
         "wall": _describe_wall(capture),
         "laser": _describe_laser(capture),
         "record": _describe_time_axis(capture),
         "wavelength_mm": {
             **_find_usable_wavelengths(capture, grid, found.cycles),
-            "chosen": scales.wavelength_mm,
+            "chosen": found.wavelength_mm,
         },
+        "gate": {"m": chosen.gate, "found": chosen.gate_found},
+        "bins_together": chosen.bins_together,
+        "method": chosen.method,
+        "reasons": dict(chosen.reasons),
         "resolution_m": _compute_resolution(capture, grid, found),
         "box_m": {"x": found.x_m, "y": found.y_m, "z": (found.near_m, found.far_m)},
-        "voxels": {"size_mm": scales.voxel_mm, "shape": grid.shape},
+        "voxels": {"size_mm": found.voxel_mm, "shape": grid.shape},
         "truth": HiddenTruth.load(source) is not None,
     }
-    methods = {name: _check_method(name, found, capture, grid) for name in METHODS}
+    methods = {name: _check_method(chosen.make_method(name), capture, grid) for name in METHODS}
     if as_json:
         report({**figures, "methods": methods}, as_json)
         return
@@ -90,6 +86,10 @@ def info(
 
 
 def _describe_wall(capture: Capture) -> dict[str, Any]:
+    from nlos.rsd.wall import PlanarWall
+    from nlos.settings import find_sampling_step
+    from tofclip.errors import InputError
+
     try:
         PlanarWall.of(capture.points)
         shape = "planar lattice"
@@ -108,6 +108,8 @@ def _describe_wall(capture: Capture) -> dict[str, Any]:
 
 
 def _describe_laser(capture: Capture) -> str:
+    from nlos.illumination_groups import group_by_illumination
+
     parts = group_by_illumination(capture)
     if parts[0].laser is None:
         return "confocal"
@@ -118,6 +120,8 @@ def _describe_laser(capture: Capture) -> str:
 
 
 def _describe_time_axis(capture: Capture) -> dict[str, Any]:
+    from tofclip.units import PICOSECOND
+
     paths = capture.axis.paths
     return {
         "bins": capture.axis.bins,
@@ -130,6 +134,9 @@ def _describe_time_axis(capture: Capture) -> dict[str, Any]:
 
 def _find_usable_wavelengths(capture: Capture, grid: Grid, cycles: float) -> dict[str, float]:
     """Bounds of the carrier: what is sampled finely enough, and what still resolves something, mm."""
+    from nlos.settings import find_shortest_wavelength
+    from tofclip.units import MILLIMETRE
+
     low, high = capture.points.min(axis=0), capture.points.max(axis=0)
     width = float(max(high[0] - low[0], high[1] - low[1]))
     distance = float(grid.z[[0, -1]].mean() - capture.points[:, 2].mean())
@@ -140,16 +147,22 @@ def _find_usable_wavelengths(capture: Capture, grid: Grid, cycles: float) -> dic
 
 
 def _compute_resolution(capture: Capture, grid: Grid, found: ImagingSettings) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    from nlos.band import VirtualPulse
+    from nlos.resolution import compute_diffraction_limit
+    from tofclip.units import MILLIMETRE
+
     middle = [float(axis[[0, -1]].mean()) for axis in (grid.x, grid.y, grid.z)]
     pulse = VirtualPulse((found.wavelength_mm or 0.0) * MILLIMETRE, found.cycles)
     return {**asdict(compute_diffraction_limit(capture, middle, pulse)), "at": middle}
 
 
-def _check_method(
-    name: str, found: ImagingSettings, capture: Capture, grid: Grid
-) -> dict[str, Any]:
-    imaging = build_method(name, found)
-    support = imaging.supports(capture, grid)
-    if not support:
-        return {"suits": False, "reason": support.reason}
-    return {"suits": True, "memory_mib": estimate_memory(imaging, capture, grid) / 2**20}
+def _check_method(method: Method, capture: Capture, grid: Grid) -> dict[str, Any]:
+    from tofclip.errors import InputError
+
+    try:
+        plan = method.plan(capture, grid)
+    except InputError as refused:
+        return {"suits": False, "reason": str(refused)}
+    return {"suits": True, "memory_mib": plan.memory_bytes / 2**20}

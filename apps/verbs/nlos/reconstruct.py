@@ -13,60 +13,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.files import make_folder
-from apps.nlos.files import (
-    VOLUME_SUFFIXES,
-    ResultFiles,
-    add_provenance,
-    is_capture_folder,
-    list_captures,
-    require_separate_folder,
-    write_volume,
-)
-from apps.nlos.imaging import (
-    choose_grid,
-    fill_box,
-    find_scales,
-    image_capture,
-    preprocess_capture,
-    warnings_to_stderr,
-)
-from apps.nlos.methods import (
-    METHODS,
-    METHODS_BY_SPEED,
-    build_method,
-    choose_device,
-    choose_quickest_method,
-    fill_in_defaults,
-    parse_method_names,
-    require_used_settings,
-)
-from apps.nlos.refining import (
-    REFINED_METHOD,
-    RefinementSettings,
-    build_refinement,
-    require_valid_refinement,
-)
+from apps.nlos.methods import METHODS, RefinementSettings
 from apps.options import ClusterOption, DeviceOption, JsonOption
-from apps.report import report
-from apps.sequences import resolve_device, run_with_progress
-from apps.settings import (
-    SettingsOption,
-    add_setting_flags,
-    load_settings,
-    save_settings,
-    setting_field,
-    settings_to_dict,
-)
-from nlos.io import read_capture
-from tofclip.arrays import ComputeDevice
-from tofclip.errors import InputError
-from tofclip.sequences.jobs import Job, run_jobs
-from tofclip.units import MILLIMETRE
+from apps.settings import SettingsOption, add_setting_flags, setting_field
 
 if TYPE_CHECKING:
-    from nlos import Capture, Volume
-    from tofclip.sequences.jobs import Report
+    from apps.nlos.files import ResultFiles
+    from apps.nlos.imaging import PreparedImaging
+    from nlos import Volume
+    from tofclip.sequences.jobs import Job, Report
 
 EXIT_SOME_FAILED = 1
 STOP_KEYS = ("iterations", "stopped_because")
@@ -159,6 +114,12 @@ def reconstruct(
 
     Example: tofclip nlos reconstruct capture.h5 --out volume.h5 --png volume.png
     """
+    from apps.nlos.files import ResultFiles, is_capture_folder
+    from apps.report import report
+    from apps.sequences import resolve_device
+    from apps.settings import load_settings
+    from tofclip.errors import InputError
+
     order = _ImagingRequest(load_settings(ReconstructSettings, settings, flags), device)
     _check_settings(order.settings)
     resolve_device(device, cluster)
@@ -174,35 +135,55 @@ def reconstruct(
 
 def _check_settings(settings: ReconstructSettings) -> None:
     """Refuse settings that no capture could make sense of, before any is read."""
+    from apps.nlos.methods import (
+        PORTABLE_METHODS,
+        parse_method_names,
+        require_valid_refinement,
+        require_valid_settings,
+    )
+    from tofclip.errors import InputError
+
     if not 0 <= settings.point_fraction <= 1:
         raise InputError(
             f"point_fraction is a share between 0 and 1, got {settings.point_fraction}"
         )
-    names = METHODS_BY_SPEED if settings.method is None else parse_method_names(settings.method)
+    names = PORTABLE_METHODS if settings.method is None else parse_method_names(settings.method)
     if settings.method is not None and len(names) > 1:
         raise InputError(
             f"one method is asked for, got '{settings.method}'; nlos compare takes several"
         )
     require_valid_refinement(settings, settings.method)
-    require_used_settings(settings, names)
-    for name in names:
-        build_method(
-            name,
-            settings
-            if settings.wavelength_mm is not None
-            else replace(settings, wavelength_mm=1.0),
-        )
+    require_valid_settings(settings, names)
 
 
 def _reconstruct_single(
     source: Path, results: ResultFiles, order: _ImagingRequest
 ) -> dict[str, Any]:
     """Image one capture, write its results, and return the figures."""
+    from apps.nlos.files import add_provenance, write_volume
+    from apps.nlos.imaging import prepare_imaging, warnings_to_stderr
+    from apps.nlos.methods import REFINED_METHOD, choose_device
+    from apps.settings import save_settings, settings_to_dict
+    from nlos.io import read_capture
+    from nlos.settings import is_brightest_on_wall
+    from tofclip.arrays import ComputeDevice
+
     device = choose_device(order.device, order.settings)
-    capture = preprocess_capture(read_capture(source), order.settings)
+    capture, wanted = read_capture(source), order.settings
+    if wanted.refine:
+        wanted = replace(wanted, method=REFINED_METHOD)
     started = time.perf_counter()
     with warnings_to_stderr():
-        found, volume = _image_capture(capture.on(device), order.settings)
+        prepared = prepare_imaging(capture, wanted, device=device)
+        found, volume = _image(prepared)
+    chosen = prepared.settings
+    on_wall = is_brightest_on_wall(volume, capture, chosen.wavelength or 0.0)
+    if on_wall:
+        print(
+            f"tofclip: warning: {source}: the brightest voxel lies on the wall, whose own light the picture shows; "
+            "blank more of it by --gate-m, or begin farther away by --near-m",
+            file=sys.stderr,
+        )
     volume = volume.on(ComputeDevice())
     seconds, imaging = time.perf_counter() - started, volume.provenance["imaging"]
     volume = add_provenance(
@@ -223,7 +204,12 @@ def _reconstruct_single(
             if found.refine
             else {}
         ),
+        "gate_m": found.gate_m,
+        "gate_found": chosen.gate_found,
         "wavelength_mm": found.wavelength_mm,
+        "wavelength_reason": chosen.reasons.get("wavelength", "given"),
+        "bins_together": found.bins_together,
+        "brightest_on_wall": on_wall,
         "voxel_mm": found.voxel_mm,
         "voxels": volume.grid.shape,
         "wall_points": len(capture.points),
@@ -233,23 +219,20 @@ def _reconstruct_single(
     }
 
 
-def _image_capture(
-    capture: Capture, wanted: ReconstructSettings
+def _image(
+    prepared: PreparedImaging[ReconstructSettings],
 ) -> tuple[ReconstructSettings, Volume]:
-    """Find what is not told, and image the capture."""
-    scales = find_scales(wanted, capture)
-    found = replace(wanted, **scales._asdict())
-    method = REFINED_METHOD if found.refine else found.method
-    if method is None:
-        method = choose_quickest_method(
-            found, capture, fill_box(found, capture, scales.voxel_mm * MILLIMETRE)[1]
-        )
-    found = replace(fill_in_defaults(found, [method]), method=method)
-    found, grid = choose_grid(found, capture)
+    """Plan the image that settings ask for, and make it."""
+    from apps.nlos.imaging import image_capture
+    from apps.nlos.methods import build_refinement
+
+    found = replace(prepared.shown, method=prepared.settings.method)
+    capture, grid = prepared.capture, prepared.grid
     if not found.refine:
-        return found, image_capture("imaging", build_method(method, found), capture, grid)
-    found, refinement = build_refinement(found, grid)
-    return found, image_capture("refining", refinement, capture, grid)
+        plan = prepared.settings.make_method().plan(capture, grid)
+        return found, image_capture("imaging", plan, capture)
+    found, refinement = build_refinement(found, prepared.settings, grid)
+    return found, image_capture("refining", refinement.plan(capture, grid), capture)
 
 
 def _reconstruct_folder(
@@ -260,6 +243,12 @@ def _reconstruct_folder(
     how: tuple[str | None, bool],
 ) -> None:
     """Image every capture of a folder whose results are not there yet."""
+    from apps.files import make_folder
+    from apps.nlos.files import list_captures, require_separate_folder
+    from apps.report import report
+    from apps.sequences import run_with_progress
+    from tofclip.sequences.jobs import run_jobs
+
     cluster, as_json = how
     _require_formats(suffixes)
     require_separate_folder(source, out)
@@ -299,6 +288,8 @@ def _plan_jobs(
     sources: Sequence[Path], out: Path, order: _ImagingRequest, suffixes: Sequence[str]
 ) -> tuple[list[Job], list[str]]:
     """Return one job for each capture without results, and the names of the others."""
+    from tofclip.sequences.jobs import Job
+
     jobs, skipped = [], []
     for path in sources:
         results = _name_results(out.resolve(), path.stem, suffixes)
@@ -321,6 +312,9 @@ def _run_job(source: Path, results: ResultFiles, order: _ImagingRequest) -> dict
 
 
 def _require_formats(suffixes: Sequence[str]) -> None:
+    from apps.nlos.files import VOLUME_SUFFIXES
+    from tofclip.errors import InputError
+
     for suffix in suffixes:
         if suffix not in VOLUME_SUFFIXES:
             raise InputError(
@@ -329,12 +323,17 @@ def _require_formats(suffixes: Sequence[str]) -> None:
 
 
 def _name_results(folder: Path, stem: str, suffixes: Sequence[str]) -> ResultFiles:
+    from apps.nlos.files import ResultFiles
+
     volumes = [folder / f"{stem}{suffix}" for suffix in suffixes]
     return ResultFiles(volumes, folder / f"{stem}.png", folder / f"{stem}{SETTINGS_SUFFIX}")
 
 
 def _check_folder_settings(file: Path, wanted: ReconstructSettings) -> None:
     """Refuse to mix results of different settings in one folder."""
+    from apps.settings import load_settings, save_settings, settings_to_dict
+    from tofclip.errors import InputError
+
     if not file.exists():
         save_settings(wanted, file, "tofclip nlos reconstruct FOLDER --settings THIS --out RESULTS")
         return

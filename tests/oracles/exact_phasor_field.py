@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
 from nlos.geometry import Grid
-from nlos.method import check_common_support
+from nlos.method import require_imageable
 from nlos.volume import Volume
 
 TERMS_PER_BLOCK = 1 << 20
@@ -40,7 +40,7 @@ def compute_exact_phasor_field(capture: Capture, grid: Grid, pulse: VirtualPulse
         An empty band, a single wall point, a grid behind the wall, or one that is too large.
     """
     band = Band(pulse, capture.axis)
-    check_common_support(capture, grid).require()
+    require_imageable(capture, grid)
     phasors = band.compute_phasors(capture.traces().astype(np.float64))
     z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
     voxels = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)

@@ -1,0 +1,474 @@
+"""Settings that suit a capture, found from it and with their reasons.
+
+`settings_for` looks at the capture as it was recorded and completes what is not given: the gate
+that takes the wall's own light away, the virtual pulse, how many time bins are put together, the
+voxels, the box, and the quickest method. The command line and Python use the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from nlos.band import BAND_EDGE_LEVEL, VirtualPulse
+from nlos.capture import Capture
+from nlos.geometry import Grid
+from nlos.illumination_groups import is_confocal
+from nlos.method import Method, Plan
+from nlos.preparation import fade_record_end, flip_capture, rebin_capture, remove_first_bounce
+from nlos.signal_analysis import (
+    SignalSpectrum,
+    find_brightest_path,
+    find_first_bounce,
+    find_lit_end,
+)
+from nlos.volume import Volume
+from tofclip.errors import InputError
+
+Limits = tuple[float, float]
+
+VOXELS_PER_WAVELENGTH = 8
+MAX_VOXELS_PER_SIDE = 256
+"""A default voxel is not so small that more would fit along the longest side of the wall."""
+
+BINS_PER_WAVELENGTH = 16
+"""Time bins are put together while a wavelength keeps so many: 0.6 % of the carrier is lost."""
+
+SIGMAS_PER_WAVELENGTH = 4
+"""The Laplacian of filtered back-projection is a quarter of a wavelength wide."""
+
+WAVELENGTH_DIGITS = 2
+"""Of the default wavelength in mm, rounded up."""
+
+GATE_RAMP_FRACTION = 0.25
+"""A gate that was found opens over this fraction of its length: a sharp edge would be an image."""
+
+FADE_FRACTION = 0.1
+"""Of the record, what fades out where light still comes at its end."""
+
+MIN_COHERENT_SIGNAL = 800.0
+"""Signal over noise of all wall points together that a wavelength needs: with it a letter of some
+hundred resolved voxels stands out. Measured on recorded letters and a mannequin."""
+
+MIN_BAND_OVER_EARLY = 3.0
+"""Energy that a wavelength has in the record, relative to before any light can have come."""
+
+MAX_ALIASED_FRACTION = 0.2
+"""Of a pulse's signal, what may be of waves finer than the wall samples."""
+
+WAVELENGTH_STEP_RATIO = 1.05
+"""From one wavelength that is tried to the next."""
+
+GATE_DEPTH_FRACTION = 0.4
+"""Nearer than this fraction of the gate everything was blanked; the default box begins there."""
+
+BRIGHTEST_ON_WALL_WAVELENGTHS = 0.5
+"""A voxel nearer to a wall point than this is on the wall."""
+
+METHOD_CLASSES = {
+    "rsd": ("PlanarRSD", ("wavelength", "cycles", "tolerance")),
+    "hybrid": ("Hybrid", ("wavelength", "cycles", "tolerance")),
+    "backprojection": ("Backprojection", ("wavelength", "cycles")),
+    "filtered-backprojection": ("FilteredBackprojection", ("sigma",)),
+    "lct": ("LightCone", ("signal_to_noise", "falloff")),
+    "fk": ("FKMigration", ("falloff",)),
+}
+"""Class in `nlos` by the method's name, and the settings that it takes."""
+
+METHODS_BY_SPEED = ("rsd", "hybrid", "backprojection")
+"""They give the same picture; the later one takes more walls and lasers, and more time."""
+
+TRANSFORM_METHODS = ("lct", "fk")
+"""They see no finer than the wall's lattice and the time bins, whatever the wavelength."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a capture is imaged; None is found by `settings_for`.
+
+    Parameters
+    ----------
+    flip : {"x", "y"}, optional
+        Coordinate that changes sign, where the picture would be mirrored.
+    gate : float, optional
+        m of path after the wall's own light that are blanked; None where nothing is.
+    gate_found : bool
+        Whether the gate was found from the capture.
+    gate_ramp : float, optional
+        m of path over which signals then rise to their whole strength.
+    fade : float, optional
+        m of path before the record's end over which signals fade out.
+    bins_together : int, optional
+        Time bins added up to one before imaging.
+    wavelength : float, optional
+        Carrier of the virtual pulse, m of path.
+    cycles : float
+        Length of the virtual pulse in wavelengths.
+    voxel : float, optional
+        Distance of neighbouring voxels, m.
+    x, y : (float, float), optional
+        First and last voxel across the wall, m.
+    near, far : float, optional
+        First and last depth, m.
+    everywhere : bool
+        Whether all of that box is filled with voxels, not only the part that is bright.
+    method : str, optional
+        One of `METHOD_CLASSES`.
+    tolerance, sigma, falloff, signal_to_noise : float, optional
+        Of the methods; None where the method's own default holds, or does not apply. `sigma` in m.
+    reasons : mapping of str to str
+        Why the settings that were found are what they are, by their names.
+    """
+
+    flip: str | None = None
+    gate: float | None = None
+    gate_found: bool = False
+    gate_ramp: float | None = None
+    fade: float | None = None
+    bins_together: int | None = None
+    wavelength: float | None = None
+    cycles: float = 3.0
+    voxel: float | None = None
+    x: Limits | None = None
+    y: Limits | None = None
+    near: float | None = None
+    far: float | None = None
+    everywhere: bool = False
+    method: str | None = None
+    tolerance: float | None = None
+    sigma: float | None = None
+    falloff: float | None = None
+    signal_to_noise: float | None = None
+    reasons: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def box(self) -> tuple[Limits, Limits, Limits]:
+        """First and last voxel along x, y and z, m."""
+        x, y, near, far = self.x, self.y, self.near, self.far
+        if x is None or y is None or near is None or far is None:
+            raise InputError("these settings have no box yet; complete them by settings_for")
+        return x, y, (near, far)
+
+    def prepare(self, capture: Capture) -> Capture:
+        """Mirror coordinates, blank the wall's own light and put time bins together, as settings say."""
+        if self.flip:
+            capture = flip_capture(capture, self.flip)
+        if self.gate is not None:
+            capture = remove_first_bounce(capture, self.gate, self.gate_ramp or 0.0)
+        if self.fade:
+            capture = fade_record_end(capture, self.fade)
+        bins = self.bins_together or 1
+        return capture if bins == 1 else rebin_capture(capture, bins)
+
+    def grid(self, voxel: float | None = None) -> Grid:
+        """Fill the box with voxels, of the settings' size unless `voxel` (m) says otherwise."""
+        return Grid.box(*self.box, voxel or self.voxel or math.nan)
+
+    def make_method(self, name: str | None = None) -> Method:
+        """Build a method by its name, the settings' own by default; what is None is left to it."""
+        import nlos
+
+        class_name, taken = METHOD_CLASSES[name or self.method or METHODS_BY_SPEED[0]]
+        arguments = {key: getattr(self, key) for key in taken if getattr(self, key) is not None}
+        made: Method = getattr(nlos, class_name)(**arguments)
+        return made
+
+    def plan_quickest(
+        self, capture: Capture, grid: Grid, names: tuple[str, ...] = METHODS_BY_SPEED
+    ) -> tuple[str, Plan]:
+        """Return the first method whose plan is not refused, and that plan.
+
+        Parameters
+        ----------
+        capture : Capture
+            As `prepare` returns it.
+        grid : Grid
+        names : sequence of str
+            Methods in the order in which they are tried.
+
+        Raises
+        ------
+        InputError
+            None of them can image the capture; the reason is that of the last.
+        """
+        for name in names[:-1]:
+            try:
+                return name, self.make_method(name).plan(capture, grid)
+            except InputError:
+                continue
+        return names[-1], self.make_method(names[-1]).plan(capture, grid)
+
+    def with_method(self, name: str) -> Settings:
+        """Return the settings with the method that was found to be the quickest."""
+        return _add(self, "method", name, "the quickest that takes this wall, laser and grid")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Name every setting that has a value."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+def settings_for(capture: Capture, **given: Any) -> Settings:
+    """Find settings that suit a capture.
+
+    Parameters
+    ----------
+    capture : Capture
+        As it was recorded: with the light that the wall returns at once, if that is in the record.
+    **given
+        Fields of `Settings` that are known; they rule over what would be found. Lengths in m.
+
+    Returns
+    -------
+    Settings
+        Complete but for the settings of other methods, with reasons for what was found. The box is
+        all that may be seen; `find_bright_box` makes it smaller.
+
+    Raises
+    ------
+    InputError
+        No settings suit: the record holds nothing, or nothing but the wall's own light.
+
+    Examples
+    --------
+    >>> import numpy as np, nlos
+    >>> x, y = np.meshgrid(np.linspace(-0.5, 0.5, 8), np.linspace(-0.5, 0.5, 8))
+    >>> wall = np.stack([x, y, 0 * x], axis=-1)
+    >>> signal = np.zeros((64, 8, 8)); signal[40] = 1
+    >>> nlos.settings_for(nlos.Capture(signal, wall, [0, 0, 0], 1e-10)).method
+    'rsd'
+    """
+    found = complete_settings(capture, **given)
+    if found.method is None:
+        # Which walls a method takes does not depend on the voxels: coarse ones are planned quickly.
+        name, _ = found.plan_quickest(found.prepare(capture), scout_grid(found) or found.grid())
+        found = found.with_method(name)
+    return found
+
+
+def complete_settings(capture: Capture, **given: Any) -> Settings:
+    """Find settings that suit a capture, but for the method; see `settings_for`."""
+    found = _complete_gate(capture, Settings(**given))
+    gated = replace(found, bins_together=1).prepare(capture)
+    if found.fade is None and find_lit_end(gated):
+        fade = FADE_FRACTION * float(np.ptp(capture.axis.paths))
+        found = _add(found, "fade", fade, "light still comes when the record ends")
+        gated = fade_record_end(gated, fade)
+    if found.wavelength is None:
+        wavelength, reason = choose_wavelength(gated, found.cycles)
+        found = _add(found, "wavelength", wavelength, reason)
+    return _complete_box(gated, _complete_sampling(capture, found))
+
+
+def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str]:
+    """Choose the carrier of a virtual pulse for a capture without the wall's own light.
+
+    It is the shortest that wall points and time bins carry, and that the signal has more of than
+    noise. In a noisy record only waves that stand out of the noise can make false images: the wall
+    has to sample these, at the steepest angle at which they arrive.
+
+    Parameters
+    ----------
+    capture : Capture
+    cycles : float
+
+    Returns
+    -------
+    float, str
+        m of path, and the reason.
+    """
+    sampled = find_shortest_wavelength(capture, cycles)
+    reason = "the shortest that wall points and time bins carry"
+    longest = max(sampled * WAVELENGTH_STEP_RATIO, find_longest_wavelength(capture))
+    spectrum = SignalSpectrum.of(capture, sampled)
+    wavelength, aliased = sampled, 0.0
+    if spectrum.is_noisy:
+        aliased = _sampling_limit(capture, _steepest_angle(capture))
+        wavelength = max(min(aliased, sampled), 4 * capture.axis.spacing)
+        reason = "the shortest above the noise that the wall points carry"
+    while wavelength < longest:
+        pulse = VirtualPulse(wavelength, cycles)
+        if spectrum.coherent_signal(pulse) < MIN_COHERENT_SIGNAL:
+            reason = "shorter waves are weaker than the photons' noise"
+        elif spectrum.fraction_shorter(pulse, aliased or np.inf) > MAX_ALIASED_FRACTION and aliased:
+            reason = "shorter waves are finer than the wall points sample"
+        elif spectrum.band_over_early(pulse) < MIN_BAND_OVER_EARLY:
+            reason = "shorter waves are as strong before any light can have come"
+        else:
+            break
+        wavelength *= WAVELENGTH_STEP_RATIO
+    else:
+        return round_wavelength_up(sampled), "no wave stands out of the noise: the shortest sampled"
+    return round_wavelength_up(wavelength), reason
+
+
+def _band_reach(cycles: float) -> float:
+    """Highest wavenumber of a virtual pulse's band, relative to its carrier."""
+    pulse = VirtualPulse(1.0, cycles)
+    return 1 + math.sqrt(-2 * math.log(BAND_EDGE_LEVEL)) / (pulse.sigma * pulse.wavenumber)
+
+
+def _sampling_limit(capture: Capture, sine: float = 1.0) -> float:
+    """Shortest wave that the wall samples twice where it arrives under an angle of that sine, m."""
+    return sine * find_sampling_step(capture) * (4 if is_confocal(capture) else 2)
+
+
+def _steepest_angle(capture: Capture) -> float:
+    """Sine of the angle between the wall's normal and the way from one end of the wall to what is
+    brightest before the other.
+    """
+    extent = float(np.ptp(capture.points[:, :2], axis=0).max())
+    depth = max(find_brightest_path(capture) / 2, 0.0)
+    return extent / math.hypot(extent, depth) if extent > 0 else 1.0
+
+
+def find_shortest_wavelength(capture: Capture, cycles: float) -> float:
+    """Carrier of the shortest virtual pulse whose whole band a capture carries, m.
+
+    The band's shortest wave is sampled twice along the wall (four times in a confocal scan, where
+    the path grows on both legs) and twice along the record.
+
+    Parameters
+    ----------
+    capture : Capture
+    cycles : float
+        Length of the pulse in wavelengths.
+    """
+    return _band_reach(cycles) * max(_sampling_limit(capture), 2 * capture.axis.spacing)
+
+
+def find_longest_wavelength(capture: Capture) -> float:
+    """Carrier above which a point's image at a wall's width is wider than half the wall, m."""
+    extent = float(np.ptp(capture.points[:, :2], axis=0).max())
+    return extent / 2
+
+
+def find_sampling_step(capture: Capture) -> float:
+    """Distance of neighbouring wall points, or of the laser spots where one wall point sees them
+    all, m; else 0.
+    """
+    if math.isfinite(capture.spacing):
+        return capture.spacing
+    if capture.laser.ndim == 1:
+        return 0.0
+    # Light runs either way: the spots sample the scene as wall points would.
+    swapped = replace(capture, wall=capture.laser, laser=capture.wall).spacing
+    return swapped if math.isfinite(swapped) else 0.0
+
+
+def scout_grid(settings: Settings) -> Grid | None:
+    """Return coarse voxels for all of the box; None where the voxels asked for are no finer, or
+    all of the box is wanted.
+
+    Half a wavelength is coarse.
+    """
+    coarse = (settings.wavelength or 0.0) / 2
+    if settings.everywhere or (settings.voxel or 0.0) >= coarse:
+        return None
+    return settings.grid(coarse)
+
+
+def find_bright_box(settings: Settings, scouted: Volume) -> Settings:
+    """Return the settings with the box that holds everything bright in a coarse volume.
+
+    Parameters
+    ----------
+    settings : Settings
+    scouted : Volume
+        On `scout_grid`. An image through a virtual pulse, whichever method images later: lct and fk
+        make up for the loss of light with distance, and would take the noise of the farthest depths
+        for the brightest things.
+    """
+    part = Grid.around(scouted, settings.voxel or math.nan)
+    x, y, z = ((float(axis[0]), float(axis[-1])) for axis in (part.x, part.y, part.z))
+    return replace(settings, x=x, y=y, near=z[0], far=z[1], everywhere=True)
+
+
+def is_brightest_on_wall(volume: Volume, capture: Capture, wavelength: float) -> bool:
+    """Whether the brightest voxel lies on the wall, so that the picture shows the wall's own light.
+
+    Parameters
+    ----------
+    volume : Volume
+    capture : Capture
+    wavelength : float
+        Nearer to a wall point than half of it, m, is on the wall.
+    """
+    away = np.linalg.norm(capture.points - np.array(volume.find_brightest()), axis=1)
+    return bool(away.min() < BRIGHTEST_ON_WALL_WAVELENGTHS * wavelength)
+
+
+def round_wavelength_up(wavelength: float) -> float:
+    """Round a wavelength in m up to two digits in mm."""
+    value = wavelength * 1e3
+    step = math.floor(math.log10(value)) - WAVELENGTH_DIGITS + 1
+    # A value that is round already stays, whatever its last bit.
+    rounded = math.ceil(value / 10**step - 1e-9) * 10**step
+    return float(round(rounded, max(0, -step))) * 1e-3
+
+
+def _add(settings: Settings, name: str, value: Any, reason: str) -> Settings:
+    """Return the settings with one more that was found, and why."""
+    return replace(settings, **{name: value}, reasons={**settings.reasons, name: reason})
+
+
+def _complete_gate(capture: Capture, settings: Settings) -> Settings:
+    if settings.gate is not None:
+        return settings
+    bounce = find_first_bounce(capture)
+    if bounce is None:
+        return _add(settings, "gate", None, "no light of the wall's own is in the record")
+    reason = (
+        f"the wall's own light is in the record, {bounce.ratio:.3g} times what follows; "
+        f"{bounce.end:.3g} m later it has faded"
+    )
+    ramp = GATE_RAMP_FRACTION * bounce.end if settings.gate_ramp is None else settings.gate_ramp
+    return replace(_add(settings, "gate", bounce.end, reason), gate_found=True, gate_ramp=ramp)
+
+
+def _complete_sampling(capture: Capture, settings: Settings) -> Settings:
+    """Find time bins and voxels: of what the wavelength resolves, or for methods without a virtual
+    pulse of what the wall's lattice does.
+    """
+    wavelength = settings.wavelength or math.nan
+    by_lattice = settings.method in TRANSFORM_METHODS and capture.spacing < math.inf
+    if settings.bins_together is None:
+        finest = capture.spacing if by_lattice else wavelength / BINS_PER_WAVELENGTH
+        bins = max(1, min(int(finest / capture.axis.spacing + 1e-9), capture.axis.bins // 2))
+        reason = (
+            "path per bin as neighbouring wall points are apart"
+            if by_lattice
+            else f"{BINS_PER_WAVELENGTH} bins per wavelength, or as recorded"
+        )
+        settings = _add(settings, "bins_together", bins, reason)
+    if settings.voxel is None:
+        extent = float(np.ptp(capture.points, axis=0).max())
+        # Half the path of a bin is its depth.
+        depth = (settings.bins_together or 1) * capture.axis.spacing / 2
+        wanted = depth if by_lattice else wavelength / VOXELS_PER_WAVELENGTH
+        reason = "half the path of a bin" if by_lattice else "an eighth of the wavelength"
+        settings = _add(settings, "voxel", max(wanted, extent / MAX_VOXELS_PER_SIDE), reason)
+    if settings.sigma is None:
+        settings = replace(settings, sigma=wavelength / SIGMAS_PER_WAVELENGTH)
+    return settings
+
+
+def _complete_box(capture: Capture, settings: Settings) -> Settings:
+    """Fill in what is not given of the box: the space in front of the wall that the record covers."""
+    voxel = settings.voxel or math.nan
+    near = settings.near
+    if near is None and settings.gate_found:
+        low, high = capture.points[:, 2].min(), capture.points[:, 2].max()
+        near = float(low + high) / 2 + max(voxel, GATE_DEPTH_FRACTION * (settings.gate or 0.0))
+    front = Grid.in_front_of(capture, voxel, near, settings.far)
+    x, y, z = ((float(axis[0]), float(axis[-1])) for axis in (front.x, front.y, front.z))
+    return replace(
+        settings,
+        x=x if settings.x is None else settings.x,
+        y=y if settings.y is None else settings.y,
+        near=z[0] if settings.near is None else settings.near,
+        far=z[1] if settings.far is None else settings.far,
+    )

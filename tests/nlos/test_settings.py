@@ -1,0 +1,148 @@
+"""Settings found from a capture: the gate, the wavelength, the voxels, the box, the method."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from relay_walls import planar_wall
+
+from nlos import Capture, Grid, PlanarRSD, Volume, settings_for
+from nlos.capture import TimeAxis
+from nlos.io import read_capture
+from nlos.preparation import fade_record_end, flip_capture, remove_first_bounce
+from nlos.settings import complete_settings, is_brightest_on_wall
+from nlos.signal_analysis import find_first_bounce
+from nlos.simulate import PointScene
+from tofclip.errors import InputError
+
+WALL = planar_wall(24, 24) * 0.6
+HIDDEN = [[0.05, -0.1, 0.8]]
+AXIS = TimeAxis(400, 16e-12)
+
+
+def clean(confocal: bool = True) -> Capture:
+    laser = WALL if confocal else [0.0, 0.0, 0.0]
+    return PointScene(HIDDEN, [400.0]).simulate_capture(WALL, laser, AXIS, 40e-12)
+
+
+def with_glare(capture: Capture, peak: float, fades: float = 0.05) -> Capture:
+    """Add the wall's own light, which fades by e over so much path."""
+    direct = np.linalg.norm(capture.wall - capture.laser, axis=-1)
+    late = capture.axis.paths[:, None, None] - direct
+    glare = np.where(late >= 0, np.exp(-np.maximum(late, 0) / fades), 0)
+    return replace(capture, signal=capture.signal + peak * capture.signal.max() * glare)
+
+
+@pytest.mark.parametrize("confocal", [True, False])
+@pytest.mark.parametrize("peak", [2.0, 1000.0])
+def test_the_walls_own_light_is_recognised_and_gated(confocal: bool, peak: float) -> None:
+    bounce = find_first_bounce(with_glare(clean(confocal), peak))
+    assert bounce is not None
+    # It has faded, and the hidden point's light (from 1.5 m on) is not cut away.
+    assert 0.05 < bounce.end < 1.2
+    settings = settings_for(with_glare(clean(confocal), peak))
+    assert settings.gate_found
+    assert "wall's own light" in settings.reasons["gate"]
+    prepared = settings.prepare(with_glare(clean(confocal), peak))
+    volume = settings.make_method().reconstruct(prepared, settings.grid(0.05))
+    assert volume.find_brightest() == pytest.approx(HIDDEN[0], abs=0.06)
+
+
+def test_nothing_is_gated_where_the_wall_is_dark() -> None:
+    assert find_first_bounce(clean()) is None
+    settings = settings_for(clean())
+    assert (settings.gate, settings.gate_found) == (None, False)
+    assert settings.method == "rsd"
+    assert settings_for(clean(), gate=0.2).gate == 0.2
+    assert settings_for(clean(), wavelength=0.3).wavelength == 0.3
+
+
+def test_noise_makes_the_wave_longer() -> None:
+    quiet, random = complete_settings(clean()).wavelength, np.random.default_rng(1)
+    many = clean().signal * (100 / clean().signal.max())
+    noisy = replace(clean(), signal=random.poisson(many + 0.5).astype(np.float32))
+    found = complete_settings(noisy)
+    assert quiet is not None
+    assert found.wavelength is not None
+    fewer = replace(clean(), signal=random.poisson(many / 10 + 0.5).astype(np.float32))
+    longer = complete_settings(fewer).wavelength
+    assert longer is not None
+    assert longer > found.wavelength
+
+
+def test_transforms_see_the_lattice_whatever_the_wavelength() -> None:
+    by_wave, by_lattice = complete_settings(clean()), complete_settings(clean(), method="fk")
+    assert by_wave.voxel == pytest.approx((by_wave.wavelength or 0) / 8)
+    bins = by_lattice.bins_together or 0
+    assert bins * AXIS.spacing <= clean().spacing < (bins + 1) * AXIS.spacing
+    assert by_lattice.voxel == pytest.approx(bins * AXIS.spacing / 2)
+
+
+def test_the_ends_of_the_record_are_soft() -> None:
+    flat = replace(clean(), signal=np.ones_like(clean().signal))
+    gated = remove_first_bounce(flat, 0.3, 0.2).signal[:, 3, 3]
+    assert gated.min() == 0
+    assert np.all(np.diff(gated) >= 0)
+    assert np.max(np.diff(gated)) < 0.05
+    faded = fade_record_end(flat, 0.2).signal[:, 3, 3]
+    assert faded[0] == 1
+    assert faded[-1] == 0
+    assert np.max(np.abs(np.diff(faded))) < 0.05
+    for bad in (-1.0, np.nan):
+        with pytest.raises(InputError):
+            remove_first_bounce(flat, 0.1, bad)
+        with pytest.raises(InputError):
+            fade_record_end(flat, bad)
+
+
+def test_a_picture_is_mirrored_along_an_axis() -> None:
+    grid = Grid.box((-0.3, 0.3), (-0.3, 0.3), (0.7, 0.9), 0.05)
+    for axis, expected in (("x", (-0.05, -0.1)), ("y", (0.05, 0.1))):
+        found = PlanarRSD(0.2).reconstruct(flip_capture(clean(), axis), grid).find_brightest()
+        assert found[:2] == pytest.approx(expected, abs=0.03)
+    with pytest.raises(InputError, match="mirrored along x or y"):
+        flip_capture(clean(), "z")
+
+
+def test_a_bright_wall_is_noticed() -> None:
+    grid = Grid([0.0, 0.2], [0.0], [0.01, 0.5])
+    for index, on_wall in ((0, True), (1, False)):
+        values = np.zeros(grid.shape)
+        values[index, 0, 0] = 1
+        assert is_brightest_on_wall(Volume(values, grid), clean(), 0.1) == on_wall
+
+
+@pytest.mark.parametrize(
+    ("name", "gated", "shortest", "longest"),
+    [
+        ("nlos_native/otoole2018_outdoor_s.mat", True, 0.08, 0.15),
+        ("nlos/otoole2018_diffuse_s.npz", True, 0.05, 0.09),
+        ("nlos_native/cmu_mannequin_transient.mat", False, 0.025, 0.06),
+    ],
+)
+def test_recorded_captures(
+    name: str, gated: bool, shortest: float, longest: float, shared_data: Path
+) -> None:
+    """The wavelengths that look best by hand, and the gate of the authors: 0.72 m."""
+    settings = settings_for(read_capture(shared_data / name))
+    assert settings.gate_found == gated
+    assert settings.method == "rsd"
+    assert shortest <= (settings.wavelength or 0) <= longest
+    if gated:
+        assert settings.gate == pytest.approx(0.72, abs=0.1)
+
+
+def test_the_letter_reads_as_an_s(shared_data: Path) -> None:
+    """O'Toole's outdoor letter with no setting at all: an S, not its mirror image."""
+    recorded = read_capture(shared_data / "nlos_native" / "otoole2018_outdoor_s.mat")
+    settings = settings_for(recorded, near=1.0, far=1.4)
+    volume = settings.make_method().reconstruct(settings.prepare(recorded), settings.grid(0.02))
+    picture, grid = volume.maximum_projection().brightness, volume.grid
+    left, right = grid.x < -0.1, grid.x > 0.1
+    upper, lower = (np.abs(grid.y - middle) < 0.08 for middle in (-0.15, 0.15))
+    assert picture[upper][:, left].max() > 1.5 * picture[upper][:, right].max()
+    assert picture[lower][:, right].max() > 1.3 * picture[lower][:, left].max()
+    assert 1.1 < volume.find_brightest()[2] < 1.25
