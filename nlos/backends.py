@@ -15,12 +15,11 @@ from nlos.band import Band
 from nlos.capture import Capture
 from nlos.illumination_groups import IlluminationGroup
 from nlos.method import Progress, ignore_progress
-from nlos.plane import Plane
+from nlos.plane import Plane, WallLattice
 from nlos.propagation.compiled import CompiledPropagation
 from nlos.rsd.diffraction import DiffractionPlan
 from nlos.rsd.image_planes import CompiledDiffraction, LaserSource
 from nlos.rsd.transfer import SphericalWaves
-from nlos.rsd.wall import WallLattice
 from tofclip.arrays import Array, is_numpy
 
 

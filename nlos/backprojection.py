@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from nlos.band import Band, VirtualPulse, Waveforms
 from nlos.capture import Capture
 from nlos.geometry import FloatArray, Grid
+from nlos.illumination_groups import warn_of_aliasing
 from nlos.kernels import add_backprojection
 from nlos.method import VOXEL_BYTES, PhasorMethod, PhasorPlan, Progress, require_imageable
-from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
 from tofclip.arrays import is_numpy
 from tofclip.errors import InputError

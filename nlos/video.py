@@ -16,7 +16,12 @@ from nlos.capture import Capture
 from nlos.depths import DepthPropagator
 from nlos.geometry import FloatArray, Grid
 from nlos.hybrid import Hybrid
-from nlos.illumination_groups import choose_band_for_paths, find_leg_bounds, group_by_illumination
+from nlos.illumination_groups import (
+    choose_band_for_paths,
+    find_leg_bounds,
+    group_by_illumination,
+    warn_of_aliasing,
+)
 from nlos.method import (
     MEMORY_LIMIT_BYTES,
     Progress,
@@ -25,7 +30,6 @@ from nlos.method import (
     require_numpy_signal,
 )
 from nlos.rsd.planar import PlanarRSD, require_even_grid
-from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
 from nlos.wave_plan import GroupPlan
 from tofclip.errors import InputError, ShapeError

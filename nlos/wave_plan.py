@@ -14,12 +14,11 @@ from nlos.backends import Backend
 from nlos.band import Band
 from nlos.capture import Capture
 from nlos.geometry import Grid
-from nlos.illumination_groups import IlluminationGroup, build_source
+from nlos.illumination_groups import IlluminationGroup, build_source, warn_of_aliasing
 from nlos.method import PhasorPlan, Progress, SubProgress
 from nlos.plane import Plane
 from nlos.propagation.propagate import WallToPlane
 from nlos.rsd.diffraction import BYTES_PER_WAVE, DiffractionPlan
-from nlos.sampling import warn_of_aliasing
 from nlos.volume import Volume
 
 SUM_BYTES, MAGNITUDE_BYTES = 8, 4

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from apps.benchmarks.case import Case, PreparedCase
 from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD
 from nlos.capture import TimeAxis
+from nlos.illumination_groups import AliasingWarning
 from nlos.method import Method
-from nlos.sampling import AliasingWarning
 from nlos.simulate import PointScene, build_relay_wall
 from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_numpy
 from tofclip.camera import Camera

@@ -15,9 +15,9 @@ from apps.benchmarks.peers import time_ytal
 from nlos import Backprojection, Capture, FKMigration, Grid, Hybrid, LightCone, PlanarRSD, propagate
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
+from nlos.illumination_groups import AliasingWarning
 from nlos.method import Method
 from nlos.plane import Plane
-from nlos.sampling import AliasingWarning
 from nlos.simulate import PointScene, build_relay_wall
 from tofclip.threads import run_blocks, thread_count
 

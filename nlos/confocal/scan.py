@@ -13,8 +13,7 @@ from nlos.capture import Capture
 from nlos.geometry import FloatArray, Grid
 from nlos.kernels import shift_signals
 from nlos.method import VOXEL_BYTES, Plan, Progress, require_imageable, require_numpy_signal
-from nlos.plane import Plane, axis_step
-from nlos.rsd.wall import PlanarWall
+from nlos.plane import PlanarWall, Plane, axis_step
 from nlos.volume import Volume
 from tofclip.errors import InputError
 

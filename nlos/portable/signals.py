@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from nlos.band import Band
 from nlos.capture import Capture
 from nlos.illumination_groups import IlluminationGroup
+from nlos.plane import WallLattice
 from nlos.portable.library import ArrayLibrary
-from nlos.rsd.wall import WallLattice
 from tofclip.arrays import Array
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.fourier_plans import FourierPlan, allocate_zeros, plan_transform
+from nlos.plane import WallLattice
 from nlos.rsd.kernels import transpose
-from nlos.rsd.wall import WallLattice
 
 COLUMN_STEP = 8
 """Columns from one plan for Fourier transforms to the next."""

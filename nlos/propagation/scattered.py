@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.plane import Plane
+from nlos.plane import Plane, WallLattice
 from nlos.propagation.wall_to_plane_plan import TERM_S, WallToPlanePlan
 from nlos.rsd.transfer import SphericalWaves
-from nlos.rsd.wall import WallLattice
 
 if TYPE_CHECKING:
     import finufft

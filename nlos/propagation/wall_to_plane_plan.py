@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.plane import Plane, axis_step
+from nlos.plane import Plane, WallLattice, axis_step
 from nlos.propagation.analysis import LatticeAnalysis, PlaneWaveAnalysis
 from nlos.propagation.low_rank_transfer import LowRankTransfer
 from nlos.rsd.transfer import (
@@ -21,7 +21,6 @@ from nlos.rsd.transfer import (
     find_max_offsets,
     find_min_periods,
 )
-from nlos.rsd.wall import WallLattice
 from tofclip.errors import InputError
 
 FloatArray = NDArray[np.float64]

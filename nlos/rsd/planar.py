@@ -18,10 +18,9 @@ from nlos.illumination_groups import (
     require_few_spots,
 )
 from nlos.method import PhasorMethod, Progress, require_imageable
-from nlos.plane import is_evenly_spaced
+from nlos.plane import PlanarWall, is_evenly_spaced
 from nlos.propagation.propagate import require_tolerance
 from nlos.rsd.diffraction import DiffractionPlan
-from nlos.rsd.wall import PlanarWall
 from nlos.wave_plan import GroupPlan, WavePlan
 from tofclip.arrays import Array
 from tofclip.errors import InputError

@@ -21,7 +21,7 @@ from apps.nlos.truth import HiddenTruth
 from apps.verbs.nlos import app
 from nlos import Capture, Volume
 from nlos.export import Mesh
-from nlos.sampling import AliasingWarning
+from nlos.illumination_groups import AliasingWarning
 
 PNG = b"\x89PNG"
 
@@ -368,8 +368,8 @@ def test_a_recording_under_its_default_settings_warns_of_nothing(shared_data: Pa
     import warnings
 
     from nlos.band import Band, VirtualPulse
+    from nlos.illumination_groups import warn_of_aliasing
     from nlos.io import read_capture
-    from nlos.sampling import warn_of_aliasing
     from nlos.settings import find_shortest_wavelength
 
     capture = read_capture(shared_data / "nlos" / "otoole2018_diffuse_s.npz")

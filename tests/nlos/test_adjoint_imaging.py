@@ -22,7 +22,7 @@ from tofclip.errors import InputError, ShapeError
 from tofclip.operators import SparseMatrix
 from tofclip.solvers import LinearInverse
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
 
 HIDDEN = (0.15, -0.2, 0.65)
 WALL = build_relay_wall("planar", 24, 1.2)

@@ -24,7 +24,7 @@ from nlos import (
     Refinement,
     TransientImaging,
 )
-from nlos.sampling import AliasingWarning
+from nlos.illumination_groups import AliasingWarning
 from tofclip.errors import InputError
 
 LONGEST_LINE = 260

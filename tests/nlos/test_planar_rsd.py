@@ -25,7 +25,7 @@ from tofclip.errors import InputError, ShapeError
 LONG = TimeAxis(560, AXIS.bin_width, 0.4)
 GRID = Grid(np.arange(-0.3, 0.42, 0.05), np.arange(-0.4, 0.25, 0.06), [0.45, 0.5, 0.56, 0.65, 0.8])
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.sampling.AliasingWarning"
+    "ignore::nlos.illumination_groups.AliasingWarning"
 )  # small walls are coarse ones
 METHOD = PlanarRSD(wavelength=0.125, cycles=3)
 SPOTS = np.array([[0.12, 0.05, 0.0], [-0.3, 0.2, 0.0]])

@@ -16,7 +16,7 @@ from nlos.simulate import PointScene
 from tofclip.arrays import to_numpy
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.sampling.AliasingWarning"
+    "ignore::nlos.illumination_groups.AliasingWarning"
 )  # small walls are coarse ones
 
 # Odd sizes, unevenly spaced; the record (paths up to 1.63 m) ends before the farthest voxels.

@@ -22,7 +22,7 @@ from nlos.simulate import PointScene
 from tofclip.arrays import ComputeDevice
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.sampling.AliasingWarning"
+    "ignore::nlos.illumination_groups.AliasingWarning"
 )  # small walls are coarse ones
 
 GRID = Grid(np.arange(-0.3, 0.3, 0.1), np.arange(-0.2, 0.3, 0.1), [0.5, 0.6, 0.75])

@@ -15,7 +15,7 @@ from tofclip.arrays import ComputeDevice, to_numpy
 from tofclip.errors import InputError
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.sampling.AliasingWarning"
+    "ignore::nlos.illumination_groups.AliasingWarning"
 )  # small walls are coarse ones
 
 GRID = Grid.box((-0.7, 0.6), (-0.5, 0.5), (0.7, 1.1), (0.13, 0.11, 0.1))

@@ -30,7 +30,7 @@ from tofclip.arrays import ComputeDevice
 from tofclip.errors import InputError
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.sampling.AliasingWarning"
+    "ignore::nlos.illumination_groups.AliasingWarning"
 )  # small walls are coarse ones
 
 LONG = TimeAxis(560, AXIS.bin_width, 0.4)

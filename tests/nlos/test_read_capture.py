@@ -21,7 +21,7 @@ from nlos.simulate import PointScene
 from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.units import SPEED_OF_LIGHT
 
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
 
 AXIS = TimeAxis(bins=220, bin_width=16e-12, start=0.5)
 WALL = planar_wall(9, 12)

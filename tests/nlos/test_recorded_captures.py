@@ -10,7 +10,7 @@ from nlos.unwarp import unwarp_signal
 from tofclip.units import SPEED_OF_LIGHT
 
 # The walls here are coarser than the shortest of the pulse's waves wants; see test_sampling.py.
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
 
 FIRST_BOUNCE_BINS = 600
 

@@ -19,7 +19,7 @@ from tofclip.errors import InputError
 from tofclip.solvers import Sparse
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore::nlos.sampling.AliasingWarning"
+    "ignore::nlos.illumination_groups.AliasingWarning"
 )  # small walls are coarse ones
 HYBRID = Hybrid(0.2, 4.0)
 SPOT = np.array([0.12, 0.05, 0.02])

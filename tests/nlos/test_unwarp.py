@@ -17,7 +17,7 @@ from tofclip.storage import Field, Record
 from tofclip.units import SPEED_OF_LIGHT
 
 # These walls are coarser than the shortest of the pulse's waves wants; see test_sampling.py.
-pytestmark = pytest.mark.filterwarnings("ignore::nlos.sampling.AliasingWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
 
 BIN_WIDTH = 5e-12
 LASER = np.array([0.1, -0.05, 0.02])

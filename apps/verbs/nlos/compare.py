@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos.methods import METHODS, ImagingSettings
+from apps.nlos.imaging import METHODS, ImagingSettings
 from apps.options import JsonOption
 from apps.settings import SettingsOption, add_setting_flags, setting_field
 
@@ -102,7 +102,7 @@ def _require_writable(
 
 
 def _check_settings(settings: CompareSettings) -> None:
-    from apps.nlos.methods import parse_method_names, require_valid_settings
+    from apps.nlos.imaging import parse_method_names, require_valid_settings
 
     names = METHODS if settings.methods is None else parse_method_names(settings.methods)
     require_valid_settings(settings, names)
@@ -114,8 +114,7 @@ def _choose_methods(
     """Choose methods and voxels; of methods that were not named, those that do not suit are left
     out, with the reason.
     """
-    from apps.nlos.imaging import prepare_imaging
-    from apps.nlos.methods import from_library, parse_method_names
+    from apps.nlos.imaging import from_library, parse_method_names, prepare_imaging
     from tofclip.errors import InputError
 
     names = METHODS if wanted.methods is None else parse_method_names(wanted.methods)

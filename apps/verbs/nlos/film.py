@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos.methods import ImagingSettings
+from apps.nlos.imaging import ImagingSettings
 from apps.options import JsonOption
 from apps.settings import SettingsOption, add_setting_flags, setting_field
 
@@ -117,7 +117,7 @@ def _require_writable(out: Path, beside: Path, inputs: tuple[Path, ...]) -> None
 def _check_settings(settings: FilmSettings, out: Path) -> None:
     """Refuse what no capture could be filmed by, before any is read."""
     from apps.mp4 import import_opencv
-    from apps.nlos.methods import parse_method_names, require_valid_settings
+    from apps.nlos.imaging import parse_method_names, require_valid_settings
     from tofclip.errors import InputError
 
     names = FILM_METHODS if settings.method is None else parse_method_names(settings.method)

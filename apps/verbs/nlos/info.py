@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos.methods import METHODS, ImagingSettings
+from apps.nlos.imaging import METHODS, ImagingSettings
 from apps.options import JsonOption
 from apps.settings import SettingsOption, add_setting_flags
 
@@ -44,7 +44,7 @@ def info(
 
     Example: tofclip nlos info capture.h5
     """
-    from apps.nlos.methods import from_library, to_library
+    from apps.nlos.imaging import from_library, to_library
     from apps.nlos.truth import HiddenTruth
     from apps.report import report
     from apps.settings import load_settings
@@ -86,7 +86,7 @@ def info(
 
 
 def _describe_wall(capture: Capture) -> dict[str, Any]:
-    from nlos.rsd.wall import PlanarWall
+    from nlos.plane import PlanarWall
     from nlos.settings import find_sampling_step
     from tofclip.errors import InputError
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos.methods import METHODS, RefinementSettings
+from apps.nlos.imaging import METHODS, RefinementSettings
 from apps.options import ClusterOption, DeviceOption, JsonOption
 from apps.settings import SettingsOption, add_setting_flags, setting_field
 
@@ -135,7 +135,7 @@ def reconstruct(
 
 def _check_settings(settings: ReconstructSettings) -> None:
     """Refuse settings that no capture could make sense of, before any is read."""
-    from apps.nlos.methods import (
+    from apps.nlos.imaging import (
         PORTABLE_METHODS,
         parse_method_names,
         require_valid_refinement,
@@ -161,8 +161,7 @@ def _reconstruct_single(
 ) -> dict[str, Any]:
     """Image one capture, write its results, and return the figures."""
     from apps.nlos.files import add_provenance, write_volume
-    from apps.nlos.imaging import prepare_imaging, warnings_to_stderr
-    from apps.nlos.methods import REFINED_METHOD, choose_device
+    from apps.nlos.imaging import REFINED_METHOD, choose_device, prepare_imaging, warnings_to_stderr
     from apps.settings import save_settings, settings_to_dict
     from nlos.io import read_capture
     from nlos.settings import is_brightest_on_wall
@@ -223,8 +222,7 @@ def _image(
     prepared: PreparedImaging[ReconstructSettings],
 ) -> tuple[ReconstructSettings, Volume]:
     """Plan the image that settings ask for, and make it."""
-    from apps.nlos.imaging import image_capture
-    from apps.nlos.methods import build_refinement
+    from apps.nlos.imaging import build_refinement, image_capture
 
     found = replace(prepared.shown, method=prepared.settings.method)
     capture, grid = prepared.capture, prepared.grid
