@@ -60,7 +60,7 @@ class PlanarRSD(PhasorMethod):
     >>> import numpy as np
     >>> import nlos
     >>> from nlos.simulate.points import PointScene
-    >>> from nlos.time_axis import TimeAxis
+    >>> from nlos.capture import TimeAxis
     >>> x, y = np.meshgrid(np.linspace(-0.5, 0.5, 16), np.linspace(-0.5, 0.5, 16))
     >>> wall, hidden = np.stack([x, y, 0 * x], axis=-1), PointScene([[0.1, -0.2, 0.8]])
     >>> capture = hidden.simulate_capture(wall, np.zeros(3), TimeAxis(256, 40e-12), jitter=60e-12)

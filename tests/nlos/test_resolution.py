@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 
 from nlos import Grid, PlanarRSD
 from nlos.capture import TimeAxis
+from nlos.resolution import compute_diffraction_limit, measure_fwhm
 from nlos.simulate import PointScene
 
 WAVELENGTH, CYCLES, SIDE = 0.08, 6.0, 1.0
