@@ -161,6 +161,18 @@ class TcpLink:
         self._take_bytes(len(end))
         return message
 
+    def discard_available(self) -> int:
+        """Throw away what has come and nobody asked for, without waiting, and return how many bytes
+        that were.
+        """
+        thrown = len(self._buffer)
+        self._buffer.clear()
+        with contextlib.suppress(DeviceError), self._translate_errors():
+            self._socket.settimeout(0)
+            while came := self._socket.recv(RECEIVE_BYTES):
+                thrown += len(came)
+        return thrown
+
     def close(self) -> None:
         """Close the connection; closing twice is fine."""
         self._socket.close()

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from devices.frames import MAX_FRAME_BYTES
 from devices.remoteex.protocol import (
+    ANNOUNCEMENT,
     DATA_GREETING,
     GREETING,
     MAX_MESSAGE_BYTES,
     TERMINATOR,
     Answer,
+    AnswerCode,
     Command,
     parse_integer,
 )
@@ -76,6 +78,7 @@ class RemoteExClient:
         self._messages: deque[Answer] = deque(maxlen=MAX_MESSAGES)
         self._owed: deque[Command] = deque()
         self._unread = 0
+        self._may_continue = False
         self._commands = TcpLink(host, port, timeout)
         try:
             self._expect_greeting(self._commands, GREETING)
@@ -99,12 +102,59 @@ class RemoteExClient:
         DeviceError
             RemoteEx refused, or the connection broke.
         """
+        answer, command = self._exchange(name, arguments)
+        return answer.require_done(command)
+
+    def is_done(self, name: str, *arguments: str) -> bool:
+        """Send a command that may be refused.
+
+        Parameters
+        ----------
+        name : str
+        *arguments : str
+
+        Returns
+        -------
+        bool
+            False where RemoteEx refused.
+
+        Raises
+        ------
+        DeviceTimeoutError
+            No answer came in time.
+        DeviceError
+            The connection broke.
+        """
+        return self._exchange(name, arguments)[0].code is AnswerCode.DONE
+
+    def start_application(self, timeout: float) -> bool:
+        """Start HPD-TA where it is not up, which takes a while; False where that is refused.
+
+        Parameters
+        ----------
+        timeout : float
+            Seconds to wait.
+
+        Returns
+        -------
+        bool
+        """
+        usual = self._timeout
+        self._timeout = timeout
+        try:
+            return self.is_done("AppStart", "1")
+        finally:
+            self._timeout = usual
+
+    def _exchange(self, name: str, arguments: tuple[str, ...]) -> tuple[Answer, Command]:
         self._wait_for_owed()
+        if name in _COMMANDS_WITH_DATA:
+            self._data.discard_available()  # of a client before this one
         command = self.send_command(name, *arguments)
         answer = self._read_answer()
         if answer.name.casefold() != command.name.casefold():
             raise ProtocolError(f"RemoteEx answered {answer.name} when asked {command}")
-        return answer.require_done(command)
+        return answer, command
 
     def send_command(self, name: str, *arguments: str) -> Command:
         """Send a command without waiting, neither for its answer nor for those that are owed."""
@@ -232,7 +282,24 @@ class RemoteExClient:
             self._messages.append(answer)
 
     def _receive(self, timeout: float) -> Answer:
-        return Answer.decode(self._commands.read_until(TERMINATOR, MAX_MESSAGE_BYTES, timeout))
+        """Return the next answer or message.
+
+        Answers of several lines, and errors whose text holds carriage returns, fall apart at these;
+        what is not the beginning of an answer is passed over.
+        """
+        deadline = monotonic() + timeout
+        while True:
+            left = max(deadline - monotonic(), 0)
+            message = self._commands.read_until(TERMINATOR, MAX_MESSAGE_BYTES, left)
+            try:
+                answer = Answer.decode(message)
+            except ProtocolError:
+                if self._may_continue or message.startswith(b"\n"):
+                    continue
+                raise
+            is_announcement = answer.name.casefold() == ANNOUNCEMENT.casefold()
+            self._may_continue = answer.code is not AnswerCode.DONE and not is_announcement
+            return answer
 
     def _read_data(self, length: int, limit: int) -> bytes:
         """Return data that an answer has announced; what is missing at a timeout stays owed."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from devices.emulation.faults import Fault
 from devices.loopback import Connection, LoopbackServer
 from devices.remoteex.protocol import (
+    ANNOUNCEMENT,
     DATA_GREETING,
     GREETING,
     TERMINATOR,
@@ -72,11 +73,42 @@ class EmulatedLight:
         return cls(light.photons, light.row_times, seed=seed)
 
 
+@dataclass(frozen=True)
+class Circumstances:
+    """What a client finds.
+
+    Parameters
+    ----------
+    is_application_up : bool
+        HPD-TA runs; otherwise all but the start of it is refused.
+    is_live : bool
+        An operator has started live mode.
+    busy_for : int
+        Questions for the state of an asynchronous command after which that is over.
+    time_range : str
+        ``20 ns`` of a single sweep, ``3`` of a synchroscan unit.
+    has_scaling_table : bool
+    stray_bytes : int
+        That wait on the data port, right behind the greeting.
+    restart_at : int or None
+        Number of the picture after which live mode is started anew, by somebody at the computer.
+    """
+
+    is_application_up: bool = True
+    is_live: bool = False
+    busy_for: int = 0
+    time_range: str = "20 ns"
+    has_scaling_table: bool = True
+    stray_bytes: int = 17
+    restart_at: int | None = None
+
+
 @dataclass
 class _Acquisition:
     """A row of pictures: numbers of those in the ring buffer, and whether more will come."""
 
     client: Connection | None = None
+    is_operators: bool = False
     buffers: int = 1
     oldest: int = 0
     newest: int = -1
@@ -98,6 +130,7 @@ class EmulatedStreakCamera:
         second late, ``short`` pauses so long in the middle of a picture, ``unplug`` hangs up,
         ``corrupt`` answers nonsense, ``lost`` lets `amount` pictures fall out of the ring buffer,
         ``overflow`` announces more than any picture takes.
+    found : Circumstances, optional
     """
 
     def __init__(
@@ -106,6 +139,7 @@ class EmulatedStreakCamera:
         frame_rate: float,
         frames: int = UNLIMITED_FRAMES,
         faults: Sequence[Fault] = (),
+        found: Circumstances | None = None,
     ) -> None:
         if not 0 < frame_rate <= 1e4:
             raise InputError(
@@ -118,13 +152,36 @@ class EmulatedStreakCamera:
                 )
         self._light, self._interval, self._frames = light, 1 / frame_rate, frames
         self._faults = {fault.transfer: fault for fault in faults}
-        self._parameters = {"Time Range": "20 ns", "Mode": "Operate", GAIN_PARAMETER: "0"}
+        self._found = found or Circumstances()
+        self._is_up = self._found.is_application_up
+        self._busy_for = self._found.busy_for
+        self._restarts = 0
+        self._parameters = {
+            "Time Range": self._found.time_range,
+            "Mode": "Operate",
+            GAIN_PARAMETER: "0",
+            "Shutter": "Closed",
+            "Gate Mode": "Normal",
+            "Trig. Mode": "Cont",
+            "Trig. level": "1",
+            "Trig. slope": "Rising",
+            "DeviceName": "C0000",
+        }
+        self._camera_parameters = {"Exposure": "30 ms", "Binning": "1 x 1"}
         self._acquisition = _Acquisition()
         self._requests = 0
         self._data: Connection | None = None
         self._lock = threading.Lock()
         self._command_server = LoopbackServer(self._serve_commands)
         self._frame_server = LoopbackServer(self._serve_data)
+        if self._found.is_live:
+            self._acquisition = _Acquisition(is_operators=True)
+            self._run_acquisition()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it takes pictures."""
+        return self._acquisition.is_running
 
     @property
     def ports(self) -> tuple[int, int]:
@@ -144,7 +201,8 @@ class EmulatedStreakCamera:
 
     def _serve_data(self, connection: Connection) -> None:
         self._data = connection
-        connection.send(DATA_GREETING.encode() + TERMINATOR)
+        stray = b"\xee" * self._found.stray_bytes
+        connection.send(DATA_GREETING.encode() + TERMINATOR + stray)
         while (
             connection.read_request(TERMINATOR) is not None
         ):  # nothing is ever said here, only the end is waited for
@@ -158,20 +216,89 @@ class EmulatedStreakCamera:
             except ProtocolError:
                 connection.send(Answer(AnswerCode.SYNTAX, "Unknown").encode())
                 continue
-            handler = self._command_handlers().get(command.name, _send_unknown)
-            handler(command, connection)
+            name = command.name.casefold()
+            if not self._is_up and name not in ("appstart", "appinfo"):
+                refusal = Answer(AnswerCode.NOT_NOW, command.name, ("application not running",))
+                connection.send(refusal.encode())
+                continue
+            self._command_handlers().get(name, _send_unknown)(command, connection)
         self._end_acquisition(connection)
 
     def _command_handlers(self) -> dict[str, Callable[[Command, Connection], None]]:
-        return {
+        known: dict[str, Callable[[Command, Connection], None]] = {
+            "AppStart": self._start_application,
+            "AppInfo": _answer_with("9.5 pf4"),
+            "AppLicenceGet": _answer_with("1", "1", "1"),
+            "AppEnd": _send_done,
             "DevParamGet": self._get_parameter,
             "DevParamSet": self._set_parameter,
+            "DevParamInfoEx": self._describe_parameter,
+            "DevParamsList": self._list_parameters,
+            "CamParamGet": self._get_camera_parameter,
+            "CamParamSet": self._set_camera_parameter,
+            "CamParamInfoEx": self._describe_camera_parameter,
             "AcqLiveMonitor": self._set_monitor,
+            "AcqAcqMonitor": _send_done,
             "AcqStart": self._start_acquisition,
             "AcqStop": self._stop_acquisition,
+            "AcqStatus": self._get_status,
+            "AsyncCommandStatus": self._get_async_status,
+            "SeqStart": _send_done,
+            "ImgIndexGet": _answer_with("0"),
+            "ImgSave": _send_done,
+            "ImgLoad": _send_done,
             "ImgRingBufferGet": self._get_frame,
             "ImgDataGet": self._get_table,
         }
+        return {name.casefold(): handler for name, handler in known.items()}
+
+    def _start_application(self, command: Command, connection: Connection) -> None:
+        self._is_up = True
+        _send_done(command, connection)
+
+    def _describe_parameter(self, command: Command, connection: Connection) -> None:
+        name = command.arguments[1] if len(command.arguments) == 2 else ""
+        if name == GAIN_PARAMETER:
+            # label, current value, type, readable and writable, range
+            return _send_done(command, connection, name, self.gain, "1", "1", "1", "0", "63")
+        ranges = ("1", "2", "3", "4", "5")
+        if not self._found.time_range.isdecimal():
+            ranges = ("1 ns", "20 ns", "100 ns", "1 us", "10 \u00b5s")
+        current = self._parameters.get(name)
+        if current is None:
+            return _send_unknown(command, connection)
+        return _send_done(command, connection, name, current, "2", "1", "1", "5", *ranges)
+
+    def _list_parameters(self, command: Command, connection: Connection) -> None:
+        _send_done(command, connection, str(len(self._parameters)), *self._parameters)
+
+    def _get_camera_parameter(self, command: Command, connection: Connection) -> None:
+        value = self._camera_parameters.get(command.arguments[-1] if command.arguments else "")
+        if value is None:
+            return _send_unknown(command, connection)
+        return _send_done(command, connection, value)
+
+    def _set_camera_parameter(self, command: Command, connection: Connection) -> None:
+        if len(command.arguments) != 3 or command.arguments[1] not in self._camera_parameters:
+            return _send_unknown(command, connection)
+        self._camera_parameters[command.arguments[1]] = command.arguments[2]
+        return _send_done(command, connection)
+
+    def _describe_camera_parameter(self, command: Command, connection: Connection) -> None:
+        name = command.arguments[-1] if command.arguments else ""
+        value = self._camera_parameters.get(name)
+        if value is None:
+            return _send_unknown(command, connection)
+        return _send_done(command, connection, name, value, "2", "1", "1", "1", value)
+
+    def _get_status(self, command: Command, connection: Connection) -> None:
+        words = ("busy", "Live") if self._acquisition.is_running else ("idle",)
+        _send_done(command, connection, *words)
+
+    def _get_async_status(self, command: Command, connection: Connection) -> None:
+        self._busy_for = max(0, self._busy_for - 1)
+        is_busy = str(int(self._busy_for > 0))
+        _send_done(command, connection, is_busy, "0", "0")
 
     def _get_parameter(self, command: Command, connection: Connection) -> None:
         value = self._parameters.get(command.arguments[1] if len(command.arguments) == 2 else "")
@@ -188,35 +315,47 @@ class EmulatedStreakCamera:
     def _set_monitor(self, command: Command, connection: Connection) -> None:
         kind, *numbers = command.arguments or ("",)
         if kind == "RingBuffer" and len(numbers) == 1 and numbers[0].isdecimal():
-            self._acquisition.is_running = False
-            self._acquisition = _Acquisition(connection, max(1, int(numbers[0])))
-        elif kind != "Off":
+            buffers = max(1, int(numbers[0]))
+            if self._acquisition.is_running and self._acquisition.is_operators:
+                self._acquisition.client = connection
+                self._acquisition.buffers = buffers
+            else:
+                self._acquisition.is_running = False
+                self._acquisition = _Acquisition(connection, buffers=buffers)
+        elif kind == "Off":
+            if self._acquisition.is_operators:
+                self._acquisition.client = None
+        else:
             return _send_unknown(command, connection)
         return _send_done(command, connection)
 
     def _start_acquisition(self, command: Command, connection: Connection) -> None:
-        if self._acquisition.is_running:
-            connection.send(
-                Answer(AnswerCode.NOT_NOW, command.name, ("acquisition runs",)).encode()
-            )
+        if self._acquisition.is_running or self._busy_for:
+            # The text of an error may hold carriage returns.
+            refusal = Answer(AnswerCode.IMPOSSIBLE, command.name).encode().removesuffix(TERMINATOR)
+            connection.send(refusal + b",command is\ralready running \xb5\r\n(HAcq)\r")
             return
-        self._acquisition.is_running = True
         _send_done(command, connection)
-        ticker = threading.Thread(
-            target=self._acquire_frames, args=(self._acquisition, connection), daemon=True
-        )
-        ticker.start()
+        self._run_acquisition()
+
+    def _run_acquisition(self) -> None:
+        run = self._acquisition
+        run.is_running = True
+        threading.Thread(target=self._acquire_frames, args=(run,), daemon=True).start()
 
     def _stop_acquisition(self, command: Command, connection: Connection) -> None:
-        self._end_acquisition(connection)
+        self._acquisition.is_running = False
+        self._busy_for = 0
         _send_done(command, connection)
 
     def _end_acquisition(self, connection: Connection) -> None:
         """Take no more pictures for this client; another one may have come by now."""
         if self._acquisition.client is connection:
-            self._acquisition.is_running = False
+            self._acquisition.client = None
+            if not self._acquisition.is_operators:
+                self._acquisition.is_running = False
 
-    def _acquire_frames(self, run: _Acquisition, connection: Connection) -> None:
+    def _acquire_frames(self, run: _Acquisition) -> None:
         """Take pictures, one after the other, and say so."""
         began = time.monotonic()
         while run.is_running and run.newest < self._frames - 1:
@@ -224,12 +363,16 @@ class EmulatedStreakCamera:
                 run.newest += 1
                 run.oldest = max(run.oldest, run.newest - run.buffers + 1)
                 number = run.newest
+            connection = run.client
             elapsed_ms = str(round((time.monotonic() - began) * 1e3))
-            connection.send(
-                Answer(
-                    AnswerCode.MESSAGE, "LiveMonitor", ("RingBuffer", str(number), elapsed_ms)
-                ).encode()
-            )
+            if connection is not None:
+                words = ("RingBuffer", str(number), elapsed_ms)
+                connection.send(Answer(AnswerCode.MESSAGE, ANNOUNCEMENT, words).encode())
+            if number == self._found.restart_at and not self._restarts:
+                with self._lock:
+                    self._restarts += 1
+                    run.oldest = 0
+                    run.newest = -1
             time.sleep(max(0.0, began + (number + 1) * self._interval - time.monotonic()))
 
     def _get_frame(self, command: Command, connection: Connection) -> None:
@@ -282,15 +425,23 @@ class EmulatedStreakCamera:
         self._send_data(data[half:])
 
     def _get_table(self, command: Command, connection: Connection) -> None:
-        if command.arguments[1:] != ("ScalingTable", "Vertical") or self._data is None:
+        is_table = command.arguments[1:] == ("ScalingTable", "Vertical")
+        if not is_table or self._data is None or not self._found.has_scaling_table:
             return _send_unknown(command, connection)
-        table = (self._light.row_times * 1e9).astype("<f4")  # the time range is in ns
+        # In the unit of the time range, which is ns, or ps for a synchroscan unit.
+        per_s = 1e12 if self._found.time_range.isdecimal() else 1e9
+        table = (self._light.row_times * per_s).astype("<f4")
         _send_done(command, connection, str(table.size), "1")
         return self._send_data(table.tobytes())
 
     def _send_data(self, data: bytes) -> None:
         if self._data is not None:
             self._data.send(data)
+
+
+def _answer_with(*words: str) -> Callable[[Command, Connection], None]:
+    """Return a handler that always gives the same answer."""
+    return lambda command, connection: _send_done(command, connection, *words)
 
 
 def _send_done(command: Command, connection: Connection, *arguments: str) -> None:

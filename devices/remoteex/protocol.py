@@ -4,6 +4,10 @@ A command is ``Name(argument,argument)`` and a carriage return, its answer
 ``code,Name,argument,argument`` and another. Answers of code 4 come unasked, when something
 happened. Pictures and tables travel on a second connection, as long as the answer says; both
 connections begin with a greeting.
+
+What the handbook does not say is taken from a client that is proven on hardware (the driver
+``hamamatsurx`` of delmic/odemis): text is Latin-1, names are not case-sensitive, a line of an
+answer may begin with a line feed, and texts of errors may hold bare carriage returns.
 """
 
 from __future__ import annotations
@@ -16,12 +20,18 @@ from tofclip.errors import DeviceBusyError, DeviceError, InputError, ProtocolErr
 
 COMMAND_PORT, DATA_PORT = 1001, 1002
 TERMINATOR = b"\r"
+ENCODING = "latin-1"
+"""Of all text: HPD-TA writes "µ" as one byte."""
+
 GREETING, DATA_GREETING = "RemoteEx Ready", "RemoteEx Data Ready"
+ANNOUNCEMENT = "Livemonitor"
+"""What a message about a new picture is called."""
+
 MAX_MESSAGE_BYTES = 1 << 16
 
 _COMMAND = re.compile(r"([A-Za-z]\w*)\((.*)\)", re.ASCII)
 _NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
-_ARGUMENT = re.compile(r"[^,()\x00-\x1f\x7f-\x9f]*")
+_ARGUMENT = re.compile(r"[^,()\x00-\x1f\x7f-\x9f\u0100-\U0010ffff]*")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
@@ -82,7 +92,7 @@ class Command:
             A name or argument holds what the protocol cannot carry.
         """
         _require_valid(self.name, self.arguments)
-        return f"{self.name}({','.join(self.arguments)})".encode() + TERMINATOR
+        return f"{self.name}({','.join(self.arguments)})".encode(ENCODING) + TERMINATOR
 
     @classmethod
     def decode(cls, message: bytes) -> Command:
@@ -127,7 +137,10 @@ class Answer:
             A name or argument holds what the protocol cannot carry.
         """
         _require_valid(self.name, self.arguments)
-        return ",".join([str(int(self.code)), self.name, *self.arguments]).encode() + TERMINATOR
+        return (
+            ",".join([str(int(self.code)), self.name, *self.arguments]).encode(ENCODING)
+            + TERMINATOR
+        )
 
     @classmethod
     def decode(cls, message: bytes) -> Answer:
@@ -207,10 +220,7 @@ def _require_valid(name: str, arguments: tuple[str, ...]) -> None:
 
 
 def _decode_text(message: bytes) -> str:
-    try:
-        text = message.decode().strip("\n")
-    except UnicodeDecodeError as fault:
-        raise ProtocolError(f"RemoteEx sent {message[:40]!r}, which is no text") from fault
+    text = message.decode(ENCODING).strip("\n")
     if _CONTROL.search(text):
         raise ProtocolError(f"RemoteEx sent {message[:40]!r}, which holds control characters")
     return text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from time import monotonic
+from time import monotonic, sleep
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,21 +21,36 @@ from devices.stream import StreamSource, Transfer
 from devices.stream_options import OPTIONS as STREAM_OPTIONS
 from devices.stream_options import parse_buffer_settings
 from devices.uri import Uri
-from tofclip.errors import DeviceDisconnectedError, DeviceError, InputError, ProtocolError
+from tofclip.errors import (
+    DeviceBusyError,
+    DeviceDisconnectedError,
+    DeviceError,
+    DeviceTimeoutError,
+    InputError,
+    ProtocolError,
+)
 from tofclip.io.hpdta import TIME_UNITS
 from tofclip.storage import Field, Record, Scalar
 
 INSTRUMENT = "Hamamatsu streak camera (RemoteEx)"
 STREAK_TUBE = "TD"
 GAIN_PARAMETER = "MCP Gain"
-OPTIONS = ("data_port", "buffers", "mcp_gain", "timeout_s", "reconnect_s", *STREAM_OPTIONS)
+OPTIONS = (
+    "data_port",
+    "buffers",
+    "mcp_gain",
+    "time_range",
+    "time_ranges_ps",
+    "timeout_s",
+    "reconnect_s",
+    *STREAM_OPTIONS,
+)
+APPLICATION_START_S = 30.0
+POLL_INTERVAL_S = 0.05
+SYNCHROSCAN_UNIT_S = 1e-12
+"""Of the scaling table where the time range is a mere number, as of synchroscan units."""
 
 _PARAMETERS = {"time_range": "Time Range", "mode": "Mode", "mcp_gain": GAIN_PARAMETER}
-_STOP_COMMANDS = (
-    ("DevParamSet", STREAK_TUBE, GAIN_PARAMETER, "0"),
-    ("AcqStop",),
-    ("AcqLiveMonitor", "Off"),
-)
 
 ConnectFunction = Callable[[], RemoteExClient]
 
@@ -55,12 +70,20 @@ class LiveSettings:
         Seconds to wait for an answer.
     reconnect : float
         Seconds to wait for HPD-TA to come back when the connection broke.
+    time_range : str
+        Set before the start, as HPD-TA writes it: ``20 ns``, or ``3`` for a synchroscan unit; empty
+        leaves it as it is.
+    time_ranges_ps : tuple of float
+        How long ranges 1, 2, ... of a synchroscan unit last, ps, for cameras that give no scaling
+        table.
     """
 
     buffers: int = 16
     gain: int | None = None
     timeout: float = 5.0
     reconnect: float = 5.0
+    time_range: str = ""
+    time_ranges_ps: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not 1 <= self.buffers <= 4096:
@@ -69,6 +92,8 @@ class LiveSettings:
             raise InputError(
                 f"the gain of the micro-channel plate must be within 0..63, got {self.gain}"
             )
+        if any(not 0 < one < 1e15 for one in self.time_ranges_ps):
+            raise InputError("time ranges must be positive numbers of ps, such as 165,500,1000")
         if not (0 < self.timeout <= 600 and 0 <= self.reconnect <= 600):
             raise InputError("times to wait must be within 0 s and 600 s")
 
@@ -134,9 +159,18 @@ class RemoteExFeed:
             return Transfer(memoryview(self.codec.pack_frame(picture.number, picture.pixels)), gap)
 
     def stop(self) -> None:
-        """Turn the gain down first, whatever the state of the connection, and stop the acquisition."""
+        """Turn the gain down first, whatever the state of the connection, and stop the acquisition.
+
+        Live mode that somebody else had started goes on, with the gain that it had.
+        """
         self._stopped = True
-        self._link.send_and_wait(*_STOP_COMMANDS)
+        gain = self._gain_before if self._has_joined else "0"
+        commands: list[tuple[str, ...]] = [("AcqLiveMonitor", "Off")]
+        if not self._has_joined:
+            commands.insert(0, ("AcqStop",))
+        if gain is not None:
+            commands.insert(0, ("DevParamSet", STREAK_TUBE, GAIN_PARAMETER, gain))
+        self._link.send_and_wait(*commands)
 
     def close(self) -> None:
         try:
@@ -150,11 +184,19 @@ class RemoteExFeed:
         """Connect, start the camera and wait for its first picture."""
         self._link = link = self._connect()
         self._stopped = False
+        self._has_joined = False
+        self._gain_before: str | None = None
         try:
-            if self._settings.gain is not None:
-                link.ask("DevParamSet", STREAK_TUBE, GAIN_PARAMETER, str(self._settings.gain))
-            link.ask("AcqLiveMonitor", "RingBuffer", str(self._settings.buffers))
-            link.ask("AcqStart", "Live")
+            try:
+                self._prepare_live(link)
+            except (DeviceDisconnectedError, DeviceTimeoutError):
+                raise
+            except DeviceError:
+                if not link.start_application(APPLICATION_START_S):
+                    raise
+                self._prepare_live(link)
+            if not link.is_done("AcqStart", "Live"):
+                self._join_or_restart(link)
             self._newest = self._wait_for_announcement(self._settings.timeout)
             self._first = link.read_frame(self._newest)
         except BaseException:
@@ -163,17 +205,63 @@ class RemoteExFeed:
             link.close()
             raise
         self._unread_frame: CameraFrame | None = self._first
-        self._next, self._newest = self._first.number, max(self._newest, self._first.number)
+        self._next = self._first.number
+        self._announced = self._newest
+        self._newest = max(self._newest, self._first.number)
+
+    def _prepare_live(self, link: RemoteExClient) -> None:
+        """Set what has to be set before live mode, and ask to be told of every picture."""
+        settings = self._settings
+        if settings.gain is not None:
+            with contextlib.suppress(ProtocolError):
+                (self._gain_before,) = link.ask("DevParamGet", STREAK_TUBE, GAIN_PARAMETER)[:1]
+            link.ask("DevParamSet", STREAK_TUBE, GAIN_PARAMETER, str(settings.gain))
+        if settings.time_range:
+            link.ask("DevParamSet", STREAK_TUBE, "Time Range", settings.time_range)
+        link.ask("AcqLiveMonitor", "RingBuffer", str(settings.buffers))
+
+    def _join_or_restart(self, link: RemoteExClient) -> None:
+        """Join live mode that runs already, or wait until what else keeps the camera busy is over;
+        in the end, stop that.
+
+        Raises
+        ------
+        DeviceBusyError
+            The camera stays busy.
+        """
+        with contextlib.suppress(ProtocolError):  # not every version knows the question
+            state = [word.strip().casefold() for word in link.ask("AcqStatus")]
+            if "live" in state:
+                self._has_joined = True
+                return
+        for is_last in (False, True):
+            deadline = monotonic() + self._settings.timeout
+            while link.ask("AsyncCommandStatus")[:1] != ("0",) and monotonic() < deadline:
+                sleep(POLL_INTERVAL_S)
+            if link.is_done("AcqStart", "Live"):
+                return
+            if not is_last:
+                link.ask("AcqStop")
+        raise DeviceBusyError("the streak camera is busy; end what HPD-TA is doing")
 
     def _read_next_frame(self, timeout: float) -> CameraFrame:
         deadline = monotonic() + timeout
         picture = self._unread_frame
-        if picture is None:
+        while picture is None:
+            with contextlib.suppress(DeviceTimeoutError):
+                while True:  # all that has been announced by now
+                    self._note_announcement(self._wait_for_announcement(0))
             while self._newest < self._next:
-                self._newest = max(
-                    self._newest, self._wait_for_announcement(max(deadline - monotonic(), 0))
-                )
-            picture = self._link.read_frame(self._next)
+                left = max(deadline - monotonic(), 0)
+                self._note_announcement(self._wait_for_announcement(left))
+            try:
+                picture = self._link.read_frame(self._next)
+            except (DeviceDisconnectedError, DeviceTimeoutError, ProtocolError):
+                raise
+            except DeviceError:
+                # Refused, as no such picture is there: the numbers begin anew when live mode does.
+                if not self._have_numbers_restarted():
+                    raise
         lost = picture.number - self._next
         if lost < 0:
             raise ProtocolError(f"RemoteEx sent picture {picture.number}, asked for {self._next}")
@@ -183,6 +271,21 @@ class RemoteExFeed:
         self._unread_frame, self._next = None, picture.number + 1
         self._newest = max(self._newest, picture.number)
         return picture
+
+    def _note_announcement(self, number: int) -> None:
+        """Note the newest picture; where its number went back, live mode was started anew."""
+        if number <= self._announced:
+            self._count_announced_lost()
+            self._next = number
+            self._gap = Gap.RESTART
+        self._announced = number
+        self._newest = max(number, self._next - 1)
+
+    def _have_numbers_restarted(self) -> bool:
+        """Wait for the next announcement, and say whether it goes back."""
+        expected = self._next
+        self._note_announcement(self._wait_for_announcement(self._settings.timeout))
+        return self._next != expected
 
     def _wait_for_announcement(self, timeout: float) -> int:
         """Return the number of the picture that the next message announces."""
@@ -212,10 +315,20 @@ class RemoteExFeed:
 
     def _read_row_times(self) -> NDArray[np.float64] | None:
         """Return the rows' times, s; the table is in the unit of the time range, as the files show."""
-        unit = TIME_UNITS.get(str(self._parameters.get("time_range", "")).rpartition(" ")[2])
+        time_range = str(self._parameters.get("time_range", "")).strip()
+        is_numbered = time_range.isdecimal() and len(time_range) < 4
+        unit = SYNCHROSCAN_UNIT_S if is_numbered else TIME_UNITS.get(time_range.rpartition(" ")[2])
         if unit is None or self._parameters.get("mode") == "Focus":
             return None
-        table = self._link.read_scaling_table().astype(np.float64)
+        try:
+            table = self._link.read_scaling_table().astype(np.float64)
+        except ProtocolError:
+            ranges = self._settings.time_ranges_ps
+            if not is_numbered or not 1 <= int(time_range) <= len(ranges):
+                raise
+            rows = self.codec.rows
+            sweep = ranges[int(time_range) - 1] * unit
+            return np.linspace(0, sweep, rows, endpoint=False) + sweep / (2 * rows)
         if (
             table.shape != (self.codec.rows,)
             or not np.all(np.isfinite(table))
@@ -228,6 +341,10 @@ class RemoteExFeed:
 def open_remoteex(uri: Uri) -> StreamSource:
     """Open
     ``remoteex://HOST:1001?data_port=1002&buffers=16&mcp_gain=N&timeout_s=5&reconnect_s=5&buffer_mib=64``.
+
+    ``time_range=20 ns`` (or ``3`` for a synchroscan unit) sets the sweep before the start;
+    ``time_ranges_ps=165,500,1000`` says how long a synchroscan unit's ranges last, for one that
+    gives no scaling table.
     """
     uri.reject_unknown(*OPTIONS)
     host, port = uri.host_and_port(COMMAND_PORT)
@@ -251,4 +368,10 @@ def parse_live_settings(uri: Uri) -> LiveSettings:
         uri.value("mcp_gain", int, 0) if "mcp_gain" in uri.values else None,
         uri.value("timeout_s", float, standard.timeout),
         uri.value("reconnect_s", float, standard.reconnect),
+        uri.value("time_range", str, ""),
+        uri.value("time_ranges_ps", _parse_numbers, ()),
     )
+
+
+def _parse_numbers(text: str) -> tuple[float, ...]:
+    return tuple(float(word) for word in text.split(","))

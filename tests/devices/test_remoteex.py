@@ -14,7 +14,7 @@ import devices
 from devices.emulation.faults import Fault
 from devices.loopback import HOST, Connection, LoopbackServer
 from devices.remoteex.client import RemoteExClient
-from devices.remoteex.emulator import EmulatedLight, EmulatedStreakCamera
+from devices.remoteex.emulator import Circumstances, EmulatedLight, EmulatedStreakCamera
 from devices.remoteex.protocol import TERMINATOR
 from devices.remoteex.source import LiveSettings
 from devices.scenes import simulate_demonstration_light, simulate_line_light
@@ -43,8 +43,11 @@ def camera() -> Iterator[Make]:
     """Make emulated cameras that are switched off in the end."""
     made = []
 
-    def make(*faults: Fault, rate: float = 100.0, frames: int = 1000) -> EmulatedStreakCamera:
-        made.append(EmulatedStreakCamera(LIGHT, rate, frames, faults))
+    def make(
+        *faults: Fault, rate: float = 100.0, frames: int = 1000, **found: object
+    ) -> EmulatedStreakCamera:
+        circumstances = Circumstances(**found)  # type: ignore[arg-type]
+        made.append(EmulatedStreakCamera(LIGHT, rate, frames, faults, circumstances))
         return made[-1]
 
     yield make
@@ -212,7 +215,9 @@ def scripted(answers: dict[bytes, bytes]) -> Callable[[Connection], None]:
 
 def data_server(data: bytes) -> LoopbackServer:
     def serve(connection: Connection) -> None:
-        connection.send(b"RemoteEx Data Ready\r" + data)
+        connection.send(b"RemoteEx Data Ready\r")
+        time.sleep(0.1)  # what comes before the question is thrown away
+        connection.send(data)
         connection.read_request(TERMINATOR)
 
     return LoopbackServer(serve)
@@ -337,3 +342,86 @@ def test_no_thread_is_left_behind(camera: Make) -> None:
     while threading.active_count() > before and time.monotonic() < deadline:
         time.sleep(0.05)
     assert threading.active_count() == before
+
+
+def test_hpd_ta_is_started_where_it_is_not_up(camera: Make) -> None:
+    server = camera(is_application_up=False)
+    with opened(server, mcp_gain=9) as source:
+        assert len(taken(source, 3)) == 3
+        assert server.gain == "9"
+
+
+def test_live_mode_of_an_operator_is_joined_and_goes_on(camera: Make) -> None:
+    server = camera(is_live=True, rate=200.0)
+    server._parameters["MCP Gain"] = "13"
+    time.sleep(0.05)
+    with opened(server, mcp_gain=20) as source:
+        frames = taken(source, 5)
+        assert server.gain == "20"
+    assert frames[0]["number"] > 0
+    assert server.is_running
+    assert server.gain == "13"
+
+
+def test_a_busy_camera_is_waited_for_or_stopped(camera: Make) -> None:
+    for busy_for in (3, 10**9):
+        server = camera(busy_for=busy_for)
+        with opened(server, timeout_s=0.5) as source:
+            assert len(taken(source, 3)) == 3
+
+
+def test_numbers_that_restart_are_followed(camera: Make) -> None:
+    server = camera(restart_at=20)
+    numbers: list[int] = []
+    gaps = []
+    with opened(server) as source:
+        while len(numbers) < 40:
+            batch = source.read(5)
+            assert batch is not None
+            numbers += batch.records["number"].tolist()
+            gaps += [batch.after_gap] * len(batch)
+        source.stop()
+        while source.read() is not None:
+            pass
+    restart = numbers.index(max(numbers[:25])) + 1
+    assert numbers[restart] < 3
+    assert gaps[restart]
+    assert source.stats.malformed == 0
+    assert source.stats.is_balanced
+
+
+def test_a_synchroscan_unit_counts_its_time_in_ps(camera: Make) -> None:
+    with opened(camera(time_range="3")) as source:
+        assert source.calibration is not None
+        times = source.calibration.fields["row_times"].values
+        np.testing.assert_allclose(times, LIGHT.row_times, rtol=1e-6)
+    server = camera(time_range="2", has_scaling_table=False)
+    with opened(server, time_ranges_ps="165,480,1200") as source:
+        assert source.calibration is not None
+        times = source.calibration.fields["row_times"].values
+        np.testing.assert_allclose(np.diff(times), 40e-12)
+
+
+def test_the_time_range_can_be_set(camera: Make) -> None:
+    server = camera()
+    with opened(server, time_range="100 ns") as source:
+        assert source.info.details["time_range"] == "100 ns"
+
+
+def test_stray_bytes_on_the_data_port_are_thrown_away(camera: Make) -> None:
+    server = camera(stray_bytes=1000)
+    with opened(server) as source:
+        for frame in taken(source, 3):
+            np.testing.assert_array_equal(frame["counts"], LIGHT.draw_frame(int(frame["number"])))
+
+
+def test_an_error_of_several_lines_does_not_shift_the_answers() -> None:
+    answers = {
+        b"AcqStart(Live)": b"7,AcqStart,raw\rdata \xb5\r\nmore\r",
+        b"AcqStatus()": b"5,HAcq: odd\rtext\r0,acqstatus,idle\r",
+    }
+    with LoopbackServer(scripted(answers)) as commands, data_server(b"") as data:
+        link = RemoteExClient(HOST, commands.port, data.port, 1)
+        assert not link.is_done("AcqStart", "Live")
+        assert link.ask("AcqStatus") == ("idle",)
+        link.close()

@@ -11,7 +11,10 @@ from tofclip.errors import DeviceBusyError, DeviceError, InputError, ProtocolErr
 
 names = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,20}", fullmatch=True)
 arguments = st.lists(
-    st.text(st.characters(exclude_characters=",()", exclude_categories=["Cs", "Cc"]), max_size=9),
+    st.text(
+        st.characters(codec="latin-1", exclude_characters=",()", exclude_categories=["Cc"]),
+        max_size=9,
+    ),
     max_size=5,
 ).filter(lambda words: words != [""])
 
@@ -20,6 +23,13 @@ arguments = st.lists(
 def test_commands_come_back(name: str, words: list[str]) -> None:
     command = Command(name, tuple(words))
     assert Command.decode(command.encode().removesuffix(TERMINATOR)) == command
+
+
+def test_text_is_latin_1() -> None:
+    assert Answer.decode(b"0,DevParamGet,10 \xb5s").arguments == ("10 µs",)
+    assert Command("DevParamSet", ("TD", "Time Range", "10 µs")).encode().endswith(b"10 \xb5s)\r")
+    with pytest.raises(InputError):
+        Command("DevParamSet", ("Ω",)).encode()
 
 
 @given(st.sampled_from(AnswerCode), names, arguments)
