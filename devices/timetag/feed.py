@@ -292,6 +292,11 @@ class SendWindow:
             Bytes that the last transfer brought.
         seconds : float
             How long it took.
+
+        Returns
+        -------
+        int
+            Bytes.
         """
         self._bytes += length
         self._transfers += 1

@@ -251,6 +251,11 @@ def recognise_axes(cube: NDArray[Any], path: Path) -> str:
     path : Path
         For the message.
 
+    Returns
+    -------
+    str
+        ``tyx``, ``ytx`` or ``yxt``.
+
     Raises
     ------
     InputError

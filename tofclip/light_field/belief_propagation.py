@@ -63,6 +63,7 @@ def find_smooth_labels(
         ):
             # what a pixel tells a neighbour leaves out what that neighbour has told it
             said = _pass_message(belief - messages[back], np.float32(smoothness))
+            # half of the step: undamped messages may oscillate
             messages[towards][neighbours] += (said[pixels] - messages[towards][neighbours]) / 2
     chosen: NDArray[np.int64] = (own + messages.sum(axis=0)).argmin(axis=0)
     return chosen
@@ -82,6 +83,7 @@ def _pass_message(costs: Array, price: np.float32) -> Array:
     price(|l - k|).
     """
     cheapest = costs.min(axis=0)
+    # truncated: from here on a jump costs the same, however far
     found = np.minimum(costs, cheapest + MAX_LABEL_STEP * price)
     for step in range(1, MAX_LABEL_STEP):
         np.minimum(found[step:], costs[:-step] + step * price, out=found[step:])

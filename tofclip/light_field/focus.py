@@ -101,6 +101,7 @@ def compute_modified_laplacian(pictures: Array) -> Array:
     """
     padded = np.pad(pictures, [(0, 0)] * (pictures.ndim - 2) + [(1, 1), (1, 1)], mode="edge")
     middle = 2 * padded[..., 1:-1, 1:-1]
+    # absolute values first: second derivatives of opposite sign must not cancel
     down: Array = np.abs(middle - padded[..., :-2, 1:-1] - padded[..., 2:, 1:-1])
     across: Array = np.abs(middle - padded[..., 1:-1, :-2] - padded[..., 1:-1, 2:])
     return down + across
@@ -157,4 +158,6 @@ def estimate_depth_from_focus(
         raise InputError(
             "these pictures are even nearly everywhere; depth from focus needs texture"
         )
+    # in units of a textured pixel's sharpness, so that the smoothness suits pictures of any
+    # contrast
     return find_smooth_labels((best - sharpness) / typical, smoothness)

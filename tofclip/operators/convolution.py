@@ -64,12 +64,14 @@ class PointSpreadConvolution(LinearOperator):
             image // 2 - sensor // 2
             for image, sensor in zip(image_shape, sensor_shape, strict=True)
         ]
+        # long enough that no period's copy of the picture reaches the sensor
         self._padded = tuple(
             scipy.fft.next_fast_len(alias_free_length(*sizes), real=True)
             for sizes in zip(image_shape, sensor_shape, spread.shape, first, centre, strict=True)
         )
         placed = np.zeros(self._padded, self.dtype)
         placed[: spread.shape[0], : spread.shape[1]] = spread
+        # pixel (0, 0) of the result is the sensor's first pixel, under the PSF's centre
         shift = [-(begin + middle) for begin, middle in zip(first, centre, strict=True)]
         self._spectrum = scipy.fft.rfft2(np.roll(placed, shift, (0, 1)))[..., np.newaxis]
 
@@ -77,6 +79,7 @@ class PointSpreadConvolution(LinearOperator):
         return self._apply_spectrum(block, self._spectrum, self.shape_out)
 
     def _adjoint(self, block: Array) -> Array:
+        # correlation: the conjugate spectrum turns the convolution around
         return self._apply_spectrum(block, self._spectrum.conj(), self.shape_in)
 
     def _apply_spectrum(
@@ -133,6 +136,7 @@ def _crop_to_support(spread: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     """Cut a PSF down to where it is not zero; return it and where its origin lies then."""
     lit = [np.flatnonzero(spread.any(axis=other)) for other in (1, 0)]
     cut = spread[lit[0][0] : lit[0][-1] + 1, lit[1][0] : lit[1][-1] + 1]
+    # the centre stays where it was, although dark rows and columns are gone
     return cut, [size // 2 - int(axis[0]) for size, axis in zip(spread.shape, lit, strict=True)]
 
 

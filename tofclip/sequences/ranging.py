@@ -86,6 +86,7 @@ class RangingSettings:
         lock_output_folder(folder, settings | {"bin_width": readers[0].bin_width})
         if made is not None:
             made.save(plan)
+        # a worker that holds an older plan notices by the hash
         version, jobs = compute_sha256(plan), []
         for number in range(-(-len(readers) // self.average)):
             some = tuple(readers[number * self.average : (number + 1) * self.average])

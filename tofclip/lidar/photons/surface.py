@@ -132,6 +132,10 @@ class SurfaceImage:
             ``(rows // 2, columns // 2)``.
         provenance : mapping, optional
             How they came about.
+
+        Returns
+        -------
+        tofclip.lidar.Returns
         """
         rows, columns = self.range.shape
         pinhole = Camera(
@@ -376,6 +380,10 @@ def remove_return(photons: PhotonImage, scene: Scene, layer: FloatArray) -> Phot
     scene : Scene
     layer : (rows, columns, 4) array
         See `SurfacePlan.locate`.
+
+    Returns
+    -------
+    PhotonImage
     """
     response = scene.response
     times = response.start + response.step * np.arange(response.density.size)
@@ -396,6 +404,11 @@ def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> F
     scene : Scene
     layer : (rows, columns, 4) array
         See `SurfacePlan.locate`.
+
+    Returns
+    -------
+    (rows, columns, 4) float64 array
+        NaN where the surface does not stand out of the background.
     """
     reach = 0.5 * scene.response.width + 1
     late = photons.bin - layer[..., 0].ravel()[photons.pixel]
@@ -422,6 +435,11 @@ def combine_layers(
     to_range : float
         Metres in a bin.
     settings : mapping
+
+    Returns
+    -------
+    SurfaceImage
+        The strongest layer of each pixel, the others in ``further``.
     """
     stack = np.stack(layers, axis=2)
     order = np.argsort(-np.nan_to_num(stack[..., 2], nan=-1.0), axis=2, kind="stable")

@@ -108,12 +108,16 @@ def assign_evenly(
 
     v, u = np.asarray(views, dtype=np.float64).T[:, :, np.newaxis]
     across = u * np.cos(directions) + v * np.sin(directions)
+    # views on one line across a direction are ranked by chance, not by their order
     tie_break = 1e-6 * random.random(across.shape)
+    # rank of every view along every direction, from 0 to 1
     place = (np.argsort(np.argsort(across + tie_break, axis=0), axis=0) + 0.5) / len(views)
     wanted = np.resize(
         np.roll(_antithetic_positions(cycle), random.integers(cycle)), directions.size
     )
+    # each view may own several lines, but none more than its share
     copies = -(-directions.size // len(views))
+    # the assignment with the least sum of squared distances from the places wanted
     taken, direction = linear_sum_assignment(np.repeat((place - wanted) ** 2, copies, axis=0))
     owners = np.empty(directions.size, np.intp)
     owners[direction] = taken // copies
@@ -128,6 +132,7 @@ def _antithetic_positions(count: int) -> NDArray[np.float64]:
     while 2 * nearer.size < count:  # van der Corput's sequence from 0 to 1/2
         nearer = np.concatenate([nearer, nearer + 0.25 / nearer.size])
     nearer += 0.5 / count
+    # each place is followed by its mirror image, so that every pair is balanced
     return np.stack([nearer, 1 - nearer], axis=1).ravel()
 
 

@@ -94,6 +94,7 @@ class LightFieldCamera(ABC):
         """Return the weights W that measurements and model get in a recovery; 1 unless the camera
         has a reason.
         """
+        # by default every measurement counts alike
         return Identity((self.measurements,))
 
     def light_field_model(self) -> LinearOperator:

@@ -37,6 +37,7 @@ class LineCamera(LightFieldCamera):
             count * self.detector_px,
             min(CORRELATION_LENGTH_PX, self.detector_px),
         )
+        # half a turn is all: a line turned by 180 degrees measures the same, mirrored
         used, self.angles = self._assign_angles(np.arange(count) * np.pi / count)
         return used
 

@@ -68,6 +68,7 @@ class PointSpreadCamera(LightFieldCamera):
             (rows, columns) pictures to (measurements,) vectors.
         """
         views = [self.views[view] for view in self.used_views]
+        # views are moved by the shear and add up on the sensor: one convolution (Eq. 5)
         return self.sensor @ self._make_convolution(
             shear_point_spreads(self._spreads, views, shear, reference).sum(axis=0)
         )

@@ -32,6 +32,7 @@ class SinglePixelCamera(LightFieldCamera):
         return tuple(range(len(self.views)))
 
     def _build_encoders(self) -> tuple[LinearOperator, ...]:
+        # independent codes for every view from one seed
         seeds = np.random.SeedSequence(self.seed).generate_state(len(self.views))
         return tuple(HadamardCodes(self.image_shape, self.codes, int(seed)) for seed in seeds)
 
