@@ -89,6 +89,7 @@ def draw_fault_script(seed: int, transfers: int) -> tuple[Fault, ...]:
         In the order of the transfers.
     """
     rng = np.random.default_rng(seed)
+    # without repeats: one fault for a transfer
     when = rng.permutation(transfers)[: rng.integers(0, 7)]
     return tuple(Fault(int(transfer), *_draw_fault(rng)) for transfer in sorted(when))
 

@@ -121,7 +121,9 @@ class Accumulator:
         total = np.zeros((self.pixels, self.axis.bins + 2))
         for part in self._parts:
             total += part
+        # steps add up to the density; the last two bins hold what lies beyond the axis
         photons = np.cumsum(total[:, : self.axis.bins], axis=1).T
+        # steps up and down cancel to rounding only
         photons[photons < ROUNDING_PHOTONS] = 0
         return photons
 
@@ -157,6 +159,7 @@ class Accumulator:
         thread uses.
         """
         size = max(_MIN_PIECE, -(-total // thread_count()))
+        # a sum for each piece, so that threads never write to the same one
         while len(self._parts) * size < total:
             self._parts.append(np.zeros((self.pixels, self.axis.bins + 2)))
         run_blocks(lambda piece: add(piece, self._parts[piece.start // size]), total, size)

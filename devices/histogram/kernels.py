@@ -29,8 +29,10 @@ def _add_step(row, position, height):
     """Add a step at `position`; one before the first bin counts from there, one behind the last
     makes no difference.
     """
+    # clamped: light before the axis steps up in its first bin, light after it in the two spare ones
     inside = min(max(position, 0.0), row.size - 2.0)
     place = int(inside)
+    # the step lies within a bin: the rest of its height comes into effect one bin later
     late = height * (inside - place)
     row[place] += height - late
     row[place + 1] += late
@@ -81,6 +83,7 @@ def add_stamps(stamps, clock_bins, codes, period, steps):
         if pixel >= codes.shape[0]:
             strays += 1
             continue
+        # the code counts whole clock periods and a phase, whose steps are uneven (calibrated)
         periods = code // number
         phase = code - periods * number
         begin, width = np.float64(codes[pixel, phase, 0]), np.float64(codes[pixel, phase, 1])
@@ -172,6 +175,7 @@ def add_tags(ticks, channels, flags, ignored, sync, known, pixel_of, scale, shif
             continue
         if lines & sync:
             known = ticks[record]
+        # no sync pulse yet: the photon has no time
         if known < 0:
             continue
         position = (ticks[record] - known) * scale + shift

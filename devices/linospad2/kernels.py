@@ -36,11 +36,13 @@ def count_stamps(cycles, header, kept_of_cycle):
         Valid words of the converter that has none.
     """
     words = cycles.shape[1]
+    # the last converter serves no pixels
     stray = words - (words - header) // CONVERTERS
     strays = 0
     for cycle in range(cycles.shape[0]):
         kept = 0
         for word in range(header, stray):
+            # bit 31 says that the word holds a time stamp
             kept += cycles[cycle, word] >> np.uint32(31)
         kept_of_cycle[cycle] = kept
         for word in range(stray, words):
@@ -84,6 +86,8 @@ def decode_stamps(cycles, header, first_cycle, pixel_of, records):
                 records[row, header] = number
                 records[row, header + 1] = word & CODE_MASK
                 records[row, header + 2] = pixels[(word >> np.uint32(28)) & np.uint32(3)]
+                # every word is written, and the next one overwrites it if it was not valid: no
+                # branch
                 row += word >> np.uint32(31)
 
 
@@ -111,6 +115,7 @@ def encode_stamps(records, header, address_of, cycles):
     for row in range(records.shape[0]):
         cycle, place = np.int64(records[row, header]), address_of[records[row, header + 2]]
         converter = np.int64(place) // ADDRESSES
+        # time stamps must come converter by converter, cycle by cycle
         queue = cycle * CONVERTERS + converter
         if queue < previous:
             return OUT_OF_ORDER

@@ -142,6 +142,7 @@ class BlockHeader:
         own = data[layout.size : layout.size + _CHECKSUM_BYTES]
         if len(own) != _CHECKSUM_BYTES or not (is_legacy or data.startswith(MAGIC)):
             return None
+        # a header that passes by chance is one in 2^32: the search for blocks may rely on it
         if zlib.crc32(front) != int.from_bytes(own, "little"):
             return None
         recording, number = 0, -1

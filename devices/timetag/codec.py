@@ -153,6 +153,7 @@ def mark_wraps(records: Records) -> Records:
         return records.copy()
     marked = records.copy()
     _, firsts = np.unique(ticks, return_index=True)
+    # a record at counter zero carries the wrap itself; only wraps without one need a record more
     at_zero = firsts[(ticks[firsts] % COUNTER_RANGE == 0) & (ticks[firsts] > 0)]
     marked["flags"][at_zero] |= WRAP
     wraps = np.arange(1, int(ticks[-1]) // COUNTER_RANGE + 1, dtype=np.int64) * COUNTER_RANGE
