@@ -27,7 +27,18 @@ class PhasorPropagation(Protocol):
     """Carries phasors from wall points onto a plane."""
 
     def field(self, phasors: Array, progress: Progress = ignore_progress) -> Array:
-        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies), complex64."""
+        """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies), complex64.
+
+        Parameters
+        ----------
+        phasors : (n, frequencies) complex64 array
+        progress : callable
+            Called with the number of plane points times frequencies just done.
+
+        Returns
+        -------
+        (y, x, frequencies) complex64 array
+        """
         ...
 
 
@@ -35,7 +46,16 @@ class Diffraction(Protocol):
     """Carries fields from a plane to all depths of a grid, where they meet the laser's wave."""
 
     def add(self, values: Array, total: Array, progress: Progress) -> None:
-        """Add the image of a field (y, x, frequencies) to a volume (z, y, x)."""
+        """Add the image of a field (y, x, frequencies) to a volume (z, y, x).
+
+        Parameters
+        ----------
+        values : (y, x, frequencies) complex64 array
+        total : (z, y, x) complex64 array
+            Added to, in place.
+        progress : callable
+            Called with the number of voxels just done.
+        """
         ...
 
 
@@ -47,21 +67,65 @@ class Backend(Protocol):
         ...
 
     def compute_phasors(self, capture: Capture, group: IlluminationGroup) -> Array:
-        """Return the phasors P_k (points, frequencies) of a group's wall points, complex64."""
+        """Return the phasors P_k (points, frequencies) of a group's wall points, complex64.
+
+        Parameters
+        ----------
+        capture : Capture
+        group : IlluminationGroup
+
+        Returns
+        -------
+        (points, frequencies) complex64 array
+        """
         ...
 
     def place_on_lattice(self, phasors: Array, lattice: WallLattice) -> Array:
-        """Put phasors (points, frequencies) into their places, (y, x, frequencies)."""
+        """Put phasors (points, frequencies) into their places, (y, x, frequencies).
+
+        Parameters
+        ----------
+        phasors : (points, frequencies) complex64 array
+        lattice : WallLattice
+
+        Returns
+        -------
+        (y, x, frequencies) complex64 array
+        """
         ...
 
     def propagate_phasors(
         self, points: Array, plane: Plane, waves: SphericalWaves, tolerance: float
     ) -> PhasorPropagation:
-        """Return what carries phasors from wall points (n, 3) onto a plane."""
+        """Return what carries phasors from wall points (n, 3) onto a plane.
+
+        Parameters
+        ----------
+        points : (n, 3) float64 array
+            Metres.
+        plane : Plane
+        waves : SphericalWaves
+        tolerance : float
+            Relative error.
+
+        Returns
+        -------
+        PhasorPropagation
+        """
         ...
 
     def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> Diffraction:
-        """Return what carries fields from the plane of `plan` to all depths."""
+        """Return what carries fields from the plane of `plan` to all depths.
+
+        Parameters
+        ----------
+        plan : DiffractionPlan
+        source : LaserSource
+
+        Returns
+        -------
+        Diffraction
+        """
         ...
 
 
@@ -81,21 +145,65 @@ class CompiledBackend:
         return np.zeros(shape, np.complex64)
 
     def compute_phasors(self, capture: Capture, group: IlluminationGroup) -> Array:
-        """Return the phasors P_k (points, frequencies) of a group's wall points, complex64."""
+        """Return the phasors P_k (points, frequencies) of a group's wall points, complex64.
+
+        Parameters
+        ----------
+        capture : Capture
+        group : IlluminationGroup
+
+        Returns
+        -------
+        (points, frequencies) complex64 array
+        """
         return group.compute_phasors(capture, self.band)
 
     def place_on_lattice(self, phasors: Array, lattice: WallLattice) -> Array:
-        """Put phasors (points, frequencies) into their places, (y, x, frequencies)."""
+        """Put phasors (points, frequencies) into their places, (y, x, frequencies).
+
+        Parameters
+        ----------
+        phasors : (points, frequencies) complex64 array
+        lattice : WallLattice
+
+        Returns
+        -------
+        (y, x, frequencies) complex64 array
+        """
         return lattice.place(phasors)
 
     def propagate_phasors(
         self, points: Array, plane: Plane, waves: SphericalWaves, tolerance: float
     ) -> PhasorPropagation:
-        """Return what carries phasors from wall points (n, 3) onto a plane."""
+        """Return what carries phasors from wall points (n, 3) onto a plane.
+
+        Parameters
+        ----------
+        points : (n, 3) float64 array
+            Metres.
+        plane : Plane
+        waves : SphericalWaves
+        tolerance : float
+            Relative error.
+
+        Returns
+        -------
+        CompiledPropagation
+        """
         return CompiledPropagation(points, plane, waves, tolerance)
 
     def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> Diffraction:
-        """Return what carries fields from the plane of `plan` to all depths."""
+        """Return what carries fields from the plane of `plan` to all depths.
+
+        Parameters
+        ----------
+        plan : DiffractionPlan
+        source : LaserSource
+
+        Returns
+        -------
+        CompiledDiffraction
+        """
         return CompiledDiffraction(plan, source)
 
 
@@ -121,13 +229,33 @@ class PortableBackend:
         return self.library.zeros(shape)
 
     def compute_phasors(self, capture: Capture, group: IlluminationGroup) -> Array:
-        """Return the phasors P_k (points, frequencies) of a group's wall points, complex64."""
+        """Return the phasors P_k (points, frequencies) of a group's wall points, complex64.
+
+        Parameters
+        ----------
+        capture : Capture
+        group : IlluminationGroup
+
+        Returns
+        -------
+        (points, frequencies) complex64 array
+        """
         from nlos.portable.signals import get_group_traces
 
         return self._transform.of(get_group_traces(capture, group))
 
     def place_on_lattice(self, phasors: Array, lattice: WallLattice) -> Array:
-        """Put phasors (points, frequencies) into their places, (y, x, frequencies)."""
+        """Put phasors (points, frequencies) into their places, (y, x, frequencies).
+
+        Parameters
+        ----------
+        phasors : (points, frequencies) complex64 array
+        lattice : WallLattice
+
+        Returns
+        -------
+        (y, x, frequencies) complex64 array
+        """
         from nlos.portable.signals import arrange_on_lattice
 
         xp = self.library.xp
@@ -137,18 +265,53 @@ class PortableBackend:
     def propagate_phasors(
         self, points: Array, plane: Plane, waves: SphericalWaves, tolerance: float
     ) -> PhasorPropagation:
-        """Return what carries phasors from wall points (n, 3) onto a plane."""
+        """Return what carries phasors from wall points (n, 3) onto a plane.
+
+        Parameters
+        ----------
+        points : (n, 3) float64 array
+            Metres.
+        plane : Plane
+        waves : SphericalWaves
+        tolerance : float
+            Relative error.
+
+        Returns
+        -------
+        PortablePropagation
+        """
         from nlos.portable.propagation import PortablePropagation
 
         return PortablePropagation(points, plane, waves, tolerance, self.library)
 
     def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> Diffraction:
-        """Return what carries fields from the plane of `plan` to all depths."""
+        """Return what carries fields from the plane of `plan` to all depths.
+
+        Parameters
+        ----------
+        plan : DiffractionPlan
+        source : LaserSource
+
+        Returns
+        -------
+        PortableDiffraction
+        """
         from nlos.portable.diffraction import PortableDiffraction
 
         return PortableDiffraction(plan, source, self.library)
 
 
 def choose_backend(capture: Capture, band: Band) -> Backend:
-    """Return the backend of a capture's arrays, for the frequencies of a band."""
+    """Return the backend of a capture's arrays, for the frequencies of a band.
+
+    Parameters
+    ----------
+    capture : Capture
+    band : Band
+        Wavenumbers, rad/m.
+
+    Returns
+    -------
+    Backend
+    """
     return CompiledBackend(band) if is_numpy(capture.signal) else PortableBackend(band, capture)

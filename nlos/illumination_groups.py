@@ -87,7 +87,18 @@ def group_by_illumination(capture: Capture) -> list[IlluminationGroup]:
 
 
 def require_few_spots(capture: Capture, groups: Sequence[IlluminationGroup]) -> None:
-    """Refuse a capture whose laser spots each lit too few points for a field of their own."""
+    """Refuse a capture whose laser spots each lit too few points for a field of their own.
+
+    Parameters
+    ----------
+    capture : Capture
+    groups : sequence of IlluminationGroup
+
+    Raises
+    ------
+    InputError
+        There are too many.
+    """
     if len(groups) * MIN_POINTS_PER_SPOT > len(capture.points):
         raise InputError(
             f"{len(groups)} laser spots for {len(capture.points)} wall points: a field per spot needs at least "
@@ -111,7 +122,19 @@ def build_waves(group: IlluminationGroup, band: Band, continued: bool) -> Spheri
 
 
 def build_source(group: IlluminationGroup, band: Band) -> LaserSource:
-    """Return what shines on the scene in one illumination group."""
+    """Return what shines on the scene in one illumination group.
+
+    Parameters
+    ----------
+    group : IlluminationGroup
+        Its laser spot, m.
+    band : Band
+        Wavenumbers and weights of the virtual pulse.
+
+    Returns
+    -------
+    LaserSource
+    """
     return LaserSource(group.laser, band.wavenumbers, band.weights / band.weights.max())
 
 

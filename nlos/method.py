@@ -140,6 +140,17 @@ class PhasorPlan(Plan):
         """Return the complex sum whose magnitude `image` gives, complex64; linear in the signal.
 
         Parameters and errors are those of `image`.
+
+        Parameters
+        ----------
+        capture : Capture
+        progress : callable
+            Called with the amount of work just done.
+
+        Returns
+        -------
+        Volume
+            (z, y, x) complex64.
         """
         self.require_same_geometry(capture)
         return self._field(capture, progress)
@@ -206,13 +217,45 @@ class PhasorMethod(Method):
 
     @abstractmethod
     def plan(self, capture: Capture, grid: Grid) -> PhasorPlan:
-        """Make the method ready for captures like `capture` on `grid`; see `Method.plan`."""
+        """Make the method ready for captures like `capture` on `grid`; see `Method.plan`.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+
+        Returns
+        -------
+        PhasorPlan
+
+        Raises
+        ------
+        InputError
+            The method cannot image the capture on the grid.
+        """
 
     def phasor_field(
         self, capture: Capture, grid: Grid, progress: Progress = ignore_progress
     ) -> Volume:
         """Return the complex sum whose magnitude `reconstruct` gives, complex64; linear in the
         signal within the method's tolerance.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
+        progress : callable
+            Called with the amount of work just done.
+
+        Returns
+        -------
+        Volume
+            (z, y, x) complex64.
+
+        Raises
+        ------
+        InputError
+            The method cannot image the capture on the grid.
         """
         return self.plan(capture, grid).field(capture, progress)
 
@@ -220,6 +263,16 @@ class PhasorMethod(Method):
 def require_imageable(capture: Capture, grid: Grid) -> None:
     """Refuse what no method can image: a single wall point, a grid behind the wall, or a volume
     larger than `MEMORY_LIMIT_BYTES`.
+
+    Parameters
+    ----------
+    capture : Capture
+    grid : Grid
+
+    Raises
+    ------
+    InputError
+        One of these is the case.
     """
     if len(capture.points) == 1:
         raise InputError("one wall point cannot locate anything: a capture needs several")
@@ -237,7 +290,18 @@ def require_imageable(capture: Capture, grid: Grid) -> None:
 
 
 def require_numpy_signal(what: str, capture: Capture) -> None:
-    """Refuse a signal on another device for a method of compiled loops, `what` in the message."""
+    """Refuse a signal on another device for a method of compiled loops, `what` in the message.
+
+    Parameters
+    ----------
+    what : str
+    capture : Capture
+
+    Raises
+    ------
+    InputError
+        The signal is not a NumPy array.
+    """
     if not is_numpy(capture.signal):
         raise InputError(
             f"{what} works on NumPy arrays only, and this capture's signal is on {capture.device}: "

@@ -173,7 +173,19 @@ class SignalSpectrum:
         return self.points * float(np.sum(weight * self.power) / np.sum(weight) / self.floor - 1)
 
     def fraction_shorter(self, pulse: VirtualPulse, wavelength: float) -> float:
-        """Fraction of a pulse's signal, noise taken off, in waves shorter than `wavelength` m."""
+        """Fraction of a pulse's signal, noise taken off, in waves shorter than `wavelength` m.
+
+        Parameters
+        ----------
+        pulse : VirtualPulse
+        wavelength : float
+            Metres.
+
+        Returns
+        -------
+        float
+            0 to 1.
+        """
         signal = pulse.spectrum(self.wavenumbers) ** 2 * np.maximum(self.power - self.floor, 0)
         shorter = self.wavenumbers > 2 * np.pi / wavelength
         total = float(signal.sum())

@@ -126,7 +126,18 @@ def parse_method_names(text: str) -> tuple[str, ...]:
 
 
 def require_used_settings(settings: ImagingSettings, methods: Sequence[str]) -> None:
-    """Refuse a setting that none of the methods takes, since it would change nothing."""
+    """Refuse a setting that none of the methods takes, since it would change nothing.
+
+    Parameters
+    ----------
+    settings : ImagingSettings
+    methods : sequence of str
+
+    Raises
+    ------
+    InputError
+        There is such a setting.
+    """
     by_method = {name: _list_settings(name) for name in METHODS}
     taken = {name for method in methods for name in by_method[method]}
     for name in sorted(
@@ -140,7 +151,18 @@ def require_used_settings(settings: ImagingSettings, methods: Sequence[str]) -> 
 
 
 def require_valid_settings(settings: ImagingSettings, methods: Sequence[str]) -> None:
-    """Refuse settings that no capture could make sense of, before any is read."""
+    """Refuse settings that no capture could make sense of, before any is read.
+
+    Parameters
+    ----------
+    settings : ImagingSettings
+    methods : sequence of str
+
+    Raises
+    ------
+    InputError
+        There is such a setting.
+    """
     require_used_settings(settings, methods)
     if settings.flip not in (None, "x", "y"):
         raise InputError(f"flip is x or y, got '{settings.flip}'")
@@ -179,6 +201,19 @@ def to_library(settings: ImagingSettings) -> Settings:
 def from_library(settings: Imaging, found: Settings, methods: Sequence[str]) -> Imaging:
     """Return the command line's settings with what was found, and what the methods' classes take
     where nothing is given; what none of the methods takes is left out.
+
+    Parameters
+    ----------
+    settings : ImagingSettings
+        As given on the command line.
+    found : Settings
+        What the library chose for the rest, in m.
+    methods : sequence of str
+
+    Returns
+    -------
+    ImagingSettings
+        In mm where names end so.
     """
     kept: dict[str, Any] = {
         name: None
@@ -216,6 +251,16 @@ def from_library(settings: Imaging, found: Settings, methods: Sequence[str]) -> 
 def choose_device(device: str, settings: ImagingSettings) -> ComputeDevice:
     """Return the device that a name asks for; ``auto`` stays with the compiled loops where a method
     has nothing else.
+
+    Parameters
+    ----------
+    device : str
+        See `tofclip.arrays.parse_device`.
+    settings : ImagingSettings
+
+    Returns
+    -------
+    ComputeDevice
     """
     from tofclip.arrays import ComputeDevice, parse_device
 
@@ -271,7 +316,18 @@ Refining = TypeVar("Refining", bound=RefinementSettings)
 
 
 def require_valid_refinement(settings: RefinementSettings, method: str | None) -> None:
-    """Refuse a refinement that makes no sense, and settings of one that nobody asked for."""
+    """Refuse a refinement that makes no sense, and settings of one that is not asked for.
+
+    Parameters
+    ----------
+    settings : RefinementSettings
+    method : str, optional
+
+    Raises
+    ------
+    InputError
+        One of these is the case.
+    """
     if settings.refine is None:
         for name in ("iterations", "prior_weight"):
             if getattr(settings, name) is not None:
@@ -392,6 +448,16 @@ def prepare_imaging(
 def image_capture(title: str, plan: Plan, capture: Capture) -> Volume:
     """Image the hidden scene under a progress bar that counts look-ups or voxels, whichever the
     plan does.
+
+    Parameters
+    ----------
+    title : str
+    plan : Plan
+    capture : Capture
+
+    Returns
+    -------
+    Volume
     """
     with show_progress(title, plan.cost) as advance:
         return plan.image(capture, advance)

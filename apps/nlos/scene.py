@@ -158,10 +158,20 @@ def choose_time_axis(
 
     A sum of distances is largest at a corner of the box about what is hidden.
 
-    import numpy as np
+    Parameters
+    ----------
+    wall : (..., 3) float64 array
+        Metres; NaN where there is no wall.
+    laser : (..., 3) float64 array
+        Metres.
+    hidden : (n, 3) float64 array
+        Metres.
+    bin_width, jitter : float
+        Seconds; the jitter is the response's standard deviation.
 
-    from nlos.capture import TimeAxis
-    from tofclip.units import SPEED_OF_LIGHT
+    Returns
+    -------
+    TimeAxis
 
     Raises
     ------

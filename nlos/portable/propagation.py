@@ -63,6 +63,15 @@ class PortablePropagation:
         """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies), complex64.
 
         Progress counts points of the plane times frequencies, all at once.
+
+        Parameters
+        ----------
+        phasors : (n, frequencies) complex64 array
+        progress : callable
+
+        Returns
+        -------
+        (y, x, frequencies) complex64 array
         """
         if self._propagator is None:
             self._propagator = self._choose_propagator(phasors)

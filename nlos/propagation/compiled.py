@@ -64,6 +64,15 @@ class CompiledPropagation:
         """Return the field (y, x, frequencies) on the plane of phasors (n, frequencies), complex64.
 
         Progress counts points of the plane times frequencies.
+
+        Parameters
+        ----------
+        phasors : (n, frequencies) complex64 array
+        progress : callable
+
+        Returns
+        -------
+        (y, x, frequencies) complex64 array
         """
         if not self._planned:
             self._plan, self._planned = self._choose_plan(phasors), True
@@ -156,7 +165,16 @@ class _Workspace:
     def propagate_group(
         self, number: int, phasors: NDArray[np.complex64], field: NDArray[np.complex64]
     ) -> None:
-        """Carry one group of frequencies."""
+        """Propagate one group of frequencies.
+
+        Parameters
+        ----------
+        number : int
+            Of the group.
+        phasors : (points, frequencies) complex64 array
+        field : (frequencies, y, x) complex64 array
+            Overwritten at the group's frequencies.
+        """
         plan = self.plan
         group, terms = plan.low_rank_transfer.groups[number], plan.low_rank_transfer.terms(number)
         values = np.ascontiguousarray(phasors[:, group].T)
@@ -184,6 +202,21 @@ def propagate_direct(
     frequencies) complex64.
 
     See `sum_spherical_waves`.
+
+    Parameters
+    ----------
+    points : (n, 3) float64 array
+        Wall points, m.
+    phasors : (n, frequencies) complex64 array
+    plane : Plane
+    wavenumbers : (frequencies,) float64 array
+        rad/m.
+    progress : callable
+        Called with the number of plane points times frequencies just done.
+
+    Returns
+    -------
+    (y, x, frequencies) complex64 array
     """
     return sum_spherical_waves(
         plane.points.reshape(-1, 3), points, phasors, wavenumbers, progress

@@ -77,7 +77,19 @@ class Window:
 
 
 def find_max_offsets(sources: Plane, y: FloatArray, x: FloatArray) -> Sides:
-    """Return the largest distance of a source on a plane from a target along y and along x, m."""
+    """Return the largest distance of a source on a plane from a target along y and along x, m.
+
+    Parameters
+    ----------
+    sources : Plane
+    y, x : (n,) float64 array
+        Coordinates of the targets, ascending, m.
+
+    Returns
+    -------
+    (float, float)
+        Along y and along x, m.
+    """
     pairs = ((y, sources.y), (x, sources.x))
     along_y, along_x = (float(max(abs(a[-1] - b[0]), abs(a[0] - b[-1]))) for a, b in pairs)
     return along_y, along_x
