@@ -21,6 +21,9 @@ from tofclip.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
+SAME_SPOT_FRACTION = 1e-6
+"""Of the wall's width: nearer to each other, a laser spot and a wall point are one."""
+
 MIN_POINTS_PER_SPOT = 4
 """With fewer wall points per laser spot, a wave from each spot is not worth its own field."""
 
@@ -68,8 +71,12 @@ class IlluminationGroup:
 
 
 def is_confocal(capture: Capture) -> bool:
-    """Whether every wall point is its own laser spot."""
-    return len(capture.lasers) > 1 and np.array_equal(capture.lasers, capture.points)
+    """Whether every wall point is its own laser spot, but for rounding."""
+    if len(capture.lasers) != len(capture.points) or len(capture.points) == 1:
+        return False
+    extent = float(np.ptp(capture.points, axis=0).max())
+    apart = float(np.abs(capture.lasers - capture.points).max())
+    return apart <= SAME_SPOT_FRACTION * extent
 
 
 def group_by_illumination(capture: Capture) -> list[IlluminationGroup]:

@@ -19,7 +19,13 @@ from nlos.capture import Capture
 from nlos.geometry import Grid
 from nlos.illumination_groups import is_confocal
 from nlos.method import Method, Plan
-from nlos.preparation import fade_record_end, flip_capture, rebin_capture, remove_first_bounce
+from nlos.preparation import (
+    fade_record_end,
+    flip_capture,
+    join_near_lasers,
+    rebin_capture,
+    remove_first_bounce,
+)
 from nlos.signal_analysis import (
     SignalSpectrum,
     find_brightest_path,
@@ -155,6 +161,7 @@ class Settings:
 
     def prepare(self, capture: Capture) -> Capture:
         """Mirror coordinates, blank the wall's own light and put time bins together, as settings say."""
+        capture = join_near_lasers(capture)
         if self.flip:
             capture = flip_capture(capture, self.flip)
         if self.gate is not None:
@@ -251,6 +258,7 @@ def settings_for(capture: Capture, **given: Any) -> Settings:
 
 def complete_settings(capture: Capture, **given: Any) -> Settings:
     """Find settings that suit a capture, but for the method; see `settings_for`."""
+    capture = join_near_lasers(capture)
     found = _complete_gate(capture, Settings(**given))
     gated = replace(found, bins_together=1).prepare(capture)
     if found.fade is None and find_lit_end(gated):

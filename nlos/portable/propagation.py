@@ -107,7 +107,7 @@ class _FrequencyGroup:
 
 
 class _LowRankPropagator:
-    """A wall in relief: every term is one flat wall; see `nlos.propagation.low_rank_propagation`."""
+    """A wall in relief: every term is one flat wall; see `nlos.propagation.compiled`."""
 
     def __init__(self, plan: WallToPlanePlan, library: ArrayLibrary) -> None:
         self.plan, self.library = plan, library
@@ -220,7 +220,7 @@ class _LowRankPropagator:
 
 
 class _DirectPropagator:
-    """Every wall point's spherical wave, summed; see `nlos.propagation.direct`."""
+    """Every wall point's spherical wave, summed; see `nlos.propagation.compiled`."""
 
     def __init__(
         self, points: FloatArray, plane: Plane, waves: SphericalWaves, library: ArrayLibrary

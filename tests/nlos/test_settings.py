@@ -115,6 +115,21 @@ def test_a_bright_wall_is_noticed() -> None:
         assert is_brightest_on_wall(Volume(values, grid), clean(), 0.1) == on_wall
 
 
+@pytest.mark.parametrize(("apart", "error"), [(1e-7, 0.02), (1e-3, 0.05), (15e-3, 0.1)])
+def test_a_laser_near_its_detector_is_confocal(apart: float, error: float) -> None:
+    lasers = WALL + np.array([apart, 0, 0])
+    capture = PointScene(HIDDEN, [400.0]).simulate_capture(WALL, lasers, AXIS, 40e-12)
+    settings = settings_for(capture)
+    assert settings.method == "rsd"
+    grid = Grid.box((-0.2, 0.3), (-0.35, 0.15), (0.7, 0.9), 0.05)
+    fast = settings.make_method().reconstruct(settings.prepare(capture), grid).values
+    # The same record, with the geometry as it is.
+    true = replace(settings.prepare(capture), wall=WALL, laser=lasers)
+    exact = settings.make_method("backprojection").reconstruct(true, grid)
+    scale = np.vdot(exact.values, fast) / np.vdot(exact.values, exact.values)
+    assert np.linalg.norm(fast / scale - exact.values) < error * np.linalg.norm(exact.values)
+
+
 @pytest.mark.parametrize(
     ("name", "gated", "shortest", "longest"),
     [
