@@ -158,6 +158,10 @@ class AdjointImaging:
         capture : CompressedCapture
         grid : Grid
 
+        Returns
+        -------
+        Plan
+
         Raises
         ------
         InputError

@@ -131,6 +131,11 @@ class Hybrid(PhasorMethod):
         band : Band
         backend : Backend
 
+        Returns
+        -------
+        list
+            One plan for each illumination group.
+
         Raises
         ------
         InputError

@@ -122,6 +122,10 @@ def build_waves(group: IlluminationGroup, band: Band, continued: bool) -> Spheri
     band : Band
     continued : bool
         Whether they go on from a plane, or start at points; see `SphericalWaves`.
+
+    Returns
+    -------
+    SphericalWaves
     """
     k = group.legs * band.wavenumbers
     step = float(k[1] - k[0]) if k.size > 1 else 1.0

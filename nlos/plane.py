@@ -133,12 +133,16 @@ def choose_virtual_plane(
     points : (n, 3) array
         Wall points, m.
     grid : Grid
-    waves : Waves
+    waves : SphericalWaves
     zones : float
         Room beside the straight ways, in radii of the first Fresnel zone.
     z : float, optional
         Where, m. Defaults to the shortest wavelength, but 5 to 10 cm, in front of the foremost wall
         point.
+
+    Returns
+    -------
+    Plane
     """
     low, high = points.min(axis=0), points.max(axis=0)
     shortest, middle = (

@@ -98,6 +98,10 @@ def remove_first_bounce(capture: Capture, margin: float, ramp: float = 0.0) -> C
         m of path over which signals then rise to their whole strength, as a raised cosine; a sharp
         edge would show as a plane at half the margin.
 
+    Returns
+    -------
+    Capture
+
     Raises
     ------
     InputError
@@ -156,6 +160,10 @@ def flip_capture(capture: Capture, axis: str) -> Capture:
     axis : {"x", "y"}
         Its coordinates change sign.
 
+    Returns
+    -------
+    Capture
+
     Raises
     ------
     InputError
@@ -185,6 +193,10 @@ def fade_record_end(capture: Capture, length: float) -> Capture:
     capture : Capture
     length : float
         m of path before the end.
+
+    Returns
+    -------
+    Capture
 
     Raises
     ------

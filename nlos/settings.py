@@ -197,6 +197,11 @@ class Settings:
         names : sequence of str
             Methods in the order in which they are tried.
 
+        Returns
+        -------
+        name : str
+        plan : Plan
+
         Raises
         ------
         InputError
@@ -344,6 +349,11 @@ def find_shortest_wavelength(capture: Capture, cycles: float) -> float:
     capture : Capture
     cycles : float
         Length of the pulse in wavelengths.
+
+    Returns
+    -------
+    float
+        Metres.
     """
     return _band_reach(cycles) * max(_sampling_limit(capture), 2 * capture.axis.spacing)
 
@@ -389,6 +399,10 @@ def find_bright_box(settings: Settings, scouted: Volume) -> Settings:
         On `scout_grid`. An image through a virtual pulse, whichever method images later: lct and fk
         make up for the loss of light with distance, and would take the noise of the farthest depths
         for the brightest things.
+
+    Returns
+    -------
+    Settings
     """
     part = Grid.around(scouted, settings.voxel or math.nan)
     x, y, z = ((float(axis[0]), float(axis[-1])) for axis in (part.x, part.y, part.z))
@@ -404,6 +418,10 @@ def is_brightest_on_wall(volume: Volume, capture: Capture, wavelength: float) ->
     capture : Capture
     wavelength : float
         Nearer to a wall point than half of it, m, is on the wall.
+
+    Returns
+    -------
+    bool
     """
     away = np.linalg.norm(capture.points - np.array(volume.find_brightest()), axis=1)
     return bool(away.min() < BRIGHTEST_ON_WALL_WAVELENGTHS * wavelength)

@@ -139,6 +139,10 @@ class SignalSpectrum:
         capture : Capture
         margin : float
             m of path before light may come that a wave reaches ahead.
+
+        Returns
+        -------
+        SignalSpectrum
         """
         traces, direct = _select_traces(capture)
         # Waves would see an edge where the record ends while light still comes.

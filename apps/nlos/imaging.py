@@ -419,6 +419,10 @@ def prepare_imaging(
         That will image; by default the one in the settings, or the quickest.
     device : ComputeDevice, optional
         Where to compute; where the capture is by default.
+
+    Returns
+    -------
+    PreparedImaging
     """
     from nlos.illumination_groups import AliasingWarning
     from nlos.settings import complete_settings, find_bright_box, scout_grid

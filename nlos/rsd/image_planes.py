@@ -78,6 +78,10 @@ def split_illumination(
         m.
     tolerance : float
         Root mean square error allowed, relative.
+
+    Returns
+    -------
+    Illumination
     """
     # Even and odd functions are known by their values at the positive half of the nodes.
     angles = np.pi * (np.arange(CHEBYSHEV_NODES // 2) + 0.5) / CHEBYSHEV_NODES

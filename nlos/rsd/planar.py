@@ -117,6 +117,11 @@ class PlanarRSD(PhasorMethod):
         band : Band
         backend : Backend
 
+        Returns
+        -------
+        list
+            One plan for each illumination group.
+
         Raises
         ------
         InputError

@@ -63,6 +63,10 @@ class Window:
             As `find_max_offsets` gives it.
         periods : (float, float)
             Along y and x, m; at least `find_min_periods`.
+
+        Returns
+        -------
+        Window
         """
         corner, along = float(np.hypot(*farthest)), max(farthest)
         room = min(period - far for period, far in zip(periods, farthest, strict=True))
