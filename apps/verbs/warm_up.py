@@ -32,7 +32,16 @@ IMAGINGS = (
 )
 """Walls, scans, and the methods to run on them."""
 
-HIDDEN_POINT = ("--points", "0.1,-0.05,0.6", "--wall-width-m", "0.8", "--bin-width-ps", "16")
+HIDDEN_SCENE = (
+    "--letters",
+    "T",
+    "--facet-mm",
+    "100",
+    "--wall-width-m",
+    "0.8",
+    "--bin-width-ps",
+    "16",
+)
 
 
 def warm_up(as_json: JsonOption = False) -> None:
@@ -67,9 +76,10 @@ def _list_steps(folder: Path) -> Iterator[Sequence[str]]:
     yield ("cloud", str(frames), "--out", str(folder / "cloud.ply"))
     yield ("lidar", "accuracy", "--trials", "10")
     yield ("lidar", "sequence", str(shots), "--out", str(folder / "clouds"))
+    yield ("demo", "--out", str(folder / "demo"))
     for wall, scan, methods in IMAGINGS:
         capture = str(folder / f"{wall}_{scan}.h5")
-        scene = ("--wall", wall, "--scan", scan, "--wall-points", "12", *HIDDEN_POINT)
+        scene = ("--wall", wall, "--scan", scan, "--wall-points", "12", *HIDDEN_SCENE)
         yield ("nlos", "simulate", *scene, "--out", capture)
         for method in methods:
             volume = str(folder / f"{method}.h5")

@@ -28,6 +28,9 @@ FULL_LIGHT_PERCENTILE = 85.0
 MIN_SHADE = 0.15
 GAMMA = 0.8
 
+SMALLEST_IN_METRES = 0.1
+"""Lengths below are in mm."""
+
 MAX_RANKED_POINTS = 100_000
 """Points from which an equalised scale is made; more would cost time and change nothing to be seen."""
 
@@ -90,7 +93,7 @@ class Colouring:
     quantity: str = "range"
     palette: str = "turbo"
     limits: tuple[float, float] | None = None
-    equalised: bool = True
+    equalised: bool = False
     shaded: bool = True
 
     def __post_init__(self) -> None:
@@ -147,6 +150,46 @@ class Scale:
             )
         colours: NDArray[np.uint8] = load_palette(self.palette)[number]
         return colours
+
+
+def format_length(length: float) -> str:
+    """Return a length in m as a person writes it: ``0.42 mm``, ``31 mm``, ``1.85 m``."""
+    if abs(length) < SMALLEST_IN_METRES:
+        return f"{1e3 * length:.3g} mm"
+    return f"{length:.3g} m"
+
+
+def choose_ticks(scale: Scale, count: int = 6) -> tuple[list[tuple[float, str]], str]:
+    """Return round values of a scale and its title, in a unit in which the numbers are short.
+
+    Parameters
+    ----------
+    scale : Scale
+    count : int
+        About how many there should be.
+
+    Returns
+    -------
+    list of (float, str), str
+        Where each one lies, 0 for the first colour to 1 for the last, and its number; then the
+        quantity with its unit.
+    """
+    low, high = scale.limits
+    factor, unit = 1.0, scale.unit
+    if unit == "m" and max(abs(low), abs(high)) < SMALLEST_IN_METRES:
+        factor, unit = 1e3, "mm"
+    step = 10.0 ** np.floor(np.log10((high - low) * factor / count))
+    # the smallest of 1, 2, 5 and 10 times a power of ten that gives no more than asked for
+    step *= next(nice for nice in (1, 2, 5, 10) if (high - low) * factor / (nice * step) <= count)
+    values = step * np.arange(np.ceil(low * factor / step), np.floor(high * factor / step) + 1)
+    places = np.interp(values / factor, scale.values, np.linspace(0, 1, PALETTE_SIZE))
+    digits = max(0, -int(np.floor(np.log10(step))))
+    labels = [
+        f"{value:.1e}".replace("e+0", "e") if abs(value) >= 1e4 else f"{value:.{digits}f}"
+        for value in values + 0.0  # no -0
+    ]
+    title = f"{scale.quantity} ({unit})" if unit else scale.quantity
+    return list(zip(places.tolist(), labels, strict=True)), title
 
 
 def make_scale(cloud: PointCloud, colouring: Colouring) -> Scale:

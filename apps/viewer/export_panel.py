@@ -6,12 +6,14 @@ from __future__ import annotations
 
 import io
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from apps.figures.style import DOTS_PER_INCH, make_figure
+from apps.viewer.colouring import choose_ticks, load_palette
 from apps.viewer.raster import BACKGROUND
 from apps.viewer.session import Session
 from apps.viewer.viewpoint import Viewpoint
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 Post = Callable[[Callable[[], None]], None]
 RENDER_TIMEOUT_S = 20.0  # s
 MAX_SIDE_PX = 1600
+LEGEND_PX = 70  # below the picture
 
 
 class ExportPanel:
@@ -32,23 +35,28 @@ class ExportPanel:
     server : ViserServer
     session : Session
     post : callable
-    viewpoint : Viewpoint
-        Where one looks from at first.
+    views : mapping of str to Viewpoint
+        Where one can look from; the first is where one looks from at first.
     """
 
     def __init__(
-        self, server: viser.ViserServer, session: Session, post: Post, viewpoint: Viewpoint
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        post: Post,
+        views: Mapping[str, Viewpoint],
     ) -> None:
         self._server, self._session, self._post = server, session, post
         self._bookmarked_views: dict[str, tuple[Any, Any]] = {
-            "start": (viewpoint.eye, viewpoint.target)
+            name: (view.eye, view.target) for name, view in views.items()
         }
+        self._bookmarks_made = 0
         gui = server.gui
         gui.add_button("screenshot").on_click(lambda event: self._send_screenshot(event.client))
         gui.add_button("export", hint="the points that are shown, as PLY").on_click(
             lambda event: self._post(lambda: self._send_points(event.client))
         )
-        self._bookmarks: Any = gui.add_dropdown("view from", ("start",))
+        self._bookmarks: Any = gui.add_dropdown("view from", tuple(views))
         self._bookmarks.on_update(self._go_to_bookmark)
         gui.add_button("bookmark", hint="remember where one looks from").on_click(
             lambda event: self._add_bookmark(event.client)
@@ -66,7 +74,9 @@ class ExportPanel:
             round(shrink * side) for side in (client.camera.image_height, client.camera.image_width)
         )
         drawn = client.get_render(height, width, transport_format="png", timeout=RENDER_TIMEOUT_S)
-        client.send_file_download("tofclip.png", _encode_png(drawn), save_immediately=True)
+        client.send_file_download(
+            "tofclip.png", _encode_png(drawn, self._session), save_immediately=True
+        )
 
     def _send_points(self, client: viser.ClientHandle | None) -> None:
         shown = self._session.latest
@@ -80,7 +90,8 @@ class ExportPanel:
     def _add_bookmark(self, client: viser.ClientHandle | None) -> None:
         if client is None:
             return
-        name = f"view {len(self._bookmarked_views)}"
+        self._bookmarks_made += 1
+        name = f"view {self._bookmarks_made}"
         self._bookmarked_views[name] = client.camera.position.copy(), client.camera.look_at.copy()
         self._bookmarks.options = tuple(self._bookmarked_views)
         self._bookmarks.value = name
@@ -136,12 +147,28 @@ class ExportPanel:
             self._session.play()
 
 
-def _encode_png(drawn: Any) -> bytes:
-    """Put a picture with a transparent ground on a dark one, as on the page."""
-    from matplotlib.image import imsave
+def _encode_png(drawn: Any, session: Session) -> bytes:
+    """Put a picture with a transparent ground on a dark one, as on the page, with the legend of its
+    colours below.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import ListedColormap
 
-    share = drawn[..., 3:] / 255.0 if drawn.shape[-1] == 4 else 1.0
-    flat = drawn[..., :3] * share + np.array(BACKGROUND) * (1 - share)
+    opacity = drawn[..., 3:] / 255.0 if drawn.shape[-1] == 4 else 1.0
+    flat = drawn[..., :3] * opacity + np.array(BACKGROUND) * (1 - opacity)
+    rows, columns = flat.shape[:2]
+    figure = make_figure(columns / DOTS_PER_INCH, (rows + LEGEND_PX) / DOTS_PER_INCH)
+    figure.set_layout_engine("none")
+    figure.figimage(np.rint(flat).astype(np.uint8), yo=LEGEND_PX, origin="upper")
+    shown = session.latest
+    if shown is not None:
+        axes = figure.add_axes((0.2, 0.6 * LEGEND_PX / (rows + LEGEND_PX), 0.6, 0.012))
+        ticks, title = choose_ticks(shown.scale)
+        mapped = ScalarMappable(cmap=ListedColormap(load_palette(shown.scale.palette) / 255.0))
+        bar = figure.colorbar(mapped, cax=axes, orientation="horizontal")
+        bar.set_ticks([place for place, _ in ticks], labels=[label for _, label in ticks])
+        bar.set_label(f"{session.source.title}: {title}", fontsize=9)
+        axes.tick_params(labelsize=8)
     file = io.BytesIO()
-    imsave(file, np.rint(flat).astype(np.uint8), format="png")
+    figure.savefig(file, format="png", dpi=DOTS_PER_INCH)
     return file.getvalue()

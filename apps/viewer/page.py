@@ -10,15 +10,17 @@ from typing import Any
 
 import numpy as np
 
+from apps.viewer.colouring import format_length
 from apps.viewer.controls import Controls
 from apps.viewer.export_panel import ExportPanel
 from apps.viewer.page_text import Status, format_page_title
 from apps.viewer.rates import FramePacer, RateCounter
+from apps.viewer.scene_figure import LABELLED_EDGES
 from apps.viewer.selection_panel import NO_SHADOWS, SelectionPanel
 from apps.viewer.server import LOOPBACK, get_address, start_server, stop_server
 from apps.viewer.session import DisplayedFrame, Session
 from apps.viewer.side_pictures import render_pictures
-from apps.viewer.viewpoint import Viewpoint, place_viewpoint
+from apps.viewer.viewpoint import Box, Viewpoint, make_presets, place_viewpoint
 from tofclip.errors import TofclipError
 
 TICK_S = 1 / 60
@@ -42,6 +44,7 @@ POINT_STYLE: dict[str, Any] = {
     "precision": "float32",
 }
 SURFACE_COLOUR = (216, 210, 196)
+BOX_COLOUR, BOX_LINE_PX = (139, 147, 163), 1.0
 
 
 class Page:
@@ -71,9 +74,14 @@ class Page:
         self.address = get_address(self.server, host)
         self._pace, self._frames = FramePacer(), RateCounter()
         self._set_up_scene()
+        presets = make_presets(first.cloud.xyz) if len(first.cloud) else {}
         self.controls = Controls(self.server, session, self.post, first)
+        if len(first.cloud):
+            self._draw_box(Box.around(first.cloud.xyz))
         self._selection_panel = SelectionPanel(self.server, session, self.post)
-        self._export_panel = ExportPanel(self.server, session, self.post, self.viewpoint)
+        self._export_panel = ExportPanel(
+            self.server, session, self.post, {"start": self.viewpoint, **presets}
+        )
         self._pictures: dict[str, Any] = {}
         self._drawn: DisplayedFrame | None = None
         self._status_at = self._pictures_at = 0.0
@@ -132,6 +140,28 @@ class Page:
         )
         server.on_client_connect(lambda _: self.post(self._redraw_pictures))
 
+    def _draw_box(self, box: Box) -> None:
+        """Draw a box around the first cloud with the lengths of its sides, which is the scale."""
+        scene, corners = self.server.scene, box.corners
+        segments = corners[np.array(box.edges)].astype(np.float32)
+        drawn: list[Any] = [
+            scene.add_line_segments(
+                "/box", segments, BOX_COLOUR, thickness=BOX_LINE_PX, thickness_units="screen"
+            )
+        ]
+        for axis, edge in enumerate(LABELLED_EDGES):
+            length = format_length(float(box.high[axis] - box.low[axis]))
+            middle = corners[list(edge)].mean(axis=0)
+            drawn.append(
+                scene.add_label(f"/box_{'xyz'[axis]}", f"{'xyz'[axis]} {length}", position=middle)
+            )
+        shown = self.server.gui.add_checkbox("box", True, hint="lengths of the first cloud")
+
+        @shown.on_update
+        def _(_: Any) -> None:
+            for node in drawn:
+                node.visible = shown.value
+
     def _redraw_pictures(self) -> None:
         """Show the flat pictures at once on a page that has just opened."""
         self._pictures_at, self._pictured = 0.0, None
@@ -176,6 +206,7 @@ class Page:
 
     def _status(self, shown: DisplayedFrame, now: float) -> Status:
         source = self.session.source
+        times = source.capabilities.times
         return Status(
             self.session.label,
             shown.frame,
@@ -186,6 +217,7 @@ class Page:
             source.latency,
             source.lost,
             source.failure_text,
+            float("nan") if times is None else float(times[shown.frame]),
         )
 
     def _show_pictures(self, shown: DisplayedFrame) -> None:

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apps.viewer.colouring import PALETTE_SIZE, Scale, load_palette
+from apps.viewer.colouring import PALETTE_SIZE, Scale, choose_ticks, load_palette
+from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
 
 GRADIENT_STOPS = 24
-SCALE_TICKS = 6
 HTML_STYLE = "padding:0.2em 0.8em 0.6em;font-size:0.85em;line-height:1.5"
 
 
@@ -33,6 +33,8 @@ class Status:
     lost : int
         Shots that came in too fast and were dropped.
     failure_text : str
+    time : float
+        Time of flight of the frame, s; NaN where frames have none.
     """
 
     label: str
@@ -44,6 +46,7 @@ class Status:
     cloud_latency: float = float("nan")
     lost: int = 0
     failure_text: str = ""
+    time: float = float("nan")
 
     @property
     def html(self) -> str:
@@ -55,6 +58,12 @@ class Status:
             if np.isfinite(self.cloud_latency)
             else ""
         )
+        instant = (
+            f"<br><span id='instant'>{self.time / NANOSECOND:.2f} ns, range "
+            f"{SPEED_OF_LIGHT * self.time / 2:.3f} m</span>"
+            if np.isfinite(self.time)
+            else ""
+        )
         trouble = (
             f"<div style='color:#e5484d'>{html.escape(self.failure_text)}</div>"
             if self.failure_text
@@ -63,7 +72,7 @@ class Status:
         return (
             f"<div style='{HTML_STYLE}'><b id='label' style='color:{colour}'>{self.label}</b> "
             f"frame <b id='frame-number'>{self.frame}</b> of {self.frames}, <span id='points'>{self.points}</span> "
-            f"points<br><span id='rates'>data {self.data_rate:.1f}/s, shown "
+            f"points{instant}<br><span id='rates'>data {self.data_rate:.1f}/s, shown "
             f"{self.frame_rate:.1f}/s{coming}</span>{trouble}</div>"
         )
 
@@ -74,13 +83,15 @@ def render_scale_html(scale: Scale) -> str:
         np.linspace(0, PALETTE_SIZE - 1, GRADIENT_STOPS).round().astype(int)
     ]
     stops = ",".join(f"rgb({red},{green},{blue})" for red, green, blue in colours.tolist())
-    values = scale.values[np.linspace(0, PALETTE_SIZE - 1, SCALE_TICKS).round().astype(int)]
-    ticks = "".join(f"<span>{value:.3g}</span>" for value in values)
-    unit = f" ({scale.unit})" if scale.unit else ""
+    places, title = choose_ticks(scale)
+    ticks = "".join(
+        f"<span style='position:absolute;left:{100 * place:.1f}%;transform:translateX(-50%)'>{label}</span>"
+        for place, label in places
+    )
     return (
-        f"<div id='scale' style='{HTML_STYLE}'>{scale.quantity}{unit}"
+        f"<div id='scale' style='{HTML_STYLE}'>{title}"
         f"<div style='height:0.9em;background:linear-gradient(to right,{stops})'></div>"
-        f"<div style='display:flex;justify-content:space-between'>{ticks}</div></div>"
+        f"<div style='position:relative;height:1.5em'>{ticks}</div></div>"
     )
 
 

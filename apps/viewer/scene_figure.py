@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.viewer.colouring import PALETTE_SIZE, load_palette
-from apps.viewer.viewpoint import Viewpoint, place_viewpoint
+from apps.viewer.colouring import PALETTE_SIZE, choose_ticks, format_length, load_palette
+from apps.viewer.viewpoint import Box, Viewpoint, place_viewpoint
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -98,12 +97,11 @@ class SceneFigure:
 
         mapped = ScalarMappable(cmap=ListedColormap(load_palette(scale.palette) / 255.0))
         mapped.set_clim(0, PALETTE_SIZE - 1)
-        places = np.linspace(0, PALETTE_SIZE - 1, COLOUR_BAR_TICKS)
+        ticks, title = choose_ticks(scale, COLOUR_BAR_TICKS)
+        places = [place * (PALETTE_SIZE - 1) for place, _ in ticks]
         bar = self._figure.colorbar(mapped, ax=self._axes, shrink=0.8, pad=0.01, ticks=places)
-        bar.set_ticklabels([f"{scale.values[round(place)]:.3g}" for place in places])
-        bar.set_label(
-            f"{scale.quantity} ({scale.unit})" if scale.unit else scale.quantity, fontsize=9
-        )
+        bar.set_ticklabels([label for _, label in ticks])
+        bar.set_label(title, fontsize=9)
         bar.ax.tick_params(labelsize=8)
 
 
@@ -138,18 +136,15 @@ def _make_axes() -> tuple[Figure, Any, Any]:
 
 def _draw_box(axes: Any, viewpoint: Viewpoint, xyz: NDArray[np.float32]) -> None:
     """Draw the box around nearly all points, and say how long its sides are."""
-    low, high = np.percentile(xyz, (0.5, 99.5), axis=0)
-    corners = np.array(
-        [[(low, high)[(n >> axis) & 1][axis] for axis in range(3)] for n in range(8)]
-    )
-    row, column, _ = viewpoint.project(corners, PICTURE_SHAPE_PX)
-    for first, second in combinations(range(8), 2):
-        axis = {1: 0, 2: 1, 4: 2}.get(first ^ second)
-        if axis is not None:
-            ends = [first, second]
-            axes.plot(column[ends], row[ends], color=BOX_COLOUR, linewidth=0.6, alpha=0.6)
-            if (first, second) in LABELLED_EDGES:
-                _label_length(axes, column[ends], row[ends], "xyz"[axis], high[axis] - low[axis])
+    box = Box.around(xyz)
+    row, column, _ = viewpoint.project(box.corners, PICTURE_SHAPE_PX)
+    for edge in box.edges:
+        ends = list(edge)
+        axes.plot(column[ends], row[ends], color=BOX_COLOUR, linewidth=0.6, alpha=0.6)
+    for axis, (first, second) in enumerate(LABELLED_EDGES):
+        ends = [first, second]
+        length = float(box.high[axis] - box.low[axis])
+        _label_length(axes, column[ends], row[ends], "xyz"[axis], length)
     axes.set_xlim(-0.5, PICTURE_SHAPE_PX[1] - 0.5)
     axes.set_ylim(PICTURE_SHAPE_PX[0] - 0.5, -0.5)
 
@@ -158,7 +153,7 @@ def _label_length(
     axes: Any, column: NDArray[Any], row: NDArray[Any], name: str, length: float
 ) -> None:
     words = {"color": BOX_COLOUR, "fontsize": 7, "ha": "center", "va": "bottom", "clip_on": True}
-    axes.text(float(column.mean()), float(row.mean()), f"{name} {length:.3g} m", **words)
+    axes.text(float(column.mean()), float(row.mean()), f"{name} {format_length(length)}", **words)
 
 
 def choose_point_size(points: int) -> int:

@@ -78,6 +78,66 @@ class Viewpoint:
         )
 
 
+@dataclass(frozen=True)
+class Box:
+    """The box around nearly all points of a cloud.
+
+    Parameters
+    ----------
+    low, high : (3,) array
+        Opposite corners, m.
+    """
+
+    low: FloatArray
+    high: FloatArray
+
+    @classmethod
+    def around(cls, xyz: NDArray[np.float32]) -> Box:
+        """Return the box of points (n, 3), m, without the outermost half per cent on each side."""
+        low, high = np.percentile(xyz, (0.5, 99.5), axis=0).astype(np.float64)
+        return cls(low, high)
+
+    @property
+    def corners(self) -> FloatArray:
+        """Corner n has the larger x, y or z where bit 0, 1 or 2 of n is set, (8, 3)."""
+        bits = (np.arange(8)[:, np.newaxis] >> np.arange(3)) & 1
+        return np.where(bits, self.high, self.low)
+
+    @property
+    def edges(self) -> list[tuple[int, int]]:
+        """The twelve edges, by their corners."""
+        return [(n, n | bit) for bit in (1, 2, 4) for n in range(8) if not n & bit]
+
+
+def make_presets(xyz: NDArray[np.float32]) -> dict[str, Viewpoint]:
+    """Return places to look at a cloud from, by name.
+
+    Parameters
+    ----------
+    xyz : (n, 3) array
+        m; not empty.
+
+    Returns
+    -------
+    dict of str to Viewpoint
+        ``"front"``, ``"top"`` and ``"side"`` see the whole cloud; ``"camera"`` is where it was taken
+        from.
+    """
+    box = Box.around(xyz)
+    middle = (box.low + box.high) / 2
+    reach = float(np.linalg.norm(box.high - box.low)) / 2
+    away = VIEW_MARGIN * max(reach, 0.01) / np.sin(FIELD_OF_VIEW_RAD / 2)
+    # straight down, no direction would be up on the page
+    directions = {"front": (0.0, 0.0, -1.0), "top": (0.0, -1.0, -0.01), "side": (1.0, 0.0, 0.0)}
+    views = {
+        name: Viewpoint(middle + away * np.array(towards), middle)
+        for name, towards in directions.items()
+    }
+    if np.linalg.norm(middle) > reach:  # the camera is outside of the cloud
+        views["camera"] = Viewpoint(np.zeros(3), middle)
+    return views
+
+
 def place_viewpoint(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
     """Return a viewpoint close to the camera's own, the origin, from which a cloud is seen whole.
 

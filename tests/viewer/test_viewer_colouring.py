@@ -10,11 +10,15 @@ from viewer_scenes import plane
 
 from apps.viewer.clouds import make_cloud
 from apps.viewer.colouring import (
+    PALETTE_SIZE,
     PALETTES,
     QUANTITIES,
     Colouring,
+    Scale,
+    choose_ticks,
     colour_points,
     find_full_light,
+    format_length,
     load_palette,
     make_scale,
 )
@@ -141,3 +145,29 @@ def test_what_is_known_about_a_pick() -> None:
     ]
     assert first.description.endswith("pixel row 3, column 4")
     assert "pixel" not in second.description
+
+
+@pytest.mark.parametrize(
+    ("limits", "unit", "labels", "title"),
+    [
+        ((1.5889, 1.6848), "m", ["1.60", "1.62", "1.64", "1.66", "1.68"], "x (m)"),
+        ((0.0, 0.00042), "m", ["0.0", "0.1", "0.2", "0.3", "0.4"], "x (mm)"),
+        ((-1.0, 1.0), "", ["-1.0", "-0.5", "0.0", "0.5", "1.0"], "x"),
+        ((0.0, 61234.0), "counts", ["0", "2.0e4", "4.0e4", "6.0e4"], "x (counts)"),
+    ],
+)
+def test_ticks_are_round_numbers_in_a_suitable_unit(
+    limits: tuple[float, float], unit: str, labels: list[str], title: str
+) -> None:
+    scale = Scale("x", unit, "grey", np.linspace(*limits, PALETTE_SIZE))
+    ticks, words = choose_ticks(scale)
+    assert ([label for _, label in ticks], words) == (labels, title)
+    assert all(0 <= place <= 1 for place, _ in ticks)
+
+
+def test_lengths_in_the_unit_that_a_person_would_use() -> None:
+    assert [format_length(one) for one in (0.00042, 0.0314, 1.853)] == [
+        "0.42 mm",
+        "31.4 mm",
+        "1.85 m",
+    ]

@@ -125,6 +125,11 @@ def test_it_loads(seen: Seen) -> None:
     assert "frames <b>.h5" in seen.tab.locator("body").inner_text()  # no file name becomes HTML
     until(lambda: picture(seen).std() > 0.02, "the scene is drawn")
     assert seen.tab.get_by_text("range (m)").is_visible()
+    instant = seen.page.session.source.capabilities.times[95]
+    words = seen.tab.locator("#instant").inner_text()
+    assert words == f"{1e9 * instant:.2f} ns, range {299792458 * instant / 2:.3f} m"
+    for axis in "xyz":  # the lengths of the box
+        assert seen.tab.get_by_text(f"{axis} 0.1").is_visible()
     until(lambda: seen.tab.locator("img").count() >= 3, "streak, intensity and depth are shown")
 
 
@@ -213,6 +218,9 @@ def test_screenshot_export_and_bookmark(seen: Seen, tmp_path: Path) -> None:
     download.value.save_as(tmp_path / "shot.png")
     drawn = imread(tmp_path / "shot.png")[..., :3]
     assert min(drawn.shape[:2]) > 300
+    legend = drawn[-70:]
+    assert legend.mean() > 0.8  # on white
+    assert np.ptp(legend[:, :, 0] - legend[:, :, 2]) > 0.5  # the colours of the ranges
     assert drawn.std() > 0.01
     with seen.tab.expect_download() as download:
         seen.press("export")
@@ -223,7 +231,8 @@ def test_screenshot_export_and_bookmark(seen: Seen, tmp_path: Path) -> None:
         lambda: seen.row("view from").locator("input").first.input_value() == "view 1",
         "the view is remembered",
     )
-    seen.choose("view from", "start")
+    for preset in ("front", "top", "side", "camera", "start"):
+        seen.choose("view from", preset)
 
 
 def test_k_shows_the_keys(seen: Seen) -> None:
