@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from nlos.geometry import Grid
 from tofclip.arrays import Array, ComputeDevice, is_numpy, namespace, to_numpy
 from tofclip.errors import InputError, ShapeError
+from tofclip.notebook import render_html
 from tofclip.storage import Field, Record
 
 if TYPE_CHECKING:
@@ -79,6 +80,15 @@ class Volume:
         if not xp.all(xp.isfinite(values)):
             raise InputError("a volume must not hold NaN or infinity")
         object.__setattr__(self, "values", values)
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.grid.shape))
+        return f"Volume({shape} voxels (z, y, x), {self.values.dtype})"
+
+    def _repr_html_(self) -> str:
+        rows = {"voxels (z, y, x)": " x ".join(map(str, self.grid.shape))}
+        picture = np.abs(to_numpy(self.values)).max(axis=0)
+        return render_html("Volume, seen from the wall", rows, picture)
 
     @property
     def device(self) -> ComputeDevice:

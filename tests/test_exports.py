@@ -17,6 +17,7 @@ NAMES = {
         "TofclipError",
         "__version__",
         "depth",
+        "load",
         "nmse",
         "point_cloud",
         "read_streak",

@@ -6,6 +6,7 @@ from .io import read_streak as read_streak
 from .lidar import PointCloud as PointCloud
 from .lidar import depth as depth
 from .lidar import point_cloud as point_cloud
+from .loading import load as load
 from .metrics import nmse as nmse
 from .recovery import recover as recover
 from .shots import Frames as Frames

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import Array, namespace
+from tofclip.arrays import Array, namespace, to_numpy
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError, MissingTimeAxisError, ShapeError
+from tofclip.notebook import render_html
 from tofclip.records import (
     Storable,
     stored_array,
@@ -33,6 +34,7 @@ from tofclip.storage import (
     require_bounded_dataset,
     translate_read_errors,
 )
+from tofclip.units import SPEED_OF_LIGHT
 
 __all__ = ["Frames", "Streak"]
 
@@ -338,6 +340,75 @@ class Frames(Storable):
         xp = namespace(self.values)
         if not xp.all(xp.isfinite(self.values)):
             raise InputError("frames must not hold NaN or infinity")
+
+    def __len__(self) -> int:
+        return int(self.times.size)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(to_numpy(self.values), dtype=dtype)
+
+    def __getitem__(self, frames: slice) -> Frames:
+        """Return some of the frames, such as ``frames[100:200]``."""
+        if not isinstance(frames, slice):
+            raise InputError(
+                "frames are selected by a slice, such as frames[100:101] for one of them"
+            )
+        return replace(
+            self,
+            values=self.values[frames],
+            times=self.times[frames],
+            shears=self.shears[frames],
+        )
+
+    def sel(
+        self,
+        *,
+        range: tuple[float, float] | None = None,  # noqa: A002 - the field's word
+        time: tuple[float, float] | None = None,
+    ) -> Frames:
+        """Return the frames of some ranges, or of some times of flight, ends included.
+
+        Parameters
+        ----------
+        range : (float, float), optional
+            m.
+        time : (float, float), optional
+            s.
+
+        Returns
+        -------
+        Frames
+
+        Raises
+        ------
+        InputError
+            Neither is given, or both are, or no frame lies between.
+        """
+        if (range is None) == (time is None):
+            raise InputError("sel takes either range=(near, far) in m or time=(first, last) in s")
+        limits = np.asarray(time if range is None else range, dtype=np.float64)
+        at = self.times if range is None else SPEED_OF_LIGHT * self.times / 2
+        first, stop = np.searchsorted(at, limits[0]), np.searchsorted(at, limits[1], side="right")
+        if first >= stop:
+            raise InputError(f"no frame lies between {limits[0]:g} and {limits[1]:g}")
+        return self[int(first) : int(stop)]
+
+    def __repr__(self) -> str:
+        frames, rows, columns = self.values.shape
+        near, far = SPEED_OF_LIGHT * self.times[[0, -1]] / 2
+        return (
+            f"Frames({frames} frames of {rows} x {columns} pixels, range {near:.3g} to {far:.3g} m)"
+        )
+
+    def _repr_html_(self) -> str:
+        near, far = SPEED_OF_LIGHT * self.times[[0, -1]] / 2
+        rows = {
+            "values (time, y, x)": " x ".join(map(str, self.values.shape)),
+            "time of flight": f"{1e9 * self.times[0]:.3f} to {1e9 * self.times[-1]:.3f} ns",
+            "range": f"{near:.3f} to {far:.3f} m",
+            "method": str(self.figures.get("method", "unknown")),
+        }
+        return render_html("Frames", rows, np.asarray(self).max(axis=0))
 
     @property
     def bin_width(self) -> float:

@@ -16,12 +16,12 @@ from tofclip.errors import FileFormatError
 from tofclip.io import read_streak
 from tofclip.io.photons import describe_photons
 from tofclip.lidar import PointCloud
+from tofclip.loading import HDF5_SIGNATURE
 from tofclip.storage import Record, translate_read_errors
 
 if TYPE_CHECKING:
     from tofclip.storage import Field
 
-HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 MAX_LISTED_VALUES = 9  # numbers that are shown one by one
 TABLE_SUFFIXES = (".ply", ".pcd", ".csv", ".npz")
 

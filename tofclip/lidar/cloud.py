@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from tofclip.lidar import export
 from tofclip.lidar.column import Column
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.returns import Returns
+from tofclip.notebook import render_html
 from tofclip.storage import Field, Record
 
 COLUMN_UNITS = {
@@ -82,6 +83,30 @@ class PointCloud:
 
     def __len__(self) -> int:
         return int(self.xyz.shape[0])
+
+    def __getitem__(self, points: Any) -> PointCloud:
+        """Return some of the points: a slice, a mask or numbers, as ``cloud[cloud.range < 2]``."""
+        names = ("xyz", "intensity", "confidence", "range", "return_number", "time")
+        try:
+            chosen = {name: getattr(self, name)[points] for name in names}
+        except (IndexError, TypeError) as fault:
+            raise InputError(
+                f"points are selected by a slice, a mask or numbers: {fault}"
+            ) from fault
+        return replace(self, **chosen)
+
+    def __repr__(self) -> str:
+        if len(self) == 0:
+            return "PointCloud(0 points)"
+        return f"PointCloud({len(self)} points, range {self.range.min():.3g} to {self.range.max():.3g} m)"
+
+    def _repr_html_(self) -> str:
+        rows = {"points": str(len(self))}
+        if len(self):
+            for axis, column in zip("xyz", self.xyz.T, strict=True):
+                rows[axis] = f"{column.min():.3f} to {column.max():.3f} m"
+            rows["range"] = f"{self.range.min():.3f} to {self.range.max():.3f} m"
+        return render_html("PointCloud", rows, None)
 
     def save(self, path: str | Path) -> None:
         """Write the points to a file whose suffix says the format, whole or not at all.
