@@ -129,3 +129,18 @@ def test_displacement_is_the_part_of_parallax_that_moves_the_picture():
     assert columns == pytest.approx(-0.05 / 0.3)
     alone = Camera([60.0], [0.2], (16, 16), 121)
     assert alone.displacement_per_shear == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_shears_that_do_not_change_with_distance_are_refused(noise):
+    distances = np.linspace(1.0, 4.0, 12)
+    shears = 0.3 + noise * np.random.default_rng(1).standard_normal(12)
+    with pytest.raises(CalibrationError, match="do not tell a parallax"):
+        fit_parallax_to_shears(shears, distances)
+
+
+def test_a_parallax_above_its_errors_is_found():
+    distances = np.linspace(1.0, 4.0, 12)
+    noise = 0.02 * np.random.default_rng(2).standard_normal(12)
+    found = fit_parallax_to_shears(-0.8 * (1 / distances - 0.4) + noise, distances)
+    assert found.strength == pytest.approx(0.8, abs=0.1)

@@ -21,6 +21,12 @@ FloatArray = NDArray[np.float64]
 GATE_METHOD = Sparse(weight=5e-3, iterations=30)
 """How a gate is recovered to see whether its views agree."""
 
+SIGNIFICANCE = 2.0
+"""Standard deviations by which a parallax must differ from none."""
+
+MIN_CHANGE_PX = 1e-3
+"""Least change of shear over the distances; less is rounding."""
+
 
 @dataclass(frozen=True)
 class Parallax:
@@ -95,7 +101,8 @@ def fit_parallax_to_shears(
     Raises
     ------
     CalibrationError
-        Fewer than two different distances.
+        Fewer than two different distances, or shears that change with distance by no more than
+        their errors.
     """
     s, d = np.asarray(shears, dtype=np.float64), np.asarray(distances, dtype=np.float64)
     w = np.ones(s.shape) if weight is None else np.asarray(weight, dtype=np.float64)
@@ -107,7 +114,31 @@ def fit_parallax_to_shears(
     design = np.stack([-1 / d, np.ones_like(d)], axis=1)
     (strength, constant), *_ = np.linalg.lstsq(design * root[:, np.newaxis], s * root, rcond=None)
     misfit = np.sqrt(np.average((design @ [strength, constant] - s) ** 2, weights=w))
+    _require_signal(float(strength), design * root[:, np.newaxis], float(misfit**2 * w.sum()))
     return Parallax(float(strength), float(constant / strength), float(misfit))
+
+
+def _require_signal(strength: float, design: FloatArray, squares: float) -> None:
+    """Refuse a strength that could as well be zero, and with it a sign and a focus at random.
+
+    Parameters
+    ----------
+    strength : float
+        Of the fit, px m.
+    design : (n, 2) array
+        Weighted; its first column is what the strength is multiplied with.
+    squares : float
+        Weighted sum of the squares that the fit leaves.
+    """
+    used = design[np.any(design != 0, axis=1)]
+    freedom = max(len(used) - 2, 1)  # two shears fit exactly, and say nothing about their errors
+    covariance = np.linalg.inv(used.T @ used) * squares / freedom
+    change_px = abs(strength) * float(np.ptp(used[:, 0] / used[:, 1]))
+    if abs(strength) <= SIGNIFICANCE * np.sqrt(covariance[0, 0]) or change_px < MIN_CHANGE_PX:
+        raise CalibrationError(
+            f"the shears do not tell a parallax: they change by {change_px:.2g} px over the distances, no more than "
+            "their errors; take surfaces at distances that differ more, or a shot with more light"
+        )
 
 
 def fit_parallax_to_centres(
