@@ -146,7 +146,7 @@ def gather_light(image, gains, first_row, time_shares, first_column, slit_shares
 
 
 @nogil_njit
-def prox_masked_tv(picture, mask, weight, iterations, dual, result):
+def prox_masked_tv(picture, mask, weight, iterations, dual, result):  # noqa: C901 - one loop nest
     """Nonnegative proximal step of total variation on a part of a picture.
 
     Fast gradient projection on the dual (A. Beck and M. Teboulle, IEEE Trans. Image Process. 18,
