@@ -66,6 +66,15 @@ MIN_BAND_OVER_EARLY = 3.0
 MAX_ALIASED_FRACTION = 0.2
 """Of a pulse's signal, what may be of waves finer than the wall samples."""
 
+MAX_LASER_WALL_WIDTHS = 5.0
+"""A laser spot farther from the wall than so many of its widths is a mistake."""
+
+MAX_START_M = 1e3
+"""A record that begins after a longer path, m, still holds the ways to the devices."""
+
+MAX_SIGNAL = 1e30
+"""Larger samples overflow once they are squared."""
+
 WAVELENGTH_STEP_RATIO = 1.05
 """From one wavelength that is tried to the next."""
 
@@ -263,6 +272,7 @@ def settings_for(capture: Capture, **given: Any) -> Settings:
 
 def complete_settings(capture: Capture, **given: Any) -> Settings:
     """Find settings that suit a capture, but for the method; see `settings_for`."""
+    require_plausible(capture)
     capture = join_near_lasers(capture)
     found = _complete_gate(capture, Settings(**given))
     gated = replace(found, bins_together=1).prepare(capture)
@@ -270,10 +280,50 @@ def complete_settings(capture: Capture, **given: Any) -> Settings:
         fade = FADE_FRACTION * float(np.ptp(capture.axis.paths))
         found = _add(found, "fade", fade, "light still comes when the record ends")
         gated = fade_record_end(gated, fade)
+    if not float(abs(gated.signal).max()) > 0:
+        raise InputError(
+            f"a gate of {found.gate or 0.0:.4g} m blanks the whole record; blank less by --gate-m"
+        )
     if found.wavelength is None:
         wavelength, reason = choose_wavelength(gated, found.cycles)
         found = _add(found, "wavelength", wavelength, reason)
     return _complete_box(gated, _complete_sampling(capture, found))
+
+
+def require_plausible(capture: Capture) -> None:
+    """Refuse what no picture can come of, before any work is done.
+
+    Parameters
+    ----------
+    capture : Capture
+
+    Raises
+    ------
+    InputError
+        The wall has no extent, the laser spot is not near the wall, the record begins after all
+        light, or the signals are dark, constant or overflow.
+    """
+    low, high = capture.points.min(axis=0), capture.points.max(axis=0)
+    extent = float((high - low).max())
+    if len(capture.points) > 1 and extent == 0 and capture.laser.ndim == 1:
+        raise InputError("all wall points stand in one place: a capture needs several places")
+    beyond = np.maximum(np.maximum(low - capture.lasers, capture.lasers - high), 0)
+    away = float(np.linalg.norm(beyond, axis=1).max())
+    if extent > 0 and away > MAX_LASER_WALL_WIDTHS * extent:
+        raise InputError(
+            f"the laser spot lies {away:.3g} m from the wall, which is {extent:.3g} m wide: give the spot on the wall"
+        )
+    if capture.start > MAX_START_M:
+        raise InputError(
+            f"the record begins at a path of {capture.start:.4g} m: take the ways to and from the devices off"
+        )
+    largest = float(abs(capture.signal).max())
+    if not largest < MAX_SIGNAL:
+        raise InputError(f"signals of {largest:.3g} overflow in single precision; scale them down")
+    if largest == 0:
+        raise InputError("every signal is 0: there is nothing to image")
+    if float(capture.signal.max()) == float(capture.signal.min()):
+        raise InputError(f"every signal is {largest:.4g}, constant or saturated: nothing to image")
 
 
 def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str]:
@@ -489,6 +539,11 @@ def _complete_box(capture: Capture, settings: Settings) -> Settings:
     if near is None and settings.gate_found:
         low, high = capture.points[:, 2].min(), capture.points[:, 2].max()
         near = float(low + high) / 2 + max(voxel, GATE_DEPTH_FRACTION * (settings.gate or 0.0))
+    last = float(capture.axis.paths[-1])
+    if near is not None and 2 * (near - float(capture.points[:, 2].max())) > last:
+        raise InputError(
+            f"a box from z = {near:.4g} m on lies beyond the record, whose paths end at {last:.4g} m"
+        )
     front = Grid.in_front_of(capture, voxel, near, settings.far)
     x, y, z = ((float(axis[0]), float(axis[-1])) for axis in (front.x, front.y, front.z))
     return replace(

@@ -131,6 +131,28 @@ def test_a_laser_near_its_detector_is_confocal(apart: float, error: float) -> No
 
 
 @pytest.mark.parametrize(
+    ("changes", "given", "reason"),
+    [
+        ({"signal": np.zeros((400, 24, 24))}, {}, "every signal is 0"),
+        ({"signal": np.full((400, 24, 24), 255.0)}, {}, "constant or saturated"),
+        ({"signal": np.full((400, 24, 24), 1e35)}, {}, "overflow"),
+        ({"laser": np.array([50.0, 0, 0])}, {}, "from the wall, which is"),
+        ({"laser": np.array([0, 0, 20.0])}, {}, "from the wall, which is"),
+        ({"start": 1e6}, {}, "take the ways to and from the devices off"),
+        ({}, {"gate": 100.0}, "blanks the whole record"),
+        ({}, {"near": 50.0, "far": 51.0}, "beyond the record"),
+        ({"wall": np.zeros((24, 24, 3)), "laser": np.zeros(3)}, {}, "stand in one place"),
+    ],
+)
+def test_what_no_picture_can_come_of_is_refused_in_one_line(
+    changes: dict[str, object], given: dict[str, float], reason: str
+) -> None:
+    with pytest.raises(InputError, match=reason) as refused:
+        settings_for(replace(clean(confocal=False), **changes), **given)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
     ("name", "gated", "shortest", "longest"),
     [
         ("nlos_native/otoole2018_outdoor_s.mat", True, 0.08, 0.15),
