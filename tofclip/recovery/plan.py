@@ -23,6 +23,7 @@ from tofclip.camera.calibration.skew import estimate_skew
 from tofclip.errors import InputError
 from tofclip.io.streaks import read_streak
 from tofclip.operators import LinearOperator
+from tofclip.recovery.defects import mask_defects
 from tofclip.recovery.focus import DEFAULT_FOCUS, Focus, FrameSegment, parse_focus
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import (
@@ -118,6 +119,8 @@ def open_shot(
 ) -> Shot:
     """Read a shot and settle which camera and which time zero belong to it.
 
+    Hot pixels, traces of particles and dead columns are masked (`tofclip.recovery.defects`).
+
     Parameters
     ----------
     source : path-like or Streak
@@ -158,6 +161,7 @@ def open_shot(
             f"{streak.source} carries no camera: give one (--camera camera.h5, made by calibrate)"
         )
     require_plausible_rows(streak, known)
+    streak = mask_defects(streak, known.pulse_fwhm)
     return Shot(streak, known if time_zero is None else known.replace(time_zero=time_zero))
 
 
