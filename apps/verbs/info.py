@@ -14,8 +14,8 @@ from apps.report import report, to_json_value
 from devices.recording.reader import read_head_if_recording
 from tofclip.errors import FileFormatError
 from tofclip.io import read_streak
-from tofclip.io.photons import describe_photons
 from tofclip.lidar import PointCloud
+from tofclip.lidar.photons.files import describe_photons
 from tofclip.loading import HDF5_SIGNATURE
 from tofclip.storage import Record, translate_read_errors
 

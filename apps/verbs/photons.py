@@ -17,9 +17,9 @@ from apps.options import JsonOption
 from apps.report import report
 from apps.verbs.cloud import CLOUD_SUFFIXES, DEPTH_SUFFIX
 from tofclip.errors import InputError
-from tofclip.io.photons import read_photons
 from tofclip.lidar import Pulse, point_cloud, save_depth
 from tofclip.lidar.photons import SurfaceImage, estimate_pixels, estimate_surface
+from tofclip.lidar.photons.files import read_photons
 from tofclip.storage import atomic_path
 from tofclip.units import NANOSECOND, PICOSECOND, SPEED_OF_LIGHT
 

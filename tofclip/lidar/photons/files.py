@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError, MissingDependencyError, TofclipError
 from tofclip.io.mat import list_mat_variables
-from tofclip.lidar.photons import PhotonImage
+from tofclip.lidar.photons.photon_image import PhotonImage
 from tofclip.storage import HDF5_SIGNATURE, format_error_line, translate_read_errors
 
 MAX_ARRAY_BYTES = 1 << 32

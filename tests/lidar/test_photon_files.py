@@ -13,7 +13,7 @@ import scipy.io
 import tifffile
 
 from tofclip.errors import FileFormatError, InputError, StorageError
-from tofclip.io.photons import describe_photons, read_photons
+from tofclip.lidar.photons.files import describe_photons, read_photons
 
 BIN = 80e-12
 ROWS, COLUMNS, BINS = 6, 8, 40
