@@ -50,4 +50,4 @@ class DecodedSource(Source):
         self._state = found.state
         first = self._ledger.stats.delivered
         self._ledger.deliver(len(found.records), found.malformed)
-        return Batch(found.records, first, has_gap)
+        return Batch(found.records, first, has_gap, piece.received_at)

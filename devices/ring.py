@@ -35,11 +35,14 @@ class Piece:
     records : int
         How many, by the codec's count.
     gap : Gap
+    received_at : float
+        When it came, s of `time.monotonic`; 0 where that is not known.
     """
 
     data: bytes
     records: int
     gap: Gap = Gap.NONE
+    received_at: float = 0.0
 
 
 class RingBuffer:
@@ -114,6 +117,15 @@ class RingBuffer:
             if self._fault is not None:
                 raise self._fault
             return None
+
+    def keep_newest(self) -> None:
+        """From now on, keep only the newest piece, and count the others as dropped."""
+        with self._changed:
+            self._policy = "drop_oldest"
+            self._capacity = 1
+            while len(self._pieces) > 1:
+                self._drop_oldest()
+            self._changed.notify_all()
 
     def fail(self, fault: BaseException) -> None:
         """End the stream with an exception; the first one counts."""

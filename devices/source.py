@@ -55,11 +55,14 @@ class Batch:
     after_gap : bool
         Something is missing right before these records. Where the instrument was away, its clock
         has started anew.
+    received_at : float
+        When they came from a live instrument, s of `time.monotonic`; 0 otherwise.
     """
 
     records: Records
     first: int = 0
     after_gap: bool = False
+    received_at: float = 0.0
 
     def __len__(self) -> int:
         return len(self.records)

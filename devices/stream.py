@@ -126,6 +126,12 @@ class StreamSource(DecodedSource):
             return None
         return self._decode_piece(piece)
 
+    def keep_newest(self) -> None:
+        """From now on, let whoever reads late have the newest piece; the others count as dropped by
+        the host.
+        """
+        self._ring.keep_newest()
+
     def stop(self) -> None:
         self._stopping.set()
 
@@ -190,7 +196,8 @@ class _FeedReader:
         end = self._codec.count_complete_bytes(as_bytes(data))
         whole, self._rest = data[:end], data[end:]
         if whole:
-            self._ring.put(Piece(whole, self._codec.count_records(as_bytes(whole)), self._gap))
+            records = self._codec.count_records(as_bytes(whole))
+            self._ring.put(Piece(whole, records, self._gap, monotonic()))
             self._gap = Gap.NONE
 
     def _count_truncated(self) -> None:

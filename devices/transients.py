@@ -15,7 +15,7 @@ Besides what a source itself takes, its address may say how to gather (`ACCUMULA
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
 from math import inf
@@ -31,6 +31,8 @@ from devices.histogram import BinAxis, StampHistogram, TagHistogram, TimeHistogr
 from devices.linospad2.calibration import BoardCalibration
 from devices.registry import open as open_source
 from devices.source import READ_TIMEOUT_S, Batch, Source
+from devices.statistics import Stats
+from devices.stream import StreamSource
 from devices.tcspc import compute_photon_times
 from devices.uri import Uri
 from tofclip.camera import Camera
@@ -191,36 +193,101 @@ def read_transient(address: str, bin_width: float | None = None) -> Streak:
     return replace(streak, camera=_read_camera(known), source=address, provenance=past)
 
 
-def read_transients(address: str, bin_width: float | None = None) -> Iterator[Streak]:
+def read_transients(address: str, bin_width: float | None = None) -> TransientStream:
     """Read a source until it ends, and yield one streak image after the other.
 
     One is made of each ``frames`` pictures of a camera or ``records`` photons, as the address says;
-    the last one may have fewer. The source is opened once, and closed with the generator. Memory: a
-    batch of the source, and a streak image.
+    the last one may have fewer. The source is opened with the first image, and closed with the
+    stream. Memory: a batch of the source, and a streak image.
 
     Parameters
     ----------
     address, bin_width
         As for `read_transient`. Reading ends after ``seconds`` only where the address gives them.
 
-    Yields
-    ------
-    Streak
+    Returns
+    -------
+    TransientStream
 
     Raises
     ------
     InputError, DeviceError
-        As for `read_transient`.
+        As for `read_transient`, with the first image.
     """
-    uri = Uri.parse(address)
-    gathering = AccumulationSettings.from_uri(uri, bin_width)
-    with open_source(_strip_accumulation_options(uri)) as source:
-        known = source.calibration
-        camera = _read_camera(known)
-        batches = _read_batches(source, gathering.seconds if "seconds" in uri.values else inf)
-        for number, parts in groupby(_split_shots(batches, gathering), itemgetter(0)):
-            streak = _accumulate_streak((part for _, part in parts), known, gathering)
-            yield replace(streak, camera=camera, source=f"{address} shot {number}")
+    return TransientStream(address, bin_width)
+
+
+class TransientStream(Iterator[Streak]):
+    """Streak images as they come, and where every other one went; see `read_transients`.
+
+    A live camera whose pictures are taken one by one is read newest first, unless the address
+    chooses a ``policy``: what is shown or ranged late would be of no use. What is dropped for that
+    is in `stats`.
+
+    Parameters
+    ----------
+    address : str
+    bin_width : float or None
+        s.
+    """
+
+    def __init__(self, address: str, bin_width: float | None = None) -> None:
+        self._uri = Uri.parse(address)
+        self._gathering = AccumulationSettings.from_uri(self._uri, bin_width)
+        self._source: Source | None = None
+        self._shots = self._read()
+        self._records_per_shot = 1
+        self.received_at: float | None = None
+        """When the last image's last data came, s of `time.monotonic`; None before the first."""
+
+    @property
+    def is_live(self) -> bool:
+        """Whether an instrument, real or emulated, is being read."""
+        return self._source is not None and self._source.is_live
+
+    @property
+    def stats(self) -> Stats:
+        """Where every record went; see `Source.stats`."""
+        return Stats() if self._source is None else self._source.stats
+
+    @property
+    def shots_acquired(self) -> int:
+        """Images for which the instrument has registered enough."""
+        return -(-self.stats.acquired // self._records_per_shot)
+
+    @property
+    def shots_lost(self) -> int:
+        """Of these, images for which the instrument or the wire lost the data."""
+        return self.stats.lost_device // self._records_per_shot
+
+    def __next__(self) -> Streak:
+        return next(self._shots)
+
+    def close(self) -> None:
+        """Close the source."""
+        self._shots.close()
+
+    def _read(self) -> Generator[Streak]:
+        gathering = self._gathering
+        with open_source(_strip_accumulation_options(self._uri)) as source:
+            self._source = source
+            known = source.calibration
+            camera = _read_camera(known)
+            self._records_per_shot = gathering.records
+            if isinstance(source, StreamSource) and source.codec.name == "frames":
+                self._records_per_shot = gathering.frames
+                if gathering.frames == 1 and "policy" not in self._uri.values:
+                    source.keep_newest()
+            seconds = gathering.seconds if "seconds" in self._uri.values else inf
+            batches = self._note_times(_read_batches(source, seconds))
+            for number, parts in groupby(_split_shots(batches, gathering), itemgetter(0)):
+                streak = _accumulate_streak((part for _, part in parts), known, gathering)
+                yield replace(streak, camera=camera, source=f"{self._uri.text} shot {number}")
+
+    def _note_times(self, batches: Iterator[Batch]) -> Iterator[Batch]:
+        for batch in batches:
+            self.received_at = batch.received_at
+            yield batch
 
 
 def _split_shots(
@@ -236,8 +303,11 @@ def _split_shots(
             end = min(len(batch), start + size - done % size)
             yield (
                 done // size,
-                Batch(
-                    batch.records[start:end], batch.first + start, batch.after_gap and start == 0
+                replace(
+                    batch,
+                    records=batch.records[start:end],
+                    first=batch.first + start,
+                    after_gap=batch.after_gap and start == 0,
                 ),
             )
             done += end - start

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
-from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any
+from time import monotonic, perf_counter
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -16,6 +16,7 @@ import typer
 from apps.options import JsonOption, TimeZeroOption
 from apps.report import report
 from apps.verbs.cloud import require_format
+from devices.transients import TransientStream, read_transients
 from tofclip.errors import InputError
 from tofclip.recovery import SharpestFocus, parse_focus
 from tofclip.sequences import list_shots
@@ -71,7 +72,7 @@ def stream(
         bool,
         typer.Option(
             "--drop",
-            help="Drop the oldest waiting shot where they come too fast, instead of letting the source wait.",
+            help="Drop the oldest waiting shot where they come too fast, as always for an instrument.",
         ),
     ] = False,
     suffix: Annotated[str, typer.Option(metavar=".EXT", help="Format of the clouds.")] = ".ply",
@@ -99,20 +100,16 @@ def stream(
     pipeline = _make_ranger(
         first, camera, None if time_zero_ns is None else time_zero_ns * NANOSECOND, focus
     )
-    with closing(
-        stream_clouds(
-            _prepend_shot(first, coming), pipeline, held, "drop_oldest" if drop else "block"
-        )
-    ) as made:
-        figures = _consume_clouds(islice(made, shots), out, suffix)
+    clock = _ShotClock(coming)
+    policy: Literal["drop_oldest", "block"] = "drop_oldest" if drop or clock.is_live else "block"
+    with closing(stream_clouds(clock.prepend(first), pipeline, held, policy)) as made:
+        figures = _consume_clouds(islice(made, shots), out, suffix, clock)
     report(figures, as_json, [] if out is None else [out])
 
 
 def _read_shots(source: str, bin_width: float | None) -> Iterator[Streak]:
     """Shots of an instrument, a folder or a stack."""
     if "://" in source:
-        from devices.transients import read_transients
-
         return read_transients(source, bin_width)
     return (shot() for shot in list_shots(source, bin_width).values())
 
@@ -126,31 +123,85 @@ def _make_ranger(
     return RangingPipeline.for_shot(first, camera, chosen, time_zero)
 
 
-def _prepend_shot(first: Streak, others: Iterator[Streak]) -> Iterator[Streak]:
-    """Put the shot that told the camera back before the others."""
-    yield first
-    yield from others
+class _ShotClock:
+    """Notes when each shot's data came from the instrument, and how many there were.
+
+    Parameters
+    ----------
+    coming : iterator of Streak
+        Behind the first one, which has been taken already.
+    """
+
+    def __init__(self, coming: Iterator[Streak]) -> None:
+        self._coming = coming
+        self._stream = coming if isinstance(coming, TransientStream) else None
+        self._received: dict[int, float] = {}
+        self._taken = 0
+        self._note()
+
+    @property
+    def is_live(self) -> bool:
+        """Whether an instrument is read, so that what comes too late is dropped."""
+        return self._stream is not None and self._stream.is_live
+
+    def prepend(self, first: Streak) -> Iterator[Streak]:
+        """Put the shot that told the camera back before the others."""
+        yield first
+        for shot in self._coming:
+            self._note()
+            yield shot
+
+    def get_age(self, shot: int) -> float | None:
+        """Return the seconds since a shot's data came, None where that is not known."""
+        received = self._received.pop(shot, 0.0)
+        return monotonic() - received if received else None
+
+    def count_shots(self, clouds: int) -> dict[str, int]:
+        """Return where every shot went, given how many became clouds."""
+        acquired, lost = self._taken, 0
+        if self._stream is not None:
+            acquired = max(self._stream.shots_acquired, self._taken)
+            lost = self._stream.shots_lost
+        return {
+            "acquired": acquired,
+            "delivered": clouds,
+            "dropped_device": lost,
+            "dropped_host": acquired - lost - clouds,
+        }
+
+    def _note(self) -> None:
+        if self._stream is not None and self._stream.received_at:
+            self._received[self._taken] = self._stream.received_at
+            self._received.pop(self._taken - MAX_LATENCY_SAMPLES, None)  # it was dropped
+        self._taken += 1
 
 
 def _consume_clouds(
-    made: Iterable[StreamedCloud], out: Path | None, suffix: str
+    made: Iterable[StreamedCloud], out: Path | None, suffix: str, clock: _ShotClock
 ) -> Mapping[str, Any]:
     """Take the clouds as they come; return what is told at the end."""
     stages: dict[str, deque[float]] = {}
     latency: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
-    clouds = points = last = 0
+    ages: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
+    clouds = points = 0
     started = perf_counter()
     for one in made:
         if out is not None:
             one.cloud.save(build_cloud_path(out, one.shot, suffix))
-        clouds, points, last = clouds + 1, points + len(one.cloud), one.shot
+        clouds += 1
+        points += len(one.cloud)
         latency.append(one.latency)
+        age = clock.get_age(one.shot)
+        ages.append(one.latency if age is None else age)
         for name, seconds in one.seconds.items():
             stages.setdefault(name, deque(maxlen=MAX_LATENCY_SAMPLES)).append(seconds)
     passed = perf_counter() - started
+    shots = clock.count_shots(clouds)
     return {
         "clouds": clouds,
-        "dropped": last + 1 - clouds if clouds else 0,
+        "dropped": shots["dropped_device"] + shots["dropped_host"],
+        **shots,
+        **{f"latency_{name}_s": value for name, value in _compute_quantiles(ages).items()},
         "points": points,
         "clouds_per_second": clouds / passed,
         "latency_s": _compute_quantiles(latency),

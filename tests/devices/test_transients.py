@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from devices.scenes import simulate_line_light
 from devices.source import Batch, Info, Source
 from devices.statistics import Stats
 from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
-from devices.transients import read_transient
+from devices.transients import read_transient, read_transients
 from tofclip.errors import InputError, MissingTimeAxisError
 from tofclip.lidar import depth
 from tofclip.recovery import recover
@@ -210,3 +211,19 @@ def test_every_scheme_of_the_tables_can_be_imported() -> None:
     for table in (registry.OPENERS, registry.FILE_OPENERS, registry.CODECS):
         for entry in table.values():
             assert callable(registry.import_entry(entry))
+
+
+def test_a_slow_viewer_gets_the_newest_picture_and_is_told_of_the_others() -> None:
+    stream = read_transients("sim+remoteex://?seed=2&scene=small&frame_rate=100")
+    next(stream)
+    assert stream.is_live
+    for _ in range(3):
+        time.sleep(0.3)
+        next(stream)
+        assert stream.received_at is not None
+        assert time.monotonic() - stream.received_at < 0.25
+    stats = stream.stats
+    assert stats.dropped_host + stats.lost_device > 10
+    assert stream.shots_acquired >= 4 + stats.dropped_host + stats.lost_device
+    stream.close()
+    assert stream.stats.is_balanced
