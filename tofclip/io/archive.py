@@ -31,6 +31,7 @@ class Archive:
         self._entries = self._load()
 
     def _load(self) -> Mapping[str, Any]:
+        # A missing file is reported as such before the decoder turns it into a damaged one.
         with translate_read_errors(self.path):
             self.path.stat()
         try:

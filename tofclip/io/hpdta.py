@@ -24,6 +24,7 @@ TIME_UNITS: Final = {
     "s": 1.0,
     "ms": 1e-3,
     "us": 1e-6,
+    # The micro sign (U+00B5) and the Greek letter mu (U+03BC) look alike; both occur.
     "µs": 1e-6,
     "μs": 1e-6,
     "ns": 1e-9,
@@ -35,6 +36,7 @@ _TOKEN = re.compile(
     r'\[(?P<section>[^\]\r\n]*)\]|(?P<key>[^\s,=\[\]"][^,=\[\]"\r\n]*)=(?:"(?P<quoted>[^"]*)"|(?P<bare>[^,\[\r\n]*))'
 )
 _TABLE = re.compile(r"#(\d{1,15}),(\d{1,9})")
+# Values of ScalingYType and of ScalingYScalingFile. In focus mode nothing is swept.
 _LINEAR, _FOCUS_MODE = "1", "Focus mode"
 _BYTES_PER_ENTRY = 4
 
@@ -90,6 +92,7 @@ def read_row_times(
     table = find_table(metadata, "Y")
     if table:
         start, count = table
+        # A table as long as the picture belongs to its own rows; a longer one covers the sensor.
         first = 0 if count == rows else _parse_first_row(metadata)
         if first + rows > count:
             raise FileFormatError(
@@ -151,6 +154,7 @@ def find_saturated_pixels(
     """
     if pixels.dtype.kind == "f":
         return None
+    # A 12-bit converter in 16-bit pixels saturates long before the pixel type does.
     limit = min(np.iinfo(pixels.dtype).max, parse_full_scale(metadata))
     saturated: NDArray[np.bool_] = pixels >= limit
     if saturated.all():

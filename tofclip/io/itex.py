@@ -27,8 +27,11 @@ from tofclip.storage import atomic_path, translate_read_errors
 
 SIGNATURE = b"IM"
 AXES = ("X", "Y")
+# Type 1 of the format is a compressed picture, which is not supported.
 PIXEL_TYPES: dict[int, np.dtype[Any]] = {0: np.dtype("u1"), 2: np.dtype("<u2"), 3: np.dtype("<u4")}
 
+# Signature; length of the text, columns, rows, column and row offset, pixel type; then reserved
+# bytes up to 64.
 _HEADER = struct.Struct("<2s6H50x")
 _MAX_FIELD = 65535  # what a field of the header can hold
 _TABLE: np.dtype[np.float32] = np.dtype("<f4")
@@ -137,6 +140,8 @@ def decode_itex(data: bytes, path: str | Path = "ITEX picture") -> ItexImage:
         )
     pixels_start = _HEADER.size + text_length
     needed = pixels_start + rows * columns * PIXEL_TYPES[kind].itemsize
+    # The sizes in the header are checked against the bytes present before anything is built on
+    # them.
     if rows * columns == 0 or needed > len(data):
         raise FileFormatError(
             path, f"is truncated: {columns} x {rows} pixels take {needed} bytes, found {len(data)}"
@@ -183,6 +188,7 @@ def _read_tables(
 ) -> dict[str, NDArray[np.float32]]:
     tables = {}
     for axis in AXES:
+        # An axis without a table is legal: it is linear, or has no unit.
         place = hpdta.find_table(metadata, axis)
         if place is None:
             continue

@@ -41,6 +41,8 @@ def read_lift(path: str | Path) -> Streak:
             raise FileFormatError(
                 path, f"field '{flag}' is {archive.array(flag)}; only {meant} has a known meaning"
             )
+    # The archive was clipped at zero when it was made, so that a negative value means another kind
+    # of file.
     counts = archive.array("streak_raw", None, None)
     if np.any(counts < 0):
         raise InputError(
@@ -61,6 +63,7 @@ def read_lift(path: str | Path) -> Streak:
         counts=counts, metadata=metadata, camera=camera, attachments=attachments, source=str(path)
     )
     bin_width = float(archive.array("dt_s"))
+    # NaN is how the archive says that the sweep speed was not recorded.
     if math.isnan(bin_width):
         return streak
     if not 0 < bin_width < math.inf:
@@ -109,6 +112,7 @@ def _read_polynomial_sweep(archive: Archive) -> PolynomialSweep:
     return PolynomialSweep(
         column_coefficients=archive.finite_array("rectify_poly_u", 6),
         row_coefficients=archive.finite_array("rectify_poly_v", 6),
+        # MATLAB keeps transformations for row vectors: the offset is in the third row.
         rectified_origin=rectified[2, :2] - 1.0,
         rectified_scale=np.diag(rectified)[:2],
         raw_origin=raw[2, :2] - 1.0,
@@ -122,6 +126,7 @@ def _read_projective_sweep(archive: Archive) -> ProjectiveSweep:
     """
     from_one = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
     try:
+        # Transposed because MATLAB multiplies row vectors from the left.
         rectified_to_raw = np.linalg.inv(archive.finite_array("rectify_matrix", 3, 3).T)
     except np.linalg.LinAlgError as fault:
         raise FileFormatError(archive.path, "field 'rectify_matrix' is singular") from fault

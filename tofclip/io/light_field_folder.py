@@ -20,6 +20,7 @@ from tofclip.light_field import LightField
 from tofclip.storage import format_error_line
 
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
+# Weights of linear red, green and blue in the luminance of ITU-R BT.709.
 LUMA_WEIGHTS = np.array([0.2125, 0.7154, 0.0721])
 GRID_NAME_PATTERN = re.compile(r"(\d+)\D+(\d+)\D*")
 RASTER_NAME_PATTERN = re.compile(r"(\d+)\D*")
@@ -46,6 +47,7 @@ def read_folder(folder: Path) -> LightField:
                 path, f"is {picture.shape} px, but the first view is {pictures[0].shape} px"
             )
     views = places - (places.max(axis=0) + 1) // 2
+    # The last key of lexsort counts most: rows first, then columns.
     order = np.lexsort((places[:, 1], places[:, 0]))
     return LightField(np.stack([pictures[n] for n in order]), views[order].astype(np.float64))
 
@@ -77,6 +79,7 @@ def _parse_grid_positions(folder: Path, paths: list[Path]) -> NDArray[np.int64]:
         )
     numbers = np.array([int(match[1]) for match in one if match])
     numbers -= numbers.min()
+    # One number says nothing about the width of the grid, so that only a square one is certain.
     side = math.isqrt(len(paths))
     if side * side != len(paths):
         raise FileFormatError(

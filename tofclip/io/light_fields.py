@@ -75,6 +75,7 @@ def _read_archive(path: Path) -> LightField:
         archive.finite_array("v", pictures.shape[0]),
         archive.finite_array("u", pictures.shape[1]),
     )
+    # Pictures may be stored as integers to save space; `scale` turns them into values.
     scaled = pictures.astype(np.float32) * np.float32(archive.finite_array("scale"))
     grid = np.stack(np.meshgrid(v, u, indexing="ij"), axis=-1)
     return LightField(scaled.reshape(-1, *pictures.shape[2:]), grid.reshape(-1, 2))

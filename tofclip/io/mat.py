@@ -22,8 +22,11 @@ from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError
 
+# A few kilobytes of zlib can claim to unpack to terabytes.
 MAX_UNPACKED_BYTES = 1 << 32
 HEADER_BYTES, PEEKED_BYTES = 128, 1 << 12
+# Data types of an element (miINT8, miMATRIX, miCOMPRESSED), then array classes: mxCELL_CLASS, and
+# mxDOUBLE_CLASS to mxUINT64_CLASS.
 INT8, MATRIX, COMPRESSED = 1, 14, 15
 CELL_CLASS, NUMERIC_CLASSES = 1, range(6, 16)
 COMPLEX_FLAG = 0x0800
@@ -75,6 +78,8 @@ def list_mat_variables(path: Path) -> list[MatVariable]:
     size, found = path.stat().st_size, []
     with open(path, "rb") as file:
         header = file.read(HEADER_BYTES)
+        # The header ends in the characters MI as a 16-bit number: read back as IM, the file is
+        # little-endian.
         order = {b"IM": "<", b"MI": ">"}.get(header[126:128])
         if order is None:
             raise FileFormatError(path, "is a truncated or damaged MAT file")
@@ -86,6 +91,7 @@ def list_mat_variables(path: Path) -> list[MatVariable]:
             packed = kind == COMPRESSED
             first = file.read(min(length, PEEKED_BYTES))
             if packed:
+                # Only the beginning is unpacked: name and shape are wanted here, not the values.
                 first = zlib.decompressobj().decompress(first, PEEKED_BYTES)
                 kind = struct.unpack(f"{order}I", first[:4])[0] if len(first) >= 8 else 0
                 first = first[8:]
@@ -163,6 +169,7 @@ class _Matrix:
             raise self._damage()
         kind, length = struct.unpack(f"{self._order}II", tag)
         start = self._place + 8
+        # A tag whose upper half is not zero is of the small data element format.
         if kind >> 16:  # a short one, whose values are inside the tag
             kind, length = kind & 0xFFFF, kind >> 16
             start = self._place + 4
@@ -180,6 +187,8 @@ class _Matrix:
         """Return the numbers, or the contents of the cells."""
         number = math.prod(self.shape)
         if self.kind == CELL_CLASS:
+            # Every cell takes a tag of eight bytes at least, so that a damaged count is found
+            # before the array is made.
             if 8 * number > len(self._content):
                 raise self._damage()
             cells = np.empty(number, dtype=object)
@@ -188,6 +197,7 @@ class _Matrix:
             return cells.reshape(self.shape, order="F")
         if self.kind not in NUMERIC_CLASSES:
             raise FileFormatError(self._path, f"'{self.name}' holds no numbers")
+        # An empty array may come without an element for its values.
         if number == 0:
             return np.zeros(self.shape, np.uint8)
         kind, part = self._read_part()

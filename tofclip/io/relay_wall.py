@@ -69,6 +69,7 @@ class RelayWall:
             In pixels of the picture; the residual is the root mean square distance on the picture.
         """
         pixels, directions = self._sight_lines()
+        # From a fisheye of one pixel to a telephoto lens: any camera lies in between.
         low, high = 1.0, 1e5
         while high / low > 1 + 1e-6:
             # a geometric grid, narrowed about its best value until both ends agree
@@ -144,5 +145,6 @@ def _align_directions(
     """
     looking = np.vstack([pixels, np.full(pixels.shape[1], focal_length_px)])
     looking /= np.linalg.norm(looking, axis=0)
+    # Wahba's problem: the rotation that maximises the trace is the product of the singular vectors.
     left, values, right = np.linalg.svd(looking @ directions.T)
     return float(values.sum()) / pixels.shape[1], left @ right

@@ -59,6 +59,7 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
         streak = streak.with_bin_width(bin_width)
     history = collect_provenance({"bin_width_s": bin_width}, path)
     if streak.provenance:
+        # A file of our own brings its history, which must not be lost under the new entry.
         history["earlier"] = dict(streak.provenance)
     return replace(streak, provenance=history)
 

@@ -83,6 +83,8 @@ def _check_only_page(tiff: tifffile.TiffFile, path: str | Path) -> tifffile.Tiff
         )
     if not 0 < page.size <= MAX_PIXELS:
         raise FileFormatError(path, f"claims an impossible size of {page.shape} pixels")
+    # Compressed strips may be shorter than the picture; uncompressed ones (TIFF compression 1) may
+    # not.
     end = max(map(sum, zip(page.dataoffsets, page.databytecounts, strict=True)), default=0)
     if end > size or (page.compression == 1 and sum(page.databytecounts) < page.nbytes):
         raise FileFormatError(

@@ -22,6 +22,7 @@ from tofclip.solvers import LinearInverse, Progress, Result, ignore_progress
 from tofclip.solvers.direct import PreparedInverse
 from tofclip.storage import Record
 
+# Two, so that sequences of two cameras may alternate; operators of more would fill the memory.
 MAX_CACHED_CAMERAS = 2
 MAX_CACHED_OPERATORS = 16
 """Of each camera: frames at more shears than that make the further operators anew."""
@@ -50,6 +51,7 @@ class CachingCamera(Camera):
         -------
         LineProjection
         """
+        # The dataclass is frozen, so that the cache is put past it into the instance dictionary.
         made: dict[tuple[float, str], LineProjection] = self.__dict__.setdefault("_made", {})
         key = float(shear), np.dtype(dtype).str
         found = made.get(key) or super().operator(shear, dtype)
@@ -64,6 +66,7 @@ def get_cached_camera(camera: Camera) -> Camera:
     with _lock:
         if key not in _camera_cache:
             while len(_camera_cache) >= MAX_CACHED_CAMERAS:
+                # Dictionaries keep the order of insertion: the first key is the oldest camera.
                 _camera_cache.pop(next(iter(_camera_cache)))
             _camera_cache[key] = CachingCamera(
                 **{one.name: getattr(camera, one.name) for one in fields(camera)}
@@ -123,6 +126,8 @@ class CachedInverse:
         Result
         """
         alive = (
+            # A slit column that is dead in every frame drops out of the Gram matrix; one masked in
+            # some frames stays.
             np.ones(operator.shape_out, bool)
             if valid is None
             else to_numpy(namespace(valid).any(valid, axis=1))

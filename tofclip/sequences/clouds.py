@@ -90,6 +90,7 @@ class CloudSettings:
             "suffix": suffix,
             "device": normalise_device(self.device),
         }
+        # Before the paths are made: a folder of other settings stays untouched.
         lock_output_folder(folder, settings)
         paths = make_result_paths(frames, folder, suffix)
         return [

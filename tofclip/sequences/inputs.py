@@ -64,8 +64,10 @@ def is_sequence(source: str | Path) -> bool:
     single file.
     """
     text, path = str(source), Path(source)
+    # The address of an instrument, which may hold characters that a pattern uses.
     if "://" in text:
         return False
+    # A file whose name contains * or [ is that file, not a pattern.
     return path.is_dir() or (_is_stack(path) if path.exists() else glob.has_magic(text))
 
 

@@ -90,6 +90,7 @@ class RangingPipeline:
         self.camera = camera
         self.times = np.asarray(row_times, dtype=np.float64) - camera.time_zero
         self.rectifier = Rectifier(camera, self.times.size)
+        # The focus is one that does not look at the shot, so that an empty one does for the plan.
         nothing = Measurement(np.empty((0, 0), np.float32), np.empty((0, 0), bool))
         pieces = focus.plan_segments(camera, self.times, nothing)
         alive, self.pixels = ~camera.dead_columns, order_by_patch(camera.image_shape)
@@ -227,6 +228,7 @@ class JitterEstimator:
         reach = min(MAX_JITTER_BINS, light.size // 2 - 1)
         near = np.concatenate([agreement[-reach:], agreement[: reach + 1]])
         best = int(near.argmax())
+        # A maximum at the edge of the search has no neighbour for the parabola.
         if best in (0, near.size - 1):
             return float(best - reach)
         # a parabola through the maximum and its neighbours gives the fraction of a bin
@@ -364,6 +366,7 @@ def _differentiate_root(light: FloatArray) -> FloatArray:
     """Changes of the root of the light: near objects outshine far ones, and a constant says
     nothing.
     """
+    # Shot noise of a root of counts is the same at every level, so that no row dominates.
     rise = np.diff(np.sqrt(np.maximum(light - np.median(light), 0)), prepend=0.0)
     length: float = float(np.linalg.norm(rise)) or 1.0
     return rise / length

@@ -80,6 +80,8 @@ class RangingSettings:
         list of Job
         """
         plan, readers = folder.resolve() / PLAN_NAME, list(shots.values())
+        # Made before the folder is claimed, and saved after: a first shot that cannot be used
+        # leaves no folder behind, and a folder of other settings gets no plan.
         made = None if plan.exists() else self.plan(readers[0]())
         camera = None if self.camera is None else compute_sha256(self.camera)
         settings = {"verb": "lidar sequence", **asdict(self), "camera": camera, "suffix": suffix}
@@ -88,6 +90,7 @@ class RangingSettings:
             made.save(plan)
         # a worker that holds an older plan notices by the hash
         version, jobs = compute_sha256(plan), []
+        # Rounded up: what is left over at the end makes one more cloud.
         for number in range(-(-len(readers) // self.average)):
             some = tuple(readers[number * self.average : (number + 1) * self.average])
             result = build_cloud_path(folder.resolve(), number, suffix)

@@ -55,6 +55,7 @@ class RecoverySettings:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
+        # Made once and thrown away, so that a wrong setting is reported before any shot is read.
         self.build_solver()
         parse_focus(self.focus)
 
@@ -85,6 +86,7 @@ class RecoverySettings:
         lock_output_folder(
             folder, self.settings() | {"bin_width": next(iter(shots.values())).bin_width}
         )
+        # Workers have another working directory.
         here = self if self.camera is None else replace(self, camera=self.camera.resolve())
         paths = make_result_paths(shots, folder, FRAMES_SUFFIX)
         return [
@@ -94,6 +96,7 @@ class RecoverySettings:
 
     def settings(self) -> dict[str, Any]:
         """Return what a result depends on besides the shot."""
+        # The content counts, not the name: a camera calibrated anew gives other frames.
         camera = None if self.camera is None else compute_sha256(self.camera)
         return {
             "verb": "recover",

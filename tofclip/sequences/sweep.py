@@ -46,5 +46,6 @@ def expand_sweep(
         except ValueError as fault:
             raise InputError(f"sweep: {fault}") from fault
         label = ",".join(f"{name}={value}" for name, value in named.items())
+        # The new object checks the combination, so that none is refused after hours of others.
         found[label] = replace(recovery, **settings)
     return found

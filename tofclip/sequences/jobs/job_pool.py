@@ -46,6 +46,7 @@ class JobPool:
 
         def submit() -> None:
             while len(running) < self._count_slots() and (job := next(waiting, None)) is not None:
+                # Not pure: Dask would otherwise give the earlier answer to an equal job.
                 future = self._client.submit(run_job, job, pure=False)
                 running[future] = job
                 finished.add(future)
@@ -58,6 +59,8 @@ class JobPool:
                 if report is not None:
                     yield report
         finally:
+            # Reached early when the caller stops iterating or is interrupted; otherwise nothing is
+            # left.
             if running:
                 self._client.cancel(list(running))
 
@@ -78,6 +81,8 @@ class JobPool:
         except KilledWorker:
             if self._on_killed is None:
                 return Report(job.name, "each worker that tried it died; is there enough memory?")
+            # Jobs queued on a worker that dies are blamed with it, so that this one may be
+            # innocent.
             self._on_killed(job)
             return None
         except Exception as fault:

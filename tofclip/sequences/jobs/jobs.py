@@ -136,6 +136,7 @@ def run_job(job: Job) -> Report:
     """
     problem, figures = "", None
     try:
+        # Asked again here: a job may be given to a second worker after the first had finished it.
         if not job.result.exists():
             with limit_blas_threads():
                 figures = job.work()
@@ -154,5 +155,6 @@ def measure_peak_memory_bytes() -> int:
         import resource
     except ImportError:  # Windows
         return 0
+    # getrusage(2) gives kilobytes on Linux and bytes on macOS.
     unit = 1024 if sys.platform.startswith("linux") else 1
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

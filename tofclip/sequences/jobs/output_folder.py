@@ -46,6 +46,8 @@ def lock_output_folder(folder: Path, settings: Mapping[str, Any]) -> None:
             temporary.write_text(json.dumps(wanted, indent=1) + "\n", encoding="utf-8")
         return
     known = _read_settings(path)
+    # Settings that only one side knows count as None on the other, so that a new setting with the
+    # default None fits folders written before it.
     names = [name for name in {**known, **wanted} if known.get(name) != wanted.get(name)]
     if names:
         told = ", ".join(

@@ -50,6 +50,7 @@ def run_jobs(
             _notify_each(_iterate_reports(jobs, cluster), on_report), started
         )
     finally:
+        # Also after an interrupt: workers that were killed could not clean up themselves.
         remove_temporary_files(path for job in jobs for path in (job.result, *job.extra_outputs))
 
 
@@ -69,5 +70,6 @@ def _iterate_reports(jobs: Sequence[Job], cluster: str | None) -> Iterator[Repor
         with connect_workers(cluster) as client:
             suspects: list[Job] = []
             yield from JobPool(client, suspects.append).run_all(jobs)
+            # One at a time, so that a death can be blamed on no other job.
             for job in suspects:
                 yield from JobPool(client).run_all([job])

@@ -77,6 +77,8 @@ def _start_local_cluster(distributed: Any, number: int) -> Iterator[Client]:
     """
     threads = str(max(1, thread_count() // number))
     with _silence_log():
+        # The shield is needed only while processes start: they inherit the handler, this one gets
+        # it back.
         with _shield_children_from_interrupt():
             cluster = distributed.LocalCluster(
                 n_workers=number,
@@ -130,6 +132,7 @@ def _shield_children_from_interrupt() -> Iterator[None]:
     """Keep processes started now from hearing Ctrl-C: a terminal sends it to all, and we end them
     ourselves.
     """
+    # Python sets signal handlers from the main thread only.
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -44,6 +44,7 @@ class Channel(Generic[Entry]):
             )
         self._capacity, self._policy = capacity, policy
         self._entries: deque[Entry] = deque()
+        # One lock for all fields; every change wakes both sides, which test again in a loop.
         self._changed = Condition()
         self._finished = self._closed = False
         self._fault: BaseException | None = None
@@ -84,6 +85,8 @@ class Channel(Generic[Entry]):
                 entry = self._entries.popleft()
                 self._changed.notify_all()
                 return entry
+            # Raised only when the queue is empty, so that what came before the fault is still
+            # delivered.
             if self._fault is not None:
                 raise self._fault
             return None
@@ -92,5 +95,6 @@ class Channel(Generic[Entry]):
         """Let go of everything; `put` fails from now on and `get` returns None."""
         with self._changed:
             self._closed = True
+            # Cleared so that memory is freed even while a thread still holds the channel.
             self._entries.clear()
             self._changed.notify_all()

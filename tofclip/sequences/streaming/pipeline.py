@@ -87,6 +87,8 @@ def stream_clouds(
     # for each other.
     with open_worker_pool() as cores:
         stages = (
+            # The first stage hands a shot to a core, the second waits for it: results come out in
+            # order.
             Stage("begin", lambda shot: cores.submit(_make_cloud, shot, own)),
             Stage("end", Future.result),
         )

@@ -88,6 +88,7 @@ def run_stages(
     """
     channels = [
         Channel[StreamItem](queue_size, policy),
+        # Only the first channel may drop: later ones hold work that has been paid for.
         *(Channel[StreamItem](queue_size) for _ in stages),
     ]
     threads = [
@@ -109,6 +110,8 @@ def run_stages(
             _add_waiting_time(item, perf_counter())
             yield item
     finally:
+        # First all channels, then the threads: a thread that waits on a neighbour's channel must
+        # wake up.
         for channel in channels:
             channel.close()
         for thread in threads:
@@ -126,6 +129,7 @@ def _run_reader(source: Iterable[Any], target: Channel[StreamItem]) -> None:
             started = perf_counter()
         target.finish()
     except ChannelClosedError:
+        # Closed on this thread, because a generator cannot be closed while another thread runs it.
         getattr(items, "close", lambda: None)()
     except BaseException as fault:  # the consumer gets to see it
         target.finish(fault)
