@@ -239,9 +239,8 @@ class Fista:
 
 
 NORM_ITERATIONS = 15
-NORM_MARGIN = (
-    1.02  # 15 power iterations on a nonnegative matrix are within 1 % of the largest eigenvalue
-)
+NORM_MARGIN = 1.02
+"""What 15 Lanczos iterations may lack of the largest eigenvalue; a test checks every camera."""
 
 
 @dataclass(frozen=True)
