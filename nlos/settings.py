@@ -177,7 +177,7 @@ class Settings:
             capture = remove_first_bounce(capture, self.gate, self.gate_ramp or 0.0)
         if self.fade:
             capture = fade_record_end(capture, self.fade)
-        bins = self.bins_together or 1
+        bins = 1 if self.bins_together is None else self.bins_together
         return capture if bins == 1 else rebin_capture(capture, bins)
 
     def grid(self, voxel: float | None = None) -> Grid:
