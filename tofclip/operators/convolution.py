@@ -27,8 +27,8 @@ class PointSpreadConvolution(LinearOperator):
     image_shape : (int, int)
         Rows and columns of the picture.
     point_spread : (rows, columns) array
-        Light on the sensor from a point of brightness 1; its origin is pixel ``(rows // 2, columns
-        // 2)``.
+        Light on the sensor from a point of brightness 1; its origin is pixel
+        ``(rows // 2, columns // 2)``.
     sensor_shape : (int, int), optional
         Rows and columns of the sensor, about the picture's middle; the default is the picture's
         shape. A lensless camera sees more than its sensor covers: then the picture is the larger.
