@@ -1,5 +1,5 @@
-"""Shots: the streak image that was measured, many of them in one file, and the frames recovered from
-one.
+"""Shots: the streak image that was measured, many of them in one file, and what is recovered from one:
+frames and returns.
 """
 
 from __future__ import annotations
@@ -290,6 +290,88 @@ def save_stack(shots: Iterable[Streak], path: str | Path) -> int:
 
 
 @dataclass(frozen=True)
+class Returns(Storable):
+    """A list of returns, pixel by pixel in raster order, nearest first within a pixel.
+
+    Parameters
+    ----------
+    y, x : (n,) int32 array
+        Row and column of the pixel.
+    range : (n,) float64 array
+        Distance from the camera along the line of sight, m.
+    intensity : (n,) float32 array
+        Counts of the return times (range / 1 m)^2: proportional to the surface's reflectance.
+    confidence : (n,) float32 array
+        Expected standard deviation of the range, m; smaller is surer.
+    return_number : (n,) uint8 array
+        1 for the nearest return of a pixel.
+    time : (n,) float64 array
+        Time of flight there and back, s.
+    camera : Camera
+        The camera that saw them.
+    provenance : mapping
+        How they came about.
+    shear : (n,) float64 array, optional
+        Shear at which the picture of that instant was recovered; 0 by default.
+    """
+
+    RECORD_KIND = "returns"
+
+    y: NDArray[np.int32] = field(metadata=stored_array("px", "return", dtype=np.int32))
+    x: NDArray[np.int32] = field(metadata=stored_array("px", "return", dtype=np.int32))
+    range: NDArray[np.float64] = field(metadata=stored_array("m", "return"))
+    intensity: NDArray[np.float32] = field(
+        metadata=stored_array("count", "return", dtype=np.float32)
+    )
+    confidence: NDArray[np.float32] = field(metadata=stored_array("m", "return", dtype=np.float32))
+    return_number: NDArray[np.uint8] = field(metadata=stored_array("", "return", dtype=np.uint8))
+    time: NDArray[np.float64] = field(metadata=stored_array("s", "return"))
+    camera: Camera = field(metadata=stored_child(Camera.from_record, "camera"))
+    provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
+    shear: NDArray[np.float64] = field(
+        default_factory=lambda: np.empty(0), metadata=stored_array("px", "return", optional=True)
+    )
+
+    def __post_init__(self) -> None:
+        if self.shear.size == 0:
+            object.__setattr__(self, "shear", np.zeros(self.y.shape))
+        for name in ("x", "range", "intensity", "confidence", "return_number", "time", "shear"):
+            if getattr(self, name).shape != self.y.shape:
+                raise ShapeError(f"{name} of the returns", self.y.shape, getattr(self, name).shape)
+
+    def __len__(self) -> int:
+        return self.y.size
+
+    @property
+    def line_of_sight_px(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(rows, columns) of the reference view's pixels in which the returns lie.
+
+        A picture that was not recovered at the shear of its range is displaced by the parallax;
+        here that is undone.
+        """
+        missing = self.camera.shear_at(self.range) - self.shear
+        rows, columns = self.camera.displacement_per_shear
+        known = self.camera.lenslet_pitch > 0
+        return self.y - known * rows * missing, self.x - known * columns * missing
+
+    def image(self, name: str) -> NDArray[np.float32]:
+        """Picture (y, x) of one property of each pixel's most intense return; NaN where nothing
+        came back.
+
+        Parameters
+        ----------
+        name : str
+            ``"range"``, ``"intensity"``, ``"confidence"``, ``"return_number"`` or ``"time"``.
+        """
+        if name not in ("range", "intensity", "confidence", "return_number", "time"):
+            raise InputError(f"returns have no property '{name}' to show as a picture")
+        picture = np.full(self.camera.image_shape, np.nan, dtype=np.float32)
+        upwards = np.argsort(self.intensity, kind="stable")  # the last one written wins
+        picture[self.y[upwards], self.x[upwards]] = getattr(self, name)[upwards]
+        return picture
+
+
+@dataclass(frozen=True)
 class Frames(Storable):
     """A transient cube with its axes and the camera that saw it.
 
@@ -311,6 +393,8 @@ class Frames(Storable):
         How they came about.
     shears : (time,) array, optional
         Shear at which each frame was recovered, pixels per view step; 0 everywhere by default.
+    returns : Returns, optional
+        Where the recovery found them itself: the surfaces of which the frames are a rendering.
     """
 
     RECORD_KIND = "frames"
@@ -323,6 +407,9 @@ class Frames(Storable):
     provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
     shears: NDArray[np.float64] = field(
         default_factory=lambda: np.empty(0), metadata=stored_array("px", "time", optional=True)
+    )
+    returns: Returns | None = field(
+        default=None, metadata=stored_child(Returns.from_record, "returns", optional=True)
     )
 
     def __post_init__(self) -> None:

@@ -33,7 +33,12 @@ HISTOGRAM_BINS = 61
 
 
 def make_demo_figure(
-    streak: Streak, frames: Frames, returns: Returns, cloud: PointCloud, truth: GroundTruth
+    streak: Streak,
+    frames: Frames,
+    returns: Returns,
+    cloud: PointCloud,
+    truth: GroundTruth,
+    compared: Frames,
 ) -> Figure:
     """Draw streak image, brightness and range as seen by the camera; top and side view in metres;
     range errors.
@@ -46,16 +51,20 @@ def make_demo_figure(
     cloud : PointCloud
     truth : GroundTruth
         Of the simulated scene, for the range errors.
+    compared : Frames
+        Of the same shot, each frame recovered alone.
 
     Returns
     -------
     Figure
     """
-    figure = make_figure(12, 7.6)
-    panels = figure.subplots(2, 3)
+    figure = make_figure(15.5, 7.6)
+    panels = figure.subplots(2, 4)
     _draw_streak(panels[0, 0], streak)
-    _draw_brightness(panels[0, 1], frames)
-    _draw_range(panels[0, 2], returns)
+    _draw_brightness(panels[0, 1], frames, "surfaces")
+    _draw_brightness(panels[0, 2], compared, "tv")
+    _draw_range(panels[0, 3], returns)
+    _draw_truth(panels[1, 3], truth)
     limits = _normalise_brightness(cloud.intensity)
     _scatter_points(panels[1, 0], cloud.xyz[:, 0], cloud.xyz[:, 2], limits)
     label_axes(panels[1, 0], "top view of the cloud", "x (m)", "z, away from the camera (m)")
@@ -87,17 +96,23 @@ def _draw_streak(axes: Axes, streak: Streak) -> None:
     add_colour_bar(axes, drawn, "photons")
 
 
-def _draw_brightness(axes: Axes, frames: Frames) -> None:
+def _draw_brightness(axes: Axes, frames: Frames, name: str) -> None:
     ranges = np.maximum(frames.times, 0) * SPEED_OF_LIGHT / 2
     picture = np.tensordot((ranges**2).astype(np.float32), frames.values, axes=1)
     drawn = draw_image(axes, picture, vmin=0, vmax=np.percentile(picture, WHITE_PERCENTILE))
     label_axes(
         axes,
-        "recovered brightness \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}",
+        f"{name}: brightness \N{MULTIPLICATION SIGN} range\N{SUPERSCRIPT TWO}",
         "x (px)",
         "y (px), down",
     )
     add_colour_bar(axes, drawn, "photons at 1 m")
+
+
+def _draw_truth(axes: Axes, truth: GroundTruth) -> None:
+    drawn = draw_image(axes, truth.reflectance, vmin=0)
+    label_axes(axes, "true reflectance", "x (px)", "y (px), down")
+    add_colour_bar(axes, drawn, "of the light that falls on it")
 
 
 def _draw_range(axes: Axes, returns: Returns) -> None:

@@ -44,7 +44,8 @@ def demo(
     """Simulate a scene of letters and plates, recover it from one streak image, and compare with
     the truth.
 
-    Skew, gains and slit centres are found from the shot itself. Writes streak.h5, frames.h5,
+    Skew and gains are found from the shot itself. Surfaces are recovered from the whole shot at
+    once; the picture shows them beside total variation of each frame. Writes streak.h5, frames.h5,
     cloud.ply and preview.png.
 
     Example: tofclip demo --out demo-output
@@ -57,7 +58,10 @@ def demo(
     run.frames.save(written[1])
     run.cloud.save(written[2])
     save_figure(
-        make_demo_figure(run.streak, run.frames, run.returns, run.cloud, run.shot.truth), written[3]
+        make_demo_figure(
+            run.streak, run.frames, run.returns, run.cloud, run.shot.truth, run.compared
+        ),
+        written[3],
     )
     report(
         {"seed": seed, **_collect_metrics(run), "seconds": time.perf_counter() - started},
@@ -74,6 +78,7 @@ class DemoRun:
     truth: Frames
     streak: Streak
     frames: Frames
+    compared: Frames
     returns: Returns
     cloud: PointCloud
 
@@ -86,16 +91,19 @@ def _run_demo(seed: int) -> DemoRun:
     # shot.
     nominal = replace(shot.camera, sweep=None, gains=1.0 + 0 * shot.camera.gains)
     streak = replace(shot.streak, camera=nominal)
-    plan = plan_recovery(open_shot(streak))
-    with show_progress("recovering", plan.work) as advance:
-        frames = plan.run(advance)
+    surfaces = plan_recovery(open_shot(streak), "surfaces")
+    with show_progress("recovering", surfaces.work) as advance:
+        frames = surfaces.run(advance)
+    by_frames = plan_recovery(open_shot(streak, frames.camera))
+    with show_progress("for comparison", by_frames.work) as advance:
+        compared = by_frames.run(advance)
     frames = replace(
         frames,
         provenance=build_provenance({"verb": "demo", "seed": seed}, earlier=frames.provenance),
     )
-    returns = depth(frames)
+    returns = depth(frames) if frames.returns is None else frames.returns
     truth = render_true_frames(scene, instrument, shot.exposure)
-    return DemoRun(shot, truth, streak, frames, returns, point_cloud(returns))
+    return DemoRun(shot, truth, streak, frames, compared, returns, point_cloud(returns))
 
 
 def _collect_metrics(run: DemoRun) -> dict[str, Any]:

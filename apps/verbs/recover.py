@@ -66,15 +66,15 @@ def recover(
         str,
         typer.Option(
             metavar="NAME",
-            help="tv, l1, linear or adjoint.",
-            autocompletion=make_completer("tv", "l1", "linear", "adjoint"),
+            help="tv, l1, linear, adjoint, or surfaces: range and brightness of each pixel from the whole shot.",
+            autocompletion=make_completer("tv", "l1", "linear", "adjoint", "surfaces"),
         ),
     ] = "tv",
     iterations: Annotated[
         int | None,
         typer.Option(
             metavar="N",
-            help="Maximum number of iterations of tv and l1.",
+            help="Maximum number of iterations of tv, l1 and surfaces.",
             show_default="the method's",
         ),
     ] = None,

@@ -66,10 +66,10 @@ def warm_up(as_json: JsonOption = False) -> None:
 def _list_steps(folder: Path) -> Iterator[Sequence[str]]:
     """Commands that between them call every compiled function."""
     shots, frames = folder / "shots", folder / "frames.h5"
-    for method in ("tv", "l1", "linear", "adjoint"):
+    for method in ("tv", "l1", "linear", "adjoint", "surfaces"):
         options = (
             ("--method", method, "--iterations", "2")
-            if method in ("tv", "l1")
+            if method in ("tv", "l1", "surfaces")
             else ("--method", method)
         )
         yield ("recover", str(shots / "first.h5"), "--out", str(frames), *options)

@@ -5,8 +5,8 @@ from tofclip.lidar.depth_exr import save_depth
 from tofclip.lidar.detection import Detection
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.pulse import Pulse
-from tofclip.lidar.returns import Returns
 from tofclip.lidar.search import depth
+from tofclip.shots import Returns
 
 __all__ = [
     "Detection",

@@ -14,8 +14,8 @@ from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.lidar import export
 from tofclip.lidar.column import Column
 from tofclip.lidar.geometry import compute_ray_directions
-from tofclip.lidar.returns import Returns
 from tofclip.notebook import render_html
+from tofclip.shots import Returns
 from tofclip.storage import Field, Record
 
 COLUMN_UNITS = {

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tofclip.lidar.geometry import compute_ray_directions
-from tofclip.lidar.returns import Returns
+from tofclip.shots import Returns
 from tofclip.storage import atomic_path
 
 

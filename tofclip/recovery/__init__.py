@@ -20,6 +20,7 @@ from tofclip.recovery.plan import (
     recover,
     require_plausible_rows,
 )
+from tofclip.recovery.surfaces import SurfaceRecovery
 
 __all__ = [
     "DepthLockedFocus",
@@ -30,6 +31,7 @@ __all__ = [
     "SharpestFocus",
     "Shot",
     "ShotParallax",
+    "SurfaceRecovery",
     "compute_view_delays_bins",
     "count_parallax_work",
     "fit_camera_to_shot",

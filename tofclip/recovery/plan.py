@@ -24,7 +24,14 @@ from tofclip.errors import InputError
 from tofclip.io.streaks import read_streak
 from tofclip.operators import LinearOperator
 from tofclip.recovery.defects import mask_defects
-from tofclip.recovery.focus import DEFAULT_FOCUS, Focus, FrameSegment, parse_focus
+from tofclip.recovery.focus import (
+    DEFAULT_FOCUS,
+    DepthLockedFocus,
+    Focus,
+    FrameSegment,
+    parse_focus,
+)
+from tofclip.recovery.surfaces import SurfaceRecovery
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import (
     Backprojection,
@@ -46,21 +53,24 @@ from tofclip.units import PICOSECOND
 MAX_ROW_PER_PULSE = 100.0
 """Longest row, in widths of the pulse: beyond, the unit of one of them is wrong."""
 
-METHODS: dict[str, Callable[..., Method]] = {
+AnyMethod = Method | SurfaceRecovery
+
+METHODS: dict[str, Callable[..., AnyMethod]] = {
     "tv": TotalVariation,
     "l1": Sparse,
     "linear": LinearInverse,
     "adjoint": Backprojection,
+    "surfaces": SurfaceRecovery,
 }
 
 
-def make_method(name: str, **settings: Any) -> Method:
+def make_method(name: str, **settings: Any) -> AnyMethod:
     """Make a recovery method by its short name, with settings of its own where given.
 
     Parameters
     ----------
     name : str
-        ``"tv"``, ``"l1"``, ``"linear"`` or ``"adjoint"``.
+        ``"tv"``, ``"l1"``, ``"linear"``, ``"adjoint"`` or ``"surfaces"``.
     **settings
         Passed on, such as ``iterations`` and ``weight`` of the iterative methods; None stands for
         the method's own.
@@ -181,7 +191,7 @@ class RecoveryPlan:
     """
 
     shot: Shot
-    method: Method
+    method: AnyMethod
     focus: Focus
     device: ComputeDevice
 
@@ -220,6 +230,8 @@ class RecoveryPlan:
         """
         started = time.perf_counter()
         shot = self.shot.fit_camera(progress)
+        if isinstance(self.method, SurfaceRecovery):
+            return self._recover_surfaces(shot, self.method, progress, started)
         streak, camera = shot.streak, shot.camera
         measurement = measure(streak.counts, streak.saturated, camera)
         solving = time.perf_counter()
@@ -256,6 +268,17 @@ class RecoveryPlan:
             provenance={**streak.provenance, "objective": result.objective.tolist()},
         )
 
+    def _recover_surfaces(
+        self, shot: Shot, method: SurfaceRecovery, progress: Progress, started: float
+    ) -> Frames:
+        """Recover frames, quickly, and then the surfaces in them."""
+        focus = DepthLockedFocus() if shot.camera.lenslet_pitch > 0 else self.focus
+        start = replace(self, shot=shot, method=method.start, focus=focus).run(progress)
+        found = method.recover_surfaces(shot.streak, start, progress)
+        seconds = time.perf_counter() - started
+        pace = {"seconds": seconds, "frames_per_second": found.times.size / seconds}
+        return replace(found, figures={**found.figures, **pace})
+
     def add_provenance(self, frames: Frames, *inputs: str | Path) -> Frames:
         """Return frames that say how they came about.
 
@@ -278,7 +301,7 @@ class RecoveryPlan:
 
 def plan_recovery(
     shot: Shot,
-    method: str | Method = "tv",
+    method: str | AnyMethod = "tv",
     focus: str | Focus = DEFAULT_FOCUS,
     device: str = "cpu",
 ) -> RecoveryPlan:
@@ -317,7 +340,7 @@ def plan_recovery(
 def recover(
     streak: Streak,
     camera: Camera | None = None,
-    method: str | Method = "tv",
+    method: str | AnyMethod = "tv",
     progress: Progress = ignore_progress,
     focus: Focus | None = None,
     device: str = "cpu",
@@ -334,8 +357,8 @@ def recover(
     camera : Camera, optional
         Defaults to the one that the streak image carries.
     method : str or Method
-        ``"tv"`` (default), ``"l1"``, ``"linear"``, ``"adjoint"``, or a configured `tofclip.solvers`
-        method.
+        ``"tv"`` (default), ``"l1"``, ``"linear"``, ``"adjoint"``, ``"surfaces"``, or a configured
+        method of `tofclip.solvers`, or a `SurfaceRecovery`.
     progress : callable
         Called with the number of frame iterations just done.
     focus : Focus, optional

@@ -146,7 +146,7 @@ def gather_light(image, gains, first_row, time_shares, first_column, slit_shares
 
 
 @nogil_njit
-def prox_masked_tv(picture, mask, weight, iterations, dual, result):  # noqa: C901 - one loop nest
+def prox_masked_tv(picture, mask, weight, iterations, dual, result):
     """Nonnegative proximal step of total variation on a part of a picture.
 
     Fast gradient projection on the dual (A. Beck and M. Teboulle, IEEE Trans. Image Process. 18,
@@ -163,40 +163,49 @@ def prox_masked_tv(picture, mask, weight, iterations, dual, result):  # noqa: C9
     result : (rows, columns) float32 array, overwritten
         0 outside the mask.
     """
-    rows, columns = picture.shape
     ahead = dual.copy()
     age = 1.0
-    for iteration in range(iterations + 1):
-        for y in range(rows):
-            for x in range(columns):
-                result[y, x] = 0
-                if mask[y, x]:
-                    divergence = ahead[0, y, x] + ahead[1, y, x]
-                    if y > 0:
-                        divergence -= ahead[0, y - 1, x]
-                    if x > 0:
-                        divergence -= ahead[1, y, x - 1]
-                    result[y, x] = max(picture[y, x] + weight * divergence, 0.0)
-        if iteration == iterations:
-            break
+    apply_dual(picture, mask, weight, ahead, result)
+    for _ in range(iterations):
         older = (1 + math.sqrt(1 + 4 * age * age)) / 2
-        momentum = (age - 1) / older
+        ascend_dual(result, mask, weight, (age - 1) / older, ahead, dual)
         age = older
-        for y in range(rows):
-            for x in range(columns):
-                down, right = 0.0, 0.0
-                if mask[y, x]:
-                    if y + 1 < rows and mask[y + 1, x]:
-                        down = result[y + 1, x] - result[y, x]
-                    if x + 1 < columns and mask[y, x + 1]:
-                        right = result[y, x + 1] - result[y, x]
-                # 8 bounds the squared norm of the gradient of a picture
-                p = ahead[0, y, x] + down / (8 * weight)
-                q = ahead[1, y, x] + right / (8 * weight)
-                length = max(1.0, math.sqrt(p * p + q * q))
-                p /= length
-                q /= length
-                ahead[0, y, x] = p + momentum * (p - dual[0, y, x])
-                ahead[1, y, x] = q + momentum * (q - dual[1, y, x])
-                dual[0, y, x] = p
-                dual[1, y, x] = q
+        apply_dual(picture, mask, weight, ahead, result)
+
+
+@nogil_njit
+def apply_dual(picture, mask, weight, ahead, result):
+    """The picture that belongs to a dual variable: ``max(picture + weight * div ahead, 0)``."""
+    for y in range(picture.shape[0]):
+        for x in range(picture.shape[1]):
+            result[y, x] = 0
+            if mask[y, x]:
+                divergence = ahead[0, y, x] + ahead[1, y, x]
+                if y > 0:
+                    divergence -= ahead[0, y - 1, x]
+                if x > 0:
+                    divergence -= ahead[1, y, x - 1]
+                result[y, x] = max(picture[y, x] + weight * divergence, 0.0)
+
+
+@nogil_njit
+def ascend_dual(result, mask, weight, momentum, ahead, dual):
+    """A projected gradient step on the dual variable, with momentum."""
+    rows, columns = result.shape
+    for y in range(rows):
+        for x in range(columns):
+            down, right = 0.0, 0.0
+            if mask[y, x] and y + 1 < rows and mask[y + 1, x]:
+                down = result[y + 1, x] - result[y, x]
+            if mask[y, x] and x + 1 < columns and mask[y, x + 1]:
+                right = result[y, x + 1] - result[y, x]
+            # 8 bounds the squared norm of the gradient of a picture
+            p = ahead[0, y, x] + down / (8 * weight)
+            q = ahead[1, y, x] + right / (8 * weight)
+            length = max(1.0, math.sqrt(p * p + q * q))
+            p /= length
+            q /= length
+            ahead[0, y, x] = p + momentum * (p - dual[0, y, x])
+            ahead[1, y, x] = q + momentum * (q - dual[1, y, x])
+            dual[0, y, x] = p
+            dual[1, y, x] = q

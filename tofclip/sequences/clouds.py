@@ -43,6 +43,7 @@ class CloudSettings:
         Parameters
         ----------
         frames : Frames
+            Those that carry returns, as of surfaces, are not searched again.
         origin : str
             Whose frames they were, for the message.
 
@@ -58,9 +59,11 @@ class CloudSettings:
         """
         from tofclip.lidar.processing import downsample_cloud, remove_outliers
 
-        device = parse_device(self.device)
-        with device.activate():
-            returns = depth(replace(frames, values=device.put(frames.values)))
+        returns = frames.returns
+        if returns is None:
+            device = parse_device(self.device)
+            with device.activate():
+                returns = depth(replace(frames, values=device.put(frames.values)))
         if len(returns) == 0:
             raise InputError(f"{origin}: {_explain_empty_cloud(frames)}")
         cloud = replace(point_cloud(returns), provenance=frames.provenance)

@@ -16,13 +16,12 @@ from tofclip.camera import Camera, Measurement, Rectifier
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.cloud import PointCloud, point_cloud
 from tofclip.lidar.detection import Detection
-from tofclip.lidar.returns import Returns
 from tofclip.lidar.search import ReturnSearch
 from tofclip.lidar.signal_rows.selection import RowBlock, SignalRowFinder
 from tofclip.lidar.traces import TraceBins, Traces
 from tofclip.recovery.focus import DEFAULT_FOCUS, Focus
 from tofclip.recovery.plan import open_shot
-from tofclip.shots import Streak
+from tofclip.shots import Returns, Streak
 from tofclip.solvers import LinearInverse
 from tofclip.solvers.traces import InverseTraces, order_by_patch
 from tofclip.threads import map_parallel

@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from tofclip.arrays import CPU
-from tofclip.recovery import RecoveryPlan, make_method, open_shot, parse_focus, plan_recovery
+from tofclip.recovery import (
+    RecoveryPlan,
+    SurfaceRecovery,
+    make_method,
+    open_shot,
+    parse_focus,
+    plan_recovery,
+)
 from tofclip.sequences.cache import CachedInverse, get_cached_camera
 from tofclip.sequences.inputs import Shot, make_result_paths
 from tofclip.sequences.jobs import Job, lock_output_folder
@@ -59,7 +66,7 @@ class RecoverySettings:
         self.build_solver()
         parse_focus(self.focus)
 
-    def build_solver(self) -> Method:
+    def build_solver(self) -> Method | SurfaceRecovery:
         """Return the method with its settings."""
         return make_method(self.method, iterations=self.iterations, weight=self.weight)
 

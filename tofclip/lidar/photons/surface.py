@@ -28,7 +28,7 @@ from tofclip.lidar.photons.detector import PhotonDetector
 from tofclip.lidar.photons.photon_image import FloatArray, PhotonImage
 from tofclip.lidar.photons.response import BinnedResponse, learn_response, measure_pulse_width
 from tofclip.lidar.pulse import Pulse
-from tofclip.lidar.returns import Returns
+from tofclip.shots import Returns
 from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
 

@@ -39,10 +39,9 @@ from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.detection import Detection
 from tofclip.lidar.pulse import Pulse
-from tofclip.lidar.returns import Returns
 from tofclip.lidar.search.array_api import ArraySearch, ArrayTraces
 from tofclip.lidar.traces import FrameTraces, Traces
-from tofclip.shots import Frames
+from tofclip.shots import Frames, Returns
 from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
 

@@ -1,0 +1,193 @@
+"""Surfaces recovered from whole shots: the model against its derivatives, and scenes with a known
+truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tofclip import depth, nmse, point_cloud, recover
+from tofclip.camera import Camera, SkewSweep
+from tofclip.errors import InputError
+from tofclip.recovery.surface_patches import evaluate_monomials, find_patches
+from tofclip.recovery.surfaces import (
+    SurfaceModel,
+    SurfaceRecovery,
+    SurfaceState,
+    refine_state,
+)
+from tofclip.sequences import CloudSettings
+from tofclip.shots import Frames, Streak
+from tofclip.simulate import (
+    Instrument,
+    Scene,
+    StreakDetector,
+    make_plate,
+    render_true_frames,
+    score_returns,
+    simulate_shot,
+)
+from tofclip.simulate.patterns import make_checkerboard, make_plain_pattern
+
+BIN = 20e-12
+BIN_M = 3e-3
+SHAPE = (48, 48)
+FOCAL = 210.0
+CENTRES = 45.0 + 62 * np.arange(7)
+ANGLES = np.radians([-43.3, -25.7, -12.7, 0.6, 22.9, 37.5, 48.0])
+CAMERA = Camera(
+    CENTRES,
+    ANGLES,
+    SHAPE,
+    462,
+    gains=np.array([0.92, 1.08, 1.02, 0.90, 1.02, 0.96, 1.10]),
+    sweep=SkewSweep(CENTRES, np.linspace(-8.0, 8.0, 7), np.linspace(5e-3, -5e-3, 7)),
+    time_zero=-8e-9,
+    focal_length_px=FOCAL,
+    lenslet_pitch=2.3e-3,
+    focus_distance=1.6,
+)
+INSTRUMENT = Instrument(CAMERA, StreakDetector(270))
+
+
+def place(name: str, middle: tuple[float, float], side: float, distance: float, **turned: float):
+    pixel = distance / FOCAL
+    pattern = {"plain": make_plain_pattern(0.8), "board": make_checkerboard(3, 0.3, 0.9)}[name]
+    return make_plate(
+        (middle[0] * pixel, middle[1] * pixel, distance),
+        (side * pixel, side * pixel),
+        pattern,
+        **turned,
+    )
+
+
+SCENE = Scene(
+    (
+        place("plain", (-9, -8), 15, 1.4),
+        place("board", (8, 6), 19, 1.65, yaw=0.3),
+        place("plain", (0, 0), 40, 1.9),
+    )
+)
+
+
+@pytest.fixture(scope="module")
+def shot():
+    return simulate_shot(SCENE, INSTRUMENT, seed=0)
+
+
+@pytest.fixture(scope="module")
+def found(shot) -> Frames:
+    return recover(shot.streak, shot.camera, "surfaces")
+
+
+def make_model(streak: Streak) -> SurfaceModel:
+    masks = np.zeros((2, *SHAPE), bool)
+    masks[0, 8:30, 5:25] = masks[1, 20:40, 18:44] = True
+    coefficients = np.zeros((2, 6))
+    coefficients[:, 0] = 1 / 1.4, 1 / 1.7
+    coefficients[:, 1] = 0.02, -0.03
+    state = SurfaceState(coefficients, CAMERA.gains.copy(), np.zeros(7), np.ones(7))
+    return SurfaceModel(streak, CAMERA, masks, state)
+
+
+def test_the_adjoint_matches(shot):
+    model = make_model(shot.streak)
+    random = np.random.default_rng(0)
+    x = random.random(model.surface.size).astype(np.float32)
+    y = random.standard_normal(model.image.shape).astype(np.float32)
+    there = np.vdot(model.render(x, model.state.gains).astype(np.float64), y)
+    assert there == pytest.approx(float(np.vdot(x.astype(np.float64), model.gather(y))), rel=1e-4)
+
+
+def test_derivatives_are_those_of_the_image(shot):
+    """Central differences in every direction; of a float32 image."""
+    model = make_model(shot.streak)
+    amplitude = np.random.default_rng(1).random(model.surface.size).astype(np.float32)
+    state = model.state
+    found = {(name, number): image for name, number, image in model.iterate_derivatives(amplitude)}
+    for name, number, step in (
+        ("coefficients", 0, 2e-4), ("coefficients", 8, 2e-4), ("gains", 2, 1e-2),
+        ("delays", 4, 2e-2), ("widths", 5, 2e-2),
+    ):  # fmt: skip
+        images = []
+        for sign in (1, -1):
+            moved = replace(
+                state, **{name: getattr(state, name).copy() for name in ("coefficients", name)}
+            )
+            values = getattr(moved, name).reshape(-1)
+            values[number] += sign * step * (values[number] if name in ("gains", "widths") else 1)
+            model.place(moved)
+            images.append(model.render(amplitude, model.state.gains))
+        model.place(state)
+        difference = (images[0] - images[1]) / (2 * step)
+        image = found[name, number]
+        assert np.linalg.norm(image - difference) < 0.03 * np.linalg.norm(difference), name
+
+
+def test_a_refused_or_taken_step_never_raises_the_misfit(shot):
+    model = make_model(shot.streak)
+    amplitude = np.full(model.surface.size, 50, np.float32)
+    before = model.misfit(amplitude)
+    refine_state(model, amplitude)
+    assert model.misfit(amplitude) <= before
+    assert model.state.gains.mean() == pytest.approx(CAMERA.gains.mean())
+
+
+def test_patches_are_planes_to_rounding_and_halves_of_one_are_joined():
+    y, x = np.indices((40, 40))
+    ray_length = np.sqrt(1 + ((x - 20) / 150) ** 2 + ((y - 20) / 150) ** 2)
+    plane = ray_length / (0.5 + 1e-3 * x - 5e-4 * y)
+    distance = plane.copy()
+    distance[:, 18:21] = np.nan  # cut in two
+    distance[5:12, 25:33] = 1.2 * ray_length[5:12, 25:33]
+    distance[30, 30] = 1.0  # alone
+    patches = find_patches(distance, ray_length, BIN_M)
+    assert [patch.pixels.size for patch in patches] == [40 * 37 - 56 - 1, 56]
+    inverse = evaluate_monomials(np.arange(1600), (40, 40)) @ patches[0].coefficients
+    np.testing.assert_allclose(ray_length.ravel() / inverse, plane.ravel(), atol=1e-4)
+
+
+def test_surfaces_are_better_than_frames_in_picture_and_range(shot, found):
+    truth = render_true_frames(SCENE, INSTRUMENT, shot.exposure).values.sum(axis=0)
+    by_frames = recover(shot.streak, shot.camera, "tv")
+    error, other = (nmse(one.values.sum(axis=0), truth) for one in (found, by_frames))
+    assert error < 0.6 * other
+    score, before = (score_returns(one, shot.truth) for one in (found.returns, depth(by_frames)))
+    assert score["median_depth_error_m"] < 0.5 * before["median_depth_error_m"]
+    assert score["share_within_one_bin"] >= 0.95
+    assert score["false_return_share"] <= 0.05  # of 48 x 48 pixels; 0.005 of the demonstration
+
+
+def test_frames_are_the_rendering_of_the_returns_and_keep_them(found, tmp_path: Path):
+    assert found.figures["method"] == "surfaces"
+    assert found.figures["surfaces"] == 3
+    assert found.figures["relative_residual"] < 0.1
+    again = depth(found)
+    strongest, rendered = (one.image("range") for one in (found.returns, again))
+    both = np.isfinite(strongest) & np.isfinite(rendered)
+    assert np.median(np.abs(strongest - rendered)[both]) < 0.2 * BIN_M
+    found.save(tmp_path / "frames.h5")
+    loaded = Frames.load(tmp_path / "frames.h5")
+    assert loaded.returns is not None
+    np.testing.assert_array_equal(loaded.returns.range, found.returns.range)
+    cloud, returns = CloudSettings().make_cloud(loaded, "these frames")
+    assert len(returns) == len(found.returns)
+    np.testing.assert_allclose(cloud.xyz, point_cloud(found.returns).xyz)
+
+
+def test_a_shot_that_is_not_of_surfaces_is_refused(shot):
+    """Light of every range in every column, as of smoke."""
+    random = np.random.default_rng(3)
+    fog = np.zeros_like(shot.streak.counts)
+    fog[60:180] = random.poisson(40 * random.random((120, fog.shape[1])))
+    with pytest.raises(InputError, match="choose --method tv"):
+        recover(replace(shot.streak, counts=fog.astype(np.float32)), shot.camera, "surfaces")
+
+
+def test_settings_that_make_no_sense_are_refused():
+    with pytest.raises(InputError, match="positive weight"):
+        SurfaceRecovery(weight=0.0)
