@@ -20,12 +20,14 @@ from tofclip.sequences.ranger import (
     JitterEstimator,
     RangingPipeline,
     compute_light_curve,
-    make_clouds,
+    make_average_cloud,
 )
+from tofclip.sequences.ranging import RangingSettings
 from tofclip.shots import StreakStack, save_stack
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.bodies import Body
 from tofclip.simulate.patterns import make_checkerboard
+from tofclip.threads import map_parallel
 from tofclip.units import SPEED_OF_LIGHT
 
 CENTRES = 40.0 + 60 * np.arange(5)
@@ -75,6 +77,15 @@ def pipeline() -> RangingPipeline:
     return RangingPipeline(camera(), np.arange(ROWS) * BIN, focus=DepthLockedFocus())
 
 
+def make_clouds(shots, pipeline, average=1, steady=True, first=0):
+    """Clouds of successive shots and their delays, as the jobs of `RangingSettings` make them."""
+    jitter = JitterEstimator(compute_light_curve(shots[0](), pipeline.camera)) if steady else None
+    starts = range(first * average, len(shots), average)
+    yield from map_parallel(
+        lambda start: make_average_cloud(shots[start : start + average], pipeline, jitter), starts
+    )
+
+
 def nearest(cloud) -> np.ndarray:
     return cloud.range[cloud.range < 1.3]
 
@@ -84,12 +95,12 @@ def test_jitter_is_found_and_taken_off(pipeline):
     shots = [partial(shot, one, seed) for seed, one in enumerate(late)]
     steps = list(make_clouds(shots, pipeline))
     # the light curve's rises are two rows wide; a tenth of a row is half a millimetre here
-    np.testing.assert_allclose([step.late_bin[0] for step in steps], late, atol=0.15)
-    first = np.median(nearest(steps[0].cloud))
-    for step in steps[1:]:
-        assert np.median(nearest(step.cloud)) == pytest.approx(first, abs=0.2 * BIN_M)
+    np.testing.assert_allclose([delays[0] for _, delays in steps], late, atol=0.15)
+    first = np.median(nearest(steps[0][0]))
+    for cloud, _ in steps[1:]:
+        assert np.median(nearest(cloud)) == pytest.approx(first, abs=0.2 * BIN_M)
     shaken = list(make_clouds(shots, pipeline, steady=False))
-    assert np.median(nearest(shaken[1].cloud)) - first == pytest.approx(2 * BIN_M, abs=0.2 * BIN_M)
+    assert np.median(nearest(shaken[1][0])) - first == pytest.approx(2 * BIN_M, abs=0.2 * BIN_M)
 
 
 def test_averaging_lowers_the_noise_and_a_sequence_goes_on_where_it_stopped(pipeline):
@@ -109,14 +120,14 @@ def test_averaging_lowers_the_noise_and_a_sequence_goes_on_where_it_stopped(pipe
             )
         )
 
-    alone = [step.cloud for step in make_clouds(shots, pipeline)]
+    alone = [cloud for cloud, _ in make_clouds(shots, pipeline)]
     averaged = list(make_clouds(shots, pipeline, average=4))
-    assert [list(step.shots) for step in averaged] == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+    assert [len(delays) for _, delays in averaged] == [4, 4, 2]
     usual = np.mean([change(one, other) for one, other in pairwise(alone)])
     # noise changes half as much; how late a shot is found to be is averaged as well
-    assert change(averaged[0].cloud, averaged[1].cloud) < 0.7 * usual
-    (resumed,) = make_clouds(shots, pipeline, average=4, first=2)
-    np.testing.assert_array_equal(resumed.cloud.xyz, averaged[2].cloud.xyz)
+    assert change(averaged[0][0], averaged[1][0]) < 0.7 * usual
+    ((resumed, _),) = make_clouds(shots, pipeline, average=4, first=2)
+    np.testing.assert_array_equal(resumed.xyz, averaged[2][0].xyz)
 
 
 def test_memory_does_not_grow_with_the_sequence(pipeline, tmp_path):
@@ -204,8 +215,9 @@ def test_other_files_are_no_stacks(tmp_path, content):
 
 
 def test_unusable_sequences_are_refused(pipeline):
-    for shots, average, first in (([], 1, 0), ([shot], 0, 0), ([shot], 1, -1)):
-        with pytest.raises(InputError, match="at least one"):
-            next(make_clouds(shots, pipeline, average, first=first))
+    with pytest.raises(InputError, match="at least one"):
+        make_average_cloud([], pipeline, None)
+    with pytest.raises(InputError, match="at least one"):
+        RangingSettings(average=0)
     with pytest.raises(ShapeError):
         pipeline.cloud(np.zeros((3, 3), np.float32))

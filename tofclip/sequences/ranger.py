@@ -4,7 +4,7 @@ once.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,30 +24,11 @@ from tofclip.recovery.plan import open_shot
 from tofclip.shots import Returns, Streak
 from tofclip.solvers import LinearInverse
 from tofclip.solvers.traces import InverseTraces, order_by_patch
-from tofclip.threads import map_parallel
 
 FloatArray = NDArray[np.float64]
 Shot = Callable[[], Streak]
 
 MAX_JITTER_BINS = 32
-
-
-@dataclass(frozen=True)
-class SequenceCloud:
-    """One cloud of a sequence.
-
-    Parameters
-    ----------
-    cloud : PointCloud
-    shots : range
-        Numbers of the shots it was made from.
-    late_bin : (shots,) array
-        Rows by which each came later than the first shot of the sequence.
-    """
-
-    cloud: PointCloud
-    shots: range
-    late_bin: FloatArray
 
 
 class RangingPipeline:
@@ -262,54 +243,6 @@ def compute_light_curve(streak: Streak, camera: Camera) -> FloatArray:
     )
 
 
-def make_clouds(
-    shots: Sequence[Shot],
-    pipeline: RangingPipeline,
-    average: int = 1,
-    steady: bool = True,
-    first: int = 0,
-) -> Iterator[SequenceCloud]:
-    """Yield one cloud for every `average` successive shots; what is left over at the end makes one
-    more.
-
-    Parameters
-    ----------
-    shots : sequence of callables
-        Each reads its shot when it is called, on the thread that works on it.
-    pipeline : RangingPipeline
-    average : int
-        Shots whose measurements are averaged.
-    steady : bool
-        Whether to find how late each shot comes against the first one, and take it off.
-    first : int
-        Number of the first cloud wanted: a sequence that was interrupted goes on there.
-
-    Yields
-    ------
-    SequenceCloud
-
-    Raises
-    ------
-    InputError
-        No shot, or fewer than one to average; a shot without any light, by its name.
-
-    Notes
-    -----
-    Every core works on a cloud of its own. Memory: a shot for each core, with what is recovered of
-    it, and what a `RangingPipeline` takes.
-    """
-    if not shots or average < 1 or first < 0:
-        raise InputError("a sequence needs at least one shot, and at least one to average")
-    jitter = JitterEstimator(compute_light_curve(shots[0](), pipeline.camera)) if steady else None
-
-    def step(start: int) -> SequenceCloud:
-        numbers = range(start, min(start + average, len(shots)))
-        cloud, late = make_average_cloud([shots[number] for number in numbers], pipeline, jitter)
-        return SequenceCloud(cloud, numbers, late)
-
-    yield from map_parallel(step, range(first * average, len(shots), average))
-
-
 def make_average_cloud(
     shots: Sequence[Shot], pipeline: RangingPipeline, jitter: JitterEstimator | None
 ) -> tuple[PointCloud, FloatArray]:
@@ -318,7 +251,7 @@ def make_average_cloud(
     Parameters
     ----------
     shots : sequence of callables
-        At least one; one is in memory at a time.
+        At least one. Each reads its shot when it is called; one is in memory at a time.
     pipeline : RangingPipeline
     jitter : JitterEstimator, optional
         None: the shots are taken as they come.
@@ -328,7 +261,14 @@ def make_average_cloud(
     PointCloud
     (shots,) array
         Rows by which each shot was late, as far as that was asked for.
+
+    Raises
+    ------
+    InputError
+        No shot.
     """
+    if not shots:
+        raise InputError("a cloud needs at least one shot")
     late = np.zeros(len(shots))
 
     def measurements(place: int) -> NDArray[np.float32]:
