@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.lidar.cloud import PointCloud, point_cloud
-from tofclip.lidar.returns import Returns
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming.channel import Policy
 from tofclip.sequences.streaming.stages import READ, WAIT, Stage, run_stages
-from tofclip.shots import Streak
+from tofclip.shots import Returns, Streak
 from tofclip.threads import open_worker_pool
 
 STEPS = ("rectify", "recover", "range", "place")
