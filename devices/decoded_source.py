@@ -44,6 +44,8 @@ class DecodedSource(Source):
         if self.tap is not None:
             self.tap(piece)
         has_gap = piece.gap is not Gap.NONE
+        # An instrument that began anew counts from zero again, so that what the decoder remembers
+        # is wrong.
         if piece.gap is Gap.RESTART:
             self._state = self.codec.start
         found = self.codec.decode(as_bytes(piece.data), self._state, has_gap)

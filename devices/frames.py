@@ -127,6 +127,8 @@ class FrameCodec:
             )
         frames = np.ascontiguousarray(words).reshape(-1, self.frame_bytes)
         numbers = frames[:, : _NUMBER_DTYPE.itemsize].copy().view(_NUMBER_DTYPE)[:, 0]
+        # A number that does not exceed all earlier ones was damaged, or belongs to a frame that
+        # came already.
         before = np.maximum.accumulate(np.concatenate([[state], numbers]))
         valid = numbers > before[:-1]
         records = np.empty(int(valid.sum()), self.dtype)

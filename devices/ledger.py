@@ -20,6 +20,7 @@ class Ledger:
     @property
     def stats(self) -> Stats:
         """The accounts as they stand."""
+        # No lock: the snapshot is immutable and replaced as a whole.
         return self._stats
 
     def receive(self, records: int) -> None:

@@ -77,6 +77,7 @@ class LoopbackServer:
     def __init__(self, serve: Callable[[Connection], None]) -> None:
         self._serve = serve
         self._closing = threading.Event()
+        # Port 0: the system chooses a free one.
         self._listener = socket.create_server((HOST, 0))
         self._listener.settimeout(POLL_INTERVAL_S)
         self.port: int = self._listener.getsockname()[1]
@@ -98,6 +99,7 @@ class LoopbackServer:
         self._listener.close()
         self.close_connections()
         for thread in self._threads:
+            # A handler may close the server; a thread cannot join itself.
             if thread is not threading.current_thread():
                 thread.join(2)
 
@@ -120,6 +122,7 @@ class LoopbackServer:
                 continue
             except OSError:
                 return
+            # Short answers leave at once, instead of waiting for more (Nagle).
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection = Connection(link, self._closing)
             self._connections.append(connection)

@@ -114,6 +114,7 @@ def record_source(
                 fault = str(failure)
                 raise
             finally:
+                # Closed first: only then are the accounts that go into the file final.
                 source.close()
                 writer.finish(source.stats, fault, source.is_complete)
         if interrupted.is_set():
@@ -155,6 +156,7 @@ def _defer_end_signals() -> Iterator[threading.Event]:
 
     numbers = [getattr(signal, name) for name in END_SIGNALS if hasattr(signal, name)]
     before = {number: signal.getsignal(number) for number in numbers}
+    # A signal ignored by the parent (nohup) stays ignored.
     heeded = [number for number in numbers if before[number] is not signal.SIG_IGN]
     for number in heeded:
         signal.signal(number, interrupt)

@@ -36,6 +36,7 @@ def retry_connect(connect: Callable[[], T], seconds: float) -> T:
         try:
             return connect()
         except (DeviceNotFoundError, DeviceDisconnectedError, DeviceTimeoutError) as fault:
+            # Looked at after the attempt, so that there is always one.
             if monotonic() > deadline:
                 raise DeviceDisconnectedError(
                     f"the connection broke and nobody answered for {seconds:g} s ({fault})"

@@ -87,6 +87,7 @@ class RingBuffer:
                 raise self._fault
             while not self._has_room(piece) and self._policy == "drop_oldest":
                 self._drop_oldest()
+            # What was dropped while the ring was empty is marked at the next piece.
             self._pieces.append(replace(piece, gap=max(piece.gap, self._lost_before_next)))
             self._bytes += len(piece.data)
             self._lost_before_next = Gap.NONE
@@ -130,6 +131,7 @@ class RingBuffer:
     def fail(self, fault: BaseException) -> None:
         """End the stream with an exception; the first one counts."""
         with self._changed:
+            # Later faults are mostly consequences of the first.
             self._fault = self._fault or fault
             self._changed.notify_all()
 
@@ -142,6 +144,8 @@ class RingBuffer:
             self._changed.notify_all()
 
     def _has_room(self, piece: Piece) -> bool:
+        # A piece larger than the ring is taken when the ring is empty; it could never enter
+        # otherwise.
         return not self._pieces or self._bytes + len(piece.data) <= self._capacity
 
     def _drop_oldest(self) -> None:

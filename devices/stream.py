@@ -104,6 +104,7 @@ class StreamSource(DecodedSource):
         self._ring = RingBuffer(buffering.capacity, buffering.policy, ledger)
         self._stopping, self._closed = threading.Event(), False
         feed.start()
+        # Asked before the thread starts, because a feed is used by one thread at a time.
         self._info, self._calibration = feed.info, feed.calibration
         self._thread = threading.Thread(target=self._run_reader, name="device reader", daemon=True)
         self._thread.start()
@@ -148,6 +149,7 @@ class StreamSource(DecodedSource):
         like an instrument in the dark.
         """
         reader = _FeedReader(self._feed, self.codec, self._ledger, self._ring)
+        # The feed is closed even if reading failed, and on the thread that used it.
         for step in (lambda: reader.run(self._stopping), self._feed.close):
             try:
                 step()
@@ -189,6 +191,7 @@ class _FeedReader:
                 self._enqueue(arrival)
 
     def _enqueue(self, arrival: Transfer) -> None:
+        # A record cut by a gap never gets its end.
         if arrival.gap is not Gap.NONE:
             self._count_truncated()
             self._gap = max(self._gap, arrival.gap)

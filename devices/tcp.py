@@ -54,6 +54,7 @@ class TcpLink:
                 raise DeviceNotFoundError(
                     f"nobody answers at {self.name} ({reason}); is its program running?"
                 ) from fault
+        # Commands are short and wait for an answer: Nagle's algorithm would hold them back.
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def send(self, data: bytes, timeout: float) -> None:
@@ -155,6 +156,7 @@ class TcpLink:
                 raise ProtocolError(
                     f"{self.name} sent {len(self._buffer)} bytes without the end of a message"
                 )
+            # The end may be split between two receptions.
             searched = max(0, len(self._buffer) - len(end) + 1)
             self._fill_buffer(deadline, timeout)
         message = self._take_bytes(found)

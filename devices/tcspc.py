@@ -138,6 +138,7 @@ def _open_file(uri: Uri, reader: Callable[[Path], FileContents]) -> TcspcFile:
 def _read_photons(path: Path) -> FileContents:
     ptufile = _import_library("ptufile")
     with ptufile.PtuFile(path) as file:
+        # T2 mode tags every event, the laser included, by an absolute time.
         if not file.is_t3:
             raise FileFormatError(
                 path, "is in T2 mode, whose times are not counted from the laser; record in T3 mode"

@@ -80,6 +80,7 @@ def measure_throughput(
                 if meter.read(source, min(POLL_INTERVAL_S, begin + seconds - now)) is None:
                     break
             now = monotonic()
+        # Measured before draining, whose bytes would flatter the rate.
         took, read = max(monotonic() - begin, 1e-9), meter.bytes
         source.stop()
         while source.read() is not None:

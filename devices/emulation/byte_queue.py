@@ -32,6 +32,7 @@ class ByteQueue:
             buffer[taken : taken + len(part)] = part
             taken += len(part)
             if len(part) < len(piece):
+                # A view of the rest: no bytes are copied.
                 self._pieces.appendleft(piece[len(part) :])
         self._length -= taken
         return taken

@@ -100,6 +100,7 @@ def _draw_fault(rng: np.random.Generator) -> tuple[FaultKind, int]:
         often = int(rng.choice([1, 2], p=[0.85, 0.15]))
         if kind == "stall" or often == 1:
             return kind, often
+        # Rarely the instrument never comes back.
         return kind, PERMANENT_ENUMERATIONS
     if kind in REPLY_FAULTS:
         return kind, int(rng.integers(1, 4))

@@ -11,6 +11,7 @@ from devices.timetag.kernels import RECORD_BYTES, TIME_BITS, TIME_MASK, WRAP
 
 compiled = njit(nogil=True, cache=True, error_model="numpy")
 
+# The 53 upper bits of a word fill the mantissa of a double.
 _DOUBLE_STEP = 2.0**-53
 
 
@@ -54,11 +55,13 @@ def fill_poisson_words(state, now, scale, weights, last, words):
     written = 0
     while written < words.size // RECORD_BYTES:
         after, bits = _next_random(state[0])
+        # One is added before the logarithm, which zero would not have.
         gap = -math.log(((bits >> np.uint64(11)) + np.uint64(1)) * _DOUBLE_STEP) * scale
         tick = now[0] + 1 + np.int64(gap)
         after, bits = _next_random(after)
         where = (bits >> np.uint64(11)) * _DOUBLE_STEP
         wrap = ((now[0] >> TIME_BITS) + 1) << TIME_BITS
+        # The counter wraps unless the photon comes first.
         lines, kind = 0, WRAP
         if tick < wrap:
             lines, kind = 1, 0
@@ -67,11 +70,13 @@ def fill_poisson_words(state, now, scale, weights, last, words):
                     lines <<= 1
         else:
             tick, after = wrap, state[0]
+        # State is not advanced: the next call draws this record again.
         if tick > last:
             break
         state[0], now[0] = after, tick
         at = written * RECORD_BYTES
         time = tick & TIME_MASK
+        # Six bytes, the highest first; see devices.timetag.codec.
         words[at] = kind << 5
         words[at + 1] = (lines << 4) | (time >> 32)
         words[at + 2] = (time >> 24) & 0xFF

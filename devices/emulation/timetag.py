@@ -206,6 +206,7 @@ class EmulatedTimeTagger(VirtualDevice):
         """
         if endpoint != COMMAND_ENDPOINT:
             raise make_usb_error(errno.EPIPE)
+        # Replies that nobody fetches block the register manager.
         if len(self._replies) >= MAX_REPLIES:
             return  # swallowed
         for byte in data:
@@ -237,6 +238,7 @@ class EmulatedTimeTagger(VirtualDevice):
             self._unfinished.extend([self._window] * (chip // self._window))
             self._unfinished.append(rest)
             self._window = min(max(value, 1), PACKET_BYTES)
+        # What firmware does with a flush differs; the driver must live with both.
         elif request == FLUSH and self.setting.flush_discards:
             self._stream.truncate(len(self._stream) - rest)
         elif request == FLUSH:
@@ -320,6 +322,7 @@ class EmulatedTimeTagger(VirtualDevice):
         return len(reply)
 
     def _write_register(self, register: Register, value: int) -> None:
+        # Read-only.
         if register in (Register.VERSION, Register.CLOCK):
             return
         is_level = register is Register.CLEAR and self.setting.clear_is_level
@@ -389,6 +392,7 @@ class EmulatedTimeTagger(VirtualDevice):
         if not self.setting.is_paced or Capture.REGISTER not in self._capture:
             return
         tick = int((monotonic() - self._started) * CLOCK_HZ)
+        # Photons beyond memory, chip and the transfer under way have nowhere to go.
         capacity = self.setting.memory_bytes + CHIP_PACKETS * self._window + in_flight
         found = MAX_BATCH_RECORDS
         while found == MAX_BATCH_RECORDS:
@@ -412,6 +416,7 @@ class EmulatedTimeTagger(VirtualDevice):
         if self._mark_lost:
             words[0] |= LOST << 5
             self._mark_lost = False
+        # Bits that have to be zero are set, by which a decoder can tell.
         garbled = min(self._records_to_corrupt, len(words) // RECORD_BYTES)
         words[: garbled * RECORD_BYTES] |= UNUSED_BITS
         self.truth.corrupted += garbled
@@ -512,6 +517,7 @@ class EmulatedTimeTagger(VirtualDevice):
 
     def _apply_fault(self, fault: Fault, buffer: memoryview, timeout: float) -> int:
         """Do what a fault orders: some are an exception, some a smaller or stranger transfer."""
+        # Faults of the transfer itself come first, then those of its contents.
         if fault.kind == "timeout":
             raise make_usb_error(errno.ETIMEDOUT)
         if fault.kind in ("stall", "unplug", "powerloss"):

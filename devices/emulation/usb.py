@@ -130,6 +130,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
 
     def get_device_descriptor(self, dev: VirtualDevice) -> SimpleNamespace:
         return SimpleNamespace(
+            # Standard device descriptor of USB 2.0, table 9-8; class 255 is vendor specific.
             bLength=18, bDescriptorType=1, bcdUSB=0x200, bDeviceClass=255, bDeviceSubClass=255, bDeviceProtocol=255,
             bMaxPacketSize0=64, idVendor=dev.identity.vendor, idProduct=dev.identity.product, bcdDevice=0x100,
             iManufacturer=1, iProduct=2, iSerialNumber=3 if dev.strings[2] else 0, bNumConfigurations=1,
@@ -152,6 +153,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         """
         _require_descriptor(config == 0)
         return SimpleNamespace(
+            # USB 2.0, table 9-10.
             bLength=9, bDescriptorType=2, wTotalLength=18 + 7 * len(dev.endpoints), bNumInterfaces=1,
             bConfigurationValue=1, iConfiguration=0, bmAttributes=0x80, bMaxPower=250, extra_descriptors=[],
         )  # fmt: skip
@@ -174,6 +176,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
         """
         _require_descriptor((intf, alt, config) == (INTERFACE_NUMBER, 0, 0))
         return SimpleNamespace(
+            # USB 2.0, table 9-12.
             bLength=9, bDescriptorType=4, bInterfaceNumber=INTERFACE_NUMBER, bAlternateSetting=0,
             bNumEndpoints=len(dev.endpoints), bInterfaceClass=255, bInterfaceSubClass=255, bInterfaceProtocol=255,
             iInterface=0, extra_descriptors=[],
@@ -199,6 +202,7 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
             ep < len(dev.endpoints) and (intf, alt, config) == (INTERFACE_NUMBER, 0, 0)
         )
         return SimpleNamespace(
+            # USB 2.0, table 9-13.
             bLength=7, bDescriptorType=5, bEndpointAddress=dev.endpoints[ep], bmAttributes=BULK_TRANSFER,
             wMaxPacketSize=PACKET_BYTES, bInterval=0, bRefresh=0, bSynchAddress=0, extra_descriptors=[],
         )  # fmt: skip
@@ -308,6 +312,8 @@ class VirtualUsb(usb.backend.IBackend):  # type: ignore[misc] # pyusb has no typ
             if number
             else ENGLISH_LANGID.to_bytes(2, "little")
         )
+        # String descriptors are UTF-16LE behind their length and type; number 0 lists the
+        # languages.
         answer = bytes([2 + len(text), STRING]) + text
         length = min(len(answer), len(data))
         data[:length] = array.array("B", answer[:length])

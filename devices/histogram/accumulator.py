@@ -67,6 +67,7 @@ class BinAxis:
             raise InputError(
                 f"the laser's period must be a positive number of seconds, got {self.period}"
             )
+        # A relative tolerance, because a width is often computed as period / bins.
         if self.bins * self.bin_width > self.period * (1 + 1e-9):
             raise InputError(
                 f"{self.bins} bins of {self.bin_width:.4g} s are longer than the laser's period of {self.period:.4g} s"

@@ -107,6 +107,8 @@ class TagHistogram(Accumulator):
         records : (n,) array of `devices.timetag.codec.RECORD_DTYPE`
         after_gap : bool
         """
+        # Sync pulses may be among the missing records, so that the last known one may be of an
+        # earlier period.
         if after_gap:
             self._known = -1
         known, columns = (
@@ -115,6 +117,8 @@ class TagHistogram(Accumulator):
         )
 
         def add(piece: slice, steps: NDArray[Any]) -> None:
+            # Each thread begins in the middle of the batch and looks back for the pulse that counts
+            # there.
             start = find_last_sync(*columns, DELTA, self._sync, piece.start, known)
             place = (self._pixel_of, self._tick_bins, self.axis.shift_bins, self.axis.period_bins)
             add_tags(

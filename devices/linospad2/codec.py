@@ -133,6 +133,7 @@ class LinoSpad2Codec:
     def pixel_of(self) -> NDArray[np.uint32]:
         """Pixel of each converter's addresses, (64, 4)."""
         converter, address = np.indices((PIXEL_CONVERTERS, ADDRESSES), np.uint32)
+        # 2212b puts four neighbours on a converter, 2212s every 64th pixel.
         if self.firmware == "2212b":
             return ADDRESSES * converter + address
         return converter + PIXEL_CONVERTERS * address
@@ -174,9 +175,12 @@ class LinoSpad2Codec:
         """
         cycles = self._view_cycles(data)
         kept, malformed = self._count_per_cycle(cycles)
+        # Counted first: each block then knows which rows of the result are its own, and threads
+        # need no lock.
         ends = np.cumsum(kept)
         total = int(ends[-1]) if len(ends) else 0
         records = np.empty(total, self.dtype)
+        # Records are whole words, so that the kernel sees them as rows of words.
         rows = records.view(_WORD_DTYPE).reshape(total, self.dtype.itemsize // _WORD_DTYPE.itemsize)
 
         def work(block: slice) -> None:

@@ -98,6 +98,7 @@ def _parse_toml(path: Path, recording: str | Path) -> dict[str, Any]:
             f"{recording}: its format is not in the file itself; write {keys} into {path.name} beside it"
         )
     with translate_read_errors(path), open(path, "rb") as file:
+        # One byte more than allowed shows that there is more, without reading all of it.
         data = file.read(_MAX_FILE_BYTES + 1)
     if len(data) > _MAX_FILE_BYTES:
         raise FileFormatError(
@@ -120,6 +121,8 @@ def _check_keys(found: dict[str, Any], path: Path) -> dict[str, Any]:
                 path, f"has the unknown key '{key}'; known are {', '.join(_KEY_TYPES)}"
             )
         kind = _KEY_TYPES[key]
+        # TOML tells 50000 from 50000.0; a person does not. By exact type, because bool is an int in
+        # Python.
         is_number = kind is float and type(value) is int
         if type(value) is not kind and not is_number:
             raise FileFormatError(path, f"{key} must be a {kind.__name__}, found {value!r}")

@@ -140,6 +140,7 @@ class SimulatedBoard:
         return codes
 
     def _drop_overflow(self, records: Records) -> Records:
+        # A converter keeps its first photons in time; later ones find its memory full.
         records = self.codec.sort_stamps(records[np.argsort(records["code"], kind="stable")])
         converter = self.codec.address_of[records["pixel"]] // ADDRESSES
         place_in_queue = np.arange(len(records)) - np.searchsorted(converter, converter)

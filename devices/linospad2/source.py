@@ -60,6 +60,7 @@ class LinoSpad2File(DecodedSource):
         self._is_cut_off = size % codec.cycle_bytes > 0
         self._cycles = max(1, PIECE_BYTES // codec.cycle_bytes)
         self._pieces = -(-(size // codec.cycle_bytes) // self._cycles)
+        # The file has no index: one pass at the start lets the accounts and seek know every number.
         self._good, self._malformed = self._count_records()
         self._next = self._skip = 0
         self._seek_to(0)
@@ -130,6 +131,7 @@ class LinoSpad2File(DecodedSource):
         self._ledger = Ledger()
         self._ledger.receive(self._good[-1] + self._malformed[-1])
         self._ledger.deliver(self._good[number], self._malformed[number])
+        # The last cycle is incomplete; it counts as one record that cannot be read.
         if self._is_cut_off:
             self._ledger.truncate()
 

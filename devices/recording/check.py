@@ -177,6 +177,7 @@ class _Inspector:
     def _count_missing(self, block: Block) -> None:
         """Find whole blocks that are not there, by the numbers of those that are."""
         if not block.header.is_legacy:
+            # Each damaged stretch stands for one block at least, which must not be counted twice.
             missing = block.header.number - self._next_number - self._holes
             if missing > 0:
                 self._count_damage(0)

@@ -184,6 +184,7 @@ class BlockReader:
 
     def _search(self, position: int, magic: bytes, accept: Callable[[BlockHeader], bool]) -> int:
         while position < self.length:
+            # Overlaps the next stretch, so that a magic across the border is found.
             stretch = self._fetch(position, SEARCH_BYTES + len(magic) - 1)
             at = stretch.find(magic)
             while at >= 0:
@@ -377,6 +378,7 @@ def parse_head(image: bytes, path: Path) -> Record:
     """
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder, path.name)
+        # HDF5 reads files rather than bytes.
         copy.write_bytes(image)
         head = Record.load(copy, RECORD_KIND)
     return Record(head.kind, {}, head.attributes, head.children, head.provenance, str(path))

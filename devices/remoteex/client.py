@@ -76,6 +76,7 @@ class RemoteExClient:
     def __init__(self, host: str, port: int, data_port: int, timeout: float = 5.0) -> None:
         self._timeout = timeout
         self._messages: deque[Answer] = deque(maxlen=MAX_MESSAGES)
+        # Commands sent and not answered yet, oldest first: RemoteEx answers in order.
         self._owed: deque[Command] = deque()
         self._unread = 0
         self._may_continue = False
@@ -147,6 +148,7 @@ class RemoteExClient:
             self._timeout = usual
 
     def _exchange(self, name: str, arguments: tuple[str, ...]) -> tuple[Answer, Command]:
+        # After a timeout the late answer would be taken for that of the next command.
         self._wait_for_owed()
         if name in _COMMANDS_WITH_DATA:
             self._data.discard_available()  # of a client before this one
@@ -294,6 +296,8 @@ class RemoteExClient:
             try:
                 answer = Answer.decode(message)
             except ProtocolError:
+                # Rest of a text that held a bare carriage return, which looks like the end of a
+                # message.
                 if self._may_continue or message.startswith(b"\n"):
                     continue
                 raise

@@ -225,6 +225,7 @@ class EmulatedStreakCamera:
         self._end_acquisition(connection)
 
     def _command_handlers(self) -> dict[str, Callable[[Command, Connection], None]]:
+        # Commands of the handbook; names are not case-sensitive.
         known: dict[str, Callable[[Command, Connection], None]] = {
             "AppStart": self._start_application,
             "AppInfo": _answer_with("9.5 pf4"),
@@ -418,6 +419,7 @@ class EmulatedStreakCamera:
                 AnswerCode.DONE, "ImgRingBufferGet", (*size, "2", "0", str(number), "0")
             ).encode()
         )
+        # In halves, so that a client has to put a picture together.
         data, half = pixels.tobytes(), pixels.nbytes // 2
         self._send_data(data[:half])
         if kind == "short":

@@ -164,6 +164,7 @@ class RemoteExFeed:
         Live mode that somebody else had started goes on, with the gain that it had.
         """
         self._stopped = True
+        # Live mode of an operator goes on with the operator's gain; otherwise 0 protects the tube.
         gain = self._gain_before if self._has_joined else "0"
         commands: list[tuple[str, ...]] = [("AcqLiveMonitor", "Off")]
         if not self._has_joined:
@@ -189,6 +190,7 @@ class RemoteExFeed:
         try:
             try:
                 self._prepare_live(link)
+            # These say nothing about HPD-TA, so that starting it would not help.
             except (DeviceDisconnectedError, DeviceTimeoutError):
                 raise
             except DeviceError:
@@ -204,6 +206,7 @@ class RemoteExFeed:
                 self.stop()
             link.close()
             raise
+        # The first picture was read for its size, and is delivered as well.
         self._unread_frame: CameraFrame | None = self._first
         self._next = self._first.number
         self._announced = self._newest

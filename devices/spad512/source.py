@@ -141,6 +141,7 @@ class Spad512Feed:
     def _read_frame(self, timeout: float) -> Transfer:
         """Return the next picture; with the last one of a request comes the end of the answer."""
         is_last = self._frames_due == 1
+        # Pixels may spell DONE: only the computed length tells where an answer ends.
         length = self.codec.pixel_bytes + (len(DONE_MARK) if is_last else 0)
         self._fill_buffer(length, timeout)
         pixels, end = (

@@ -176,6 +176,8 @@ def _require_valid(records: Records) -> None:
     if np.any(ticks < 0) or np.any(steps < 0):
         raise InputError("time tags must not go back")
     marked = flags & WRAP != 0
+    # A decoder counts wraps by their records; after a loss it may infer one from a counter that
+    # went back.
     wraps = np.diff(ticks >> TIME_BITS, prepend=0)
     counter = ticks & TIME_MASK
     skipped = (flags & LOST != 0) & (steps < COUNTER_RANGE // 2) & ~marked

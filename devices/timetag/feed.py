@@ -104,6 +104,7 @@ class TimeTaggerFeed:
         self._records_received = 0
         self._bytes_since_gap = 0
         self._clock_hz = self._tagger.read(Register.CLOCK)
+        # Ticks become seconds by this number, so that a wrong one is refused before any record.
         if not self._clock_hz:
             raise ProtocolError(
                 "the time tagger says that its clock has 0 Hz; is its gateware loaded?"
@@ -218,6 +219,7 @@ class TimeTaggerFeed:
                 raise DeviceTimeoutError("the time tagger is unplugged") from fault
             raise
         self._tagger.synchronize()
+        # After a loss of power the register is zero.
         if self._tagger.read(Register.CAPTURE) & Capture.COUNT:
             self._must_clear = True  # it kept its power and went on
         else:
