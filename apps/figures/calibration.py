@@ -41,6 +41,7 @@ def make_calibration_figure(found: FocusCalibration) -> Figure:
 def _draw_picture(axes: Axes, found: FocusCalibration, picture: NDArray[Any], title: str) -> None:
     first = max(0, int(found.line_rows_px.min()) - MARGIN_ROWS)
     last = min(picture.shape[0], int(found.line_rows_px.max()) + MARGIN_ROWS + 1)
+    # The square root shows faint lines beside bright ones.
     shown = np.sqrt(np.maximum(picture[first:last], 0))
     extent = (-0.5, picture.shape[1] - 0.5, last - 0.5, first - 0.5)
     draw_image(axes, shown, extent, aspect="auto", vmax=np.percentile(shown, WHITE_PERCENTILE))

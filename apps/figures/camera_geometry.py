@@ -67,6 +67,7 @@ def _draw_focus_picture(axes: Axes) -> None:
                 centre + point[0] + (rows - point[1]) * np.tan(angle), rows, color=colour, lw=2
             )
             axes.plot(column, 0, "o", color=colour, ms=5)
+        # An empty curve gives the legend one entry for all lines of a point.
         axes.plot([], [], color=colour, lw=2, label=name)
     axes.plot(
         [], [], "o", color=TEXT_COLOUR, ms=5, label="on the slit: column c_k + X - Y tan(a_k)"

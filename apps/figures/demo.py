@@ -69,6 +69,7 @@ def make_demo_figure(
     _scatter_points(panels[1, 0], cloud.xyz[:, 0], cloud.xyz[:, 2], limits)
     label_axes(panels[1, 0], "top view of the cloud", "x (m)", "z, away from the camera (m)")
     _scatter_points(panels[1, 1], cloud.xyz[:, 2], cloud.xyz[:, 1], limits)
+    # y points down in a cloud, as in a picture.
     panels[1, 1].invert_yaxis()
     label_axes(panels[1, 1], "side view of the cloud", "z, away from the camera (m)", "y, down (m)")
     _draw_errors(panels[1, 2], returns, truth)

@@ -84,6 +84,7 @@ class Library:
             return read_light_field(self.recording(f"lightfields/{variant}.npz"))
         if variant == "4x4":
             whole = self.light_field(scene)
+            # The 4 x 4 views in the middle of the array.
             middle = np.all((whole.views >= -2) & (whole.views < 2), axis=1)
             return LightField(whole.pictures[middle], whole.views[middle])
         known = make_scene(scene, self.array)
@@ -193,6 +194,8 @@ def solve_cases(
     list of SolvedCase
         In the order of the cases.
     """
+    # Made once, before the threads start: many cases share a truth, and the library keeps a plain
+    # dictionary.
     truths = {
         (case.scene, case.shear): library.light_field(case.scene).refocus(case.shear)
         for case in cases
@@ -203,6 +206,7 @@ def solve_cases(
         recovery, found = ClipRecovery(data_term=case.data_term), []
         for seed in range(seeds):
             found.append(recovery.recover(measure_case(case, library, seed), case.shear))
+            # The weight chosen with the first seed serves the others.
             recovery = replace(recovery, weight=found[0].weight)
             advance(1)
         percent = tuple(100 * nmse(recovered.picture, truth, BORDER_PX) for recovered in found)

@@ -126,6 +126,7 @@ def _tabulate_model(
 
     shape = (sensors[0].shape_in[0], sensors[0].shape_in[1])
     pixels = int(np.prod(shape))
+    # The columns of a matrix are the responses to the unit vectors: a point in each pixel.
     points = np.eye(pixels, dtype=np.float32).reshape(*shape, pixels)
     parts = []
     for sensor, (v, u) in zip(sensors, views, strict=True):
@@ -181,6 +182,7 @@ def measure_arm(light_field: LightField, shear: float, seeds: int, arm: LineArm)
     """
     truth = light_field.refocus(shear)
     shape = (truth.shape[0], truth.shape[1])
+    # None: chosen with the first seed, then kept.
     weight, pictures = None, []
     for seed in range(seeds):
         sensors = make_coded_line_sensors(shape, LINES, arm.width_px, arm.max_angle, seed)
@@ -277,6 +279,7 @@ def select_views(light_field: LightField, count: int) -> LightField:
 def halve_pictures(light_field: LightField) -> LightField:
     """Return the light field with pixels twice as wide, the brightest of them 1."""
     views, rows, columns = light_field.pictures.shape
+    # An odd last row or column has no partner.
     even = light_field.pictures[:, : rows // 2 * 2, : columns // 2 * 2]
     halved = even.reshape(views, rows // 2, 2, columns // 2, 2).mean(axis=(2, 4))
     return LightField((halved / halved.max()).astype(np.float32), light_field.views)

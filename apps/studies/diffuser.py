@@ -27,6 +27,7 @@ POSTER_CASES = [
         (scene, str(sparsity)),
         f"{scene}:flat",
         "diffuser",
+        # Every n-th pixel on either axis.
         1 / sparsity**2,
         0.0,
         white_noise=NOISE_FRACTION,
@@ -143,6 +144,7 @@ def read_diffuser_recording(path: str | Path) -> DiffuserRecording:
     archive = Archive(path)
     background = float(archive.finite_array("background"))
     spread, measurements = (
+        # Counts below the background are noise; light is not negative.
         np.clip(archive.finite_array(name, None, None) - background, 0, None)
         for name in ("psf", "raw")
     )

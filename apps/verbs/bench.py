@@ -55,6 +55,7 @@ def bench(
     """
     cases = find_cases(name)
     if page is not None:
+        # Before the measurements, which take minutes.
         require_writable(page, ".md")
     with show_progress("measuring", count_processes(cases)) as advance:
         figures = run_cases(cases, None if peers is None else str(peers), advance)
@@ -72,6 +73,7 @@ def _format_summary(figures: Mapping[str, Any]) -> dict[str, str]:
     """One line for each case, of its greatest size on all threads."""
     found = {}
     for entry in figures["entries"]:
+        # Sizes and threads rise, so that the last run is the largest.
         run = entry["runs"][-1]
         found[entry["name"]] = run.get("problem") or (
             f"{run['seconds']['median']:.4g} s at {run['size']} {entry['size']}, {run['times_floor']:.2f} times "

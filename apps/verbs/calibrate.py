@@ -65,6 +65,7 @@ def calibrate(
     """
     pictures = (line, line_background, dot, dot_background)
     preview = preview or out.with_suffix(".png")
+    # Both outputs are checked before any picture is read, and neither may replace an input.
     require_writable(out, *RECORD_SUFFIXES, inputs=pictures)
     require_writable(preview, *PICTURE_SUFFIXES, inputs=pictures)
     lines, no_lines, dots, no_dots = (read_streak(path).counts for path in pictures)
@@ -74,6 +75,7 @@ def calibrate(
         "focal_length_px": focal_length_px,
         "pulse_fwhm": None if pulse_ps is None else pulse_ps * PICOSECOND,
     }
+    # Options that were not given leave the defaults of the camera alone.
     camera = found.camera(**{name: value for name, value in known.items() if value is not None})
     camera.save(out)
     save_figure(make_calibration_figure(found), preview)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+# Views leave the picture there, so that the rim is not scored.
 SCORED_BORDER_PX = 12
 
 app = typer.Typer(help="Light fields from few nonlocal measurements.", no_args_is_help=True)
@@ -148,6 +149,7 @@ def recover(
     Example: tofclip clip recover readings.h5 --shear -0.3 --preset quality --out picture.png
     """
     inputs = (measurement,) if truth is None else (measurement, truth)
+    # A wrong ending is refused before the recovery, not after it.
     require_writable(out, ".h5", ".png", ".exr", inputs=inputs)
     settings = ClipRecovery(prior, preset, _parse_weight(weight), data_term)
     measurements = ClipMeasurement.load(measurement)
@@ -205,6 +207,7 @@ def _write_picture(
         past = build_provenance(settings, measurement)
         Record("picture", fields_kept, {"shear": settings["shear"]}, provenance=past).save(out)
         return
+    # Both libraries write to the name they get, which is not the final one yet.
     with atomic_path(out) as temporary:
         if out.suffix.lower() == ".exr":
             import OpenEXR

@@ -107,6 +107,7 @@ def _convert_single(
     out, _ = made
     require_writable(out, *CLOUD_SUFFIXES, DEPTH_SUFFIX, inputs=(frames,))
     recovered = Frames.load(frames)
+    # The cloud carries the history of its frames, and so that of the shot.
     past = build_provenance({"verb": "cloud"}, frames, earlier=recovered.provenance)
     points, returns = clouds.make_cloud(replace(recovered, provenance=past), str(frames))
     save_cloud(points, returns, out)

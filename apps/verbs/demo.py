@@ -94,6 +94,7 @@ def _run_demo(seed: int) -> DemoRun:
     surfaces = plan_recovery(open_shot(streak), "surfaces")
     with show_progress("recovering", surfaces.work) as advance:
         frames = surfaces.run(advance)
+    # The sweep found by the first recovery serves the second, so that only the methods differ.
     by_frames = plan_recovery(open_shot(streak, frames.camera))
     with show_progress("for comparison", by_frames.work) as advance:
         compared = by_frames.run(advance)

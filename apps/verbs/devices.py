@@ -66,6 +66,7 @@ def info(uri: AddressArgument, as_json: JsonOption = False) -> None:
         }
         calibration = source.calibration
     if calibration is not None:
+        # Tables have thousands of entries; their shapes say what is known.
         shapes = {name: list(entry.values.shape) for name, entry in calibration.fields.items()}
         figures |= {f"calibration_{name}": value for name, value in calibration.attributes.items()}
         figures |= {f"calibration_{name}_shape": shape for name, shape in shapes.items()}

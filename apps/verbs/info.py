@@ -53,6 +53,7 @@ def _describe_file(file: Path) -> dict[str, Any]:
         try:
             return describe_photons(file)
         except FileFormatError:
+            # The first refusal names the formats that were expected.
             raise refusal from None
 
 
@@ -104,6 +105,7 @@ def _describe_field(entry: Field) -> dict[str, Any]:
         return known
     if values.size <= MAX_LISTED_VALUES:
         return {**known, "values": values}
+    # NaN marks unknown pixels; it would hide the range of the others.
     finite = values[np.isfinite(values)]
     return {**known, "range": [finite.min(), finite.max()] if finite.size else [None, None]}
 

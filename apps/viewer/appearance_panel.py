@@ -61,6 +61,7 @@ class AppearancePanel:
         content = render_scale_html(shown.scale)
         if self._scale.content != content:
             self._scale.content = content
+        # Limits that the user has set are not overwritten.
         if self._session.colouring.limits is None:
             low, high = shown.scale.limits
             self._limits.value = (round(low, 4), round(high, 4))
@@ -126,6 +127,7 @@ class AppearancePanel:
         self._session.filters = Filters()
 
     def _set_quantity(self, quantity: str) -> None:
+        # Limits of one quantity mean nothing for another, which may have another unit.
         self._session.colouring = replace(self._session.colouring, quantity=quantity, limits=None)
         self._automatic.value = True
 

@@ -122,6 +122,7 @@ class PlaybackClock:
         if self.position < count:
             return
         if self.loop:
+            # The remainder is kept, so that a loop runs as fast as the frames do.
             self.position = oldest + (self.position - oldest) % (count - oldest)
         else:
             self.position = float(count - 1)

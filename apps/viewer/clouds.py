@@ -49,6 +49,7 @@ class CloudSource(Source):
         if number not in self._cache:
             self._cache[number] = View(read_cloud(self._paths[number]))
             if len(self._cache) > MAX_CACHED_CLOUDS:
+                # The entry that was read first.
                 self._cache.popitem(last=False)
         return self._cache[number]
 
@@ -102,6 +103,7 @@ def make_cloud(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) 
         "confidence": known.get("confidence", nothing),
         "range": known.get("range", distance),
         "return_number": known.get("return_number", np.ones(len(xyz), np.uint8)),
+        # Light travels the range twice.
         "time": known.get("time", 2 * distance / SPEED_OF_LIGHT),
     }
     return PointCloud(xyz=xyz, **columns)

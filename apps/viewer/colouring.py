@@ -139,6 +139,7 @@ class Scale:
     def colours(self, values: NDArray[Any]) -> NDArray[np.uint8]:
         """Return red, green and blue, (n, 3); values beyond the limits get the outermost colours."""
         low, high = self.limits
+        # An even scale needs no search: the number of the colour is a product.
         if np.allclose(np.diff(self.values), (high - low) / (PALETTE_SIZE - 1), rtol=1e-6, atol=0):
             even = (np.clip(values, low, high) - np.float32(low)) * np.float32(
                 (PALETTE_SIZE - 1) / (high - low)
@@ -231,6 +232,7 @@ def colour_points(cloud: PointCloud, scale: Scale, brightest: float = 0.0) -> ND
     (n, 3) uint8 array
     """
     colours = scale.colours(QUANTITIES[scale.quantity].extract(cloud))
+    # Intensity is in the colour already.
     if brightest <= 0 or scale.quantity == "intensity":
         return colours
     light = np.clip(cloud.intensity / np.float32(brightest), 0, 1) ** np.float32(GAMMA)
@@ -261,4 +263,5 @@ def _find_limits(values: NDArray[Any]) -> tuple[float, float]:
     low, high = (float(value) for value in np.percentile(values, LIMIT_PERCENTILES))
     if high - low > 1e-6 * max(abs(low), abs(high)):
         return low, high
+    # All values alike, to rounding: any width will do but zero.
     return low - 0.5, low + 0.5

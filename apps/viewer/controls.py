@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 Post = Callable[[Callable[[], None]], None]
 
 SPEEDS = ("1/16", "1/8", "1/4", "1/2", "1", "2", "4", "8", "16")
+# The outermost steps are longer than any source; the clock stops at the ends.
 FRAME_STEPS = {"|<": -(10**9), "-10": -10, "-1": -1, "+1": 1, "+10": 10, ">|": 10**9}
 MAX_HALF_GATE_FRAMES = 200
 
@@ -72,6 +73,7 @@ class Controls:
 
     def _add_playback(self) -> None:
         session, gui = self._session, self._gui
+        # A slider needs two different ends, even for a single frame.
         last = max(1, len(session.source) - 1)
         self._frame: Any = gui.add_slider("frame", 0, last, 1, min(session.clock.frame, last))
         self._bind(self._frame, session.jump)

@@ -42,6 +42,7 @@ class DesktopWindow:
             viewpoint.eye.tolist(),
             viewpoint.target.tolist(),
         )
+        # VTK turns the picture so that this points up; y of the clouds points down.
         plotter.camera.up = (-DOWN).tolist()
         plotter.camera.view_angle = float(np.rad2deg(viewpoint.field_of_view))
         plotter.renderer.reset_camera_clipping_range()

@@ -67,6 +67,7 @@ class ExportPanel:
     def _send_screenshot(self, client: viser.ClientHandle | None) -> None:
         if client is None:
             return
+        # Large windows are scaled down: the browser sends the whole picture back.
         shrink = min(
             1.0, MAX_SIDE_PX / max(client.camera.image_height, client.camera.image_width, 1)
         )
@@ -92,6 +93,7 @@ class ExportPanel:
             return
         self._bookmarks_made += 1
         name = f"view {self._bookmarks_made}"
+        # Copied, because the page goes on changing the camera's own arrays.
         self._bookmarked_views[name] = client.camera.position.copy(), client.camera.look_at.copy()
         self._bookmarks.options = tuple(self._bookmarked_views)
         self._bookmarks.value = name

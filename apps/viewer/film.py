@@ -60,6 +60,7 @@ def save_film(
         raise InputError(f"{session.source.title}: there is nothing to film")
     with open_film(out, rate) as film:
         for frame in frames:
+            # The clock stands still, so that the frame that is due is the one jumped to.
             session.jump(frame)
             shown = session.frame_at(0.0)
             film.add(still.pixels(shown))

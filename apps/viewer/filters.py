@@ -54,6 +54,7 @@ class Filters:
         columns |= dict(zip("xyz", cloud.xyz.T, strict=True))
         for name, values in columns.items():
             low, high = getattr(self, name)
+            # Limits that are not set cost no comparison, and keep NaN.
             if low > -np.inf:
                 kept &= values >= np.float32(low)
             if high < np.inf:

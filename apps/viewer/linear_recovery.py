@@ -92,7 +92,9 @@ class LinearRecovery:
         return Gate(first, max(gate.stop, first + MIN_FRAMES))
 
     def _prepare_inverse(self, shear: float) -> PreparedInverse:
+        # Sliders give numbers that differ by rounding only.
         key = round(shear, 6)
+        # Two threads that ask for the same shear wait for one preparation instead of making two.
         with self._lock:
             if key not in self._inverses:
                 self._inverses[key] = LinearInverse().prepare(

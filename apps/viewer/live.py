@@ -116,11 +116,14 @@ class LiveShotSource(ShotSource):
         try:
             with closing(stream_clouds(shots, self._pipeline, policy="drop_oldest")) as clouds:
                 for kept, streamed in enumerate(clouds):
+                    # Leaving the loop closes the generator, which stops its threads and the
+                    # instrument.
                     if self._stopping.is_set():
                         break
                     self._latency, self._lost = streamed.latency, streamed.shot - kept
                     self._append_entry((streamed.measurements, make_view(streamed.returns)))
         except TofclipError as fault:
+            # Shown on the page: an exception on this thread would reach nobody.
             self._failure_text = format_error_line(fault)
         finally:
             self._ended = True

@@ -95,6 +95,7 @@ class Page:
     def run(self) -> None:
         """Keep the page up to date until `close`, or Ctrl-C."""
         while not self._stopping.is_set():
+            # Cleared before the work: a command that comes meanwhile wakes the next wait at once.
             self._woken.clear()
             self.update(time.monotonic())
             self._woken.wait(TICK_S)
@@ -168,6 +169,7 @@ class Page:
 
     def _draw(self, shown: DisplayedFrame, now: float) -> None:
         server = self.server
+        # Browsers get points and surface of one frame together.
         with server.atomic():
             self._draw_scene(shown)
         server.flush()

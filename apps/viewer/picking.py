@@ -87,6 +87,7 @@ def find_point_on_ray(
     depth = away @ (along / np.linalg.norm(along))
     square = np.einsum("ij,ij->i", away, away)
     with np.errstate(divide="ignore", invalid="ignore"):
+        # Tangent of the angle by which a point is missed; rounding may make the square negative.
         miss = np.sqrt(np.maximum(square - depth**2, 0)) / depth
     miss[~(depth > 0)] = np.inf  # behind the eye
     close = np.flatnonzero(miss < CLOSE_MISS_RAD)
