@@ -191,12 +191,14 @@ def run_study(capture: Capture, grid: Grid, solver: Method, seed: int = 0) -> li
     -------
     list of StudyRow
     """
+    # Without noise: what more light could reach at best.
     clean = solver.reconstruct(capture, grid)
     rows = []
     for exposure, largest_count in EXPOSURES.items():
         seen = add_poisson_noise(
             capture, find_expected_peak(capture, largest_count, seed), seed=seed
         )
+        # All points at the same noise: what compression is measured against.
         full = solver.reconstruct(seen, grid)
         for ratio in SAMPLING_RATIOS:
             compressed = CompressedCapture.of(
@@ -249,6 +251,7 @@ def replace_between_marks(text: str, document: Path) -> None:
 
     with translate_read_errors(document):
         parts = document.read_text().split(DOCUMENT_MARK)
+    # Two marks cut the text into three parts.
     if len(parts) != 3:
         raise InputError(f"{document} must hold the mark {DOCUMENT_MARK} twice")
     with atomic_path(document) as temporary:

@@ -159,6 +159,7 @@ def _build_tall_model(camera: LightFieldCamera) -> LinearOperator:
 def _build_solver(model: LinearOperator, measurements: NDArray[Any]) -> Fista:
     block = measurements[:, np.newaxis]
     weight = TV_WEIGHT * float(model.adjoint(block).max())
+    # The power iteration approaches the norm from below, hence the margin.
     step = 1 / (1.02 * estimate_squared_norm(model, NORM_ITERATIONS))
     return Fista(model, LeastSquares(block), NonnegativeTotalVariation(weight), step, 1)
 
@@ -168,6 +169,7 @@ def _measure_median_seconds(action: Callable[[], object], repeats: int) -> float
     for number in range(repeats + 1):
         started = perf_counter()
         action()
+        # The first run fills caches and compiles; it does not count.
         if number:
             seconds.append(perf_counter() - started)
     return float(np.median(seconds))

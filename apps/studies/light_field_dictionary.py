@@ -88,6 +88,7 @@ def learn_dictionary(
     kept = min(MAX_COMPONENTS, *flat.shape)
     components = PCA(kept, svd_solver="randomized", random_state=seed).fit(flat).components_
     learner = MiniBatchDictionaryLearning(
+        # One atom is kept for brightness: patches are learnt without their mean.
         atoms - 1,
         alpha=SPARSITY_WEIGHT,
         max_iter=EPOCHS,
@@ -166,6 +167,7 @@ def recover_with_dictionary(
         for window, patch in zip(windows, patches, strict=True):
             total[(slice(None), *window)] += patch
             count[window] += 1
+    # Every pixel lies in at least one patch.
     return total / count
 
 
@@ -175,6 +177,7 @@ def _compute_sparse_weights(
     """Shares of the atoms, (patches, atoms), for coded dictionaries (patches, pixels, atoms)."""
     transposed = coded.swapaxes(1, 2)
     correlation = (transposed @ measurements[..., np.newaxis])[..., 0]
+    # The power iteration approaches the eigenvalue from below, hence the margin.
     step = 1 / (1.05 * _compute_largest_eigenvalues(coded))[:, np.newaxis]
     threshold = (
         step * weight * np.abs(correlation).max(axis=1, keepdims=True) * np.ones_like(correlation)
@@ -186,6 +189,7 @@ def _compute_sparse_weights(
         residual = coded @ ahead[..., np.newaxis] - measurements[..., np.newaxis]
         moved = ahead - step * (transposed @ residual)[..., 0]
         following = np.sign(moved) * np.maximum(np.abs(moved) - threshold, 0)
+        # FISTA (A. Beck and M. Teboulle, SIAM J. Imaging Sci. 2, 183 (2009)).
         older, age = age, (1 + np.sqrt(1 + 4 * age**2)) / 2
         ahead = following + np.float32((older - 1) / age) * (following - shares)
         shares = following

@@ -64,6 +64,8 @@ def compute_depth_accuracy(
     """
     slope = np.hypot(*np.gradient(picture))
     textured = slope > TEXTURE_THRESHOLD * np.quantile(slope, 0.99)
+    # At an edge the focus measure answers for a neighbour, so that the best shear within a few
+    # pixels counts.
     near = range(-SEARCH_RADIUS_PX, SEARCH_RADIUS_PX + 1)
     errors = [np.abs(found - np.roll(true, (y, x), (0, 1))) for y in near for x in near]
     right = np.min(errors, axis=0) <= 0.75 * step
@@ -213,6 +215,7 @@ def _make_scene(library: Library, material: Lambertian) -> Scene:
 def _recover_stack(field: LightField, seed: int, advance: Advance) -> FocalStack:
     measurement = measure(field, CameraSetup("line", 1.0, seed))
     chosen = ClipRecovery().recover(measurement, PLATE_SHEAR)
+    # One weight for all planes: depth from focus compares their contrast.
     recovery = replace(ClipRecovery(), weight=chosen.weight)
     pictures = list(
         map_parallel(

@@ -148,6 +148,7 @@ def recover(
 
     Example: tofclip clip recover readings.h5 --shear -0.3 --preset quality --out picture.png
     """
+    # No output may replace a file that is read.
     inputs = (measurement,) if truth is None else (measurement, truth)
     # A wrong ending is refused before the recovery, not after it.
     require_writable(out, ".h5", ".png", ".exr", inputs=inputs)
@@ -178,6 +179,7 @@ def recover(
 
 def _parse_weight(text: str) -> float | None:
     """Return the weight that was asked for, None for `auto`."""
+    # No weight lets the recovery choose one by cross-validation.
     if text == "auto":
         return None
     try:

@@ -73,6 +73,7 @@ def cloud(
     if is_sequence(frames):
         _convert_sequence(clouds, frames, out, suffix, (cluster, used, as_json))
         return
+    # An option without effect is refused rather than ignored.
     if cluster is not None:
         raise InputError(
             f"{frames}: --cluster is for a sequence: a folder or a quoted pattern of frames"

@@ -29,6 +29,7 @@ def convert(
     Example: tofclip convert wall.npz --out wall.h5
     """
     require_writable(out, *RECORD_SUFFIXES, inputs=(streak,))
+    # Options are in ps, everything inside in s.
     shot = read_streak(streak, None if bin_width_ps is None else bin_width_ps * PICOSECOND)
     shot.save(out)
     figures = {

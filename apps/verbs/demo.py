@@ -108,6 +108,7 @@ def _run_demo(seed: int) -> DemoRun:
 
 
 def _collect_metrics(run: DemoRun) -> dict[str, Any]:
+    # Light of all instants together: the picture a camera without time of flight would take.
     picture, truth = run.frames.values.sum(axis=0), run.truth.values.sum(axis=0)
     return {
         **score_returns(run.returns, run.shot.truth),

@@ -40,6 +40,7 @@ def list_(as_json: JsonOption = False) -> None:
     Example: tofclip devices list
     """
     found = [asdict(one) for one in discover()]
+    # Files have no opener of their own: the name's ending chooses one.
     kinds = sorted({*registry.OPENERS, "file"})
     if as_json:
         report(
@@ -99,6 +100,7 @@ def verify(file: RecordingArgument, as_json: JsonOption = False) -> None:
     """
     found = verified(file)
     report(found.as_dict(), as_json)
+    # The findings are printed in either case; only the exit status differs.
     if not found.is_sound:
         typer.echo(
             f"tofclip: error: {file}: is damaged; tofclip devices repair makes a sound copy",

@@ -66,6 +66,7 @@ def _read_record(file: Path) -> Record:
         return recording  # its pieces do not fit into memory
     with translate_read_errors(file), open(file, "rb") as opened:
         start = opened.read(len(HDF5_SIGNATURE))
+    # Decided by content, because suffixes get lost.
     if start == HDF5_SIGNATURE:
         return Record.load(file)
     if file.suffix.lower() not in TABLE_SUFFIXES:

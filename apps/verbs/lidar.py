@@ -40,6 +40,7 @@ def _show_help(context: typer.Context) -> None:
     """How well a range can be known, and how the views' parallax grows with it; many shots in a
     row.
     """
+    # The group alone shows its help; a verb below it runs by itself.
     if context.invoked_subcommand is None:
         print(context.get_help())
 
@@ -161,6 +162,7 @@ def scene(
     recovered = Frames.load(frames)
     cloud = point_cloud(depth(recovered))
     objects = find_objects(cloud, reach_mm * MILLIMETRE, fewest_points)
+    # Before the picture, which would show an empty scene.
     if not objects:
         raise InputError(f"{frames}: no {fewest_points} points lie together within {reach_mm:g} mm")
     save_figure(make_scene_figure(recovered, cloud, objects), out)
@@ -222,6 +224,7 @@ def sequence(
 
     Example: tofclip lidar sequence shots/ --camera camera.h5 --out clouds/
     """
+    # Before the jobs claim the folder.
     require_format(suffix)
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
     zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
@@ -232,11 +235,13 @@ def sequence(
     late: list[float] = []
 
     def watch(report: Report) -> None:
+        # None for clouds that were there already, whose points are not counted again.
         if report.figures is not None:
             points.append(report.figures[0])
             late.extend(report.figures[1])
 
     summary = run_with_progress("ranging", jobs, cluster, watch)
+    # Root mean square; 0 where nothing was done.
     jitter = (sum(one**2 for one in late) / len(late)) ** 0.5 if late else 0.0
     figures = {
         "shots": len(late),

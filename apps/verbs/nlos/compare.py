@@ -72,6 +72,7 @@ def compare(
     wanted = load_settings(CompareSettings, settings, flags)
     written = [out, out.with_suffix(".toml")]
     _require_writable(written, volumes, (source,) if settings is None else (source, settings))
+    # Everything that can be refused is refused before the capture is read.
     _check_settings(wanted)
     capture, truth = read_capture(source), HiddenTruth.load(source)
     with warnings_to_stderr():
@@ -123,9 +124,11 @@ def _choose_methods(
     left_out = {}
     for name in names:
         try:
+            # A plan checks the geometry without imaging, and so is cheap.
             prepared.settings.make_method(name).plan(prepared.capture, prepared.grid)
         except InputError as refused:
             left_out[name] = str(refused)
+    # A method that was named must not vanish silently; of all methods, one has to remain.
     if left_out and (wanted.methods is not None or len(left_out) == len(names)):
         name, reason = next(iter(left_out.items()))
         raise InputError(f"{name} does not suit this capture: {reason}")
@@ -152,6 +155,7 @@ def _collect_metrics(
     from apps.nlos.measure import compare_with_truth, measure_sharpness
     from apps.studies.hidden_scene_adjoint import correlate_views
 
+    # Dictionaries keep the order in which methods were named.
     reference = next(iter(runs.values())).volume
     return {
         name: {

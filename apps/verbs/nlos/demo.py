@@ -87,6 +87,7 @@ def demo(
     started = time.perf_counter()
     make_folder(out)
     picture = out / "nlos_demo.png" if png is None else png
+    # Before the simulation and three images, which take a while.
     require_writable(picture, *PICTURE_SUFFIXES)
     run = _run_demo(seed)
     written = [out / f"{name}.h5" for name in ("capture", "hybrid", "backprojection")]
@@ -117,6 +118,7 @@ def _run_demo(seed: int) -> DemoRun:
         "backprojection": measure_imaging(
             "backprojection", Backprojection(WAVELENGTH_M), capture, grid
         ),
+        # The same capture with the curve ignored shows what knowing the wall is worth.
         "flat": measure_imaging("as if flat", hybrid, _flatten_wall(capture), grid),
     }
     return DemoRun(capture, truth, images)
@@ -141,6 +143,7 @@ def _simulate_capture(seed: int) -> tuple[Capture, HiddenTruth]:
 
 def _flatten_wall(capture: Capture) -> Capture:
     """Take the wall for a plane: the same signals, at points without their depth."""
+    # Copies: the curved capture is still needed.
     wall, laser = capture.wall.copy(), capture.laser.copy()
     wall[..., 2] = laser[..., 2] = 0.0
     return replace(capture, wall=wall, laser=laser)

@@ -88,6 +88,7 @@ def film(
     _require_writable(out, beside, (source,) if settings is None else (source, settings))
     _check_settings(wanted, out)
     capture = read_capture(source)
+    # Reading the file does not count as imaging.
     started = time.perf_counter()
     with warnings_to_stderr():
         found, video = _make_video(capture, wanted)
@@ -131,6 +132,7 @@ def _check_settings(settings: FilmSettings, out: Path) -> None:
             f"{out}: a film shows one picture per instant; write every depth to a .h5 file"
         )
     if out.suffix.lower() == ".mp4":
+        # A missing library is reported before the film is computed.
         import_opencv()
 
 
@@ -164,6 +166,7 @@ def _choose_instants(
     from tofclip.units import SPEED_OF_LIGHT
 
     nearest, farthest = find_leg_bounds(capture.lasers, grid)
+    # The virtual pulse has a width, so that its flank arrives before its middle.
     room = MARGIN_SIGMAS * imaging.method.pulse.sigma
     first, last = (
         (plan / SPEED_OF_LIGHT) / NANOSECOND for plan in (nearest - room, farthest + room)

@@ -91,6 +91,7 @@ def _describe_wall(capture: Capture) -> dict[str, Any]:
     from tofclip.errors import InputError
 
     try:
+        # The class refuses any other wall, which is the test wanted here.
         PlanarWall.of(capture.points)
         shape = "planar lattice"
     except InputError:
@@ -111,6 +112,7 @@ def _describe_laser(capture: Capture) -> str:
     from nlos.illumination_groups import group_by_illumination
 
     parts = group_by_illumination(capture)
+    # Confocal captures have a laser spot for each wall point, and none for the group.
     if parts[0].laser is None:
         return "confocal"
     if len(parts) > 1:
@@ -164,5 +166,6 @@ def _check_method(method: Method, capture: Capture, grid: Grid) -> dict[str, Any
     try:
         plan = method.plan(capture, grid)
     except InputError as refused:
+        # The refusal itself is the reason to show.
         return {"suits": False, "reason": str(refused)}
     return {"suits": True, "memory_mib": plan.memory_bytes / 2**20}

@@ -122,6 +122,7 @@ def reconstruct(
 
     order = _ImagingRequest(load_settings(ReconstructSettings, settings, flags), device)
     _check_settings(order.settings)
+    # A device that does not exist is refused before any capture is read.
     resolve_device(device, cluster)
     if is_capture_folder(source):
         _reconstruct_folder(source, out, order, suffix or [".h5"], (cluster, as_json))
@@ -183,6 +184,7 @@ def _reconstruct_single(
             "blank more of it by --gate-m, or begin farther away by --near-m",
             file=sys.stderr,
         )
+    # Files are written from the host's memory.
     volume = volume.on(ComputeDevice())
     seconds, imaging = time.perf_counter() - started, volume.provenance["imaging"]
     volume = add_provenance(
@@ -252,11 +254,13 @@ def _reconstruct_folder(
     require_separate_folder(source, out)
     sources = list_captures(source)
     make_folder(out)
+    # Results of other settings in the same folder would be taken for finished.
     _check_folder_settings(out / FOLDER_SETTINGS_NAME, order.settings)
     jobs, skipped = _plan_jobs(sources, out, order, suffixes)
     imaged: list[dict[str, Any]] = []
 
     def note(report: Report) -> None:
+        # None where the result was there already.
         if report.figures is not None:
             imaged.append({"capture": report.name, **report.figures})
 
@@ -266,6 +270,7 @@ def _reconstruct_folder(
         if cluster is None
         else run_with_progress("imaging", jobs, cluster, note)
     )
+    # Workers of a cluster finish in any order.
     imaged.sort(key=lambda one: str(one["capture"]))
     failed = {failure.name: failure.problem for failure in summary.failures}
     for name, reason in failed.items():
