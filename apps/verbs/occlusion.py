@@ -131,6 +131,7 @@ def demo(
     started = time.perf_counter()
     if encoder not in DEFAULT_PHOTONS:
         raise InputError(f"unknown encoder '{encoder}'; take one of {', '.join(DEFAULT_PHOTONS)}")
+    # A single pixel sums a whole picture and so needs more photons.
     usual = DEFAULT_PHOTONS[encoder] if photons is None else photons
     settings = ExperimentSettings(side_px, encoder, sampling_ratio, illumination, usual, seed)
     experiment = Experiment(make_occlusion_scene(scene), settings)
@@ -156,6 +157,7 @@ def _run_experiment(experiment: Experiment) -> list[ProbeResult]:
     ends.
     """
     scene, probes = experiment.scene, []
+    # Without a bound there is no distance beyond the region to try.
     factors = DISTANCE_FACTORS if scene.region.is_bounded else ()
     with show_progress("looking past", 2 + len(factors)) as advance:
         experiment.measurements  # noqa: B018 - computed once and kept; the bar shows the time it takes

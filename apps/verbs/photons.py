@@ -127,10 +127,12 @@ def photons(
         if single_pixel
         else estimate_surface(image, shape, learn=pulse is None, max_returns=returns)
     )
+    # Light travels the range twice, hence half the speed.
     shift = SPEED_OF_LIGHT / 2 * time_zero_ns * NANOSECOND
     further = tuple(replace(layer, range=layer.range - shift) for layer in found.further)
     found = replace(found, range=found.range - shift, further=further)
     columns = image.image_shape[1]
+    # Half the width over the tangent of half the field of view: a pinhole camera.
     focal = focal_length_px or columns / 2 / np.tan(np.deg2rad(field_of_view_deg) / 2)
     settings = {
         "bin_width_ps": image.bin_width / PICOSECOND,
@@ -143,6 +145,7 @@ def photons(
         **found.settings,
     }
     past = build_provenance({"verb": "lidar photons", **settings}, *_list_inputs(file, pulse))
+    # The ending of the name chooses what is written.
     if suffix == RANGE_IMAGE_SUFFIX:
         save_range_image(found, out)
     elif suffix in PICTURE_SUFFIXES:

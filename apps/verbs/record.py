@@ -77,6 +77,7 @@ def show_time_progress(title: str, seconds: float | None) -> Iterator[Callable[[
 
         def watch(passed: float) -> None:
             nonlocal shown
+            # A bar takes whole steps forward; the difference of rounded sums never drifts.
             advance(round(passed * PROGRESS_STEPS_PER_S) - shown)
             shown = round(passed * PROGRESS_STEPS_PER_S)
 

@@ -118,17 +118,20 @@ def recover(
     zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
     if is_sequence(streak):
+        # Options without effect are refused rather than ignored.
         _check_sequence_options(cloud, preview)
         recovery = RecoverySettings(method, iterations, None, focus, camera, zero, device)
         used = resolve_device(device, cluster)
         _recover_sequence(recovery, (streak, width), out, sweep or [], (cluster, used, as_json))
         return
     _check_single_options(streak, cluster, sweep)
+    # An instrument's address is no file that an output could replace.
     inputs = tuple(Path(name) for name in (streak, camera) if name and not _is_address(name))
     preview = preview or out.with_suffix(".png")
     _require_writable_results(inputs, out, preview, cloud)
     solver, chosen_focus = make_method(method, iterations=iterations), parse_focus(focus)
     started = time.perf_counter()
+    # Outputs and settings have been checked by now: an instrument is not started for nothing.
     shot = _open_source(streak, camera, zero, width)
     plan = plan_recovery(shot, solver, chosen_focus, device)
     with show_progress("recovering", plan.work) as advance:

@@ -77,6 +77,8 @@ def reproduce(
     folder = out / STUDY_FOLDER
     make_folder(folder)
     library = Library(data)
+    # A single study that was named is tried even without its recording, so that the reason is an
+    # error.
     possible = [study for study in studies if _is_possible(study, library) or len(studies) == 1]
     summary = (
         None if cluster is None else _run_on_cluster(possible, library, seeds, folder, cluster)
@@ -127,6 +129,7 @@ def _run_on_cluster(
         path = folder.resolve() / f"{study.name}.json"
         if load_result(path, _describe_settings(study, library, seeds)) is None:
             path.unlink(missing_ok=True)  # of other settings, or damaged
+            # By name, because a job has to survive pickling.
             work = partial(make_study, study.name, data, seeds, path.parent)
             beside = tuple(path.with_suffix(suffix) for suffix in (".md", ".csv", ".png"))
             jobs.append(Job(study.name, path, work, beside))

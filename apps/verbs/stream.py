@@ -94,6 +94,7 @@ def stream(
 
         make_folder(out)
     coming = _read_shots(source, None if bin_width_ps is None else bin_width_ps * PICOSECOND)
+    # The first shot brings the camera and the time axis of all.
     first = next(coming, None)
     if first is None:
         raise InputError(f"{source}: the source ended before it gave a shot")
@@ -101,6 +102,7 @@ def stream(
         first, camera, None if time_zero_ns is None else time_zero_ns * NANOSECOND, focus
     )
     clock = _ShotClock(coming)
+    # Instruments do not wait: the newest shot counts. Files do, and lose nothing.
     policy: Literal["drop_oldest", "block"] = "drop_oldest" if drop or clock.is_live else "block"
     with closing(stream_clouds(clock.prepend(first), pipeline, held, policy)) as made:
         figures = _consume_clouds(islice(made, shots), out, suffix, clock)
@@ -160,6 +162,7 @@ class _ShotClock:
         """Return where every shot went, given how many became clouds."""
         acquired, lost = self._taken, 0
         if self._stream is not None:
+            # The instrument knows of shots that never reached this program.
             acquired = max(self._stream.shots_acquired, self._taken)
             lost = self._stream.shots_lost
         return {

@@ -88,6 +88,7 @@ def view(
         None if bin_width_ps is None else bin_width_ps * PICOSECOND,
         None if time_zero_ns is None else time_zero_ns * NANOSECOND,
     )
+    # Closing stops a live source and its threads, however the view ends.
     with contextlib.closing(open_source(source, known)) as opened:
         session = Session(opened)
         if png is not None:
@@ -103,6 +104,7 @@ def view(
 def _check_outputs(
     desktop: bool, png: Path | None, mp4: Path | None, *inputs: str | Path | None
 ) -> None:
+    # Truth values add up: more than one was asked for.
     if desktop + (png is not None) + (mp4 is not None) > 1:
         raise InputError("choose one of --desktop, --png and --mp4")
     files = tuple(Path(name) for name in inputs if name is not None and "://" not in str(name))
