@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
 
 from apps.figures.style import (
     LINE_COLOUR,
@@ -133,8 +135,6 @@ def draw_outline(axes: Axes, truth: HiddenTruth, plane: PlaneAxes) -> None:
     plane : (str, str)
         Names of the axes to the right and downwards.
     """
-    from scipy.ndimage import gaussian_filter
-
     places = truth.positions[:, ["xyz".index(name) for name in plane]]
     radius = truth.spacing / 2 if truth.spacing else POINT_RADIUS_M
     low, high = places.min(axis=0) - 3 * radius, places.max(axis=0) + 3 * radius
@@ -156,8 +156,6 @@ def _rasterise_outline(
     round_ones: bool,
 ) -> NDArray[np.float64]:
     """Return 1 inside the squares about facets, or the circles about points, and 0 outside."""
-    from scipy.spatial import cKDTree
-
     pixels = np.stack(np.meshgrid(right, down), axis=-1)
     norm = 2 if round_ones else np.inf
     # Squares that touch overlap by a hair, or gaps would be drawn between them.

@@ -4,18 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from apps.settings import setting_field
 from tofclip.errors import InputError
 from tofclip.units import MILLIMETRE
-
-if TYPE_CHECKING:
-    from nlos import Settings
-    from tofclip.arrays import ComputeDevice
-
-
-from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from nlos import Grid, Hybrid, Refinement, Settings
@@ -28,6 +21,12 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Generic
 
 from apps.progress import show_progress
+from nlos import Refinement
+from nlos.illumination_groups import AliasingWarning
+from nlos.refinement.refine import build_total_variation
+from nlos.settings import METHOD_CLASSES, Settings, complete_settings, find_bright_box, scout_grid
+from tofclip.arrays import ComputeDevice, parse_device
+from tofclip.solvers import Sparse
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid, Plan, Settings, Volume
@@ -175,8 +174,6 @@ def require_valid_settings(settings: ImagingSettings, methods: Sequence[str]) ->
 
 def to_library(settings: ImagingSettings) -> Settings:
     """Return the settings in the library's units; None stays to be found."""
-    from nlos.settings import Settings
-
     lengths: dict[str, Any] = {
         name: None if (value := getattr(settings, f"{name}_mm")) is None else value * MILLIMETRE
         for name in LENGTHS_IN_MM
@@ -262,8 +259,6 @@ def choose_device(device: str, settings: ImagingSettings) -> ComputeDevice:
     -------
     ComputeDevice
     """
-    from tofclip.arrays import ComputeDevice, parse_device
-
     named, refine = (getattr(settings, name, None) for name in ("method", "refine"))
     portable = named in (None, *PORTABLE_METHODS) and refine is None
     return ComputeDevice() if device == "auto" and not portable else parse_device(device)
@@ -271,8 +266,6 @@ def choose_device(device: str, settings: ImagingSettings) -> ComputeDevice:
 
 def _list_settings(method: str) -> tuple[str, ...]:
     """Names of the command line's settings that a method takes."""
-    from nlos.settings import METHOD_CLASSES
-
     return tuple(
         f"{name}_mm" if name in LENGTHS_IN_MM else name for name in METHOD_CLASSES[method][1]
     )
@@ -366,10 +359,6 @@ def build_refinement(
     RefinementSettings, Refinement
         The settings come back with what was not given.
     """
-    from nlos import Refinement
-    from nlos.refinement.refine import build_total_variation
-    from tofclip.solvers import Sparse
-
     weight = DEFAULT_PRIOR_WEIGHT if settings.prior_weight is None else settings.prior_weight
     iterations = settings.iterations or DEFAULT_ITERATIONS
     prior = (
@@ -424,9 +413,6 @@ def prepare_imaging(
     -------
     PreparedImaging
     """
-    from nlos.illumination_groups import AliasingWarning
-    from nlos.settings import complete_settings, find_bright_box, scout_grid
-
     given = to_library(wanted).to_dict()
     if methods:
         given["method"] = methods[0]

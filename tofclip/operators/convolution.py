@@ -43,9 +43,8 @@ class PointSpreadConvolution(LinearOperator):
     Notes
     -----
     ``scipy.fft`` is used: 0.18 ms for both transforms of a 128 x 128 picture padded to 192 x 192. A
-    pyFFTW plan takes
-    0.16 ms unmeasured and 0.12 ms measured, but owns its memory, so that threads would have to wait
-      for each other.
+    pyFFTW plan takes 0.16 ms unmeasured and 0.12 ms measured, but owns its memory, so that threads
+    would have to wait for each other.
     """
 
     def __init__(

@@ -9,14 +9,38 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos.imaging import METHODS, ImagingSettings
+from apps.figures.nlos_compare import make_comparison_figure
+from apps.figures.style import save_figure as save_figure
+from apps.files import PICTURE_SUFFIXES, make_folder, require_writable
+from apps.nlos.files import add_provenance
+from apps.nlos.imaging import (
+    METHODS,
+    ImagingSettings,
+    from_library,
+    parse_method_names,
+    prepare_imaging,
+    require_valid_settings,
+    warnings_to_stderr,
+)
+from apps.nlos.measure import compare_with_truth, measure_imaging, measure_sharpness
+from apps.nlos.truth import HiddenTruth
 from apps.options import JsonOption
-from apps.settings import SettingsOption, add_setting_flags, setting_field
+from apps.report import report
+from apps.settings import (
+    SettingsOption,
+    add_setting_flags,
+    load_settings,
+    save_settings,
+    setting_field,
+    settings_to_dict,
+)
+from apps.studies.hidden_scene_adjoint import correlate_views
+from nlos.io import read_capture
+from tofclip.errors import InputError
 
 if TYPE_CHECKING:
     from apps.nlos.imaging import PreparedImaging
     from apps.nlos.measure import MeasuredVolume
-    from apps.nlos.truth import HiddenTruth
     from nlos import Capture, Grid
 
 SETTINGS_HEADING = "tofclip nlos compare CAPTURE --settings THIS --out PICTURE"
@@ -62,13 +86,6 @@ def compare(
 
     Example: tofclip nlos compare capture.h5 --methods hybrid,backprojection --out compare.png
     """
-    from apps.figures.nlos_compare import make_comparison_figure
-    from apps.figures.style import save_figure as save_figure
-    from apps.nlos.imaging import warnings_to_stderr
-    from apps.nlos.truth import HiddenTruth
-    from apps.settings import load_settings, save_settings
-    from nlos.io import read_capture
-
     wanted = load_settings(CompareSettings, settings, flags)
     written = [out, out.with_suffix(".toml")]
     _require_writable(written, volumes, (source,) if settings is None else (source, settings))
@@ -93,8 +110,6 @@ def compare(
 def _require_writable(
     pictures: Sequence[Path], volumes: Path | None, inputs: tuple[Path, ...]
 ) -> None:
-    from apps.files import PICTURE_SUFFIXES, make_folder, require_writable
-
     picture, settings = pictures
     require_writable(picture, *PICTURE_SUFFIXES, inputs=inputs)
     require_writable(settings, inputs=inputs)
@@ -103,8 +118,6 @@ def _require_writable(
 
 
 def _check_settings(settings: CompareSettings) -> None:
-    from apps.nlos.imaging import parse_method_names, require_valid_settings
-
     names = METHODS if settings.methods is None else parse_method_names(settings.methods)
     require_valid_settings(settings, names)
 
@@ -115,9 +128,6 @@ def _choose_methods(
     """Choose methods and voxels; of methods that were not named, those that do not suit are left
     out, with the reason.
     """
-    from apps.nlos.imaging import from_library, parse_method_names, prepare_imaging
-    from tofclip.errors import InputError
-
     names = METHODS if wanted.methods is None else parse_method_names(wanted.methods)
     # The voxels are those of the virtual pulse, for all methods alike.
     prepared = prepare_imaging(capture, wanted)
@@ -138,8 +148,6 @@ def _choose_methods(
 
 
 def _measure_methods(prepared: PreparedImaging[CompareSettings]) -> dict[str, MeasuredVolume]:
-    from apps.nlos.measure import measure_imaging
-
     return {
         name: measure_imaging(
             name, prepared.settings.make_method(name), prepared.capture, prepared.grid
@@ -152,9 +160,6 @@ def _collect_metrics(
     runs: Mapping[str, MeasuredVolume], truth: HiddenTruth | None
 ) -> dict[str, dict[str, Any]]:
     """Figures of every method; the first is the reference."""
-    from apps.nlos.measure import compare_with_truth, measure_sharpness
-    from apps.studies.hidden_scene_adjoint import correlate_views
-
     # Dictionaries keep the order in which methods were named.
     reference = next(iter(runs.values())).volume
     return {
@@ -172,9 +177,6 @@ def _save_volumes(
     runs: Mapping[str, MeasuredVolume], folder: Path, source: Path, settings: CompareSettings
 ) -> Iterator[Path]:
     """Write each method's volume, and name the files."""
-    from apps.nlos.files import add_provenance
-    from apps.settings import settings_to_dict
-
     for name, run in runs.items():
         path = folder / f"{name}.h5"
         add_provenance(
@@ -192,8 +194,6 @@ def _report_comparison(
     as_json: bool,
     written: Sequence[Path],
 ) -> None:
-    from apps.report import report
-
     if as_json:
         report({"voxels": grid.shape, "methods": figures, "left_out": left_out}, as_json)
         return

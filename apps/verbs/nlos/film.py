@@ -7,14 +7,38 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
-from apps.nlos.imaging import ImagingSettings
+from apps.files import build_provenance, require_writable
+from apps.mp4 import import_opencv, open_film
+from apps.nlos.imaging import (
+    ImagingSettings,
+    parse_method_names,
+    prepare_imaging,
+    require_valid_settings,
+    warnings_to_stderr,
+)
 from apps.options import JsonOption
-from apps.settings import SettingsOption, add_setting_flags, setting_field
+from apps.progress import show_progress
+from apps.report import report
+from apps.settings import (
+    SettingsOption,
+    add_setting_flags,
+    load_settings,
+    save_settings,
+    setting_field,
+    settings_to_dict,
+)
+from nlos import TransientImaging
+from nlos.film import render_frames
+from nlos.illumination_groups import find_leg_bounds
+from nlos.io import read_capture
+from tofclip.errors import InputError
+from tofclip.units import SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
-    from nlos import Capture, Grid, TransientImaging, TransientVideo
+    from nlos import Capture, Grid, TransientVideo
     from nlos.geometry import FloatArray
 
 FILM_METHODS = ("rsd", "hybrid")
@@ -78,11 +102,6 @@ def film(
 
     Example: tofclip nlos film capture.h5 --out flash.gif
     """
-    from apps.nlos.imaging import warnings_to_stderr
-    from apps.report import report
-    from apps.settings import load_settings, save_settings
-    from nlos.io import read_capture
-
     wanted = load_settings(FilmSettings, settings, flags)
     beside = out.with_suffix(".toml")
     _require_writable(out, beside, (source,) if settings is None else (source, settings))
@@ -109,18 +128,12 @@ def film(
 
 
 def _require_writable(out: Path, beside: Path, inputs: tuple[Path, ...]) -> None:
-    from apps.files import require_writable
-
     require_writable(out, *FILM_SUFFIXES, inputs=inputs)
     require_writable(beside, inputs=inputs)
 
 
 def _check_settings(settings: FilmSettings, out: Path) -> None:
     """Refuse what no capture could be filmed by, before any is read."""
-    from apps.mp4 import import_opencv
-    from apps.nlos.imaging import parse_method_names, require_valid_settings
-    from tofclip.errors import InputError
-
     names = FILM_METHODS if settings.method is None else parse_method_names(settings.method)
     if not set(names) <= set(FILM_METHODS):
         raise InputError(f"films are made by {' or '.join(FILM_METHODS)}, not by {settings.method}")
@@ -138,10 +151,6 @@ def _check_settings(settings: FilmSettings, out: Path) -> None:
 
 def _make_video(capture: Capture, wanted: FilmSettings) -> tuple[FilmSettings, TransientVideo]:
     """Find what is not given, and film the capture."""
-    from apps.nlos.imaging import prepare_imaging
-    from apps.progress import show_progress
-    from nlos import TransientImaging
-
     prepared = prepare_imaging(capture, wanted)
     capture, grid, settings = prepared.capture, prepared.grid, prepared.settings
     method = settings.method
@@ -159,12 +168,6 @@ def _choose_instants(
     settings: FilmSettings, capture: Capture, grid: Grid, imaging: TransientImaging
 ) -> tuple[FilmSettings, FloatArray]:
     """Return evenly spaced instants, s, and the settings with the first and the last of them."""
-    import numpy as np
-
-    from nlos.illumination_groups import find_leg_bounds
-    from tofclip.errors import InputError
-    from tofclip.units import SPEED_OF_LIGHT
-
     nearest, farthest = find_leg_bounds(capture.lasers, grid)
     # The virtual pulse has a width, so that its flank arrives before its middle.
     room = MARGIN_SIGMAS * imaging.method.pulse.sigma
@@ -182,18 +185,12 @@ def _choose_instants(
 def _build_video_provenance(
     video: TransientVideo, source: Path, found: FilmSettings
 ) -> dict[str, Any]:
-    from apps.files import build_provenance
-    from apps.settings import settings_to_dict
-
     return build_provenance(
         {"verb": "nlos film", **settings_to_dict(found)}, source, earlier=video.provenance
     )
 
 
 def _write_video(video: TransientVideo, out: Path) -> None:
-    from apps.mp4 import open_film
-    from nlos.film import render_frames
-
     if out.suffix.lower() == ".h5":
         video.save(out)
     elif out.suffix.lower() == ".gif":

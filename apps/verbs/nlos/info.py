@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos.imaging import METHODS, ImagingSettings
+from apps.nlos.imaging import METHODS, ImagingSettings, from_library, to_library
+from apps.nlos.truth import HiddenTruth
 from apps.options import JsonOption
-from apps.settings import SettingsOption, add_setting_flags
+from apps.report import report
+from apps.settings import SettingsOption, add_setting_flags, load_settings
+from nlos.band import VirtualPulse
+from nlos.illumination_groups import group_by_illumination
+from nlos.io import read_capture
+from nlos.plane import PlanarWall
+from nlos.resolution import compute_diffraction_limit
+from nlos.settings import find_sampling_step, find_shortest_wavelength, settings_for
+from tofclip.errors import InputError
+from tofclip.units import MILLIMETRE, PICOSECOND
 
 if TYPE_CHECKING:
     from nlos import Capture, Grid, Method
@@ -44,13 +55,6 @@ def info(
 
     Example: tofclip nlos info capture.h5
     """
-    from apps.nlos.imaging import from_library, to_library
-    from apps.nlos.truth import HiddenTruth
-    from apps.report import report
-    from apps.settings import load_settings
-    from nlos.io import read_capture
-    from nlos.settings import settings_for
-
     wanted = load_settings(ImagingSettings, settings, flags)
     recorded = read_capture(source)
     given = to_library(wanted).to_dict()
@@ -86,10 +90,6 @@ def info(
 
 
 def _describe_wall(capture: Capture) -> dict[str, Any]:
-    from nlos.plane import PlanarWall
-    from nlos.settings import find_sampling_step
-    from tofclip.errors import InputError
-
     try:
         # The class refuses any other wall, which is the test wanted here.
         PlanarWall.of(capture.points)
@@ -109,8 +109,6 @@ def _describe_wall(capture: Capture) -> dict[str, Any]:
 
 
 def _describe_laser(capture: Capture) -> str:
-    from nlos.illumination_groups import group_by_illumination
-
     parts = group_by_illumination(capture)
     # Confocal captures have a laser spot for each wall point, and none for the group.
     if parts[0].laser is None:
@@ -122,8 +120,6 @@ def _describe_laser(capture: Capture) -> str:
 
 
 def _describe_time_axis(capture: Capture) -> dict[str, Any]:
-    from tofclip.units import PICOSECOND
-
     paths = capture.axis.paths
     return {
         "bins": capture.axis.bins,
@@ -136,9 +132,6 @@ def _describe_time_axis(capture: Capture) -> dict[str, Any]:
 
 def _find_usable_wavelengths(capture: Capture, grid: Grid, cycles: float) -> dict[str, float]:
     """Bounds of the carrier: what is sampled finely enough, and what still resolves something, mm."""
-    from nlos.settings import find_shortest_wavelength
-    from tofclip.units import MILLIMETRE
-
     low, high = capture.points.min(axis=0), capture.points.max(axis=0)
     width = float(max(high[0] - low[0], high[1] - low[1]))
     distance = float(grid.z[[0, -1]].mean() - capture.points[:, 2].mean())
@@ -149,20 +142,12 @@ def _find_usable_wavelengths(capture: Capture, grid: Grid, cycles: float) -> dic
 
 
 def _compute_resolution(capture: Capture, grid: Grid, found: ImagingSettings) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    from nlos.band import VirtualPulse
-    from nlos.resolution import compute_diffraction_limit
-    from tofclip.units import MILLIMETRE
-
     middle = [float(axis[[0, -1]].mean()) for axis in (grid.x, grid.y, grid.z)]
     pulse = VirtualPulse((found.wavelength_mm or 0.0) * MILLIMETRE, found.cycles)
     return {**asdict(compute_diffraction_limit(capture, middle, pulse)), "at": middle}
 
 
 def _check_method(method: Method, capture: Capture, grid: Grid) -> dict[str, Any]:
-    from tofclip.errors import InputError
-
     try:
         plan = method.plan(capture, grid)
     except InputError as refused:

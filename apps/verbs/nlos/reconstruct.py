@@ -13,15 +13,51 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.nlos.imaging import METHODS, RefinementSettings
+from apps.files import make_folder
+from apps.nlos.files import (
+    VOLUME_SUFFIXES,
+    ResultFiles,
+    add_provenance,
+    is_capture_folder,
+    list_captures,
+    require_separate_folder,
+    write_volume,
+)
+from apps.nlos.imaging import (
+    METHODS,
+    PORTABLE_METHODS,
+    REFINED_METHOD,
+    RefinementSettings,
+    build_refinement,
+    choose_device,
+    image_capture,
+    parse_method_names,
+    prepare_imaging,
+    require_valid_refinement,
+    require_valid_settings,
+    warnings_to_stderr,
+)
 from apps.options import ClusterOption, DeviceOption, JsonOption
-from apps.settings import SettingsOption, add_setting_flags, setting_field
+from apps.report import report
+from apps.sequences import resolve_device, run_with_progress
+from apps.settings import (
+    SettingsOption,
+    add_setting_flags,
+    load_settings,
+    save_settings,
+    setting_field,
+    settings_to_dict,
+)
+from nlos.io import read_capture
+from nlos.settings import is_brightest_on_wall
+from tofclip.arrays import ComputeDevice
+from tofclip.errors import InputError
+from tofclip.sequences.jobs import Job, run_jobs
 
 if TYPE_CHECKING:
-    from apps.nlos.files import ResultFiles
     from apps.nlos.imaging import PreparedImaging
     from nlos import Volume
-    from tofclip.sequences.jobs import Job, Report
+    from tofclip.sequences.jobs import Report
 
 EXIT_SOME_FAILED = 1
 STOP_KEYS = ("iterations", "stopped_because")
@@ -114,12 +150,6 @@ def reconstruct(
 
     Example: tofclip nlos reconstruct capture.h5 --out volume.h5 --png volume.png
     """
-    from apps.nlos.files import ResultFiles, is_capture_folder
-    from apps.report import report
-    from apps.sequences import resolve_device
-    from apps.settings import load_settings
-    from tofclip.errors import InputError
-
     order = _ImagingRequest(load_settings(ReconstructSettings, settings, flags), device)
     _check_settings(order.settings)
     # A device that does not exist is refused before any capture is read.
@@ -136,14 +166,6 @@ def reconstruct(
 
 def _check_settings(settings: ReconstructSettings) -> None:
     """Refuse settings that no capture could make sense of, before any is read."""
-    from apps.nlos.imaging import (
-        PORTABLE_METHODS,
-        parse_method_names,
-        require_valid_refinement,
-        require_valid_settings,
-    )
-    from tofclip.errors import InputError
-
     if not 0 <= settings.point_fraction <= 1:
         raise InputError(
             f"point_fraction is a share between 0 and 1, got {settings.point_fraction}"
@@ -161,13 +183,6 @@ def _reconstruct_single(
     source: Path, results: ResultFiles, order: _ImagingRequest
 ) -> dict[str, Any]:
     """Image one capture, write its results, and return the figures."""
-    from apps.nlos.files import add_provenance, write_volume
-    from apps.nlos.imaging import REFINED_METHOD, choose_device, prepare_imaging, warnings_to_stderr
-    from apps.settings import save_settings, settings_to_dict
-    from nlos.io import read_capture
-    from nlos.settings import is_brightest_on_wall
-    from tofclip.arrays import ComputeDevice
-
     device = choose_device(order.device, order.settings)
     capture, wanted = read_capture(source), order.settings
     if wanted.refine:
@@ -224,8 +239,6 @@ def _image(
     prepared: PreparedImaging[ReconstructSettings],
 ) -> tuple[ReconstructSettings, Volume]:
     """Plan the image that settings ask for, and make it."""
-    from apps.nlos.imaging import build_refinement, image_capture
-
     found = replace(prepared.shown, method=prepared.settings.method)
     capture, grid = prepared.capture, prepared.grid
     if not found.refine:
@@ -243,12 +256,6 @@ def _reconstruct_folder(
     how: tuple[str | None, bool],
 ) -> None:
     """Image every capture of a folder whose results are not there yet."""
-    from apps.files import make_folder
-    from apps.nlos.files import list_captures, require_separate_folder
-    from apps.report import report
-    from apps.sequences import run_with_progress
-    from tofclip.sequences.jobs import run_jobs
-
     cluster, as_json = how
     _require_formats(suffixes)
     require_separate_folder(source, out)
@@ -291,8 +298,6 @@ def _plan_jobs(
     sources: Sequence[Path], out: Path, order: _ImagingRequest, suffixes: Sequence[str]
 ) -> tuple[list[Job], list[str]]:
     """Return one job for each capture without results, and the names of the others."""
-    from tofclip.sequences.jobs import Job
-
     jobs, skipped = [], []
     for path in sources:
         results = _name_results(out.resolve(), path.stem, suffixes)
@@ -315,9 +320,6 @@ def _run_job(source: Path, results: ResultFiles, order: _ImagingRequest) -> dict
 
 
 def _require_formats(suffixes: Sequence[str]) -> None:
-    from apps.nlos.files import VOLUME_SUFFIXES
-    from tofclip.errors import InputError
-
     for suffix in suffixes:
         if suffix not in VOLUME_SUFFIXES:
             raise InputError(
@@ -326,17 +328,12 @@ def _require_formats(suffixes: Sequence[str]) -> None:
 
 
 def _name_results(folder: Path, stem: str, suffixes: Sequence[str]) -> ResultFiles:
-    from apps.nlos.files import ResultFiles
-
     volumes = [folder / f"{stem}{suffix}" for suffix in suffixes]
     return ResultFiles(volumes, folder / f"{stem}.png", folder / f"{stem}{SETTINGS_SUFFIX}")
 
 
 def _check_folder_settings(file: Path, wanted: ReconstructSettings) -> None:
     """Refuse to mix results of different settings in one folder."""
-    from apps.settings import load_settings, save_settings, settings_to_dict
-    from tofclip.errors import InputError
-
     if not file.exists():
         save_settings(wanted, file, "tofclip nlos reconstruct FOLDER --settings THIS --out RESULTS")
         return
