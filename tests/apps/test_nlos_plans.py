@@ -23,6 +23,7 @@ def note(frame, event, _):
     # Of all code only functions are optimised: modules and classes are run by being imported.
     if event == "call" and frame.f_code.co_flags & inspect.CO_OPTIMIZED:
         seen.add(frame.f_code.co_filename)
+import apps.verbs.nlos.reconstruct  # what is called while modules are imported is not its path
 from apps.cli import main
 sys.argv = {words!r}
 sys.setprofile(note)
