@@ -252,7 +252,7 @@ class RemoteExFeed:
         picture = self._unread_frame
         while picture is None:
             with contextlib.suppress(DeviceTimeoutError):
-                while True:  # all that has been announced by now
+                while self._newest >= self._next:  # all that has been announced meanwhile
                     self._note_announcement(self._wait_for_announcement(0))
             while self._newest < self._next:
                 left = max(deadline - monotonic(), 0)
