@@ -22,8 +22,9 @@ from apps.help import (
     EXIT_DEFECT,
     EXIT_INPUT_ERROR,
     EXIT_INTERRUPTED,
+    VerbTable,
+    make_lazy_group,
 )
-from apps.lazy_verbs import VerbTable, make_lazy_group
 from tofclip import __version__
 from tofclip.dependencies import describe_missing_package
 from tofclip.errors import TofclipError

@@ -11,8 +11,7 @@ import typer
 from typer.core import TyperArgument, TyperCommand, TyperOption
 
 from apps.cli import VERB_OVERVIEW, app
-from apps.help import EPILOG, PROGRAM, split_docstring
-from apps.lazy_verbs import walk_verbs
+from apps.help import EPILOG, PROGRAM, split_docstring, walk_verbs
 
 COMPLETION_NOTE = """\
 `tofclip --install-completion` teaches the shell that it is called from (bash, zsh or fish) to complete verbs, options

@@ -17,7 +17,7 @@ import tofclip
 
 ROOT = Path(tofclip.__file__).parents[1]
 OURS = tuple(f"{ROOT / package}/" for package in ("tofclip", "apps", "nlos", "devices"))
-MAX_FILES = 31
+MAX_FILES = 30
 
 
 def count_calls(action: Callable[[], object]) -> Counter[tuple[str, str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from apps.lazy_verbs import VerbTable, make_lazy_group
+from apps.help import VerbTable, make_lazy_group
 
 VERBS: VerbTable = {
     "reconstruct": "Image the hidden scene from the transients on a relay wall.",
