@@ -12,9 +12,9 @@ from apps.viewer.linear_recovery import Readings, make_view
 from apps.viewer.shots import ShotSource
 from apps.viewer.source import View
 from tofclip.camera import Camera
-from tofclip.errors import InputError, TofclipError
+from tofclip.errors import InputError
 from tofclip.sequences.ranger import RangingPipeline
-from tofclip.sequences.streaming import stream_clouds
+from tofclip.sequences.streaming import Stage, run_stages
 from tofclip.shots import Streak
 from tofclip.storage import format_error_line
 
@@ -30,8 +30,9 @@ class LiveShotSource(ShotSource):
     """Shots that an iterator delivers, made into clouds as they come; the last 32 can be looked at
     again.
 
-    Clouds are those of `tofclip.sequences.streaming.stream_clouds`. Shots that come faster than
-    they are made are dropped, the oldest that waits first, so that what one sees is never late.
+    Reading, rectifying and ranging are stages side by side (`tofclip.sequences.streaming`). Shots
+    that come faster than that are dropped, the oldest that waits first, so that what one sees is
+    never late.
 
     Parameters
     ----------
@@ -59,8 +60,7 @@ class LiveShotSource(ShotSource):
         self.rectifier = self._pipeline.rectifier  # knows the sweep already
         self._lock, self._stopping = threading.Lock(), threading.Event()
         self._ended = False
-        measurements = self.rectify(first)
-        self._append_entry((measurements, make_view(self._pipeline.find_returns(measurements))))
+        self._append_entry(self._locate_returns(self.rectify(first)))
         self._thread = threading.Thread(
             target=self._run, args=(shots,), name="live shots", daemon=True
         )
@@ -113,20 +113,24 @@ class LiveShotSource(ShotSource):
             return self._cache[min(max(place, 0), len(self._cache) - 1)]
 
     def _run(self, shots: Iterator[Streak]) -> None:
+        stages = Stage("rectify", self.rectify), Stage("range", self._locate_returns)
         try:
-            with closing(stream_clouds(shots, self._pipeline, policy="drop_oldest")) as clouds:
-                for kept, streamed in enumerate(clouds):
+            with closing(run_stages(shots, stages, policy="drop_oldest")) as made:
+                for kept, passage in enumerate(made):
                     # Leaving the loop closes the generator, which stops its threads and the
                     # instrument.
                     if self._stopping.is_set():
                         break
-                    self._latency, self._lost = streamed.latency, streamed.shot - kept
-                    self._append_entry((streamed.measurements, make_view(streamed.returns)))
-        except TofclipError as fault:
-            # Shown on the page: an exception on this thread would reach nobody.
+                    self._latency, self._lost = passage.latency, passage.number - kept
+                    self._append_entry(passage.value)
+        except Exception as fault:
+            # Whatever ends it is shown on the page: an exception on this thread would reach nobody.
             self._failure_text = format_error_line(fault)
         finally:
             self._ended = True
+
+    def _locate_returns(self, measurements: Readings) -> tuple[Readings, View]:
+        return measurements, make_view(self._pipeline.find_returns(measurements))
 
     def _append_entry(self, entry: tuple[Readings, View]) -> None:
         with self._lock:

@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
-from apps.nlos.methods import METHODS
 from small_instrument import Run
 from verb_pages import collect_verbs
 
+from apps.nlos.imaging import METHODS
 from apps.verbs import warm_up
 
 

@@ -14,7 +14,7 @@ def test_public_names() -> None:
     for name in nlos.__all__:
         assert getattr(nlos, name).__name__ == name
         assert name in dir(nlos)
-    with pytest.raises(AttributeError, match="no attribute 'Telepathy'"):
+    with pytest.raises(AttributeError, match="No nlos attribute Telepathy"):
         _ = nlos.Telepathy
 
 

@@ -61,7 +61,7 @@ def test_a_single_return_is_not_split(plate):
 def test_the_model_of_hidden_pixels_and_shadows_agrees_with_cast_rays(plate):
     """The true target through the model, with the true cover, is what the true views read."""
     array = plate.rig.array
-    bare = plate._middle_view(plate.scene.occluder, array).sum(axis=-1)
+    bare = plate._render_middle_view(plate.scene.occluder, array).sum(axis=-1)
     cover = (bare > 0.5 * bare.max()).astype(np.float32)
     shears = tuple(
         float(array.shear(z)) for z in (OCCLUDER_DISTANCE_M, OCCLUDER_DISTANCE_M + TARGET_DEPTH_M)

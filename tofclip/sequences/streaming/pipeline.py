@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import dataclass
-from itertools import pairwise
 from time import perf_counter
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from tofclip.lidar.cloud import PointCloud, point_cloud
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming.channel import Policy
 from tofclip.sequences.streaming.stages import READ, WAIT, Stage, run_stages
-from tofclip.shots import Returns, Streak
+from tofclip.shots import Streak
 from tofclip.threads import open_worker_pool
-
-STEPS = ("rectify", "recover", "range", "place")
-"""What is done to a shot on its core."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +24,6 @@ class StreamedCloud:
     Parameters
     ----------
     cloud : PointCloud
-    returns : Returns
-        Those that the cloud's points are, in the same order.
-    measurements : (columns, rows) float32 array
-        The shot, rectified.
     shot : int
         Number of its shot in the source, from 0; what was dropped has been counted.
     seconds : mapping
@@ -44,8 +34,6 @@ class StreamedCloud:
     """
 
     cloud: PointCloud
-    returns: Returns
-    measurements: NDArray[np.float32]
     shot: int
     seconds: Mapping[str, float]
     latency: float
@@ -84,7 +72,7 @@ def stream_clouds(
 
     Notes
     -----
-    Memory: ``3 * (queue_size + 1)`` shots, one more for each core with what is recovered of it, and what
+    Memory: ``3 * (held + 1)`` shots, one more for each core with what is recovered of it, and what
     a `RangingPipeline` takes.
     """
     coming = iter(shots)
@@ -106,29 +94,27 @@ def stream_clouds(
         )
         with closing(run_stages(coming, stages, queue_size, policy)) as items:
             for item in items:
-                measurements, returns, cloud, seconds = item.value
+                cloud, seconds = item.value
                 waited = item.latency - sum(seconds.values())
                 told = {READ: item.seconds[READ], WAIT: waited, **seconds}
-                yield StreamedCloud(cloud, returns, measurements, item.number, told, item.latency)
+                yield StreamedCloud(cloud, item.number, told, item.latency)
 
 
-def _make_cloud(
-    shot: Streak, pipeline: RangingPipeline
-) -> tuple[NDArray[np.float32], Returns, PointCloud, dict[str, float]]:
-    """Make the cloud of a shot; return its measurements, returns and cloud, and what each step
-    took, s.
-    """
-    ends = [perf_counter()]
-    measurements = pipeline.rectifier.rectify(shot.counts)
-    ends.append(perf_counter())
-    traces = pipeline.recover(measurements)
-    ends.append(perf_counter())
-    returns = pipeline.search(traces)
-    ends.append(perf_counter())
-    cloud = point_cloud(returns)
-    ends.append(perf_counter())
-    seconds = [last - first for first, last in pairwise(ends)]
-    return measurements, returns, cloud, dict(zip(STEPS, seconds, strict=True))
+def _make_cloud(shot: Streak, pipeline: RangingPipeline) -> tuple[PointCloud, dict[str, float]]:
+    """Make the cloud of a shot; return it and what each step took, s."""
+    steps: dict[str, Callable[[Any], Any]] = {
+        "rectify": lambda streak: pipeline.rectifier.rectify(streak.counts),
+        "recover": pipeline.recover,
+        "range": pipeline.search,
+        "place": point_cloud,
+    }
+    value: Any = shot
+    seconds, last = {}, perf_counter()
+    for name, step in steps.items():
+        value = step(value)
+        now = perf_counter()
+        seconds[name], last = now - last, now
+    return value, seconds
 
 
 def _prepend_shot(first: Streak, others: Iterator[Streak]) -> Iterator[Streak]:
