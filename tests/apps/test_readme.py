@@ -55,7 +55,11 @@ def test_the_walk_through(
     assert len(walk) == 20
     for command in walk:
         outcome = run(*shlex.split(command)[1:])
-        assert (outcome.status, outcome.err) == (0, ""), command
+        assert outcome.status == 0, command
+        # The small wall hides nothing, and the program says that its brightest voxel is the wall's.
+        expected_warnings = ["brightest voxel lies on the wall"] if "nlos recon" in command else []
+        lines = outcome.err.splitlines()
+        assert all(any(text in line for text in expected_warnings) for line in lines), command
     expected = "camera.h5 camera.png frames.h5 frames.png mip.png scene.ply volume.h5 wall.h5 wall_frames.h5"
     expected += " scene.png clouds occlusion-output nlos-demo-output"
     assert {

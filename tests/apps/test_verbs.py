@@ -217,7 +217,11 @@ class TestConvertAndNlos:
         ]
         assert run("recover", copy, "--out", frames, "--method", "linear").status == 0
         words = ["nlos", "reconstruct", frames, "--out", volume, "--png", tmp_path / "mip.png"]
-        found = object_of(run, *words, "--voxel-mm", 40, "--far-m", 0.4)
+        outcome = run(*words, "--voxel-mm", 40, "--far-m", 0.4, "--json")
+        found = json.loads(outcome.out)
+        # Nothing is hidden there: the brightest voxel is the wall's own light, which is said.
+        assert outcome.status == 0
+        assert found["brightest_on_wall"] == ("lies on the wall" in outcome.err)
         stored = Volume.load(volume)
         assert list(stored.values.shape) == found["voxels"]
         assert found["wall_points"] == 144
