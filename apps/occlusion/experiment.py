@@ -1,8 +1,7 @@
 """The demonstration: one scene with an occluder, and three cameras that look at it.
 
-* Compact light-field photography with time of flight: a row of views, nonlocal measurements at
-every
-  instant.
+* Compact light-field photography with time of flight: a row of views, nonlocal measurements in
+  every time bin.
 * A single view with as many pixels as the other has measurements; it has time of flight too.
 * A conventional light-field camera: every pixel of every view, but no time of flight; it can only
   defocus the occluder.
