@@ -145,65 +145,21 @@ class CompiledBackend:
         return np.zeros(shape, np.complex64)
 
     def compute_phasors(self, capture: Capture, group: IlluminationGroup) -> Array:
-        """Return the phasors P_k (points, frequencies) of a group's wall points, complex64.
-
-        Parameters
-        ----------
-        capture : Capture
-        group : IlluminationGroup
-
-        Returns
-        -------
-        (points, frequencies) complex64 array
-        """
+        """Return the phasors P_k (points, frequencies) of a group's wall points, complex64."""
         return group.compute_phasors(capture, self.band)
 
     def place_on_lattice(self, phasors: Array, lattice: WallLattice) -> Array:
-        """Put phasors (points, frequencies) into their places, (y, x, frequencies).
-
-        Parameters
-        ----------
-        phasors : (points, frequencies) complex64 array
-        lattice : WallLattice
-
-        Returns
-        -------
-        (y, x, frequencies) complex64 array
-        """
+        """Put phasors (points, frequencies) into their places, (y, x, frequencies)."""
         return lattice.place(phasors)
 
     def propagate_phasors(
         self, points: Array, plane: Plane, waves: SphericalWaves, tolerance: float
     ) -> PhasorPropagation:
-        """Return what carries phasors from wall points (n, 3) onto a plane.
-
-        Parameters
-        ----------
-        points : (n, 3) float64 array
-            Metres.
-        plane : Plane
-        waves : SphericalWaves
-        tolerance : float
-            Relative error.
-
-        Returns
-        -------
-        CompiledPropagation
-        """
+        """Return what carries phasors from wall points (n, 3) onto a plane."""
         return CompiledPropagation(points, plane, waves, tolerance)
 
     def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> Diffraction:
-        """Return what carries fields from the plane of `plan` to all depths.
-
-        Parameters
-        ----------
-        plan : DiffractionPlan
-        source : LaserSource
-
-        Returns
-        -------
-        CompiledDiffraction
-        """
+        """Return what carries fields from the plane of `plan` to all depths."""
         return CompiledDiffraction(plan, source)
 
 
@@ -229,33 +185,13 @@ class PortableBackend:
         return self.library.zeros(shape)
 
     def compute_phasors(self, capture: Capture, group: IlluminationGroup) -> Array:
-        """Return the phasors P_k (points, frequencies) of a group's wall points, complex64.
-
-        Parameters
-        ----------
-        capture : Capture
-        group : IlluminationGroup
-
-        Returns
-        -------
-        (points, frequencies) complex64 array
-        """
+        """Return the phasors P_k (points, frequencies) of a group's wall points, complex64."""
         from nlos.portable.signals import get_group_traces
 
         return self._transform.of(get_group_traces(capture, group))
 
     def place_on_lattice(self, phasors: Array, lattice: WallLattice) -> Array:
-        """Put phasors (points, frequencies) into their places, (y, x, frequencies).
-
-        Parameters
-        ----------
-        phasors : (points, frequencies) complex64 array
-        lattice : WallLattice
-
-        Returns
-        -------
-        (y, x, frequencies) complex64 array
-        """
+        """Put phasors (points, frequencies) into their places, (y, x, frequencies)."""
         from nlos.portable.signals import arrange_on_lattice
 
         xp = self.library.xp
@@ -265,37 +201,13 @@ class PortableBackend:
     def propagate_phasors(
         self, points: Array, plane: Plane, waves: SphericalWaves, tolerance: float
     ) -> PhasorPropagation:
-        """Return what carries phasors from wall points (n, 3) onto a plane.
-
-        Parameters
-        ----------
-        points : (n, 3) float64 array
-            Metres.
-        plane : Plane
-        waves : SphericalWaves
-        tolerance : float
-            Relative error.
-
-        Returns
-        -------
-        PortablePropagation
-        """
+        """Return what carries phasors from wall points (n, 3) onto a plane."""
         from nlos.portable.propagation import PortablePropagation
 
         return PortablePropagation(points, plane, waves, tolerance, self.library)
 
     def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> Diffraction:
-        """Return what carries fields from the plane of `plan` to all depths.
-
-        Parameters
-        ----------
-        plan : DiffractionPlan
-        source : LaserSource
-
-        Returns
-        -------
-        PortableDiffraction
-        """
+        """Return what carries fields from the plane of `plan` to all depths."""
         from nlos.portable.diffraction import PortableDiffraction
 
         return PortableDiffraction(plan, source, self.library)

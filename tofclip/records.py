@@ -267,15 +267,7 @@ class _StoredArray:
     optional: bool
 
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
-        """Store an array in its declared dtype, with its unit and axes; booleans as bytes.
-
-        Parameters
-        ----------
-        own_name : str
-        value : array or None
-        contents : _Contents
-            Added to, in place.
-        """
+        """Store an array in its declared dtype, with its unit and axes; booleans as bytes."""
         if value is None and self.optional:
             return
         dtype = np.dtype(self.dtypes[0])
@@ -286,18 +278,7 @@ class _StoredArray:
         contents.fields[self.name or own_name] = Field(values, self.units, axes)
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
-        """Return the array, checked for dtype, dimensions and unit.
-
-        Parameters
-        ----------
-        own_name : str
-        record : Record
-        kind : type
-
-        Returns
-        -------
-        array, or `MISSING`
-        """
+        """Return the array, checked for dtype, dimensions and unit."""
         name = self.name or own_name
         if self.optional and name not in record.fields:
             return MISSING
@@ -319,15 +300,7 @@ class _StoredValue:
     optional: bool
 
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
-        """Store one scalar, or several under a name each.
-
-        Parameters
-        ----------
-        own_name : str
-        value : scalar or tuple
-        contents : _Contents
-            Added to, in place.
-        """
+        """Store one scalar, or several under a name each."""
         names = self.names or (own_name,)
         values = value if len(names) > 1 else (value,)
         contents.attributes.update(zip(names, values, strict=True))
@@ -369,30 +342,11 @@ class _StoredPart:
     part: type
 
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
-        """Store the fields of a part among those of the whole.
-
-        Parameters
-        ----------
-        own_name : str
-        value : dataclass
-        contents : _Contents
-            Added to, in place.
-        """
+        """Store the fields of a part among those of the whole."""
         _write_fields(value, contents)
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
-        """Return the part, from fields of the whole.
-
-        Parameters
-        ----------
-        own_name : str
-        record : Record
-        kind : type
-
-        Returns
-        -------
-        dataclass
-        """
+        """Return the part, from fields of the whole."""
         return _read_fields(self.part, record)
 
 
@@ -404,31 +358,12 @@ class _StoredChild:
     name: str
 
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
-        """Store an object as a record inside the record.
-
-        Parameters
-        ----------
-        own_name : str
-        value : Storable or None
-        contents : _Contents
-            Added to, in place.
-        """
+        """Store an object as a record inside the record."""
         if value is not None or not self.optional:
             contents.children[self.name or own_name] = value.to_record()
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
-        """Return the object whose record lies inside the record.
-
-        Parameters
-        ----------
-        own_name : str
-        record : Record
-        kind : type
-
-        Returns
-        -------
-        object or None
-        """
+        """Return the object whose record lies inside the record."""
         name = self.name or own_name
         if name not in record.children and self.optional:
             return None
@@ -439,59 +374,21 @@ class _StoredChild:
 
 class _StoredAttributes:
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
-        """Store a mapping as scalar attributes.
-
-        Parameters
-        ----------
-        own_name : str
-        value : mapping
-        contents : _Contents
-            Added to, in place.
-        """
+        """Store a mapping as scalar attributes."""
         contents.attributes.update(value)
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
-        """Return all scalar attributes.
-
-        Parameters
-        ----------
-        own_name : str
-        record : Record
-        kind : type
-
-        Returns
-        -------
-        mapping
-        """
+        """Return all scalar attributes."""
         return record.attributes
 
 
 class _StoredTexts:
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
-        """Store a mapping of texts as a record of its own.
-
-        Parameters
-        ----------
-        own_name : str
-        value : mapping of str to str
-        contents : _Contents
-            Added to, in place.
-        """
+        """Store a mapping of texts as a record of its own."""
         contents.children[own_name] = Record(own_name, attributes=dict(value))
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
-        """Return the mapping of texts.
-
-        Parameters
-        ----------
-        own_name : str
-        record : Record
-        kind : type
-
-        Returns
-        -------
-        dict of str to str, or `MISSING`
-        """
+        """Return the mapping of texts."""
         if own_name not in record.children:
             return MISSING
         return {name: str(text) for name, text in record.children[own_name].attributes.items()}
@@ -499,31 +396,12 @@ class _StoredTexts:
 
 class _StoredAttachments:
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
-        """Store records inside the record that no other field declares.
-
-        Parameters
-        ----------
-        own_name : str
-        value : mapping of str to Record
-        contents : _Contents
-            Added to, in place.
-        """
+        """Store records inside the record that no other field declares."""
         # what other fields declare comes first, whatever their order
         contents.children = {**value, **contents.children}
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
-        """Return the records inside the record that no other field declares.
-
-        Parameters
-        ----------
-        own_name : str
-        record : Record
-        kind : type
-
-        Returns
-        -------
-        dict of str to Record
-        """
+        """Return the records inside the record that no other field declares."""
         declared = {
             (declaration.name if isinstance(declaration, _StoredChild) else "") or name
             for name, declaration in _declarations(kind).items()
@@ -534,55 +412,18 @@ class _StoredAttachments:
 
 class _StoredProvenance:
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
-        """Store where an object came from.
-
-        Parameters
-        ----------
-        own_name : str
-        value : mapping
-        contents : _Contents
-            Added to, in place.
-        """
+        """Store where an object came from."""
         contents.provenance = value
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
-        """Return where the object came from.
-
-        Parameters
-        ----------
-        own_name : str
-        record : Record
-        kind : type
-
-        Returns
-        -------
-        mapping
-        """
+        """Return where the object came from."""
         return record.provenance
 
 
 class _StoredOrigin:
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
-        """Store nothing: the file's own name is its origin.
-
-        Parameters
-        ----------
-        own_name : str
-        value : str
-        contents : _Contents
-        """
+        """Store nothing: the file's own name is its origin."""
 
     def read(self, own_name: str, record: Record, kind: type) -> Any:
-        """Return the name of the file that the record came from.
-
-        Parameters
-        ----------
-        own_name : str
-        record : Record
-        kind : type
-
-        Returns
-        -------
-        str, or `MISSING`
-        """
+        """Return the name of the file that the record came from."""
         return record.origin or MISSING
