@@ -118,7 +118,7 @@ def _format_cells(entry: Mapping[str, Any], run: Mapping[str, Any]) -> list[str]
 
 def _format_peers(entry: Mapping[str, Any]) -> str:
     """Sentences about other programs, of the runs in which they were asked for."""
-    told: dict[str, list[str]] = {}
+    comparisons: dict[str, list[str]] = {}
     absent: dict[str, str] = {}
     for run in entry["runs"]:
         for name, found in run.get("peers", {}).items():
@@ -129,14 +129,14 @@ def _format_peers(entry: Mapping[str, Any]) -> str:
                     if run["threads"] > 1
                     else f"{run['size']}, 1 thread"
                 )
-                told.setdefault(name, []).append(
+                comparisons.setdefault(name, []).append(
                     f"{_format_seconds(found['seconds'])} at {size} ({ratio:.1f} times ours)"
                 )
             else:
                 absent[name] = found["absent"]
-    sentences = [f" {name}: {'; '.join(found)}." for name, found in told.items()]
+    sentences = [f" {name}: {'; '.join(found)}." for name, found in comparisons.items()]
     sentences += [
-        f" Not compared: {reason}." for name, reason in absent.items() if name not in told
+        f" Not compared: {reason}." for name, reason in absent.items() if name not in comparisons
     ]
     return "".join(sentences)
 

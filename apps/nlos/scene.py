@@ -48,7 +48,7 @@ class SceneSettings:
     """What is hidden, and how it is captured; None is chosen."""
 
     letters: str | None = setting_field(
-        "TEXT", "Flat letters, as read from the wall.", shown="T, if nothing else is told"
+        "TEXT", "Flat letters, as read from the wall.", shown="T, if nothing else is given"
     )
     points: str | None = setting_field(
         "'X,Y,Z; ...'", "Points that scatter evenly, in m.", shown="none"
@@ -121,9 +121,9 @@ def simulate_scene(settings: SceneSettings) -> tuple[Capture, HiddenTruth]:
 
 def build_hidden_scene(settings: SceneSettings) -> tuple[HiddenScene | PointScene, HiddenTruth]:
     """Build what is hidden, and say where it is."""
-    told = [name for name in ("letters", "points", "mesh") if getattr(settings, name) is not None]
-    if len(told) > 1:
-        raise InputError(f"{' and '.join(told)} cannot be hidden together; choose one of them")
+    given = [name for name in ("letters", "points", "mesh") if getattr(settings, name) is not None]
+    if len(given) > 1:
+        raise InputError(f"{' and '.join(given)} cannot be hidden together; choose one of them")
     if settings.points is not None:
         points = PointScene(np.array(_parse_points(settings.points)))
         return points, HiddenTruth(points.positions, 0.0)
@@ -218,6 +218,6 @@ def _parse_points(text: str) -> list[list[float]]:
         points = []
     if not points or any(len(point) != 3 or not all(map(math.isfinite, point)) for point in points):
         raise InputError(
-            f"points are told as X,Y,Z in m with semicolons between them, got '{text}'"
+            f"points are given as X,Y,Z in m with semicolons between them, got '{text}'"
         )
     return points

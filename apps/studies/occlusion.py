@@ -78,7 +78,7 @@ BLACK_STUDY = Study(
     ("fig15",),
     "Through occluders",
     "Rendered figures and words stand for the paper's. Its errors are against shift-and-add, so are ours; how far that "
-    "itself is from the bare target is told in rows of their own.",
+    "itself is from the bare target is given in rows of their own.",
     15,
     len(BLACK_CASES),
     run_black_occluders,

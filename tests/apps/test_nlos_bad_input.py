@@ -45,8 +45,8 @@ def test_imaging_that_makes_no_sense(
     ("words", "complaint"),
     [
         (["--letters", "A", "--points", "0,0,1"], "letters and points cannot be hidden together"),
-        (["--points", "0,0"], "points are told as X,Y,Z"),
-        (["--points", "0,0,x"], "points are told as X,Y,Z"),
+        (["--points", "0,0"], "points are given as X,Y,Z"),
+        (["--points", "0,0,x"], "points are given as X,Y,Z"),
         (["--wall", "cave"], "no wall is called 'cave'"),
         (["--scan", "spiral"], "no scan is called 'spiral'"),
         (["--material", "velvet"], "no material is called 'velvet'"),

@@ -46,6 +46,7 @@ def test_a_streaming_camera_becomes_clouds(tmp_path: Path, capsys: pytest.Captur
     assert len(saved) == 3
     # Named by their shots: a live camera's newest are taken, and those between are left out.
     numbers = [int(path.stem.removeprefix("cloud_")) for path in saved]
+    assert [path.name for path in saved] == [f"cloud_{number:06d}.ply" for number in numbers]
     assert numbers[-1] >= 2
     cloud = PointCloud.load(saved[0])
     assert 1.6 < np.median(cloud.range) < 3.3  # where the simulated scene stands

@@ -96,8 +96,8 @@ def stream_clouds(
             for item in items:
                 cloud, seconds = item.value
                 waited = item.latency - sum(seconds.values())
-                told = {READ: item.seconds[READ], WAIT: waited, **seconds}
-                yield StreamedCloud(cloud, item.number, told, item.latency)
+                seconds_by_step = {READ: item.seconds[READ], WAIT: waited, **seconds}
+                yield StreamedCloud(cloud, item.number, seconds_by_step, item.latency)
 
 
 def _make_cloud(shot: Streak, pipeline: RangingPipeline) -> tuple[PointCloud, dict[str, float]]:
