@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -166,3 +169,29 @@ def test_blas_limits_of_many_threads_leave_the_number_as_it_was():
             during = set().union(*pool.map(limit_briefly, range(64)))
         assert during == {1}
         assert _blas_threads() == before
+
+
+def test_a_library_that_is_loaded_later_is_limited_too():
+    pytest.importorskip("cv2", reason="OpenCV brings a BLAS of its own")
+    script = """
+from threadpoolctl import threadpool_info
+from tofclip.threads import limit_blas_threads
+
+def blas_threads():
+    return {x["filepath"]: x["num_threads"] for x in threadpool_info() if x["user_api"] == "blas"}
+
+with limit_blas_threads():
+    before = blas_threads()
+    import cv2
+    with limit_blas_threads():
+        during = blas_threads()
+print(len(before), set(during.values()), set(blas_threads().values()))
+"""
+    finished = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "2"},
+    )
+    assert finished.stdout == "2 {1} {2}\n"

@@ -8,12 +8,13 @@ second thread pool (OpenMP, numba's) to compete with, and BLAS is limited to one
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache
+from functools import lru_cache
 from typing import TYPE_CHECKING, TypeVar
 
 from tofclip.errors import InputError
@@ -181,7 +182,8 @@ class _BlasLimit:
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.open_blocks = 0
-        self.before: list[int] = []
+        self.limited: dict[str, tuple[LibController, int]] = {}
+        """By file: a library that has one number of threads for the process, and what it had."""
 
 
 _blas_limit = _BlasLimit()
@@ -196,40 +198,45 @@ def limit_blas_threads() -> Iterator[None]:
     several threads are counted, the first one sets the limit and the last one restores what was
     there before. Libraries that run on OpenMP have a number for each calling thread.
     """
-    shared, per_thread = _blas_libraries()
-    own_before = [library.get_num_threads() for library in per_thread]
+    shared, per_thread = _blas_libraries(len(sys.modules))
+    own_before = [(library, library.get_num_threads()) for library in per_thread]
     with _blas_limit.lock:
-        if _blas_limit.open_blocks == 0:
-            _blas_limit.before = [library.get_num_threads() for library in shared]
-            _set_blas_threads(shared, [1] * len(shared))
         _blas_limit.open_blocks += 1
-    _set_blas_threads(per_thread, [1] * len(per_thread))
+        for library in shared:  # also those that were loaded while another block was open
+            if library.filepath not in _blas_limit.limited:
+                _blas_limit.limited[library.filepath] = library, library.get_num_threads()
+                _set_blas_threads(library, 1)
+    for library in per_thread:
+        _set_blas_threads(library, 1)
     try:
         yield
     finally:
-        _set_blas_threads(per_thread, own_before)
+        for library, number in own_before:
+            _set_blas_threads(library, number)
         with _blas_limit.lock:
             _blas_limit.open_blocks -= 1
             if _blas_limit.open_blocks == 0:
-                _set_blas_threads(shared, _blas_limit.before)
+                for library, number in _blas_limit.limited.values():
+                    _set_blas_threads(library, number)
+                _blas_limit.limited.clear()
 
 
-def _set_blas_threads(libraries: list[LibController], numbers: list[int]) -> None:
-    for library, number in zip(libraries, numbers, strict=True):
-        # From 3.8 on, threadpoolctl lets only the thread that came first set OpenBLAS's number and
-        # ignores all others, which leaves them unlimited. Here the lock and the count keep order.
-        release = getattr(library, "clear_controlling_thread", lambda force: None)
-        release(force=True)
-        library.set_num_threads(number)
-        release(force=True)
+def _set_blas_threads(library: LibController, number: int) -> None:
+    # From 3.8 on, threadpoolctl lets only the thread that came first set OpenBLAS's number and
+    # ignores all others, which leaves them unlimited. Here the lock and the count keep order.
+    release = getattr(library, "clear_controlling_thread", lambda force: None)
+    release(force=True)
+    library.set_num_threads(number)
+    release(force=True)
 
 
-@cache
-def _blas_libraries() -> tuple[list[LibController], list[LibController]]:
+@lru_cache(maxsize=1)
+def _blas_libraries(modules: int) -> tuple[list[LibController], list[LibController]]:
     """Return the linear-algebra libraries that are loaded: those with one number of threads for the
     process, and those with one for each thread.
 
-    Looking for them takes as long as a small image.
+    Looking for them takes as long as a small image, so it is done again only where `modules`, the
+    number of imported modules, says that a package may have brought one of its own since.
     """
     import scipy.linalg  # noqa: F401 - brings one of its own beside NumPy's
     from threadpoolctl import ThreadpoolController
