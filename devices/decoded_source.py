@@ -52,4 +52,4 @@ class DecodedSource(Source):
         self._state = found.state
         first = self._ledger.stats.delivered
         self._ledger.deliver(len(found.records), found.malformed)
-        return Batch(found.records, first, has_gap, piece.received_at)
+        return Batch(found.records, first, has_gap, piece.received_at, piece.taken_at)

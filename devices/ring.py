@@ -37,12 +37,16 @@ class Piece:
     gap : Gap
     received_at : float
         When it came, s of `time.monotonic`; 0 where that is not known.
+    taken_at : float
+        When the instrument took the last of it by its own clock, s of `time.monotonic` (see
+        `devices.clock.InstrumentClock`); 0 where the instrument does not say.
     """
 
     data: bytes
     records: int
     gap: Gap = Gap.NONE
     received_at: float = 0.0
+    taken_at: float = 0.0
 
 
 class RingBuffer:

@@ -57,12 +57,16 @@ class Batch:
         has started anew.
     received_at : float
         When they came from a live instrument, s of `time.monotonic`; 0 otherwise.
+    taken_at : float
+        When the instrument took the last of them by its own clock, s of `time.monotonic` (see
+        `devices.clock.InstrumentClock`); 0 where the instrument does not say.
     """
 
     records: Records
     first: int = 0
     after_gap: bool = False
     received_at: float = 0.0
+    taken_at: float = 0.0
 
     def __len__(self) -> int:
         return len(self.records)

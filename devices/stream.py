@@ -41,10 +41,14 @@ class Transfer:
         Valid until the next `Feed.pull`.
     gap : Gap
         What is missing before it. After a gap the data begins with a whole record.
+    taken_at : float
+        When the instrument took the last of it by its own clock, s of `time.monotonic`; 0 where it
+        does not say.
     """
 
     data: memoryview
     gap: Gap = Gap.NONE
+    taken_at: float = 0.0
 
 
 class Feed(Protocol):
@@ -200,7 +204,7 @@ class _FeedReader:
         whole, self._rest = data[:end], data[end:]
         if whole:
             records = self._codec.count_records(as_bytes(whole))
-            self._ring.put(Piece(whole, records, self._gap, monotonic()))
+            self._ring.put(Piece(whole, records, self._gap, monotonic(), arrival.taken_at))
             self._gap = Gap.NONE
 
     def _count_truncated(self) -> None:

@@ -15,12 +15,9 @@ Besides what a source itself takes, its address may say how to gather (`ACCUMULA
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import groupby
 from math import inf
-from operator import itemgetter
-from sys import maxsize
 from time import monotonic
 from urllib.parse import quote, urlencode
 
@@ -31,8 +28,6 @@ from devices.histogram import BinAxis, StampHistogram, TagHistogram, TimeHistogr
 from devices.linospad2.calibration import BoardCalibration
 from devices.registry import open as open_source
 from devices.source import READ_TIMEOUT_S, Batch, Source
-from devices.statistics import Stats
-from devices.stream import StreamSource
 from devices.tcspc import compute_photon_times
 from devices.uri import Uri
 from tofclip.camera import Camera
@@ -177,9 +172,9 @@ def read_transient(address: str, bin_width: float | None = None) -> Streak:
     """
     uri = Uri.parse(address)
     gathering = AccumulationSettings.from_uri(uri, bin_width)
-    with open_source(_strip_accumulation_options(uri)) as source:
-        streak = _accumulate_streak(
-            _read_batches(source, gathering.seconds), source.calibration, gathering
+    with open_source(strip_accumulation_options(uri)) as source:
+        streak = accumulate_streak(
+            read_batches(source, gathering.seconds), source.calibration, gathering
         )
         known = source.calibration
         past = {
@@ -190,133 +185,30 @@ def read_transient(address: str, bin_width: float | None = None) -> Streak:
         while source.read() is not None:
             pass
     past["stats"] = source.stats.as_dict()
-    return replace(streak, camera=_read_camera(known), source=address, provenance=past)
+    return replace(streak, camera=read_camera(known), source=address, provenance=past)
 
 
-def read_transients(address: str, bin_width: float | None = None) -> TransientStream:
-    """Read a source until it ends, and yield one streak image after the other.
-
-    One is made of each ``frames`` pictures of a camera or ``records`` photons, as the address says;
-    the last one may have fewer. The source is opened with the first image, and closed with the
-    stream. Memory: a batch of the source, and a streak image.
+def accumulate_streak(
+    batches: Iterator[Batch], calibration: Record | None, gathering: AccumulationSettings
+) -> Streak:
+    """Make one streak image of everything that comes.
 
     Parameters
     ----------
-    address, bin_width
-        As for `read_transient`. Reading ends after ``seconds`` only where the address gives them.
+    batches : iterator of Batch
+    calibration : Record, optional
+        The source's.
+    gathering : AccumulationSettings
 
     Returns
     -------
-    TransientStream
+    Streak
 
     Raises
     ------
-    InputError, DeviceError
-        As for `read_transient`, with the first image.
+    InputError
+        Nothing came, or these records make no streak image.
     """
-    return TransientStream(address, bin_width)
-
-
-class TransientStream(Iterator[Streak]):
-    """Streak images as they come, and where every other one went; see `read_transients`.
-
-    A live camera whose pictures are taken one by one is read newest first, unless the address
-    chooses a ``policy``: what is shown or ranged late would be of no use. What is dropped for that
-    is in `stats`.
-
-    Parameters
-    ----------
-    address : str
-    bin_width : float or None
-        s.
-    """
-
-    def __init__(self, address: str, bin_width: float | None = None) -> None:
-        self._uri = Uri.parse(address)
-        self._gathering = AccumulationSettings.from_uri(self._uri, bin_width)
-        self._source: Source | None = None
-        self._shots = self._read()
-        self._records_per_shot = 1
-        self.received_at: float | None = None
-        """When the last image's last data came, s of `time.monotonic`; None before the first."""
-
-    @property
-    def is_live(self) -> bool:
-        """Whether an instrument, real or emulated, is being read."""
-        return self._source is not None and self._source.is_live
-
-    @property
-    def stats(self) -> Stats:
-        """Where every record went; see `Source.stats`."""
-        return Stats() if self._source is None else self._source.stats
-
-    @property
-    def shots_acquired(self) -> int:
-        """Images for which the instrument has registered enough."""
-        return -(-self.stats.acquired // self._records_per_shot)
-
-    @property
-    def shots_lost(self) -> int:
-        """Of these, images for which the instrument or the wire lost the data."""
-        return self.stats.lost_device // self._records_per_shot
-
-    def __next__(self) -> Streak:
-        return next(self._shots)
-
-    def close(self) -> None:
-        """Close the source."""
-        self._shots.close()
-
-    def _read(self) -> Generator[Streak]:
-        gathering = self._gathering
-        with open_source(_strip_accumulation_options(self._uri)) as source:
-            self._source = source
-            known = source.calibration
-            camera = _read_camera(known)
-            self._records_per_shot = gathering.records
-            if isinstance(source, StreamSource) and source.codec.name == "frames":
-                self._records_per_shot = gathering.frames
-                if gathering.frames == 1 and "policy" not in self._uri.values:
-                    source.keep_newest()
-            seconds = gathering.seconds if "seconds" in self._uri.values else inf
-            batches = self._note_times(_read_batches(source, seconds))
-            for number, parts in groupby(_split_shots(batches, gathering), itemgetter(0)):
-                streak = _accumulate_streak((part for _, part in parts), known, gathering)
-                yield replace(streak, camera=camera, source=f"{self._uri.text} shot {number}")
-
-    def _note_times(self, batches: Iterator[Batch]) -> Iterator[Batch]:
-        for batch in batches:
-            self.received_at = batch.received_at
-            yield batch
-
-
-def _split_shots(
-    batches: Iterator[Batch], gathering: AccumulationSettings
-) -> Iterator[tuple[int, Batch]]:
-    """Cut batches where shots end, and say to which shot each part belongs."""
-    done = 0
-    for batch in batches:
-        names = batch.records.dtype.names or ()
-        size = {"counts": gathering.frames, "histogram": maxsize}.get(names[-1], gathering.records)
-        start = 0
-        while start < len(batch):
-            end = min(len(batch), start + size - done % size)
-            yield (
-                done // size,
-                replace(
-                    batch,
-                    records=batch.records[start:end],
-                    first=batch.first + start,
-                    after_gap=batch.after_gap and start == 0,
-                ),
-            )
-            done += end - start
-            start = end
-
-
-def _accumulate_streak(
-    batches: Iterator[Batch], calibration: Record | None, gathering: AccumulationSettings
-) -> Streak:
     first = next(batches, None)
     if first is None:
         raise InputError("the source ended before it gave anything")
@@ -340,8 +232,23 @@ def _accumulate_streak(
     return histogram.to_streak()
 
 
-def _read_batches(source: Source, seconds: float) -> Iterator[Batch]:
-    """Read until the end, or for the given seconds of a live source."""
+def read_batches(source: Source, seconds: float) -> Iterator[Batch]:
+    """Read until the end, or for some seconds of a live source.
+
+    Parameters
+    ----------
+    source : Source
+    seconds : float
+
+    Yields
+    ------
+    Batch
+
+    Raises
+    ------
+    DeviceError
+        The instrument failed, or nothing came at all.
+    """
     deadline = monotonic() + seconds
     while not source.is_live or monotonic() < deadline:
         try:
@@ -413,12 +320,13 @@ def _sum_frames(
     return streak if gathering.bin_width is None else streak.with_bin_width(gathering.bin_width)
 
 
-def _read_camera(calibration: Record | None) -> Camera | None:
+def read_camera(calibration: Record | None) -> Camera | None:
+    """Return the camera that a source knows, None where it knows none."""
     known = None if calibration is None else calibration.children.get("camera")
     return None if known is None else Camera.from_record(known)
 
 
-def _strip_accumulation_options(uri: Uri) -> str:
+def strip_accumulation_options(uri: Uri) -> str:
     """Return the address without what says how to gather."""
     values = {name: value for name, value in uri.values.items() if name not in ACCUMULATION_OPTIONS}
     place = quote(uri.location, safe="/:@[]~ ")

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
+from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
-from time import monotonic, perf_counter
+from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -16,7 +17,7 @@ import typer
 from apps.options import JsonOption, TimeZeroOption
 from apps.report import report
 from apps.verbs.cloud import require_format
-from devices.transients import TransientStream, read_transients
+from devices.shot_stream import TrackedShots, read_transients
 from tofclip.errors import InputError
 from tofclip.recovery import SharpestFocus, parse_focus
 from tofclip.sequences import list_shots
@@ -82,7 +83,10 @@ def stream(
     latencies.
 
     Photons become a shot for every so many of them, pictures one by one: see records= and frames=
-    of an address.
+    of an address. Of an instrument the newest shot is taken. acquired = delivered + dropped_device
+    + dropped_host counts every shot that it took, and clouds bear its numbers. latency_median_s is
+    the time from the instrument's own stamp until the cloud is there (latency_from says so;
+    "arrival" where it sends no time), with the least delay of its messages taken for none.
 
     Example: tofclip stream 'sim+remoteex://?seed=1' --shots 20 --out clouds/
     """
@@ -93,19 +97,23 @@ def stream(
         from apps.files import make_folder
 
         make_folder(out)
-    coming = _read_shots(source, None if bin_width_ps is None else bin_width_ps * PICOSECOND)
+    coming = TrackedShots(
+        _read_shots(source, None if bin_width_ps is None else bin_width_ps * PICOSECOND)
+    )
     # The first shot brings the camera and the time axis of all.
-    first = next(coming, None)
+    first = coming.peek()
     if first is None:
         raise InputError(f"{source}: the source ended before it gave a shot")
     pipeline = _make_ranger(
         first, camera, None if time_zero_ns is None else time_zero_ns * NANOSECOND, focus
     )
-    clock = _ShotClock(coming)
     # Instruments do not wait: the newest shot counts. Files do, and lose nothing.
-    policy: Literal["drop_oldest", "block"] = "drop_oldest" if drop or clock.is_live else "block"
-    with closing(stream_clouds(clock.prepend(first), pipeline, held, policy)) as made:
-        figures = _consume_clouds(islice(made, shots), out, suffix, clock)
+    policy: Literal["drop_oldest", "block"] = "drop_oldest" if drop or coming.is_live else "block"
+    with closing(stream_clouds(coming, pipeline, held, policy)) as made:
+        figures = _consume_clouds(islice(made, shots), out, suffix, coming)
+    # Counted last: only when the instrument has been stopped are its accounts final.
+    accounts = coming.count_shots(figures["clouds"])
+    figures |= {"dropped": accounts.dropped, **asdict(accounts)}
     report(figures, as_json, [] if out is None else [out])
 
 
@@ -125,86 +133,33 @@ def _make_ranger(
     return RangingPipeline.for_shot(first, camera, chosen, time_zero)
 
 
-class _ShotClock:
-    """Notes when each shot's data came from the instrument, and how many there were.
-
-    Parameters
-    ----------
-    coming : iterator of Streak
-        Behind the first one, which has been taken already.
-    """
-
-    def __init__(self, coming: Iterator[Streak]) -> None:
-        self._coming = coming
-        self._stream = coming if isinstance(coming, TransientStream) else None
-        self._received: dict[int, float] = {}
-        self._taken = 0
-        self._note()
-
-    @property
-    def is_live(self) -> bool:
-        """Whether an instrument is read, so that what comes too late is dropped."""
-        return self._stream is not None and self._stream.is_live
-
-    def prepend(self, first: Streak) -> Iterator[Streak]:
-        """Put the shot that told the camera back before the others."""
-        yield first
-        for shot in self._coming:
-            self._note()
-            yield shot
-
-    def get_age(self, shot: int) -> float | None:
-        """Return the seconds since a shot's data came, None where that is not known."""
-        received = self._received.pop(shot, 0.0)
-        return monotonic() - received if received else None
-
-    def count_shots(self, clouds: int) -> dict[str, int]:
-        """Return where every shot went, given how many became clouds."""
-        acquired, lost = self._taken, 0
-        if self._stream is not None:
-            # The instrument knows of shots that never reached this program.
-            acquired = max(self._stream.shots_acquired, self._taken)
-            lost = self._stream.shots_lost
-        return {
-            "acquired": acquired,
-            "delivered": clouds,
-            "dropped_device": lost,
-            "dropped_host": acquired - lost - clouds,
-        }
-
-    def _note(self) -> None:
-        if self._stream is not None and self._stream.received_at:
-            self._received[self._taken] = self._stream.received_at
-            self._received.pop(self._taken - MAX_LATENCY_SAMPLES, None)  # it was dropped
-        self._taken += 1
-
-
 def _consume_clouds(
-    made: Iterable[StreamedCloud], out: Path | None, suffix: str, clock: _ShotClock
-) -> Mapping[str, Any]:
-    """Take the clouds as they come; return what is told at the end."""
+    made: Iterable[StreamedCloud], out: Path | None, suffix: str, shots: TrackedShots
+) -> dict[str, Any]:
+    """Take the clouds as they come; return what is reported of them at the end."""
     stages: dict[str, deque[float]] = {}
     latency: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
     ages: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
     clouds = points = 0
+    origin = "file"
     started = perf_counter()
     for one in made:
+        stamp = shots.get_stamp(one.shot)
+        age = stamp.compute_age()
+        ages.append(one.latency if age is None else age)
+        origin = "instrument" if stamp.taken_at else "arrival" if stamp.received_at else origin
+        latency.append(one.latency)
         if out is not None:
-            one.cloud.save(build_cloud_path(out, one.shot, suffix))
+            one.cloud.save(build_cloud_path(out, stamp.number, suffix))
         clouds += 1
         points += len(one.cloud)
-        latency.append(one.latency)
-        age = clock.get_age(one.shot)
-        ages.append(one.latency if age is None else age)
         for name, seconds in one.seconds.items():
             stages.setdefault(name, deque(maxlen=MAX_LATENCY_SAMPLES)).append(seconds)
     passed = perf_counter() - started
-    shots = clock.count_shots(clouds)
     return {
         "clouds": clouds,
-        "dropped": shots["dropped_device"] + shots["dropped_host"],
-        **shots,
         **{f"latency_{name}_s": value for name, value in _compute_quantiles(ages).items()},
+        "latency_from": origin,
         "points": points,
         "clouds_per_second": clouds / passed,
         "latency_s": _compute_quantiles(latency),

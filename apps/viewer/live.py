@@ -11,6 +11,7 @@ from contextlib import closing
 from apps.viewer.linear_recovery import Readings, make_view
 from apps.viewer.shots import ShotSource
 from apps.viewer.source import View
+from devices.shot_stream import TrackedShots
 from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.sequences.ranger import RangingPipeline
@@ -32,25 +33,32 @@ class LiveShotSource(ShotSource):
 
     Reading, rectifying and ranging are stages side by side (`tofclip.sequences.streaming`). Shots
     that come faster than that are dropped, the oldest that waits first, so that what one sees is
-    never late.
+    never late; `lost` counts them wherever it happened, in the instrument, its driver or here.
 
     Parameters
     ----------
     title : str
     shots : iterator of Streak
         Its end, or a fault of an instrument, ends the source; what came can still be looked at. A
-        generator lets go of its instrument when it is dropped then.
+        generator lets go of its instrument when it is dropped then. The first one is shown at once.
     camera : Camera
         With its sweep.
-    first : Streak
-        The shot that was needed to find out about the camera; shown as number 0.
+
+    Raises
+    ------
+    InputError
+        There is no shot.
 
     Notes
     -----
     Memory: the measurements and clouds of 32 shots.
     """
 
-    def __init__(self, title: str, shots: Iterator[Streak], camera: Camera, first: Streak) -> None:
+    def __init__(self, title: str, shots: Iterator[Streak], camera: Camera) -> None:
+        self._shots = shots if isinstance(shots, TrackedShots) else TrackedShots(shots)
+        first = next(self._shots, None)
+        if first is None:
+            raise InputError(f"{title}: the source ended before it gave anything")
         super().__init__(title, camera, first.times)
         self._cache: deque[tuple[Readings, View]] = deque(maxlen=MAX_CACHED_SHOTS)
         self._arrivals: deque[float] = deque(maxlen=RATE_WINDOW_SHOTS + 1)
@@ -61,9 +69,7 @@ class LiveShotSource(ShotSource):
         self._lock, self._stopping = threading.Lock(), threading.Event()
         self._ended = False
         self._append_entry(self._locate_returns(self.rectify(first)))
-        self._thread = threading.Thread(
-            target=self._run, args=(shots,), name="live shots", daemon=True
-        )
+        self._thread = threading.Thread(target=self._run, name="live shots", daemon=True)
         self._thread.start()
 
     def __len__(self) -> int:
@@ -112,21 +118,25 @@ class LiveShotSource(ShotSource):
             place = number - (self._count - len(self._cache))
             return self._cache[min(max(place, 0), len(self._cache) - 1)]
 
-    def _run(self, shots: Iterator[Streak]) -> None:
+    def _run(self) -> None:
         stages = Stage("rectify", self.rectify), Stage("range", self._locate_returns)
         try:
-            with closing(run_stages(shots, stages, policy="drop_oldest")) as made:
-                for kept, passage in enumerate(made):
+            with closing(run_stages(self._shots, stages, policy="drop_oldest")) as made:
+                for passage in made:
                     # Leaving the loop closes the generator, which stops its threads and the
                     # instrument.
                     if self._stopping.is_set():
                         break
-                    self._latency, self._lost = passage.latency, passage.number - kept
+                    stamp = self._shots.get_stamp(passage.number + 1)  # the first one is shown
                     self._append_entry(passage.value)
+                    age = stamp.compute_age()
+                    self._latency = passage.latency if age is None else age
+                    self._lost = self._shots.count_dropped(stamp, self._count)
         except Exception as fault:
             # Whatever ends it is shown on the page: an exception on this thread would reach nobody.
             self._failure_text = format_error_line(fault)
         finally:
+            self._lost = self._shots.count_shots(self._count).dropped
             self._ended = True
 
     def _locate_returns(self, measurements: Readings) -> tuple[Readings, View]:
@@ -137,28 +147,3 @@ class LiveShotSource(ShotSource):
             self._cache.append(entry)
             self._count += 1
             self._arrivals.append(time.monotonic())
-
-
-def take_first(shots: Iterator[Streak], title: str) -> tuple[Streak, Iterator[Streak]]:
-    """Wait for the first shot.
-
-    Parameters
-    ----------
-    shots : iterator of Streak
-    title : str
-        Of the source, for the message.
-
-    Returns
-    -------
-    first : Streak
-    shots : iterator of Streak
-        Those after it.
-
-    Raises
-    ------
-    InputError
-        The source ended without a shot.
-    """
-    for first in shots:
-        return first, shots
-    raise InputError(f"{title}: the source ended before it gave anything")

@@ -29,9 +29,9 @@ class Status:
     data_rate, frame_rate : float
         Frames per second that come in, and that are sent to the page.
     cloud_latency : float
-        From when a shot came in until its cloud was there, s; NaN where none comes in.
+        From when a shot was taken until its cloud was there, s; NaN where none comes in.
     lost : int
-        Shots that came in too fast and were dropped.
+        Shots that were taken and are not shown, wherever they were lost.
     failure_text : str
     time : float
         Time of flight of the frame, s; NaN where frames have none.

@@ -144,14 +144,14 @@ class Source(abc.ABC):
 
     @property
     def latency(self) -> float:
-        """Time from when a live shot was there until it could be shown, s; NaN where nothing comes
-        in.
+        """Time from when the instrument took a live shot, by its own clock where it sends one, until
+        it could be shown, s; NaN where nothing comes in.
         """
         return float("nan")
 
     @property
     def lost(self) -> int:
-        """Shots that came in too fast and were dropped."""
+        """Shots that were taken and are not shown, wherever they were lost."""
         return 0
 
     @property

@@ -13,11 +13,12 @@ import h5py
 
 from apps.viewer.clouds import CLOUD_SUFFIXES, CloudSource, find_clouds
 from apps.viewer.linear_recovery import LinearRecovery
-from apps.viewer.live import LiveShotSource, take_first
+from apps.viewer.live import LiveShotSource
 from apps.viewer.shots import StoredShotSource
 from apps.viewer.source import Gate
 from apps.viewer.transient import TransientSource
-from devices.transients import read_transient, read_transients
+from devices.shot_stream import TrackedShots, read_transients
+from devices.transients import read_transient
 from tofclip.camera import Camera, measure
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io import read_streak
@@ -141,8 +142,11 @@ def _open_instrument(address: str, options: ShotOptions) -> Source:
     """An instrument that goes on, or a recording, which is gathered once."""
     if address.lower().startswith("file://"):
         return _open_shots(address, [lambda: read_transient(address, options.bin_width)], options)
-    first, rest = take_first(read_transients(address, options.bin_width), address)
-    return LiveShotSource(address, rest, _find_camera(first, options), first)
+    shots = TrackedShots(read_transients(address, options.bin_width))
+    first = shots.peek()
+    if first is None:
+        raise InputError(f"{address}: the source ended before it gave anything")
+    return LiveShotSource(address, shots, _find_camera(first, options))
 
 
 def _find_camera(shot: Streak, options: ShotOptions) -> Camera:

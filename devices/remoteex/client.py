@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import monotonic
 
 import numpy as np
@@ -294,7 +294,7 @@ class RemoteExClient:
             left = max(deadline - monotonic(), 0)
             message = self._commands.read_until(TERMINATOR, MAX_MESSAGE_BYTES, left)
             try:
-                answer = Answer.decode(message)
+                answer = replace(Answer.decode(message), received_at=monotonic())
             except ProtocolError:
                 # Rest of a text that held a bare carriage return, which looks like the end of a
                 # message.

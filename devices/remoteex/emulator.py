@@ -170,6 +170,10 @@ class EmulatedStreakCamera:
         self._camera_parameters = {"Exposure": "30 ms", "Binning": "1 x 1"}
         self._acquisition = _Acquisition()
         self._requests = 0
+        self.taken = 0
+        """Pictures taken since it was switched on, in all rows of them."""
+        self.sent = 0
+        """Pictures sent, each counted once for every request."""
         self._data: Connection | None = None
         self._lock = threading.Lock()
         self._command_server = LoopbackServer(self._serve_commands)
@@ -198,6 +202,9 @@ class EmulatedStreakCamera:
         self._acquisition.is_running = False
         self._command_server.close()
         self._frame_server.close()
+
+    def note_taken(self, number: int) -> None:
+        """Hear of every picture, at the moment when it is taken; for who watches the camera."""
 
     def _serve_data(self, connection: Connection) -> None:
         self._data = connection
@@ -345,7 +352,8 @@ class EmulatedStreakCamera:
         threading.Thread(target=self._acquire_frames, args=(run,), daemon=True).start()
 
     def _stop_acquisition(self, command: Command, connection: Connection) -> None:
-        self._acquisition.is_running = False
+        with self._lock:  # none is taken after the answer
+            self._acquisition.is_running = False
         self._busy_for = 0
         _send_done(command, connection)
 
@@ -359,9 +367,13 @@ class EmulatedStreakCamera:
     def _acquire_frames(self, run: _Acquisition) -> None:
         """Take pictures, one after the other, and say so."""
         began = time.monotonic()
-        while run.is_running and run.newest < self._frames - 1:
+        while run.newest < self._frames - 1:
             with self._lock:
+                if not run.is_running:
+                    return
                 run.newest += 1
+                self.taken += 1
+                self.note_taken(run.newest)
                 run.oldest = max(run.oldest, run.newest - run.buffers + 1)
                 number = run.newest
             connection = run.client
@@ -425,6 +437,7 @@ class EmulatedStreakCamera:
         if kind == "short":
             time.sleep(pause)
         self._send_data(data[half:])
+        self.sent += 1
 
     def _get_table(self, command: Command, connection: Connection) -> None:
         is_table = command.arguments[1:] == ("ScalingTable", "Vertical")

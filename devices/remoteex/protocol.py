@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import enum
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from tofclip.errors import DeviceBusyError, DeviceError, InputError, ProtocolError
 
@@ -117,11 +117,14 @@ class Answer:
     name : str
         The command's, or what a message is about.
     arguments : tuple of str
+    received_at : float
+        When it came, s of `time.monotonic`.
     """
 
     code: AnswerCode
     name: str
     arguments: tuple[str, ...] = ()
+    received_at: float = field(default=0.0, compare=False)
 
     @property
     def is_message(self) -> bool:

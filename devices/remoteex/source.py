@@ -6,10 +6,12 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import monotonic, sleep
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from devices.clock import InstrumentClock
 from devices.frames import FrameCodec
 from devices.ledger import Ledger
 from devices.remoteex.client import CameraFrame, RemoteExClient
@@ -98,6 +100,23 @@ class LiveSettings:
             raise InputError("times to wait must be within 0 s and 600 s")
 
 
+class _Announcement(NamedTuple):
+    """A message that a picture was taken.
+
+    Parameters
+    ----------
+    number : int
+    stamp : float or None
+        Its time by the camera's computer, s since live mode was started.
+    received_at : float
+        s of `time.monotonic`.
+    """
+
+    number: int
+    stamp: float | None
+    received_at: float
+
+
 class RemoteExFeed:
     """Live pictures in the order of their numbers; see `devices.stream.Feed`.
 
@@ -115,6 +134,8 @@ class RemoteExFeed:
     def __init__(self, connect: ConnectFunction, ledger: Ledger, settings: LiveSettings) -> None:
         self._connect, self._ledger, self._settings = connect, ledger, settings
         self._gap = Gap.NONE
+        self._clock = InstrumentClock()
+        self._stamps: dict[int, float] = {}
         self._start_camera()
         first = self._first
         self.codec = FrameCodec(first.rows, first.columns, 8 * first.pixel_bytes)
@@ -156,7 +177,8 @@ class RemoteExFeed:
             ):
                 raise ProtocolError("the pictures' size has changed; open the camera anew")
             gap, self._gap = self._gap, Gap.NONE
-            return Transfer(memoryview(self.codec.pack_frame(picture.number, picture.pixels)), gap)
+            data = memoryview(self.codec.pack_frame(picture.number, picture.pixels))
+            return Transfer(data, gap, self._estimate_time(picture.number))
 
     def stop(self) -> None:
         """Turn the gain down first, whatever the state of the connection, and stop the acquisition.
@@ -177,6 +199,10 @@ class RemoteExFeed:
         try:
             if not self._stopped:
                 self.stop()
+            # What was announced before the stop, and not read by now, is lost.
+            with contextlib.suppress(DeviceError):
+                while True:
+                    self._note_announcement(self._wait_for_announcement(0))
         finally:
             self._count_announced_lost()
             self._link.close()
@@ -199,18 +225,21 @@ class RemoteExFeed:
                 self._prepare_live(link)
             if not link.is_done("AcqStart", "Live"):
                 self._join_or_restart(link)
-            self._newest = self._wait_for_announcement(self._settings.timeout)
-            self._first = link.read_frame(self._newest)
+            announced = self._wait_for_announcement(self._settings.timeout)
+            self._clock.reset()
+            self._stamps.clear()
+            self._note_stamp(announced)
+            self._first = link.read_frame(announced.number)
         except BaseException:
             with contextlib.suppress(DeviceError):
                 self.stop()
             link.close()
             raise
-        # The first picture was read for its size, and is delivered as well.
+        # The first picture was read for its size, and is delivered as well. Where it has fallen out
+        # of the ring buffer already, it is an older one's successor.
         self._unread_frame: CameraFrame | None = self._first
-        self._next = self._first.number
-        self._announced = self._newest
-        self._newest = max(self._newest, self._first.number)
+        self._next = self._announced = announced.number
+        self._newest = max(announced.number, self._first.number)
 
     def _prepare_live(self, link: RemoteExClient) -> None:
         """Set what has to be set before live mode, and ask to be told of every picture."""
@@ -275,14 +304,35 @@ class RemoteExFeed:
         self._newest = max(self._newest, picture.number)
         return picture
 
-    def _note_announcement(self, number: int) -> None:
+    def _note_announcement(self, announced: _Announcement) -> None:
         """Note the newest picture; where its number went back, live mode was started anew."""
+        number = announced.number
         if number <= self._announced:
             self._count_announced_lost()
             self._next = number
             self._gap = Gap.RESTART
+            self._clock.reset()
+            self._stamps.clear()
         self._announced = number
         self._newest = max(number, self._next - 1)
+        self._note_stamp(announced)
+
+    def _note_stamp(self, announced: _Announcement) -> None:
+        if announced.stamp is not None:
+            self._clock.observe(announced.stamp, announced.received_at)
+            self._stamps[announced.number] = announced.stamp
+
+    def _estimate_time(self, number: int) -> float:
+        """Return when a picture was taken, s of `time.monotonic`; 0 where its announcement has not
+        come, or had no time.
+        """
+        # A picture that was sent for one that is gone may be announced right before the answer.
+        with contextlib.suppress(DeviceTimeoutError):
+            while number not in self._stamps and self._announced < number:
+                self._note_announcement(self._wait_for_announcement(0))
+        stamp = self._stamps.get(number)
+        self._stamps = {later: one for later, one in self._stamps.items() if later > number}
+        return 0.0 if stamp is None else self._clock.to_host(stamp)
 
     def _have_numbers_restarted(self) -> bool:
         """Wait for the next announcement, and say whether it goes back."""
@@ -290,12 +340,17 @@ class RemoteExFeed:
         self._note_announcement(self._wait_for_announcement(self._settings.timeout))
         return self._next != expected
 
-    def _wait_for_announcement(self, timeout: float) -> int:
-        """Return the number of the picture that the next message announces."""
+    def _wait_for_announcement(self, timeout: float) -> _Announcement:
+        """Return the next message that announces a picture."""
         while True:
-            words = self._link.read_message(timeout).arguments
+            message = self._link.read_message(timeout)
+            words = message.arguments
             if len(words) >= 2 and words[0].casefold() == "ringbuffer":
-                return parse_integer(words[1], "a picture's number")
+                number = parse_integer(words[1], "a picture's number")
+                is_stamped = len(words) > 2 and words[2].isdecimal() and len(words[2]) < 16
+                return _Announcement(
+                    number, int(words[2]) * 1e-3 if is_stamped else None, message.received_at
+                )
 
     def _reconnect(self) -> None:
         self._count_announced_lost()

@@ -7,13 +7,16 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from time import monotonic, sleep
 
 import numpy as np
 import pytest
 
 from apps.cli import main
+from devices.remoteex.emulator import EmulatedLight, EmulatedStreakCamera
 from devices.scenes import draw_exposure, simulate_line_light
-from devices.transients import read_transient, read_transients
+from devices.shot_stream import read_transients
+from devices.transients import read_transient
 from tofclip.lidar import PointCloud
 from tofclip.shots import Streak, save_stack
 
@@ -50,6 +53,52 @@ def test_a_streaming_camera_becomes_clouds(tmp_path: Path, capsys: pytest.Captur
     assert numbers[-1] >= 2
     cloud = PointCloud.load(saved[0])
     assert 1.6 < np.median(cloud.range) < 3.3  # where the simulated scene stands
+
+
+def test_a_slow_consumer_gets_the_newest_shot_and_the_truth_about_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    """200 shots a second, 2 clouds a second: every shot is accounted for as the camera itself
+    counts, and clouds are younger than two of them take.
+    """
+    pause, clouds = 0.5, 5
+    pictures = [EmulatedLight.of(simulate_line_light(), 1).draw_frame(n) for n in range(4)]
+    monkeypatch.setattr(EmulatedLight, "draw_frame", lambda self, number: pictures[number % 4])
+    cameras: list[WatchedCamera] = []
+
+    class WatchedCamera(EmulatedStreakCamera):
+        def __init__(self, *arguments: object) -> None:
+            self.taken_at: dict[int, float] = {}
+            cameras.append(self)
+            super().__init__(*arguments)
+
+        def note_taken(self, number: int) -> None:
+            self.taken_at[number] = monotonic()
+
+    monkeypatch.setattr("devices.remoteex.simulation.EmulatedStreakCamera", WatchedCamera)
+    ages = []
+
+    def save_slowly(self: PointCloud, path: Path) -> None:
+        # The file's number is the camera's own: with any other the age would be another.
+        number = int(path.stem.removeprefix("cloud_"))
+        ages.append(monotonic() - cameras[0].taken_at[number])
+        sleep(pause)
+
+    monkeypatch.setattr(PointCloud, "save", save_slowly)
+    address = "sim+remoteex://?seed=1&scene=small&frame_rate=200"
+    words = ["stream", address, "--shots", str(clouds), "--out", str(tmp_path)]
+    assert main([*words, "--json"]) == 0
+    figures = told(capsys)
+    camera = cameras[0]
+    assert camera.taken > 100 * pause * clouds  # the emulated camera kept its pace, about
+    assert figures["acquired"] == camera.taken
+    assert figures["dropped_device"] == camera.taken - camera.sent
+    assert figures["dropped_host"] == camera.sent - clouds
+    assert figures["delivered"] == clouds
+    assert figures["latency_from"] == "instrument"
+    assert figures["latency_median_s"] < 2 * pause
+    # Stamps are whole milliseconds; the rest is the least delay of a message.
+    assert figures["latency_median_s"] == pytest.approx(np.median(ages), abs=0.05)
 
 
 def test_photons_become_shots_of_so_many(capsys: pytest.CaptureFixture[str]):

@@ -15,10 +15,11 @@ from devices.linospad2.calibration import BoardCalibration, load_calibration
 from devices.linospad2.codec import LinoSpad2Codec
 from devices.linospad2.simulation import SimulatedBoard, draw_uneven_calibration
 from devices.scenes import simulate_line_light
+from devices.shot_stream import read_transients
 from devices.source import Batch, Info, Source
 from devices.statistics import Stats
 from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
-from devices.transients import read_transient, read_transients
+from devices.transients import read_transient
 from tofclip.errors import InputError, MissingTimeAxisError
 from tofclip.lidar import depth
 from tofclip.recovery import recover
@@ -220,8 +221,9 @@ def test_a_slow_viewer_gets_the_newest_picture_and_is_told_of_the_others() -> No
     for _ in range(3):
         time.sleep(0.3)
         next(stream)
-        assert stream.received_at is not None
-        assert time.monotonic() - stream.received_at < 0.25
+        assert stream.stamp is not None
+        assert 0 < stream.stamp.taken_at <= stream.stamp.received_at
+        assert time.monotonic() - stream.stamp.taken_at < 0.25
     stats = stream.stats
     assert stats.dropped_host + stats.lost_device > 10
     assert stream.shots_acquired >= 4 + stats.dropped_host + stats.lost_device

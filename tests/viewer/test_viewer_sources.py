@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -245,7 +246,7 @@ def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
         yield streak(2)
         raise DeviceTimeoutError("nothing came")
 
-    source = LiveShotSource("test", shots(), camera(), streak(0))
+    source = LiveShotSource("test", chain([streak(0)], shots()), camera())
     session = Session(source)
     deadline = time.monotonic() + 20
     while source.is_live and time.monotonic() < deadline:
@@ -277,14 +278,16 @@ def test_live_shots_that_come_too_fast_are_dropped(monkeypatch: pytest.MonkeyPat
 
     rectified = LiveShotSource.rectify
     monkeypatch.setattr(LiveShotSource, "rectify", slowly)
-    source = LiveShotSource("test", shots(), camera(), streak(0))
+    source = LiveShotSource("test", chain([streak(0)], shots()), camera())
     assert came.wait(20)
     go_on.set()
     deadline = time.monotonic() + 20
     while source.is_live and time.monotonic() < deadline:
         time.sleep(0.01)
-    # one was being rectified, and one more could wait
-    assert (len(source), source.lost) == (3, 10)
+    # One was being rectified, and one more could wait; on a busy computer that one replaces the
+    # other, which is finished and not yet taken.
+    assert len(source) in (2, 3)
+    assert len(source) + source.lost == 13
     assert 0 < source.latency < 20
     source.close()
 

@@ -70,6 +70,12 @@ class Channel(Generic[Entry]):
             self._entries.append(entry)
             self._changed.notify_all()
 
+    def wait_for_room(self) -> None:
+        """Wait until an entry can be put without waiting or dropping, or the channel is closed."""
+        with self._changed:
+            while len(self._entries) >= self._capacity and not self._closed:
+                self._changed.wait()
+
     def finish(self, fault: BaseException | None = None) -> None:
         """Say that no further entry will come, because of a fault or because that was all."""
         with self._changed:

@@ -63,9 +63,13 @@ def run_stages(
 
     Each stage runs on a thread of its own, and so does the source. When the consumer is slow the
     stages wait for it, and then the channel before the first stage is full: there the policy
-    decides. So whatever is dropped has cost no work, and at most ``(held + 1) * (len(stages) + 1)``
-    things are alive at a time. Closing the generator stops the threads, and closes the source on
-    its own thread if it can be closed.
+    decides. At most ``(queue_size + 1) * (len(stages) + 1)`` things are alive at a time. Closing
+    the generator stops the threads, and closes the source on its own thread if it can be closed.
+
+    With ``"drop_oldest"`` no work is begun while a result waits for the consumer, and of several
+    that were under way by then only the newest are kept. So what the consumer gets is about as old
+    as its own work on the one before takes, not as all the stages' together; at most one thing in
+    each stage and channel was worked on in vain for each that is handed out.
 
     Parameters
     ----------
@@ -76,7 +80,7 @@ def run_stages(
         Things that wait before each stage, at most.
     policy : "block" or "drop_oldest"
         ``"block"`` lets the source wait: nothing is lost of a file, and an instrument's own buffer
-        fills up. ``"drop_oldest"`` keeps the latency low.
+        fills up. ``"drop_oldest"`` keeps the latency low: a live view takes the newest.
 
     Yields
     ------
@@ -88,17 +92,21 @@ def run_stages(
     """
     channels = [
         Channel[StreamItem](queue_size, policy),
-        # Only the first channel may drop: later ones hold work that has been paid for.
-        *(Channel[StreamItem](queue_size) for _ in stages),
+        *(Channel[StreamItem](queue_size) for _ in stages[1:]),
+        # Results that were finished meanwhile are dropped for newer ones as well: were they kept,
+        # everything behind them would wait and grow old.
+        Channel[StreamItem](queue_size, policy),
     ]
     threads = [
         Thread(target=_run_reader, args=(source, channels[0]), name="stream reader", daemon=True)
     ]
-    for stage, (before, after) in zip(stages, pairwise(channels), strict=True):
+    # Nothing is begun while the consumer has not taken what is there.
+    gates = [channels[-1] if policy == "drop_oldest" else None, *(None for _ in stages[1:])]
+    for stage, gate, (before, after) in zip(stages, gates, pairwise(channels), strict=True):
         threads.append(
             Thread(
                 target=_run_stage,
-                args=(stage, before, after),
+                args=(stage, before, after, gate),
                 name=f"stream {stage.name}",
                 daemon=True,
             )
@@ -135,10 +143,20 @@ def _run_reader(source: Iterable[Any], target: Channel[StreamItem]) -> None:
         target.finish(fault)
 
 
-def _run_stage(stage: Stage, source: Channel[StreamItem], target: Channel[StreamItem]) -> None:
-    """Work on one thing after the other; a stage's whole life."""
+def _run_stage(
+    stage: Stage,
+    source: Channel[StreamItem],
+    target: Channel[StreamItem],
+    gate: Channel[StreamItem] | None,
+) -> None:
+    """Work on one thing after the other, each when the gate has room; a stage's whole life."""
     try:
-        while (item := source.get()) is not None:
+        while True:
+            if gate is not None:
+                gate.wait_for_room()
+            item = source.get()
+            if item is None:
+                break
             started = perf_counter()
             _add_waiting_time(item, started)
             item.value = stage.work(item.value)

@@ -1,0 +1,326 @@
+"""A source read shot after shot: streak images as they come, with what became of every other one.
+
+::
+
+    Source -> TransientStream (one image of so many pictures or photons) -> TrackedShots
+           -> stages that make clouds -> consumer, which asks TrackedShots for the age of each and
+                                         for the accounts of all
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, replace
+from itertools import groupby
+from math import inf
+from operator import itemgetter
+from sys import maxsize
+from time import monotonic
+
+from devices.clock import InstrumentClock
+from devices.registry import open as open_source
+from devices.source import Batch, Source
+from devices.statistics import Stats
+from devices.stream import StreamSource
+from devices.transients import (
+    AccumulationSettings,
+    accumulate_streak,
+    read_batches,
+    read_camera,
+    strip_accumulation_options,
+)
+from devices.uri import Uri
+from tofclip.shots import Streak
+
+MAX_STAMPS = 10_000
+"""Shots on their way whose stamps are kept."""
+
+
+@dataclass(frozen=True)
+class ShotStamp:
+    """As which shot, and when, a streak image was taken.
+
+    Parameters
+    ----------
+    number : int
+        Its number at the instrument, from 0: those that were lost on the way have been counted.
+    taken_at : float
+        When the instrument took the last of it by its own clock, s of `time.monotonic`; 0 where it
+        does not say.
+    received_at : float
+        When the last of it came, s of `time.monotonic`; 0 where it comes from a file.
+    """
+
+    number: int
+    taken_at: float = 0.0
+    received_at: float = 0.0
+
+    def compute_age(self) -> float | None:
+        """Return the seconds since it was taken, or since it came where the instrument does not say
+        when it was taken; None for a file.
+        """
+        began = self.taken_at or self.received_at
+        return monotonic() - began if began else None
+
+
+@dataclass(frozen=True)
+class ShotAccounts:
+    """What became of every shot.
+
+    Parameters
+    ----------
+    acquired : int
+        Shots that the instrument took, or that were read from a file.
+    delivered : int
+    dropped_device : int
+        Lost by the instrument or on the wire, or damaged when they came.
+    dropped_host : int
+        Came and were dropped for newer ones, by the driver's buffer or between the stages, or
+        waited still when the stream was ended.
+    """
+
+    acquired: int
+    delivered: int
+    dropped_device: int
+    dropped_host: int
+
+    @property
+    def dropped(self) -> int:
+        """All that were taken and not delivered."""
+        return self.dropped_device + self.dropped_host
+
+
+def read_transients(address: str, bin_width: float | None = None) -> TransientStream:
+    """Read a source until it ends, and yield one streak image after the other.
+
+    One is made of each ``frames`` pictures of a camera or ``records`` photons, as the address says;
+    the last one may have fewer. The source is opened with the first image, and closed with the
+    stream. Memory: a batch of the source, and a streak image.
+
+    Parameters
+    ----------
+    address, bin_width
+        As for `devices.read_transient`. Reading ends after ``seconds`` only where the address gives
+        them.
+
+    Returns
+    -------
+    TransientStream
+
+    Raises
+    ------
+    InputError, DeviceError
+        As for `devices.read_transient`, with the first image.
+    """
+    return TransientStream(address, bin_width)
+
+
+class TransientStream(Iterator[Streak]):
+    """Streak images as they come, and where every other one went; see `read_transients`.
+
+    A live camera whose pictures are taken one by one is read newest first, unless the address
+    chooses a ``policy``: what is shown or ranged late would be of no use. What is dropped for that
+    is in `stats`.
+
+    Parameters
+    ----------
+    address : str
+    bin_width : float or None
+        s.
+    """
+
+    def __init__(self, address: str, bin_width: float | None = None) -> None:
+        self._uri = Uri.parse(address)
+        self._gathering = AccumulationSettings.from_uri(self._uri, bin_width)
+        self._source: Source | None = None
+        self._shots = self._read()
+        self._records_per_shot = 1
+        self._clock = InstrumentClock()
+        self._taken_at = self._received_at = 0.0
+        self.stamp: ShotStamp | None = None
+        """Of the last image; None before the first."""
+        self.is_numbered = False
+        """Whether the instrument itself numbers its shots, as cameras do."""
+
+    @property
+    def is_live(self) -> bool:
+        """Whether an instrument, real or emulated, is being read."""
+        return self._source is not None and self._source.is_live
+
+    @property
+    def stats(self) -> Stats:
+        """Where every record went; see `Source.stats`."""
+        return Stats() if self._source is None else self._source.stats
+
+    @property
+    def shots_acquired(self) -> int:
+        """Images for which the instrument has registered enough."""
+        return -(-self.stats.acquired // self._records_per_shot)
+
+    @property
+    def shots_lost(self) -> int:
+        """Of these, images for which the instrument or the wire lost or damaged the data."""
+        return (self.stats.lost_device + self.stats.malformed) // self._records_per_shot
+
+    def __next__(self) -> Streak:
+        return next(self._shots)
+
+    def close(self) -> None:
+        """Close the source."""
+        self._shots.close()
+
+    def _read(self) -> Generator[Streak]:
+        gathering = self._gathering
+        with open_source(strip_accumulation_options(self._uri)) as source:
+            self._source = source
+            known = source.calibration
+            camera = read_camera(known)
+            tick = None if known is None else known.attributes.get("tick_s")
+            self._records_per_shot = gathering.records
+            if isinstance(source, StreamSource) and source.codec.name == "frames":
+                self._records_per_shot = gathering.frames
+                self.is_numbered = True
+                if gathering.frames == 1 and "policy" not in self._uri.values:
+                    source.keep_newest()
+            seconds = gathering.seconds if "seconds" in self._uri.values else inf
+            batches = self._note_times(read_batches(source, seconds), tick)
+            for number, parts in groupby(_split_shots(batches, gathering), itemgetter(0)):
+                streak = accumulate_streak((part for _, part in parts), known, gathering)
+                self.stamp = ShotStamp(number, self._taken_at, self._received_at)
+                yield replace(streak, camera=camera, source=f"{self._uri.text} shot {number}")
+
+    def _note_times(self, batches: Iterator[Batch], tick: object) -> Iterator[Batch]:
+        """Note when each batch was taken and came; photons carry the instrument's clock in their
+        time tags, of which `tick` is the unit in s.
+        """
+        for batch in batches:
+            self._taken_at, self._received_at = batch.taken_at, batch.received_at
+            names = batch.records.dtype.names or ()
+            if isinstance(tick, float) and "time_ticks" in names and len(batch):
+                stamp = float(batch.records["time_ticks"][-1]) * tick
+                self._clock.observe(stamp, batch.received_at)
+                self._taken_at = self._clock.to_host(stamp) if batch.received_at else 0.0
+            yield batch
+
+
+class TrackedShots(Iterator[Streak]):
+    """Shots on their way into stages, each with its stamp, so that the consumer behind the stages
+    can say how old a shot is and where the others went.
+
+    Parameters
+    ----------
+    shots : iterator of Streak
+        A `TransientStream`, or shots from files.
+    """
+
+    def __init__(self, shots: Iterator[Streak]) -> None:
+        self._shots = shots
+        self._stream = shots if isinstance(shots, TransientStream) else None
+        self._stamps: dict[int, ShotStamp] = {}
+        self._count = self._first_number = 0
+        self._peeked: Streak | None = None
+
+    @property
+    def is_live(self) -> bool:
+        """Whether an instrument is read, so that what comes too late is dropped."""
+        return self._stream is not None and self._stream.is_live
+
+    def peek(self) -> Streak | None:
+        """Return the next shot, which stays the next one; None at the end."""
+        if self._peeked is None:
+            self._peeked = next(self, None)
+        return self._peeked
+
+    def __next__(self) -> Streak:
+        if self._peeked is not None:
+            shot, self._peeked = self._peeked, None
+            return shot
+        shot = next(self._shots)
+        stamp = None if self._stream is None else self._stream.stamp
+        stamp = stamp or ShotStamp(self._count)
+        self._stamps[self._count] = stamp
+        if self._count == 0:
+            self._first_number = stamp.number
+        self._stamps.pop(self._count - MAX_STAMPS, None)
+        self._count += 1
+        return shot
+
+    def get_stamp(self, place: int) -> ShotStamp:
+        """Return the stamp of the shot that came as number `place` out of this iterator, from 0.
+        Asked once for each shot, and not for one before.
+        """
+        for earlier in [known for known in list(self._stamps) if known < place]:
+            del self._stamps[earlier]  # they were dropped
+        return self._stamps.pop(place, ShotStamp(place))
+
+    def count_dropped(self, stamp: ShotStamp, delivered: int) -> int:
+        """Return how many shots up to a delivered one were lost, wherever that was. Of those behind
+        it nobody can say yet.
+
+        Parameters
+        ----------
+        stamp : ShotStamp
+            The newest delivered one's.
+        delivered : int
+            Shots delivered so far, this one included.
+
+        Returns
+        -------
+        int
+        """
+        missing = stamp.number - self._first_number + 1 - delivered
+        if self._stream is not None and not self._stream.is_numbered:
+            missing += self._stream.shots_lost
+        return missing
+
+    def count_shots(self, delivered: int) -> ShotAccounts:
+        """Return what became of every shot, given how many were delivered; final once the stream
+        has been closed.
+        """
+        acquired, lost = self._count, 0
+        if self._stream is not None and self._stream.is_live:
+            # The instrument knows of shots that never reached this program.
+            acquired = max(self._stream.shots_acquired, self._count)
+            lost = self._stream.shots_lost
+        return ShotAccounts(acquired, delivered, lost, acquired - lost - delivered)
+
+    def close(self) -> None:
+        """Close the source; not while another thread waits for a shot."""
+        close = getattr(self._shots, "close", None)
+        if close is not None:
+            close()
+
+
+def _split_shots(
+    batches: Iterator[Batch], gathering: AccumulationSettings
+) -> Iterator[tuple[int, Batch]]:
+    """Cut batches where shots end, and say to which shot each part belongs.
+
+    Pictures carry the instrument's number, in which those that were lost have been counted; where
+    it begins anew, it is counted on from the last one. Photons are counted here.
+    """
+    done = number = base = 0
+    last = -1
+    for batch in batches:
+        names = batch.records.dtype.names or ()
+        size = {"counts": gathering.frames, "histogram": maxsize}.get(names[-1], gathering.records)
+        own = batch.records["number"] if "number" in names else None
+        if own is not None and len(own):
+            base += last + 1 if own[0] <= last else 0
+            last = int(own[-1])
+        start = 0
+        while start < len(batch):
+            end = min(len(batch), start + size - done % size)
+            if done % size == 0:
+                number = (done if own is None else base + int(own[start])) // size
+            yield (
+                number,
+                replace(
+                    batch,
+                    records=batch.records[start:end],
+                    first=batch.first + start,
+                    after_gap=batch.after_gap and start == 0,
+                ),
+            )
+            done += end - start
+            start = end
