@@ -104,7 +104,7 @@ def prepare_stream(rows: int, shots: int) -> PreparedCase:
 @contextlib.contextmanager
 def start_workers(number: int) -> Iterator[str]:
     """Address of a scheduler with workers of one thread each."""
-    with LocalCluster(  # type: ignore[no-untyped-call]
+    with LocalCluster(
         n_workers=number,
         threads_per_worker=1,
         dashboard_address="127.0.0.1:0",
