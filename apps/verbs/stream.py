@@ -66,9 +66,7 @@ def stream(
             metavar="N", help="Stop after so many clouds.", show_default="at the source's end"
         ),
     ] = None,
-    held: Annotated[
-        int, typer.Option(metavar="N", help="Shots that may wait before each stage.")
-    ] = 1,
+    held: Annotated[int, typer.Option(metavar="N", help="Shots that may wait for their turn.")] = 1,
     drop: Annotated[
         bool,
         typer.Option(

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
-
 import numpy as np
 from numpy.typing import NDArray
 
 from apps.viewer.source import FloatArray, Gate, View
 from tofclip.camera import Camera
-from tofclip.lidar import Detection, Returns, depth, point_cloud
+from tofclip.lidar import Detection, PointCloud, Returns, depth, point_cloud
 from tofclip.lidar.detection import SCENE_BRIGHTNESS_QUANTILE
 from tofclip.lidar.processing import select_points
+from tofclip.sequences.cache import get_cached_camera, prepare_inverse
 from tofclip.shots import Frames
 from tofclip.solvers import LinearInverse
 from tofclip.solvers.direct import PreparedInverse
 
 Readings = NDArray[np.float32]
 
-MAX_SHEARS = 6
 SHEAR_LIMITS = (-3.0, 3.0)
 """Pixels per view step between which a picture can be refocused."""
 
@@ -38,14 +35,13 @@ class LinearRecovery:
 
     Notes
     -----
-    Memory: one operator and one matrix (columns, columns) for each of the last 6 shears. Safe to
-    share by threads.
+    Memory: one operator and one matrix (columns, columns) for each of the last 16 shears, which
+    every recovery of this process shares (`tofclip.sequences.cache`). Safe to share by threads.
     """
 
     def __init__(self, camera: Camera, times: FloatArray) -> None:
         self.camera, self.times = camera, times
-        self._inverses: OrderedDict[float, PreparedInverse] = OrderedDict()
-        self._lock = threading.Lock()
+        self._cached_camera = get_cached_camera(camera)
 
     def frames(self, measurements: Readings, shear: float, gate: Gate) -> Frames:
         """Recover the frames of a gate.
@@ -92,23 +88,26 @@ class LinearRecovery:
         return Gate(first, max(gate.stop, first + MIN_FRAMES))
 
     def _prepare_inverse(self, shear: float) -> PreparedInverse:
-        # Sliders give numbers that differ by rounding only.
-        key = round(shear, 6)
-        # Two threads that ask for the same shear wait for one preparation instead of making two.
-        with self._lock:
-            if key not in self._inverses:
-                self._inverses[key] = LinearInverse().prepare(
-                    self.camera.operator(key), ~self.camera.dead_columns
-                )
-                if len(self._inverses) > MAX_SHEARS:
-                    self._inverses.popitem(last=False)
-            self._inverses.move_to_end(key)
-            return self._inverses[key]
+        # Rounded, because sliders give numbers that differ by rounding only.
+        operator = self._cached_camera.operator(round(shear, 6))
+        return prepare_inverse(LinearInverse(), operator, ~self.camera.dead_columns)
 
 
-def make_view(returns: Returns) -> View:
-    """Place returns in space and keep which pixel saw them."""
-    return View(point_cloud(returns), np.stack([returns.y, returns.x], axis=-1))
+def make_view(returns: Returns, cloud: PointCloud | None = None) -> View:
+    """Return the points of returns and which pixel saw them.
+
+    Parameters
+    ----------
+    returns : Returns
+    cloud : PointCloud, optional
+        Of these returns, where they have been placed in space already.
+
+    Returns
+    -------
+    View
+    """
+    points = point_cloud(returns) if cloud is None else cloud
+    return View(points, np.stack([returns.y, returns.x], axis=-1))
 
 
 def find_min_intensity(whole: View) -> float:

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
 from apps.viewer.linear_recovery import Readings, make_view
@@ -15,7 +16,7 @@ from devices.shot_stream import TrackedShots
 from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.sequences.ranger import RangingPipeline
-from tofclip.sequences.streaming import Stage, run_stages
+from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Streak
 from tofclip.storage import format_error_line
 
@@ -31,9 +32,10 @@ class LiveShotSource(ShotSource):
     """Shots that an iterator delivers, made into clouds as they come; the last 32 can be looked at
     again.
 
-    Reading, rectifying and ranging are stages side by side (`tofclip.sequences.streaming`). Shots
-    that come faster than that are dropped, the oldest that waits first, so that what one sees is
-    never late; `lost` counts them wherever it happened, in the instrument, its driver or here.
+    Clouds are those of `tofclip.sequences.streaming.stream_clouds`, one shot at a time on all cores,
+    so that each is seen soon. Of the shots that come meanwhile only the newest waits, so that what
+    one sees is never late; `lost` counts the others wherever it happened, in the instrument, its
+    driver or here.
 
     Parameters
     ----------
@@ -68,7 +70,8 @@ class LiveShotSource(ShotSource):
         self.rectifier = self._pipeline.rectifier  # knows the sweep already
         self._lock, self._stopping = threading.Lock(), threading.Event()
         self._ended = False
-        self._append_entry(self._locate_returns(self.rectify(first)))
+        measurements = self.rectify(first)
+        self._append_entry(measurements, make_view(self._pipeline.find_returns(measurements)))
         self._thread = threading.Thread(target=self._run, name="live shots", daemon=True)
         self._thread.start()
 
@@ -119,18 +122,28 @@ class LiveShotSource(ShotSource):
             return self._cache[min(max(place, 0), len(self._cache) - 1)]
 
     def _run(self) -> None:
-        stages = Stage("rectify", self.rectify), Stage("range", self._locate_returns)
         try:
-            with closing(run_stages(self._shots, stages, policy="drop_oldest")) as made:
-                for passage in made:
+            with (
+                ThreadPoolExecutor(1) as worker,
+                closing(
+                    stream_clouds(
+                        self._shots,
+                        self._pipeline,
+                        policy="drop_oldest",
+                        executor=worker,
+                        at_once=1,
+                    )
+                ) as clouds,
+            ):
+                for made in clouds:
                     # Leaving the loop closes the generator, which stops its threads and the
                     # instrument.
                     if self._stopping.is_set():
                         break
-                    stamp = self._shots.get_stamp(passage.number + 1)  # the first one is shown
-                    self._append_entry(passage.value)
+                    stamp = self._shots.get_stamp(made.shot + 1)  # the first one is shown
+                    self._append_entry(made.measurements, make_view(made.returns, made.cloud))
                     age = stamp.compute_age()
-                    self._latency = passage.latency if age is None else age
+                    self._latency = made.latency if age is None else age
                     self._lost = self._shots.count_dropped(stamp, self._count)
         except Exception as fault:
             # Whatever ends it is shown on the page: an exception on this thread would reach nobody.
@@ -139,11 +152,8 @@ class LiveShotSource(ShotSource):
             self._lost = self._shots.count_shots(self._count).dropped
             self._ended = True
 
-    def _locate_returns(self, measurements: Readings) -> tuple[Readings, View]:
-        return measurements, make_view(self._pipeline.find_returns(measurements))
-
-    def _append_entry(self, entry: tuple[Readings, View]) -> None:
+    def _append_entry(self, measurements: Readings, view: View) -> None:
         with self._lock:
-            self._cache.append(entry)
+            self._cache.append((measurements, view))
             self._count += 1
             self._arrivals.append(time.monotonic())

@@ -8,7 +8,7 @@ from time import sleep
 import pytest
 
 from tofclip.errors import InputError
-from tofclip.sequences.streaming.channel import Channel, ChannelClosedError
+from tofclip.sequences.streaming import Channel, ChannelClosedError
 
 
 def test_entries_come_in_order_and_then_the_end():

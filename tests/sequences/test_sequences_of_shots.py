@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import weakref
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,12 @@ from tofclip.sequences import (
     list_files,
     list_shots,
 )
-from tofclip.sequences.cache import CachedInverse, CachingCamera, get_cached_camera
+from tofclip.sequences.cache import (
+    CachedInverse,
+    CachingCamera,
+    get_cached_camera,
+    prepare_inverse,
+)
 from tofclip.sequences.jobs import run_jobs, select_unfinished
 from tofclip.solvers import LinearInverse
 from tofclip.storage import Record
@@ -221,10 +227,26 @@ def test_operators_are_kept_by_content(camera):
     assert get_cached_camera(camera) is not one
     many = CachingCamera(camera.centres_px, camera.angles, camera.image_shape, camera.slit_width_px)
     shears = np.linspace(0, 1, 20)
-    made = [many.operator(shear) for shear in shears]
+    made = [weakref.ref(many.operator(shear)) for shear in shears]
     assert (
-        sum(many.operator(shear) is first for shear, first in zip(shears, made, strict=True)) == 16
+        sum(
+            one() is not None and many.operator(shear) is one()
+            for shear, one in zip(shears, made, strict=True)
+        )
+        == 16
     )
+
+
+def test_an_operator_is_found_again_as_long_as_its_inverse_is_kept(camera):
+    many = get_cached_camera(camera.replace(time_zero=3e-9))
+    alive = np.ones(camera.slit_width_px, bool)
+    inverses = [
+        prepare_inverse(LinearInverse(), many.operator(shear), alive)
+        for shear in np.linspace(0, 1, 18)
+    ]
+    assert prepare_inverse(LinearInverse(), many.operator(1.0), alive) is inverses[-1]
+    # 16 are kept, the first two had to go
+    assert prepare_inverse(LinearInverse(), many.operator(0.0), alive) is not inverses[0]
 
 
 def test_kept_inverses_are_those_of_the_method(camera, streaks):

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,6 +35,7 @@ from apps.viewer.side_pictures import project_front, render_pictures
 from apps.viewer.source import Gate, Source
 from apps.viewer.source_factory import ShotOptions, open_source
 from apps.viewer.volume import PROJECTION_MODE, SLICE_MODE, SURFACE_MODE
+from tofclip.camera import Rectifier
 from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError, StorageError
 from tofclip.shots import Streak, save_stack
 
@@ -270,14 +272,14 @@ def test_live_shots_that_come_too_fast_are_dropped(monkeypatch: pytest.MonkeyPat
             busy.wait(20)
         came.set()
 
-    def slowly(self: LiveShotSource, shot: Streak) -> NDArray[np.float32]:
+    def slowly(self: Rectifier, *shot: Any) -> NDArray[np.float32]:
         if threading.current_thread() is not threading.main_thread():
             busy.set()
             go_on.wait(20)
-        return rectified(self, shot)
+        return rectified(self, *shot)
 
-    rectified = LiveShotSource.rectify
-    monkeypatch.setattr(LiveShotSource, "rectify", slowly)
+    rectified = Rectifier.rectify
+    monkeypatch.setattr(Rectifier, "rectify", slowly)
     source = LiveShotSource("test", chain([streak(0)], shots()), camera())
     assert came.wait(20)
     go_on.set()

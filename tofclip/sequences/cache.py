@@ -1,5 +1,5 @@
 """What does not change from shot to shot, made once in a process: operators and inverted matrices
-of a camera.
+of a camera. Sequences, streams and views share them.
 
 Things are known by their content: two shots whose files carry the same camera share its operators.
 """
@@ -7,12 +7,13 @@ Things are known by their content: two shots whose files carry the same camera s
 from __future__ import annotations
 
 import hashlib
+from collections import OrderedDict
 from dataclasses import dataclass, fields
-from functools import lru_cache
 from threading import Lock
+from weakref import WeakValueDictionary
 
 import numpy as np
-from numpy.typing import DTypeLike
+from numpy.typing import DTypeLike, NDArray
 
 from tofclip.arrays import Array, namespace, to_numpy
 from tofclip.camera import Camera
@@ -27,8 +28,13 @@ MAX_CACHED_CAMERAS = 2
 MAX_CACHED_OPERATORS = 16
 """Of each camera: frames at more shears than that make the further operators anew."""
 
+MAX_CACHED_INVERSES = 16
+
+_InverseKey = tuple[LinearInverse, LinearOperator, bytes]
+
 _camera_cache: dict[str, Camera] = {}
-_lock = Lock()
+_inverse_cache: OrderedDict[_InverseKey, PreparedInverse] = OrderedDict()
+_camera_lock, _inverse_lock = Lock(), Lock()
 
 
 class CachingCamera(Camera):
@@ -52,18 +58,25 @@ class CachingCamera(Camera):
         LineProjection
         """
         # The dataclass is frozen, so that the cache is put past it into the instance dictionary.
-        made: dict[tuple[float, str], LineProjection] = self.__dict__.setdefault("_made", {})
+        kept: dict[tuple[float, str], LineProjection] = self.__dict__.setdefault("_kept", {})
+        # An operator of which an inverse is still kept is found again as well, or that inverse
+        # never would be.
+        alive = self.__dict__.setdefault("_alive", WeakValueDictionary())
         key = float(shear), np.dtype(dtype).str
-        found = made.get(key) or super().operator(shear, dtype)
-        if len(made) < MAX_CACHED_OPERATORS:
-            made[key] = found
+        found: LineProjection | None = alive.get(key)
+        if found is None:
+            found = alive[key] = super().operator(shear, dtype)
+            # The first ones stay: with the last ones, frames that run through more shears than are
+            # kept, shot after shot, would find none.
+            if len(kept) < MAX_CACHED_OPERATORS:
+                kept[key] = found
         return found
 
 
 def get_cached_camera(camera: Camera) -> Camera:
     """Return the camera of the same content that this process has kept, with its operators."""
     key = hash_record(camera.to_record())
-    with _lock:
+    with _camera_lock:
         if key not in _camera_cache:
             while len(_camera_cache) >= MAX_CACHED_CAMERAS:
                 # Dictionaries keep the order of insertion: the first key is the oldest camera.
@@ -84,6 +97,40 @@ def hash_record(record: Record) -> str:
     for name, child in sorted(record.children.items()):
         found.update(f"{name} {hash_record(child)}".encode())
     return found.hexdigest()
+
+
+def prepare_inverse(
+    method: LinearInverse, operator: LinearOperator, alive: NDArray[np.bool_]
+) -> PreparedInverse:
+    """Return what `LinearInverse.prepare` does, the same object for the same arguments.
+
+    The 16 inverses used last are kept. Threads that ask for one at the same time wait for a single
+    preparation.
+
+    Parameters
+    ----------
+    method : LinearInverse
+    operator : LinearOperator
+        Of a camera that `get_cached_camera` returned; another one is not found again.
+    alive : (measurements,) bool array
+
+    Returns
+    -------
+    PreparedInverse
+
+    Raises
+    ------
+    InputError
+        As for `LinearInverse.prepare`.
+    """
+    key = method, operator, alive.tobytes()
+    with _inverse_lock:
+        if key not in _inverse_cache:
+            _inverse_cache[key] = method.prepare(operator, alive)
+            if len(_inverse_cache) > MAX_CACHED_INVERSES:
+                _inverse_cache.popitem(last=False)
+        _inverse_cache.move_to_end(key)
+        return _inverse_cache[key]
 
 
 @dataclass(frozen=True, repr=False)
@@ -132,17 +179,8 @@ class CachedInverse:
             if valid is None
             else to_numpy(namespace(valid).any(valid, axis=1))
         )
-        return _prepare_inverse(self.method, operator, alive.tobytes()).recover(
-            measurements, progress
-        )
+        return prepare_inverse(self.method, operator, alive).recover(measurements, progress)
 
     def work(self, frames: int) -> int:
         """Return how many frame iterations `recover` reports at most."""
         return self.method.work(frames)
-
-
-@lru_cache(maxsize=MAX_CACHED_OPERATORS)
-def _prepare_inverse(
-    method: LinearInverse, operator: LinearOperator, alive: bytes
-) -> PreparedInverse:
-    return method.prepare(operator, np.frombuffer(alive, bool))

@@ -21,6 +21,7 @@ from tofclip.lidar.signal_rows.selection import RowBlock, SignalRowFinder
 from tofclip.lidar.traces import TraceBins, Traces
 from tofclip.recovery.focus import DEFAULT_FOCUS, Focus
 from tofclip.recovery.plan import open_shot
+from tofclip.sequences.cache import get_cached_camera, prepare_inverse
 from tofclip.shots import Returns, Streak
 from tofclip.solvers import LinearInverse
 from tofclip.solvers.traces import InverseTraces, order_by_patch
@@ -73,11 +74,14 @@ class RangingPipeline:
         # The focus is one that does not look at the shot, so that an empty one does for the plan.
         nothing = Measurement(np.empty((0, 0), np.float32), np.empty((0, 0), bool))
         pieces = focus.plan_segments(camera, self.times, nothing)
+        cached = get_cached_camera(camera)
         alive, self.pixels = ~camera.dead_columns, order_by_patch(camera.image_shape)
         self.places = [
             RowBlock(
                 piece.frames,
-                InverseTraces(method.prepare(camera.operator(piece.shear), alive), self.pixels),
+                InverseTraces(
+                    prepare_inverse(method, cached.operator(piece.shear), alive), self.pixels
+                ),
             )
             for piece in pieces
         ]

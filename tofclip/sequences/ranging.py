@@ -118,9 +118,8 @@ def write_average_cloud(
 ) -> tuple[int, list[float]]:
     """Write the cloud of some shots; return its points and how many rows each shot was late.
 
-    Operators and inverted matrices are made once in a process for each `version` (SHA-256) of the
-    plan. Memory: one shot, and twice as much again for its measurements and what is recovered of
-    them.
+    The pipeline is made once in a process for each `version` (SHA-256) of the plan. Memory: one
+    shot, and twice as much again for its measurements and what is recovered of them.
 
     Parameters
     ----------

@@ -1,0 +1,156 @@
+"""Work on a stream: order, overlap, bounded numbers, measured times, ends."""
+
+from __future__ import annotations
+
+import gc
+import threading
+import weakref
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from time import perf_counter, sleep
+
+import pytest
+
+from tofclip.sequences.streaming import run_in_order
+
+STEP = 0.05
+
+
+@pytest.fixture
+def worker() -> Iterator[ThreadPoolExecutor]:
+    with ThreadPoolExecutor(1) as pool:
+        yield pool
+
+
+def slow(value: int) -> int:
+    sleep(STEP)
+    return value
+
+
+def keep(value: int) -> int:
+    return value
+
+
+def stream_threads() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name.startswith("stream ")]
+
+
+def test_values_are_worked_on_in_order(worker):
+    items = list(run_in_order(range(20), lambda value: str(2 * value), worker, 2))
+    assert [item.value for item in items] == [str(2 * number) for number in range(20)]
+    assert [item.number for item in items] == list(range(20))
+
+
+def test_work_overlaps_and_its_latency_is_measured():
+    started = perf_counter()
+    with ThreadPoolExecutor(2) as workers:
+        items = list(run_in_order(range(8), slow, workers, 2))
+    # one after the other they would take 8 steps, two at a time 4
+    assert perf_counter() - started < 6.5 * STEP
+    assert all(item.latency >= STEP and item.read_seconds < STEP for item in items)
+    assert items[0].latency < 2.5 * STEP
+
+
+def test_a_slow_consumer_holds_the_source_back(worker):
+    brought: list[int] = []
+
+    def source() -> Iterator[int]:
+        for number in range(50):
+            brought.append(number)
+            yield number
+
+    stream = run_in_order(source(), keep, worker, at_once=2, queue_size=2)
+    next(stream)
+    sleep(4 * STEP)
+    # two before the work and two in it, the one handed out, and the one that the reader holds
+    assert len(brought) <= 6
+    assert [item.number for item in stream] == list(range(1, 50))
+
+
+def test_slow_work_drops_the_oldest_where_that_is_wanted(worker):
+    def source() -> Iterator[int]:
+        for number in range(20):
+            sleep(STEP / 5)
+            yield number
+
+    items = list(run_in_order(source(), slow, worker, at_once=1, policy="drop_oldest"))
+    numbers = [item.number for item in items]
+    assert numbers[-1] == 19  # the newest is never dropped
+    assert numbers == sorted(numbers)
+    assert 4 <= len(numbers) < 12
+    assert all(item.latency < 3.5 * STEP for item in items)
+
+
+def test_a_slow_consumer_gets_the_newest_where_that_is_wanted():
+    def source() -> Iterator[int]:
+        for number in range(40):
+            sleep(STEP / 5)
+            yield number
+
+    with ThreadPoolExecutor(3) as workers:
+        items = []
+        for item in run_in_order(source(), keep, workers, at_once=3, policy="drop_oldest"):
+            items.append(item)
+            sleep(2 * STEP)
+    assert items[-1].number == 39
+    # what comes next was read while the consumer was busy with the one before
+    assert all(item.latency < 2.5 * STEP for item in items)
+
+
+def test_few_things_are_alive(worker):
+    class Thing:
+        pass
+
+    alive: weakref.WeakSet[Thing] = weakref.WeakSet()
+    highest = 0
+
+    def source() -> Iterator[Thing]:
+        nonlocal highest
+        for _ in range(30):
+            thing = Thing()
+            alive.add(thing)
+            gc.collect()
+            highest = max(highest, len(alive))
+            yield thing
+
+    work = lambda thing: slow(1)  # noqa: E731
+    assert sum(item.value for item in run_in_order(source(), work, worker, at_once=1)) == 30
+    # one being worked on, one that waits, the one that the reader holds, and the one that it makes
+    assert highest <= 4
+
+
+@pytest.mark.parametrize("place", ["source", "work"])
+def test_a_fault_is_raised_behind_what_was_done(place, worker):
+    def source() -> Iterator[int]:
+        yield from range(3)
+        if place == "source":
+            raise OSError("unplugged")
+        yield from range(3, 99)
+
+    def work(value: int) -> int:
+        if place == "work" and value == 3:
+            raise OSError("unplugged")
+        return value
+
+    stream = run_in_order(source(), work, worker, at_once=2)
+    assert [next(stream).number for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(OSError, match="unplugged"):
+        next(stream)
+    assert not stream_threads()
+
+
+def test_leaving_early_ends_the_threads_and_closes_the_source(worker):
+    closed = threading.Event()
+
+    def source() -> Iterator[int]:
+        try:
+            while True:
+                yield 0
+        finally:
+            closed.set()
+
+    stream = run_in_order(source(), keep, worker, at_once=2)
+    next(stream)
+    stream.close()
+    assert closed.wait(5)
+    assert not stream_threads()
