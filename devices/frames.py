@@ -35,17 +35,20 @@ class FrameCodec:
     rows, columns : int
     bits : int
         1 (eight pixels in a byte, the leftmost highest), 8, 16 or 32 (little-endian).
+    quarter_turns : int
+        Counter-clockwise ones that put upright what came; 0 to 3, for square pictures only.
 
     Raises
     ------
     InputError
-        There is no such depth, or a picture would be empty, larger than 64 MiB, or not made of
-        whole bytes.
+        There is no such depth, or a picture would be empty, larger than 64 MiB, not made of whole
+        bytes, or turned without being square.
     """
 
     rows: int
     columns: int
     bits: int = 16
+    quarter_turns: int = 0
 
     name: ClassVar[str] = "frames"
     start: ClassVar[int] = -1
@@ -62,6 +65,8 @@ class FrameCodec:
             or self.columns < 1
             or total > 8 * MAX_FRAME_BYTES
             or self.columns * self.bits % 8
+            or not 0 <= self.quarter_turns <= 3
+            or (self.quarter_turns and self.rows != self.columns)
         ):
             raise InputError(
                 f"pictures of {self.rows} x {self.columns} pixels of {self.bits} bits cannot be"
@@ -80,7 +85,8 @@ class FrameCodec:
     @property
     def settings(self) -> Mapping[str, Scalar]:
         """Arguments that build this codec again."""
-        return {"rows": self.rows, "columns": self.columns, "bits": self.bits}
+        shape = {"rows": self.rows, "columns": self.columns, "bits": self.bits}
+        return {**shape, "quarter_turns": self.quarter_turns} if self.quarter_turns else shape
 
     @property
     def pixel_bytes(self) -> int:
@@ -175,11 +181,14 @@ class FrameCodec:
     def _unpack_pixels(self, data: ByteView) -> Any:
         shape = (len(data), self.rows, self.columns)
         if self.bits == 1:
-            return np.unpackbits(data, axis=1).reshape(shape)
-        return np.ascontiguousarray(data).view(_PIXEL_DTYPES[self.bits]).reshape(shape)
+            pixels = np.unpackbits(data, axis=1).reshape(shape)
+        else:
+            pixels = np.ascontiguousarray(data).view(_PIXEL_DTYPES[self.bits]).reshape(shape)
+        return np.rot90(pixels, self.quarter_turns, axes=(1, 2))
 
     def _pack_pixels(self, counts: Any) -> Any:
-        flat = np.ascontiguousarray(counts).reshape(len(counts), self.rows * self.columns)
+        as_sent = np.rot90(counts, -self.quarter_turns, axes=(1, 2))
+        flat = np.ascontiguousarray(as_sent).reshape(len(counts), self.rows * self.columns)
         if self.bits == 1:
             return np.packbits(flat, axis=1)
         return flat.view(np.uint8)

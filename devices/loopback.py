@@ -58,6 +58,17 @@ class Connection:
         request, _, self._buffer = self._buffer.partition(end)
         return request
 
+    def read_available(self) -> bytes | None:
+        """Return what came at once, None when the client is gone or the server closes."""
+        while not self._closing.is_set():
+            try:
+                return self._link.recv(4096) or None
+            except TimeoutError:
+                continue
+            except OSError:
+                break
+        return None
+
     def close(self) -> None:
         """Hang up; the client sees the end of the stream."""
         with contextlib.suppress(OSError):

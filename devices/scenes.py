@@ -5,6 +5,7 @@ their photons is known.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from tofclip.simulate.patterns import (
     make_plain_pattern,
     make_stripes,
 )
+from tofclip.units import SPEED_OF_LIGHT
 
 SENSOR_PIXELS = 256
 LENSLET_COUNT = 7
@@ -114,10 +116,14 @@ def simulate_demonstration_light() -> LineLight:
 
 def render_array_light() -> NDArray[np.float64]:
     """Return the demonstration's reference view as an array of 512 x 512 pixels sees it, 0..1."""
-    picture = np.nan_to_num(
-        GroundTruth.from_scene(make_default_scene(), make_default_instrument()).reflectance
-    )
-    return np.asarray(np.kron(picture, np.ones((4, 4))), np.float64)
+    return _enlarge(np.nan_to_num(_render_truth().reflectance))
+
+
+def render_array_delays() -> NDArray[np.float64]:
+    """Return when the light of each pixel of `render_array_light` comes back, s; NaN where none
+    does.
+    """
+    return _enlarge(_render_truth().range) * 2 / SPEED_OF_LIGHT
 
 
 def draw_exposure(light: LineLight, seed: int) -> Streak:
@@ -135,6 +141,17 @@ def draw_exposure(light: LineLight, seed: int) -> Streak:
     """
     counts = np.random.default_rng(seed).poisson(light.photons).astype(np.float32)
     return Streak(counts, light.row_times, camera=light.camera)
+
+
+@lru_cache(maxsize=1)
+def _render_truth() -> GroundTruth:
+    """Return what the demonstration's reference view shows."""
+    return GroundTruth.from_scene(make_default_scene(), make_default_instrument())
+
+
+def _enlarge(picture: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Let 4 x 4 pixels of an array of 512 x 512 see each pixel of the reference view."""
+    return np.asarray(np.kron(picture, np.ones((4, 4))), np.float64)
 
 
 def _simulate_light(scene: Scene, instrument: Instrument) -> LineLight:

@@ -27,7 +27,7 @@ from devices.transients import (
     accumulate_streak,
     read_batches,
     read_camera,
-    strip_accumulation_options,
+    strip_options,
 )
 from devices.uri import Uri
 from tofclip.shots import Streak
@@ -171,7 +171,7 @@ class TransientStream(Iterator[Streak]):
 
     def _read(self) -> Generator[Streak]:
         gathering = self._gathering
-        with open_source(strip_accumulation_options(self._uri)) as source:
+        with open_source(strip_options(self._uri)) as source:
             self._source = source
             known = source.calibration
             camera = read_camera(known)

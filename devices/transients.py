@@ -15,7 +15,7 @@ Besides what a source itself takes, its address may say how to gather (`ACCUMULA
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from math import inf
 from time import monotonic
@@ -172,7 +172,7 @@ def read_transient(address: str, bin_width: float | None = None) -> Streak:
     """
     uri = Uri.parse(address)
     gathering = AccumulationSettings.from_uri(uri, bin_width)
-    with open_source(strip_accumulation_options(uri)) as source:
+    with open_source(strip_options(uri)) as source:
         streak = accumulate_streak(
             read_batches(source, gathering.seconds), source.calibration, gathering
         )
@@ -326,9 +326,20 @@ def read_camera(calibration: Record | None) -> Camera | None:
     return None if known is None else Camera.from_record(known)
 
 
-def strip_accumulation_options(uri: Uri) -> str:
-    """Return the address without what says how to gather."""
-    values = {name: value for name, value in uri.values.items() if name not in ACCUMULATION_OPTIONS}
+def strip_options(uri: Uri, names: Collection[str] = ACCUMULATION_OPTIONS) -> str:
+    """Return the address without what says how to gather.
+
+    Parameters
+    ----------
+    uri : Uri
+    names : collection of str
+        Options to leave out.
+
+    Returns
+    -------
+    str
+    """
+    values = {name: value for name, value in uri.values.items() if name not in names}
     place = quote(uri.location, safe="/:@[]~ ")
     return f"{uri.scheme}://{place}" + (f"?{urlencode(values)}" if values else "")
 

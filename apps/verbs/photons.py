@@ -16,9 +16,10 @@ from apps.files import PICTURE_SUFFIXES, build_provenance, require_writable
 from apps.options import JsonOption
 from apps.report import report
 from apps.verbs.cloud import CLOUD_SUFFIXES, DEPTH_SUFFIX
+from devices.photons import read_photons as read_counted_photons
 from tofclip.errors import InputError
 from tofclip.lidar import Pulse, point_cloud, save_depth
-from tofclip.lidar.photons import SurfaceImage, estimate_pixels, estimate_surface
+from tofclip.lidar.photons import PhotonImage, SurfaceImage, estimate_pixels, estimate_surface
 from tofclip.lidar.photons.files import read_photons
 from tofclip.storage import atomic_path
 from tofclip.units import NANOSECOND, PICOSECOND, SPEED_OF_LIGHT
@@ -33,11 +34,12 @@ DEFAULT_FIELD_OF_VIEW_DEG = 30.0
 
 def photons(
     file: Annotated[
-        Path,
+        str,
         typer.Argument(
             metavar="FILE",
             help="Counted photons: .npy, .npz, .mat, HDF5, multi-page TIFF, .ptu or .sdt; a cube of counts, a list of "
-            "photon times for each pixel, or events x, y, time.",
+            "photon times for each pixel, or events x, y, time. Or an instrument that counts them, such as "
+            "'spad512://HOST?mode=gated'.",
         ),
     ],
     out: Annotated[
@@ -90,7 +92,10 @@ def photons(
     ] = DEFAULT_FIELD_OF_VIEW_DEG,
     time_zero_ns: Annotated[
         float,
-        typer.Option(metavar="NS", help="When light of range 0 arrives, after the first bin."),
+        typer.Option(
+            metavar="NS",
+            help="When light of range 0 arrives, after the first bin; of an instrument's own time.",
+        ),
     ] = 0.0,
     single_pixel: Annotated[
         bool, typer.Option("--single-pixel", help="Judge every pixel by its own photons alone.")
@@ -108,9 +113,8 @@ def photons(
     """
     started = time.perf_counter()
     suffix = out.suffix.lower()
-    require_writable(
-        out, *CLOUD_SUFFIXES, DEPTH_SUFFIX, *PICTURE_SUFFIXES, inputs=_list_inputs(file, pulse)
-    )
+    inputs = _list_inputs(file, pulse)
+    require_writable(out, *CLOUD_SUFFIXES, DEPTH_SUFFIX, *PICTURE_SUFFIXES, inputs=inputs)
     if pulse is not None and pulse_ps is not None:
         raise InputError("give the pulse's width (--pulse-ps) or its shape (--pulse), not both")
     if returns < 1:
@@ -118,8 +122,8 @@ def photons(
     if not 0 < field_of_view_deg < 180 or (focal_length_px is not None and not focal_length_px > 0):
         raise InputError("the focal length must be positive, the field of view within 0..180")
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
-    image = read_photons(file, width, axes)
-    shape = _load_pulse(pulse, image.bin_width)
+    image, shape, first_time = _read_photons(file, width, axes)
+    shape = _load_pulse(pulse, image.bin_width) or shape
     if pulse_ps is not None:
         shape = Pulse.gaussian(pulse_ps * PICOSECOND)
     found = (
@@ -128,7 +132,7 @@ def photons(
         else estimate_surface(image, shape, learn=pulse is None, max_returns=returns)
     )
     # Light travels the range twice, hence half the speed.
-    shift = SPEED_OF_LIGHT / 2 * time_zero_ns * NANOSECOND
+    shift = SPEED_OF_LIGHT / 2 * (time_zero_ns * NANOSECOND - first_time)
     further = tuple(replace(layer, range=layer.range - shift) for layer in found.further)
     found = replace(found, range=found.range - shift, further=further)
     columns = image.image_shape[1]
@@ -144,7 +148,7 @@ def photons(
         "returns": returns,
         **found.settings,
     }
-    past = build_provenance({"verb": "lidar photons", **settings}, *_list_inputs(file, pulse))
+    past = build_provenance({"verb": "lidar photons", "source": file, **settings}, *inputs)
     # The ending of the name chooses what is written.
     if suffix == RANGE_IMAGE_SUFFIX:
         save_range_image(found, out)
@@ -158,8 +162,23 @@ def photons(
     report(_make_figures(found, seen, time.perf_counter() - started, settings), as_json, [out])
 
 
-def _list_inputs(file: Path, pulse: Path | None) -> tuple[Path, ...]:
-    return (file,) if pulse is None else (file, pulse)
+def _list_inputs(file: str, pulse: Path | None) -> tuple[Path, ...]:
+    named = () if "://" in file else (Path(file),)
+    return named if pulse is None else (*named, pulse)
+
+
+def _read_photons(
+    file: str, bin_width: float | None, axes: str | None
+) -> tuple[PhotonImage, Pulse | None, float]:
+    """Read a file or an instrument; return its photons, its response where it knows that, and the
+    time of its first bin, s.
+    """
+    if "://" not in file:
+        return read_photons(Path(file), bin_width, axes), None, 0.0
+    if bin_width is not None or axes is not None:
+        raise InputError(f"{file}: an instrument knows its own bins and axes")
+    counted = read_counted_photons(file)
+    return counted.to_image(), counted.pulse, float(counted.times[0])
 
 
 def _make_figures(

@@ -11,22 +11,35 @@ from devices.retry import retry_connect
 from devices.ring import Gap
 from devices.source import Info
 from devices.spad512.protocol import (
+    BREAKDOWN_BEGINS,
+    BREAKDOWN_ENDS,
     DEFAULT_PORT,
     DONE_MARK,
-    ERROR_MARK,
+    INFORMATION_COMMAND,
     MAX_TEXT_BYTES,
     ExposureRequest,
+    GateScan,
+    find_error_text,
 )
 from devices.stream import StreamSource, Transfer
 from devices.stream_options import OPTIONS as STREAM_OPTIONS
 from devices.stream_options import parse_buffer_settings, parse_seconds
 from devices.tcp import TcpLink
 from devices.uri import Uri
-from tofclip.errors import DeviceDisconnectedError, DeviceError, DeviceTimeoutError, ProtocolError
-from tofclip.storage import Record
+from tofclip.errors import (
+    DeviceDisconnectedError,
+    DeviceError,
+    DeviceTimeoutError,
+    InputError,
+    ProtocolError,
+)
+from tofclip.storage import Field, Record
 
 INSTRUMENT = "SPAD512 array"
+GATE_OPTIONS = ("gate_steps", "gate_step_ps", "gate_width_ns", "gate_offset_ps")
 OPTIONS = (
+    "mode",
+    *GATE_OPTIONS,
     "bits",
     "exposure_us",
     "images",
@@ -40,6 +53,12 @@ OPTIONS = (
 _SILENCE_S = 0.2
 """Seconds after which a text of unknown length has ended."""
 
+BREAKDOWN_CALIBRATION_S = 60.0
+"""Seconds that the server may calibrate itself when it is first asked."""
+
+GATE_SCAN = "gate_scan"
+"""Kind of the calibration of pictures behind a moving gate."""
+
 ConnectFunction = Callable[[], TcpLink]
 
 
@@ -47,7 +66,8 @@ class Spad512Feed:
     """One picture after the other; see `devices.stream.Feed`.
 
     Pictures are asked for a request at a time, and a request that finds no answer in time is not
-    sent again.
+    sent again. Behind a gate a picture's number modulo the gate's steps is its step: a scan that
+    was cut is never finished, and the next one's numbers begin behind it.
 
     Parameters
     ----------
@@ -79,9 +99,10 @@ class Spad512Feed:
     def info(self) -> Info:
         return Info(
             INSTRUMENT,
-            "",
+            self._facts[0].rpartition(":")[2].strip() if self._facts else "",
             {
                 "greeting": self._greeting,
+                "system": "; ".join(self._facts),
                 "bits": self._exposure.bits,
                 "exposure_s": self._exposure.seconds,
                 "rows": self.codec.rows,
@@ -91,8 +112,14 @@ class Spad512Feed:
 
     @property
     def calibration(self) -> Record | None:
-        """Nothing: a picture has no time axis."""
-        return None
+        """When the gate opens in each picture of a scan, s, and for how long; nothing where there is
+        no gate, and so no time axis.
+        """
+        gate = self._exposure.gate
+        if gate is None:
+            return None
+        times = Field(gate.opening_times, "s", ("gate_step",))
+        return Record(GATE_SCAN, {"gate_times": times}, {"gate_width_s": gate.width_ns * 1e-9})
 
     def start(self) -> None:
         """Do nothing: the first request starts the instrument."""
@@ -119,23 +146,40 @@ class Spad512Feed:
         self._link = link = self._connect()
         try:
             self._greeting = self._read_text(self._patience)
+            self._facts = self._ask_system()
             link.send(self._exposure.encode_pile_up(), self._patience)
             self._read_text(self._patience)
         except BaseException:
             link.close()
             raise
 
+    def _ask_system(self) -> list[str]:
+        """Ask what the system is, as the vendor's clients do first; where the first question lets it
+        calibrate itself, wait for the end of that and ask again.
+        """
+        self._link.send(INFORMATION_COMMAND, self._patience)
+        text = self._read_text(self._patience)
+        if BREAKDOWN_BEGINS in text:
+            deadline = monotonic() + BREAKDOWN_CALIBRATION_S
+            while BREAKDOWN_ENDS not in text:
+                if monotonic() > deadline:
+                    raise DeviceTimeoutError("the SPAD array does not end its calibration")
+                text = self._read_text(BREAKDOWN_CALIBRATION_S)
+            self._link.send(INFORMATION_COMMAND, self._patience)
+            text = self._read_text(self._patience)
+        return [line.strip() for line in text.splitlines() if line.strip()]
+
     def _read_text(self, patience: float) -> str:
-        """Return a text of unknown length: what comes until it is quiet."""
+        """Return a text of unknown length: what comes up to its mark, or until it is quiet."""
         text = self._link.read_available(MAX_TEXT_BYTES, patience)
         with contextlib.suppress(DeviceTimeoutError):
-            while len(text) < MAX_TEXT_BYTES:
+            while len(text) < MAX_TEXT_BYTES and not text.endswith(DONE_MARK):
                 text += self._link.read_available(MAX_TEXT_BYTES - len(text), _SILENCE_S)
-        return text.decode("ascii", "replace").strip()
+        return text.removesuffix(DONE_MARK).decode("ascii", "replace").strip()
 
     def _request_frames(self) -> None:
         self._link.send(self._exposure.encode(), self._patience)
-        self._frames_due = self._exposure.images
+        self._frames_due = self._exposure.frames
         self._deadline = monotonic() + self._exposure.seconds + self._patience
 
     def _read_frame(self, timeout: float) -> Transfer:
@@ -175,9 +219,9 @@ class Spad512Feed:
 
     def _raise_server_error(self) -> None:
         """Raise what the server says instead of a picture, or that it says nothing at all."""
-        if self._received.endswith(ERROR_MARK) and self._received.isascii():
-            said = self._received[-160:].decode("ascii").strip()
-            raise DeviceError(f"the SPAD array could not take pictures: {' '.join(said.split())}")
+        said = find_error_text(self._received)
+        if said is not None:
+            raise DeviceError(f"the SPAD array could not take pictures: {said}")
         if monotonic() > self._deadline:
             raise DeviceDisconnectedError(
                 f"the SPAD array sent nothing for {self._patience:g} s beyond the exposure"
@@ -196,6 +240,10 @@ class Spad512Feed:
         """
         if self._received:
             self._ledger.truncate()
+            self._number += 1
+        gate = self._exposure.gate
+        if gate is not None:
+            self._number += -self._number % gate.steps  # the scan is not finished
         self._frames_due = 0
         self._received.clear()
 
@@ -203,6 +251,9 @@ class Spad512Feed:
 def open_spad512(uri: Uri) -> StreamSource:
     """Open
     ``spad512://HOST:9999?bits=8&exposure_us=1000&images=1&width=512&pile_up=0&timeout_s=5&reconnect_s=5``.
+
+    ``mode=gated&gate_steps=72&gate_step_ps=252&gate_width_ns=5&gate_offset_ps=5000`` moves a gate
+    from picture to picture; ``images`` are whole scans then.
     """
     uri.reject_unknown(*OPTIONS)
     host, port = uri.host_and_port(DEFAULT_PORT)
@@ -217,12 +268,24 @@ def open_spad512(uri: Uri) -> StreamSource:
 def parse_exposure(uri: Uri) -> ExposureRequest:
     """Read the values of an address that say what pictures to take."""
     standard = ExposureRequest()
+    gate = None
+    if uri.choice("mode", "intensity", "gated") == "gated":
+        usual = GateScan()
+        gate = GateScan(
+            uri.value("gate_steps", int, usual.steps),
+            uri.value("gate_step_ps", float, usual.step_ps),
+            uri.value("gate_width_ns", float, usual.width_ns),
+            uri.value("gate_offset_ps", float, usual.offset_ps),
+        )
+    elif set(uri.values) & set(GATE_OPTIONS):
+        raise InputError(f"'{uri.text}': a gate needs mode=gated")
     return ExposureRequest(
         uri.value("bits", int, standard.bits),
         uri.value("exposure_us", float, standard.seconds * 1e6) * 1e-6,
         uri.value("images", int, standard.images),
         uri.value("width", int, standard.width),
         uri.choice("pile_up", "0", "1") == "1",
+        gate,
     )
 
 

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from small_instrument import Run
 
+from apps.cli import main
+from devices.scenes import render_array_delays
 from tofclip.lidar import PointCloud
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -94,3 +96,17 @@ def test_info_says_what_a_file_of_photons_holds(run: Run, shot) -> None:
     found = json.loads(outcome.out)
     assert (found["kind"], found["layout"]) == ("photons", "cube")
     assert found["arrays"] == {"array": "40 x 56 x 200 uint8"}
+
+
+def test_a_gated_arrays_address_becomes_ranges(tmp_path: Path) -> None:
+    """One command from an instrument to ranges on its own time axis."""
+    address = "sim+spad512://?seed=1&mode=gated&binning=16&gate_steps=30&gate_step_ps=700"
+    out = tmp_path / "range.npz"
+    assert main(["lidar", "photons", address, "--out", str(out), "--json"]) == 0
+    found = np.load(out)["range_m"]
+    delays = render_array_delays().reshape(32, 16, 32, 16)
+    even = delays.max(axis=(1, 3)) - delays.min(axis=(1, 3)) < 1e-11
+    error = found[even] - delays.mean(axis=(1, 3))[even] * SPEED_OF_LIGHT / 2
+    # 256 pixels of some 100 photons each behind an edge of 100 ps: 1 mm; steps are 105 mm.
+    assert np.median(np.abs(error)) < 0.005
+    assert main(["lidar", "photons", address, "--out", str(out), "--bin-width-ps", "9"]) == 2

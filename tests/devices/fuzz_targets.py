@@ -202,7 +202,7 @@ def _spad512_session() -> Target:
     pictures = bytes(range(256)) * (exposure.codec.pixel_bytes * 2 // 256)
 
     def decode(data: bytes) -> None:
-        texts = [b"hello", b"", b"off", b""]
+        texts = [b"hello", b"", b"system", b"", b"off", b""]
 
         class Server(Replayed):
             def read_available(self, limit: int, timeout: float) -> bytes:

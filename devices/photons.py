@@ -1,0 +1,140 @@
+"""From an instrument's address to photons counted in time for each pixel, (t, y, x): what
+`tofclip lidar photons` takes.
+
+Besides what a source itself takes, its address may say how to gather (`GATHERING_OPTIONS`):
+
+* ``scans``: whole scans of a gate, or whole histograms, to add up; 1 by default;
+* ``binning``: pixels along each side of a square that count as one; 1 by default.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from devices.registry import open as open_source
+from devices.source import Source
+from devices.transients import read_batches, strip_options
+from devices.uri import Uri
+from tofclip.errors import InputError
+from tofclip.lidar import Pulse
+from tofclip.lidar.photons import PhotonImage
+from tofclip.storage import Record
+
+GATHERING_OPTIONS = ("scans", "binning")
+MAX_CUBE_BYTES = 1 << 32
+EDGE_S = 1e-10
+"""Standard deviation of a gate's edges and the laser's pulse, where nothing better is known, s."""
+
+
+@dataclass(frozen=True)
+class CountedPhotons:
+    """Photons of a picture, as an instrument counted them.
+
+    Parameters
+    ----------
+    counts : (bins, rows, columns) float32 array
+    times : (bins,) float64 array
+        Of each bin, s after the laser's pulse; evenly spaced.
+    pulse : Pulse or None
+        How a return at one instant shows in successive bins, where the instrument knows.
+    """
+
+    counts: NDArray[np.float32]
+    times: NDArray[np.float64]
+    pulse: Pulse | None = None
+
+    @property
+    def bin_width(self) -> float:
+        """Duration of a bin, s."""
+        return float(self.times[-1] - self.times[0]) / (len(self.times) - 1)
+
+    def to_image(self) -> PhotonImage:
+        """Return the photons as events, sorted by pixel."""
+        return PhotonImage.from_cube(np.moveaxis(self.counts, 0, -1), self.bin_width)
+
+
+def read_photons(address: str) -> CountedPhotons:
+    """Read as many whole scans as an address asks for.
+
+    Memory: the counts, and one batch of the source.
+
+    Parameters
+    ----------
+    address : str
+        As `devices.open` takes it, with `GATHERING_OPTIONS` where wanted.
+
+    Returns
+    -------
+    CountedPhotons
+
+    Raises
+    ------
+    InputError
+        The source counts no photons in time, or ended before a whole scan.
+    DeviceError
+        The instrument failed before that.
+    """
+    uri = Uri.parse(address)
+    scans, binning = uri.value("scans", int, 1), uri.value("binning", int, 1)
+    if scans < 1 or binning < 1:
+        raise InputError(f"'{address}': scans and binning must be positive")
+    with open_source(strip_options(uri, GATHERING_OPTIONS)) as source:
+        known = source.calibration
+        if known is None or "gate_times" not in known.fields:
+            raise InputError(
+                f"'{address}': {source.info.instrument} counts no photons in time for each pixel; "
+                "a SPAD array does with mode=gated"
+            )
+        times = known.array("gate_times", np.float64, 1, "s")
+        counts = _add_scans(source, len(times), scans, binning)
+        source.stop()
+        while source.read() is not None:
+            pass
+    return CountedPhotons(counts, times, _make_gate_response(known, times))
+
+
+def _add_scans(source: Source, steps: int, scans: int, binning: int) -> NDArray[np.float32]:
+    """Add up whole scans; pictures of one that was cut are left out."""
+    total: NDArray[np.float32] | None = None
+    present: NDArray[np.float32] | None = None
+    done = step = 0
+    for batch in read_batches(source, inf):
+        for record in batch.records:
+            counts = record["counts"]
+            rows, columns = (size // binning for size in counts.shape)
+            if total is None or present is None:
+                if steps * rows * columns * 4 > MAX_CUBE_BYTES:
+                    raise InputError("so many photons do not fit into 4 GiB: choose binning=2 or 4")
+                total = np.zeros((steps, rows, columns), np.float32)
+                present = np.zeros_like(total)
+            if int(record["number"]) % steps != step:  # cut: wait for the next beginning
+                step = 0
+                if int(record["number"]) % steps:
+                    continue
+            whole = counts[: rows * binning, : columns * binning]
+            present[step] = whole.reshape(rows, binning, columns, binning).sum(axis=(1, 3))
+            step += 1
+            if step == steps:
+                total += present
+                step, done = 0, done + 1
+                if done == scans:
+                    return total
+    raise InputError(f"the source ended after {done} of {scans} whole scans")
+
+
+def _make_gate_response(known: Record, times: NDArray[np.float64]) -> Pulse:
+    """Return how one instant shows while a gate moves over it: it is seen from when the gate still
+    closes behind it until it opens after it, which is the instant itself.
+    """
+    width = float(known.attribute("gate_width_s"))
+    step = float(times[1] - times[0])
+    spacing = min(step, EDGE_S) / 4
+    margin = 5 * EDGE_S
+    offset = np.arange(-width - margin, margin + spacing, spacing)
+    seen = ndtr(-offset / EDGE_S) - ndtr((-offset - width) / EDGE_S)
+    return Pulse(seen, spacing, (width + margin) / spacing)
