@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from tofclip.errors import InputError, StorageError
 
 @pytest.fixture
 def frames() -> tofclip.Frames:
-    camera = tofclip.Camera(np.array([8.0, 24.0]), np.zeros(2), (6, 5), 32)
+    camera = tofclip.Camera(np.array([8.0, 24.0]), np.zeros(2), (6, 5), 32, time_zero=-1e-9)
     times = 10e-9 + 1e-10 * np.arange(50)
     values = np.random.default_rng(0).random((50, 6, 5), dtype=np.float32)
     return tofclip.Frames(values, times, camera, {"method": "<tv>"})
@@ -60,6 +61,9 @@ def test_a_line_and_a_page_say_what_is_held(
 ) -> None:
     volume = nlos.Volume(np.ones((4, 5, 6), np.float32), nlos.Grid.box((0, 5), (0, 4), (1, 4), 1.0))
     assert repr(frames) == "Frames(50 frames of 6 x 5 pixels, range 1.5 to 2.23 m)"
+    no_zero = replace(frames, camera=frames.camera.replace(time_zero=0.0))
+    assert repr(no_zero).endswith("2.23 m up to a constant, no time zero given)")
+    assert "no time zero given" in no_zero._repr_html_()
     assert repr(cloud).startswith("PointCloud(40 points, range ")
     assert repr(volume) == "Volume(4 x 5 x 6 voxels (z, y, x), float32)"
     for one in (frames, volume):

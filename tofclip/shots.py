@@ -480,11 +480,17 @@ class Frames(Storable):
             raise InputError(f"no frame lies between {limits[0]:g} and {limits[1]:g}")
         return self[int(first) : int(stop)]
 
+    @property
+    def _time_zero_note(self) -> str:
+        """Said beside ranges, which are right up to a constant where no time zero was given."""
+        return "" if self.camera.time_zero else " up to a constant, no time zero given"
+
     def __repr__(self) -> str:
         frames, rows, columns = self.values.shape
         near, far = SPEED_OF_LIGHT * self.times[[0, -1]] / 2
         return (
-            f"Frames({frames} frames of {rows} x {columns} pixels, range {near:.3g} to {far:.3g} m)"
+            f"Frames({frames} frames of {rows} x {columns} pixels, range {near:.3g} to {far:.3g} m"
+            f"{self._time_zero_note})"
         )
 
     def _repr_html_(self) -> str:
@@ -492,7 +498,7 @@ class Frames(Storable):
         rows = {
             "values (time, y, x)": " x ".join(map(str, self.values.shape)),
             "time of flight": f"{1e9 * self.times[0]:.3f} to {1e9 * self.times[-1]:.3f} ns",
-            "range": f"{near:.3f} to {far:.3f} m",
+            "range": f"{near:.3f} to {far:.3f} m{self._time_zero_note}",
             "method": str(self.figures.get("method", "unknown")),
         }
         return render_html("Frames", rows, np.asarray(self).max(axis=0))

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from apps.files import require_writable
-from apps.options import JsonOption, TimeZeroOption
+from apps.options import JsonOption, TimeZeroOption, make_completer
 from apps.progress import show_progress
 from apps.report import report
 from apps.viewer.desktop import open_window
@@ -22,7 +22,7 @@ from apps.viewer.render import choose_renderer
 from apps.viewer.scene_figure import save_picture
 from apps.viewer.server import parse_loopback
 from apps.viewer.session import Session
-from apps.viewer.source_factory import ShotOptions, open_source
+from apps.viewer.source_factory import LOOK_METHODS, ShotOptions, open_source
 from tofclip.errors import InputError
 from tofclip.units import NANOSECOND, PICOSECOND
 
@@ -47,6 +47,16 @@ def view(
         float | None, typer.Option(metavar="PS", help="For raw shots: duration of a row in ps.")
     ] = None,
     time_zero_ns: TimeZeroOption = None,
+    method: Annotated[
+        str | None,
+        typer.Option(
+            "--method",
+            metavar="NAME",
+            help="For raw shots: tv, l1, linear or adjoint, with few iterations.",
+            show_default="l1 for one shot, linear for many",
+            autocompletion=make_completer(*LOOK_METHODS),
+        ),
+    ] = None,
     port: Annotated[
         int | None,
         typer.Option(min=1, max=65535, metavar="N", help="Of the page.", show_default="a free one"),
@@ -87,6 +97,7 @@ def view(
         camera,
         None if bin_width_ps is None else bin_width_ps * PICOSECOND,
         None if time_zero_ns is None else time_zero_ns * NANOSECOND,
+        method,
     )
     # Closing stops a live source and its threads, however the view ends.
     with contextlib.closing(open_source(source, known)) as opened:
@@ -115,7 +126,7 @@ def _check_outputs(
 
 def _draw_picture(session: Session, out: Path, started: float, as_json: bool) -> None:
     shown, renderer = session.frame_at(0.0), choose_renderer()
-    save_picture(session.source.title, shown, renderer, out)
+    save_picture(session.title, shown, renderer, out)
     report(_collect_metrics(len(shown.cloud), renderer.name, started), as_json, [out])
 
 

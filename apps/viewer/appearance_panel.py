@@ -10,8 +10,10 @@ import numpy as np
 
 from apps.viewer.colouring import PALETTES, QUANTITIES
 from apps.viewer.filters import NO_LIMITS, Filters, Limits
+from apps.viewer.furniture import ClipBox
 from apps.viewer.page_text import render_scale_html
 from apps.viewer.session import DisplayedFrame, Session
+from apps.viewer.viewpoint import Box
 
 if TYPE_CHECKING:
     import viser
@@ -48,6 +50,7 @@ class AppearancePanel:
         self._points = server
         with self._gui.add_folder("colours"):
             self._add_colours(first)
+        self._clip = ClipBox(server.scene, lambda box: post(lambda: self._take_clip_box(box)))
         with self._gui.add_folder("filters", expand_by_default=False):
             self._add_filters(first)
 
@@ -111,8 +114,25 @@ class AppearancePanel:
             )
             self._filter_handles[name] = handle, whole
             self._bind(handle, lambda _: self._set_filters())
+        self._clip_shown: Any = self._gui.add_checkbox(
+            "clip box", False, hint="drag the corners of a box in the scene; same as x, y and z"
+        )
+        self._bind(self._clip_shown, self._show_clip_box)
         button = self._gui.add_button("reset filters")
         button.on_click(lambda _: self._post(self._reset_filters))
+
+    def _show_clip_box(self, shown: bool) -> None:
+        if not shown:
+            self._clip.hide()
+            return
+        sides = np.array([self._filter_handles[axis][0].value for axis in "xyz"], float)
+        self._clip.show(Box(sides[:, 0], sides[:, 1]))
+
+    def _take_clip_box(self, box: Box) -> None:
+        """Filter by a box that was dragged."""
+        for axis, low, high in zip("xyz", box.low, box.high, strict=True):
+            self._filter_handles[axis][0].value = (round(float(low), 4), round(float(high), 4))
+        self._set_filters()
 
     def _set_filters(self) -> None:
         sides = {
@@ -125,6 +145,7 @@ class AppearancePanel:
         for handle, whole in self._filter_handles.values():
             handle.value = whole
         self._session.filters = Filters()
+        self._show_clip_box(self._clip.is_shown)
 
     def _set_quantity(self, quantity: str) -> None:
         # Limits of one quantity mean nothing for another, which may have another unit.

@@ -36,7 +36,7 @@ class CloudSource(Source):
     """
 
     def __init__(self, title: str, paths: Sequence[Path]) -> None:
-        super().__init__(title, CLOUD_RATE_HZ)
+        super().__init__(title, CLOUD_RATE_HZ, frame_name="cloud")
         self._paths = list(paths)
         self._cache: OrderedDict[int, View] = OrderedDict()
         if not self._paths:
@@ -44,6 +44,10 @@ class CloudSource(Source):
 
     def __len__(self) -> int:
         return len(self._paths)
+
+    def describe_frame(self, number: int) -> str:
+        """Name the file of cloud `number`."""
+        return self._paths[number].name if len(self._paths) > 1 else ""
 
     def view(self, number: int) -> View:
         if number not in self._cache:

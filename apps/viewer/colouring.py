@@ -28,8 +28,8 @@ FULL_LIGHT_PERCENTILE = 85.0
 MIN_SHADE = 0.15
 GAMMA = 0.8
 
-SMALLEST_IN_METRES = 0.1
-"""Lengths below are in mm."""
+SMALLEST_IN_METRES, SMALLEST_IN_MILLIMETRES = 0.1, 1e-4
+"""m; lengths below the one are in mm, below the other in um."""
 
 MAX_RANKED_POINTS = 100_000
 """Points from which an equalised scale is made; more would cost time and change nothing to be seen."""
@@ -58,7 +58,7 @@ QUANTITIES: Mapping[str, Quantity] = {
     "range": Quantity("m", lambda cloud: cloud.range),
     "height": Quantity("m", lambda cloud: -cloud.xyz[:, 1]),
     "intensity": Quantity("counts", lambda cloud: cloud.intensity),
-    "confidence": Quantity("m", lambda cloud: cloud.confidence),
+    "standard deviation": Quantity("m", lambda cloud: cloud.confidence),
     "return number": Quantity("", lambda cloud: cloud.return_number),
     "time": Quantity("ns", lambda cloud: cloud.time / np.float32(NANOSECOND)),
 }
@@ -155,6 +155,8 @@ class Scale:
 
 def format_length(length: float) -> str:
     """Return a length in m as a person writes it: ``0.42 mm``, ``31 mm``, ``1.85 m``."""
+    if 0 < abs(length) < SMALLEST_IN_MILLIMETRES:
+        return f"{1e6 * length:.3g} um"
     if abs(length) < SMALLEST_IN_METRES:
         return f"{1e3 * length:.3g} mm"
     return f"{length:.3g} m"
@@ -179,10 +181,8 @@ def choose_ticks(scale: Scale, count: int = 6) -> tuple[list[tuple[float, str]],
     factor, unit = 1.0, scale.unit
     if unit == "m" and max(abs(low), abs(high)) < SMALLEST_IN_METRES:
         factor, unit = 1e3, "mm"
-    step = 10.0 ** np.floor(np.log10((high - low) * factor / count))
-    # the smallest of 1, 2, 5 and 10 times a power of ten that gives no more than asked for
-    step *= next(nice for nice in (1, 2, 5, 10) if (high - low) * factor / (nice * step) <= count)
-    values = step * np.arange(np.ceil(low * factor / step), np.floor(high * factor / step) + 1)
+    values = choose_round_values(low * factor, high * factor, count)
+    step = values[1] - values[0] if len(values) > 1 else (high - low) * factor
     places = np.interp(values / factor, scale.values, np.linspace(0, 1, PALETTE_SIZE))
     digits = max(0, -int(np.floor(np.log10(step))))
     labels = [
@@ -191,6 +191,27 @@ def choose_ticks(scale: Scale, count: int = 6) -> tuple[list[tuple[float, str]],
     ]
     title = f"{scale.quantity} ({unit})" if unit else scale.quantity
     return list(zip(places.tolist(), labels, strict=True)), title
+
+
+def choose_round_values(low: float, high: float, count: int) -> NDArray[np.float64]:
+    """Return at most about `count` round values, evenly apart, between two limits.
+
+    Parameters
+    ----------
+    low, high : float
+        Rising, or equal.
+    count : int
+
+    Returns
+    -------
+    (n,) array
+    """
+    if not high > low:
+        return np.array([low])
+    step = 10.0 ** np.floor(np.log10((high - low) / count))
+    # the smallest of 1, 2, 5 and 10 times a power of ten that gives no more than asked for
+    step *= next(nice for nice in (1, 2, 5, 10) if (high - low) / (nice * step) <= count)
+    return np.asarray(step * np.arange(np.ceil(low / step), np.floor(high / step) + 1))
 
 
 def make_scale(cloud: PointCloud, colouring: Colouring) -> Scale:

@@ -6,11 +6,14 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apps.viewer.appearance_panel import AppearancePanel
 from apps.viewer.clock import MAX_SPEED, MIN_SPEED
+from apps.viewer.colouring import choose_round_values
 from apps.viewer.page_text import Status
 from apps.viewer.session import GATE_MODES, DisplayedFrame, Session
+from tofclip.units import NANOSECOND
 
 if TYPE_CHECKING:
     import viser
@@ -21,6 +24,7 @@ SPEEDS = ("1/16", "1/8", "1/4", "1/2", "1", "2", "4", "8", "16")
 # The outermost steps are longer than any source; the clock stops at the ends.
 FRAME_STEPS = {"|<": -(10**9), "-10": -10, "-1": -1, "+1": 1, "+10": 10, ">|": 10**9}
 MAX_HALF_GATE_FRAMES = 200
+MAX_TIME_MARKS = 4
 
 
 class Controls:
@@ -75,7 +79,15 @@ class Controls:
         session, gui = self._session, self._gui
         # A slider needs two different ends, even for a single frame.
         last = max(1, len(session.source) - 1)
-        self._frame: Any = gui.add_slider("frame", 0, last, 1, min(session.clock.frame, last))
+        times = session.source.capabilities.times
+        self._frame: Any = gui.add_slider(
+            session.source.frame_name,
+            0,
+            last,
+            1,
+            min(session.clock.frame, last),
+            marks=None if times is None else mark_times(times),
+        )
         self._bind(self._frame, session.jump)
         live = ("play", "pause", "live") if session.source.is_live else ("play", "pause")
         self._bind(gui.add_button_group("playback", live), self._run_playback)
@@ -147,6 +159,24 @@ class Controls:
 
     def _bind(self, handle: Any, act: Callable[[Any], None]) -> None:
         bind_user_input(handle, self._post, act)
+
+
+def mark_times(times: NDArray[np.float64]) -> tuple[tuple[int, str], ...]:
+    """Return the frames at round times of flight, with their times in ns, for a time line.
+
+    Parameters
+    ----------
+    times : (frames,) array
+        Time of flight, s; rising.
+
+    Returns
+    -------
+    tuple of (int, str)
+    """
+    in_ns = times / NANOSECOND
+    places = choose_round_values(in_ns[0], in_ns[-1], MAX_TIME_MARKS)
+    frames = np.abs(in_ns - places[:, np.newaxis]).argmin(axis=1)
+    return tuple((int(frame), f"{place:g} ns") for frame, place in zip(frames, places, strict=True))
 
 
 def bind_user_input(handle: Any, post: Post, act: Callable[[Any], None]) -> None:

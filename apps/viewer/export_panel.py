@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apps.figures.style import DOTS_PER_INCH, make_figure
-from apps.viewer.colouring import choose_ticks, load_palette
+from apps.viewer.colouring import choose_ticks, format_length, load_palette
 from apps.viewer.raster import BACKGROUND
 from apps.viewer.session import Session
-from apps.viewer.viewpoint import Viewpoint
+from apps.viewer.viewpoint import Box, Viewpoint, move_camera
 
 if TYPE_CHECKING:
     import viser
@@ -35,8 +36,9 @@ class ExportPanel:
     server : ViserServer
     session : Session
     post : callable
-    views : mapping of str to Viewpoint
-        Where one can look from; the first is where one looks from at first.
+    list_views : callable
+        Takes a window's width over its height, returns where one can look from, by name; the first
+        is where one looks from at first.
     """
 
     def __init__(
@@ -44,19 +46,18 @@ class ExportPanel:
         server: viser.ViserServer,
         session: Session,
         post: Post,
-        views: Mapping[str, Viewpoint],
+        list_views: Callable[[float], Mapping[str, Viewpoint]],
     ) -> None:
         self._server, self._session, self._post = server, session, post
-        self._bookmarked_views: dict[str, tuple[Any, Any]] = {
-            name: (view.eye, view.target) for name, view in views.items()
-        }
+        self._list_views = list_views
+        self._bookmarked_views: dict[str, Viewpoint] = {}
         self._bookmarks_made = 0
         gui = server.gui
         gui.add_button("screenshot").on_click(lambda event: self._send_screenshot(event.client))
         gui.add_button("export", hint="the points that are shown, as PLY").on_click(
             lambda event: self._post(lambda: self._send_points(event.client))
         )
-        self._bookmarks: Any = gui.add_dropdown("view from", tuple(views))
+        self._bookmarks: Any = gui.add_dropdown("view from", tuple(list_views(1.0)))
         self._bookmarks.on_update(self._go_to_bookmark)
         gui.add_button("bookmark", hint="remember where one looks from").on_click(
             lambda event: self._add_bookmark(event.client)
@@ -93,16 +94,20 @@ class ExportPanel:
             return
         self._bookmarks_made += 1
         name = f"view {self._bookmarks_made}"
+        camera = client.camera
         # Copied, because the page goes on changing the camera's own arrays.
-        self._bookmarked_views[name] = client.camera.position.copy(), client.camera.look_at.copy()
-        self._bookmarks.options = tuple(self._bookmarked_views)
+        self._bookmarked_views[name] = Viewpoint(
+            camera.position.copy(), camera.look_at.copy(), camera.fov
+        )
+        self._bookmarks.options = (*self._list_views(1.0), *self._bookmarked_views)
         self._bookmarks.value = name
 
     def _go_to_bookmark(self, event: Any) -> None:
-        if event.client is not None:
-            event.client.camera.position, event.client.camera.look_at = self._bookmarked_views[
-                event.target.value
-            ]
+        if event.client is None:
+            return
+        camera = event.client.camera
+        presets = self._list_views(camera.image_width / max(camera.image_height, 1))
+        move_camera(camera, {**presets, **self._bookmarked_views}[event.target.value])
 
     def _show_keys(self, client: viser.ClientHandle | None) -> None:
         if client is None:
@@ -149,6 +154,20 @@ class ExportPanel:
             self._session.play()
 
 
+def format_box(xyz: NDArray[np.float32]) -> str:
+    """Return the lengths of the box around a cloud in words; empty for an empty cloud.
+
+    Parameters
+    ----------
+    xyz : (n, 3) array
+        m.
+    """
+    if len(xyz) == 0:
+        return ""
+    box = Box.around(xyz)
+    return "box " + " x ".join(map(format_length, (box.high - box.low).tolist()))
+
+
 def _encode_png(drawn: Any, session: Session) -> bytes:
     """Put a picture with a transparent ground on a dark one, as on the page, with the legend of its
     colours below.
@@ -169,7 +188,7 @@ def _encode_png(drawn: Any, session: Session) -> bytes:
         mapped = ScalarMappable(cmap=ListedColormap(load_palette(shown.scale.palette) / 255.0))
         bar = figure.colorbar(mapped, cax=axes, orientation="horizontal")
         bar.set_ticks([place for place, _ in ticks], labels=[label for _, label in ticks])
-        bar.set_label(f"{session.source.title}: {title}", fontsize=9)
+        bar.set_label(f"{session.title}: {title}; {format_box(shown.cloud.xyz)}", fontsize=9)
         axes.tick_params(labelsize=8)
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=DOTS_PER_INCH)

@@ -51,7 +51,7 @@ def save_film(
     """
     whole = session.frame_at(0.0)  # a transient begins at its end: with all of its points
     still, most, frames = (
-        SceneFigure(session.source.title, whole, renderer),
+        SceneFigure(session.title, whole, renderer),
         0,
         choose_frames(session),
     )

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
-from apps.viewer.linear_recovery import Readings, make_view
+from apps.viewer.shot_recovery import Readings, make_view
 from apps.viewer.shots import ShotSource
 from apps.viewer.source import View
 from devices.shot_stream import TrackedShots
@@ -18,6 +18,7 @@ from tofclip.errors import InputError
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Streak
+from tofclip.solvers import Method
 from tofclip.storage import format_error_line
 
 MAX_CACHED_SHOTS = 32
@@ -45,6 +46,8 @@ class LiveShotSource(ShotSource):
         generator lets go of its instrument when it is dropped then. The first one is shown at once.
     camera : Camera
         With its sweep.
+    method : Method, optional
+        The linear inverse by default: others take seconds for a shot.
 
     Raises
     ------
@@ -56,12 +59,14 @@ class LiveShotSource(ShotSource):
     Memory: the measurements and clouds of 32 shots.
     """
 
-    def __init__(self, title: str, shots: Iterator[Streak], camera: Camera) -> None:
+    def __init__(
+        self, title: str, shots: Iterator[Streak], camera: Camera, method: Method | None = None
+    ) -> None:
         self._shots = shots if isinstance(shots, TrackedShots) else TrackedShots(shots)
         first = next(self._shots, None)
         if first is None:
             raise InputError(f"{title}: the source ended before it gave anything")
-        super().__init__(title, camera, first.times)
+        super().__init__(title, camera, first.times, method)
         self._cache: deque[tuple[Readings, View]] = deque(maxlen=MAX_CACHED_SHOTS)
         self._arrivals: deque[float] = deque(maxlen=RATE_WINDOW_SHOTS + 1)
         self._count, self._failure_text = 0, ""
@@ -153,6 +158,9 @@ class LiveShotSource(ShotSource):
             self._ended = True
 
     def _append_entry(self, measurements: Readings, view: View) -> None:
+        if not self.recovery.is_linear:
+            # seconds of work, meanwhile the newest shot waits and older ones are dropped
+            view = self.recovery.view(measurements, 0.0, self._full_gate)
         with self._lock:
             self._cache.append((measurements, view))
             self._count += 1

@@ -9,18 +9,18 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from apps.viewer.colouring import format_length
 from apps.viewer.controls import Controls
 from apps.viewer.export_panel import ExportPanel
-from apps.viewer.page_text import Status, format_page_title
+from apps.viewer.furniture import draw_furniture
+from apps.viewer.page_text import Status, format_page_title, render_page_html
 from apps.viewer.rates import FramePacer, RateCounter
-from apps.viewer.scene_figure import LABELLED_EDGES
 from apps.viewer.selection_panel import NO_SHADOWS, SelectionPanel
 from apps.viewer.server import LOOPBACK, get_address, start_server, stop_server
 from apps.viewer.session import DisplayedFrame, Session
 from apps.viewer.side_pictures import render_pictures
-from apps.viewer.viewpoint import Box, Viewpoint, make_presets, place_viewpoint
+from apps.viewer.viewpoint import Box, Viewpoint, make_presets, move_camera, place_viewpoint
 from tofclip.errors import TofclipError
 
 TICK_S = 1 / 60
@@ -32,9 +32,16 @@ the points do.
 """
 
 SCENE_ASPECT = 0.9
-"""Width over height of the scene between two panels, on a usual screen."""
+"""Width over height of the scene between two panels, on a usual screen: until a browser says its own."""
 
-PANEL_PX, PICTURES_PANEL_PX = 345, 260
+PANEL_PX, PICTURES_PANEL_PX = 352, 240
+
+MAX_MOVING_POINTS = 200_000
+"""Points of a larger cloud are thinned to about as many while somebody turns it."""
+
+STILL_AFTER_S = 0.25
+"""s after the last movement of a camera at which all points are drawn again."""
+
 AMBIENT_INTENSITY = 2.0
 """Light from everywhere, so that no side of a surface is black."""
 
@@ -44,7 +51,6 @@ POINT_STYLE: dict[str, Any] = {
     "precision": "float32",
 }
 SURFACE_COLOUR = (216, 210, 196)
-BOX_COLOUR, BOX_LINE_PX = (139, 147, 163), 1.0
 
 
 class Page:
@@ -69,23 +75,28 @@ class Page:
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stopping, self._woken = threading.Event(), threading.Event()
         first = session.frame_at(time.monotonic())
+        self._framed_cloud = first.cloud.xyz
         self.viewpoint = place_viewpoint(first.cloud.xyz, SCENE_ASPECT)
         self.server = start_server(port, host)
         self.address = get_address(self.server, host)
         self._pace, self._frames = FramePacer(), RateCounter()
+        self._moved_at = -np.inf
+        self._points: Any = None
+        self._thinned: Any = None
         self._set_up_scene()
-        presets = make_presets(first.cloud.xyz) if len(first.cloud) else {}
+        self._pictures_panel, self._pictures_tab = self._add_pictures_panel()
         self.controls = Controls(self.server, session, self.post, first)
-        if len(first.cloud):
-            self._draw_box(Box.around(first.cloud.xyz))
-        self._selection_panel = SelectionPanel(self.server, session, self.post)
-        self._export_panel = ExportPanel(
-            self.server, session, self.post, {"start": self.viewpoint, **presets}
+        self._add_furniture(first)
+        self._selection_panel = SelectionPanel(
+            self.server, session, self.post, self._pictures_panel
         )
+        self._export_panel = ExportPanel(self.server, session, self.post, self._list_views)
+        self.server.gui.add_html(render_page_html(session.source.title))
         self._pictures: dict[str, Any] = {}
         self._drawn: DisplayedFrame | None = None
         self._status_at = self._pictures_at = 0.0
         self._pictured: DisplayedFrame | None = None
+        self.server.on_client_connect(self._welcome)
 
     def post(self, command: Callable[[], None]) -> None:
         """Have a command carried out by the thread that owns the session."""
@@ -114,6 +125,7 @@ class Page:
             shown = self.session.frame_at(now) if self._pace.can_send(now) else self._drawn
             if shown is not None and shown is not self._drawn:
                 self._draw(shown, now)
+            self._choose_detail(now)
             self._update_status(now)
         except TofclipError as fault:
             self._notify_error(fault)
@@ -131,7 +143,7 @@ class Page:
         server.scene.configure_environment_map(hdri=None)
         server.scene.add_light_ambient("/light", intensity=AMBIENT_INTENSITY)
         move_camera(server.initial_camera, self.viewpoint)
-        server.scene.add_frame("/camera", axes_length=0.1, axes_radius=0.003)
+        server.scene.add_frame("/camera", show_axes=False)
         # The page makes a new material for every frame's points, and forgets the compiled shader
         # with the last old one. Two points that stay keep it: compiling it again for every frame
         # would take twenty times as long as drawing.
@@ -139,24 +151,41 @@ class Page:
         server.scene.add_point_cloud(
             "/camera/staying", staying, staying, point_size=1e-4, **POINT_STYLE
         )
-        server.on_client_connect(lambda _: self.post(self._redraw_pictures))
 
-    def _draw_box(self, box: Box) -> None:
-        """Draw a box around the first cloud with the lengths of its sides, which is the scale."""
-        scene, corners = self.server.scene, box.corners
-        segments = corners[np.array(box.edges)].astype(np.float32)
-        drawn: list[Any] = [
-            scene.add_line_segments(
-                "/box", segments, BOX_COLOUR, thickness=BOX_LINE_PX, thickness_units="screen"
-            )
-        ]
-        for axis, edge in enumerate(LABELLED_EDGES):
-            length = format_length(float(box.high[axis] - box.low[axis]))
-            middle = corners[list(edge)].mean(axis=0)
-            drawn.append(
-                scene.add_label(f"/box_{'xyz'[axis]}", f"{'xyz'[axis]} {length}", position=middle)
-            )
-        shown = self.server.gui.add_checkbox("box", True, hint="lengths of the first cloud")
+    def _welcome(self, client: Any) -> None:
+        """Frame the scene for the window of a browser that has just come, as long as nobody moves."""
+        framed: list[Viewpoint] = []
+
+        def follow_window(camera: Any) -> None:
+            self._moved_at = time.monotonic()
+            aspect = camera.image_width / max(camera.image_height, 1)
+            if framed and not np.allclose(camera.position, framed[-1].eye, atol=1e-4):
+                return  # moved by hand
+            viewpoint = place_viewpoint(self._framed_cloud, aspect)
+            if framed and viewpoint.is_close_to(framed[-1]):
+                return
+            framed.append(viewpoint)
+            self.viewpoint = viewpoint
+            move_camera(camera, viewpoint)
+
+        follow_window(client.camera)
+        client.camera.on_update(follow_window)
+        self.post(self._redraw_pictures)
+
+    def _list_views(self, aspect: float) -> dict[str, Viewpoint]:
+        """Places to look from, for a window of that aspect."""
+        if len(self._framed_cloud) == 0:
+            return {"start": self.viewpoint}
+        return make_presets(self._framed_cloud, aspect)
+
+    def _add_furniture(self, first: DisplayedFrame) -> None:
+        """Draw what gives the scene its scale, and a switch for it."""
+        if len(first.cloud) == 0:
+            return
+        drawn = draw_furniture(self.server.scene, Box.around(first.cloud.xyz))
+        shown = self.server.gui.add_checkbox(
+            "box", True, hint="box with lengths, scale bar and axes of the first cloud"
+        )
 
         @shown.on_update
         def _(_: Any) -> None:
@@ -192,7 +221,35 @@ class Page:
         colours: Any = (
             shown.colours if len(points) else (0, 0, 0)
         )  # the page complains about no colours at all
-        scene.add_point_cloud("/points", points, colours, point_size=size, **POINT_STYLE)
+        self._points = scene.add_point_cloud(
+            "/points", points, colours, point_size=size, **POINT_STYLE
+        )
+        self._draw_thinned(points, colours)
+
+    def _draw_thinned(self, points: NDArray[np.float32], colours: Any) -> None:
+        """Keep a part of a large cloud ready, to be drawn instead of it while somebody turns it."""
+        scene, thinned = self.server.scene, self._thinned
+        self._thinned = None
+        if len(points) <= MAX_MOVING_POINTS:
+            if thinned is not None:
+                thinned.remove()
+            return
+        # drawn by lot: every n-th point of rows of pixels would make stripes
+        some = np.random.default_rng(0).choice(len(points), MAX_MOVING_POINTS, replace=False)
+        # surfaces stay closed with fewer, larger points
+        size = self.controls.point_size * float(np.sqrt(len(points) / MAX_MOVING_POINTS))
+        self._thinned = scene.add_point_cloud(
+            "/points_thinned", points[some], colours[some], point_size=size, **POINT_STYLE
+        )
+        self._thinned.visible = False
+
+    def _choose_detail(self, now: float) -> None:
+        """Draw a large cloud thinned while somebody turns it."""
+        if self._thinned is None:
+            return
+        moving = now - self._moved_at < STILL_AFTER_S
+        if self._thinned.visible != moving:
+            self._thinned.visible, self._points.visible = moving, not moving
 
     def _update_status(self, now: float) -> None:
         """Bring words and flat pictures up to date, now and then."""
@@ -220,36 +277,32 @@ class Page:
             source.lost,
             source.failure_text,
             float("nan") if times is None else float(times[shown.frame]),
+            source.frame_name,
+            source.describe_frame(shown.frame),
+            self.session.notes,
         )
 
     def _show_pictures(self, shown: DisplayedFrame) -> None:
         images = render_pictures(self.session.pictures(shown), shown.scale)
         if not self._pictures:
-            panel = self.server.gui.add_panel()
-            with panel.add_tab("pictures"):
+            with self._pictures_tab:
                 self._pictures = {
                     name: self.server.gui.add_image(one, label=name) for name, one in images.items()
                 }
-            panel.dock_left()
-            panel.set_width(PICTURES_PANEL_PX)
             return
         for name, image in images.items():
             self._pictures[name].image = image
+
+    def _add_pictures_panel(self) -> tuple[Any, Any]:
+        """The panel on the left, and its tab for flat pictures."""
+        panel = self.server.gui.add_panel()
+        tab = panel.add_tab("pictures")
+        panel.dock_left()
+        panel.set_width(PICTURES_PANEL_PX)
+        return panel, tab
 
     def _notify_error(self, fault: TofclipError) -> None:
         for client in self.server.get_clients().values():
             client.add_notification(
                 "that cannot be", str(fault), auto_close_seconds=6.0, color="red"
             )
-
-
-def move_camera(camera: Any, viewpoint: Viewpoint) -> None:
-    """Move a camera of the page, or the one that pages start with, to a viewpoint.
-
-    Parameters
-    ----------
-    camera : viser camera handle
-    viewpoint : Viewpoint
-    """
-    camera.position, camera.look_at = viewpoint.eye, viewpoint.target
-    camera.fov = max(viewpoint.field_of_view, float(np.deg2rad(5.0)))

@@ -14,6 +14,27 @@ from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
 
 GRADIENT_STOPS = 24
 HTML_STYLE = "padding:0.2em 0.8em 0.6em;font-size:0.85em;line-height:1.5"
+LINE_STYLE = (
+    "white-space:nowrap;overflow:hidden;text-overflow:ellipsis;font-variant-numeric:tabular-nums"
+)
+
+# The page dims its panels and takes no clicks while its connection is down; the words in them are
+# shown by that very style, which needs no script.
+LOST_STYLE = """
+.tofclip-lost {display: none}
+div[style*="pointer-events: none"] .tofclip-lost {
+  display: block; position: fixed; z-index: 1000; top: 1em; left: 50%; transform: translateX(-50%);
+  padding: 0.8em 1.2em; border-radius: 0.4em; background: #e5484d; color: white; font-size: 1.1em}
+"""
+LOST_TEXT = (
+    "Connection lost: tofclip view has ended, or cannot be reached. What you see is the last "
+    "picture; this page goes on by itself when the program is back at this address."
+)
+SHARED_TEXT = (
+    "Every browser at this address shows the same frame, colours, filters and picked points; where "
+    "you look from is your own."
+)
+BLANK_PIXEL = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7"
 
 
 @dataclass(frozen=True)
@@ -35,6 +56,12 @@ class Status:
     failure_text : str
     time : float
         Time of flight of the frame, s; NaN where frames have none.
+    frame_name : str
+        What a frame is: frame, slice, shot or cloud.
+    depth_text : str
+        Where a slice lies; empty where frames are no slices.
+    notes : tuple of str
+        What has to be known about the picture, such as that its ranges have no time zero.
     """
 
     label: str
@@ -47,34 +74,50 @@ class Status:
     lost: int = 0
     failure_text: str = ""
     time: float = float("nan")
+    frame_name: str = "frame"
+    depth_text: str = ""
+    notes: tuple[str, ...] = ()
 
     @property
     def html(self) -> str:
-        """The line, with ids for scripts."""
+        """Its lines, with ids for scripts. Each is as high whatever it says, so that nothing below
+        moves while frames pass.
+        """
         colour = "#e5484d" if self.label == "LIVE" else "#3e8ed0"
-        lost = f", {self.lost} dropped" if self.lost else ""
-        coming = (
-            f"<br>shot to cloud {1e3 * self.cloud_latency:.0f} ms{lost}"
-            if np.isfinite(self.cloud_latency)
-            else ""
+        name = html.escape(self.frame_name)
+        lines = [
+            f"<b id='label' style='color:{colour}'>{self.label}</b> {name} "
+            f"<b id='frame-number'>{self.frame}</b> of {self.frames}"
+        ]
+        if np.isfinite(self.time):
+            distance = SPEED_OF_LIGHT * self.time / 2
+            lines.append(
+                f"<span id='instant'>{self.time / NANOSECOND:.2f} ns, range {distance:.3f} m</span>"
+            )
+        if self.depth_text:
+            lines.append(f"<span id='depth'>{html.escape(self.depth_text)}</span>")
+        lines.append(
+            f"<span id='points'>{self.points}</span> points, <span id='rates'>data "
+            f"{self.data_rate:.1f}/s, shown {self.frame_rate:.1f}/s</span>"
         )
-        instant = (
-            f"<br><span id='instant'>{self.time / NANOSECOND:.2f} ns, range "
-            f"{SPEED_OF_LIGHT * self.time / 2:.3f} m</span>"
-            if np.isfinite(self.time)
-            else ""
+        if self.label == "LIVE" or np.isfinite(self.cloud_latency):
+            delay = (
+                f"{1e3 * self.cloud_latency:.0f} ms"
+                if np.isfinite(self.cloud_latency)
+                else "not known yet"
+            )
+            lines.append(f"shot to cloud {delay}, {self.lost} dropped")
+        shown = "".join(f"<div style='{LINE_STYLE}'>{line}</div>" for line in lines)
+        shown += "".join(
+            f"<div class='note' style='color:#ffb020'>{html.escape(note)}</div>"
+            for note in self.notes
         )
         trouble = (
             f"<div style='color:#e5484d'>{html.escape(self.failure_text)}</div>"
             if self.failure_text
             else ""
         )
-        return (
-            f"<div style='{HTML_STYLE}'><b id='label' style='color:{colour}'>{self.label}</b> "
-            f"frame <b id='frame-number'>{self.frame}</b> of {self.frames}, <span id='points'>{self.points}</span> "
-            f"points{instant}<br><span id='rates'>data {self.data_rate:.1f}/s, shown "
-            f"{self.frame_rate:.1f}/s{coming}</span>{trouble}</div>"
-        )
+        return f"<div style='{HTML_STYLE}'>{shown}{trouble}</div>"
 
 
 def render_scale_html(scale: Scale) -> str:
@@ -92,6 +135,23 @@ def render_scale_html(scale: Scale) -> str:
         f"<div id='scale' style='{HTML_STYLE}'>{title}"
         f"<div style='height:0.9em;background:linear-gradient(to right,{stops})'></div>"
         f"<div style='position:relative;height:1.5em'>{ticks}</div></div>"
+    )
+
+
+def render_page_html(title: str) -> str:
+    """Return what is said at the foot of the controls, and what names the browser's tab.
+
+    Parameters
+    ----------
+    title : str
+        Of the source.
+    """
+    name = html.escape(format_page_title(title), quote=True)
+    # a picture's event is the one script that runs in a text put into a page
+    tab = f'<img hidden src="{BLANK_PIXEL}" data-name="{name}" onload="document.title=this.dataset.name">'
+    return (
+        f"<style>{LOST_STYLE}</style>{tab}<div class='tofclip-lost'>{LOST_TEXT}</div>"
+        f"<div id='shared' style='{HTML_STYLE};opacity:0.7'>{SHARED_TEXT}</div>"
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from apps.viewer.colouring import format_length
 from apps.viewer.source import Waveform
 from tofclip.lidar import PointCloud
 from tofclip.units import NANOSECOND
@@ -37,6 +38,8 @@ class Pick:
         Row and column that saw it.
     waveform : Waveform, optional
         That pixel's signal over time.
+    return_times : tuple of float
+        Time of flight of every return that was found in that pixel and is shown, s.
     """
 
     position: tuple[float, float, float]
@@ -47,16 +50,16 @@ class Pick:
     time: float
     pixel: tuple[int, int] | None = None
     waveform: Waveform | None = None
+    return_times: tuple[float, ...] = ()
 
     @property
     def description(self) -> str:
         """One line for each thing that is known."""
         x, y, z = self.position
         lines = [
-            f"x {x:.4f} m, y {y:.4f} m, z {z:.4f} m",
-            f"range {self.range:.4f} m ± {1e3 * self.confidence:.2f} mm",
-            f"intensity {self.intensity:.4g} counts, return {self.return_number}",
-            f"time {self.time / NANOSECOND:.3f} ns",
+            f"x {x:.4f}, y {y:.4f}, z {z:.4f} m",
+            f"range {self.range:.4f} m ± {format_length(self.confidence)}",
+            f"{self.time / NANOSECOND:.3f} ns, {self.intensity:.4g} counts, return {self.return_number}",
         ]
         if self.pixel is not None:
             lines.append(f"pixel row {self.pixel[0]}, column {self.pixel[1]}")
@@ -103,6 +106,7 @@ def make_pick(
     number: int,
     pixel: tuple[int, int] | None = None,
     waveform: Waveform | None = None,
+    return_times: tuple[float, ...] = (),
 ) -> Pick:
     """Return what is known about point `number` of a cloud.
 
@@ -115,6 +119,8 @@ def make_pick(
         Row and column that the point comes from.
     waveform : Waveform, optional
         Of that pixel.
+    return_times : tuple of float
+        Time of flight of that pixel's returns, s.
 
     Returns
     -------
@@ -130,6 +136,7 @@ def make_pick(
         float(cloud.time[number]),
         pixel,
         waveform,
+        return_times,
     )
 
 

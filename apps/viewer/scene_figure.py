@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 PICTURE_SHAPE_PX = (640, 960)
 DOTS_PER_INCH = 100
 COLOUR_BAR_TICKS = 7
-BOX_COLOUR = "#8b93a3"
+BOX_COLOUR, SCALE_BAR_COLOUR = "#8b93a3", "#ebeef5"
+SCALE_LABEL_PX = 4
 LABELLED_EDGES = ((6, 7), (4, 6), (2, 6))
 """Edges of the box, by corners, that carry their length: those of its far side, which is always in
 the picture.
@@ -145,6 +146,19 @@ def _draw_box(axes: Any, viewpoint: Viewpoint, xyz: NDArray[np.float32]) -> None
         ends = [first, second]
         length = float(box.high[axis] - box.low[axis])
         _label_length(axes, column[ends], row[ends], "xyz"[axis], length)
+    bar = box.scale_bar
+    row, column, _ = viewpoint.project(bar, PICTURE_SHAPE_PX)
+    axes.plot(column, row, color=SCALE_BAR_COLOUR, linewidth=2.5, solid_capstyle="butt")
+    length = float(bar[1, 0] - bar[0, 0])
+    axes.text(
+        float(column.mean()),
+        float(row.mean()) + SCALE_LABEL_PX,
+        format_length(length),
+        color=SCALE_BAR_COLOUR,
+        fontsize=8,
+        ha="center",
+        va="top",
+    )
     axes.set_xlim(-0.5, PICTURE_SHAPE_PX[1] - 0.5)
     axes.set_ylim(PICTURE_SHAPE_PX[0] - 0.5, -0.5)
 

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from apps.viewer.picking import Pick
 from apps.viewer.session import Session
-from tofclip.units import NANOSECOND
+from tofclip.units import SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
     import viser
@@ -22,6 +22,8 @@ MARKER_COLOURS = ((255, 80, 80), (80, 220, 255))
 MARKER_RADIUS_FRACTION = 0.006
 """Of the distance."""
 
+RETURN_HALF_WIDTH_BINS = 3.0
+"""Bins on either side of a detected return that are filled in its pixel's waveform."""
 
 NO_SHADOWS: Any = {"cast_shadow": False, "receive_shadow": False}
 
@@ -34,6 +36,8 @@ class SelectionPanel:
     server : ViserServer
     session : Session
     post : callable
+    above : PanelHandle
+        The docked panel below which this one stays in sight.
     """
 
     def __init__(
@@ -41,14 +45,17 @@ class SelectionPanel:
         server: viser.ViserServer,
         session: Session,
         post: Callable[[Callable[[], None]], None],
+        above: viser.PanelHandle,
     ) -> None:
         self._server, self._session = server, session
-        with server.gui.add_folder("picked point"):
+        panel = server.gui.add_panel()
+        with panel.add_tab("picked point"):
             self._text = server.gui.add_html(
                 _format_html("click a point; a second one gives their distance")
             )
             self._plot: Any = None
             self._container = server.gui.add_folder(None)
+        panel.dock_below(above)
         server.scene.on_click()(
             lambda event: post(lambda: self._handle_click(event.ray_origin, event.ray_direction))
         )
@@ -87,16 +94,40 @@ class SelectionPanel:
     def _draw_waveform(self, pick: Pick) -> None:
         if pick.waveform is None:
             return
-        data = (pick.waveform.times / NANOSECOND, pick.waveform.counts.astype(np.float64))
+        data = _make_plot_data(pick)
         if self._plot is not None:
             self._plot.data = data
             return
-        series: Any = ({"label": "time (ns)"}, {"label": "counts", "stroke": "#3dd6c8", "width": 1})
-        axes: Any = ({"stroke": "#aab", "label": "time (ns)"}, {"stroke": "#aab"})
+        series: Any = (
+            {"label": "range (m)"},
+            {"label": "counts", "stroke": "#3dd6c8", "width": 1},
+            {"label": "return", "stroke": "#ff5050", "fill": "#ff505066", "width": 1.5},
+        )
+        axes: Any = (
+            {"stroke": "#aab", "label": "range (m), c t / 2", "size": 30, "labelSize": 18},
+            {"stroke": "#aab", "label": "counts", "size": 40, "labelSize": 18},
+        )
+        scales: Any = {"x": {"time": False}}
         with self._container:
             self._plot = self._server.gui.add_uplot(
-                data, series, title="waveform", scales={"x": {"time": False}}, axes=axes, aspect=1.8
+                data,
+                series,
+                scales=scales,
+                axes=axes,
+                legend={"show": False},
+                aspect=1.45,
             )
+
+
+def _make_plot_data(pick: Pick) -> tuple[NDArray[np.float64], ...]:
+    """Ranges in m, the pixel's signal, and that signal where its returns were found, else 0."""
+    waveform = pick.waveform
+    assert waveform is not None
+    counts = waveform.counts.astype(np.float64)
+    row = float(np.median(np.diff(waveform.times))) if waveform.times.size > 1 else 1.0
+    away = np.abs(waveform.times[:, np.newaxis] - np.asarray(pick.return_times)[np.newaxis])
+    near = (away <= RETURN_HALF_WIDTH_BINS * row).any(axis=1)
+    return SPEED_OF_LIGHT * waveform.times / 2, counts, np.where(near, counts, 0.0)
 
 
 def _format_html(text: str) -> str:

@@ -93,6 +93,17 @@ class Session:
         """``"LIVE"`` while the newest frame of an instrument is shown, ``"REPLAY"`` otherwise."""
         return "LIVE" if self.following and self.source.is_live else "REPLAY"
 
+    @property
+    def title(self) -> str:
+        """The source's title with what has to be known about what is shown."""
+        return "; ".join((self.source.title, *self.notes))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What has to be known about what is shown, each once."""
+        refocused = (self.source.refocus_note,) if self.shear is not None else ()
+        return tuple(dict.fromkeys(note for note in (*refocused, *self.source.notes) if note))
+
     def play(self) -> None:
         """Run through the frames; a live source from the oldest one that is still there."""
         self.following = False
@@ -172,8 +183,17 @@ class Session:
             if shown.pixels is None
             else (int(shown.pixels[number, 0]), int(shown.pixels[number, 1]))
         )
-        waveform = None if pixel is None else self.source.waveform(shown.frame, pixel)
-        pick = make_pick(shown.cloud, number, pixel, waveform)
+        if pixel is None or shown.pixels is None:
+            pick = make_pick(shown.cloud, number)
+        else:
+            beside = np.all(shown.pixels == pixel, axis=1)
+            pick = make_pick(
+                shown.cloud,
+                number,
+                pixel,
+                self.source.waveform(shown.frame, pixel),
+                tuple(shown.cloud.time[beside].astype(float).tolist()),
+            )
         self.picks = [*self.picks, pick][-2:]
         return pick
 

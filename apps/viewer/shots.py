@@ -1,4 +1,4 @@
-"""Raw streak images in a row, recovered by the linear inverse as they are looked at."""
+"""Raw streak images in a row, recovered as they are looked at."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.viewer.linear_recovery import SHEAR_LIMITS, LinearRecovery, Readings
+from apps.viewer.shot_recovery import SHEAR_LIMITS, Readings, ShotRecovery, list_recovery_notes
 from apps.viewer.source import Capabilities, Gate, Source, View, Waveform
 from apps.viewer.transient import render_depth
 from tofclip.camera import Camera, Rectifier
 from tofclip.shots import Streak
+from tofclip.solvers import Method
 
 SHOT_RATE_HZ = 10.0
 MAX_CACHED_VIEWS = 16
@@ -30,19 +31,31 @@ class ShotSource(Source):
         With its sweep.
     row_times : (rows,) array
         Instant of each row, s.
+    method : Method, optional
+        The linear inverse by default.
     """
 
-    def __init__(self, title: str, camera: Camera, row_times: NDArray[np.float64]) -> None:
+    def __init__(
+        self,
+        title: str,
+        camera: Camera,
+        row_times: NDArray[np.float64],
+        method: Method | None = None,
+    ) -> None:
+        self.recovery = ShotRecovery(camera, row_times - camera.time_zero, method)
         super().__init__(
-            title, SHOT_RATE_HZ, Capabilities(shears=SHEAR_LIMITS if camera.views > 1 else None)
+            title,
+            SHOT_RATE_HZ,
+            Capabilities(shears=SHEAR_LIMITS if camera.views > 1 else None),
+            frame_name="shot",
+            notes=list_recovery_notes(self.recovery),
         )
-        self.linear = LinearRecovery(camera, row_times - camera.time_zero)
         self._views: OrderedDict[int, View] = OrderedDict()
 
     @cached_property
     def rectifier(self) -> Rectifier:
         """What takes the sweep off a shot."""
-        return Rectifier(self.linear.camera, self.linear.times.size)
+        return Rectifier(self.recovery.camera, self.recovery.times.size)
 
     @abc.abstractmethod
     def measurements(self, number: int) -> Readings:
@@ -54,7 +67,9 @@ class ShotSource(Source):
 
     def view(self, number: int) -> View:
         if number not in self._views:
-            self._views[number] = self.linear.view(self.measurements(number), 0.0, self._full_gate)
+            self._views[number] = self.recovery.view(
+                self.measurements(number), 0.0, self._full_gate
+            )
             if len(self._views) > MAX_CACHED_VIEWS:
                 self._views.popitem(last=False)
         return self._views[number]
@@ -74,11 +89,11 @@ class ShotSource(Source):
             Depth in m.
         """
         measurements = self.measurements(number)
-        bright = self.linear.frames(measurements, 0.0, self._find_bright_gate(measurements))
+        bright = self.recovery.frames(measurements, 0.0, self._find_bright_gate(measurements))
         return {
             "streak": measurements.T,
             "intensity": bright.values.sum(axis=0),
-            "depth": render_depth(self.view(number)),
+            "depth": render_depth(self.view(number), self.recovery.camera.image_shape),
         }
 
     def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform:
@@ -94,7 +109,7 @@ class ShotSource(Source):
         -------
         Waveform
         """
-        frames = self.linear.frames(self.measurements(number), 0.0, self._full_gate)
+        frames = self.recovery.frames(self.measurements(number), 0.0, self._full_gate)
         return Waveform(frames.times, frames.values[:, pixel[0], pixel[1]].copy())
 
     def refocus(self, number: int, shear: float, gate: Gate) -> View:
@@ -112,16 +127,16 @@ class ShotSource(Source):
         -------
         View
         """
-        return self.linear.view(self.measurements(number), shear, self._full_gate)
+        return self.recovery.view(self.measurements(number), shear, self._full_gate)
 
     @property
     def _full_gate(self) -> Gate:
-        return Gate(0, int(self.linear.times.size))
+        return Gate(0, int(self.recovery.times.size))
 
     def _find_bright_gate(self, measurements: Readings) -> Gate:
         """The 64 frames about the brightest one: a picture of all would cost as much as the cloud."""
         brightest = int(measurements.sum(axis=0).argmax())
-        return Gate(max(0, brightest - 32), min(int(self.linear.times.size), brightest + 32))
+        return Gate(max(0, brightest - 32), min(int(self.recovery.times.size), brightest + 32))
 
 
 class StoredShotSource(ShotSource):
@@ -134,14 +149,22 @@ class StoredShotSource(ShotSource):
         Each reads its shot.
     camera : Camera
         With its sweep.
+    method : Method, optional
+        The linear inverse by default.
 
     Notes
     -----
     Memory: the measurements of the last shot, and the last 16 clouds.
     """
 
-    def __init__(self, title: str, shots: Sequence[Callable[[], Streak]], camera: Camera) -> None:
-        super().__init__(title, camera, shots[0]().times)
+    def __init__(
+        self,
+        title: str,
+        shots: Sequence[Callable[[], Streak]],
+        camera: Camera,
+        method: Method | None = None,
+    ) -> None:
+        super().__init__(title, camera, shots[0]().times, method)
         self._shots = shots
         self._last: tuple[int, Readings] | None = None
 

@@ -29,8 +29,9 @@ def render_pictures(pictures: Mapping[str, Picture], scale: Scale) -> dict[str, 
     pictures : mapping of str to (rows, columns) array
         ``"depth"`` is in m, NaN where there is nothing; all others are brightness.
     scale : Scale
-        Colours of the depth: the same as the scene's where these show range, and otherwise as many,
-        evenly.
+        The scene's colours. The depth has the very same where these show range, and otherwise its
+        own limits; brightness has the scene's palette where that shows intensity, and otherwise is
+        grey, so that no second meaning of a colour is beside the scene.
 
     Returns
     -------
@@ -38,7 +39,11 @@ def render_pictures(pictures: Mapping[str, Picture], scale: Scale) -> dict[str, 
     """
     return {
         name: resize_image(
-            colour_depth(picture, scale) if name == "depth" else colour_brightness(picture)
+            colour_depth(picture, scale)
+            if name == "depth"
+            else colour_brightness(
+                picture, scale.palette if scale.quantity == "intensity" else "grey"
+            )
         )
         for name, picture in pictures.items()
     }
@@ -65,12 +70,22 @@ def project_front(cloud: PointCloud) -> dict[str, Picture]:
     return {"intensity": light, "depth": depth}
 
 
-def colour_brightness(picture: Picture) -> Image:
-    """Colour a picture by its brightness, negative values as dark."""
+def colour_brightness(picture: Picture, palette: str) -> Image:
+    """Colour a picture by its brightness, negative values as dark.
+
+    Parameters
+    ----------
+    picture : (rows, columns) float array
+    palette : str
+
+    Returns
+    -------
+    (rows, columns, 3) uint8 array
+    """
     light = np.maximum(np.nan_to_num(picture), 0)
     top = float(np.percentile(light, WHITE_PERCENTILE)) or float(light.max()) or 1.0
     toned = np.clip(light / np.float32(top), 0, 1) ** np.float32(GAMMA)
-    return load_palette("inferno")[(255 * toned).astype(np.intp)]
+    return load_palette(palette)[(255 * toned).astype(np.intp)]
 
 
 def colour_depth(picture: Picture, scale: Scale) -> Image:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
 
@@ -112,12 +113,20 @@ class Source(abc.ABC):
         What the page calls it.
     rate : float
         Frames per second at natural speed.
+    capabilities : Capabilities
+    display_modes : DisplayModes
+    frame_name : str
+        What a frame is: an instant's frame, a slice, a shot or a cloud.
+    notes : tuple of str
+        What has to be known about everything that is shown, such as that ranges have no time zero.
     """
 
     title: str
     rate: float
     capabilities: Capabilities = field(default_factory=Capabilities)
     display_modes: DisplayModes = field(default_factory=DisplayModes)
+    frame_name: str = "frame"
+    notes: tuple[str, ...] = ()
 
     @abc.abstractmethod
     def __len__(self) -> int:
@@ -157,6 +166,17 @@ class Source(abc.ABC):
     @property
     def failure_text(self) -> str:
         """What ended a live source early, in a line; empty while all is well."""
+        return ""
+
+    @property
+    def refocus_note(self) -> str:
+        """What has to be said while a refocus is shown; empty where there is nothing to say."""
+        return ""
+
+    def describe_frame(self, number: int) -> str:
+        """Say in a few words what frame `number` is, beyond its time; empty where there is nothing to
+        say.
+        """
         return ""
 
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
@@ -214,6 +234,18 @@ class Source(abc.ABC):
 
     def close(self) -> None:  # noqa: B027 - most sources hold nothing
         """Let go of files and instruments."""
+
+
+NO_TIME_ZERO_NOTE = "no time zero: ranges are right up to a constant (--time-zero-ns)"
+LINEAR_NOTE = "quick look (linear): --method tv shows it sharper"
+LINEAR_FRAMES_NOTE = "quick look (linear): tofclip recover --method tv gives sharper frames"
+
+
+def list_camera_notes(camera: Camera) -> tuple[str, ...]:
+    """Return what has to be said about ranges that a camera measured: without a time zero all of them
+    are off by one constant.
+    """
+    return (NO_TIME_ZERO_NOTE,) if camera.time_zero == 0 else ()
 
 
 def make_empty_cloud() -> PointCloud:

@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import h5py
 
 from apps.viewer.clouds import CLOUD_SUFFIXES, CloudSource, find_clouds
-from apps.viewer.linear_recovery import LinearRecovery
 from apps.viewer.live import LiveShotSource
+from apps.viewer.shot_recovery import ShotRecovery
 from apps.viewer.shots import StoredShotSource
 from apps.viewer.source import Gate
 from apps.viewer.transient import TransientSource
@@ -22,13 +22,21 @@ from devices.transients import read_transient
 from tofclip.camera import Camera, measure
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io import read_streak
-from tofclip.recovery import open_shot
+from tofclip.recovery import make_method, open_shot
 from tofclip.shots import Frames
+from tofclip.solvers import Method
 from tofclip.storage import HDF5_SIGNATURE, Record, translate_read_errors
 
 if TYPE_CHECKING:
     from apps.viewer.source import Source
     from tofclip.shots import Streak, StreakStack
+
+
+LOOK_METHODS = ("tv", "l1", "linear", "adjoint")
+"""`tofclip.recovery` has one more, which takes half a minute."""
+
+FIRST_LOOK_METHOD, FIRST_LOOK_ITERATIONS = "l1", 40
+"""Enough to read what is written on a surface; `tofclip recover` takes 60."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +51,15 @@ class ShotOptions:
         Duration of a row, s; by default the shot's own time axis.
     time_zero : float, optional
         Reading of the time axis at which light of range 0 would arrive, s; by default the camera's.
+    method : str, optional
+        How shots are recovered: a name of `tofclip.recovery.METHODS` but ``"surfaces"``. By default
+        a single one by a few iterations of ``"tv"``, and one after the other by ``"linear"``.
     """
 
     camera: Path | None = None
     bin_width: float | None = None
     time_zero: float | None = None
+    method: str | None = None
 
 
 def open_source(name: str, options: ShotOptions | None = None) -> Source:
@@ -99,7 +111,9 @@ def _open_hdf5(path: Path, options: ShotOptions) -> Source:
         )
     record = Record.load(path)
     if record.kind == "frames":
-        return TransientSource(path.name, Frames.from_record(record))
+        return TransientSource(
+            path.name, Frames.from_record(record), method=_make_method(options.method)
+        )
     if record.kind == "volume":
         from apps.viewer.volume import VolumeSource
         from nlos import Volume
@@ -128,14 +142,22 @@ def _open_shots(title: str, shots: Sequence[Callable[[], Streak]], options: Shot
     first = shots[0]()
     camera = _find_camera(first, options)
     if len(shots) > 1:
-        return StoredShotSource(title, shots, camera)
+        return StoredShotSource(title, shots, camera, _make_method(options.method))
     measured = measure(first.counts, first.saturated, camera)
-    linear = LinearRecovery(camera, first.times - camera.time_zero)
-    return TransientSource(
-        title,
-        linear.frames(measured.values, 0.0, Gate(0, first.times.size)),
-        measured.values,
-    )
+    method = _make_method(options.method or FIRST_LOOK_METHOD)
+    recovery = ShotRecovery(camera, first.times - camera.time_zero, method)
+    frames = recovery.frames(measured.values, 0.0, Gate(0, first.times.size))
+    return TransientSource(title, frames, measured.values, method)
+
+
+def _make_method(name: str | None) -> Method | None:
+    """A method quick enough to look by; None where a source is to choose."""
+    if name is None:
+        return None
+    if name not in LOOK_METHODS:
+        raise InputError(f"unknown method '{name}'; choose one of {', '.join(LOOK_METHODS)}")
+    iterations = FIRST_LOOK_ITERATIONS if name in ("tv", "l1") else None
+    return cast(Method, make_method(name, iterations=iterations))
 
 
 def _open_instrument(address: str, options: ShotOptions) -> Source:
@@ -146,7 +168,8 @@ def _open_instrument(address: str, options: ShotOptions) -> Source:
     first = shots.peek()
     if first is None:
         raise InputError(f"{address}: the source ended before it gave anything")
-    return LiveShotSource(address, shots, _find_camera(first, options))
+    camera = _find_camera(first, options)
+    return LiveShotSource(address, shots, camera, _make_method(options.method))
 
 
 def _find_camera(shot: Streak, options: ShotOptions) -> Camera:

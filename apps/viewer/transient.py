@@ -9,16 +9,27 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.viewer.linear_recovery import (
+from apps.viewer.shot_recovery import (
     SHEAR_LIMITS,
-    LinearRecovery,
     Readings,
+    ShotRecovery,
     find_min_intensity,
+    list_recovery_notes,
     make_view,
 )
-from apps.viewer.source import Capabilities, Gate, Source, View, Waveform
-from tofclip.lidar import PointCloud, depth
+from apps.viewer.source import (
+    LINEAR_FRAMES_NOTE,
+    LINEAR_NOTE,
+    Capabilities,
+    Gate,
+    Source,
+    View,
+    Waveform,
+    list_camera_notes,
+)
+from tofclip.lidar import depth
 from tofclip.shots import Frames
+from tofclip.solvers import LinearInverse, Method
 from tofclip.units import SPEED_OF_LIGHT
 
 PLAY_TIME_S = 12.0
@@ -38,17 +49,31 @@ class TransientSource(Source):
     frames : Frames
     measurements : (columns, frames) array, optional
         Rectified measurements from which the frames were recovered.
+    method : Method, optional
+        Of a refocus; the linear inverse by default.
 
     Notes
     -----
     Memory: the frames, and on the first refocus their measurements (columns, frames).
     """
 
-    def __init__(self, title: str, frames: Frames, measurements: Readings | None = None) -> None:
+    def __init__(
+        self,
+        title: str,
+        frames: Frames,
+        measurements: Readings | None = None,
+        method: Method | None = None,
+    ) -> None:
         shears = SHEAR_LIMITS if frames.camera.views > 1 else None
-        super().__init__(title, frames.times.size / PLAY_TIME_S, Capabilities(frames.times, shears))
+        capabilities = Capabilities(frames.times, shears)
+        super().__init__(title, frames.times.size / PLAY_TIME_S, capabilities)
         self.frames = frames
-        self._linear = LinearRecovery(frames.camera, frames.times)
+        self._recovery = ShotRecovery(frames.camera, frames.times, method)
+        self.notes = list_camera_notes(frames.camera)
+        if measurements is not None:
+            self.notes = list_recovery_notes(self._recovery)
+        elif frames.figures.get("method") == LinearInverse.name:
+            self.notes = (LINEAR_FRAMES_NOTE, *self.notes)
         self._measured = measurements
 
     def __len__(self) -> int:
@@ -77,8 +102,13 @@ class TransientSource(Source):
         return {
             "streak": self._measurements.T,
             "intensity": light,
-            "depth": render_depth(self._full_view),
+            "depth": render_depth(self._full_view, self.frames.camera.image_shape),
         }
+
+    @property
+    def refocus_note(self) -> str:
+        """What is said while a refocus is shown."""
+        return LINEAR_NOTE if self._recovery.is_linear else ""
 
     def waveform(self, number: int, pixel: tuple[int, int]) -> Waveform:
         """Return the signal of a pixel; see `Source`.
@@ -112,7 +142,7 @@ class TransientSource(Source):
         -------
         View
         """
-        return self._linear.view(
+        return self._recovery.view(
             self._measurements, shear, gate, find_min_intensity(self._full_view)
         )
 
@@ -138,18 +168,22 @@ class TransientSource(Source):
         return measurements
 
 
-def render_depth(view: View) -> NDArray[np.float32]:
-    """Return the range of each pixel's most intense return, (rows, columns) in m; NaN where nothing
-    came back.
+def render_depth(view: View, shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Return the range of each pixel's most intense return, m; NaN where nothing came back.
+
+    Parameters
+    ----------
+    view : View
+    shape : (int, int)
+        Rows and columns of the camera's picture.
+
+    Returns
+    -------
+    (rows, columns) float32 array
     """
-    if view.pixels is None or len(view.cloud) == 0:
-        return np.full((1, 1), np.nan, np.float32)
-    return _scatter_depth(view.cloud, view.pixels)
-
-
-def _scatter_depth(cloud: PointCloud, pixels: NDArray[np.int32]) -> NDArray[np.float32]:
-    picture = np.full(tuple(pixels.max(axis=0) + 1), np.nan, np.float32)
-    upwards = np.argsort(cloud.intensity, kind="stable")  # the last one written wins
-    row, column = pixels[upwards].T
-    picture[row, column] = cloud.range[upwards]
+    picture = np.full(shape, np.nan, np.float32)
+    if view.pixels is not None:
+        upwards = np.argsort(view.cloud.intensity, kind="stable")  # the last one written wins
+        row, column = view.pixels[upwards].T
+        picture[row, column] = view.cloud.range[upwards]
     return picture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,14 @@ class Viewpoint:
     eye: FloatArray
     target: FloatArray
     field_of_view: float = float(FIELD_OF_VIEW_RAD)
+
+    def is_close_to(self, other: Viewpoint) -> bool:
+        """Whether another viewpoint shows the same, as far as one can see."""
+        return bool(
+            np.allclose(self.eye, other.eye, atol=1e-4)
+            and np.allclose(self.target, other.target, atol=1e-4)
+            and np.isclose(self.field_of_view, other.field_of_view, rtol=1e-3)
+        )
 
     @property
     def axes(self) -> FloatArray:
@@ -78,6 +87,10 @@ class Viewpoint:
         )
 
 
+SCALE_BAR_FRACTION = 0.4
+"""The scale bar is at most as long as this fraction of the box's width."""
+
+
 @dataclass(frozen=True)
 class Box:
     """The box around nearly all points of a cloud.
@@ -108,33 +121,56 @@ class Box:
         """The twelve edges, by their corners."""
         return [(n, n | bit) for bit in (1, 2, 4) for n in range(8) if not n & bit]
 
+    @property
+    def scale_bar(self) -> FloatArray:
+        """Ends of a bar of a round length across the floor, half way to the back, (2, 3) in m."""
+        width = float(self.high[0] - self.low[0])
+        length = round_length_down(SCALE_BAR_FRACTION * width) if width > 0 else 0.0
+        middle = (self.low + self.high) / 2
+        start = np.array([middle[0] - length / 2, self.high[1], middle[2]])
+        return np.stack([start, start + np.array([length, 0.0, 0.0])])
 
-def make_presets(xyz: NDArray[np.float32]) -> dict[str, Viewpoint]:
+
+def round_length_down(length: float) -> float:
+    """Return the largest of 1, 2 and 5 times a power of ten that is not above a positive length."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(nice * power for nice in (1, 2, 5) if nice * power <= length * (1 + 1e-9)))
+
+
+def make_presets(xyz: NDArray[np.float32], aspect: float = 1.5) -> dict[str, Viewpoint]:
     """Return places to look at a cloud from, by name.
 
     Parameters
     ----------
     xyz : (n, 3) array
         m; not empty.
+    aspect : float
+        Width of the picture over its height.
 
     Returns
     -------
     dict of str to Viewpoint
-        ``"front"``, ``"top"`` and ``"side"`` see the whole cloud; ``"camera"`` is where it was taken
-        from.
+        ``"start"`` is `place_viewpoint`'s; ``"front"``, ``"top"`` and ``"side"`` see the whole cloud;
+        ``"camera"`` is where it was taken from.
     """
     box = Box.around(xyz)
     middle = (box.low + box.high) / 2
     reach = float(np.linalg.norm(box.high - box.low)) / 2
-    away = VIEW_MARGIN * max(reach, 0.01) / np.sin(FIELD_OF_VIEW_RAD / 2)
+    # the narrower side of the picture has to hold the ball around the box
+    half_angle = np.arctan(np.tan(FIELD_OF_VIEW_RAD / 2) * min(1.0, aspect))
+    away = VIEW_MARGIN * max(reach, 0.01) / np.sin(half_angle)
     # straight down, no direction would be up on the page
     directions = {"front": (0.0, 0.0, -1.0), "top": (0.0, -1.0, -0.01), "side": (1.0, 0.0, 0.0)}
-    views = {
+    views = {"start": place_viewpoint(xyz, aspect)}
+    views |= {
         name: Viewpoint(middle + away * np.array(towards), middle)
         for name, towards in directions.items()
     }
     if np.linalg.norm(middle) > reach:  # the camera is outside of the cloud
-        views["camera"] = Viewpoint(np.zeros(3), middle)
+        camera = Viewpoint(np.zeros(3), middle)
+        views["camera"] = Viewpoint(
+            np.zeros(3), middle, min(_fit_field_of_view(camera, xyz, aspect), np.deg2rad(120.0))
+        )
     return views
 
 
@@ -169,6 +205,18 @@ def place_viewpoint(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
     slope = np.tan(FIELD_OF_VIEW_RAD / 2)
     away = half_depth + VIEW_MARGIN * max(half_height / slope, half_width / (slope * aspect), 0.05)
     return Viewpoint(middle + away * direction, middle)
+
+
+def move_camera(camera: Any, viewpoint: Viewpoint) -> None:
+    """Move a camera of the page, or the one that pages start with, to a viewpoint.
+
+    Parameters
+    ----------
+    camera : viser camera handle
+    viewpoint : Viewpoint
+    """
+    camera.position, camera.look_at = viewpoint.eye, viewpoint.target
+    camera.fov = max(viewpoint.field_of_view, float(np.deg2rad(5.0)))
 
 
 def _fit_field_of_view(viewpoint: Viewpoint, xyz: NDArray[np.float32], aspect: float) -> float:

@@ -38,20 +38,26 @@ class VolumeSource(Source):
     """
 
     def __init__(self, title: str, volume: Volume) -> None:
-        super().__init__(title, max(1.0, volume.grid.z.size / PLAY_TIME_S))
+        super().__init__(title, max(1.0, volume.grid.z.size / PLAY_TIME_S), frame_name="slice")
         can_have_surface = min(volume.grid.shape) > 1 and bool(volume.magnitude.any())
         names = (
-            (VOXEL_MODE, SURFACE_MODE, PROJECTION_MODE, SLICE_MODE)
+            (PROJECTION_MODE, VOXEL_MODE, SURFACE_MODE, SLICE_MODE)
             if can_have_surface
-            else (VOXEL_MODE, PROJECTION_MODE, SLICE_MODE)
+            else (PROJECTION_MODE, VOXEL_MODE, SLICE_MODE)
         )
-        self.display_modes = DisplayModes(names, VOXEL_MODE)
+        self.display_modes = DisplayModes(names, PROJECTION_MODE)
         self.volume = volume
         self._magnitude = volume.magnitude.astype(np.float32)
         self._views: dict[tuple[str, float, int], View] = {}
 
     def __len__(self) -> int:
         return int(self.volume.grid.z.size)
+
+    def describe_frame(self, number: int) -> str:
+        """Say where a slice lies, or that slices do not matter in this mode."""
+        if self.display_modes.current == SLICE_MODE:
+            return f"z {self.volume.grid.z[number]:.3f} m"
+        return f"{self.display_modes.current} of all {len(self)} slices"
 
     def view(self, number: int) -> View:
         chosen = self.display_modes.current

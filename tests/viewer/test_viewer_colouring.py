@@ -22,9 +22,11 @@ from apps.viewer.colouring import (
     load_palette,
     make_scale,
 )
+from apps.viewer.controls import mark_times
 from apps.viewer.filters import Filters
 from apps.viewer.picking import find_point_on_ray, make_pick, measure_distance
 from apps.viewer.source import make_empty_cloud
+from apps.viewer.viewpoint import SCALE_BAR_FRACTION, Box, round_length_down
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
 
@@ -140,8 +142,8 @@ def test_what_is_known_about_a_pick() -> None:
     first, second = make_pick(cloud, 0, (3, 4)), make_pick(cloud, 1)
     assert measure_distance(first, second) == pytest.approx(1.3)
     assert first.description.splitlines()[:2] == [
-        "x 0.3000 m, y 0.4000 m, z 1.2000 m",
-        "range 1.3000 m ± 2.00 mm",
+        "x 0.3000, y 0.4000, z 1.2000 m",
+        "range 1.3000 m ± 2 mm",
     ]
     assert first.description.endswith("pixel row 3, column 4")
     assert "pixel" not in second.description
@@ -166,8 +168,20 @@ def test_ticks_are_round_numbers_in_a_suitable_unit(
 
 
 def test_lengths_in_the_unit_that_a_person_would_use() -> None:
-    assert [format_length(one) for one in (0.00042, 0.0314, 1.853)] == [
-        "0.42 mm",
-        "31.4 mm",
-        "1.85 m",
-    ]
+    lengths = (3.86e-6, 0.00042, 0.0314, 1.853)
+    assert list(map(format_length, lengths)) == ["3.86 um", "0.42 mm", "31.4 mm", "1.85 m"]
+
+
+@pytest.mark.parametrize(("longest", "bar"), [(1.0, 1.0), (0.43, 0.2), (0.0199, 0.01), (7.0, 5.0)])
+def test_a_scale_bar_is_one_two_or_five(longest: float, bar: float) -> None:
+    assert round_length_down(longest) == pytest.approx(bar)
+    box = Box(np.zeros(3), np.array([longest / SCALE_BAR_FRACTION, 1.0, 2.0]))
+    ends = box.scale_bar
+    assert np.diff(ends, axis=0)[0] == pytest.approx([bar, 0, 0])
+    assert ends.mean(axis=0) == pytest.approx([longest / SCALE_BAR_FRACTION / 2, 1.0, 1.0])
+
+
+def test_a_time_line_has_round_instants_at_their_frames() -> None:
+    times = 10.02e-9 + 20e-12 * np.arange(96)
+    assert mark_times(times) == ((24, "10.5 ns"), (49, "11 ns"), (74, "11.5 ns"))
+    assert mark_times(times[:1]) == ((0, "10.02 ns"),)

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from viewer_scenes import frames, volume
+from viewer_scenes import PlaneSource, frames, volume
 
 from apps.viewer.page import Page
 from apps.viewer.session import GATE_AROUND_FRAME, Session
 from apps.viewer.transient import TransientSource
-from apps.viewer.volume import SURFACE_MODE, VolumeSource
+from apps.viewer.volume import SLICE_MODE, SURFACE_MODE, VolumeSource
 from tofclip.lidar import PointCloud
 
 playwright = pytest.importorskip(
@@ -31,6 +31,7 @@ FLAGS = (
     "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run "
     "--disable-background-networking --disable-component-update --disable-sync"
 )
+MOTION_S = 2.0  # .ci/nightly looks for ten
 PATIENCE_MS = 30_000  # a software renderer on a busy machine draws twice a second
 SCENE = "canvas[data-engine]"
 HARMLESS = ("THREE.Clock", "GPU stall", "GroupMarkerNotSet", "Automatic fallback to software WebGL")
@@ -53,7 +54,7 @@ class Seen:
         self.page, self.complaints = Page(session), []
         self._thread = threading.Thread(target=self.page.run, daemon=True)
         self._thread.start()
-        self.tab = browser.new_page(viewport={"width": 1100, "height": 640})
+        self.tab = browser.new_page(viewport={"width": 1024, "height": 700})
         self.tab.set_default_timeout(PATIENCE_MS)
         self.tab.on("console", self._listen)
         self.tab.on("pageerror", lambda fault: self.complaints.append(str(fault)))
@@ -125,6 +126,9 @@ def test_it_loads(seen: Seen) -> None:
     assert "frames <b>.h5" in seen.tab.locator("body").inner_text()  # no file name becomes HTML
     until(lambda: picture(seen).std() > 0.02, "the scene is drawn")
     assert seen.tab.get_by_text("range (m)").is_visible()
+    assert seen.tab.title() == "tofclip · frames <b>.h5"
+    assert "where you look from is your own" in seen.tab.locator("#shared").inner_text()
+    assert seen.tab.get_by_text("10.5 ns").is_visible()  # the time line
     instant = seen.page.session.source.capabilities.times[95]
     words = seen.tab.locator("#instant").inner_text()
     assert words == f"{1e9 * instant:.2f} ns, range {299792458 * instant / 2:.3f} m"
@@ -133,6 +137,54 @@ def test_it_loads(seen: Seen) -> None:
     until(lambda: bool(np.abs(picture(seen) - whole).max() > 0.2), "the box disappears")
     seen.row("box").locator("label, input").last.click(force=True)
     until(lambda: seen.tab.locator("img").count() >= 3, "streak, intensity and depth are shown")
+
+
+@pytest.mark.parametrize("size", [(1024, 700), (1280, 800), (1920, 1080)])
+def test_the_cloud_fits_between_the_panels(seen: Seen, size: tuple[int, int]) -> None:
+    """Every point lies in the free part of the window, and the cloud fills much of it."""
+    seen.tab.set_viewport_size({"width": size[0], "height": size[1]})
+    (client,) = seen.page.server.get_clients().values()
+
+    def framed() -> bool:
+        canvas = seen.tab.locator(SCENE).bounding_box()
+        fits = (client.camera.image_width, client.camera.image_height) == (
+            round(canvas["width"]),
+            round(canvas["height"]),
+        )
+        return fits and bool(
+            np.isclose(client.camera.fov, seen.page.viewpoint.field_of_view, rtol=1e-3)
+        )
+
+    until(framed, "the page has framed the cloud for this window")
+    canvas = seen.tab.locator(SCENE).bounding_box()
+    panel = seen.tab.locator("#label").bounding_box()
+    assert canvas["x"] >= 200  # right of the pictures
+    assert canvas["x"] + canvas["width"] <= panel["x"]  # left of the controls
+    shape = round(canvas["height"]), round(canvas["width"])
+    row, column, _ = seen.page.viewpoint.project(seen.page.session.latest.cloud.xyz, shape)
+    assert 0 < row.min() < row.max() < shape[0]
+    assert 0 < column.min() < column.max() < shape[1]
+    assert max(np.ptp(row) / shape[0], np.ptp(column) / shape[1]) > 0.6
+    seen.tab.set_viewport_size({"width": 1024, "height": 700})
+
+
+def test_no_control_moves_while_frames_pass(seen: Seen) -> None:
+    seen.press("|<")
+    seen.choose("speed", "1/2")
+    places = """Array.from(document.querySelectorAll("label, button, input"))
+        .filter(e => e.offsetParent && !e.closest("[class*=Slider]"))
+        .map(e => e.getBoundingClientRect()).map(r => [r.x, r.y, r.width, r.height])"""
+    seen.press("play")
+    until(lambda: seen.number("#frame-number") > 2, "the frame advances")
+    before, frames_seen = seen.tab.evaluate(places), set()
+    ends = time.monotonic() + MOTION_S
+    while time.monotonic() < ends:
+        assert seen.tab.evaluate(places) == before
+        frames_seen.add(seen.number("#frame-number"))
+    assert len(frames_seen) > 3
+    seen.press("pause")
+    seen.choose("speed", "1")
+    seen.press(">|")
 
 
 def test_play_pause_and_step(seen: Seen) -> None:
@@ -171,6 +223,28 @@ def test_filter(seen: Seen) -> None:
     until(lambda: seen.number("#points") == 85, "it is back")
 
 
+def test_the_clip_box_is_dragged_by_its_corners(seen: Seen) -> None:
+    seen.row("clip box").locator("label, input").last.click(force=True)
+    scene = seen.page.server.scene
+    until(lambda: scene.get_handle_by_name("/clip/low") is not None, "there are handles")
+    handle: Any = scene.get_handle_by_name("/clip/low")
+    canvas = seen.tab.locator(SCENE).bounding_box()
+    # along the arrow that points right, until a part of the nearer square is outside
+    arrow = handle.position + np.outer((0.5, 2.5), (handle.scale, 0, 0))
+    shape = round(canvas["height"]), round(canvas["width"])
+    row, column, _ = seen.page.viewpoint.project(arrow, shape)
+    seen.tab.mouse.move(canvas["x"] + column[0], canvas["y"] + row[0])
+    time.sleep(0.5)
+    seen.tab.mouse.down()
+    seen.tab.mouse.move(canvas["x"] + column[1], canvas["y"] + row[1], steps=8)
+    seen.tab.mouse.up()
+    until(lambda: seen.number("#points") < 85, "what lies outside of the box is left out")
+    seen.press("reset filters")
+    until(lambda: seen.number("#points") == 85, "it is back")
+    seen.row("clip box").locator("label, input").last.click(force=True)
+    until(lambda: scene.get_handle_by_name("/clip/low") is None, "the handles are gone")
+
+
 def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
     shown, before = seen.page.session.latest, picture(seen)
     assert shown is not None
@@ -185,6 +259,11 @@ def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
     until(lambda: "range 1.58" in words.inner_text(), "the point is described")
     assert "pixel row 1" in words.inner_text()
     until(lambda: seen.tab.locator(".uplot canvas").count() == 1, "its waveform is drawn")
+    plot = seen.tab.locator(".uplot canvas").bounding_box()
+    assert plot["y"] + plot["height"] <= 700  # without scrolling
+    drawn = imread(io.BytesIO(seen.tab.locator(".uplot canvas").screenshot()))
+    red = (drawn[..., 0] > 0.6) & (drawn[..., 1] < 0.5)
+    assert 0.002 < red.mean() < 0.2  # the return
     far = shown.cloud.xyz[shown.cloud.range > 1.63].mean(axis=0, keepdims=True)
     row, column, _ = seen.page.viewpoint.project(
         far, (round(canvas["height"]), round(canvas["width"]))
@@ -201,6 +280,7 @@ def test_refocus(seen: Seen) -> None:
     until(lambda: seen.number("#points") == 36, "the gate is shown")
     before = seen.page.session.latest
     seen.type("refocus", "1")
+    until(lambda: "quick look (linear)" in seen.tab.inner_text("body"), "it says how")
     until(
         lambda: seen.page.session.shear == 1.0 and seen.page.session.latest is not before,
         "it is recovered anew",
@@ -248,10 +328,25 @@ def test_nothing_was_complained_about(seen: Seen) -> None:
     assert seen.complaints == []
 
 
+def test_a_lost_connection_is_said_in_words(browser: Any) -> None:
+    seen = Seen(browser, Session(PlaneSource()))
+    words = seen.tab.locator(".tofclip-lost")
+    assert not words.is_visible()
+    seen.page.close()
+    until(words.is_visible, "the page says that nobody answers")
+    assert words.inner_text().startswith("Connection lost: tofclip view has ended")
+    seen.close()
+
+
 def test_a_volume_as_a_surface(browser: Any) -> None:
     seen = Seen(browser, Session(VolumeSource("ball", volume())))
     try:
-        until(lambda: seen.number("#points") > 10, "voxels are shown")
+        until(lambda: seen.number("#points") > 10, "the maximum projection is shown first")
+        words = "maximum projection of all 21 slices"
+        assert seen.tab.locator("#depth").inner_text() == words
+        seen.choose("show as", SLICE_MODE)
+        seen.type("slice", "10")
+        until(lambda: seen.tab.locator("#depth").inner_text() == "z 0.500 m", "its depth is said")
         seen.choose("show as", SURFACE_MODE)
         seen.type("threshold", "0.6")
         until(

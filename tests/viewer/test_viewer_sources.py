@@ -32,7 +32,7 @@ from viewer_scenes import (
 from apps.viewer.live import LiveShotSource
 from apps.viewer.session import GATE_ALL_TIMES, GATE_AROUND_FRAME, GATE_UP_TO_FRAME, Session
 from apps.viewer.side_pictures import project_front, render_pictures
-from apps.viewer.source import Gate, Source
+from apps.viewer.source import LINEAR_NOTE, NO_TIME_ZERO_NOTE, Gate, Source
 from apps.viewer.source_factory import ShotOptions, open_source
 from apps.viewer.volume import PROJECTION_MODE, SLICE_MODE, SURFACE_MODE
 from tofclip.camera import Rectifier
@@ -190,6 +190,36 @@ def test_a_single_shot_is_recovered_as_a_transient(folder: Path) -> None:
     for frame in (NEAR_FRAME, FAR_FRAME):
         close = np.abs(ranges - range_of(frame)) < 3e-3  # a bin
         assert close.sum() > 25
+
+
+def test_a_quick_look_is_called_one_and_another_method_can_be_asked_for(folder: Path) -> None:
+    """A single shot is recovered by iterations; what is linear says so, as does a missing time zero."""
+    shot, stack = str(folder / "shot.h5"), str(folder / "stack.h5")
+    with_camera = ShotOptions(camera=folder / "camera.h5")
+    assert open_source(shot).notes == ()
+    assert open_source(shot, ShotOptions(method="linear")).notes == (LINEAR_NOTE,)
+    assert open_source(stack, with_camera).notes == (LINEAR_NOTE,)
+    sharp = open_source(stack, replace(with_camera, method="l1"))
+    quick = open_source(stack, with_camera)
+    assert sharp.notes == ()
+    # nearly all light is inside the squares, where the linear inverse draws rays around them
+    inside = np.zeros((32, 32), bool)
+    inside[NEAR] = inside[FAR] = True
+    fractions = []
+    for source in (sharp, quick):
+        values = source.recovery.frames(source.measurements(0), 0.0, Gate(0, FRAMES)).values
+        light = np.maximum(values, 0).sum(axis=0)
+        fractions.append(light[inside].sum() / light.sum())
+    assert fractions[0] > 2 * fractions[1]  # 0.78 and 0.2: far from noise of a per cent
+    assert sharp.view(0).cloud.range.min() == pytest.approx(range_of(NEAR_FRAME), abs=3e-3)
+    no_zero = open_source(shot, ShotOptions(time_zero=0.0))
+    assert no_zero.notes == (NO_TIME_ZERO_NOTE,)
+    session = Session(open_source(str(folder / "frames.h5")))
+    assert session.notes == ()
+    session.shear = 0.5
+    assert session.notes == (LINEAR_NOTE,)
+    with pytest.raises(InputError, match="choose one of tv, l1, linear, adjoint"):
+        open_source(shot, ShotOptions(method="surfaces"))
 
 
 def test_a_stack_of_shots_is_recovered_shot_by_shot(folder: Path) -> None:

@@ -1,18 +1,20 @@
-"""Recovery while one looks: the linear inverse at any shear, each prepared once."""
+"""Recovery while one looks, at any shear: by the linear inverse, each prepared once, or by a method of
+iterations.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.viewer.source import FloatArray, Gate, View
+from apps.viewer.source import LINEAR_NOTE, FloatArray, Gate, View, list_camera_notes
 from tofclip.camera import Camera
 from tofclip.lidar import Detection, PointCloud, Returns, depth, point_cloud
 from tofclip.lidar.detection import SCENE_BRIGHTNESS_QUANTILE
 from tofclip.lidar.processing import select_points
 from tofclip.sequences.cache import get_cached_camera, prepare_inverse
 from tofclip.shots import Frames
-from tofclip.solvers import LinearInverse
+from tofclip.solvers import LinearInverse, Method
 from tofclip.solvers.direct import PreparedInverse
 
 Readings = NDArray[np.float32]
@@ -24,7 +26,7 @@ MIN_FRAMES = 3
 """Without a neighbour on either side no return is located."""
 
 
-class LinearRecovery:
+class ShotRecovery:
     """Turns the measurements of one camera into frames, at any shear.
 
     Parameters
@@ -32,16 +34,25 @@ class LinearRecovery:
     camera : Camera
     times : (frames,) array
         Time of flight of each column of measurements, s.
+    method : Method, optional
+        The linear inverse by default.
 
     Notes
     -----
-    Memory: one operator and one matrix (columns, columns) for each of the last 16 shears, which
-    every recovery of this process shares (`tofclip.sequences.cache`). Safe to share by threads.
+    Memory of the linear inverse: one operator and one matrix (columns, columns) for each of the last
+    16 shears, which every recovery of this process shares (`tofclip.sequences.cache`). Safe to share
+    by threads.
     """
 
-    def __init__(self, camera: Camera, times: FloatArray) -> None:
+    def __init__(self, camera: Camera, times: FloatArray, method: Method | None = None) -> None:
         self.camera, self.times = camera, times
+        self.method: Method = LinearInverse() if method is None else method
         self._cached_camera = get_cached_camera(camera)
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether frames are a quick look, by the linear inverse."""
+        return isinstance(self.method, LinearInverse)
 
     def frames(self, measurements: Readings, shear: float, gate: Gate) -> Frames:
         """Recover the frames of a gate.
@@ -59,7 +70,13 @@ class LinearRecovery:
         Frames
         """
         part = np.ascontiguousarray(measurements[:, gate.frames])
-        found = self._prepare_inverse(shear).recover(part).frames
+        if self.is_linear:
+            found = self._prepare_inverse(shear).recover(part).frames
+        elif part.max(initial=0.0) > 0:
+            valid = np.broadcast_to(~self.camera.dead_columns[:, np.newaxis], part.shape)
+            found = self.method.recover(self.camera.operator(shear), part, valid).frames
+        else:  # a dark gate has no brightest frame to set a prior's weight by
+            found = np.zeros((part.shape[1], *self.camera.image_shape), np.float32)
         times = self.times[gate.frames]
         return Frames(found, times, self.camera, shears=np.full(times.size, shear))
 
@@ -91,6 +108,12 @@ class LinearRecovery:
         # Rounded, because sliders give numbers that differ by rounding only.
         operator = self._cached_camera.operator(round(shear, 6))
         return prepare_inverse(LinearInverse(), operator, ~self.camera.dead_columns)
+
+
+def list_recovery_notes(recovery: ShotRecovery) -> tuple[str, ...]:
+    """Return what has to be said about clouds that were recovered while one looks."""
+    quick = (LINEAR_NOTE,) if recovery.is_linear else ()
+    return quick + list_camera_notes(recovery.camera)
 
 
 def make_view(returns: Returns, cloud: PointCloud | None = None) -> View:
