@@ -112,3 +112,18 @@ def test_what_is_optional_may_be_absent():
 def test_what_is_declared_must_be_there(change, message):
     with pytest.raises(FileFormatError, match=message):
         Whole.from_record(replace(WHOLE.to_record(), **change))
+
+
+def test_an_array_without_elements_can_be_left_out():
+    @dataclass(frozen=True)
+    class Board(Storable):
+        RECORD_KIND = "board"
+
+        hot: Any = field(
+            default=(),
+            metadata=stored_array("px", "hot", dtype=np.int64, skip_empty=True, optional=True),
+        )
+
+    assert not Board().to_record().fields
+    assert Board.from_record(Board().to_record()).hot == ()
+    assert Board.from_record(Board([3]).to_record()).hot.tolist() == [3]

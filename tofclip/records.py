@@ -87,6 +87,7 @@ def stored_array(
     dimensions: int | None = None,
     name_axes: Callable[[int], tuple[str, ...]] | None = None,
     optional: bool = False,
+    skip_empty: bool = False,
 ) -> Metadata:
     """Declare an array.
 
@@ -107,6 +108,8 @@ def stored_array(
         Where the number of axes is free: from that number to their names.
     optional : bool
         Whether None is a value, and whether files without the array get the field's default.
+    skip_empty : bool
+        Whether an array without elements is left out of the file.
 
     Returns
     -------
@@ -114,7 +117,9 @@ def stored_array(
         Metadata for `dataclasses.field`.
     """
     kinds = dtype if isinstance(dtype, tuple) else (dtype,)
-    return {_KEY: _StoredArray(units, axes, kinds, name, dimensions, name_axes, optional)}
+    return {
+        _KEY: _StoredArray(units, axes, kinds, name, dimensions, name_axes, optional, skip_empty)
+    }
 
 
 def stored_value(
@@ -265,6 +270,7 @@ class _StoredArray:
     dimensions: int | None
     name_axes: Callable[[int], tuple[str, ...]] | None
     optional: bool
+    skip_empty: bool
 
     def write(self, own_name: str, value: Any, contents: _Contents) -> None:
         """Store an array in its declared dtype, with its unit and axes; booleans as bytes."""
@@ -274,6 +280,8 @@ class _StoredArray:
         values = to_numpy(value) if len(self.dtypes) > 1 else np.asarray(to_numpy(value), dtype)
         if dtype.kind == "b":
             values = values.astype(np.uint8)
+        if self.skip_empty and values.size == 0:
+            return
         axes = self.axes if self.name_axes is None else self.name_axes(values.ndim)
         contents.fields[self.name or own_name] = Field(values, self.units, axes)
 

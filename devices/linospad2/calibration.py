@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from devices.codec import Records
 from devices.linospad2.codec import PIXELS
 from tofclip.errors import FileFormatError, InputError, ShapeError
-from tofclip.storage import Field, Record, format_error_line, translate_read_errors
+from tofclip.records import Storable, stored_array
+from tofclip.storage import format_error_line, translate_read_errors
 
 CODES_PER_PERIOD = 140
 """Codes in one period of the board's clock."""
@@ -28,7 +29,7 @@ _ROUNDING_S = 1e-6 * CLOCK_PERIOD_S
 
 
 @dataclass(frozen=True)
-class BoardCalibration:
+class BoardCalibration(Storable):
     """Tables that turn a pixel's codes into seconds.
 
     Parameters
@@ -48,9 +49,14 @@ class BoardCalibration:
         is no such pixel.
     """
 
-    code_ends: NDArray[np.float64]
-    offsets: NDArray[np.float64]
-    hot_pixels: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    RECORD_KIND = "linospad2_calibration"
+
+    code_ends: NDArray[np.float64] = field(metadata=stored_array("s", "pixel", "code"))
+    offsets: NDArray[np.float64] = field(metadata=stored_array("s", "pixel"))
+    hot_pixels: NDArray[np.int64] = field(
+        default_factory=lambda: np.empty(0, np.int64),
+        metadata=stored_array("px", "hot", dtype=np.int64, optional=True, skip_empty=True),
+    )
 
     def __post_init__(self) -> None:
         for name, shape in (("code_ends", (PIXELS, CODES_PER_PERIOD)), ("offsets", (PIXELS,))):
@@ -95,27 +101,6 @@ class BoardCalibration:
         found += self.code_ends[records["pixel"], code]
         found += self.offsets[records["pixel"]]
         return found
-
-    def to_record(self) -> Record:
-        """Return everything that has to be stored."""
-        fields = {
-            "code_ends": Field(self.code_ends, "s", ("pixel", "code")),
-            "offsets": Field(self.offsets, "s", ("pixel",)),
-        }
-        if self.hot_pixels.size:
-            fields["hot_pixels"] = Field(self.hot_pixels, "px", ("hot",))
-        return Record("linospad2_calibration", fields)
-
-    @classmethod
-    def from_record(cls, record: Record) -> BoardCalibration:
-        """Rebuild the tables from what was stored."""
-        ends, offsets = (
-            record.array("code_ends", np.float64, 2, "s"),
-            record.array("offsets", np.float64, 1, "s"),
-        )
-        if "hot_pixels" not in record.fields:
-            return cls(ends, offsets)
-        return cls(ends, offsets, record.array("hot_pixels", np.int64, 1, "px"))
 
 
 def load_calibration(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from tofclip.io.archive import Archive
 from tofclip.io.light_field_exr import read_exr, write_exr
 from tofclip.io.light_field_folder import read_folder
 from tofclip.light_field import LightField
-from tofclip.storage import Field, Record, collect_provenance
+from tofclip.storage import collect_provenance
 
 
 def read_light_field(path: str | Path) -> LightField:
@@ -81,23 +82,14 @@ def _read_archive(path: Path) -> LightField:
     return LightField(scaled.reshape(-1, *pictures.shape[2:]), grid.reshape(-1, 2))
 
 
-def _read_record(path: Path) -> LightField:
-    record = Record.load(path, "light_field")
-    return LightField(record.array("pictures", np.float32, 3), record.array("views", np.float64, 2))
-
-
 def _write_record(light_field: LightField, path: Path) -> None:
-    fields = {
-        "pictures": Field(light_field.pictures.astype(np.float32), "", ("view", "y", "x")),
-        "views": Field(light_field.views, "", ("view", "vu")),
-    }
-    Record("light_field", fields, provenance=collect_provenance({})).save(path)
+    replace(light_field.to_record(), provenance=collect_provenance({})).save(path)
 
 
 _READERS: dict[str, Callable[[Path], LightField]] = {
     ".npz": _read_archive,
-    ".h5": _read_record,
-    ".hdf5": _read_record,
+    ".h5": LightField.load,
+    ".hdf5": LightField.load,
     ".exr": read_exr,
 }
 _WRITERS: dict[str, Callable[[LightField, Path], None]] = {

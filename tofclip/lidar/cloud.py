@@ -15,8 +15,8 @@ from tofclip.lidar import export
 from tofclip.lidar.column import Column
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.notebook import render_html
+from tofclip.records import Storable, stored_array, stored_provenance
 from tofclip.shots import Returns
-from tofclip.storage import Field, Record
 
 COLUMN_UNITS = {
     "x": "m",
@@ -31,8 +31,13 @@ COLUMN_UNITS = {
 """The columns of a point cloud, in the order in which files hold them."""
 
 
+def _column(name: str, dtype: type = np.float32) -> dict[str, Any]:
+    """Declare a column with one value for each point."""
+    return stored_array(COLUMN_UNITS[name], "point", dtype=dtype)
+
+
 @dataclass(frozen=True)
-class PointCloud:
+class PointCloud(Storable):
     """Points in the reference view's frame: x right, y down, z forward, origin at the reference
     lenslet.
 
@@ -59,13 +64,15 @@ class PointCloud:
         Columns of different length, or positions that are not finite.
     """
 
-    xyz: NDArray[np.float32]
-    intensity: NDArray[np.float32]
-    confidence: NDArray[np.float32]
-    range: NDArray[np.float32]
-    return_number: NDArray[np.uint8]
-    time: NDArray[np.float32]
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    RECORD_KIND = "cloud"
+
+    xyz: NDArray[np.float32] = field(metadata=stored_array("m", "point", "xyz", dtype=np.float32))
+    intensity: NDArray[np.float32] = field(metadata=_column("intensity"))
+    confidence: NDArray[np.float32] = field(metadata=_column("confidence"))
+    range: NDArray[np.float32] = field(metadata=_column("range"))
+    return_number: NDArray[np.uint8] = field(metadata=_column("return_number", np.uint8))
+    time: NDArray[np.float32] = field(metadata=_column("time"))
+    provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
 
     def __post_init__(self) -> None:
         xyz = np.ascontiguousarray(self.xyz, dtype=np.float32)
@@ -125,7 +132,7 @@ class PointCloud:
             The file could not be written; what was there before is left as it was.
         """
         if Path(path).suffix.lower() == ".h5":
-            self.to_record().save(path)
+            super().save(path)
         else:
             export.write_table(path, self._columns())
 
@@ -140,7 +147,7 @@ class PointCloud:
             a column.
         """
         if Path(path).suffix.lower() == ".h5":
-            return cls.from_record(Record.load(path, "cloud"))
+            return super().load(path)
         values = export.read_table(path)
         missing = [name for name in COLUMN_UNITS if name not in values]
         if missing:
@@ -152,28 +159,6 @@ class PointCloud:
             name: values[name] for name in COLUMN_UNITS if name not in "xyz"
         }
         return cls(xyz=positions, **properties)
-
-    def to_record(self) -> Record:
-        """Return everything that has to be stored."""
-        fields = {"xyz": Field(self.xyz, "m", ("point", "xyz"))}
-        for name in COLUMN_UNITS:
-            if name not in "xyz":
-                fields[name] = Field(getattr(self, name), COLUMN_UNITS[name], ("point",))
-        return Record("cloud", fields, provenance=self.provenance)
-
-    @classmethod
-    def from_record(cls, record: Record) -> PointCloud:
-        """Rebuild a point cloud from what was stored."""
-        columns: dict[str, Any] = {
-            name: record.array(
-                name, np.uint8 if name == "return_number" else np.float32, 1, COLUMN_UNITS[name]
-            )
-            for name in COLUMN_UNITS
-            if name not in "xyz"
-        }
-        return cls(
-            xyz=record.array("xyz", np.float32, 2, "m"), provenance=record.provenance, **columns
-        )
 
     def _columns(self) -> list[Column]:
         values = dict(zip("xyz", self.xyz.T, strict=True))

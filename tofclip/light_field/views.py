@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearShear
+from tofclip.records import Storable, stored_array
 
 
 @dataclass(frozen=True)
-class LightField:
+class LightField(Storable):
     """The sub-aperture pictures of a scene.
 
     Parameters
@@ -28,8 +29,10 @@ class LightField:
         Views and pictures do not match, or the pictures hold NaN or are constant.
     """
 
-    pictures: NDArray[Any]
-    views: NDArray[np.float64]
+    RECORD_KIND = "light_field"
+
+    pictures: NDArray[Any] = field(metadata=stored_array("", "view", "y", "x", dtype=np.float32))
+    views: NDArray[np.float64] = field(metadata=stored_array("", "view", "vu"))
 
     def __post_init__(self) -> None:
         if self.pictures.ndim != 3:

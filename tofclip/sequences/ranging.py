@@ -5,7 +5,7 @@ kept in a file.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from tofclip.camera import Camera
 from tofclip.errors import InputError
+from tofclip.records import Storable, stored_array, stored_child, stored_value
 from tofclip.recovery import SharpestFocus, open_shot, parse_focus
 from tofclip.sequences.inputs import Shot
 from tofclip.sequences.jobs import Job, lock_output_folder
@@ -25,9 +26,34 @@ from tofclip.sequences.ranger import (
     make_average_cloud,
 )
 from tofclip.shots import Streak
-from tofclip.storage import Field, Record, compute_sha256
+from tofclip.storage import compute_sha256
 
 PLAN_NAME = "plan.h5"
+
+
+@dataclass(frozen=True)
+class RangingPlan(Storable):
+    """What all shots of a sequence share.
+
+    Parameters
+    ----------
+    camera : Camera
+        With its sweep.
+    row_times : (rows,) array
+        Instant of each row, s.
+    light : (rows,) array
+        Light of the first shot over time, with which the others are compared; empty where they are
+        taken as they come.
+    focus : str
+        As `tofclip.recovery.parse_focus` reads it.
+    """
+
+    RECORD_KIND = "ranging"
+
+    camera: Camera = field(metadata=stored_child(Camera.from_record, "camera"))
+    row_times: NDArray[np.float64] = field(metadata=stored_array("s", "time"))
+    light: NDArray[np.float64] = field(metadata=stored_array("count", "time"))
+    focus: str = field(metadata=stored_value(dtype=str))
 
 
 @dataclass(frozen=True)
@@ -99,18 +125,12 @@ class RangingSettings:
             )
         return jobs
 
-    def plan(self, first: Streak) -> Record:
-        """Return what all shots share: camera, time axis, focus, and the first shot's light over
-        time.
-        """
-        known = open_shot(first, self.camera, self.time_zero).fit_camera().camera
-        parse_focus(self.focus).check_camera(known)
-        light = compute_light_curve(first, known) if self.steady else np.empty(0)
-        fields = {
-            "row_times": Field(first.times, "s", ("time",)),
-            "light": Field(light, "count", ("time",)),
-        }
-        return Record("ranging", fields, {"focus": self.focus}, {"camera": known.to_record()})
+    def plan(self, first: Streak) -> RangingPlan:
+        """Return what all shots share with the first one."""
+        camera = open_shot(first, self.camera, self.time_zero).fit_camera().camera
+        parse_focus(self.focus).check_camera(camera)
+        light = compute_light_curve(first, camera) if self.steady else np.empty(0)
+        return RangingPlan(camera, first.times, light, self.focus)
 
 
 def write_average_cloud(
@@ -143,15 +163,6 @@ def write_average_cloud(
 
 @lru_cache(maxsize=2)
 def _load_plan(plan: Path, version: str) -> tuple[RangingPipeline, JitterEstimator | None]:
-    record = Record.load(plan, "ranging")
-    camera = Camera.from_record(record.child("camera", "camera"))
-    times, light = (
-        _read_field(record, name, units) for name, units in (("row_times", "s"), ("light", "count"))
-    )
-    pipeline = RangingPipeline(camera, times, focus=parse_focus(str(record.attribute("focus"))))
-    return pipeline, JitterEstimator(light) if light.size else None
-
-
-def _read_field(record: Record, name: str, units: str) -> NDArray[np.float64]:
-    values: NDArray[np.float64] = record.array(name, np.float64, 1, units)
-    return values
+    shared = RangingPlan.load(plan)
+    pipeline = RangingPipeline(shared.camera, shared.row_times, focus=parse_focus(shared.focus))
+    return pipeline, JitterEstimator(shared.light) if shared.light.size else None
