@@ -100,14 +100,17 @@ def test_info_says_what_a_file_of_photons_holds(run: Run, shot) -> None:
 
 def test_a_gated_arrays_address_becomes_ranges(tmp_path: Path) -> None:
     """One command from an instrument to ranges on its own time axis."""
-    address = "sim+spad512://?seed=1&mode=gated&binning=16&gate_steps=30&gate_step_ps=700"
+    address = (
+        "sim+spad512://?seed=1&mode=gated&binning=16&gate_steps=24&gate_step_ps=640"
+        "&gate_offset_ps=7000&gate_width_ns=3"
+    )
     out = tmp_path / "range.npz"
-    words = ["lidar", "photons", address, "--single-pixel", "--out", str(out)]
+    words = ["lidar", "photons", address, "--out", str(out)]
     assert main(words) == 0
     found = np.load(out)["range_m"]
     delays = render_array_delays().reshape(32, 16, 32, 16)
     even = delays.max(axis=(1, 3)) - delays.min(axis=(1, 3)) < 1e-11
     error = found[even] - delays.mean(axis=(1, 3))[even] * SPEED_OF_LIGHT / 2
-    # Steps are 105 mm; where none of them falls on an edge, the edge may be anywhere between two.
-    assert np.median(np.abs(error)) < 0.03
+    # Steps are 96 mm; where none of them falls on an edge, the edge may be anywhere between two.
+    assert np.median(np.abs(error)) < 0.048
     assert main([*words, "--bin-width-ps", "9"]) == 2
