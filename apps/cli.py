@@ -54,6 +54,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
   lidar parallax     a shot to how the views move with range, for recover --focus depth-locked
   lidar scene        recovered frames to a list of objects and a picture
   lidar sequence     a folder or stack of shots to a sequence of clouds
+  lidar bag          a sequence of clouds to a ROS 2 bag or an MCAP file
   nlos reconstruct   recovered frames of a wall, or a folder of them, to what is hidden around the corner
   nlos film          the flash passing through the hidden scene, as a film
   nlos compare       several methods on one capture, side by side, with time and memory

@@ -25,7 +25,7 @@ HOMES = {
 package.
 """
 
-CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz")
+CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".e57")
 
 
 def load(path: str | Path) -> Any:

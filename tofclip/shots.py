@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,9 @@ from tofclip.storage import (
 from tofclip.units import SPEED_OF_LIGHT
 
 __all__ = ["Frames", "Streak"]
+
+RETURN_CHOICES = ("first", "strongest", "last", "all")
+"""Which return of a pixel counts."""
 
 MAX_BIN_WIDTH_S = 1e-3
 """s; the slowest sweeps of streak cameras last milliseconds in all."""
@@ -353,6 +356,41 @@ class Returns(Storable):
         rows, columns = self.camera.displacement_per_shear
         known = self.camera.lenslet_pitch > 0
         return self.y - known * rows * missing, self.x - known * columns * missing
+
+    def __getitem__(self, chosen: NDArray[Any]) -> Returns:
+        """Return some of the returns, by a mask or by numbers."""
+        columns = {
+            one.name: getattr(self, one.name)[chosen]
+            for one in fields(self)
+            if isinstance(getattr(self, one.name), np.ndarray)
+        }
+        return replace(self, **columns)
+
+    def select(self, which: str) -> Returns:
+        """Return one return of each pixel, or all of them.
+
+        Parameters
+        ----------
+        which : str
+            ``"first"`` is the nearest of a pixel, ``"last"`` the furthest, ``"strongest"`` the one
+            of the highest intensity; ``"all"`` are all.
+
+        Raises
+        ------
+        InputError
+            There is no such choice.
+        """
+        if which not in RETURN_CHOICES:
+            raise InputError(
+                f"no return is called '{which}'; choose one of {', '.join(RETURN_CHOICES)}"
+            )
+        if which == "all":
+            return self
+        rank = {"first": self.range, "last": -self.range, "strongest": -self.intensity}[which]
+        pixel = self.y.astype(np.int64) * self.camera.image_shape[1] + self.x
+        order = np.lexsort((rank, pixel))
+        first_of_pixel = np.flatnonzero(np.diff(pixel[order], prepend=-1))
+        return self[np.sort(order[first_of_pixel])]
 
     def image(self, name: str) -> NDArray[np.float32]:
         """Picture (y, x) of one property of each pixel's most intense return; NaN where nothing

@@ -13,6 +13,7 @@ from apps.options import ClusterOption, DeviceOption, JsonOption
 from apps.report import report
 from apps.sequences import report_summary, resolve_device, run_with_progress
 from tofclip.errors import InputError
+from tofclip.lidar.organised import ORGANISED_SUFFIXES
 from tofclip.sequences import CloudSettings, is_sequence, list_files
 from tofclip.sequences.clouds import save_cloud
 from tofclip.shots import Frames
@@ -21,7 +22,7 @@ from tofclip.units import MILLIMETRE
 if TYPE_CHECKING:
     from tofclip.lidar import PointCloud, Returns
 
-CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".h5")
+CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".e57", ".h5")
 DEPTH_SUFFIX = ".exr"
 
 
@@ -37,12 +38,24 @@ def cloud(
         Path,
         typer.Option(
             metavar="FILE",
-            help="Ends in .ply, .pcd, .csv, .npz, .las, .laz, .h5, or .exr for a depth picture; of a sequence: a "
+            help="Ends in .ply, .pcd, .csv, .npz, .las, .laz, .e57, .h5, or .exr for a depth picture; of a sequence: a "
             "folder.",
         ),
     ],
     drop_outliers: Annotated[
-        bool, typer.Option("--drop-outliers", help="Leave out points far from their neighbours.")
+        bool, typer.Option("--drop-outliers", help="Leave out points further from their neighbours than these are.")
+    ] = False,
+    returns: Annotated[
+        str,
+        typer.Option(metavar="WHICH", help="Of each pixel: first, strongest, last or all."),
+    ] = "all",
+    organised: Annotated[
+        bool,
+        typer.Option(
+            "--organised",
+            help="A point for every pixel, row by row, NaN where nothing came back (.pcd, .ply, .npz, .csv); of a "
+            "pixel's returns the strongest, unless --returns says which.",
+        ),
     ] = False,
     voxel_mm: Annotated[
         float | None,
@@ -64,10 +77,17 @@ def cloud(
 
     Example: tofclip cloud frames.h5 --out scene.ply
 
+    Example: tofclip cloud frames.h5 --out scene.pcd --returns first --organised
+
     Example: tofclip cloud 'frames/*.h5' --out clouds/ --cluster local
     """
     clouds = CloudSettings(
-        drop_outliers, None if voxel_mm is None else voxel_mm * MILLIMETRE, device
+        drop_outliers,
+        None if voxel_mm is None else voxel_mm * MILLIMETRE,
+        device,
+        # A pixel has one place in an organised cloud.
+        "strongest" if organised and returns == "all" else returns,
+        organised,
     )
     used = resolve_device(device, cluster)
     if is_sequence(frames):
@@ -106,12 +126,13 @@ def _convert_single(
     clouds: CloudSettings, frames: Path, made: tuple[Path, str], as_json: bool
 ) -> None:
     out, _ = made
-    require_writable(out, *CLOUD_SUFFIXES, DEPTH_SUFFIX, inputs=(frames,))
+    suffixes = ORGANISED_SUFFIXES if clouds.organised else (*CLOUD_SUFFIXES, DEPTH_SUFFIX)
+    require_writable(out, *suffixes, inputs=(frames,))
     recovered = Frames.load(frames)
     # The cloud carries the history of its frames, and so that of the shot.
     past = build_provenance({"verb": "cloud"}, frames, earlier=recovered.provenance)
     points, returns = clouds.make_cloud(replace(recovered, provenance=past), str(frames))
-    save_cloud(points, returns, out)
+    save_cloud(points, returns, out, clouds.organised)
     _report_cloud(points, returns, as_json, made)
 
 

@@ -17,6 +17,7 @@ from apps.options import ClusterOption, JsonOption, TimeZeroOption
 from apps.progress import show_progress
 from apps.report import report
 from apps.sequences import report_summary, run_with_progress
+from apps.verbs.bag import bag
 from apps.verbs.cloud import require_format
 from apps.verbs.photons import photons
 from tofclip.errors import InputError
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 app.command()(photons)
+app.command()(bag)
 
 
 @app.callback(invoke_without_command=True)

@@ -16,7 +16,7 @@ from tofclip.lidar import PointCloud
 from tofclip.lidar.export import read_table
 from tofclip.units import SPEED_OF_LIGHT
 
-CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz")
+CLOUD_SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".las", ".laz", ".e57")
 CLOUD_RATE_HZ = 10.0
 MAX_CACHED_CLOUDS = 32
 
@@ -104,7 +104,8 @@ def make_cloud(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) 
     nothing = np.zeros(len(xyz), np.float32)
     columns: dict[str, Any] = {
         "intensity": known.get("intensity", known.get("brightness", nothing)),
-        "confidence": known.get("confidence", nothing),
+        # Files of earlier versions call it confidence.
+        "range_sigma": known.get("range_sigma", known.get("confidence", nothing)),
         "range": known.get("range", distance),
         "return_number": known.get("return_number", np.ones(len(xyz), np.uint8)),
         # Light travels the range twice.

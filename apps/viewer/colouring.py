@@ -58,7 +58,7 @@ QUANTITIES: Mapping[str, Quantity] = {
     "range": Quantity("m", lambda cloud: cloud.range),
     "height": Quantity("m", lambda cloud: -cloud.xyz[:, 1]),
     "intensity": Quantity("counts", lambda cloud: cloud.intensity),
-    "standard deviation": Quantity("m", lambda cloud: cloud.confidence),
+    "standard deviation": Quantity("m", lambda cloud: cloud.range_sigma),
     "return number": Quantity("", lambda cloud: cloud.return_number),
     "time": Quantity("ns", lambda cloud: cloud.time / np.float32(NANOSECOND)),
 }

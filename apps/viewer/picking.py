@@ -130,7 +130,7 @@ def make_pick(
     return Pick(
         (x, y, z),
         float(cloud.range[number]),
-        float(cloud.confidence[number]),
+        float(cloud.range_sigma[number]),
         float(cloud.intensity[number]),
         int(cloud.return_number[number]),
         float(cloud.time[number]),

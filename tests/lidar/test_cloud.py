@@ -18,7 +18,7 @@ from tofclip.lidar import PointCloud, Returns, compute_ray_directions, export, p
 from tofclip.units import SPEED_OF_LIGHT
 
 SUFFIXES = (".ply", ".pcd", ".csv", ".npz", ".h5")
-PROPERTIES = ("intensity", "confidence", "range", "return_number", "time")
+PROPERTIES = ("intensity", "range_sigma", "range", "return_number", "time")
 
 
 def camera(rows: int = 128, columns: int = 96, focal_length_px: float = 560.0) -> Camera:
@@ -106,7 +106,7 @@ def test_a_cloud_keeps_what_was_known_of_its_returns():
     np.testing.assert_allclose(cloud.range, [1.0, 2.0])
     np.testing.assert_allclose(np.linalg.norm(cloud.xyz, axis=1), [1.0, 2.0], rtol=1e-6)
     np.testing.assert_allclose(cloud.time, [2 / SPEED_OF_LIGHT, 4 / SPEED_OF_LIGHT], rtol=1e-6)
-    assert cloud.confidence.tolist() == pytest.approx([1e-3, 1e-3])
+    assert cloud.range_sigma.tolist() == pytest.approx([1e-3, 1e-3])
     assert cloud.return_number.tolist() == [1, 1]
     assert cloud.provenance == {"origin": "a test"}
 
@@ -133,7 +133,7 @@ def test_open3d_reads_the_same_points(open3d, tmp_path, suffix):
     seen = open3d.t.io.read_point_cloud(str(tmp_path / f"scene{suffix}"))
     np.testing.assert_array_equal(seen.point.positions.numpy(), cloud.xyz)
     np.testing.assert_array_equal(seen.point["intensity"].numpy().ravel(), cloud.intensity)
-    np.testing.assert_array_equal(seen.point["confidence"].numpy().ravel(), cloud.confidence)
+    np.testing.assert_array_equal(seen.point["range_sigma"].numpy().ravel(), cloud.range_sigma)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd"])
@@ -153,10 +153,10 @@ def test_files_say_their_units(tmp_path):
             .read_bytes()
             .split(b"0 0 0 1" if suffix == ".pcd" else b"element")[0]
         )
-        assert b"units: x m, y m, z m, intensity count, confidence m, range m, time s\n" in header
+        assert b"units: x m, y m, z m, intensity count, range_sigma m, range m, time s\n" in header
     cloud.save(tmp_path / "scene.csv")
     assert (tmp_path / "scene.csv").read_text().splitlines()[0] == (
-        "x_m,y_m,z_m,intensity_count,confidence_m,range_m,return_number,time_s"
+        "x_m,y_m,z_m,intensity_count,range_sigma_m,range_m,return_number,time_s"
     )
     cloud.save(tmp_path / "scene.npz")
     with np.load(tmp_path / "scene.npz") as arrays:
@@ -194,7 +194,7 @@ def test_saving_is_all_or_nothing(tmp_path, monkeypatch):
 def test_unknown_formats_and_places_are_refused(tmp_path):
     cloud = random_cloud(2, 0)
     with pytest.raises(
-        InputError, match=r"'\.xyz'; use one of \.ply, \.pcd, \.csv, \.npz, \.las, \.laz, \.h5"
+        InputError, match=r"'\.xyz'; use one of \.ply, \.pcd, \.csv, \.npz, \.las, \.laz, \.e57, \.h5"
     ):
         cloud.save(tmp_path / "scene.xyz")
     with pytest.raises(InputError, match="use one of"):

@@ -94,6 +94,22 @@ def test_strays_are_left_out_and_columns_stay_with_their_points():
     assert len(remove_outliers(select_points(cloud, np.arange(5)))) == 5
 
 
+def test_a_distant_surface_is_as_good_as_a_near_one_and_strays_are_left_out():
+    """The same grid of pixels sees a wall at 1 m and one at 8 m, whose points lie 8 times apart."""
+    random = np.random.default_rng(3)
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(40) - 20, np.arange(30) - 15))
+    depth = np.where(x < 6, 1.0, 8.0) + random.normal(0, 2e-3, x.size)
+    walls = np.stack([x * depth / 200, y * depth / 200, depth], axis=1)
+    height = random.uniform(-0.5, 0.5, 25)
+    strays = np.stack([np.linspace(-0.5, 0.5, 25), height, random.uniform(2, 6, 25)], axis=1)
+    kept = remove_outliers(cloud_of(np.concatenate([walls, strays])))
+    near = kept.xyz[:, 2] < 1.5
+    far = kept.xyz[:, 2] > 7.5
+    assert near.sum() >= 0.99 * np.sum(x < 6)
+    assert far.sum() >= 0.99 * np.sum(x >= 6)
+    assert np.sum(~near & ~far) <= 2
+
+
 @settings(max_examples=20, deadline=None)
 @given(points=st.integers(0, 60), voxel=st.floats(0.05, 3.0), seed=st.integers(0, 99))
 def test_voxels_hold_one_point_each_and_keep_the_mean(points, voxel, seed):
@@ -103,7 +119,7 @@ def test_voxels_hold_one_point_each_and_keep_the_mean(points, voxel, seed):
     assert len(thin) == len(cells)
     if points and len(cells) == 1:
         assert thin.xyz[0] == pytest.approx(cloud.xyz.mean(axis=0), abs=1e-5)
-        assert thin.confidence[0] == pytest.approx(1e-3 / np.sqrt(points), rel=1e-4)
+        assert thin.range_sigma[0] == pytest.approx(1e-3 / np.sqrt(points), rel=1e-4)
         assert thin.return_number[0] == cloud.return_number.min()
     if points:
         assert thin.intensity.min() >= cloud.intensity.min()
@@ -228,7 +244,7 @@ def test_las_holds_micrometres_and_all_columns(tmp_path):
     xyz, names, extra = las_points(tmp_path / "scene.las")
     np.testing.assert_allclose(xyz, cloud.xyz, atol=0.51e-6)
     assert names == [
-        f"tofclip_{name}" for name in ("intensity", "confidence", "range", "return_number", "time")
+        f"tofclip_{name}" for name in ("intensity", "range_sigma", "range", "return_number", "time")
     ]
     raw = np.ascontiguousarray(extra)
     np.testing.assert_array_equal(
@@ -254,7 +270,7 @@ def test_las_and_laz_are_read_by_laspy_and_by_us(tmp_path, suffix):
     assert seen.header.are_points_compressed == (suffix == ".laz")
     assert seen.intensity.max() == 65535
     np.testing.assert_allclose(back.xyz, cloud.xyz, atol=0.7e-6)
-    for name in ("intensity", "confidence", "range", "return_number", "time"):
+    for name in ("intensity", "range_sigma", "range", "return_number", "time"):
         np.testing.assert_array_equal(getattr(back, name), getattr(cloud, name))
     content = path.read_bytes()
     for length in (0, 300, len(content) // 2, len(content) - 60):
@@ -311,8 +327,8 @@ def test_depth_pictures_hold_metres_along_the_axis(tmp_path):
 
 def test_the_mean_of_points_is_known_better_than_each():
     cloud = cloud_of(np.full((4, 3), 0.5) + 1e-3 * np.eye(4, 3))
-    (confidence,) = downsample_cloud(cloud, 1.0).confidence
-    assert confidence == pytest.approx(0.5e-3)
+    (sigma,) = downsample_cloud(cloud, 1.0).range_sigma
+    assert sigma == pytest.approx(0.5e-3)
 
 
 def test_a_mirror_is_not_a_pose():

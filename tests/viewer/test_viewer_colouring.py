@@ -137,7 +137,7 @@ def test_the_point_in_front_is_meant_and_a_miss_means_none() -> None:
 
 def test_what_is_known_about_a_pick() -> None:
     cloud = make_cloud(
-        np.array([[0.3, 0.4, 1.2], [0.0, 0, 0]]), {"confidence": np.array([0.002, 0.0])}
+        np.array([[0.3, 0.4, 1.2], [0.0, 0, 0]]), {"range_sigma": np.array([0.002, 0.0])}
     )
     first, second = make_pick(cloud, 0, (3, 4)), make_pick(cloud, 1)
     assert measure_distance(first, second) == pytest.approx(1.3)

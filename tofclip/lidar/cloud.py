@@ -17,18 +17,22 @@ from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.notebook import render_html
 from tofclip.records import Storable, stored_array, stored_provenance
 from tofclip.shots import Returns
+from tofclip.storage import Record
 
 COLUMN_UNITS = {
     "x": "m",
     "y": "m",
     "z": "m",
     "intensity": "count",
-    "confidence": "m",
+    "range_sigma": "m",
     "range": "m",
     "return_number": "",
     "time": "s",
 }
 """The columns of a point cloud, in the order in which files hold them."""
+
+OLD_NAMES = {"confidence": "range_sigma"}
+"""Columns of older files, read for one more version, and what they are called now."""
 
 
 def _column(name: str, dtype: type = np.float32) -> dict[str, Any]:
@@ -47,8 +51,8 @@ class PointCloud(Storable):
         Positions, m.
     intensity : (n,) float32 array
         Counts, referred to a range of 1 m: proportional to reflectance.
-    confidence : (n,) float32 array
-        Expected standard deviation of the range, m; smaller is surer.
+    range_sigma : (n,) float32 array
+        One standard deviation of the range, m.
     range : (n,) float32 array
         Distance from the origin, m.
     return_number : (n,) uint8 array
@@ -68,7 +72,7 @@ class PointCloud(Storable):
 
     xyz: NDArray[np.float32] = field(metadata=stored_array("m", "point", "xyz", dtype=np.float32))
     intensity: NDArray[np.float32] = field(metadata=_column("intensity"))
-    confidence: NDArray[np.float32] = field(metadata=_column("confidence"))
+    range_sigma: NDArray[np.float32] = field(metadata=_column("range_sigma"))
     range: NDArray[np.float32] = field(metadata=_column("range"))
     return_number: NDArray[np.uint8] = field(metadata=_column("return_number", np.uint8))
     time: NDArray[np.float32] = field(metadata=_column("time"))
@@ -81,7 +85,7 @@ class PointCloud(Storable):
         if not np.all(np.isfinite(xyz)):
             raise InputError("the positions of a point cloud must be finite")
         object.__setattr__(self, "xyz", xyz)
-        for name in ("intensity", "confidence", "range", "return_number", "time"):
+        for name in ("intensity", "range_sigma", "range", "return_number", "time"):
             dtype = np.uint8 if name == "return_number" else np.float32
             column = np.ascontiguousarray(getattr(self, name), dtype=dtype)
             if column.shape != (xyz.shape[0],):
@@ -93,7 +97,7 @@ class PointCloud(Storable):
 
     def __getitem__(self, points: Any) -> PointCloud:
         """Return some of the points: a slice, a mask or numbers, as ``cloud[cloud.range < 2]``."""
-        names = ("xyz", "intensity", "confidence", "range", "return_number", "time")
+        names = ("xyz", "intensity", "range_sigma", "range", "return_number", "time")
         try:
             chosen = {name: getattr(self, name)[points] for name in names}
         except (IndexError, TypeError) as fault:
@@ -101,6 +105,11 @@ class PointCloud(Storable):
                 f"points are selected by a slice, a mask or numbers: {fault}"
             ) from fault
         return replace(self, **chosen)
+
+    @property
+    def confidence(self) -> NDArray[np.float32]:
+        """`range_sigma` by its name in earlier versions; goes with the next one."""
+        return self.range_sigma
 
     def __repr__(self) -> str:
         if len(self) == 0:
@@ -122,7 +131,7 @@ class PointCloud(Storable):
         ----------
         path : path-like
             ``.ply`` and ``.pcd`` (binary, little endian), ``.csv``, ``.npz``, ``.las``, ``.laz``
-            (both need laspy), or ``.h5`` (with provenance).
+            (both need laspy), ``.e57`` (needs pye57), or ``.h5`` (with provenance).
 
         Raises
         ------
@@ -134,11 +143,12 @@ class PointCloud(Storable):
         if Path(path).suffix.lower() == ".h5":
             super().save(path)
         else:
-            export.write_table(path, self._columns())
+            export.write_table(path, self.columns)
 
     @classmethod
     def load(cls, path: str | Path) -> PointCloud:
-        """Read a point cloud that `save` wrote, in any of its formats.
+        """Read a point cloud that `save` wrote, in any of its formats; of an organised one the points
+        that are there.
 
         Raises
         ------
@@ -148,19 +158,30 @@ class PointCloud(Storable):
         """
         if Path(path).suffix.lower() == ".h5":
             return super().load(path)
-        values = export.read_table(path)
+        table = export.read_table(path)
+        values = {OLD_NAMES.get(name, name): column for name, column in table.items()}
         missing = [name for name in COLUMN_UNITS if name not in values]
         if missing:
             raise FileFormatError(
                 path, f"has no column '{missing[0]}': it was not written by tofclip"
             )
+        values = {name: np.ravel(values[name]) for name in COLUMN_UNITS}
         positions = np.stack([values.pop(axis) for axis in "xyz"], axis=-1)
-        properties: dict[str, Any] = {
-            name: values[name] for name in COLUMN_UNITS if name not in "xyz"
-        }
+        # An organised cloud has a place for every pixel, with or without a point.
+        there = np.isfinite(positions).all(axis=1)
+        positions = positions[there]
+        properties: dict[str, Any] = {name: column[there] for name, column in values.items()}
         return cls(xyz=positions, **properties)
 
-    def _columns(self) -> list[Column]:
+    @classmethod
+    def from_record(cls, record: Record) -> PointCloud:
+        """Rebuild a point cloud from what was stored, whatever its columns were called then."""
+        fields = {OLD_NAMES.get(name, name): one for name, one in record.fields.items()}
+        return super().from_record(replace(record, fields=fields))
+
+    @property
+    def columns(self) -> list[Column]:
+        """Everything that is known of the points, in the order in which files hold it."""
         values = dict(zip("xyz", self.xyz.T, strict=True))
         return [
             Column(name, unit, values[name] if name in values else getattr(self, name))
@@ -183,7 +204,7 @@ def point_cloud(returns: Returns) -> PointCloud:
     return PointCloud(
         xyz=(directions * returns.range[:, np.newaxis]).astype(np.float32),
         intensity=returns.intensity,
-        confidence=returns.confidence,
+        range_sigma=returns.confidence,
         range=returns.range.astype(np.float32),
         return_number=returns.return_number,
         time=returns.time.astype(np.float32),

@@ -15,6 +15,7 @@ import numpy as np
 
 from tofclip.errors import FileFormatError, InputError
 from tofclip.lidar.column import Columns, Table
+from tofclip.lidar.e57 import read_e57, write_e57
 from tofclip.lidar.las import read_las, write_las
 from tofclip.storage import atomic_path, translate_read_errors
 
@@ -23,7 +24,9 @@ PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8", ("U", "1"): "u1"}
 MAX_HEADER_BYTES = 1 << 16
 
 
-def write_table(path: str | Path, columns: Columns) -> None:
+def write_table(
+    path: str | Path, columns: Columns, shape: tuple[int, int] | None = None
+) -> None:
     """Write columns to the format that the suffix of `path` names, whole or not at all.
 
     Parameters
@@ -31,6 +34,9 @@ def write_table(path: str | Path, columns: Columns) -> None:
     path : str or Path
     columns : sequence of Column
         With name, unit and (n,) values each.
+    shape : (int, int), optional
+        Rows and columns of a picture whose pixels the values are, in raster order. PCD and NPZ say
+        so.
 
     Raises
     ------
@@ -39,7 +45,11 @@ def write_table(path: str | Path, columns: Columns) -> None:
     """
     writer = _look_up_format(path)[0]
     with atomic_path(path) as temporary:
-        writer(temporary, columns)
+        # Only these formats can say where in a picture the points lie.
+        if shape is not None and writer in (_write_pcd, _write_npz):
+            writer(temporary, columns, shape)
+        else:
+            writer(temporary, columns)
 
 
 def read_table(path: str | Path) -> Table:
@@ -51,7 +61,7 @@ def read_table(path: str | Path) -> Table:
 
 def _look_up_format(
     path: str | Path,
-) -> tuple[Callable[[Path, Columns], None], Callable[[Path], Table]]:
+) -> tuple[Callable[..., None], Callable[[Path], Table]]:
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
         known = ", ".join([*FORMATS, ".h5"])
@@ -67,8 +77,9 @@ def _write_ply(path: Path, columns: Columns) -> None:
     _write_binary(path, [*lines, "end_header"], columns)
 
 
-def _write_pcd(path: Path, columns: Columns) -> None:
+def _write_pcd(path: Path, columns: Columns, shape: tuple[int, int] | None = None) -> None:
     points = columns[0].values.size
+    height, width = (1, points) if shape is None else shape
     kinds = {np.dtype(code): kind for kind, code in PCD_TYPES.items()}
     types, sizes = zip(*(kinds[column.values.dtype] for column in columns), strict=True)
     lines = [
@@ -79,8 +90,8 @@ def _write_pcd(path: Path, columns: Columns) -> None:
         "SIZE " + " ".join(sizes),
         "TYPE " + " ".join(types),
         "COUNT " + " ".join("1" for _ in columns),
-        f"WIDTH {points}",
-        "HEIGHT 1",
+        f"WIDTH {width}",
+        f"HEIGHT {height}",
         "VIEWPOINT 0 0 0 1 0 0 0",
         f"POINTS {points}",
         "DATA binary",
@@ -95,8 +106,11 @@ def _write_csv(path: Path, columns: Columns) -> None:
     np.savetxt(path, table, fmt="%.9g", delimiter=",", header=header, comments="", encoding="ascii")
 
 
-def _write_npz(path: Path, columns: Columns) -> None:
-    arrays: Mapping[str, Any] = {column.label: column.values for column in columns}
+def _write_npz(path: Path, columns: Columns, shape: tuple[int, int] | None = None) -> None:
+    arrays: Mapping[str, Any] = {
+        column.label: column.values if shape is None else column.values.reshape(shape)
+        for column in columns
+    }
     np.savez_compressed(path, **arrays)
 
 
@@ -197,11 +211,12 @@ def _read_rows(
     return {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names or ()}
 
 
-FORMATS: dict[str, tuple[Callable[[Path, Columns], None], Callable[[Path], Table]]] = {
+FORMATS: dict[str, tuple[Callable[..., None], Callable[[Path], Table]]] = {
     ".ply": (_write_ply, _read_ply),
     ".pcd": (_write_pcd, _read_pcd),
     ".csv": (_write_csv, _read_csv),
     ".npz": (_write_npz, _read_npz),
     ".las": (write_las, read_las),
     ".laz": (write_las, read_las),
+    ".e57": (write_e57, read_e57),
 }

@@ -93,7 +93,7 @@ def _measure_object(cloud: PointCloud, points: NDArray[np.intp]) -> DetectedObje
     return DetectedObject(
         points=points,
         range=middle,
-        confidence=float(np.median(cloud.confidence[points])),
+        confidence=float(np.median(cloud.range_sigma[points])),
         scatter=1.4826 * float(np.median(np.abs(distance - middle))),
         centre=(x, y, z),
         width=float(high[0] - low[0]),

@@ -11,13 +11,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
 from tofclip.lidar.cloud import PointCloud
 
 FloatArray = NDArray[np.float64]
 
-PROPERTY_COLUMNS = ("intensity", "confidence", "range", "return_number", "time")
+MAD_TO_SIGMA = 1.4826
+MIN_SPACING_RATIO = 3.0
+
+PROPERTY_COLUMNS = ("intensity", "range_sigma", "range", "return_number", "time")
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,7 @@ def transform_cloud(cloud: PointCloud, pose: ArrayLike) -> PointCloud:
 def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     """Return one point for each occupied cube of side `voxel`, m: means of its points.
 
-    Confidences of independent points shrink with their number; the return number is the least.
+    Deviations of independent points shrink with their number; the return number is the least.
 
     Parameters
     ----------
@@ -145,20 +149,22 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
         name: mean(getattr(cloud, name)) for name in ("intensity", "range", "time")
     }
     # the error of a mean of n independent points is the root of their mean variance over n
-    columns["confidence"] = np.sqrt(mean(cloud.confidence.astype(np.float64) ** 2) / number)
+    columns["range_sigma"] = np.sqrt(mean(cloud.range_sigma.astype(np.float64) ** 2) / number)
     positions = np.stack([mean(axis) for axis in cloud.xyz.T], axis=-1).astype(np.float32)
     return replace(cloud, xyz=positions, return_number=first, **columns)
 
 
-def remove_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 2.0) -> PointCloud:
-    """Leave out points whose mean distance to their neighbours stands out from that of all points.
+def remove_outliers(
+    cloud: PointCloud, neighbours: int = 16, deviations: float = 4.0
+) -> PointCloud:
+    """Leave out points that lie far from their neighbours, by the density of where these are.
 
     Parameters
     ----------
     cloud : PointCloud
     neighbours : int
     deviations : float
-        Standard deviations above the mean from which a point counts as an outlier.
+        See `find_outliers`.
 
     Returns
     -------
@@ -169,12 +175,56 @@ def remove_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float =
     InputError
         There is no neighbour to ask, or the number of deviations is not positive.
     """
+    return select_points(cloud, ~find_outliers(cloud, neighbours, deviations))
+
+
+def find_outliers(
+    cloud: PointCloud, neighbours: int = 16, deviations: float = 4.0
+) -> NDArray[np.bool_]:
+    """Say which points lie further from their neighbours than those do from theirs.
+
+    A surface at twice the range has its points twice as far apart, and one mean distance for all
+    would take them for outliers. So each point's mean distance to its neighbours is compared with
+    what is usual in the cloud at its range, and with what these neighbours have (a local outlier
+    factor: M. M. Breunig et al., ACM SIGMOD Rec. 29, 93 (2000)), whichever is less.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    neighbours : int
+    deviations : float
+        Robust standard deviations of the logarithm of that ratio beyond which a point is an
+        outlier. At least a factor of `MIN_SPACING_RATIO`: at its border a surface has neighbours on
+        one side only.
+
+    Returns
+    -------
+    (points,) bool array
+
+    Raises
+    ------
+    InputError
+        There is no neighbour to ask, or the number of deviations is not positive.
+    """
     if neighbours < 1 or not deviations > 0:
         raise InputError("outliers need at least one neighbour and a positive number of deviations")
     if len(cloud) <= neighbours:
-        return cloud
-    _, kept = _to_open3d(cloud).remove_statistical_outlier(neighbours, deviations)
-    return select_points(cloud, np.asarray(kept, dtype=np.int64))
+        return np.zeros(len(cloud), bool)
+    xyz = cloud.xyz.astype(np.float64)
+    # The nearest point to each is itself.
+    apart, near = cKDTree(xyz).query(xyz, neighbours + 1)
+    spacing = apart[:, 1:].mean(axis=1)
+    tiny = np.finfo(np.float64).tiny
+    per_range = spacing / np.maximum(cloud.range, tiny)
+    usual = np.minimum(
+        np.median(spacing[near[:, 1:]], axis=1), np.median(per_range) * cloud.range
+    )
+    ratio = np.log(np.maximum(spacing, tiny) / np.maximum(usual, tiny))
+    middle = float(np.median(ratio))
+    sigma = MAD_TO_SIGMA * float(np.median(np.abs(ratio - middle)))
+    limit = max(middle + deviations * sigma, np.log(MIN_SPACING_RATIO))
+    outliers: NDArray[np.bool_] = ratio > limit
+    return outliers
 
 
 def estimate_normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:

@@ -10,10 +10,11 @@ from pathlib import Path
 from tofclip.arrays import parse_device
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud, Returns, depth, point_cloud
+from tofclip.lidar.organised import save_organised
 from tofclip.sequences.inputs import make_result_paths
 from tofclip.sequences.jobs import Job, lock_output_folder
 from tofclip.sequences.recovering import normalise_device
-from tofclip.shots import Frames
+from tofclip.shots import RETURN_CHOICES, Frames
 from tofclip.units import SPEED_OF_LIGHT
 
 DEPTH_IMAGE_SUFFIX = ".exr"
@@ -31,11 +32,35 @@ class CloudSettings:
         One point for each cube of this side, m; all points by default.
     device : str
         Where returns are looked for, by a name that `tofclip.arrays.parse_device` knows.
+    returns : str
+        Which return of a pixel: ``"first"``, ``"strongest"``, ``"last"`` or ``"all"``.
+    organised : bool
+        Files have a place for every pixel of the picture, see `tofclip.lidar.organised`.
+
+    Raises
+    ------
+    InputError
+        An organised cloud is to have all returns, or one point for each of some cubes.
     """
 
     drop_outliers: bool = False
     voxel: float | None = None
     device: str = "cpu"
+    returns: str = "all"
+    organised: bool = False
+
+    def __post_init__(self) -> None:
+        if self.returns not in RETURN_CHOICES:
+            raise InputError(
+                f"no return is called '{self.returns}'; choose one of {', '.join(RETURN_CHOICES)}"
+            )
+        if self.organised and self.returns == "all":
+            raise InputError(
+                "an organised cloud has one point for a pixel: choose the first, strongest or last "
+                "return"
+            )
+        if self.organised and self.voxel is not None:
+            raise InputError("an organised cloud keeps its pixels: leave the side of voxels out")
 
     def make_cloud(self, frames: Frames, origin: str) -> tuple[PointCloud, Returns]:
         """Find each pixel's returns and place them in space.
@@ -57,7 +82,7 @@ class CloudSettings:
         InputError
             There is no return.
         """
-        from tofclip.lidar.processing import downsample_cloud, remove_outliers
+        from tofclip.lidar.processing import downsample_cloud, find_outliers
 
         returns = frames.returns
         if returns is None:
@@ -66,9 +91,10 @@ class CloudSettings:
                 returns = depth(replace(frames, values=device.put(frames.values)))
         if len(returns) == 0:
             raise InputError(f"{origin}: {_explain_empty_cloud(frames)}")
-        cloud = replace(point_cloud(returns), provenance=frames.provenance)
+        returns = returns.select(self.returns)
         if self.drop_outliers:
-            cloud = remove_outliers(cloud)
+            returns = returns[~find_outliers(point_cloud(returns))]
+        cloud = replace(point_cloud(returns), provenance=frames.provenance)
         return (cloud if self.voxel is None else downsample_cloud(cloud, self.voxel)), returns
 
     def jobs(self, frames: Mapping[str, Path], folder: Path, suffix: str) -> list[Job]:
@@ -139,11 +165,11 @@ def write_cloud(clouds: CloudSettings, frames: Path, result: Path) -> int:
         The frames hold no return.
     """
     cloud, returns = clouds.make_cloud(Frames.load(frames), str(frames))
-    save_cloud(cloud, returns, result)
+    save_cloud(cloud, returns, result, clouds.organised)
     return len(cloud)
 
 
-def save_cloud(cloud: PointCloud, returns: Returns, path: Path) -> None:
+def save_cloud(cloud: PointCloud, returns: Returns, path: Path, organised: bool = False) -> None:
     """Write a cloud, or the depth picture of its returns where the name ends in .exr.
 
     Parameters
@@ -151,10 +177,14 @@ def save_cloud(cloud: PointCloud, returns: Returns, path: Path) -> None:
     cloud : PointCloud
     returns : Returns
     path : Path
+    organised : bool
+        Write a point for every pixel.
     """
     if path.suffix.lower() == DEPTH_IMAGE_SUFFIX:
         from tofclip.lidar.depth_exr import save_depth
 
         save_depth(returns, path)
+    elif organised:
+        save_organised(returns, path)
     else:
         cloud.save(path)

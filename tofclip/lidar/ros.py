@@ -1,0 +1,159 @@
+"""Clouds with stamps as ROS 2 messages (sensor_msgs/PointCloud2), in a bag or in one MCAP file.
+
+Through rosbags, an optional library that needs no ROS. Axes are those of an optical frame: x right,
+y down, z forward. The time of flight is called ``time_of_flight`` there, because programs take a
+field ``time`` for the instant at which a moving scanner saw the point.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tofclip.errors import InputError, MissingDependencyError, StorageError
+from tofclip.lidar.cloud import PointCloud
+
+MCAP_SUFFIX = ".mcap"
+TOPIC = "/tofclip/points"
+FRAME_ID = "tofclip_optical"
+MESSAGE_TYPE = "sensor_msgs/msg/PointCloud2"
+FIELD_TYPES = {"<f4": 7, "|u1": 2}
+"""NumPy's name of a type and ROS's number for it."""
+
+NANOSECONDS_PER_SECOND = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class StampedCloud:
+    """A cloud and when it was taken.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    stamp_ns : int
+        Nanoseconds since the epoch of the recording's clock.
+    """
+
+    cloud: PointCloud
+    stamp_ns: int
+
+
+def write_bag(clouds: Iterable[StampedCloud], path: str | Path) -> int:
+    """Write clouds as a ROS 2 recording, whole or not at all; return how many.
+
+    Parameters
+    ----------
+    clouds : iterable of StampedCloud
+        Taken one at a time, in the order of their stamps.
+    path : path-like
+        A name that ends in ``.mcap`` becomes one MCAP file. Any other name becomes a folder, a bag
+        in SQLite, and must not exist yet.
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    InputError
+        There is no cloud, or a stamp is negative or earlier than the one before.
+    MissingDependencyError
+        rosbags is not installed.
+    StorageError
+        The recording could not be written.
+    """
+    target = Path(path)
+    single = target.suffix.lower() == MCAP_SUFFIX
+    if not single and target.exists():
+        raise StorageError(f"{target}: exists already; a bag is a new folder")
+    rosbag2, typestore = _import_rosbags()
+    plugin = rosbag2.StoragePlugin.MCAP if single else rosbag2.StoragePlugin.SQLITE3
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as scratch:
+            bag = Path(scratch) / target.name
+            # Version 8 is read by all present releases of ROS 2.
+            with rosbag2.Writer(bag, version=8, storage_plugin=plugin) as writer:
+                number = _write_messages(clouds, writer, typestore)
+            if number == 0:
+                raise InputError(f"{target}: there is no cloud to write")
+            if single:
+                (written,) = bag.glob(f"*{MCAP_SUFFIX}")
+                written.replace(target)
+            else:
+                shutil.move(bag, target)
+    except OSError as fault:
+        raise StorageError(f"{target}: cannot be written: {fault.strerror or fault}") from fault
+    return number
+
+
+def _write_messages(clouds: Iterable[StampedCloud], writer: Any, typestore: Any) -> int:
+    connection = writer.add_connection(TOPIC, MESSAGE_TYPE, typestore=typestore)
+    number, latest = 0, 0
+    for one in clouds:
+        if one.stamp_ns < latest:
+            raise InputError("stamps must not be negative, nor earlier than the one before")
+        latest = one.stamp_ns
+        message = make_point_cloud_message(one, typestore)
+        writer.write(connection, one.stamp_ns, typestore.serialize_cdr(message, MESSAGE_TYPE))
+        number += 1
+    return number
+
+
+def make_point_cloud_message(stamped: StampedCloud, typestore: Any) -> Any:
+    """Return a cloud as the message that ROS 2 passes on.
+
+    Parameters
+    ----------
+    stamped : StampedCloud
+    typestore : rosbags.typesys.Typestore
+        With ROS 2's common messages.
+
+    Returns
+    -------
+    sensor_msgs/msg/PointCloud2
+    """
+    types, cloud = typestore.types, stamped.cloud
+    columns = {axis: cloud.xyz[:, number] for number, axis in enumerate("xyz")}
+    for name in ("intensity", "range_sigma", "range", "return_number"):
+        columns[name] = getattr(cloud, name)
+    columns["time_of_flight"] = cloud.time
+    layout = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
+    rows = np.empty(len(cloud), layout)
+    for name, values in columns.items():
+        rows[name] = values
+    fields = [
+        types["sensor_msgs/msg/PointField"](
+            name=name, offset=offset, datatype=FIELD_TYPES[kind.str], count=1
+        )
+        for name, (kind, offset, *_) in (layout.fields or {}).items()
+    ]
+    seconds, rest = divmod(stamped.stamp_ns, NANOSECONDS_PER_SECOND)
+    stamp = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest)
+    return types[MESSAGE_TYPE](
+        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=FRAME_ID),
+        height=1,
+        width=len(cloud),
+        fields=fields,
+        is_bigendian=False,
+        point_step=layout.itemsize,
+        row_step=layout.itemsize * len(cloud),
+        data=rows.view(np.uint8).reshape(-1),
+        is_dense=True,
+    )
+
+
+def _import_rosbags() -> tuple[Any, Any]:
+    try:
+        from rosbags import rosbag2
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as fault:
+        raise MissingDependencyError(
+            "ROS 2 bags and MCAP need rosbags: pip install 'tofclip[exchange]'"
+        ) from fault
+    return rosbag2, get_typestore(Stores.ROS2_HUMBLE)
