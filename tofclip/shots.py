@@ -386,9 +386,13 @@ class Returns(Storable):
             )
         if which == "all":
             return self
-        rank = {"first": self.range, "last": -self.range, "strongest": -self.intensity}[which]
+        ranks: dict[str, NDArray[Any]] = {
+            "first": self.range,
+            "last": -self.range,
+            "strongest": -self.intensity,
+        }
         pixel = self.y.astype(np.int64) * self.camera.image_shape[1] + self.x
-        order = np.lexsort((rank, pixel))
+        order = np.lexsort((ranks[which], pixel))
         first_of_pixel = np.flatnonzero(np.diff(pixel[order], prepend=-1))
         return self[np.sort(order[first_of_pixel])]
 

@@ -64,9 +64,7 @@ def bag(
         for number, file in enumerate(files):
             cloud = PointCloud.load(file)
             points += len(cloud)
-            yield StampedCloud(
-                cloud, round((start_s + number / rate_hz) * NANOSECONDS_PER_SECOND)
-            )
+            yield StampedCloud(cloud, round((start_s + number / rate_hz) * NANOSECONDS_PER_SECOND))
             advance(1)
 
     with show_progress("writing", len(files)) as advance:

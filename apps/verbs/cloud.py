@@ -43,7 +43,10 @@ def cloud(
         ),
     ],
     drop_outliers: Annotated[
-        bool, typer.Option("--drop-outliers", help="Leave out points further from their neighbours than these are.")
+        bool,
+        typer.Option(
+            "--drop-outliers", help="Leave out points further from their neighbours than these are."
+        ),
     ] = False,
     returns: Annotated[
         str,

@@ -194,7 +194,8 @@ def test_saving_is_all_or_nothing(tmp_path, monkeypatch):
 def test_unknown_formats_and_places_are_refused(tmp_path):
     cloud = random_cloud(2, 0)
     with pytest.raises(
-        InputError, match=r"'\.xyz'; use one of \.ply, \.pcd, \.csv, \.npz, \.las, \.laz, \.e57, \.h5"
+        InputError,
+        match=r"'\.xyz'; use one of \.ply, \.pcd, \.csv, \.npz, \.las, \.laz, \.e57, \.h5",
     ):
         cloud.save(tmp_path / "scene.xyz")
     with pytest.raises(InputError, match="use one of"):

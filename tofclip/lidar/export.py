@@ -24,9 +24,7 @@ PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8", ("U", "1"): "u1"}
 MAX_HEADER_BYTES = 1 << 16
 
 
-def write_table(
-    path: str | Path, columns: Columns, shape: tuple[int, int] | None = None
-) -> None:
+def write_table(path: str | Path, columns: Columns, shape: tuple[int, int] | None = None) -> None:
     """Write columns to the format that the suffix of `path` names, whole or not at all.
 
     Parameters

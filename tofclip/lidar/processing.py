@@ -154,9 +154,7 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     return replace(cloud, xyz=positions, return_number=first, **columns)
 
 
-def remove_outliers(
-    cloud: PointCloud, neighbours: int = 16, deviations: float = 4.0
-) -> PointCloud:
+def remove_outliers(cloud: PointCloud, neighbours: int = 16, deviations: float = 4.0) -> PointCloud:
     """Leave out points that lie far from their neighbours, by the density of where these are.
 
     Parameters
@@ -216,9 +214,7 @@ def find_outliers(
     spacing = apart[:, 1:].mean(axis=1)
     tiny = np.finfo(np.float64).tiny
     per_range = spacing / np.maximum(cloud.range, tiny)
-    usual = np.minimum(
-        np.median(spacing[near[:, 1:]], axis=1), np.median(per_range) * cloud.range
-    )
+    usual = np.minimum(np.median(spacing[near[:, 1:]], axis=1), np.median(per_range) * cloud.range)
     ratio = np.log(np.maximum(spacing, tiny) / np.maximum(usual, tiny))
     middle = float(np.median(ratio))
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(ratio - middle)))

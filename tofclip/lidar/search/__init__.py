@@ -19,6 +19,7 @@ The steps, for each pixel:
    others leave (`refine_returns`, `take_gauss_newton_step`).
 5. Measure what the fit confirms: sum over the bins and the arrival's standard deviation
    (`measure_returns`, `estimate_sum_and_deviation`).
+6. Add the recovery's own errors to the deviation, by what neighbours show (`add_recovery_error`).
 
 They are carried out by one of two sets of inner loops, in which the same step has the same name:
 `tofclip.lidar.search.compiled` takes NumPy's traces one after the other, `.array_api` all pixels of
@@ -38,6 +39,8 @@ from tofclip.arrays import is_numpy
 from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.detection import Detection
+from tofclip.lidar.geometry import compute_ray_directions
+from tofclip.lidar.neighbours import add_recovery_error
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.search.array_api import ArraySearch, ArrayTraces
 from tofclip.lidar.traces import FrameTraces, Traces
@@ -119,12 +122,20 @@ class ReturnSearch:
         intensity = signal * (distance / REFERENCE_RANGE_M) ** 2
         kept = (time > 0) & self.detection.find_significant(pixel, time, intensity, self.pulse.fwhm)
         y, x = np.divmod(pixel[kept], self.camera.image_shape[1])
+        sigma = add_recovery_error(
+            SPEED_OF_LIGHT / 2 * deviation[kept],
+            distance[kept],
+            compute_ray_directions(self.camera, y, x)[:, 2],
+            pixel[kept],
+            self.camera.image_shape,
+            SPEED_OF_LIGHT / 2 * self.pulse.fwhm,
+        )
         return Returns(
             y=y.astype(np.int32),
             x=x.astype(np.int32),
             range=distance[kept],
             intensity=intensity[kept].astype(np.float32),
-            confidence=(SPEED_OF_LIGHT * deviation[kept] / 2).astype(np.float32),
+            confidence=sigma.astype(np.float32),
             return_number=_rank_within_pixel(pixel[kept]),
             time=time[kept],
             camera=self.camera,

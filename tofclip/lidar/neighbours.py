@@ -1,0 +1,221 @@
+"""How far ranges are off, by what their neighbours on the same surface show.
+
+A recovered frame's errors have two parts. Noise of the measurements is told by each pixel's own
+trace, since it differs from bin to bin. What the recovery gets wrong (a prior that smooths, a
+resolution that mixes neighbours, directions that no view sees) is alike in all bins of a pulse: it
+moves the return without a trace in the fit's residual. On simulated shots it makes errors 1.7 to
+2.5 times as large as the fit says, and a second recovery of what was recovered first (a parametric
+bootstrap) does not show it either, because the first result already agrees with the prior.
+
+But it changes from pixel to pixel along a surface. A plane in space is linear in inverse depth over
+the picture, whatever its tilt. So a plane is fitted through the returns within `REACH_PX` of each,
+and what these scatter about it beyond their own noise is the recovery's part. A plane takes up some
+of what is alike over its whole reach: `PLANE_SHARE` makes up for that. It was found on two scenes, a
+recorded shot's geometry and one by another forward model, with total variation and l1; z-scores are
+0.9 to 1.07 there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from tofclip.lidar.pulse_fit import compiled
+from tofclip.threads import run_blocks
+
+FloatArray = NDArray[np.float64]
+
+REACH_PX, STRIDE_PX = 8, 2
+"""Neighbours that share a plane, and their distance: errors of adjacent pixels are much alike."""
+
+PLANE_SHARE = 1.5
+"""Variance of the recovery's errors, relative to what a plane of this reach leaves of it."""
+
+FIT_ROUNDS = 4
+MIN_NEIGHBOURS = 8
+OUTLIER_DEVIATIONS = 3.0
+MIN_KNOWN = 20
+"""Returns with enough neighbours that say how far the others are off."""
+
+MAD_TO_SIGMA = 1.4826
+RETURNS_PER_BLOCK = 512
+
+
+def add_recovery_error(
+    sigma: FloatArray,
+    distance: FloatArray,
+    along_axis: FloatArray,
+    pixel: NDArray[np.int64],
+    image_shape: tuple[int, int],
+    gate: float,
+) -> FloatArray:
+    """Return the deviation of ranges with the recovery's own errors.
+
+    Parameters
+    ----------
+    sigma : (n,) array
+        Deviation that the noise in each pixel's trace explains, m.
+    distance : (n,) array
+        Range, m.
+    along_axis : (n,) array
+        Depth along the optical axis for a range of 1: the direction's z.
+    pixel : (n,) int array
+        Number of the pixel, not decreasing.
+    image_shape : (int, int)
+    gate : float
+        A neighbour that is further away than this, m, is on another surface.
+
+    Returns
+    -------
+    (n,) float64 array
+        One standard deviation, m. Returns with few neighbours get what is usual for the others.
+    """
+    total = np.asarray(sigma, dtype=np.float64).copy()
+    starts = np.searchsorted(pixel, np.arange(image_shape[0] * image_shape[1] + 1))
+    nearness = 1 / (distance * along_axis)
+    metres = distance / nearness
+    scatter = np.empty(total.size)
+
+    def work(piece: slice) -> None:
+        scatter_about_planes(
+            nearness, metres, pixel, starts, image_shape, gate, (piece.start, piece.stop), scatter
+        )
+
+    run_blocks(work, total.size, RETURNS_PER_BLOCK)
+    known = scatter >= 0
+    if np.count_nonzero(known) < MIN_KNOWN:
+        return total
+    excess = np.maximum(scatter[known] ** 2 - total[known] ** 2, 0)
+    found = np.sqrt(total[known] ** 2 + PLANE_SHARE * excess)
+    usual = float(np.median(found / total[known]))
+    total *= usual
+    total[known] = found
+    return total
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def scatter_about_planes(nearness, metres, pixel, starts, image_shape, gate, span, scatter):
+    """Robust deviation of the returns around each from a plane through them, -1 if they are few.
+
+    Parameters
+    ----------
+    nearness : (n,) array
+        Inverse depth along the optical axis, 1/m.
+    metres : (n,) array
+        Change of a return's range for a change of its nearness, m^2.
+    pixel : (n,) int64 array
+        Not decreasing.
+    starts : (pixels + 1,) int64 array
+        First return of each pixel.
+    image_shape : (int, int)
+    gate : float
+        m.
+    span : (int, int)
+        First return, and the one after the last.
+    scatter : (n,) array
+        Overwritten in the span: m.
+    """
+    side = 2 * (REACH_PX // STRIDE_PX) + 1
+    around, residual = np.empty((side * side, 3)), np.empty(side * side)
+    used = np.empty(side * side, np.bool_)
+    for own in range(span[0], span[1]):
+        number = collect_neighbours(nearness, metres, pixel, starts, image_shape, own, around)
+        for t in range(number):
+            used[t] = abs(around[t, 2]) < gate
+        scatter[own] = -1.0
+        for _ in range(FIT_ROUNDS):
+            a, b, c, count = fit_plane_around(around[:number], used)
+            if count < MIN_NEIGHBOURS:
+                scatter[own] = -1.0
+                break
+            left = 0
+            for t in range(number):
+                if used[t]:
+                    residual[left] = abs(around[t, 2] - a * around[t, 0] - b * around[t, 1] - c)
+                    left += 1
+            free = count / (count - 3.0)
+            scatter[own] = MAD_TO_SIGMA * np.median(residual[:left]) * np.sqrt(free)
+            limit = OUTLIER_DEVIATIONS * scatter[own]
+            for t in range(number):
+                off = around[t, 2] - a * around[t, 0] - b * around[t, 1] - c
+                used[t] = abs(off) <= limit
+
+
+@compiled
+def collect_neighbours(nearness, metres, pixel, starts, image_shape, own, around):
+    """List the returns around one: columns and rows away, and how much further off, in m.
+
+    Of several returns of a pixel the one that is nearest in range counts.
+
+    Parameters
+    ----------
+    nearness, metres, pixel, starts, image_shape
+        As for `scatter_about_planes`.
+    own : int
+        Number of the return.
+    around : (neighbours, 3) array
+        Overwritten.
+
+    Returns
+    -------
+    int
+    """
+    rows, columns = image_shape
+    y, x = pixel[own] // columns, pixel[own] % columns
+    number = 0
+    for j in range(max(-REACH_PX, -(y // STRIDE_PX) * STRIDE_PX), REACH_PX + 1, STRIDE_PX):
+        for i in range(max(-REACH_PX, -(x // STRIDE_PX) * STRIDE_PX), REACH_PX + 1, STRIDE_PX):
+            if y + j >= rows or x + i >= columns:
+                break
+            there = (y + j) * columns + x + i
+            best = np.inf
+            for k in range(starts[there], starts[there + 1]):
+                off = (nearness[own] - nearness[k]) * metres[own]
+                if abs(off) < abs(best):
+                    best = off
+            if best < np.inf:
+                around[number, 0], around[number, 1], around[number, 2] = i, j, best
+                number += 1
+    return number
+
+
+@compiled
+def fit_plane_around(around, used):
+    """Least-squares plane ``a * right + b * down + c`` through the neighbours that are used.
+
+    Parameters
+    ----------
+    around : (neighbours, 3) array
+    used : (neighbours,) bool array
+
+    Returns
+    -------
+    a, b, c : float
+    count : int
+        Neighbours used; 0 if they lie in one line, which says nothing of the slope across it.
+    """
+    count = 0
+    s = sx = sy = sxx = sxy = syy = sxv = syv = 0.0
+    for t in range(around.shape[0]):
+        if used[t]:
+            right, down, off = around[t]
+            count += 1
+            s += off
+            sx += right
+            sy += down
+            sxx += right * right
+            sxy += right * down
+            syy += down * down
+            sxv += right * off
+            syv += down * off
+    if count < MIN_NEIGHBOURS:
+        return 0.0, 0.0, 0.0, 0
+    cxx, cxy, cyy = sxx - sx * sx / count, sxy - sx * sy / count, syy - sy * sy / count
+    cxv, cyv = sxv - sx * s / count, syv - sy * s / count
+    determinant = cxx * cyy - cxy * cxy
+    if determinant <= 1e-6 * cxx * cyy:
+        return 0.0, 0.0, 0.0, 0
+    a = (cyy * cxv - cxy * cyv) / determinant
+    b = (cxx * cyv - cxy * cxv) / determinant
+    return a, b, (s - a * sx - b * sy) / count, count
