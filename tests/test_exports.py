@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import inspect
+import pkgutil
+import re
 import subprocess
 import sys
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,7 +31,7 @@ NAMES = {
         "recover",
     ],
     "tofclip.io": ["read_streak"],
-    "tofclip.shots": ["Frames", "Streak"],
+    "tofclip.shots": ["Frames", "Returns", "Streak", "StreakStack", "save_stack"],
     "nlos": [
         "Backprojection",
         "Capture",
@@ -91,3 +98,85 @@ def test_reading_a_streak_image_imports_no_compiler() -> None:
         check=True,
     ).stdout.split()
     assert not (HEAVY - {"numpy"}) & set(listing)
+
+
+ROOTS = ("tofclip", "nlos", "devices")
+API_PAGES = Path(__file__).parents[1] / "docs" / "api"
+
+
+def public_names() -> dict[str, Any]:
+    """What packages list in ``__all__`` and what the pages of the API document, by full name."""
+    found: dict[str, Any] = {}
+    for root in ROOTS:
+        home = importlib.import_module(root)
+        packages = [
+            item.name for item in pkgutil.walk_packages(home.__path__, f"{root}.") if item.ispkg
+        ]
+        for package in (root, *packages):
+            module = importlib.import_module(package)
+            found |= {
+                f"{package}.{name}": getattr(module, name)
+                for name in getattr(module, "__all__", ())
+            }
+    text = "".join(page.read_text("utf-8") for page in API_PAGES.glob("*.md"))
+    for name in re.findall(r"automodule:: (\S+)", text):
+        module = importlib.import_module(name)
+        own = [
+            one for one, value in vars(module).items() if getattr(value, "__module__", "") == name
+        ]
+        for one in getattr(module, "__all__", own):
+            if not one.startswith("_"):
+                found[f"{name}.{one}"] = getattr(module, one)
+    for name in re.findall(r"auto(?:class|function):: (\S+)", text):
+        module, _, one = name.rpartition(".")
+        found[name] = getattr(importlib.import_module(module), one)
+    return found
+
+
+def signatures(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """The annotated things that a public name consists of: itself, and a class's public methods."""
+    if inspect.isclass(value) or inspect.isfunction(value):
+        yield name, value
+    if inspect.isclass(value):
+        for own, member in vars(value).items():
+            function = (
+                member.fget if isinstance(member, property) else getattr(member, "__func__", member)
+            )
+            if inspect.isfunction(function) and (own in ("__init__", "__call__") or own[0] != "_"):
+                yield f"{name}.{own}", function
+
+
+def parts(annotation: Any) -> Iterator[Any]:
+    """A type and all that it is made of."""
+    yield annotation
+    for part in typing.get_args(annotation):
+        yield from (
+            (one for item in part for one in parts(item)) if isinstance(part, list) else parts(part)
+        )
+
+
+def test_every_type_in_a_public_signature_can_be_imported_from_a_public_place() -> None:
+    names = public_names()
+    public = {id(value) for value in names.values()}
+    # For annotations that are imported for the type checker only.
+    by_name = {name.rpartition(".")[2]: value for name, value in names.items()}
+    by_name |= {name: importlib.import_module(name) for name in ("h5py", "scipy")}
+    hidden: dict[str, str] = {}
+    audited = 0
+    for name, value in names.items():
+        if not str(getattr(value, "__module__", "")).startswith(ROOTS):
+            continue
+        for where, item in signatures(name, value):
+            own = vars(sys.modules[item.__module__])
+            scope = {key: one for key, one in by_name.items() if key not in own}
+            hints = typing.get_type_hints(item, localns=scope)
+            audited += 1
+            for one in (part for hint in hints.values() for part in parts(hint)):
+                if (
+                    isinstance(one, type)
+                    and one.__module__.startswith(ROOTS)
+                    and id(one) not in public
+                ):
+                    hidden[f"{one.__module__}.{one.__qualname__}"] = where
+    assert audited > 800
+    assert not hidden

@@ -36,7 +36,7 @@ from tofclip.storage import (
 )
 from tofclip.units import SPEED_OF_LIGHT
 
-__all__ = ["Frames", "Streak"]
+__all__ = ["Frames", "Returns", "Streak", "StreakStack", "save_stack"]
 
 RETURN_CHOICES = ("first", "strongest", "last", "all")
 """Which return of a pixel counts."""

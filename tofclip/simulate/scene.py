@@ -63,10 +63,10 @@ def make_plate(
     return Body(Rectangle(*size), material, np.asarray(centre, np.float64), axes)
 
 
-class Hits(NamedTuple):
+class RayCast(NamedTuple):
     """What the rays of one viewpoint see, ray by ray.
 
-    Attributes
+    Parameters
     ----------
     body : (n,) int array
         Number of the body; `NO_BODY` where the ray meets none.
@@ -108,7 +108,7 @@ class Scene:
         if not self.bodies:
             raise InputError("a scene needs at least one body")
 
-    def trace(self, viewpoint: FloatArray, directions: FloatArray) -> Hits:
+    def trace(self, viewpoint: FloatArray, directions: FloatArray) -> RayCast:
         """Follow rays to the nearest surface and from there to the lamp.
 
         Parameters
@@ -120,7 +120,7 @@ class Scene:
 
         Returns
         -------
-        Hits
+        RayCast
         """
         first, lamp = cast_rays(self.bodies, viewpoint, directions), np.asarray(self.lamp)
         seen = first.body != NO_BODY
@@ -133,7 +133,7 @@ class Scene:
             spread[seen] = values
             return spread
 
-        return Hits(
+        return RayCast(
             first.body,
             scatter((lamp_distance + np.linalg.norm(points - viewpoint, axis=1)) / 2),
             scatter(lamp_distance),

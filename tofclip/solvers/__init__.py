@@ -1,17 +1,20 @@
 """Solvers that know no physics: an operator, a data term and a prior in, pictures out."""
 
-from tofclip.solvers.data_terms import DataTerm, Huber, LeastSquares, Poisson
+from tofclip.solvers.data_terms import DataTerm, DataTermMaker, Huber, LeastSquares, Poisson
 from tofclip.solvers.direct import Backprojection, LinearInverse, PreparedInverse
 from tofclip.solvers.fista import (
     Fista,
     NonnegativeSparsity,
     NonnegativeTotalVariation,
     ProximalMethod,
+    Regulariser,
     Sparse,
     TotalVariation,
     Wavelets,
 )
 from tofclip.solvers.method import (
+    IterationHistory,
+    IterativeSolver,
     Method,
     Progress,
     Result,
@@ -25,8 +28,11 @@ from tofclip.solvers.plug_and_play import PlugAndPlay, RegularisationByDenoising
 __all__ = [
     "Backprojection",
     "DataTerm",
+    "DataTermMaker",
     "Fista",
     "Huber",
+    "IterationHistory",
+    "IterativeSolver",
     "LeastSquares",
     "LinearInverse",
     "Method",
@@ -38,6 +44,7 @@ __all__ = [
     "Progress",
     "ProximalMethod",
     "RegularisationByDenoising",
+    "Regulariser",
     "Result",
     "Sparse",
     "StoppingRule",

@@ -2,6 +2,7 @@
 
 from tofclip.camera.calibration.focus_pictures import FocusCalibration, calibrate_views
 from tofclip.camera.calibration.parallax import (
+    FocusCurve,
     Parallax,
     find_sharpest_shears,
     fit_parallax_to_centres,
@@ -13,6 +14,7 @@ from tofclip.camera.calibration.skew import SkewEstimate, estimate_skew
 
 __all__ = [
     "FocusCalibration",
+    "FocusCurve",
     "Parallax",
     "Registration",
     "SkewEstimate",

@@ -2,7 +2,7 @@
 their exact shears.
 """
 
-from tofclip.simulate.bodies import Body, Box, Lambertian, Rectangle, Specular, Sphere
+from tofclip.simulate.bodies import Body, Box, Hits, Lambertian, Rectangle, Shape, Specular, Sphere
 from tofclip.simulate.light_fields.array import CameraArray
 from tofclip.simulate.light_fields.pulsed import (
     PulsedScene,
@@ -24,11 +24,13 @@ __all__ = [
     "Body",
     "Box",
     "CameraArray",
+    "Hits",
     "Lambertian",
     "PulsedScene",
     "Rectangle",
     "RenderedLightField",
     "Scene",
+    "Shape",
     "Specular",
     "Sphere",
     "TimeAxis",
