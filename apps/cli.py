@@ -6,6 +6,7 @@ A verb's module is imported when the verb is called, so that the program's own h
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import threading
@@ -28,6 +29,21 @@ from apps.help import (
 from tofclip import __version__
 from tofclip.dependencies import describe_missing_package
 from tofclip.errors import TofclipError
+
+ARGUMENT_IN_MESSAGE = re.compile(r"`(?P<name>[a-z_]+)(?:=\"?(?P<value>[^`\"]*)\"?)?`")
+OPTIONS_OF_ARGUMENTS = {
+    "axes": "--axes",
+    "bin_width": "--bin-width-ps",
+    "camera": "--camera camera.h5",
+    "device": "--device",
+    "focus": "--focus",
+    "gate": "--gate-m",
+    "method": "--method",
+    "overwrite": "--overwrite",
+    "pulse": "--pulse-ps",
+    "time_zero": "--time-zero-ns",
+}
+"""The command line's option for an argument that the libraries' messages name."""
 
 COMPLETION_VARIABLE = "_TOFCLIP_COMPLETE"  # set by shells that ask how a command line may go on
 
@@ -171,7 +187,7 @@ def _report_error(fault: Exception) -> int:
         )
         return EXIT_INPUT_ERROR
     if isinstance(fault, TofclipError):
-        print(f"tofclip: error: {_one_line(str(fault))}", file=sys.stderr)
+        print(f"tofclip: error: {_one_line(name_options(str(fault)))}", file=sys.stderr)
         return EXIT_INPUT_ERROR
     missing = describe_missing_package(fault) if isinstance(fault, ImportError) else None
     if missing is not None:
@@ -183,6 +199,34 @@ def _report_error(fault: Exception) -> int:
         file=sys.stderr,
     )
     return EXIT_DEFECT
+
+
+def name_options(message: str) -> str:
+    """Put the options of the command line in the place of arguments that a message of the libraries
+    names as in Python.
+
+    Parameters
+    ----------
+    message : str
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> name_options('give `bin_width`, or use `device="cpu"`')
+    'give --bin-width-ps, or use --device cpu'
+    """
+
+    def name_option(found: re.Match[str]) -> str:
+        option = OPTIONS_OF_ARGUMENTS.get(found["name"])
+        if option is None:
+            return found[0]
+        value = found["value"]
+        return option if value in (None, "True") else f"{option} {value}"
+
+    return ARGUMENT_IN_MESSAGE.sub(name_option, message)
 
 
 def _one_line(text: str) -> str:

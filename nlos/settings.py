@@ -282,7 +282,7 @@ def complete_settings(capture: Capture, **given: Any) -> Settings:
         gated = fade_record_end(gated, fade)
     if not float(abs(gated.signal).max()) > 0:
         raise InputError(
-            f"a gate of {found.gate or 0.0:.4g} m blanks the whole record; blank less by --gate-m"
+            f"a gate of {found.gate or 0.0:.4g} m blanks the whole record; blank less (`gate`)"
         )
     if found.wavelength is None:
         wavelength, reason = choose_wavelength(gated, found.cycles)

@@ -146,7 +146,7 @@ def _require_even_bin_width(frames: Frames) -> float:
     if np.max(np.abs(steps - bin_width)) > STEP_TOLERANCE * bin_width:
         raise InputError(
             f"the frames are {steps.min():.3e} to {steps.max():.3e} s apart; imaging around a corner needs evenly "
-            "spaced ones: recover with one bin width (--bin-width-ps)"
+            "spaced ones: recover with one `bin_width`"
         )
     return bin_width
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nlos.geometry import Grid
 from tofclip.arrays import Array, ComputeDevice, is_numpy, namespace, to_numpy
 from tofclip.errors import InputError, ShapeError
-from tofclip.notebook import render_html
+from tofclip.notebook import make_data_array, plot_picture, render_html, require_package
 from tofclip.storage import Field, Record
 
 if TYPE_CHECKING:
@@ -176,6 +176,41 @@ class Volume:
         from nlos.picture import save_picture
 
         save_picture(self, path)
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the brightest voxel along every line of sight, as seen from the wall.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            Where to draw; by default the current figure's.
+
+        Returns
+        -------
+        matplotlib Axes
+        """
+        return plot_picture(self.maximum_projection().brightness, "seen from the wall", ax)
+
+    def to_xarray(self) -> Any:
+        """Return an `xarray.DataArray` (z, y, x) with places in m as coordinates.
+
+        Raises
+        ------
+        MissingDependencyError
+            xarray is not installed.
+        """
+        axes = {name: (getattr(self.grid, name), "m") for name in AXES}
+        return make_data_array(to_numpy(self.values), axes, "brightness", "")
+
+    def to_torch(self) -> Any:
+        """Return the values as a PyTorch tensor (z, y, x), which shares NumPy's memory.
+
+        Raises
+        ------
+        MissingDependencyError
+            PyTorch is not installed.
+        """
+        return require_package("torch").as_tensor(to_numpy(self.values))
 
     def to_record(self) -> Record:
         """Return everything that has to be stored."""

@@ -162,7 +162,7 @@ def no_graphics(monkeypatch):
 def test_without_a_graphics_processor():
     assert parse_device("auto") == ComputeDevice()
     for name in ("cuda", "cuda:1"):
-        with pytest.raises(MissingDependencyError, match="use --device cpu"):
+        with pytest.raises(MissingDependencyError, match='use `device="cpu"`'):
             parse_device(name)
 
 
@@ -175,5 +175,5 @@ def test_names_that_are_no_device(name):
 def test_a_device_that_pytorch_does_not_have():
     pytest.importorskip("torch", reason="PyTorch is optional")
     for name in ("cuda:99", "nonsense"):
-        with pytest.raises(MissingDependencyError, match="use --device cpu"):
+        with pytest.raises(MissingDependencyError, match='use `device="cpu"`'):
             parse_device(f"torch:{name}")

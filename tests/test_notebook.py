@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import nlos
 import tofclip
-from tofclip.errors import InputError, StorageError
+from tofclip.errors import InputError, MissingDependencyError, StorageError
 
 
 @pytest.fixture
@@ -87,3 +91,100 @@ def test_one_function_opens_every_file(
         assert type(tofclip.load(tmp_path / name)) is type(one)
     with pytest.raises(StorageError):
         tofclip.load(tmp_path / "absent.h5")
+
+
+def test_objects_become_those_of_other_libraries(
+    frames: tofclip.Frames, cloud: tofclip.PointCloud
+) -> None:
+    assert np.array_equal(np.asarray(frames), frames.values)
+    volume = nlos.Volume(np.ones((4, 5, 6), np.float32), nlos.Grid.box((0, 5), (0, 4), (1, 4), 1.0))
+    pytest.importorskip("torch", reason="pip install torch")
+    for tensor, array in (
+        (frames.to_torch(), frames.values),
+        (cloud.to_torch(), cloud.xyz),
+        (volume.to_torch(), volume.values),
+    ):
+        assert np.array_equal(tensor.numpy(), array)
+
+
+def test_labelled_arrays_carry_times_and_places(frames: tofclip.Frames) -> None:
+    pytest.importorskip("xarray", reason="pip install 'tofclip[notebook]'")
+    labelled = frames.to_xarray()
+    assert labelled.dims == ("time", "y", "x")
+    assert labelled.attrs["units"] == "counts"
+    assert labelled.time.attrs["units"] == "s"
+    near = labelled.sel(time=slice(11e-9, 12e-9))
+    assert np.array_equal(near.values, frames.sel(time=(11e-9, 12e-9)).values)
+    volume = nlos.Volume(np.ones((4, 5, 6), np.float32), nlos.Grid.box((0, 5), (0, 4), (1, 4), 1.0))
+    assert np.array_equal(volume.to_xarray().z.values, volume.grid.z)
+
+
+def test_points_become_a_table(cloud: tofclip.PointCloud) -> None:
+    pytest.importorskip("pandas", reason="pip install 'tofclip[notebook]'")
+    table = cloud.to_pandas()
+    assert list(table.columns[:4]) == ["x", "y", "z", "intensity"]
+    assert np.array_equal(table[["x", "y", "z"]].to_numpy(), cloud.xyz)
+
+
+def test_points_become_open3ds(cloud: tofclip.PointCloud) -> None:
+    pytest.importorskip("open3d")
+    assert np.allclose(np.asarray(cloud.to_open3d().points), cloud.xyz)
+
+
+def test_pictures_are_drawn_where_asked(frames: tofclip.Frames, cloud: tofclip.PointCloud) -> None:
+    volume = nlos.Volume(np.ones((4, 5, 6), np.float32), nlos.Grid.box((0, 5), (0, 4), (1, 4), 1.0))
+    figure = Figure()
+    axes = figure.subplots(1, 3)
+    for one, ax in zip((frames, cloud, volume), axes, strict=True):
+        assert one.plot(ax) is ax
+    assert np.array_equal(axes[0].images[0].get_array(), frames.values.sum(axis=0))
+    assert "1.5 to 2.23 m" in axes[0].get_title()
+    assert len(axes[1].collections[0].get_offsets()) == len(cloud)
+    assert axes[1].yaxis_inverted()  # y points down
+
+
+@pytest.mark.parametrize(
+    ("package", "export"),
+    [
+        ("xarray", lambda frames, cloud: frames.to_xarray()),
+        ("pandas", lambda frames, cloud: cloud.to_pandas()),
+        ("open3d", lambda frames, cloud: cloud.to_open3d()),
+        ("torch", lambda frames, cloud: frames.to_torch()),
+    ],
+)
+def test_a_missing_library_is_named_in_a_line(
+    monkeypatch: pytest.MonkeyPatch,
+    frames: tofclip.Frames,
+    cloud: tofclip.PointCloud,
+    package: str,
+    export: Callable[[tofclip.Frames, tofclip.PointCloud], Any],
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MissingDependencyError, match=f"pip install {package}") as fault:
+        export(frames, cloud)
+    assert "\n" not in str(fault.value)
+
+
+def test_wrong_types_and_names_are_refused_by_our_own_errors(
+    frames: tofclip.Frames, cloud: tofclip.PointCloud, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=r"saved as HDF5 \(\.h5\), not as '\.npz'"):
+        frames.save(tmp_path / "frames.npz")
+    with pytest.raises(InputError, match=r"\.xyz"):
+        cloud.save(tmp_path / "cloud.xyz")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(InputError, match=r"see tofclip\.read_streak, not a str"):
+        tofclip.recover("shot.tif")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="not a ndarray"):
+        tofclip.depth(frames.values)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="not a Frames"):
+        tofclip.point_cloud(frames)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="not a list"):
+        tofclip.Frames([1.0], frames.times, frames.camera)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="not a str"):
+        tofclip.Frames(frames.values, frames.times, "camera.h5")  # type: ignore[arg-type]
+    for limits in ("near", 2.0, (1, 2, 3)):
+        with pytest.raises(InputError):
+            frames.sel(range=limits)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="slice, a mask or numbers"):
+        cloud["near"]

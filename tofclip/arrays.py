@@ -294,7 +294,7 @@ def parse_device(name: str) -> ComputeDevice:
             if device := _find_gpu(library, number):
                 return device
         raise MissingDependencyError(
-            f"no CUDA device {number} was found through CuPy or PyTorch; install tofclip[cuda], or use --device cpu"
+            f'no CUDA device {number} was found through CuPy or PyTorch; install tofclip[cuda], or use `device="cpu"`'
         )
     if kind == "torch" and which:
         return _find_torch_device(which)
@@ -323,7 +323,7 @@ def _find_torch_device(name: str) -> ComputeDevice:
         import torch
     except ImportError as problem:
         raise MissingDependencyError(
-            "PyTorch is not installed; pip install torch, or use --device cpu"
+            'PyTorch is not installed; pip install torch, or use `device="cpu"`'
         ) from problem
     try:
         # Sums are taken in double precision, which some devices do not have. The array knows its
@@ -331,6 +331,6 @@ def _find_torch_device(name: str) -> ComputeDevice:
         device = torch.zeros(1, dtype=torch.float64, device=name).device
     except (RuntimeError, AssertionError, NotImplementedError, TypeError) as problem:
         raise MissingDependencyError(
-            f"PyTorch finds no device '{name}' with float64 here; use --device cpu"
+            f"PyTorch finds no device '{name}' with float64 here; use `device=\"cpu\"`"
         ) from problem
     return ComputeDevice("torch", device)

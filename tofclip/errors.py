@@ -27,8 +27,9 @@
         +-- BufferOverflowError                the records came faster than they were read
         +-- ProtocolError                      it said what its protocol does not allow
 
-A message is one line that says what was wrong and what to do about it. The command line prints it
-and exits with status 2.
+A message is one line that says what was wrong and what to do about it. An argument that would help is
+named as in Python, in backquotes (`bin_width`); the command line puts its option in that place
+(``--bin-width-ps``), prints the line and exits with status 2.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ __all__ = [
     "TofclipError",
     "TransferOverflowError",
     "UsbBackendError",
+    "require_type",
 ]
 
 
@@ -147,3 +149,28 @@ class BufferOverflowError(DeviceError):
 
 class ProtocolError(DeviceError):
     """The instrument said something that its protocol does not allow."""
+
+
+def require_type(value: object, wanted: type, use: str) -> None:
+    """Refuse an argument of another type than the one that is needed.
+
+    Parameters
+    ----------
+    value : object
+    wanted : type
+    use : str
+        What needs it and how one comes by it, such as ``"recover takes a Streak, see read_streak"``.
+
+    Raises
+    ------
+    InputError
+        It is of another type.
+
+    Examples
+    --------
+    >>> require_type("shot.tif", float, "a bin lasts a number of seconds")
+    Traceback (most recent call last):
+    tofclip.errors.InputError: a bin lasts a number of seconds, not a str
+    """
+    if not isinstance(value, wanted):
+        raise InputError(f"{use}, not a {type(value).__name__}")

@@ -1,4 +1,6 @@
-"""How objects show themselves in a notebook: a table of what they hold, and a picture."""
+"""How objects show themselves in a notebook, and how they become those of other libraries: a table of
+what they hold, a picture, labelled arrays and tables.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +8,39 @@ import base64
 import html
 import io
 from collections.abc import Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-PICTURE_COLOURMAP = "inferno"
+from tofclip.dependencies import describe_missing_package
+from tofclip.errors import MissingDependencyError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+PICTURE_COLOURMAP, RANGE_COLOURMAP = "inferno", "turbo"
 PICTURE_WIDTH_PX = 240
+MAX_PLOTTED_POINTS = 20_000
+
+
+def require_package(name: str) -> Any:
+    """Return another library's module.
+
+    Parameters
+    ----------
+    name : str
+
+    Raises
+    ------
+    MissingDependencyError
+        It is not installed, or does not load.
+    """
+    try:
+        return import_module(name)
+    except ImportError as fault:
+        raise MissingDependencyError(describe_missing_package(fault) or str(fault)) from fault
 
 
 def render_html(title: str, rows: Mapping[str, str], picture: NDArray[np.floating] | None) -> str:
@@ -36,6 +65,83 @@ def render_html(title: str, rows: Mapping[str, str], picture: NDArray[np.floatin
     drawn = "" if picture is None else f"<td>{_encode_picture(picture)}</td>"
     return (
         f"<b>{html.escape(title)}</b><table><tr><td><table>{cells}</table></td>{drawn}</tr></table>"
+    )
+
+
+def plot_picture(picture: NDArray[np.floating], title: str, ax: Axes | None = None) -> Axes:
+    """Draw a picture with a scale of its brightness.
+
+    Parameters
+    ----------
+    picture : (y, x) array
+    title : str
+    ax : matplotlib Axes, optional
+        Where to draw; by default the current figure's.
+
+    Returns
+    -------
+    matplotlib Axes
+    """
+    pyplot = require_package("matplotlib.pyplot")
+    ax = ax or pyplot.gca()
+    drawn = ax.imshow(picture, cmap=PICTURE_COLOURMAP)
+    ax.figure.colorbar(drawn, ax=ax, label="counts")
+    ax.set(title=title, xlabel="x (px)", ylabel="y (px)")
+    return ax
+
+
+def plot_points(
+    xyz: NDArray[np.floating], distance: NDArray[np.floating], ax: Axes | None = None
+) -> Axes:
+    """Draw points as the camera sees them, coloured by their range.
+
+    Parameters
+    ----------
+    xyz : (n, 3) array
+        m: x right, y down, z forward.
+    distance : (n,) array
+        m.
+    ax : matplotlib Axes, optional
+
+    Returns
+    -------
+    matplotlib Axes
+    """
+    pyplot = require_package("matplotlib.pyplot")
+    ax = ax or pyplot.gca()
+    step = max(1, len(xyz) // MAX_PLOTTED_POINTS)
+    order = np.argsort(-distance[::step], kind="stable")  # near points are drawn over far ones
+    x, y, _ = xyz[::step][order].T
+    drawn = ax.scatter(x, y, c=distance[::step][order], s=2, cmap=RANGE_COLOURMAP)
+    ax.figure.colorbar(drawn, ax=ax, label="range (m)")
+    ax.set(xlabel="x (m)", ylabel="y (m), down", aspect="equal")
+    if not ax.yaxis_inverted():
+        ax.invert_yaxis()
+    return ax
+
+
+def make_data_array(
+    values: NDArray[Any], axes: Mapping[str, tuple[NDArray[Any], str]], name: str, unit: str
+) -> Any:
+    """Return an `xarray.DataArray` whose coordinates carry their units.
+
+    Parameters
+    ----------
+    values : array
+    axes : mapping of str to (array, str)
+        Coordinates and unit of each axis, in order.
+    name, unit : str
+        Of the values.
+
+    Raises
+    ------
+    MissingDependencyError
+        xarray is not installed.
+    """
+    xarray = require_package("xarray")
+    places = {axis: (axis, place, {"units": units}) for axis, (place, units) in axes.items()}
+    return xarray.DataArray(
+        values, dims=tuple(axes), coords=places, name=name, attrs={"units": unit}
     )
 
 

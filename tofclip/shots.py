@@ -15,8 +15,14 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import Array, namespace, to_numpy
 from tofclip.camera import Camera
-from tofclip.errors import FileFormatError, InputError, MissingTimeAxisError, ShapeError
-from tofclip.notebook import render_html
+from tofclip.errors import (
+    FileFormatError,
+    InputError,
+    MissingTimeAxisError,
+    ShapeError,
+    require_type,
+)
+from tofclip.notebook import make_data_array, plot_picture, render_html, require_package
 from tofclip.records import (
     Storable,
     stored_array,
@@ -136,7 +142,7 @@ class Streak(Storable):
         """Raise `MissingTimeAxisError` where the instants of the rows are not known."""
         if self.row_times is None:
             raise MissingTimeAxisError(
-                f"{self.source} has no time axis: give the duration of a row (--bin-width-ps, or bin_width in seconds)"
+                f"{self.source} has no time axis: give the duration of a row (`bin_width`)"
             )
 
     def with_bin_width(self, bin_width: float) -> Streak:
@@ -145,7 +151,7 @@ class Streak(Storable):
             raise InputError(f"bin width must be a positive number of seconds, got {bin_width}")
         if bin_width > MAX_BIN_WIDTH_S:
             raise InputError(
-                f"a row of {bin_width:.3g} s is longer than any sweep; --bin-width-ps is in picoseconds"
+                f"a row of {bin_width:.3g} s is longer than any sweep; check the unit of `bin_width`"
             )
         return replace(
             self, row_times=np.arange(self.counts.shape[0], dtype=np.float64) * float(bin_width)
@@ -457,6 +463,9 @@ class Frames(Storable):
     def __post_init__(self) -> None:
         times = np.asarray(self.times, dtype=np.float64)
         object.__setattr__(self, "times", times)
+        require_type(self.camera, Camera, "frames belong to a Camera")
+        if not hasattr(self.values, "shape"):
+            require_type(self.values, np.ndarray, "the values of frames are an array (time, y, x)")
         expected = (times.size, *self.camera.image_shape)
         if self.values.shape != expected:
             raise ShapeError("frames", f"(time, y, x) = {expected}", tuple(self.values.shape))
@@ -515,7 +524,12 @@ class Frames(Storable):
         """
         if (range is None) == (time is None):
             raise InputError("sel takes either range=(near, far) in m or time=(first, last) in s")
-        limits = np.asarray(time if range is None else range, dtype=np.float64)
+        try:
+            limits = np.asarray(time if range is None else range, dtype=np.float64)
+        except (TypeError, ValueError) as fault:
+            raise InputError(f"limits are two numbers: {fault}") from fault
+        if limits.shape != (2,):
+            raise ShapeError("the limits of sel", "(lower, upper)", limits.shape)
         at = self.times if range is None else SPEED_OF_LIGHT * self.times / 2
         first, stop = np.searchsorted(at, limits[0]), np.searchsorted(at, limits[1], side="right")
         if first >= stop:
@@ -544,6 +558,48 @@ class Frames(Storable):
             "method": str(self.figures.get("method", "unknown")),
         }
         return render_html("Frames", rows, np.asarray(self).max(axis=0))
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the sum of all frames.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            Where to draw; by default the current figure's.
+
+        Returns
+        -------
+        matplotlib Axes
+        """
+        near, far = SPEED_OF_LIGHT * self.times[[0, -1]] / 2
+        title = f"{len(self)} frames, {near:.3g} to {far:.3g} m{self._time_zero_note}"
+        return plot_picture(np.asarray(self).sum(axis=0), title, ax)
+
+    def to_xarray(self) -> Any:
+        """Return an `xarray.DataArray` (time, y, x), times in s and pixels as coordinates.
+
+        Raises
+        ------
+        MissingDependencyError
+            xarray is not installed.
+        """
+        _, rows, columns = self.values.shape
+        axes = {
+            "time": (self.times, "s"),
+            "y": (np.arange(rows), "px"),
+            "x": (np.arange(columns), "px"),
+        }
+        return make_data_array(np.asarray(self), axes, "brightness", "counts")
+
+    def to_torch(self) -> Any:
+        """Return the values as a PyTorch tensor (time, y, x), which shares NumPy's memory.
+
+        Raises
+        ------
+        MissingDependencyError
+            PyTorch is not installed.
+        """
+        return require_package("torch").as_tensor(np.asarray(self))
 
     @property
     def bin_width(self) -> float:

@@ -26,13 +26,37 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from tofclip.errors import FileFormatError, StorageError
+from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.version import __version__
 
 if TYPE_CHECKING:
     import h5py
 
 Scalar = str | int | float | bool
+
+FOREIGN_SUFFIXES = frozenset(
+    [
+        ".csv",
+        ".exr",
+        ".jpg",
+        ".json",
+        ".las",
+        ".laz",
+        ".mat",
+        ".mp4",
+        ".npy",
+        ".npz",
+        ".obj",
+        ".pcd",
+        ".pdf",
+        ".ply",
+        ".png",
+        ".tif",
+        ".tiff",
+        ".txt",
+    ]
+)
+"""Of formats that a record is not written in: a file is not called what it is not."""
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """The first bytes of every HDF5 file."""
@@ -212,11 +236,16 @@ def write_record(record: Record, path: str | Path) -> None:
 
     Raises
     ------
+    InputError
+        The name ends in the suffix of another format.
     StorageError
         The file cannot be written.
     """
     import h5py
 
+    suffix = Path(path).suffix.lower()
+    if suffix in FOREIGN_SUFFIXES:
+        raise InputError(f"{path}: {record.kind} is saved as HDF5 (.h5), not as '{suffix}'")
     with atomic_path(path) as temporary:
         # HDF5 crashes the process when the disk fills up under it: it writes to memory, and Python
         # to the disk.
@@ -505,7 +534,7 @@ def _flush_to_disk(path: Path) -> None:
 
 def _explain_os_error(fault: OSError) -> str:
     if fault.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return "the disk is full; free some space or choose another folder with --out"
+        return "the disk is full; free some space or choose another folder"
     if isinstance(fault, FileNotFoundError):
         return "the folder does not exist; create it first"
     if isinstance(fault, NotADirectoryError):

@@ -226,7 +226,7 @@ def _create_file(path: Path, overwrite: bool, stack: contextlib.ExitStack) -> tu
         stack.callback(os.close, old)
         if not overwrite:
             raise InputError(
-                f"{path}: exists already; choose another name, or replace it with --overwrite"
+                f"{path}: exists already; choose another name, or replace it (`overwrite=True`)"
             )
     try:
         mode = 0o666  # less what the user's umask takes away
@@ -287,7 +287,7 @@ def _publish(temporary: Path, path: Path, overwrite: bool) -> None:
             os.link(temporary, path)
         except FileExistsError:
             raise InputError(
-                f"{path}: exists already; choose another name, or replace it with --overwrite"
+                f"{path}: exists already; choose another name, or replace it (`overwrite=True`)"
             ) from None
         except OSError:  # a file system without links
             os.replace(temporary, path)

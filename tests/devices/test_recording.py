@@ -479,7 +479,7 @@ def test_a_second_recorder_is_refused(tmp_path: Path) -> None:
             RecordingWriter(path, head, overwrite)
     first.add(Piece(b"", 0))
     first.close()
-    with pytest.raises(InputError, match="--overwrite"):
+    with pytest.raises(InputError, match="overwrite=True"):
         RecordingWriter(path, head)
     RecordingWriter(path, head, overwrite=True).close()
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.h5"]

@@ -102,7 +102,7 @@ def test_no_time_axis_is_an_error_only_when_times_are_asked_for(
 ) -> None:
     streak = read_streak(write_hpdta(place=place, unit=unit, kind=1))
     assert streak.row_times is None
-    with pytest.raises(MissingTimeAxisError, match=r"shot\.tif has no time axis.*--bin-width-ps"):
+    with pytest.raises(MissingTimeAxisError, match=r"shot\.tif has no time axis.*`bin_width`"):
         _ = streak.times
 
 

@@ -113,7 +113,7 @@ def test_the_files_own_bin_width_is_recognised(name, counts, tmp_path) -> None:
 
 def test_without_a_bin_width_one_is_asked_for(counts, tmp_path) -> None:
     np.save(tmp_path / "a.npy", counts)
-    with pytest.raises(InputError, match="--bin-width-ps"):
+    with pytest.raises(InputError, match="`bin_width`"):
         read_photons(tmp_path / "a.npy")
 
 
@@ -135,7 +135,7 @@ def test_time_is_recognised_by_its_peak_where_it_is_not_the_longest(tmp_path) ->
     np.save(tmp_path / "a.npy", np.moveaxis(cube, 2, 0))
     assert read_photons(tmp_path / "a.npy", BIN).image_shape == (30, 50)
     np.save(tmp_path / "flat.npy", np.ones((20, 20, 20), int))
-    with pytest.raises(InputError, match="--axes"):
+    with pytest.raises(InputError, match="`axes`"):
         read_photons(tmp_path / "flat.npy", BIN)
     with pytest.raises(InputError, match="yxt"):
         read_photons(tmp_path / "flat.npy", BIN, "yx")

@@ -114,7 +114,7 @@ def test_what_is_not_a_photon_image_is_refused() -> None:
     with pytest.raises(InputError, match="no pixel counted a photon"):
         PhotonImage.from_cube(np.zeros((2, 2, 4)), BIN)
     flat = np.random.default_rng(0).poisson(0.02, (20, 20, 400))
-    with pytest.raises(InputError, match="--pulse-ps"):
+    with pytest.raises(InputError, match="`pulse`"):
         estimate_surface(PhotonImage.from_cube(flat, BIN))
 
 

@@ -184,7 +184,7 @@ def test_a_shot_that_is_not_of_surfaces_is_refused(shot):
     random = np.random.default_rng(3)
     fog = np.zeros_like(shot.streak.counts)
     fog[60:180] = random.poisson(40 * random.random((120, fog.shape[1])))
-    with pytest.raises(InputError, match="choose --method tv"):
+    with pytest.raises(InputError, match='choose `method="tv"`'):
         recover(replace(shot.streak, counts=fog.astype(np.float32)), shot.camera, "surfaces")
 
 

@@ -79,7 +79,7 @@ def test_negative_readings_are_kept() -> None:
 def test_the_time_axis_is_asked_for_by_name() -> None:
     streak = Streak(COUNTS, source="shot.tif")
     with pytest.raises(
-        MissingTimeAxisError, match=r"shot\.tif has no time axis: give .*--bin-width-ps"
+        MissingTimeAxisError, match=r"shot\.tif has no time axis: give .*`bin_width`"
     ):
         _ = streak.times
     np.testing.assert_allclose(streak.with_bin_width(2e-12).times, [0, 2e-12, 4e-12], rtol=1e-15)

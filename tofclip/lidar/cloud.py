@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.errors import FileFormatError, InputError, ShapeError
+from tofclip.errors import FileFormatError, InputError, ShapeError, require_type
 from tofclip.lidar import export
 from tofclip.lidar.column import Column
 from tofclip.lidar.geometry import compute_ray_directions
-from tofclip.notebook import render_html
+from tofclip.notebook import plot_points, render_html, require_package
 from tofclip.records import Storable, stored_array, stored_provenance
 from tofclip.shots import Returns
 from tofclip.storage import Record
@@ -124,6 +124,54 @@ class PointCloud(Storable):
             rows["range"] = f"{self.range.min():.3f} to {self.range.max():.3f} m"
         return render_html("PointCloud", rows, None)
 
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the points as the camera sees them, coloured by range.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            Where to draw; by default the current figure's.
+
+        Returns
+        -------
+        matplotlib Axes
+        """
+        return plot_points(self.xyz, self.range, ax)
+
+    def to_pandas(self) -> Any:
+        """Return a `pandas.DataFrame` with a row for each point, columns as in `COLUMN_UNITS`.
+
+        Raises
+        ------
+        MissingDependencyError
+            pandas is not installed.
+        """
+        columns = {column.name: column.values for column in self.columns}
+        return require_package("pandas").DataFrame(columns)
+
+    def to_open3d(self) -> Any:
+        """Return an `open3d.geometry.PointCloud` of the positions.
+
+        Raises
+        ------
+        MissingDependencyError
+            Open3D is not installed.
+        """
+        open3d = require_package("open3d")
+        return open3d.geometry.PointCloud(
+            open3d.utility.Vector3dVector(self.xyz.astype(np.float64))
+        )
+
+    def to_torch(self) -> Any:
+        """Return the positions as a PyTorch tensor (points, 3), m, which shares NumPy's memory.
+
+        Raises
+        ------
+        MissingDependencyError
+            PyTorch is not installed.
+        """
+        return require_package("torch").as_tensor(self.xyz)
+
     def save(self, path: str | Path) -> None:
         """Write the points to a file whose suffix says the format, whole or not at all.
 
@@ -200,6 +248,7 @@ def point_cloud(returns: Returns) -> PointCloud:
     returns : Returns
         Radial distances with their camera.
     """
+    require_type(returns, Returns, "a point cloud is made of Returns, see tofclip.depth")
     directions = compute_ray_directions(returns.camera, *returns.line_of_sight_px)
     return PointCloud(
         xyz=(directions * returns.range[:, np.newaxis]).astype(np.float32),

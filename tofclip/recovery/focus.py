@@ -159,7 +159,7 @@ class DepthLockedFocus:
         if camera.lenslet_pitch <= 0:
             raise CalibrationError(
                 "the camera does not know its lenslet pitch, so that range says nothing about shear: calibrate it "
-                "(tofclip.camera.calibration.parallax) or choose --focus fixed:S or stack:S0:S1:N"
+                "(tofclip.camera.calibration.parallax) or choose another `focus`, fixed:S or stack:S0:S1:N"
             )
 
     def plan_segments(

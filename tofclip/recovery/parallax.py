@@ -88,7 +88,7 @@ def fit_parallax_to_shot(
     measurement = measure(shot.streak.counts, shot.streak.saturated, camera)
     if times[0] <= 0:
         raise CalibrationError(
-            "light cannot come before time zero: give the camera's (--time-zero-ns)"
+            "light cannot come before time zero: give the camera's (`time_zero`)"
         )
     cut, distances = split_gates_by_brightness(measurement, times, gates)
     curve = find_sharpest_shears(measurement, camera, cut, np.linspace(*shears), progress)

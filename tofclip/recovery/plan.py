@@ -20,7 +20,7 @@ from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_num
 from tofclip.camera import Camera, Measurement, measure
 from tofclip.camera.calibration.registration import count_registration_iterations, register_views
 from tofclip.camera.calibration.skew import estimate_skew
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_type
 from tofclip.io.streaks import read_streak
 from tofclip.operators import LinearOperator
 from tofclip.recovery.defects import mask_defects
@@ -168,7 +168,7 @@ def open_shot(
     known = known or streak.camera
     if known is None:
         raise InputError(
-            f"{streak.source} carries no camera: give one (--camera camera.h5, made by calibrate)"
+            f"{streak.source} carries no camera: give one (`camera`, made by tofclip calibrate)"
         )
     require_plausible_rows(streak, known)
     streak = mask_defects(streak, known.pulse_fwhm)
@@ -399,6 +399,7 @@ def recover(
     >>> frames.values.shape, int(frames.values.sum(axis=(1, 2)).argmax())
     ((40, 16, 16), 20)
     """
+    require_type(streak, Streak, "recover takes a Streak, see tofclip.read_streak")
     shot = open_shot(streak, camera)
     return plan_recovery(shot, method, focus or DEFAULT_FOCUS, device).run(progress)
 
@@ -429,7 +430,7 @@ def require_plausible_rows(streak: Streak, camera: Camera) -> None:
         return
     raise InputError(
         f"{streak.source}: a row of {width / PICOSECOND:.4g} ps {fault} ({pulse / PICOSECOND:.3g} ps); "
-        "check the unit of --bin-width-ps, or give the pulse to calibrate (--pulse-ps)"
+        "check the unit of `bin_width`, or give the pulse to calibrate (`pulse`)"
     )
 
 

@@ -586,7 +586,8 @@ def _require_surfaces(found: Returns, patches: list[Patch]) -> None:
     share = float(found.intensity[on_surface[found.y, found.x]].sum()) / light if light else 0.0
     if share < MIN_SURFACE_SHARE:
         raise InputError(
-            f"only {100 * share:.0f} % of this shot's light comes from surfaces; choose --method tv"
+            f"only {100 * share:.0f} % of this shot's light comes from surfaces; choose "
+            '`method="tv"`'
         )
 
 

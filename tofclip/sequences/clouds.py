@@ -138,7 +138,7 @@ def _explain_empty_cloud(frames: Frames) -> str:
             ranges = later.range - SPEED_OF_LIGHT * (last - 2 * first) / 2
             return (
                 f"all {len(later)} returns have negative ranges ({ranges.min():.3g} to {ranges.max():.3g} m): "
-                "time zero is later than the light; check the sign of --time-zero-ns"
+                "time zero is later than the light; check the sign of `time_zero`"
             )
     return "no return stands out of the background, so there is no point to write"
 

@@ -132,7 +132,7 @@ def read_photons(
     opened = open_photons(source)
     width = opened.bin_width if bin_width is None else bin_width
     if width is None:
-        raise InputError(f"{source}: does not say how long a bin lasts; give --bin-width-ps")
+        raise InputError(f"{source}: does not say how long a bin lasts; give `bin_width`")
     try:
         return _read_layout(opened, source, width, axes)
     except TofclipError:
@@ -278,7 +278,7 @@ def recognise_axes(cube: NDArray[Any], path: Path) -> str:
         time = int(by_length[0])
     else:
         raise InputError(
-            f"{path}: its shape {cube.shape} does not say which axis is time; give --axes, e.g. yxt"
+            f"{path}: its shape {cube.shape} does not say which axis is time; give `axes`, e.g. yxt"
         )
     return {0: "tyx", 1: "ytx", 2: "yxt"}[time]
 

@@ -162,7 +162,7 @@ def measure_pulse_width(photons: PhotonImage) -> float:
                 return float(np.sqrt(2) * max(half, 0.5) * photons.bin_width)
         group *= 2
     raise InputError(
-        "no pulse stands out from the background in these photons; give its width with --pulse-ps"
+        "no pulse stands out from the background in these photons; give its width (`pulse`)"
     )
 
 

@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import is_numpy
 from tofclip.camera import Camera
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError, ShapeError, require_type
 from tofclip.lidar.detection import Detection
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.neighbours import add_recovery_error
@@ -258,6 +258,7 @@ def depth(
     >>> int(returns.y[0]), int(returns.x[0]), round(float(returns.range[0]), 4)
     (3, 4, 0.06)
     """
+    require_type(frames, Frames, "returns are found in Frames, see tofclip.recover")
     camera = frames.camera if camera is None else camera
     if camera.image_shape != frames.values.shape[1:]:
         raise ShapeError(

@@ -47,7 +47,7 @@ def connect_workers(where: str) -> Iterator[Client]:
         import distributed
     except ImportError as fault:
         raise MissingDependencyError(
-            "--cluster needs dask.distributed: pip install 'tofclip[cluster]'"
+            "a cluster needs dask.distributed: pip install 'tofclip[cluster]'"
         ) from fault
     opened = (
         _start_local_cluster(distributed, number)
