@@ -19,9 +19,11 @@ from tofclip.errors import InputError
 from tofclip.storage import Scalar
 
 OPENERS: dict[str, str] = {
+    "aravis": "devices.aravis:open_aravis",
     "linospad2": "devices.linospad2.source:open_recording",
     "remoteex": "devices.remoteex.source:open_remoteex",
     "spad512": "devices.spad512.source:open_spad512",
+    "sim+aravis": "devices.aravis:open_emulated",
     "sim+linospad2": "devices.linospad2.simulation:open_simulated",
     "sim+remoteex": "devices.remoteex.simulation:open_emulated",
     "sim+spad512": "devices.spad512.emulator:open_emulated",
@@ -31,6 +33,7 @@ OPENERS: dict[str, str] = {
 """Scheme of an address -> function ``(Uri) -> Source``."""
 
 FILE_OPENERS: dict[str, str] = {
+    "aravis": "devices.aravis:open_aravis",
     ".dat": "devices.linospad2.source:open_recording",
     ".img": "devices.streak_file:open_streak_file",
     ".tif": "devices.streak_file:open_streak_file",
@@ -45,7 +48,10 @@ FILE_OPENERS: dict[str, str] = {
 ``file://PATH``.
 """
 
-FINDERS: tuple[str, ...] = ("devices.timetag.source:find_timetaggers",)
+FINDERS: tuple[str, ...] = (
+    "devices.timetag.source:find_timetaggers",
+    "devices.aravis:find_cameras",
+)
 """Functions ``() -> list[Found]`` that look for instruments. They return nothing, and never fail,
 without hardware.
 """

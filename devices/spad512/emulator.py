@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from devices.emulation.faults import Fault
+from devices.gate_scan import GateScan
 from devices.ledger import Ledger
 from devices.loopback import HOST, Connection, LoopbackServer
 from devices.scenes import render_array_delays, render_array_light
@@ -22,7 +23,6 @@ from devices.spad512.protocol import (
     INFORMATION_COMMAND,
     ROWS,
     ExposureRequest,
-    GateScan,
 )
 from devices.spad512.source import OPTIONS, Spad512Feed, parse_exposure, parse_timeouts
 from devices.stream import StreamSource

@@ -16,10 +16,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from devices.frames import FrameCodec
+from devices.gate_scan import GateScan
 from tofclip.errors import InputError, ProtocolError
 
 DEFAULT_PORT = 9999
@@ -56,51 +54,6 @@ _GATED = re.compile(
 )
 _ERROR_TEXT = re.compile(rb"[\t\n\r -~]{0,240}\Z")
 _MICROSECOND_DEPTHS = (1, 4)  # the others take milliseconds
-
-
-@dataclass(frozen=True)
-class GateScan:
-    """A gate that opens later from picture to picture.
-
-    Parameters
-    ----------
-    steps : int
-        Pictures of one scan.
-    step_ps : float
-        How much later the gate opens from one to the next, ps.
-    width_ns : float
-        How long it is open, ns.
-    offset_ps : float
-        When it opens in the first one, ps after the laser's pulse.
-
-    Raises
-    ------
-    InputError
-        The instrument cannot do that.
-    """
-
-    steps: int = 72
-    step_ps: float = 252.0
-    width_ns: float = 5.0
-    offset_ps: float = 5000.0
-
-    def __post_init__(self) -> None:
-        if not (
-            2 <= self.steps <= 4096
-            and GATE_STEP_PS <= self.step_ps <= 1e6
-            and 0 < self.width_ns <= 1000
-            and 0 <= self.offset_ps <= 1e9
-        ):
-            raise InputError(
-                f"a gate moves in 2 to 4096 steps of at least {GATE_STEP_PS} ps and is open for up to 1000 ns, "
-                f"got {self}"
-            )
-
-    @property
-    def opening_times(self) -> NDArray[np.float64]:
-        """When the gate opens in each picture of a scan, s after the laser's pulse."""
-        steps = np.arange(self.steps, dtype=np.float64)
-        return (self.offset_ps + self.step_ps * steps) * 1e-12
 
 
 @dataclass(frozen=True)
@@ -144,6 +97,10 @@ class ExposureRequest:
             raise InputError("single bits come at full width and without correction of pile-up")
         if self.gate is not None and (self.bits not in GATED_BIT_DEPTHS or self.width != ROWS):
             raise InputError("pictures behind a gate have full width and 6 to 12 bits")
+        if self.gate is not None and self.gate.step_ps < GATE_STEP_PS:
+            raise InputError(
+                f"a SPAD512's gate moves by at least {GATE_STEP_PS} ps, got {self.gate.step_ps:g}"
+            )
         if not (0 < self.seconds <= 3600 and self.images >= 1 and self.frames <= MAX_IMAGES):
             raise InputError(
                 f"pictures need an exposure within 0..3600 s, and 1..{MAX_IMAGES} of them, got {self}"

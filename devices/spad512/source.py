@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Callable
 from time import monotonic
 
+from devices.gate_scan import GATE_OPTIONS, GateScan
 from devices.ledger import Ledger
 from devices.retry import retry_connect
 from devices.ring import Gap
@@ -18,7 +19,6 @@ from devices.spad512.protocol import (
     INFORMATION_COMMAND,
     MAX_TEXT_BYTES,
     ExposureRequest,
-    GateScan,
     find_error_text,
 )
 from devices.stream import StreamSource, Transfer
@@ -33,10 +33,9 @@ from tofclip.errors import (
     InputError,
     ProtocolError,
 )
-from tofclip.storage import Field, Record
+from tofclip.storage import Record
 
 INSTRUMENT = "SPAD512 array"
-GATE_OPTIONS = ("gate_steps", "gate_step_ps", "gate_width_ns", "gate_offset_ps")
 OPTIONS = (
     "mode",
     *GATE_OPTIONS,
@@ -55,9 +54,6 @@ _SILENCE_S = 0.2
 
 BREAKDOWN_CALIBRATION_S = 60.0
 """Seconds that the server may calibrate itself when it is first asked."""
-
-GATE_SCAN = "gate_scan"
-"""Kind of the calibration of pictures behind a moving gate."""
 
 ConnectFunction = Callable[[], TcpLink]
 
@@ -116,10 +112,7 @@ class Spad512Feed:
         no gate, and so no time axis.
         """
         gate = self._exposure.gate
-        if gate is None:
-            return None
-        times = Field(gate.opening_times, "s", ("gate_step",))
-        return Record(GATE_SCAN, {"gate_times": times}, {"gate_width_s": gate.width_ns * 1e-9})
+        return None if gate is None else gate.to_record()
 
     def start(self) -> None:
         """Do nothing: the first request starts the instrument."""
@@ -270,13 +263,7 @@ def parse_exposure(uri: Uri) -> ExposureRequest:
     standard = ExposureRequest()
     gate = None
     if uri.choice("mode", "intensity", "gated") == "gated":
-        usual = GateScan()
-        gate = GateScan(
-            uri.value("gate_steps", int, usual.steps),
-            uri.value("gate_step_ps", float, usual.step_ps),
-            uri.value("gate_width_ns", float, usual.width_ns),
-            uri.value("gate_offset_ps", float, usual.offset_ps),
-        )
+        gate = GateScan.from_uri(uri)
     elif set(uri.values) & set(GATE_OPTIONS):
         raise InputError(f"'{uri.text}': a gate needs mode=gated")
     return ExposureRequest(

@@ -12,6 +12,7 @@ from hypothesis import given
 
 import devices
 from devices.emulation.faults import Fault
+from devices.gate_scan import GateScan
 from devices.loopback import HOST, Connection, LoopbackServer
 from devices.photons import read_photons
 from devices.scenes import render_array_delays, render_array_light
@@ -22,7 +23,6 @@ from devices.spad512.protocol import (
     IMAGE_WIDTHS_PX,
     ROWS,
     ExposureRequest,
-    GateScan,
     find_error_text,
 )
 from devices.tcp import TcpLink

@@ -1,0 +1,464 @@
+"""Industrial cameras (GigE Vision, USB3 Vision) through the Aravis library, as a source of frames.
+
+Aravis and its Python binding come with the system, not with pip: on Debian ``apt install
+python3-gi gir1.2-aravis-0.8``. They are looked for when such a camera is asked for, also outside a
+virtual environment where that has the same version of Python.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.machinery
+import importlib.util
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from devices.clock import InstrumentClock
+from devices.frames import FrameCodec
+from devices.gate_scan import GATE_OPTIONS, GateScan
+from devices.ledger import Ledger
+from devices.registry import DiscoveredInstrument
+from devices.retry import retry_connect
+from devices.ring import Gap
+from devices.source import Info
+from devices.stream import StreamSource, Transfer
+from devices.stream_options import OPTIONS as STREAM_OPTIONS
+from devices.stream_options import parse_buffer_settings, parse_seconds
+from devices.uri import Uri
+from tofclip.errors import (
+    DeviceDisconnectedError,
+    DeviceError,
+    DeviceNotFoundError,
+    DeviceTimeoutError,
+    InputError,
+    MissingDependencyError,
+    ProtocolError,
+)
+from tofclip.storage import Field, Record
+
+OPTIONS = (
+    "exposure_us",
+    "gain",
+    "frame_rate",
+    "pixel_format",
+    "row_ps",
+    "mode",
+    *GATE_OPTIONS,
+    "buffers",
+    "timeout_s",
+    "reconnect_s",
+    *STREAM_OPTIONS,
+)
+PIXEL_BITS = {"Mono8": 8, "Mono10": 16, "Mono12": 16, "Mono14": 16, "Mono16": 16}
+FRAME_ID_RANGE = 0xFFFF
+"""GigE Vision's 16-bit identifiers go from 1 to this, and then to 1 again."""
+
+SYSTEM_PACKAGES = ("/usr/lib/python3/dist-packages",)
+LOOPBACK = "127.0.0.1"
+NANOSECOND_S, PICOSECOND_S = 1e-9, 1e-12
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """How to acquire; None leaves the camera's own setting.
+
+    Parameters
+    ----------
+    exposure_us : float or None
+    gain : float or None
+        In the camera's own unit, dB for most.
+    frame_rate : float or None
+        1/s.
+    pixel_format : str
+        As GenICam calls it, e.g. ``Mono16``; empty leaves the camera's.
+    row_ps : float or None
+        Duration of a row, ps, where the camera looks at a streak tube's screen.
+    gate : GateScan or None
+        Where a gated intensifier stands before it, stepped by each frame.
+    buffers : int
+        Frames that Aravis holds.
+    timeout, reconnect : float
+        s without any frame after which the camera is asked whether it is there, and for it to come
+        back.
+    """
+
+    exposure_us: float | None = None
+    gain: float | None = None
+    frame_rate: float | None = None
+    pixel_format: str = ""
+    row_ps: float | None = None
+    gate: GateScan | None = None
+    buffers: int = 16
+    timeout: float = 5.0
+    reconnect: float = 5.0
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.buffers <= 4096:
+            raise InputError(f"the number of buffers must be within 2..4096, got {self.buffers}")
+        for name in ("exposure_us", "frame_rate", "row_ps"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < 1e12:
+                raise InputError(f"{name} must be positive, got {value:g}")
+        if self.pixel_format and self.pixel_format not in PIXEL_BITS:
+            raise InputError(
+                f"pixel_format must be one of {', '.join(PIXEL_BITS)}, not '{self.pixel_format}'"
+            )
+
+    @classmethod
+    def from_uri(cls, uri: Uri) -> CameraSettings:
+        """Read the values of an address (`OPTIONS`) that say how to acquire."""
+
+        def number(name: str) -> float | None:
+            return uri.value(name, float, 0.0) if name in uri.values else None
+
+        gate = GateScan.from_uri(uri) if uri.choice("mode", "free", "gated") == "gated" else None
+        return cls(
+            number("exposure_us"),
+            number("gain"),
+            number("frame_rate"),
+            uri.value("pixel_format", str, ""),
+            number("row_ps"),
+            gate,
+            uri.value("buffers", int, cls.buffers),
+            parse_seconds(uri, "timeout_s", cls.timeout),
+            parse_seconds(uri, "reconnect_s", cls.reconnect),
+        )
+
+
+class AravisFeed:
+    """Frames in the order of their identifiers; see `devices.stream.Feed`.
+
+    A gap in the identifiers is lost by the camera or on the wire, except for frames that found no
+    buffer in Aravis, which this program dropped. A frame of which packets are missing is malformed.
+
+    Parameters
+    ----------
+    library : module
+        Aravis.
+    place : str
+        Name or address of the camera; empty for the first one found.
+    ledger : Ledger
+    settings : CameraSettings
+    """
+
+    def __init__(self, library: Any, place: str, ledger: Ledger, settings: CameraSettings) -> None:
+        self._library, self._place = library, place
+        self._ledger, self._settings = ledger, settings
+        self._clock = InstrumentClock()
+        self._number = 0
+        self._gap = Gap.NONE
+        self._camera: Any = None
+        self._stream: Any = None
+        self._open_camera()
+        self.codec = self._make_codec()
+
+    @property
+    def info(self) -> Info:
+        camera = self._camera
+        with self._translate_errors():
+            return Info(
+                f"{camera.get_vendor_name()} {camera.get_model_name()} (Aravis)",
+                camera.get_device_serial_number() or "",
+                {
+                    "pixel_format": camera.get_pixel_format_as_string(),
+                    "exposure_us": camera.get_exposure_time(),
+                    "gain": camera.get_gain(),
+                    "frame_rate": camera.get_frame_rate(),
+                    "rows": self.codec.rows,
+                    "columns": self.codec.columns,
+                },
+            )
+
+    @property
+    def calibration(self) -> Record | None:
+        """Times of the gate, or of the rows of a streak picture, where the address gives them."""
+        if self._settings.gate is not None:
+            return self._settings.gate.to_record()
+        if self._settings.row_ps is None:
+            return None
+        times = (np.arange(self.codec.rows) + 0.5) * self._settings.row_ps * PICOSECOND_S
+        return Record("streak_calibration", {"row_times": Field(times, "s", ("row",))})
+
+    def start(self) -> None:
+        with self._translate_errors():
+            for _ in range(self._settings.buffers):
+                self._stream.push_buffer(
+                    self._library.Buffer.new_allocate(self._camera.get_payload())
+                )
+            self._camera.start_acquisition()
+        self._running = True
+        self._heard_at = monotonic()
+
+    def pull(self, timeout: float) -> Transfer | None:
+        deadline = monotonic() + timeout
+        while True:
+            wait_us = max(0.0, deadline - monotonic()) * 1e6
+            buffer = self._stream.timeout_pop_buffer(int(wait_us))
+            arrived_at = monotonic()
+            if buffer is None:
+                if not self._running:
+                    return None
+                self._check_presence(arrived_at)
+                raise DeviceTimeoutError("the camera sent nothing; is it triggered?")
+            self._heard_at = arrived_at
+            try:
+                taken = self._take_frame(buffer, arrived_at)
+            finally:
+                self._stream.push_buffer(buffer)
+            if taken is not None:
+                return taken
+
+    def stop(self) -> None:
+        self._running = False
+        with self._translate_errors():
+            self._camera.stop_acquisition()
+
+    def close(self) -> None:
+        try:
+            if self._running:
+                self.stop()
+        finally:
+            # Letting go of the last reference closes the connection.
+            self._stream = self._camera = None
+
+    def _open_camera(self) -> None:
+        settings = self._settings
+        self._running = False
+        self._last_id: int | None = None
+        self._underruns = 0
+        self._clock.reset()
+        with self._translate_errors(DeviceNotFoundError):
+            self._camera = camera = self._library.Camera.new(self._place or None)
+        with self._translate_errors(InputError):
+            camera.set_acquisition_mode(self._library.AcquisitionMode.CONTINUOUS)
+            if settings.pixel_format:
+                camera.set_pixel_format_from_string(settings.pixel_format)
+            if settings.frame_rate is not None:
+                camera.set_frame_rate(settings.frame_rate)
+            if settings.exposure_us is not None:
+                camera.set_exposure_time(settings.exposure_us)
+            if settings.gain is not None:
+                camera.set_gain(settings.gain)
+        with self._translate_errors():
+            self._stream = camera.create_stream(None, None)
+
+    def _make_codec(self) -> FrameCodec:
+        with self._translate_errors():
+            pixel_format = self._camera.get_pixel_format_as_string()
+            _, _, width, height = self._camera.get_region()
+        bits = PIXEL_BITS.get(pixel_format)
+        if bits is None:
+            raise InputError(
+                f"the camera sends {pixel_format}; choose pixel_format={' or '.join(PIXEL_BITS)}"
+            )
+        return FrameCodec(height, width, bits)
+
+    def _take_frame(self, buffer: Any, arrived_at: float) -> Transfer | None:
+        """Enter a frame into the accounts; None where packets of it are missing."""
+        status, frame_id = buffer.get_status(), buffer.get_frame_id()
+        known = self._library.BufferStatus
+        if status in (known.CLEARED, known.ABORTED):
+            return None  # never filled: acquisition was stopped
+        if not self._count_missing(frame_id):
+            return None
+        stamp = buffer.get_timestamp() * NANOSECOND_S
+        self._number += 1
+        if status != known.SUCCESS:
+            self._ledger.truncate()
+            self._gap = max(self._gap, Gap.LOSS)
+            return None
+        pixels = buffer.get_data()
+        if len(pixels) != self.codec.pixel_bytes:
+            raise ProtocolError("the frames' size has changed; open the camera anew")
+        self._clock.observe(stamp, arrived_at)
+        gap, self._gap = self._gap, Gap.NONE
+        data = memoryview(self.codec.pack_frame(self._number - 1, pixels))
+        return Transfer(data, gap, self._clock.to_host(stamp))
+
+    def _count_missing(self, frame_id: int) -> bool:
+        """Enter frames between the last identifier and this one; False for one that comes behind a
+        later one, which has been entered already, as lost or torn.
+        """
+        if self._last_id is None:
+            self._last_id = frame_id
+            return True
+        missing = frame_id - self._last_id - 1
+        if max(frame_id, self._last_id) <= FRAME_ID_RANGE:
+            # 65535 is followed by 1, and then frames from before may still be handed over.
+            half = FRAME_ID_RANGE // 2
+            missing = (missing + 1 + half) % FRAME_ID_RANGE - half - 1
+        if missing < 0:
+            return False
+        self._last_id = frame_id
+        if missing == 0:
+            return True
+        underruns = self._stream.get_info_uint64_by_name("n_underruns")
+        dropped = min(missing, max(0, underruns - self._underruns))
+        self._underruns += dropped
+        self._ledger.receive(dropped)
+        self._ledger.drop(dropped)
+        self._ledger.lose(missing - dropped)
+        self._number += missing
+        self._gap = max(self._gap, Gap.LOSS)
+        return True
+
+    def _check_presence(self, now: float) -> None:
+        """Where nothing came for long, ask the camera something; open it anew if it is gone."""
+        if now - self._heard_at < self._settings.timeout:
+            return
+        self._heard_at = now
+        try:
+            with self._translate_errors():
+                self._camera.get_exposure_time()
+        except DeviceError:
+            retry_connect(self._reopen, self._settings.reconnect)
+            self._ledger.reconnect()
+            self._gap = Gap.RESTART
+            gate = self._settings.gate
+            if gate is not None:
+                self._number += -self._number % gate.steps  # the scan is not finished
+
+    def _reopen(self) -> None:
+        self._open_camera()
+        self.start()
+
+    @contextlib.contextmanager
+    def _translate_errors(
+        self, kind: type[DeviceError | InputError] = DeviceDisconnectedError
+    ) -> Iterator[None]:
+        try:
+            yield
+        except (DeviceError, InputError):
+            raise
+        except Exception as fault:  # the binding's own, which is not known before it is imported
+            where = self._place or "the first camera found"
+            said = getattr(fault, "message", str(fault))
+            raise kind(f"{where}: {said}") from fault
+
+
+@lru_cache(maxsize=1)
+def load_aravis() -> Any:
+    """Import Aravis.
+
+    Raises
+    ------
+    MissingDependencyError
+        Aravis or the binding is not there, or the binding is for another version of Python.
+    """
+    try:
+        if importlib.util.find_spec("gi") is None:
+            _import_system_module("gi")
+        import gi
+
+        gi.require_version("Aravis", "0.8")
+        from gi.repository import Aravis
+    except (ImportError, ValueError) as fault:
+        raise MissingDependencyError(
+            "aravis:// needs Aravis and its Python binding: apt install python3-gi gir1.2-aravis-0.8, with the "
+            f"system's version of Python ({fault})"
+        ) from fault
+    return Aravis
+
+
+def _import_system_module(name: str) -> None:
+    """Import a module that the system installed, from outside a virtual environment."""
+    found = importlib.machinery.PathFinder.find_spec(name, SYSTEM_PACKAGES)
+    if found is None or found.loader is None:
+        raise ImportError(f"no module named {name}")
+    module = importlib.util.module_from_spec(found)
+    sys.modules[name] = module
+    try:
+        found.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+
+
+def find_cameras() -> list[DiscoveredInstrument]:
+    """Look for cameras on the network and on USB, which takes a second; none without Aravis."""
+    try:
+        library = load_aravis()
+    except MissingDependencyError:
+        return []
+    library.update_device_list()
+    return [
+        DiscoveredInstrument(
+            f"aravis://{library.get_device_id(place)}",
+            f"{library.get_device_vendor(place)} {library.get_device_model(place)}",
+        )
+        for place in range(library.get_n_devices())
+    ]
+
+
+def open_aravis(uri: Uri) -> StreamSource:
+    """Open ``aravis://NAME?exposure_us=1000&gain=0&frame_rate=25&pixel_format=Mono16&buffers=16``.
+
+    NAME is a camera's identifier or address, or nothing for the first one. ``row_ps`` gives the
+    duration of a row of a streak picture; ``mode=gated`` and `GATE_OPTIONS` say how an intensifier's
+    gate moves from frame to frame.
+    """
+    uri.reject_unknown(*OPTIONS)
+    settings, held = CameraSettings.from_uri(uri), parse_buffer_settings(uri)
+    ledger = Ledger()
+    feed = AravisFeed(load_aravis(), uri.location, ledger, settings)
+    return StreamSource(feed, feed.codec, ledger, held)
+
+
+class EmulatedFeed(AravisFeed):
+    """Frames of Aravis' own emulated GigE Vision camera on this computer's loopback.
+
+    Parameters
+    ----------
+    library, ledger, settings
+        As for `AravisFeed`.
+    serial : str
+    lost_per_thousand : int
+        Packets of a thousand that are lost on the wire.
+    """
+
+    def __init__(
+        self,
+        library: Any,
+        ledger: Ledger,
+        settings: CameraSettings,
+        serial: str,
+        lost_per_thousand: int,
+    ) -> None:
+        self._camera_process = library.GvFakeCamera.new(LOOPBACK, serial)
+        if not self._camera_process.is_running():
+            raise DeviceNotFoundError(
+                f"an emulated camera cannot listen on {LOOPBACK}; another one does already"
+            )
+        self._camera_process.set_property("gvsp-lost-ratio", lost_per_thousand / 1000)
+        super().__init__(library, LOOPBACK, ledger, settings)
+
+    @property
+    def info(self) -> Info:
+        known = super().info
+        return replace(known, instrument=f"emulated {known.instrument}")
+
+    def close(self) -> None:
+        try:
+            super().close()
+        finally:
+            del self._camera_process
+
+
+def open_emulated(uri: Uri) -> StreamSource:
+    """Open ``sim+aravis://?frame_rate=100&lost_per_thousand=0``: Aravis' own emulated camera, which
+    shows moving stripes.
+    """
+    uri.reject_unknown(*OPTIONS, "lost_per_thousand")
+    settings, held = CameraSettings.from_uri(uri), parse_buffer_settings(uri)
+    lost = uri.value("lost_per_thousand", int, 0)
+    if not 0 <= lost <= 1000:
+        raise InputError(f"'{uri.text}': lost_per_thousand must be within 0..1000")
+    ledger = Ledger()
+    feed = EmulatedFeed(load_aravis(), ledger, settings, uri.location or "EMULATED", lost)
+    return StreamSource(feed, feed.codec, ledger, held)

@@ -1,0 +1,272 @@
+"""Industrial cameras through Aravis: its own emulated camera where it is installed, and everywhere a
+stand-in for the library whose frames can be lost, torn and renumbered.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import deque
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import devices
+from devices.aravis import find_cameras, load_aravis
+from devices.photons import read_photons
+from devices.scenes import draw_exposure, simulate_line_light
+from devices.source import Source
+from devices.transients import read_transient
+from tofclip.errors import (
+    DeviceDisconnectedError,
+    DeviceNotFoundError,
+    InputError,
+    MissingDependencyError,
+)
+from tofclip.recovery import FixedFocus
+from tofclip.sequences.ranger import RangingPipeline
+from tofclip.sequences.streaming import stream_clouds
+
+
+def finish(source: Source) -> None:
+    source.stop()
+    while source.read(5) is not None:
+        pass
+    source.close()
+    assert source.stats.is_balanced, source.stats
+
+
+def take(source: Source, frames: int) -> list[Any]:
+    found: list[Any] = []
+    while len(found) < frames:
+        batch = source.read(10)
+        assert batch is not None
+        found += list(batch.records)
+    return found
+
+
+@pytest.fixture
+def aravis() -> Any:
+    try:
+        return load_aravis()
+    except MissingDependencyError as fault:
+        pytest.skip(str(fault))
+
+
+def test_the_emulated_camera_loses_nothing(aravis: Any) -> None:
+    address = "sim+aravis://?frame_rate=200&exposure_us=500&gain=2&pixel_format=Mono16"
+    with devices.open(address) as source:
+        info = source.info.as_dict()
+        frames = take(source, 60)
+        finish(source)
+    assert (info["pixel_format"], info["exposure_us"], info["gain"]) == ("Mono16", 500.0, 2.0)
+    assert [int(frame["number"]) for frame in frames] == list(range(60))
+    assert frames[0]["counts"].shape == (info["rows"], info["columns"])
+    assert np.ptp(frames[0]["counts"]) > 0
+    stats = source.stats
+    assert (stats.lost_device, stats.malformed, stats.dropped_host) == (0, 0, 0)
+    assert stats.delivered == stats.acquired
+
+
+def test_frames_with_missing_packets_are_counted(aravis: Any) -> None:
+    """One packet in a hundred is lost, so that one frame in six is whole."""
+    with devices.open("sim+aravis://?frame_rate=100&lost_per_thousand=10") as source:
+        numbers = [int(frame["number"]) for frame in take(source, 3)]
+        finish(source)
+    stats = source.stats
+    assert stats.malformed > 0
+    # Every number that is passed over is in the accounts.
+    assert np.all(np.diff(numbers) > 0)
+    assert numbers[-1] + 1 - len(numbers) <= stats.malformed + stats.lost_device
+    assert stats.acquired < 200
+
+
+@dataclass
+class StandInBuffer:
+    """A frame as Aravis hands it over."""
+
+    frame_id: int = 0
+    status: str = "cleared"
+    data: bytes = b""
+    stamp: int = 0
+
+    def get_frame_id(self) -> int:
+        return self.frame_id
+
+    def get_status(self) -> str:
+        return self.status
+
+    def get_timestamp(self) -> int:
+        return self.stamp
+
+    def get_data(self) -> bytes:
+        return self.data
+
+
+class StandInLibrary:
+    """As much of Aravis as the driver needs; `frames` are sent when acquisition is started, and what
+    it was told is in `told`.
+    """
+
+    BufferStatus = SimpleNamespace(SUCCESS="success", CLEARED="cleared", ABORTED="aborted")
+    AcquisitionMode = SimpleNamespace(CONTINUOUS="continuous")
+    Buffer = SimpleNamespace(new_allocate=lambda payload: StandInBuffer())
+
+    def __init__(self, pictures: np.ndarray, frames: list[StandInBuffer]) -> None:
+        self.told: dict[str, Any] = {}
+        self.underruns = 0
+        self.gone_for = 0
+        self._shape, self._format = pictures.shape[1:], f"Mono{8 * pictures.itemsize}"
+        self._frames = frames
+        self.Camera = SimpleNamespace(new=self._open)
+
+    def _open(self, place: str | None) -> StandInLibrary:
+        if self.gone_for:
+            self.gone_for -= 1
+            raise RuntimeError("No camera found")
+        return self
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("set_"):
+            return lambda value: self.told.__setitem__(name, value)
+        if name in ("start_acquisition", "stop_acquisition"):
+            return lambda: self.told.__setitem__(name, True)
+        known = {
+            "get_vendor_name": "Stand-in",
+            "get_model_name": "camera",
+            "get_device_serial_number": "S1",
+            "get_pixel_format_as_string": self._format,
+            "get_region": (0, 0, self._shape[1], self._shape[0]),
+            "get_payload": 1,
+            "get_gain": 0.0,
+            "get_frame_rate": 10.0,
+        }
+        if name in known:
+            return lambda: known[name]
+        raise AttributeError(name)
+
+    def get_exposure_time(self) -> float:
+        if self.gone_for:
+            raise RuntimeError("timeout")
+        return 1000.0
+
+    def create_stream(self, *nothing: None) -> StandInLibrary:
+        self._waiting = deque(self._frames)
+        return self
+
+    def push_buffer(self, buffer: StandInBuffer) -> None:
+        pass
+
+    def timeout_pop_buffer(self, wait_us: int) -> StandInBuffer | None:
+        return self._waiting.popleft() if self._waiting else None
+
+    def get_info_uint64_by_name(self, name: str) -> int:
+        return self.underruns
+
+
+@pytest.fixture
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> Any:
+    def make(pictures: np.ndarray, ids: list[int], torn: tuple[int, ...] = ()) -> StandInLibrary:
+        frames = [
+            StandInBuffer(
+                frame_id,
+                "missing-packets" if place in torn else "success",
+                pictures[place % len(pictures)].tobytes(),
+                10**9 + place * 10**7,
+            )
+            for place, frame_id in enumerate(ids)
+        ]
+        library = StandInLibrary(pictures, frames)
+        monkeypatch.setattr("devices.aravis.load_aravis", lambda: library)
+        return library
+
+    return make
+
+
+SMALL = np.arange(24, dtype=np.uint16).reshape(2, 3, 4)
+
+
+def test_identifiers_tell_what_is_missing(stand_in: Any) -> None:
+    """Across the end of 16 bits; one comes late, one is torn, two found no buffer."""
+    library = stand_in(SMALL, [65533, 65535, 1, 65534, 4, 5, 8], torn=(4,))
+    library.underruns = 2
+    with devices.open("aravis://lab?exposure_us=50&gain=3&frame_rate=9") as source:
+        numbers = [int(frame["number"]) for frame in take(source, 5)]
+        finish(source)
+    assert numbers == [0, 2, 3, 7, 10]
+    stats = source.stats
+    assert (stats.delivered, stats.malformed, stats.acquired) == (5, 1, 11)
+    assert (stats.dropped_host, stats.lost_device) == (2, 3)
+    assert library.told["set_exposure_time"] == 50
+    assert (library.told["set_gain"], library.told["set_frame_rate"]) == (3, 9)
+    assert library.told["stop_acquisition"]
+
+
+def test_a_streak_picture_becomes_a_cloud(stand_in: Any) -> None:
+    light = simulate_line_light()
+    shot = draw_exposure(light, 1)
+    stand_in(shot.counts.astype(np.uint16)[np.newaxis], list(range(1, 4)))
+    row_ps = (light.row_times[1] - light.row_times[0]) * 1e12
+    streak = read_transient(f"aravis://?row_ps={row_ps}")
+    np.testing.assert_array_equal(streak.counts, shot.counts)
+    np.testing.assert_allclose(np.diff(streak.times), np.diff(shot.times), rtol=1e-9)
+    # The address gives rows their duration; when the first one is swept, the camera's time zero does.
+    shift = float(streak.times[0] - shot.times[0])
+    pipeline = RangingPipeline.for_shot(
+        streak, light.camera, FixedFocus(0.0), light.camera.time_zero + shift
+    )
+    cloud = next(stream_clouds([streak], pipeline)).cloud
+    assert len(cloud) > 100
+    assert 1.6 < np.median(cloud.range) < 3.3  # where the simulated scene stands
+
+
+def test_gated_frames_become_photons_in_time(stand_in: Any) -> None:
+    pictures = np.arange(4 * 24, dtype=np.uint16).reshape(4, 4, 6)
+    # Of the first scan a frame is lost: it is left out, and the second one counts.
+    stand_in(pictures[[0, 1, 3, 0, 1, 2, 3]], [1, 2, 4, 5, 6, 7, 8])
+    gate = "mode=gated&gate_steps=4&gate_step_ps=1000&gate_width_ns=2&gate_offset_ps=500"
+    counted = read_photons(f"aravis://?{gate}")
+    np.testing.assert_array_equal(counted.counts, pictures)
+    np.testing.assert_allclose(counted.times, 1e-9 * (0.5 + np.arange(4)))
+
+
+def test_a_camera_that_goes_away(stand_in: Any) -> None:
+    library = stand_in(SMALL, [1, 2])
+    with devices.open("aravis://?timeout_s=0.1&reconnect_s=0.2") as source:
+        take(source, 2)
+        library.gone_for = 1  # and then it is back
+        batch = source.read(10)
+        assert batch is not None
+        assert batch.after_gap
+        assert source.stats.reconnects == 1
+        library.gone_for = 99
+        with pytest.raises(DeviceDisconnectedError, match="nobody answered"):
+            take(source, 9)
+    assert source.stats.is_balanced
+
+
+def test_what_cannot_be_opened(stand_in: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    for query in ("pixel_format=RGB8", "buffers=1", "exposure_us=-1", "speed=3", "row_ps=0"):
+        with pytest.raises(InputError):
+            devices.open(f"aravis://?{query}")
+    library = stand_in(SMALL, [])
+    library._format = "BayerRG8"
+    with pytest.raises(InputError, match="choose pixel_format"):
+        devices.open("aravis://")
+    library.gone_for = 99
+    with pytest.raises(DeviceNotFoundError, match="No camera found"):
+        devices.open("aravis://10.0.0.9")
+
+
+def test_without_the_library_one_line_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    load_aravis.cache_clear()
+    monkeypatch.setattr("devices.aravis.SYSTEM_PACKAGES", ())
+    monkeypatch.setitem(sys.modules, "gi", None)
+    try:
+        with pytest.raises(MissingDependencyError, match=r"apt install python3-gi gir1\.2-aravis"):
+            devices.open("aravis://")
+        assert find_cameras() == []
+    finally:
+        load_aravis.cache_clear()
