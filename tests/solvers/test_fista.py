@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 import scipy.optimize
@@ -10,6 +13,7 @@ import scipy.sparse
 from tofclip.operators import LineProjection, SparseMatrix, estimate_squared_norm
 from tofclip.solvers import (
     Fista,
+    Huber,
     LeastSquares,
     NonnegativeSparsity,
     NonnegativeTotalVariation,
@@ -19,7 +23,8 @@ from tofclip.solvers import (
     ignore_progress,
     iterate,
 )
-from tofclip.solvers.method import IterationHistory, Result
+from tofclip.solvers.fista import ProximalStep
+from tofclip.solvers.method import GAP_INTERVAL, IterationHistory, Result
 from tofclip.threads import LANES
 
 
@@ -182,6 +187,9 @@ class _Scripted:
         self._steps = list(steps)
         self.objective, self.rejected = np.array([10.0]), np.array([False])
 
+    def duality_gap(self) -> None:
+        raise AssertionError("nobody asked for the gap")
+
     def step(self) -> None:
         value, refused = self._steps.pop(0)
         self.objective, self.rejected = np.array([value]), np.array([refused])
@@ -200,32 +208,134 @@ def _lanes(measurements: np.ndarray) -> np.ndarray:
 
 
 def test_after_a_refused_step_the_momentum_starts_anew():
-    """The first step from there is a plain one, the second has the second momentum of all runs."""
+    """The first step from there is a plain one, the second has the second momentum of all runs, and
+    both the size that the solver says.
+    """
     operator = projection()
     measurements = np.abs(np.random.default_rng(3).standard_normal((40, LANES)))
     regulariser = NonnegativeSparsity(1e-3)
-    step_size = 1 / estimate_squared_norm(operator, 99)
-    solver = Fista(operator, LeastSquares(measurements), regulariser, step_size, LANES)
-    golden = (1 + np.sqrt(5)) / 2
+    safe = 1 / estimate_squared_norm(operator, 99)
+    solver = Fista(operator, LeastSquares(measurements), regulariser, safe, LANES)
     checked = 0
     for _ in range(200):
         solver.step()
         fresh = solver.rejected.copy()
-        for momentum in (0.0, (golden - 1) / ((1 + np.sqrt(1 + 4 * golden**2)) / 2)):
+        age, size_before = np.ones(LANES), solver.step_sizes
+        for number in range(2):
             if not fresh.any():
                 break
+            size = solver.step_sizes
+            # the first step's momentum is 0; the next one's follows the ratio of the steps
+            older, age = age, (1 + np.sqrt(1 + 4 * size_before / size * age**2)) / 2
+            momentum = (older - 1) / age
             current, previous = solver.current.copy(), solver.previous.copy()
             ahead = current + momentum * (current - previous)
             gradient = operator.adjoint(operator(ahead) - measurements)
-            every = np.full(LANES, momentum)
-            found, _ = regulariser.proximal_step(current, previous, every, gradient, step_size)
-            expected = np.array(found)
+            expected = np.maximum(ahead - size * (gradient + 1e-3), 0)
+            size_before = size
             solver.step()
             fresh &= ~solver.rejected
             difference = np.abs(solver.current - expected)[..., fresh]
             assert np.all(difference <= 1e-9 * np.abs(expected).max())
-            checked += np.count_nonzero(fresh) if momentum else 0
+            checked += np.count_nonzero(fresh) if number else 0
     assert checked > 0
+
+
+def test_steps_grow_as_far_as_they_are_safe_and_save_iterations():
+    """Two thirds of the iterations of steps of one size lead to the same objective."""
+    operator = projection()
+    truth = np.zeros((12, 11))
+    truth[3:5, 4:8] = [[1, 2, 1, 3], [2, 2, 1, 1]]
+    solvers = [
+        Fista(
+            operator,
+            LeastSquares(_lanes(operator(truth))),
+            regulariser,
+            1 / estimate_squared_norm(operator, 99),
+            LANES,
+        )
+        for regulariser in (NonnegativeSparsity(0.02), _WithoutDistance(0.02))
+    ]
+    for solver, iterations in zip(solvers, (40, 60), strict=True):
+        iterate(solver, StoppingRule(iterations), ignore_progress, LANES)
+    growing, fixed = solvers
+    assert growing.step_sizes.max() > 1.5 * growing.step_size
+    assert np.all(fixed.step_sizes == fixed.step_size)
+    assert np.all(growing.objective <= fixed.objective)
+
+
+class _WithoutDistance(NonnegativeSparsity):
+    """Keeps all steps at one size."""
+
+    def proximal_step(self, *given: np.ndarray) -> ProximalStep:
+        return super().proximal_step(*given)._replace(distance=None)
+
+
+def test_the_duality_gap_bounds_what_is_left():
+    operator = projection()
+    measurements = np.abs(np.random.default_rng(8).standard_normal((40, LANES)))
+    for data_term in (LeastSquares(measurements), Huber(measurements, threshold=0.5)):
+        solver = Fista(
+            operator,
+            data_term,
+            NonnegativeSparsity(0.1),
+            1 / estimate_squared_norm(operator, 99),
+            LANES,
+        )
+        gaps, objectives = [], []
+        for _ in range(6):
+            for _ in range(200):
+                solver.step()
+            gaps.append(solver.duality_gap())
+            objectives.append(solver.objective)
+        least = objectives[-1]
+        for gap, objective in zip(gaps, objectives, strict=True):
+            assert np.all(objective - least <= gap + 1e-9)
+        assert np.all(gaps[-1] < 1e-3 * least)
+
+
+def test_the_gap_ends_a_run_and_is_told():
+    operator = projection()
+    measurements = np.abs(np.random.default_rng(7).standard_normal((40, 5)))
+    limited = Sparse(0.1, 10).recover(operator, measurements)
+    assert (limited.stop_reason, limited.iterations) == ("iteration limit", 10)
+    done = Sparse(0.1, 3000).recover(operator, measurements)
+    assert done.stop_reason == "converged"
+    assert 10 < done.iterations < 3000
+    assert done.iterations % GAP_INTERVAL == 0
+    assert 0 <= done.duality_gap <= 1e-3 < limited.duality_gap
+    least = Sparse(0.1, 3000, gap=1e-8).recover(operator, measurements).objective[-1]
+    assert least <= done.objective[-1] <= least * (1 + 1e-3)
+    assert np.isnan(TotalVariation(0.1, 10).recover(operator, measurements).duality_gap)
+
+
+@pytest.mark.parametrize("method", [Sparse(0.05, 12), TotalVariation(0.05, 12)], ids=["l1", "tv"])
+@pytest.mark.parametrize("data_term", [LeastSquares, partial(Huber, threshold=0.5)])
+def test_dark_frames_are_zero_and_cost_nothing(method, data_term):
+    """The others are what they are without them, and the objective and the work count them all."""
+    operator = projection()
+    measurements = np.abs(np.random.default_rng(9).standard_normal((40, 50)))
+    dark = np.zeros(50, bool)
+    dark[[0, 1, 7, 30, 48, 49]] = True
+    measurements[:, dark] *= -1e-3
+    done: list[int] = []
+    method = replace(method, data_term=data_term, gap=0.0)
+    found = method.recover(operator, measurements, progress=done.append)
+    alone = method.recover(operator, measurements[:, ~dark])
+    assert not found.frames[dark].any()
+    assert found.frames[~dark].any(axis=(1, 2)).all()
+    np.testing.assert_allclose(found.frames[~dark], alone.frames, rtol=1e-9, atol=1e-12)
+    data = data_term(np.ascontiguousarray(measurements[:, dark]))
+    of_dark = data.value(np.zeros_like(data.measurements)).sum()
+    np.testing.assert_allclose(found.objective, alone.objective + of_dark, rtol=1e-12)
+    assert sum(done) == method.work(50)
+
+
+def test_a_weight_that_leaves_nothing_takes_no_iteration():
+    result = Sparse(1.0).recover(projection(), np.ones((40, 3)))
+    assert (result.iterations, result.stop_reason, result.duality_gap) == (0, "converged", 0)
+    assert not result.frames.any()
+    np.testing.assert_allclose(result.objective, [60.0])
 
 
 def test_blocks_that_stopped_early_count_with_their_last_value():

@@ -19,8 +19,8 @@ def denoised(
     """Run the warm-started proximal step on the same point until it has converged."""
     still = np.zeros(noisy.shape[-1], noisy.dtype)
     for _ in range(calls):
-        result, penalty = prior.proximal_step(
-            noisy, np.zeros_like(noisy), still, np.zeros_like(noisy), 1.0
+        result, penalty, _ = prior.proximal_step(
+            noisy, np.zeros_like(noisy), still, np.zeros_like(noisy), np.ones_like(still)
         )
     return result, penalty
 

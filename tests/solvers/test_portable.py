@@ -205,16 +205,35 @@ def test_a_tolerance_waits_for_the_device_once_in_an_iteration(monkeypatch):
 @pytest.mark.parametrize("shape", [(7, 6, 3), (1, 9, 2), (8, 1, 1)], ids=str)
 @pytest.mark.parametrize("weight", [0.0, 0.3])
 def test_total_variation_sweep_by_sweep(device, shape, weight):
-    noisy = np.random.default_rng(3).standard_normal(shape)
+    rng = np.random.default_rng(3)
+    current, previous, gradient = rng.standard_normal((3, *shape))
+    momentum, step = rng.random((2, shape[-1]))
     here, there = None, None
     for _ in range(3):
-        result, total, here = CompiledLoops().prox_tv(noisy, here, weight, 4, np.empty(shape))
-        found, variation, there = PortableLoops().prox_tv(
-            device.put(noisy), there, weight, 4, device.put(np.empty(shape))
+        result, total, here = CompiledLoops().prox_tv(
+            current, previous.copy(), momentum, gradient.copy(), step, weight, here
         )
+        given = (device.put(a) for a in (current, previous, momentum, gradient.copy(), step))
+        found, variation, there = PortableLoops().prox_tv(*given, weight, there)
         np.testing.assert_allclose(to_numpy(found), result, atol=1e-13)
         np.testing.assert_allclose(to_numpy(variation), total, rtol=1e-12, atol=1e-13)
         np.testing.assert_allclose(to_numpy(there), here, atol=1e-13)
+
+
+def test_sparse_step(device):
+    rng = np.random.default_rng(5)
+    current, previous, gradient = rng.standard_normal((3, 7, 6, 4))
+    momentum, step = rng.random((2, 4))
+    found = CompiledLoops().prox_l1(current, previous.copy(), momentum, gradient.copy(), step, 0.3)
+    given = (device.put(a) for a in (current, previous, momentum, gradient.copy(), step))
+    point = current + momentum * (current - previous)
+    picture = np.maximum(point - step * (gradient + 0.3), 0)
+    expected = picture, picture.sum((0, 1)), ((picture - point) ** 2).sum((0, 1))
+    for one, other, wanted in zip(
+        found, PortableLoops().prox_l1(*given, 0.3), expected, strict=True
+    ):
+        np.testing.assert_allclose(one, wanted, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(to_numpy(other), wanted, rtol=1e-12, atol=1e-14)
 
 
 def test_refused_frames_are_put_back(device):

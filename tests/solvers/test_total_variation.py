@@ -17,8 +17,8 @@ def denoise(
     prior = NonnegativeTotalVariation(weight)
     still = np.zeros(LANES, dtype)
     for _ in range(calls):
-        result, penalty = prior.proximal_step(
-            block, np.zeros_like(block), still, np.zeros_like(block), 1.0
+        result, penalty, _ = prior.proximal_step(
+            block, np.zeros_like(block), still, np.zeros_like(block), np.ones(LANES, dtype)
         )
     assert np.ptp(result, axis=-1).max() == 0  # every lane the same
     return result[..., 0], float(penalty[0])

@@ -12,9 +12,10 @@ from tofclip.solvers.wavelets import NonnegativeWavelets
 
 def step(picture: np.ndarray, weight: float) -> tuple[np.ndarray, np.ndarray]:
     before, still = np.zeros_like(picture), np.zeros(picture.shape[-1], picture.dtype)
-    return NonnegativeWavelets(weight).proximal_step(
-        picture, before, still, np.zeros_like(picture), 1.0
+    result, penalty, _ = NonnegativeWavelets(weight).proximal_step(
+        picture, before, still, np.zeros_like(picture), np.ones_like(still)
     )
+    return result, penalty
 
 
 @pytest.mark.parametrize("shape", [(32, 32, 1), (37, 45, 3)])

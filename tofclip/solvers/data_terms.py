@@ -55,6 +55,23 @@ class DataTerm(ABC):
         """Return the derivative with respect to `predicted`, same shape."""
         return self.weights(predicted) * (predicted - self.measurements)
 
+    def dual_value(self, slope: Array, scale: Array) -> Array | None:
+        """Return the value of the dual point ``-scale * slope``, (frames,) float64, where the
+        conjugate is known.
+
+        Parameters
+        ----------
+        slope : (measurements, frames) array
+            Of `gradient`.
+        scale : (frames,) float64 array
+            From 0 to 1.
+        """
+        return None
+
+    def squared_length(self, change: Array) -> Array:
+        """Return the sum of squares over the valid measurements of each frame, (frames,) float64."""
+        return select_loops(change).sum_squares(self._apply_mask(change))
+
     def _apply_mask(self, values: Array) -> Array:
         return values if self.valid is None else values * self.valid
 
@@ -67,7 +84,28 @@ class DataTermMaker(Protocol):
         ...
 
 
-class LeastSquares(DataTerm):
+class _SquaredNearZero(DataTerm):
+    """A data term whose conjugate is ``<dual, f> + 1/2 |dual|^2`` wherever its gradient gets to."""
+
+    def dual_value(self, slope: Array, scale: Array) -> Array:
+        """Return ``-<dual, f> - 1/2 |dual|^2`` of the dual point; see `DataTerm.dual_value`.
+
+        Parameters
+        ----------
+        slope : (measurements, frames) array
+        scale : (frames,) float64 array
+
+        Returns
+        -------
+        (frames,) float64 array
+        """
+        xp = namespace(slope)
+        # the slope of an invalid measurement is zero
+        along = xp.sum(slope * self.measurements, axis=0, dtype=xp.float64)
+        return -scale * along - scale**2 / 2 * select_loops(slope).sum_squares(slope)
+
+
+class LeastSquares(_SquaredNearZero):
     """``1/2 |W (predicted - measurements)|^2`` for each frame, W = 0 or 1: right for even, Gaussian
     errors.
     """
@@ -86,7 +124,7 @@ class LeastSquares(DataTerm):
         return residual
 
 
-class Huber(DataTerm):
+class Huber(_SquaredNearZero):
     """Squares up to a threshold and straight lines beyond: a few wildly wrong measurements do no
     harm.
 

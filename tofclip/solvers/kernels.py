@@ -25,41 +25,69 @@ inline_njit = njit(
 )  # so that a full block's number of lanes is a constant to the compiler
 
 
+helper_njit = njit(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy")
+"""For a row of a picture with all its lanes, one after the other: a loop over few arrays is a vector
+loop, because the compiler checks only a few for overlap. Numbers that each lane has are repeated for
+every pixel of a row.
+"""
+
+
 @fast_njit
-def shrink_nonnegative(current, previous, momentum, gradient, step, threshold, total):
+def shrink_nonnegative(current, previous, momentum, gradient, step, threshold, total, distance):
     """``previous = max(z - step * gradient - threshold, 0)`` with ``z = current + momentum *
     (current - previous)``.
 
-    Pictures are (rows, columns, lanes), `momentum` is (lanes,); `total` (lanes,) float64 gets the
-    sum of the result.
-
     Parameters
     ----------
-    current : (rows, columns, lanes) array
-    previous : (rows, columns, lanes) array
+    current : (rows, row) array
+        Pictures, all lanes of a pixel side by side.
+    previous : (rows, row) array
         Overwritten with the result.
-    momentum : (lanes,) array
-    gradient : (rows, columns, lanes) array
-    step, threshold : scalar of the arrays' dtype
+    momentum : (row,) array
+    gradient : (rows, row) array
+        Overwritten.
+    step, threshold : (row,) array
         Step size, and step size times weight.
-    total : (lanes,) float64 array
-        Overwritten with each lane's sum.
+    total, distance : (row,) float64 array
+        Overwritten with sums over rows of the result, and of its squared difference from z.
     """
-    lanes = current.shape[2]
-    partial = np.empty(lanes, current.dtype)
+    rows, width = current.shape
     total[:] = 0
-    for row in range(current.shape[0]):
-        # the dtype of the pictures within a row, float64 across rows: quick, and exact enough to
-        # compare objectives
-        partial[:] = 0
-        for column in range(current.shape[1]):
-            for lane in range(lanes):
-                here = current[row, column, lane]
-                point = here + momentum[lane] * (here - previous[row, column, lane])
-                value = max(point - step * gradient[row, column, lane] - threshold, np.float32(0))
-                previous[row, column, lane] = value
-                partial[lane] += value
-        total += partial
+    distance[:] = 0
+    for row in range(rows):
+        _shrink_row(current[row], previous[row], momentum, gradient[row], step, threshold)
+        _add_distance(current[row], previous[row], momentum, gradient[row], distance)
+        _put_row(gradient[row], previous[row])
+        for i in range(width):
+            total[i] += previous[row, i]
+
+
+@helper_njit
+def _shrink_row(current, previous, momentum, gradient, step, threshold):
+    for i in range(current.size):
+        point = current[i] + momentum[i] * (current[i] - previous[i])
+        gradient[i] = max(point - step[i] * gradient[i] - threshold[i], np.float32(0))
+
+
+@helper_njit
+def _descend_row(current, previous, momentum, gradient, step):
+    for i in range(current.size):
+        point = current[i] + momentum[i] * (current[i] - previous[i])
+        gradient[i] = point - step[i] * gradient[i]
+
+
+@helper_njit
+def _add_distance(current, previous, momentum, result, distance):
+    """Add the squares of ``result - z``."""
+    for i in range(current.size):
+        moved = result[i] - (current[i] + momentum[i] * (current[i] - previous[i]))
+        distance[i] += moved * moved
+
+
+@helper_njit
+def _put_row(row, target):
+    for i in range(row.size):
+        target[i] = row[i]
 
 
 @fast_njit
@@ -192,123 +220,104 @@ def restore_frames(candidate, current, rejected):
                 )
 
 
-@inline_njit
-def _primal_row(row, noisy, dual, weight, result, lanes):
-    """One row of ``result = max(noisy + weight * div(dual), 0)``; `dual` is (2, rows, columns,
-    lanes).
+@fast_njit
+def descend_total_variation(
+    lanes, current, previous, momentum, gradient, step, weight, dual, total
+):
+    """A gradient step from ``z = current + momentum * (current - previous)``, and one sweep towards
+    the picture nearest to it in total variation.
 
-    The last row of the vertical and the last column of the horizontal dual are always zero (the
-    difference across the border is), so only the first ones need care.
+    The sweep is one of projected gradient on the dual of ``1/2 |x - noisy|^2 + weight * TV(x), x >=
+    0`` (Chambolle 2004). Every row passes through memory once: the primal row below is made before
+    a row's dual changes.
+
+    Parameters
+    ----------
+    lanes : int
+        Pixels of a row are `lanes` numbers apart.
+    current : (rows, row) array
+        Pictures, all lanes of a pixel side by side.
+    previous : (rows, row) array
+        Overwritten with the result.
+    momentum : (row,) array
+    gradient : (rows, row) array
+        Overwritten with ``noisy = z - step * gradient``.
+    step, weight : (row,) array
+        Step size, and step size times the variation's weight.
+    dual : (2, rows, row) array
+        Vertical and horizontal; updated in place. The last row of the one and the last column of
+        the other stay zero: the difference across the border is.
+    total : (row,) float64 array
+        Overwritten with the sum over rows of the result's isotropic total variation.
     """
-    above = max(row - 1, 0)
-    # 0 or 1 as a factor: no branch inside the loops over columns and lanes
-    has_above = noisy.dtype.type(row > 0)
-    for column in range(noisy.shape[1]):
-        left = max(column - 1, 0)
-        has_left = noisy.dtype.type(column > 0)
-        for lane in range(lanes):
-            divergence = dual[0, row, column, lane] - has_above * dual[0, above, column, lane]
-            divergence += dual[1, row, column, lane] - has_left * dual[1, row, left, lane]
-            result[row, column, lane] = max(
-                noisy[row, column, lane] + weight * divergence, np.float32(0)
-            )
-
-
-@inline_njit
-def _dual_row(row, picture, dual, step, lanes):
-    """One row of ``dual = project(dual + step * grad(picture))`` onto vectors of length at most 1."""
-    below = min(row + 1, picture.shape[0] - 1)
-    for column in range(picture.shape[1]):
-        right = min(column + 1, picture.shape[1] - 1)
-        for lane in range(lanes):
-            here = picture[row, column, lane]
-            vertical = dual[0, row, column, lane] + step * (picture[below, column, lane] - here)
-            horizontal = dual[1, row, column, lane] + step * (picture[row, right, lane] - here)
-            shrink = 1 / max(np.sqrt(vertical * vertical + horizontal * horizontal), np.float32(1))
-            dual[0, row, column, lane] = vertical * shrink
-            dual[1, row, column, lane] = horizontal * shrink
-
-
-@inline_njit
-def _dual_sweeps(noisy, dual, weight, sweeps, result, lanes):
-    rows = noisy.shape[0]
+    rows, width = current.shape
+    dark, scratch, primal = np.zeros_like(step), np.empty_like(step), np.empty_like(current[:2])
     # the squared norm of the gradient is at most 8 (Chambolle 2004)
-    step = 1 / (8 * weight)
-    for _ in range(sweeps):
-        _primal_row(0, noisy, dual, weight, result, lanes)
-        for row in range(rows):
-            # the next row is made from the old dual, before this row's dual changes
-            if row + 1 < rows:
-                _primal_row(row + 1, noisy, dual, weight, result, lanes)
-            _dual_row(row, result, dual, step, lanes)
-
-
-@fast_njit
-def sweep_total_variation_dual(noisy, dual, weight, sweeps, result):
-    """Projected-gradient sweeps on the dual of ``1/2 |x - noisy|^2 + weight * TV(x), x >= 0``
-    (Chambolle 2004).
-
-    The primal row below is made before a dual row changes, so that a sweep passes through memory
-    once.
-
-    Parameters
-    ----------
-    noisy : (rows, columns, lanes) array
-    dual : (2, rows, columns, lanes) array
-        Vertical and horizontal; updated in place.
-    weight : scalar of the arrays' dtype
-        Above zero.
-    sweeps : int
-    result : (rows, columns, lanes) array
-        Overwritten; room for the primal picture.
-    """
-    # a constant number of lanes lets the compiler unroll the innermost loop
-    if noisy.shape[2] == LANES:
-        _dual_sweeps(noisy, dual, weight, sweeps, result, LANES)
-    else:
-        _dual_sweeps(noisy, dual, weight, sweeps, result, noisy.shape[2])
-
-
-@inline_njit
-def _primal_block(noisy, dual, weight, result, total, lanes):
-    rows, columns = noisy.shape[0], noisy.shape[1]
-    partial = np.empty(lanes, noisy.dtype)
+    sweep = np.zeros_like(step)
+    for i in range(width):
+        if weight[i] > 0:
+            sweep[i] = 1 / (8 * weight[i])
     total[:] = 0
-    _primal_row(0, noisy, dual, weight, result, lanes)
-    for row in range(rows):
-        below = min(row + 1, rows - 1)
-        if row + 1 < rows:
-            _primal_row(row + 1, noisy, dual, weight, result, lanes)
-        partial[:] = 0
-        for column in range(columns):
-            right = min(column + 1, columns - 1)
-            for lane in range(lanes):
-                here = result[row, column, lane]
-                vertical = result[below, column, lane] - here
-                horizontal = result[row, right, lane] - here
-                partial[lane] += np.sqrt(vertical * vertical + horizontal * horizontal)
-        total += partial
+    for row in range(rows + 1):
+        if row < rows:
+            _descend_row(current[row], previous[row], momentum, gradient[row], step)
+            above = dual[0, row - 1] if row > 0 else dark
+            _make_primal_row(
+                lanes, gradient[row], weight, dual[0, row], above, dual[1, row], primal[row % 2]
+            )
+        if row > 0:
+            done = row - 1
+            made, below = primal[done % 2], primal[(row if row < rows else done) % 2]
+            _update_dual_row(lanes, made, below, sweep, dual[0, done], dual[1, done], scratch)
+            above = dual[0, done - 1] if done > 0 else dark
+            _make_primal_row(
+                lanes, gradient[done], weight, dual[0, done], above, dual[1, done], previous[done]
+            )
+            if done > 0:
+                _add_variation(lanes, previous[done - 1], previous[done], total)
+    _add_variation(lanes, previous[rows - 1], previous[rows - 1], total)
 
 
-@fast_njit
-def compute_total_variation_primal(noisy, dual, weight, result, total):
-    """Make the picture that belongs to `dual`; `total` (lanes,) float64 gets its isotropic total
-    variation.
+@helper_njit
+def _make_primal_row(lanes, noisy, weight, down, above, across, result):
+    """``result = max(noisy + weight * div(dual), 0)``; `above` is `down` one row higher."""
+    nothing, inner = np.float32(0), noisy.size - lanes
+    for i in range(lanes):
+        result[i] = max(noisy[i] + weight[i] * (down[i] - above[i] + across[i]), nothing)
+    # slices, because an index with `lanes` taken off might be negative for all the compiler knows
+    noisy, weight, result = noisy[lanes:], weight[lanes:], result[lanes:]
+    down, above, here = down[lanes:], above[lanes:], across[lanes:]
+    for i in range(inner):
+        divergence = down[i] - above[i] + (here[i] - across[i])
+        result[i] = max(noisy[i] + weight[i] * divergence, nothing)
 
-    Parameters
-    ----------
-    noisy : (rows, columns, lanes) array
-    dual : (2, rows, columns, lanes) array
-    weight : scalar of the arrays' dtype
-    result : (rows, columns, lanes) array
-        Overwritten with ``max(noisy + weight * div(dual), 0)``.
-    total : (lanes,) float64 array
-        Overwritten.
+
+@helper_njit
+def _update_dual_row(lanes, here, below, sweep, down, across, shrink):
+    """``dual = project(dual + sweep * grad(picture))`` onto vectors of length at most 1; `shrink` is
+    room for a row.
     """
-    if noisy.shape[2] == LANES:
-        _primal_block(noisy, dual, weight, result, total, LANES)
-    else:
-        _primal_block(noisy, dual, weight, result, total, noisy.shape[2])
+    one, inner, right = np.float32(1), here.size - lanes, here[lanes:]
+    for i in range(inner):
+        vertical = down[i] + sweep[i] * (below[i] - here[i])
+        horizontal = across[i] + sweep[i] * (right[i] - here[i])
+        shrink[i] = one / np.sqrt(max(vertical * vertical + horizontal * horizontal, one))
+    for i in range(inner, here.size):
+        shrink[i] = one / max(abs(down[i] + sweep[i] * (below[i] - here[i])), one)
+    for i in range(inner):
+        across[i] = (across[i] + sweep[i] * (right[i] - here[i])) * shrink[i]
+    for i in range(here.size):
+        down[i] = (down[i] + sweep[i] * (below[i] - here[i])) * shrink[i]
+
+
+@helper_njit
+def _add_variation(lanes, here, below, total):
+    inner, right = here.size - lanes, here[lanes:]
+    for i in range(inner):
+        vertical, horizontal = below[i] - here[i], right[i] - here[i]
+        total[i] += np.sqrt(vertical * vertical + horizontal * horizontal)
+    for i in range(inner, here.size):
+        total[i] += abs(below[i] - here[i])
 
 
 @fast_njit

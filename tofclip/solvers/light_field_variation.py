@@ -8,7 +8,7 @@ import numpy as np
 
 from tofclip.arrays import Array
 from tofclip.errors import InputError, ShapeError
-from tofclip.solvers.fista import ProximalMethod, Regulariser, validate_weight
+from tofclip.solvers.fista import ProximalMethod, ProximalStep, Regulariser, validate_weight
 
 
 class NonnegativeLightFieldVariation:
@@ -29,6 +29,8 @@ class NonnegativeLightFieldVariation:
         0: every view on its own.
     """
 
+    zero_bound = 0.0
+
     def __init__(self, weight: float, grid: tuple[int, int], angular: float) -> None:
         if not (np.isfinite(angular) and angular >= 0):
             raise InputError(f"the angular weight must be finite and not negative, got {angular}")
@@ -36,8 +38,8 @@ class NonnegativeLightFieldVariation:
         self._dual: Array | None = None
 
     def proximal_step(
-        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
-    ) -> tuple[Array, Array]:
+        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
+    ) -> ProximalStep:
         """Take a proximal gradient step on a block of light fields; see `Regulariser`.
 
         Parameters
@@ -47,14 +49,13 @@ class NonnegativeLightFieldVariation:
         momentum : (lanes,) array
         gradient : (views, rows, columns, lanes) array
             Overwritten.
-        step : float
-            Step size.
+        step : (lanes,) array
+            The same for all: they keep their size, as no distance is returned.
 
         Returns
         -------
-        picture : (views, rows, columns, lanes) array
-        penalty : (lanes,) float64 array
-            Weight times total variation.
+        ProximalStep
+            Its penalty is weight times total variation.
 
         Raises
         ------
@@ -68,14 +69,13 @@ class NonnegativeLightFieldVariation:
             raise ShapeError("the light field's views", self.grid[0] * self.grid[1], views)
         flat = (views * rows, columns, lanes)
         pair = (a.reshape(flat) for a in (current, previous))
-        kernels.take_gradient_step(
-            *pair, momentum, gradient.reshape(flat), current.dtype.type(step)
-        )
+        size = current.dtype.type(step[0])
+        kernels.take_gradient_step(*pair, momentum, gradient.reshape(flat), size)
         shape = (*self.grid, rows, columns, lanes)
         if self._dual is None:
             self._dual = np.zeros((4, *shape), current.dtype)
         noisy, result = gradient.reshape(shape), previous.reshape(shape)
-        weight, angular = current.dtype.type(step * self.weight), current.dtype.type(self.angular)
+        weight, angular = current.dtype.type(size * self.weight), current.dtype.type(self.angular)
         if weight > 0:
             kernels.compute_light_field_primal(noisy, self._dual, weight, angular, result)
             kernels.update_light_field_dual(
@@ -89,7 +89,10 @@ class NonnegativeLightFieldVariation:
         total = np.zeros(lanes)
         kernels.compute_light_field_primal(noisy, self._dual, weight, angular, result)
         kernels.sum_light_field_variation(result, angular, total)
-        return previous, self.weight * total
+        return ProximalStep(previous, self.weight * total)
+
+    def scale_dual(self, pull: Array) -> None:
+        """Not known."""
 
 
 @dataclass(frozen=True)

@@ -35,10 +35,11 @@ class Loops(Protocol):
         previous: Array,
         momentum: Array,
         gradient: Array,
-        step: float,
-        threshold: float,
-    ) -> tuple[Array, Array]:
-        """Return ``max(z - step * gradient - threshold, 0)`` and its sum for each frame, float64.
+        step: Array,
+        weight: float,
+    ) -> tuple[Array, Array, Array]:
+        """Return ``max(z - step * (gradient + weight), 0)``, its sum for each frame, and its squared
+        distance from z.
 
         ``z = current + momentum * (current - previous)``. `previous` may be overwritten.
 
@@ -50,61 +51,48 @@ class Loops(Protocol):
             Weight of the extrapolation, 0 after a restart.
         gradient : (..., columns, frames) array
             Of the data term at z; may be overwritten.
-        step : float
-            Step size.
-        threshold : float
-            Step size times the prior's weight, in the unit of the solution.
+        step : (frames,) array
+            Step sizes, of the pictures' dtype.
+        weight : float
+            Of the prior.
 
         Returns
         -------
         result : (..., columns, frames) array
-        total : (frames,) float64 array
-        """
-        ...
-
-    def gradient_step(
-        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
-    ) -> Array:
-        """Return ``z - step * gradient``, z as in `prox_l1`; `gradient` may be overwritten.
-
-        Parameters
-        ----------
-        current, previous : (..., columns, frames) array
-            The last two solutions.
-        momentum : (frames,) array
-        gradient : (..., columns, frames) array
-            Of the data term at z.
-        step : float
-            Step size.
-
-        Returns
-        -------
-        (..., columns, frames) array
+        total, distance : (frames,) float64 array
         """
         ...
 
     def prox_tv(
-        self, noisy: Array, dual: Array | None, weight: float, sweeps: int, result: Array
+        self,
+        current: Array,
+        previous: Array,
+        momentum: Array,
+        gradient: Array,
+        step: Array,
+        weight: float,
+        dual: Array | None,
     ) -> tuple[Array, Array, Array]:
-        """Return the picture nearest to `noisy` in total variation, its variation for each frame,
-        and its dual.
+        """Return the picture nearest to ``z - step * gradient`` in total variation, its variation
+        for each frame, and its dual.
 
-        Projected-gradient sweeps on the dual of ``1/2 |x - noisy|^2 + weight * TV(x), x >= 0`` (A.
-        Chambolle, J. Math. Imaging Vis. 20, 89 (2004)), from `dual` on, (2, rows, columns, frames),
-        or from zero. Frames are (rows, columns, frames); `dual` and `result`, which is like them,
-        may be overwritten.
+        One projected-gradient sweep on the dual of ``1/2 |x - noisy|^2 + step * weight * TV(x), x >=
+        0`` (A. Chambolle, J. Math. Imaging Vis. 20, 89 (2004)), from `dual` on or from zero. z is as
+        in `prox_l1`; all arrays may be overwritten but `current`.
 
         Parameters
         ----------
-        noisy : (rows, columns, frames) array
-        dual : (2, rows, columns, frames) array, optional
-            Where the sweeps start; None is zero.
+        current, previous : (rows, columns, frames) array
+            The last two solutions.
+        momentum : (frames,) array
+        gradient : (rows, columns, frames) array
+            Of the data term at z.
+        step : (frames,) array
+            Step sizes, of the pictures' dtype.
         weight : float
-            Of the total variation, in the unit of the pictures.
-        sweeps : int
-            Projected-gradient sweeps.
-        result : (rows, columns, frames) array
-            Memory for the result.
+            Of the total variation; 0 only clips at zero.
+        dual : (2, rows, columns, frames) array, optional
+            Where the sweep starts; None is zero.
 
         Returns
         -------
@@ -170,41 +158,10 @@ class CompiledLoops:
         previous: Array,
         momentum: Array,
         gradient: Array,
-        step: float,
-        threshold: float,
-    ) -> tuple[Array, Sums]:
-        """Overwrite and return `previous`.
-
-        Parameters
-        ----------
-        current, previous : (..., columns, frames) array
-            The last two solutions; `previous` is overwritten with the result.
-        momentum : (frames,) array
-        gradient : (..., columns, frames) array
-            Of the data term at the extrapolated point.
-        step : float
-            Step size.
-        threshold : float
-            Step size times the prior's weight.
-
-        Returns
-        -------
-        previous : (..., columns, frames) array
-        total : (frames,) float64 array
-            Sum of each frame's result.
-        """
-        number, total = current.dtype.type, np.empty(current.shape[-1])
-        # Every pixel is on its own: a block of volumes is one of tall pictures.
-        now, before, slope = (_flatten_rows(array) for array in (current, previous, gradient))
-        self._kernels.shrink_nonnegative(
-            now, before, momentum, slope, number(step), number(threshold), total
-        )
-        return previous, total
-
-    def gradient_step(
-        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
-    ) -> Array:
-        """Overwrite and return `gradient`.
+        step: Array,
+        weight: float,
+    ) -> tuple[Array, Sums, Sums]:
+        """Overwrite and return `previous`; `gradient` is overwritten too.
 
         Parameters
         ----------
@@ -212,34 +169,52 @@ class CompiledLoops:
             The last two solutions.
         momentum : (frames,) array
         gradient : (..., columns, frames) array
-            Overwritten with the result.
-        step : float
+            Of the data term at the extrapolated point.
+        step : (frames,) array
+            Step sizes, of the pictures' dtype.
+        weight : float
+            Of the prior.
 
         Returns
         -------
-        (..., columns, frames) array
-            `gradient`.
+        previous : (..., columns, frames) array
+        total : (frames,) float64 array
+            Sum of each frame's result.
+        distance : (frames,) float64 array
+            Its squared distance from the extrapolated point.
         """
-        now, before, slope = (_flatten_rows(array) for array in (current, previous, gradient))
-        self._kernels.take_gradient_step(now, before, momentum, slope, current.dtype.type(step))
-        return gradient
+        now, before, slope = (_join_lanes(array) for array in (current, previous, gradient))
+        total, distance = np.empty((2, now.shape[1]))
+        self._kernels.shrink_nonnegative(
+            now, before, *self._repeat(now, momentum, slope, step, weight), total, distance
+        )
+        return previous, _sum_columns(total, step), _sum_columns(distance, step)
 
     def prox_tv(
-        self, noisy: Array, dual: Array | None, weight: float, sweeps: int, result: Array
+        self,
+        current: Array,
+        previous: Array,
+        momentum: Array,
+        gradient: Array,
+        step: Array,
+        weight: float,
+        dual: Array | None,
     ) -> tuple[Array, Sums, Array]:
-        """Overwrite and return `result` and `dual`.
+        """Overwrite and return `previous` and `dual`; `gradient` is overwritten too.
 
         Parameters
         ----------
-        noisy : (rows, columns, frames) array
-        dual : (2, rows, columns, frames) array, optional
-            Overwritten; None starts from zero.
+        current, previous : (rows, columns, frames) array
+            The last two solutions.
+        momentum : (frames,) array
+        gradient : (rows, columns, frames) array
+            Of the data term at the extrapolated point.
+        step : (frames,) array
+            Step sizes, of the pictures' dtype.
         weight : float
-            Of the total variation; 0 only clips at zero.
-        sweeps : int
-            Projected-gradient sweeps on the dual.
-        result : (rows, columns, frames) array
-            Overwritten.
+            Of the total variation.
+        dual : (2, rows, columns, frames) array, optional
+            None starts from zero.
 
         Returns
         -------
@@ -249,12 +224,32 @@ class CompiledLoops:
         dual : (2, rows, columns, frames) array
         """
         if dual is None:
-            dual = np.zeros((2, *noisy.shape), noisy.dtype)
-        weight, total = noisy.dtype.type(weight), np.empty(noisy.shape[-1])
-        if weight > 0:
-            self._kernels.sweep_total_variation_dual(noisy, dual, weight, sweeps, result)
-        self._kernels.compute_total_variation_primal(noisy, dual, weight, result, total)
-        return result, total, dual
+            dual = np.zeros((2, *current.shape), current.dtype)
+        now, before, slope = (_join_lanes(array) for array in (current, previous, gradient))
+        total = np.empty(now.shape[1])
+        self._kernels.descend_total_variation(
+            step.size,
+            now,
+            before,
+            *self._repeat(now, momentum, slope, step, weight),
+            dual.reshape(2, *now.shape),
+            total,
+        )
+        return previous, _sum_columns(total, step), dual
+
+    @staticmethod
+    def _repeat(
+        pictures: Array, momentum: Array, gradient: Array, step: Array, weight: float
+    ) -> tuple[Array, Array, Array, Array]:
+        """What each lane has, for every pixel of a row."""
+        columns = pictures.shape[1] // step.size
+        scaled = step * pictures.dtype.type(weight)
+        return (
+            np.tile(momentum, columns),
+            gradient,
+            np.tile(step, columns),
+            np.tile(scaled, columns),
+        )
 
     def sum_squares(self, values: Array) -> Sums:
         """Multiply and add without a temporary."""
@@ -288,6 +283,17 @@ def _flatten_rows(array: Array) -> Array:
     return array.reshape(-1, *array.shape[-2:])
 
 
+def _join_lanes(array: Array) -> Array:
+    """The same memory as (rows, columns * frames)."""
+    return array.reshape(-1, array.shape[-2] * array.shape[-1])
+
+
+def _sum_columns(row: Sums, step: Array) -> Sums:
+    """Add up what belongs to the same lane."""
+    total: Sums = row.reshape(-1, step.size).sum(axis=0)
+    return total
+
+
 class PortableLoops:
     """Loops on arrays of any library, each a few passes through memory, for many frames at once;
     see `Loops`.
@@ -299,9 +305,9 @@ class PortableLoops:
         previous: Array,
         momentum: Array,
         gradient: Array,
-        step: float,
-        threshold: float,
-    ) -> tuple[Array, Array]:
+        step: Array,
+        weight: float,
+    ) -> tuple[Array, Array, Array]:
         """Leave all arrays but `gradient` as they are.
 
         Parameters
@@ -311,59 +317,49 @@ class PortableLoops:
         momentum : (frames,) array
         gradient : (..., columns, frames) array
             Overwritten.
-        step : float
-        threshold : float
-            Step size times the prior's weight.
+        step : (frames,) array
+            Step sizes, of the pictures' dtype.
+        weight : float
+            Of the prior.
 
         Returns
         -------
         result : (..., columns, frames) array
-        total : (frames,) float64 array
+        total, distance : (frames,) float64 array
         """
         xp = namespace(current)
-        noisy = self.gradient_step(current, previous, momentum, gradient, step)
-        noisy -= threshold
-        result = xp.clip(noisy, min=0.0)
+        point = current + momentum * (current - previous)
+        gradient += weight
+        gradient *= -step
+        gradient += point
+        result = xp.clip(gradient, min=0.0)
         pixels = tuple(range(result.ndim - 1))
-        return result, xp.sum(result, axis=pixels, dtype=xp.float64)
+        total = xp.sum(result, axis=pixels, dtype=xp.float64)
+        return result, total, _sum_squared_difference(result, point)
 
-    def gradient_step(
-        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
-    ) -> Array:
+    def prox_tv(
+        self,
+        current: Array,
+        previous: Array,
+        momentum: Array,
+        gradient: Array,
+        step: Array,
+        weight: float,
+        dual: Array | None,
+    ) -> tuple[Array, Array, Array]:
         """Leave all arrays but `gradient` as they are.
 
         Parameters
         ----------
-        current, previous : (..., columns, frames) array
+        current, previous : (rows, columns, frames) array
             The last two solutions.
         momentum : (frames,) array
-        gradient : (..., columns, frames) array
-            Overwritten with the result.
-        step : float
-
-        Returns
-        -------
-        (..., columns, frames) array
-            `gradient`.
-        """
-        gradient *= -step
-        gradient += current
-        gradient += momentum * (current - previous)
-        return gradient
-
-    def prox_tv(
-        self, noisy: Array, dual: Array | None, weight: float, sweeps: int, result: Array
-    ) -> tuple[Array, Array, Array]:
-        """Leave all arrays as they are.
-
-        Parameters
-        ----------
-        noisy : (rows, columns, frames) array
-        dual : (2, rows, columns, frames) array, optional
+        gradient : (rows, columns, frames) array
+            Overwritten.
+        step : (frames,) array
+            Step sizes, of the pictures' dtype.
         weight : float
-        sweeps : int
-        result : (rows, columns, frames) array
-            Not used: array libraries make their own memory.
+        dual : (2, rows, columns, frames) array, optional
 
         Returns
         -------
@@ -371,18 +367,20 @@ class PortableLoops:
         total : (frames,) float64 array
         dual : (2, rows, columns, frames) array
         """
-        xp = namespace(noisy)
+        xp = namespace(current)
+        gradient *= -step
+        gradient += current + momentum * (current - previous)
         if dual is None:
-            dual = zeros((2, *noisy.shape), noisy)
+            dual = zeros((2, *current.shape), current)
+        scaled = step * weight
         if weight > 0:
-            for _ in range(sweeps):
-                # step 1 / 8: the squared norm of the gradient is at most 8 (Chambolle 2004)
-                dual = _project_to_unit_ball(
-                    dual + _forward_differences(_primal_block(noisy, dual, weight)) / (8 * weight)
-                )
-        result = _primal_block(noisy, dual, weight)
+            # step 1 / 8: the squared norm of the gradient is at most 8 (Chambolle 2004)
+            slope = _forward_differences(_primal_block(gradient, dual, scaled)) / (8 * scaled)
+            dual = _project_to_unit_ball(dual + slope)
+        result = _primal_block(gradient, dual, scaled)
         length = xp.sqrt(xp.sum(_forward_differences(result) ** 2, axis=0))
-        return result, xp.sum(length, axis=(0, 1), dtype=xp.float64), dual
+        total = xp.sum(length, axis=(0, 1), dtype=xp.float64)
+        return result, total, dual
 
     def sum_squares(self, values: Array) -> Array:
         """Square and add."""
@@ -405,7 +403,14 @@ class PortableLoops:
         return namespace(values).where(rejected, before, values)
 
 
-def _primal_block(noisy: Array, dual: Array, weight: float) -> Array:
+def _sum_squared_difference(one: Array, other: Array) -> Array:
+    """Of each frame, float64."""
+    xp, difference = namespace(one), one - other
+    pixels = tuple(range(one.ndim - 1))
+    return xp.sum(difference * difference, axis=pixels, dtype=xp.float64)
+
+
+def _primal_block(noisy: Array, dual: Array, weight: Array) -> Array:
     """Return ``max(noisy + weight * div(dual), 0)``.
 
     The last row of the vertical and the last column of the horizontal dual are always zero (the
@@ -492,6 +497,15 @@ class Batches(Protocol):
         """
         ...
 
+    def leave_out(self, dark: NDArray[np.bool_]) -> None:
+        """Make zero the frames that are dark; pieces count the others only.
+
+        Parameters
+        ----------
+        dark : (frames,) bool array
+        """
+        ...
+
     def for_each_piece(self, work: Callable[[slice], None]) -> None:
         """Call `work` on every piece of the batch; the first exception is raised."""
         ...
@@ -552,6 +566,7 @@ class CompiledBatches:
     def __init__(self, operator: LinearOperator, measurements: NDArray[Any]) -> None:
         self._measurements = measurements
         self.frames = np.empty((measurements.shape[1], *operator.shape_in), operator.dtype)
+        self._order = np.arange(measurements.shape[1])
 
     def zero_measurements(self) -> NDArray[Any]:
         """Return a block like all others."""
@@ -571,7 +586,7 @@ class CompiledBatches:
         (measurements, LANES) array
             A copy; (measurements, 1) where the batch has a single frame.
         """
-        return pad_block(values, piece)
+        return pad_block(values, self._order[piece])
 
     def write_block(self, block: NDArray[Any], piece: slice) -> None:
         """Copy the block's frames without the zeros that fill it up.
@@ -581,11 +596,27 @@ class CompiledBatches:
         block : (rows, columns, LANES) array
         piece : slice
         """
-        write_frames(block, self.frames, piece)
+        chosen = self._order[piece]
+        if chosen[-1] - chosen[0] == chosen.size - 1:
+            write_frames(block, self.frames, slice(chosen[0], chosen[-1] + 1))
+        else:
+            together = np.empty((chosen.size, *self.frames.shape[1:]), self.frames.dtype)
+            write_frames(block, together, slice(0, chosen.size))
+            self.frames[chosen] = together
+
+    def leave_out(self, dark: NDArray[np.bool_]) -> None:
+        """Make zero what is dark, and pieces of the other frames only.
+
+        Parameters
+        ----------
+        dark : (frames,) bool array
+        """
+        self.frames[dark] = 0
+        self._order = np.flatnonzero(~dark)
 
     def for_each_piece(self, work: Callable[[slice], None]) -> None:
         """Share the pieces between threads."""
-        run_blocks(work, len(self.frames))
+        run_blocks(work, self._order.size)
 
 
 class PortableBatches:
@@ -594,6 +625,7 @@ class PortableBatches:
     def __init__(self, operator: LinearOperator, measurements: Array) -> None:
         self._measurements, self._size = measurements, frames_per_block(operator, measurements)
         self.frames = zeros((measurements.shape[1], *operator.shape_in), measurements)
+        self._order = np.arange(measurements.shape[1])
 
     def zero_measurements(self) -> Array:
         """Return a lone frame."""
@@ -612,7 +644,8 @@ class PortableBatches:
         (measurements, frames of the piece) array
             A view.
         """
-        return values[:, piece]
+        runs = [values[:, run] for run in self._runs(piece)]
+        return runs[0] if len(runs) == 1 else namespace(values).concat(runs, axis=1)
 
     def write_block(self, block: Array, piece: slice) -> None:
         """Copy with the frames as first axis.
@@ -622,23 +655,46 @@ class PortableBatches:
         block : (rows, columns, frames of the piece) array
         piece : slice
         """
-        self.frames[piece, ...] = namespace(block).moveaxis(block, -1, 0)
+        pictures, done = namespace(block).moveaxis(block, -1, 0), 0
+        for run in self._runs(piece):
+            size = run.stop - run.start
+            self.frames[run, ...] = pictures[done : done + size, ...]
+            done += size
+
+    def leave_out(self, dark: NDArray[np.bool_]) -> None:
+        """Make pieces of the other frames only; what is not written is zero.
+
+        Parameters
+        ----------
+        dark : (frames,) bool array
+        """
+        self._order = np.flatnonzero(~dark)
 
     def for_each_piece(self, work: Callable[[slice], None]) -> None:
         """Work on one piece after the other."""
-        for piece in split_blocks(self.frames.shape[0], self._size):
+        for piece in split_blocks(self._order.size, self._size):
             work(piece)
 
+    def _runs(self, piece: slice) -> list[slice]:
+        """Neighbouring frames of a piece, which a slice can name on any device."""
+        chosen = self._order[piece]
+        starts = np.flatnonzero(np.diff(chosen, prepend=-2) > 1)
+        ends = np.append(starts[1:], chosen.size)
+        return [
+            slice(int(chosen[start]), int(chosen[end - 1]) + 1)
+            for start, end in zip(starts, ends, strict=True)
+        ]
 
-def pad_block(values: NDArray[Any], piece: slice) -> NDArray[Any]:
-    """Copy the columns `piece` into a block of exactly `LANES` columns, zero beyond them; a lone
+
+def pad_block(values: NDArray[Any], chosen: NDArray[np.intp]) -> NDArray[Any]:
+    """Copy the columns `chosen` into a block of exactly `LANES` columns, zero beyond them; a lone
     frame stays alone.
 
     Parameters
     ----------
     values : (measurements, frames) array
-    piece : slice
-        At most `LANES` frames.
+    chosen : (at most LANES,) int array
+        Numbers of the frames.
 
     Returns
     -------
@@ -648,7 +704,7 @@ def pad_block(values: NDArray[Any], piece: slice) -> NDArray[Any]:
     # always the same width: the compiled loops unroll it, and results do not depend on how many
     # frames share a block
     block = np.zeros((values.shape[0], LANES if values.shape[1] > 1 else 1), values.dtype)
-    block[:, : piece.stop - piece.start] = values[:, piece]
+    block[:, : chosen.size] = values[:, chosen]
     return block
 
 

@@ -31,6 +31,10 @@ def ignore_progress(_: int) -> None:
     """Report nothing."""
 
 
+GAP_INTERVAL = 10
+"""Iterations between two looks at the duality gap, each of which costs half an iteration."""
+
+
 @dataclass(frozen=True)
 class StoppingRule:
     """When a block of frames is done.
@@ -42,16 +46,21 @@ class StoppingRule:
     tolerance : float
         Stop as soon as the block's objective changes by less than this fraction in an iteration in
         which no frame's step was refused. 0 runs all iterations.
+    gap : float
+        Stop, too, as soon as every frame's duality gap is at most this fraction of its objective,
+        for solvers that know one. It is looked at every `GAP_INTERVAL` iterations.
     """
 
     iterations: int
     tolerance: float = 0.0
+    gap: float = 0.0
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
             raise InputError(f"at least one iteration is needed, got {self.iterations}")
-        if not (np.isfinite(self.tolerance) and self.tolerance >= 0):
-            raise InputError(f"tolerance must be finite and not negative, got {self.tolerance}")
+        for name, value in (("tolerance", self.tolerance), ("gap", self.gap)):
+            if not (np.isfinite(value) and value >= 0):
+                raise InputError(f"{name} must be finite and not negative, got {value}")
 
 
 class IterativeSolver(Protocol):
@@ -64,6 +73,12 @@ class IterativeSolver(Protocol):
         """Advance by one iteration."""
         ...
 
+    def duality_gap(self) -> Array | None:
+        """Return how far each frame's objective is above the least one at most, where that is
+        known.
+        """
+        ...
+
 
 @dataclass(frozen=True)
 class IterationHistory:
@@ -74,11 +89,14 @@ class IterationHistory:
     objective : (iterations + 1,) array
         Sum over the frames before the first and after every iteration.
     converged : bool
-        Whether the tolerance ended it.
+        Whether the tolerance or the gap ended it.
+    gap : float
+        How far the last objective is above the least one at most; NaN where that is not known.
     """
 
     objective: NDArray[np.float64]
     converged: bool
+    gap: float = float("nan")
 
     @property
     def iterations(self) -> int:
@@ -112,19 +130,26 @@ def iterate(
     """
     xp = namespace(solver.objective)
     objective = [xp.sum(solver.objective)]
-    converged = False
-    for done in range(stopping.iterations):
+    converged, gap = False, None
+    for done in range(1, stopping.iterations + 1):
         solver.step()
         objective.append(xp.sum(solver.objective))
         if stopping.tolerance > 0:
             # a refused step changes nothing, which does not mean that the block has converged
             little = objective[-2] - objective[-1] < stopping.tolerance * objective[-1]
             converged = bool(little & ~xp.any(solver.rejected))
+        if stopping.gap > 0 and (
+            converged or done == stopping.iterations or done % GAP_INTERVAL == 0
+        ):
+            gap = solver.duality_gap()
+            if gap is not None:
+                converged |= bool(xp.all(gap <= stopping.gap * solver.objective))
         if converged:
-            progress(frames * (stopping.iterations - done))
+            progress(frames * (stopping.iterations - done + 1))
             break
         progress(frames)
-    return IterationHistory(to_numpy(xp.stack(objective)), converged)
+    excess = float("nan") if gap is None else float(xp.sum(gap))
+    return IterationHistory(to_numpy(xp.stack(objective)), converged, excess)
 
 
 @dataclass(frozen=True)
@@ -145,6 +170,9 @@ class Result:
     setup_seconds : float
         Time spent on what depends on the operator only and on loading compiled loops, not on the
         measurements.
+    duality_gap : float
+        The last objective is above the least one by at most this fraction of it; NaN where that is
+        not known.
     """
 
     frames: Array
@@ -152,6 +180,7 @@ class Result:
     objective: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     stop_reason: str = "direct method"
     setup_seconds: float = 0.0
+    duality_gap: float = float("nan")
 
     @classmethod
     def from_blocks(
@@ -180,8 +209,14 @@ class Result:
             kept_on = np.full(longest - history.iterations, history.objective[-1])
             total += np.concatenate([history.objective, kept_on])
         converged = all(history.converged for history in histories)
+        gap = sum(history.gap for history in histories)
         return cls(
-            frames, longest, total, "converged" if converged else "iteration limit", setup_seconds
+            frames,
+            longest,
+            total,
+            "converged" if converged else "iteration limit",
+            setup_seconds,
+            gap / total[-1] if total[-1] > 0 else gap,
         )
 
 

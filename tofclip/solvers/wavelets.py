@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofclip.arrays import Array
-from tofclip.solvers.fista import validate_weight
+from tofclip.solvers.fista import ProximalStep, validate_weight
 
 SHIFT_COUNT = 4
 """Grid positions that are averaged over."""
@@ -31,14 +31,16 @@ class NonnegativeWavelets:
         Of the shifts.
     """
 
+    zero_bound = 0.0
+
     def __init__(self, weight: float, wavelet: str = "db4", seed: int = 0) -> None:
         self.weight = validate_weight(weight)
         self.wavelet = wavelet
         self._shifts = np.random.default_rng(seed).integers(0, 64, (SHIFT_COUNT, 2))
 
     def proximal_step(
-        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: float
-    ) -> tuple[Array, Array]:
+        self, current: Array, previous: Array, momentum: Array, gradient: Array, step: Array
+    ) -> ProximalStep:
         """Shrink the wavelet details at `SHIFT_COUNT` shifts and average; see `Regulariser`.
 
         Parameters
@@ -49,29 +51,31 @@ class NonnegativeWavelets:
         momentum : (lanes,) array
         gradient : (rows, columns, lanes) array
             Overwritten.
-        step : float
-            Step size.
+        step : (lanes,) array
+            The same for all: they keep their size, as no distance is returned.
 
         Returns
         -------
-        picture : (rows, columns, lanes) array
-            `previous`.
-        penalty : (lanes,) float64 array
-            Weight times the details' l1 norm, averaged over the shifts.
+        ProximalStep
+            `previous`, and the weight times its details' l1 norm, averaged over the shifts.
         """
         from tofclip.solvers.kernels import take_gradient_step
 
-        take_gradient_step(current, previous, momentum, gradient, current.dtype.type(step))
+        size = current.dtype.type(step[0])
+        take_gradient_step(current, previous, momentum, gradient, size)
         previous[:] = 0
         penalty = np.zeros(current.shape[-1])
         for shift in self._shifts:
             shifted = np.roll(gradient, shift, (0, 1))
-            shrunk, total = self._shrink_details(shifted, step * self.weight)
+            shrunk, total = self._shrink_details(shifted, float(size) * self.weight)
             previous += np.roll(shrunk, -shift, (0, 1))
             penalty += total
         previous /= SHIFT_COUNT
         np.maximum(previous, 0, out=previous)
-        return previous, self.weight * penalty / SHIFT_COUNT
+        return ProximalStep(previous, self.weight * penalty / SHIFT_COUNT)
+
+    def scale_dual(self, pull: Array) -> None:
+        """Not known."""
 
     def _shrink_details(self, picture: Array, threshold: float) -> tuple[Array, Array]:
         """Shrink the details; return the picture and the sum of its details' sizes for each frame."""
