@@ -123,6 +123,7 @@ class TestRecover:
         # The shot has no skew; the estimate is good to about a tenth of a row at this brightness.
         np.testing.assert_allclose(found["time_shift_bins"], 0, atol=0.5)
         np.testing.assert_allclose(found["view_gains"], 1, atol=0.1)
+        assert 0 < found["duality_gap"] < 1
 
     @pytest.mark.parametrize("method", ["linear", "adjoint"])
     def test_direct_methods(self, run: Run, files: Path, tmp_path: Path, method: str) -> None:

@@ -256,6 +256,8 @@ class RecoveryPlan:
             "setup_seconds": result.setup_seconds,
             "device": str(self.device),
         }
+        if np.isfinite(result.duality_gap):
+            figures["duality_gap"] = result.duality_gap
         return Frames(
             values=values,
             times=shot.times,
@@ -592,7 +594,15 @@ def _join_results(frames: Array, results: list[Result]) -> Result:
         objective,
         "iteration limit" if "iteration limit" in reasons else results[0].stop_reason,
         sum(result.setup_seconds for result in results),
+        _join_gaps(results),
     )
+
+
+def _join_gaps(results: list[Result]) -> float:
+    """The duality gap of all segments as a fraction of all their objectives; NaN where one has none."""
+    last = [result.objective[-1] if result.objective.size else np.nan for result in results]
+    excess = sum(result.duality_gap * value for result, value in zip(results, last, strict=True))
+    return float(excess / sum(last)) if sum(last) > 0 else float("nan")
 
 
 def compute_view_delays_bins(camera: Camera) -> list[float]:

@@ -508,7 +508,7 @@ class Sparse(ProximalMethod):
     """Nonnegative pictures with few bright pixels (l1): right for single time bins of a ToF scene."""
 
     weight: float = 2e-3
-    iterations: int = 60
+    iterations: int = 40
     name = "l1"
     portable = True
 
