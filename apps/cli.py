@@ -189,6 +189,12 @@ def _report_error(fault: Exception) -> int:
     if isinstance(fault, TofclipError):
         print(f"tofclip: error: {_one_line(name_options(str(fault)))}", file=sys.stderr)
         return EXIT_INPUT_ERROR
+    if isinstance(fault, MemoryError):
+        print(
+            f"tofclip: error: this computer's memory does not suffice: {_one_line(str(fault))}",
+            file=sys.stderr,
+        )
+        return EXIT_INPUT_ERROR
     missing = describe_missing_package(fault) if isinstance(fault, ImportError) else None
     if missing is not None:
         print(f"tofclip: error: {_one_line(missing)}", file=sys.stderr)

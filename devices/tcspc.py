@@ -19,7 +19,12 @@ from devices.source import READ_TIMEOUT_S, Batch, Info, Source
 from devices.statistics import Stats
 from devices.uri import Uri
 from tofclip.errors import FileFormatError, InputError, MissingDependencyError, TofclipError
+from tofclip.file_limits import BoundedFile, require_bounded_size
+from tofclip.io.becker_hickl import require_bounded_sdt
 from tofclip.storage import Record, Scalar, format_error_line, translate_read_errors
+
+HISTOGRAM_BYTES = 4
+"""Of one bin in a PHU file."""
 
 PHOTON_DTYPE = np.dtype([("sync", "<u8"), ("bin", "<u4"), ("channel", "<u4")])
 """`sync`: number of the laser's pulse. `bin`: time after it, in the file's resolution. `channel`:
@@ -137,7 +142,7 @@ def _open_file(uri: Uri, reader: Callable[[Path], FileContents]) -> TcspcFile:
 
 def _read_photons(path: Path) -> FileContents:
     ptufile = _import_library("ptufile")
-    with ptufile.PtuFile(path) as file:
+    with BoundedFile(path) as opened, ptufile.PtuFile(opened) as file:
         # T2 mode tags every event, the laser included, by an absolute time.
         if not file.is_t3:
             raise FileFormatError(
@@ -167,7 +172,11 @@ def _read_photons(path: Path) -> FileContents:
 
 def _read_picoquant_histograms(path: Path) -> FileContents:
     ptufile = _import_library("ptufile")
-    with ptufile.PhuFile(path) as file:
+    with BoundedFile(path) as opened, ptufile.PhuFile(opened) as file:
+        bins = np.ravel(file.tags["HistResDscr_HistogramBins"]).tolist()
+        require_bounded_size(
+            path, "histograms", sum(map(abs, bins)) * HISTOGRAM_BYTES, path.stat().st_size
+        )
         return _make_histogram_records(
             file.histograms(), float(file.tcspc_resolution), "PicoQuant histograms", path
         )
@@ -175,6 +184,7 @@ def _read_picoquant_histograms(path: Path) -> FileContents:
 
 def _read_becker_hickl_histograms(path: Path) -> FileContents:
     sdtfile = _import_library("sdtfile")
+    require_bounded_sdt(path)
     with sdtfile.SdtFile(path) as file:
         curves = [
             curve for block in file.data for curve in np.asarray(block).reshape(-1, block.shape[-1])

@@ -7,6 +7,7 @@ import os
 import stat
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -17,7 +18,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tofclip.errors import FileFormatError, StorageError
-from tofclip.storage import Field, Record, atomic_path, collect_provenance
+from tofclip.storage import (
+    MAX_OUTLINE_VALUES,
+    Field,
+    Record,
+    atomic_path,
+    collect_provenance,
+    is_stand_in,
+    read_outline,
+)
 
 names = st.from_regex(r"[a-z][a-z_]{0,8}", fullmatch=True)
 words = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=20)
@@ -339,6 +348,21 @@ def test_contents_are_on_the_disk_before_the_name_is(
     with atomic_path(tmp_path / "a.txt") as temporary:
         temporary.write_text("text")
     assert steps == ["4 bytes", "rename", "folder"]
+
+
+def test_an_outline_has_no_values_but_a_few(record: Record, tmp_path: Path) -> None:
+    few = Field(np.arange(3.0), "px", ("view",))
+    record = replace(record, fields={**record.fields, "few": few})
+    large = Field(np.random.default_rng(0).random((300, 400)), "m", ("y", "x"))
+    replace(record, fields={**record.fields, "large": large}).save(tmp_path / "a.h5")
+    outline = read_outline(tmp_path / "a.h5").fields
+    assert set(outline) == {*record.fields, "large"}
+    assert is_stand_in(outline["large"].values)
+    assert (outline["large"].values.shape, outline["large"].axes) == ((300, 400), ("y", "x"))
+    for name, entry in record.fields.items():
+        if entry.values.size <= MAX_OUTLINE_VALUES:
+            np.testing.assert_array_equal(outline[name].values, entry.values)
+            assert not is_stand_in(outline[name].values)
 
 
 def _open_to_edit(record: Record, path: Path) -> h5py.File:

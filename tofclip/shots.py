@@ -22,6 +22,7 @@ from tofclip.errors import (
     ShapeError,
     require_type,
 )
+from tofclip.file_limits import require_bounded_dataset, require_own_member
 from tofclip.notebook import make_data_array, plot_picture, render_html, require_package
 from tofclip.records import (
     Storable,
@@ -34,10 +35,11 @@ from tofclip.records import (
     stored_texts,
 )
 from tofclip.storage import (
+    Field,
     Record,
     Scalar,
     atomic_path,
-    require_bounded_dataset,
+    make_stand_in,
     translate_read_errors,
 )
 from tofclip.units import SPEED_OF_LIGHT
@@ -158,6 +160,43 @@ class Streak(Storable):
         )
 
 
+def outline_streak(
+    shape: tuple[int, ...],
+    has_times: bool,
+    has_limit: bool,
+    metadata: Mapping[str, str],
+    camera: Camera | None = None,
+    attachments: Mapping[str, Record] | None = None,
+) -> Record:
+    """Describe a streak image whose pixels are not read; see `tofclip.storage.read_outline`.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    has_times, has_limit : bool
+        Whether the instants of its rows, and the limit of its pixels, are known.
+    metadata : mapping of str to str
+    camera : Camera, optional
+    attachments : mapping of str to Record, optional
+
+    Returns
+    -------
+    Record
+        With the fields and children of a `Streak`'s.
+    """
+    axes = ("time", "column")
+    fields = {"counts": Field(make_stand_in(shape, np.float32), "count", axes)}
+    if has_times:
+        fields["row_times"] = Field(make_stand_in(shape[:1], np.float64), "s", axes[:1])
+    if has_limit:
+        fields["saturated"] = Field(make_stand_in(shape, np.uint8), "", axes)
+    children = {**(attachments or {}), "metadata": Record("metadata", attributes=dict(metadata))}
+    if camera is not None:
+        children["camera"] = camera.to_record()
+    return Record(Streak.RECORD_KIND, fields, children=children)
+
+
 class StreakStack:
     """A sequence of streak images in an HDF5 file: dataset ``counts`` (shot, time, column),
     ``row_times`` (time) in s.
@@ -183,7 +222,8 @@ class StreakStack:
 
         try:
             with h5py.File(path, "r") as file:
-                counts = file.get("counts")
+                is_own = isinstance(file.get("counts", getlink=True), h5py.HardLink)
+                counts = file["counts"] if is_own else None
                 return isinstance(counts, h5py.Dataset) and counts.ndim == 3 and counts.size > 0
         except (OSError, KeyError, RuntimeError):
             return False
@@ -196,12 +236,15 @@ class StreakStack:
             open(path, "rb").close()
         try:
             with h5py.File(path, "r") as file:
+                require_own_member(file, "counts", path)
                 counts = file["counts"]
                 self._shape = tuple(int(n) for n in counts.shape)
                 require_bounded_dataset(counts, path, at_once=math.prod(self._shape[1:]))
-                self.row_times: NDArray[np.float64] | None = (
-                    np.asarray(file["row_times"], dtype=np.float64) if "row_times" in file else None
-                )
+                self.row_times: NDArray[np.float64] | None = None
+                if "row_times" in file:
+                    require_own_member(file, "row_times", path)
+                    require_bounded_dataset(file["row_times"], path)
+                    self.row_times = np.asarray(file["row_times"], dtype=np.float64)
         except FileFormatError:
             raise
         except (OSError, KeyError, RuntimeError, AttributeError) as fault:

@@ -18,7 +18,7 @@ import json
 import math
 import os
 import secrets
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from tofclip.errors import FileFormatError, InputError, StorageError
+from tofclip.file_limits import require_bounded_dataset, require_own_member
 from tofclip.version import __version__
 
 if TYPE_CHECKING:
@@ -68,13 +69,10 @@ LIBRARY_VERSIONS = ("v110", "v110")
 CUBE_CHUNK_SHAPE = (64, 32, 32)
 MIN_COMPRESSED_BYTES = 1 << 16
 
-MAX_ARRAY_BYTES = 1 << 35
-"""Largest array that is read from a file, 32 GiB."""
-MAX_CHUNK_BYTES = 1 << 26
-MAX_COMPRESSION = 1032
-"""Deflate makes at most so many bytes of one."""
 MAX_DEPTH = 16
 """Of records within records."""
+MAX_OUTLINE_VALUES = 9
+"""Arrays up to this size are part of a record's outline."""
 
 
 @dataclass(frozen=True)
@@ -260,9 +258,52 @@ def write_record(record: Record, path: str | Path) -> None:
 
 def read_record(path: str | Path) -> Record:
     """Read the record in `path`, of whatever kind; see `Record.load`."""
+    return _read_file(path, _read_values)
+
+
+def read_outline(path: str | Path) -> Record:
+    """Read what kind of record `path` holds, its attributes, and shape, type, unit and axes of its
+    arrays.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    Record
+        Arrays of more than `MAX_OUTLINE_VALUES` values are stand-ins (`make_stand_in`): no file is
+        too large for this.
+    """
+    return _read_file(path, _read_few_values)
+
+
+def make_stand_in(shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
+    """Return an array of that shape and type that takes no memory; all its values are the same."""
+    return np.broadcast_to(np.zeros((), dtype), tuple(shape))
+
+
+def is_stand_in(values: NDArray[Any]) -> bool:
+    """Whether an array came from `make_stand_in`."""
+    return values.ndim > 0 and not any(values.strides)
+
+
+def _read_file(path: str | Path, read_dataset: Callable[[h5py.Dataset, str], Any]) -> Record:
     with _open_file(path) as file:
-        found = _read_group(file, str(path))
+        found = _read_group(file, str(path), read_dataset)
         return replace(found, provenance=_parse_provenance(_read_text(file, "provenance"), path))
+
+
+def _read_values(dataset: h5py.Dataset, origin: str) -> Any:
+    require_bounded_dataset(dataset, origin)
+    return dataset[()]
+
+
+def _read_few_values(dataset: h5py.Dataset, origin: str) -> Any:
+    require_bounded_dataset(dataset, origin, at_once=0)
+    if math.prod(dataset.shape) > MAX_OUTLINE_VALUES:
+        return make_stand_in(dataset.shape, dataset.dtype)
+    return dataset[()]
 
 
 @contextlib.contextmanager
@@ -335,7 +376,12 @@ def _storage_options(values: NDArray[Any]) -> dict[str, Any]:
     }
 
 
-def _read_group(group: h5py.Group, origin: str, depth: int = 0) -> Record:
+def _read_group(
+    group: h5py.Group,
+    origin: str,
+    read_dataset: Callable[[h5py.Dataset, str], Any],
+    depth: int = 0,
+) -> Record:
     import h5py
 
     if depth > MAX_DEPTH:
@@ -343,17 +389,17 @@ def _read_group(group: h5py.Group, origin: str, depth: int = 0) -> Record:
     fields: dict[str, Field] = {}
     children: dict[str, Record] = {}
     for name in group:
-        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            raise FileFormatError(origin, f"'{name}' cannot be read: links are not followed")
+        require_own_member(group, name, origin)
         item = group[name]
         if isinstance(item, h5py.Dataset):
             axes = _read_text(item, "axes")
-            require_bounded_dataset(item, origin)
             fields[name] = Field(
-                item[()], _read_text(item, "units"), tuple(axes.split(",")) if axes else ()
+                read_dataset(item, origin),
+                _read_text(item, "units"),
+                tuple(axes.split(",")) if axes else (),
             )
         elif isinstance(item, h5py.Group):
-            children[name] = _read_group(item, origin, depth + 1)
+            children[name] = _read_group(item, origin, read_dataset, depth + 1)
         else:
             raise FileFormatError(origin, f"is damaged: '{name}' cannot be read")
     _require_bounded_attributes(group, origin)
@@ -363,46 +409,6 @@ def _read_group(group: h5py.Group, origin: str, depth: int = 0) -> Record:
         if name.startswith("value.")
     }
     return Record(_read_text(group, "kind"), fields, attributes, children, origin=origin)
-
-
-def require_bounded_dataset(
-    dataset: h5py.Dataset, origin: str | Path, at_once: int | None = None
-) -> None:
-    """Refuse a dataset whose values are not in its own file, or claim more than the file can hold.
-
-    Checked before anything is allocated: a damaged or malicious file of a few kilobytes may claim
-    terabytes.
-
-    Parameters
-    ----------
-    dataset : h5py.Dataset
-    origin : path-like
-        The file that it is in.
-    at_once : int, optional
-        How many of its values are read at once; by default all.
-
-    Raises
-    ------
-    FileFormatError
-    """
-    name, dtype = dataset.name.lstrip("/"), dataset.dtype
-    if dataset.is_virtual or dataset.external:
-        raise FileFormatError(origin, f"'{name}' lies in other files, which are not read")
-    if dtype.hasobject or dataset.shape is None:
-        raise FileFormatError(origin, f"'{name}' does not hold numbers of a fixed size")
-    claimed = math.prod(dataset.shape) * dtype.itemsize
-    wanted = claimed if at_once is None else at_once * dtype.itemsize
-    chunk = math.prod(dataset.chunks or ()) * dtype.itemsize
-    stored = dataset.id.get_storage_size()
-    if wanted > MAX_ARRAY_BYTES or chunk > max(claimed, MAX_CHUNK_BYTES):
-        raise FileFormatError(
-            origin,
-            f"'{name}' claims {max(wanted, chunk)} bytes, more than the {MAX_ARRAY_BYTES} that are read",
-        )
-    if stored > os.path.getsize(origin) or claimed > MAX_COMPRESSION * stored:
-        raise FileFormatError(
-            origin, f"is damaged: '{name}' claims {claimed} bytes, which the file cannot hold"
-        )
 
 
 def _require_bounded_attributes(item: h5py.Group | h5py.Dataset, origin: str) -> None:

@@ -6,24 +6,20 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from apps.options import JsonOption
 from apps.report import report, to_json_value
 from devices.recording.reader import read_head_if_recording
 from tofclip.errors import FileFormatError
-from tofclip.io import read_streak
+from tofclip.io.streaks import outline_streak_file
 from tofclip.lidar import PointCloud
 from tofclip.lidar.photons.files import describe_photons
-from tofclip.loading import HDF5_SIGNATURE
-from tofclip.storage import Record, translate_read_errors
+from tofclip.loading import CLOUD_SUFFIXES, HDF5_SIGNATURE
+from tofclip.storage import Record, is_stand_in, read_outline, translate_read_errors
 
 if TYPE_CHECKING:
     from tofclip.storage import Field
-
-MAX_LISTED_VALUES = 9  # numbers that are shown one by one
-TABLE_SUFFIXES = (".ply", ".pcd", ".csv", ".npz")
 
 
 def info(
@@ -33,6 +29,9 @@ def info(
     as_json: JsonOption = False,
 ) -> None:
     """Say what kind of thing a file holds: shapes, axes, units, text, and how it came about.
+
+    Values are not read, but for arrays of up to nine: a file larger than the memory is described as
+    quickly as a small one.
 
     Example: tofclip info frames.h5
     """
@@ -44,11 +43,9 @@ def info(
 
 
 def _describe_file(file: Path) -> dict[str, Any]:
-    """Describe our own records and streak images by their values, counted photons by their
-    arrays.
-    """
+    """Describe our own records, streak images, point clouds and counted photons by their headers."""
     try:
-        return _describe_record(_read_record(file))
+        return _describe_record(_read_outline(file))
     except FileFormatError as refusal:
         try:
             return describe_photons(file)
@@ -57,26 +54,24 @@ def _describe_file(file: Path) -> dict[str, Any]:
             raise refusal from None
 
 
-def _read_record(file: Path) -> Record:
-    """Read our own records as they are, streak images and point clouds of other formats through
-    their readers.
-    """
+def _read_outline(file: Path) -> Record:
+    """Read what a file says about its arrays, not their values, which may not fit into memory."""
     recording = read_head_if_recording(file)
     if recording is not None:
-        return recording  # its pieces do not fit into memory
+        return recording
     with translate_read_errors(file), open(file, "rb") as opened:
         start = opened.read(len(HDF5_SIGNATURE))
     # Decided by content, because suffixes get lost.
     if start == HDF5_SIGNATURE:
-        return Record.load(file)
-    if file.suffix.lower() not in TABLE_SUFFIXES:
-        return read_streak(file).to_record()
+        return read_outline(file)
+    if file.suffix.lower() not in CLOUD_SUFFIXES:
+        return outline_streak_file(file)
     try:
-        return PointCloud.load(file).to_record()
+        return PointCloud.read_outline(file)
     except FileFormatError:
         if file.suffix.lower() != ".npz":
             raise
-    return read_streak(file).to_record()  # an archive that is not a point cloud may be a LIFT shot
+    return outline_streak_file(file)  # an archive that is not a point cloud may be a LIFT shot
 
 
 def _describe_record(record: Record) -> dict[str, Any]:
@@ -102,13 +97,9 @@ def _describe_field(entry: Field) -> dict[str, Any]:
         "units": entry.units,
         "axes": entry.axes,
     }
-    if values.dtype.kind not in "uif":
+    if values.dtype.kind not in "uif" or is_stand_in(values):
         return known
-    if values.size <= MAX_LISTED_VALUES:
-        return {**known, "values": values}
-    # NaN marks unknown pixels; it would hide the range of the others.
-    finite = values[np.isfinite(values)]
-    return {**known, "range": [finite.min(), finite.max()] if finite.size else [None, None]}
+    return {**known, "values": values}
 
 
 def _format_tree(found: Mapping[str, Any], depth: int = 0) -> Iterator[str]:
@@ -133,9 +124,7 @@ def _format_field(known: Mapping[str, Any]) -> str:
     axes = f" ({', '.join(known['axes'])})" if known["axes"] else ""
     if "values" in known:
         return f"{shape}{axes} {known['type']}, {_format_values(known['values'])} {known['units']}".rstrip()
-    least, most = known.get("range", (None, None))
-    spread = "" if least is None else f", {least:.6g} .. {most:.6g}"
-    return f"{shape}{axes} {known['type']}{spread} {known['units']}".rstrip()
+    return f"{shape}{axes} {known['type']} {known['units']}".rstrip()
 
 
 def _format_values(values: Any) -> str:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError
-from tofclip.io.archive import Archive
+from tofclip.file_limits import require_bounded_dataset
+from tofclip.io.archive import Archive, ArchiveEntry
+from tofclip.io.mat import list_mat_variables
 from tofclip.storage import HDF5_SIGNATURE, format_error_line, translate_read_errors
 
 MATLAB_HEADER_BYTES = 512
 """Of a v7.3 file, before the HDF5 data begin."""
 
-MAX_FIELD_BYTES = 8 << 30
-"""Larger arrays are refused before they are read."""
+Entries = Mapping[str, ArchiveEntry]
 
 
 class NamedArrays(Archive):
@@ -27,65 +27,85 @@ class NamedArrays(Archive):
     Parameters
     ----------
     path : path-like
-    entries : mapping of str to array, optional
-        Defaults to what the file, then a NumPy archive, holds.
+    list_entries : callable, optional
+        Lists what the file holds; by default that of a NumPy archive.
     """
 
-    def __init__(self, path: str | Path, entries: Mapping[str, Any] | None = None) -> None:
-        self._given = entries
+    def __init__(
+        self, path: str | Path, list_entries: Callable[[Path], Entries] | None = None
+    ) -> None:
+        self._list_own = list_entries
         super().__init__(path)
 
-    def _load(self) -> Mapping[str, Any]:
-        return super()._load() if self._given is None else self._given
+    def _list_entries(self) -> Entries:
+        if self._list_own is None:
+            return super()._list_entries()
+        list_own = self._list_own
+        with translate_read_errors(self.path):
+            self.path.stat()
+        found: Entries = self._guard(lambda: list_own(self.path))
+        return found
 
-    @property
-    def names(self) -> set[str]:
-        """Names of all entries."""
-        return set(self._entries)
+    def _guard(self, read: Callable[[], Any]) -> Any:
+        if self._list_own is None:
+            return super()._guard(read)
+        try:
+            return read()
+        except (FileFormatError, MemoryError):
+            raise
+        except (
+            Exception
+        ) as fault:  # whatever the decoder stumbles over, it is the file that is damaged
+            raise FileFormatError(
+                self.path, f"is truncated or damaged ({format_error_line(fault)})"
+            ) from fault
 
     def read_numbers(self, name: str) -> NDArray[Any]:
         """Return entry `name`, numbers of any shape but an empty one."""
-        return self.array(name, *[None] * np.ndim(self._entries.get(name, 0)))
+        return self.array(name, *[None] * self._count_axes(name))
 
     def read_coordinates(self, name: str) -> NDArray[np.float64]:
         """Return entry `name`, an array (..., 3) of coordinates; NaN is allowed."""
-        dimensions = max(1, np.ndim(self._entries.get(name, 0)))
+        dimensions = max(1, self._count_axes(name))
         return self.array(name, *[None] * (dimensions - 1), 3).astype(np.float64)
 
     def number(self, name: str) -> float:
         """Return entry `name`, a single finite number with or without axes of length 1."""
-        return float(self.finite_array(name, *[1] * np.ndim(self._entries.get(name, 0))).squeeze())
+        return float(self.finite_array(name, *[1] * self._count_axes(name)).squeeze())
 
     def flag(self, name: str) -> bool:
         """Whether entry `name` is there and true."""
-        return name in self and bool(np.all(self._entries[name]))
+        return name in self and bool(np.all(self.read(name)))
+
+    def _count_axes(self, name: str) -> int:
+        return len(self.describe(name).shape)
 
 
 def read_hdf5(path: str | Path) -> NamedArrays:
-    """Read all arrays of an HDF5 file; groups become names with dots.
+    """List all arrays of an HDF5 file; groups become names with dots.
 
     Raises
     ------
     StorageError, FileFormatError
-        The file cannot be read, is damaged, or an array is larger than 8 GiB.
+        The file cannot be read, is damaged, or an array claims more than can be read.
     """
-    return NamedArrays(path, _read_entries(path, _read_hdf5_entries, False))
+    return NamedArrays(path, lambda opened: _list_hdf5_entries(opened, False))
 
 
 def read_matlab(path: str | Path) -> NamedArrays:
-    """Read all numeric variables of a .mat file of any version, without axes of length 1; structs
-    become dotted names.
+    """List all numeric variables of a .mat file of version 5 to 7.3, without axes of length 1;
+    structs become dotted names.
 
     Axes are in MATLAB's order, whatever the version.
 
     Raises
     ------
     StorageError, FileFormatError
-        The file cannot be read, is damaged, or an array is larger than 8 GiB.
+        The file cannot be read, is damaged, or an array claims more than can be read.
     """
     if _is_hdf5(path):
-        return NamedArrays(path, _read_entries(path, _read_hdf5_entries, True))
-    return NamedArrays(path, _read_entries(path, _read_scipy_entries))
+        return NamedArrays(path, lambda opened: _list_hdf5_entries(opened, True))
+    return NamedArrays(path, _list_mat_entries)
 
 
 def is_matlab(path: str | Path) -> bool:
@@ -93,56 +113,48 @@ def is_matlab(path: str | Path) -> bool:
     return _read_start(path, 6) == b"MATLAB"
 
 
-def _read_entries(path: str | Path, load: Any, *arguments: Any) -> Mapping[str, Any]:
-    with translate_read_errors(path):
-        try:
-            found: Mapping[str, Any] = load(path, *arguments)
-        except (FileNotFoundError, IsADirectoryError, PermissionError, FileFormatError):
-            raise
-        except (
-            Exception
-        ) as fault:  # whatever the decoder stumbles over, it is the file that is damaged
-            raise FileFormatError(
-                path, f"is truncated or damaged ({format_error_line(fault)})"
-            ) from fault
-    return found
-
-
-def _read_hdf5_entries(path: str | Path, matlab: bool) -> dict[str, Any]:
+def _list_hdf5_entries(path: Path, matlab: bool) -> Entries:
     import h5py
 
-    entries: dict[str, Any] = {}
+    entries: dict[str, ArchiveEntry] = {}
 
-    def take(name: str, item: Any) -> None:
+    def note(name: str, item: Any) -> None:
         if not isinstance(item, h5py.Dataset) or name.startswith("#refs#"):
             return
         if item.shape is None or item.dtype.kind not in "uifbSO":
             return
-        if item.size * item.dtype.itemsize > MAX_FIELD_BYTES:
-            raise FileFormatError(
-                path, f"field '{name}' holds {item.nbytes / 2**30:.1f} GiB, more than can be read"
-            )
-        values = item[()]
-        entries[name.replace("/", ".")] = np.squeeze(values.T) if matlab else values
+        # Texts of variable length, references and MATLAB's cells are no numbers: never read.
+        if not item.dtype.hasobject:
+            require_bounded_dataset(item, path)
+        shape = tuple(n for n in item.shape[::-1] if n != 1) if matlab else item.shape
+        load = _make_hdf5_loader(path, name, matlab)
+        entries[name.replace("/", ".")] = ArchiveEntry(shape, item.dtype, load)
 
     with h5py.File(path, "r") as file:
-        file.visititems(take)
+        file.visititems(note)  # which follows no links
     return entries
 
 
-def _read_scipy_entries(path: str | Path) -> dict[str, Any]:
-    from scipy.io import loadmat
+def _make_hdf5_loader(path: Path, name: str, matlab: bool) -> Callable[[], NDArray[Any]]:
+    def load() -> NDArray[Any]:
+        import h5py
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        loaded = loadmat(path, simplify_cells=True)
-    entries: dict[str, Any] = {}
-    for name, value in loaded.items():
-        if isinstance(value, dict):
-            entries.update({f"{name}.{inner}": np.asarray(part) for inner, part in value.items()})
-        elif not name.startswith("__"):
-            entries[name] = np.asarray(value)
-    return entries
+        with h5py.File(path, "r") as file:
+            values = np.asarray(file[name][()])
+        return np.squeeze(values.T) if matlab else values
+
+    return load
+
+
+def _list_mat_entries(path: Path) -> Entries:
+    return {
+        variable.name: ArchiveEntry(
+            tuple(n for n in variable.shape if n != 1),
+            variable.dtype,
+            lambda load=variable.load: np.squeeze(load()),  # type: ignore[misc]
+        )
+        for variable in list_mat_variables(path)
+    }
 
 
 def _is_hdf5(path: str | Path) -> bool:

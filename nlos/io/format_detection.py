@@ -35,7 +35,7 @@ def read_native(path: str | Path) -> Capture | None:
     try:
         with h5py.File(path, "r") as file:
             own = "format" in file.attrs
-    except OSError as fault:
+    except (OSError, KeyError, RuntimeError) as fault:
         raise FileFormatError(path, "is a truncated or damaged HDF5 file") from fault
     if not own:
         return None

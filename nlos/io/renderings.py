@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.capture import Capture
-from tofclip.errors import FileFormatError, MissingDependencyError
+from tofclip.errors import FileFormatError
+from tofclip.io.exr import read_exr_parts
 from tofclip.storage import format_error_line
 from tofclip.units import PICOSECOND
 
@@ -70,22 +71,8 @@ def _parse_file_number(path: Path) -> tuple[list[int], str]:
 
 def _read_picture(path: Path) -> NDArray[np.float32]:
     """Brightness (column, t): mean of all channels but alpha and depth."""
-    try:
-        import OpenEXR
-    except ImportError as fault:
-        raise MissingDependencyError(
-            f"reading {path} needs OpenEXR: {format_error_line(fault)}"
-        ) from fault
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {
-                name: np.array(channel.pixels, np.float32)
-                for name, channel in file.channels().items()
-            }
-    except Exception as fault:  # whatever the decoder stumbles over, it is the file that is damaged
-        raise FileFormatError(
-            path, f"is a truncated or damaged EXR file ({format_error_line(fault)})"
-        ) from fault
+    parts = read_exr_parts(path)
+    channels = {name: pixels.astype(np.float32) for name, pixels in parts[0][1].items()}
     colours = [
         pixels for name, pixels in channels.items() if name.split(".")[-1] in ("R", "G", "B", "Y")
     ]

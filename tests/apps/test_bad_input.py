@@ -224,6 +224,18 @@ def test_clouds(run: Run, files: Path, tmp_path: Path, folder: Path) -> None:
     assert list(folder.iterdir()) == []
 
 
+@pytest.mark.parametrize("verb", ["info", "cloud"])
+def test_a_small_file_that_claims_a_tebibyte(
+    run: Run, files: Path, tmp_path: Path, folder: Path, verb: str
+) -> None:
+    bad = of_bytes(tmp_path / "bad.h5", (files / "camera.h5").read_bytes())
+    with h5py.File(bad, "r+", libver="latest") as file:
+        huge = file.create_dataset("huge", (1 << 38,), np.float32, chunks=(1 << 20,))
+        huge.attrs["units"] = huge.attrs["axes"] = ""
+    flags = () if verb == "info" else ("--out", folder / "scene.ply")
+    assert_refused(run(verb, bad, *flags), "'huge' claims")
+
+
 def test_frames_without_any_return(run: Run, camera: Camera, tmp_path: Path, folder: Path) -> None:
     from tofclip import Frames
 

@@ -89,7 +89,7 @@ def test_a_defect_is_one_line_as_well(
     def fail(*_: object) -> None:
         raise ZeroDivisionError("a defect\nin two lines")
 
-    monkeypatch.setattr("apps.verbs.info._read_record", fail)
+    monkeypatch.setattr("apps.verbs.info._read_outline", fail)
     outcome = run("info", files / "camera.h5")
     assert outcome.status == cli.EXIT_DEFECT
     assert outcome.err.startswith(

@@ -1,6 +1,4 @@
-"""What takes bytes from outside: every codec, the drivers' conversations, and the files beside
-recordings.
-"""
+"""What takes bytes from outside: every codec, the drivers' conversations, and files of every format."""
 
 from __future__ import annotations
 
@@ -11,6 +9,7 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
+from fuzz_files import FORMATS, FileFormat
 
 from devices.codec import Codec, as_bytes
 from devices.frames import FrameCodec
@@ -30,6 +29,7 @@ from devices.uri import Uri
 from tofclip.errors import DeviceDisconnectedError, DeviceTimeoutError, ProtocolError
 from tofclip.io import hpdta, itex
 
+FILE_SLOWNESS = 20
 Decode = Callable[[bytes], object]
 
 
@@ -37,14 +37,15 @@ Decode = Callable[[bytes], object]
 class Target:
     """Something that takes bytes from outside, with a few inputs that it likes.
 
-    `slowness`: so many times fewer inputs are tried. `room`: bytes that decoding may take whatever
-    the input.
+    `slowness`: so many times fewer inputs are tried in a sample. `room`: bytes that decoding may take whatever
+    the input. `notices_all`: no damage at all is let through, as every byte has a checksum.
     """
 
     decode: Decode
     seeds: tuple[bytes, ...]
     slowness: int = 1
     room: int = 1 << 16
+    notices_all: bool = False
 
     def bound(self, length: int) -> int:
         """Bytes that decoding an input of `length` bytes may take at most."""
@@ -238,6 +239,23 @@ def _sidecar() -> Target:
     return Target(decode, (seed,), slowness=2, room=1 << 21)  # a board's tables have 36 000 numbers
 
 
+def _file(file_format: FileFormat) -> Target:
+    folder = tempfile.TemporaryDirectory()
+
+    def decode(data: bytes) -> None:
+        assert folder.name  # it lives as long as this function
+        file_format.decode(Path(folder.name), data)
+
+    # The libraries' own tables and buffers, whatever the file; what it claims would be far more.
+    return Target(
+        decode,
+        file_format.seeds(),
+        FILE_SLOWNESS,
+        room=1 << 24,
+        notices_all=file_format.notices_all,
+    )
+
+
 TARGETS = {
     "RemoteEx sessions": _remoteex_session(),
     "SPAD512 sessions": _spad512_session(),
@@ -276,4 +294,5 @@ TARGETS = {
         lambda data: Uri.parse(data.decode("latin-1")).host_and_port(9),
         (b"remoteex://lab-7:1001?seed=4&rate=x", b"spad512://[::1]:99?seed=1"),
     ),
+    **{name: _file(file_format) for name, file_format in FORMATS.items()},
 }

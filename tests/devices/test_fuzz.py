@@ -1,8 +1,8 @@
 """Damaged bytes, in every way that a wire or a disk can damage them, through every codec.
 
 Whatever comes in, only our own exceptions come out, and no more memory is taken than `Target.bound`
-says. In the suite it is a sample; ``python tests/devices/test_fuzz.py 200000`` runs as many
-mutations as it is told and prints a table.
+says. In the suite it is a sample, small where a target is slow; ``python
+tests/devices/test_fuzz.py 100000`` shares that number of mutations out evenly and prints a table.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ from fuzz_targets import TARGETS, Target
 
 from tofclip.errors import TofclipError
 
-SUITE_MUTATIONS = 24_000
+SUITE_MUTATIONS = 12_000
+SAMPLE = "sample"
+MIN_JUDGED = 400
+"""Of fewer inputs, all may well be refused."""
 
 
 TELLING = np.array([0, 1, 0x7F, 0x80, 0xFF, 0x20, 0x2C, 0x0D, 0x23, 0x30, 0x39], np.uint8)
@@ -94,20 +97,20 @@ def attack(target: Target, count: int, seed: int) -> tuple[int, int]:
 
 def test_damaged_input_raises_only_our_own_errors_and_takes_little_memory() -> None:
     """In a process of its own: threads that other libraries leave behind take memory as well."""
-    command = [sys.executable, __file__, str(SUITE_MUTATIONS)]
+    command = [sys.executable, __file__, str(SUITE_MUTATIONS), SAMPLE]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     assert [line[:24].strip() for line in done.stdout.splitlines()[1:]] == list(TARGETS)
 
 
-def main(total: int) -> None:
-    """Attack every target and print what came of it."""
+def main(total: int, is_sample: bool) -> None:
+    """Attack every target and print what came of it; of a sample, slow targets get less."""
     print(f"{'target':24} {'inputs':>9} {'refused':>9} {'most bytes':>11} {'per second':>11}")
     for name, target in TARGETS.items():
         began = time.perf_counter()
-        count = -(-total // len(TARGETS)) // target.slowness
+        count = -(-total // len(TARGETS)) // (target.slowness if is_sample else 1)
         refused, most = attack(target, count, seed=2)
-        assert refused < count, (
+        assert refused < count or count < MIN_JUDGED or target.notices_all, (
             f"{name}: the damage is so heavy that nothing ever gets beyond the first check"
         )
         assert most > 0, f"{name}: no memory was watched"
@@ -118,4 +121,4 @@ def main(total: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 100_000)
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 100_000, SAMPLE in sys.argv)

@@ -9,6 +9,7 @@ uniform, because no sweep voltage is a straight line.
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -185,9 +186,12 @@ def _parse_first_row(metadata: Mapping[str, str]) -> int:
 
 
 def _read_table(path: str | Path, start: int, count: int) -> NDArray[np.float64]:
+    data = b""
     with translate_read_errors(path), open(path, "rb") as file:
-        file.seek(start)
-        data = file.read(count * _BYTES_PER_ENTRY)
+        # Asking for more than there is would take the memory for it first.
+        if start + count * _BYTES_PER_ENTRY <= os.fstat(file.fileno()).st_size:
+            file.seek(start)
+            data = file.read(count * _BYTES_PER_ENTRY)
     if len(data) < count * _BYTES_PER_ENTRY:
         raise FileFormatError(
             path,

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from tofclip.errors import FileFormatError, InputError, ShapeError
 from tofclip.io import hpdta
 from tofclip.io.tiff import MAX_PIXELS
-from tofclip.shots import Streak
-from tofclip.storage import atomic_path, translate_read_errors
+from tofclip.shots import Streak, outline_streak
+from tofclip.storage import Record, atomic_path, translate_read_errors
 
 SIGNATURE = b"IM"
 AXES = ("X", "Y")
@@ -97,6 +97,15 @@ def read_itex(path: str | Path) -> Streak:
     )
 
 
+def outline_itex(path: str | Path) -> Record:
+    """Describe what `read_itex` would read, without reading a pixel."""
+    with translate_read_errors(path):
+        image = decode_itex(np.memmap(path, np.uint8, "r").data, path)
+    rows = image.pixels.shape[0]
+    has_times = hpdta.read_row_times(image.metadata, path, rows) is not None
+    return outline_streak(image.pixels.shape, has_times, True, image.metadata)
+
+
 def write_itex(image: ItexImage, path: str | Path) -> None:
     """Write an ITEX file, whole or not at all.
 
@@ -110,7 +119,7 @@ def write_itex(image: ItexImage, path: str | Path) -> None:
         temporary.write_bytes(data)
 
 
-def decode_itex(data: bytes, path: str | Path = "ITEX picture") -> ItexImage:
+def decode_itex(data: bytes | memoryview, path: str | Path = "ITEX picture") -> ItexImage:
     """Take the bytes of an ITEX file apart.
 
     The pixels are a view of `data`; nothing else is larger than the text, so that a damaged header
@@ -118,7 +127,7 @@ def decode_itex(data: bytes, path: str | Path = "ITEX picture") -> ItexImage:
 
     Parameters
     ----------
-    data : bytes
+    data : bytes or memoryview
     path : path-like
         Where they come from, for messages.
 
@@ -131,7 +140,7 @@ def decode_itex(data: bytes, path: str | Path = "ITEX picture") -> ItexImage:
     FileFormatError
         They are not an ITEX file, or less than the header and the text say.
     """
-    if len(data) < _HEADER.size or not data.startswith(SIGNATURE):
+    if len(data) < _HEADER.size or bytes(data[:2]) != SIGNATURE:
         raise FileFormatError(path, "has no ITEX header")
     _, text_length, columns, rows, x_offset, y_offset, kind = _HEADER.unpack_from(data)
     if kind not in PIXEL_TYPES:
@@ -146,7 +155,7 @@ def decode_itex(data: bytes, path: str | Path = "ITEX picture") -> ItexImage:
         raise FileFormatError(
             path, f"is truncated: {columns} x {rows} pixels take {needed} bytes, found {len(data)}"
         )
-    text = _decode_text(data[_HEADER.size : pixels_start])
+    text = _decode_text(bytes(data[_HEADER.size : pixels_start]))
     pixels = np.frombuffer(data, PIXEL_TYPES[kind], rows * columns, pixels_start).reshape(
         rows, columns
     )
@@ -184,7 +193,7 @@ def _read_bytes(path: str | Path) -> bytes:
 
 
 def _read_tables(
-    data: bytes, metadata: Mapping[str, str], path: str | Path
+    data: bytes | memoryview, metadata: Mapping[str, str], path: str | Path
 ) -> dict[str, NDArray[np.float32]]:
     tables = {}
     for axis in AXES:

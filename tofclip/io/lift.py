@@ -22,7 +22,8 @@ from tofclip.camera import Camera, PolynomialSweep, ProjectiveSweep, SkewSweep, 
 from tofclip.errors import CalibrationError, FileFormatError, InputError
 from tofclip.io.archive import Archive
 from tofclip.io.relay_wall import read_relay_wall
-from tofclip.shots import Streak
+from tofclip.shots import Streak, outline_streak
+from tofclip.storage import Record
 
 EXPECTED_FLAGS = {"resample_flag": 1, "image_inverted_flag": 0}
 """Flags of the archive and the only value whose meaning is known."""
@@ -35,12 +36,7 @@ def read_lift(path: str | Path) -> Streak:
     non-line-of-sight scenes also bring their relay wall, as the attachment ``"relay_wall"``, and
     from it the camera's focal length.
     """
-    archive = Archive(path)
-    for flag, meant in EXPECTED_FLAGS.items():
-        if archive.array(flag) != meant:
-            raise FileFormatError(
-                path, f"field '{flag}' is {archive.array(flag)}; only {meant} has a known meaning"
-            )
+    archive = _open_archive(path)
     # The archive was clipped at zero when it was made, so that a negative value means another kind
     # of file.
     counts = archive.array("streak_raw", None, None)
@@ -48,10 +44,41 @@ def read_lift(path: str | Path) -> Streak:
         raise InputError(
             f"{path}: streak_raw holds negative readings; a LIFT archive is clipped at zero"
         )
+    camera, metadata, attachments = _read_calibration(archive)
+    streak = Streak(
+        counts=counts, metadata=metadata, camera=camera, attachments=attachments, source=str(path)
+    )
+    bin_width = _read_bin_width(archive)
+    return streak if bin_width is None else streak.with_bin_width(bin_width)
+
+
+def outline_lift(path: str | Path) -> Record:
+    """Describe what `read_lift` would read, without reading a pixel of the streak image."""
+    archive = _open_archive(path)
+    camera, metadata, attachments = _read_calibration(archive)
+    shape = archive.describe("streak_raw").shape
+    return outline_streak(
+        shape, _read_bin_width(archive) is not None, False, metadata, camera, attachments
+    )
+
+
+def _open_archive(path: str | Path) -> Archive:
+    archive = Archive(path)
+    for flag, meant in EXPECTED_FLAGS.items():
+        if archive.array(flag) != meant:
+            raise FileFormatError(
+                path, f"field '{flag}' is {archive.array(flag)}; only {meant} has a known meaning"
+            )
+    archive.require_numbers("streak_raw", None, None)
+    return archive
+
+
+def _read_calibration(archive: Archive) -> tuple[Camera, dict[str, str], dict[str, Record]]:
+    """Return the camera, what the archive says in words, and the relay wall where there is one."""
     try:
-        camera = _read_camera(archive, counts.shape)
+        camera = _read_camera(archive, archive.describe("streak_raw").shape)
     except CalibrationError as fault:
-        raise CalibrationError(f"{path}: {fault}") from fault
+        raise CalibrationError(f"{archive.path}: {fault}") from fault
     metadata, attachments = archive.scalars(), {}
     if "wall_grid_m" in archive:
         wall = read_relay_wall(archive, camera.image_shape)
@@ -59,18 +86,20 @@ def read_lift(path: str | Path) -> Streak:
         focal_length_px, residual_px = wall.fit_focal_length()
         camera = camera.replace(focal_length_px=focal_length_px)
         metadata["focal_length_residual_px"] = f"{residual_px:.3g}"
-    streak = Streak(
-        counts=counts, metadata=metadata, camera=camera, attachments=attachments, source=str(path)
-    )
+    return camera, metadata, attachments
+
+
+def _read_bin_width(archive: Archive) -> float | None:
+    """Duration of a row, s; None where the sweep speed was not recorded."""
     bin_width = float(archive.array("dt_s"))
-    # NaN is how the archive says that the sweep speed was not recorded.
+    # NaN is how the archive says that it does not know.
     if math.isnan(bin_width):
-        return streak
+        return None
     if not 0 < bin_width < math.inf:
         raise FileFormatError(
-            path, f"field 'dt_s' must be positive, or NaN where unknown, found {bin_width}"
+            archive.path, f"field 'dt_s' must be positive, or NaN where unknown, found {bin_width}"
         )
-    return streak.with_bin_width(bin_width)
+    return bin_width
 
 
 def _read_camera(archive: Archive, shape: tuple[int, ...]) -> Camera:

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError
+from tofclip.io.exr import Channels, read_exr_parts
 from tofclip.io.light_field_folder import compute_luminance
 from tofclip.light_field import LightField
-from tofclip.storage import atomic_path, format_error_line, translate_read_errors
+from tofclip.storage import atomic_path
 
 NUMBER_PATTERN = r"([-+]?\d+(?:\.\d+)?)"
 PART_NAME_PATTERN = re.compile(rf"v={NUMBER_PATTERN},u={NUMBER_PATTERN}")
@@ -26,20 +27,7 @@ def read_exr(path: Path) -> LightField:
     StorageError, FileFormatError
         The file cannot be read, a part has another name or channels, or the parts differ in size.
     """
-    import OpenEXR
-
-    with translate_read_errors(path):
-        path.stat()
-    try:
-        parts = OpenEXR.File(str(path), separate_channels=True).parts
-        named = [
-            (part.name(), {name: channel.pixels for name, channel in part.channels.items()})
-            for part in parts
-        ]
-    except Exception as fault:  # whatever the decoder stumbles over, it is the file that is damaged
-        raise FileFormatError(
-            path, f"is a truncated or damaged OpenEXR file ({format_error_line(fault)})"
-        ) from fault
+    named = read_exr_parts(path)
     pictures = [_read_luminance(path, name, channels) for name, channels in named]
     if len({picture.shape for picture in pictures}) != 1:
         raise FileFormatError(path, "its parts differ in size; every view must have as many pixels")
@@ -78,7 +66,7 @@ def _parse_view(path: Path, name: str) -> tuple[float, float]:
     return float(found[1]), float(found[2])
 
 
-def _read_luminance(path: Path, name: str, channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
+def _read_luminance(path: Path, name: str, channels: Channels) -> NDArray[Any]:
     if "Y" in channels:
         return channels["Y"].astype(np.float32)
     if not {"R", "G", "B"} <= channels.keys():

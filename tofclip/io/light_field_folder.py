@@ -7,6 +7,7 @@ anywhere; n rows become views ``-(n // 2), ...``, so that 8 run from -4 to 3.
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 from pathlib import Path
@@ -16,10 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError
+from tofclip.file_limits import BoundedFile, require_bounded_size
+from tofclip.io.tiff import MAX_PIXELS, NULL_LOG_HANDLER, require_bounded_page
 from tofclip.light_field import LightField
 from tofclip.storage import format_error_line
 
-IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
+TIFF_SUFFIXES = (".tif", ".tiff")
+IMAGE_SUFFIXES = (".png", *TIFF_SUFFIXES, ".jpg", ".jpeg", ".bmp")
 # Weights of linear red, green and blue in the luminance of ITU-R BT.709.
 LUMA_WEIGHTS = np.array([0.2125, 0.7154, 0.0721])
 GRID_NAME_PATTERN = re.compile(r"(\d+)\D+(\d+)\D*")
@@ -114,14 +118,38 @@ def _check_complete_grid(folder: Path, places: NDArray[np.int64]) -> None:
 
 
 def _read_picture(path: Path) -> NDArray[Any]:
-    from matplotlib.image import imread
-    from tifffile import imread as read_tiff
-
     try:
-        picture = read_tiff(path) if path.suffix.lower().startswith(".tif") else imread(path)
+        picture = _decode_tiff(path) if path.suffix.lower() in TIFF_SUFFIXES else _decode(path)
+    except (FileFormatError, MemoryError):
+        raise
     except Exception as fault:  # whatever the decoder stumbles over, it is the file that is damaged
         raise FileFormatError(path, f"is a damaged picture ({format_error_line(fault)})") from fault
     if picture.ndim not in (2, 3):
         raise FileFormatError(path, f"must be one grey or colour picture, found {picture.shape}")
     scale = np.iinfo(picture.dtype).max if picture.dtype.kind in "ui" else 1
     return compute_luminance(picture) / np.float32(scale)
+
+
+def _decode_tiff(path: Path) -> NDArray[Any]:
+    import tifffile
+
+    logging.getLogger("tifffile").addHandler(NULL_LOG_HANDLER)
+    with BoundedFile(path) as file, tifffile.TiffFile(file) as tiff:
+        if len(tiff.pages) != 1:
+            raise FileFormatError(path, f"holds {len(tiff.pages)} pictures, expected one view")
+        require_bounded_page(tiff.pages.first, path)
+        return np.asarray(tiff.pages.first.asarray())
+
+
+def _decode(path: Path) -> NDArray[Any]:
+    from matplotlib.image import imread
+    from PIL import Image
+
+    with BoundedFile(path) as file, Image.open(file) as header:  # reads no pixels yet
+        claimed = math.prod(header.size) * len(header.getbands())
+    if claimed > MAX_PIXELS:
+        raise FileFormatError(path, f"claims an impossible size of {header.size} pixels")
+    # JPEG is no deflate, but no photograph is smaller than this either.
+    require_bounded_size(path, "pixels", claimed, path.stat().st_size, compressed=True)
+    with BoundedFile(path) as file:
+        return np.asarray(imread(file, format=path.suffix[1:].lower()))

@@ -1,10 +1,11 @@
-"""Numbers and cells in MATLAB's files of version 5.
+"""Numbers, cells and structs in MATLAB's files of version 5.
 
 SciPy's reader trusts the sizes that a file states, and a damaged one ends the program; this one
 holds every size against the bytes that are there.
 
 The format is MathWorks' "MAT-File Format" (R2022a): elements with a tag of type and length, padded
-to eight bytes; a matrix holds flags, dimensions, name and values, a cell holds matrices.
+to eight bytes; a matrix holds flags, dimensions, name and values, a cell holds matrices, a struct
+the names of its fields and their matrices.
 """
 
 from __future__ import annotations
@@ -21,14 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError
+from tofclip.file_limits import require_bounded_size
 
-# A few kilobytes of zlib can claim to unpack to terabytes.
-MAX_UNPACKED_BYTES = 1 << 32
 HEADER_BYTES, PEEKED_BYTES = 128, 1 << 12
-# Data types of an element (miINT8, miMATRIX, miCOMPRESSED), then array classes: mxCELL_CLASS, and
-# mxDOUBLE_CLASS to mxUINT64_CLASS.
-INT8, MATRIX, COMPRESSED = 1, 14, 15
-CELL_CLASS, NUMERIC_CLASSES = 1, range(6, 16)
+# Data types of an element: miMATRIX, miCOMPRESSED.
+MATRIX, COMPRESSED = 14, 15
+# Array classes: mxCELL_CLASS, mxSTRUCT_CLASS, and mxDOUBLE_CLASS to mxUINT64_CLASS.
+CELL_CLASS, STRUCT_CLASS = 1, 2
+NUMERIC_CLASSES = {
+    number: np.dtype(name)
+    for number, name in enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), 6)
+}
+EMPTY_CLASS = 6
 COMPLEX_FLAG = 0x0800
 VALUE_TYPES = {
     1: "i1",
@@ -51,20 +56,22 @@ class MatVariable:
     Parameters
     ----------
     name : str
+        With a dot for a field of a struct.
     shape : tuple of int
-    is_cell : bool
+    dtype : dtype
+        Objects for cells.
     load : callable
         Returns its values: numbers, or an object array of arrays.
     """
 
     name: str
     shape: tuple[int, ...]
-    is_cell: bool
+    dtype: np.dtype[Any]
     load: Callable[[], NDArray[Any]]
 
 
 def list_mat_variables(path: Path) -> list[MatVariable]:
-    """List the numeric and cell arrays of a MAT file of version 5.
+    """List the numeric and cell arrays of a MAT file of version 5, and those in its structs.
 
     Parameters
     ----------
@@ -73,9 +80,10 @@ def list_mat_variables(path: Path) -> list[MatVariable]:
     Raises
     ------
     FileFormatError
-        The file is truncated or damaged.
+        The file is truncated or damaged, or an array claims more than the file can hold.
     """
-    size, found = path.stat().st_size, []
+    size = path.stat().st_size
+    found: list[MatVariable] = []
     with open(path, "rb") as file:
         header = file.read(HEADER_BYTES)
         # The header ends in the characters MI as a 16-bit number: read back as IM, the file is
@@ -96,34 +104,47 @@ def list_mat_variables(path: Path) -> list[MatVariable]:
                 kind = struct.unpack(f"{order}I", first[:4])[0] if len(first) >= 8 else 0
                 first = first[8:]
             if kind == MATRIX:
-                matrix = _Matrix(path, order, memoryview(first), complete=False)
-                if matrix.kind == CELL_CLASS or matrix.kind in NUMERIC_CLASSES:
-                    load = _make_loader(path, order, (start, length, packed))
-                    found.append(
-                        MatVariable(matrix.name, matrix.shape, matrix.kind == CELL_CLASS, load)
-                    )
+                element = _Element(path, order, start, length, packed)
+                found += _list_matrix(_Matrix(path, order, memoryview(first)), element)
             file.seek(start + length)
     return found
 
 
-def _make_loader(
-    path: Path, order: str, place: tuple[int, int, bool]
-) -> Callable[[], NDArray[Any]]:
-    start, length, packed = place
+@dataclass(frozen=True)
+class _Element:
+    """Where a matrix lies in a file: its bytes from `start` on, compressed ones where `packed`."""
 
-    def load() -> NDArray[Any]:
-        with open(path, "rb") as file:
-            file.seek(start)
-            content = file.read(length)
-        if packed:
+    path: Path
+    order: str
+    start: int
+    length: int
+    packed: bool
+
+    def read(self) -> _Matrix:
+        with open(self.path, "rb") as file:
+            file.seek(self.start)
+            content = file.read(self.length)
+        if self.packed:
             unpacker = zlib.decompressobj()
-            content = unpacker.decompress(content, MAX_UNPACKED_BYTES)
-            if unpacker.unconsumed_tail:
-                raise FileFormatError(path, "holds more than can be read at once")
-            content = content[8:]
-        return _Matrix(path, order, memoryview(content), complete=True).values()
+            claimed = struct.unpack(f"{self.order}I", unpacker.decompress(content, 8)[4:])[0]
+            require_bounded_size(self.path, "a variable", claimed, self.length, True)
+            content = unpacker.decompress(unpacker.unconsumed_tail, claimed + 1)
+        return _Matrix(self.path, self.order, memoryview(content))
 
-    return load
+
+def _list_matrix(matrix: _Matrix, element: _Element) -> Iterator[MatVariable]:
+    """List a variable, of a struct its fields; what is neither is left out."""
+    if matrix.kind == STRUCT_CLASS and math.prod(matrix.shape) == 1:
+        for name, part in element.read().fields():
+            if part.is_readable:
+                label = f"{matrix.name}.{name}"
+                yield MatVariable(label, part.shape, part.dtype, part.values)
+    elif matrix.is_readable:
+        if matrix.kind != CELL_CLASS:
+            # A number takes at least one byte in the file, whatever its class.
+            number = math.prod(matrix.shape)
+            require_bounded_size(element.path, matrix.name, number, element.length, element.packed)
+        yield MatVariable(matrix.name, matrix.shape, matrix.dtype, lambda: element.read().values())
 
 
 class _Matrix:
@@ -136,15 +157,15 @@ class _Matrix:
     order : str
         ``<`` or ``>``.
     content : memoryview
-        The element without its tag; if not `complete`, its beginning.
-    complete : bool
+        The element without its tag, or its beginning, if only name and shape are wanted.
     """
 
-    def __init__(self, path: Path, order: str, content: memoryview, complete: bool) -> None:
+    def __init__(self, path: Path, order: str, content: memoryview) -> None:
         self._path, self._order, self._content = path, order, content
-        self._place, self.kind, self.shape, self.name = 0, 0, (0, 0), ""
-        if complete and not content:  # MATLAB's empty cell
-            self.kind = NUMERIC_CLASSES[-1]
+        self._place, self._contents = 0, 0
+        self.kind, self.shape, self.name = 0, (0, 0), ""
+        if not content:  # MATLAB's empty cell
+            self.kind = EMPTY_CLASS
             return
         flags = self._read_part()[1]
         dimensions = self._read_part()[1]
@@ -156,8 +177,19 @@ class _Matrix:
         self._is_complex = bool(word & COMPLEX_FLAG)
         self.shape = tuple(np.frombuffer(dimensions, f"{order}i4").tolist())
         self.name = bytes(name).decode("latin-1")
-        if min(self.shape) < 0 or math.prod(self.shape) > MAX_UNPACKED_BYTES:
+        if min(self.shape) < 0:
             raise self._damage()
+        self._contents = self._place
+
+    @property
+    def is_readable(self) -> bool:
+        """Whether it holds numbers or cells."""
+        return self.kind == CELL_CLASS or self.kind in NUMERIC_CLASSES
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of its values, objects for cells."""
+        return NUMERIC_CLASSES.get(self.kind, np.dtype(object))
 
     def _damage(self) -> FileFormatError:
         return FileFormatError(self._path, "is a truncated or damaged MAT file")
@@ -186,6 +218,7 @@ class _Matrix:
     def values(self) -> NDArray[Any]:
         """Return the numbers, or the contents of the cells."""
         number = math.prod(self.shape)
+        self._place = self._contents
         if self.kind == CELL_CLASS:
             # Every cell takes a tag of eight bytes at least, so that a damaged count is found
             # before the array is made.
@@ -199,21 +232,36 @@ class _Matrix:
             raise FileFormatError(self._path, f"'{self.name}' holds no numbers")
         # An empty array may come without an element for its values.
         if number == 0:
-            return np.zeros(self.shape, np.uint8)
+            return np.zeros(self.shape, self.dtype)
         kind, part = self._read_part()
         if kind not in VALUE_TYPES or self._is_complex:
             raise FileFormatError(self._path, f"'{self.name}' holds no real numbers")
         values = np.frombuffer(part, self._order + VALUE_TYPES[kind])
         if values.size != number:
             raise self._damage()
-        return values.reshape(self.shape, order="F")
+        return values.astype(self.dtype, copy=False).reshape(self.shape, order="F")
+
+    def fields(self) -> Iterator[tuple[str, _Matrix]]:
+        """Yield names and contents of the fields of a struct."""
+        width_part, names = self._read_part()[1], bytes(self._read_part()[1])
+        if len(width_part) < 4:
+            raise self._damage()
+        width = struct.unpack(f"{self._order}i", width_part[:4])[0]
+        if width <= 0:
+            raise self._damage()
+        for start in range(0, len(names), width):
+            name = names[start : start + width].partition(b"\0")[0].decode("latin-1")
+            yield name, self._read_matrix()
+
+    def _read_matrix(self) -> _Matrix:
+        kind, part = self._read_part()
+        if kind != MATRIX:
+            raise self._damage()
+        return _Matrix(self._path, self._order, part)
 
     def _iterate_cells(self, number: int) -> Iterator[NDArray[Any]]:
         for _ in range(number):
-            kind, part = self._read_part()
-            if kind != MATRIX:
-                raise self._damage()
-            inner = _Matrix(self._path, self._order, part, complete=True)
+            inner = self._read_matrix()
             if inner.kind == CELL_CLASS:
                 raise FileFormatError(self._path, "holds cells inside cells")
             yield inner.values()

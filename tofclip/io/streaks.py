@@ -9,19 +9,25 @@ from pathlib import Path
 
 from tofclip.errors import FileFormatError
 from tofclip.io.itex import SIGNATURE as ITEX_SIGNATURE
-from tofclip.io.itex import read_itex
-from tofclip.io.lift import read_lift
-from tofclip.io.tiff import read_tiff
+from tofclip.io.itex import outline_itex, read_itex
+from tofclip.io.lift import outline_lift, read_lift
+from tofclip.io.tiff import outline_tiff, read_tiff
 from tofclip.shots import Streak
-from tofclip.storage import HDF5_SIGNATURE, collect_provenance, translate_read_errors
+from tofclip.storage import (
+    HDF5_SIGNATURE,
+    Record,
+    collect_provenance,
+    read_outline,
+    translate_read_errors,
+)
 
 # A file is known by its first bytes: suffixes get lost and lie.
-READERS: dict[bytes, Callable[[str | Path], Streak]] = {
-    b"II*\0": read_tiff,
-    b"MM\0*": read_tiff,
-    b"PK\x03\x04": read_lift,
-    HDF5_SIGNATURE: Streak.load,
-    ITEX_SIGNATURE: read_itex,
+READERS: dict[bytes, tuple[Callable[[str | Path], Streak], Callable[[str | Path], Record]]] = {
+    b"II*\0": (read_tiff, outline_tiff),
+    b"MM\0*": (read_tiff, outline_tiff),
+    b"PK\x03\x04": (read_lift, outline_lift),
+    HDF5_SIGNATURE: (Streak.load, read_outline),
+    ITEX_SIGNATURE: (read_itex, outline_itex),
 }
 
 
@@ -54,7 +60,7 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
     InputError
         Its pixels hold NaN, are all zero, all saturated, or negative where counts cannot be.
     """
-    streak = _select_reader(path)(path)
+    streak = _select_reader(path)[0](path)
     if bin_width is not None:
         streak = streak.with_bin_width(bin_width)
     history = collect_provenance({"bin_width_s": bin_width}, path)
@@ -64,14 +70,39 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
     return replace(streak, provenance=history)
 
 
-def _select_reader(path: str | Path) -> Callable[[str | Path], Streak]:
+def outline_streak_file(path: str | Path) -> Record:
+    """Describe the streak image in a file without reading its pixels.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    Record
+        See `tofclip.storage.read_outline`.
+
+    Raises
+    ------
+    StorageError, FileFormatError
+        See `read_streak`.
+    """
+    outline = _select_reader(path)[1](path)
+    if outline.provenance:
+        return outline
+    return replace(outline, provenance=collect_provenance({"bin_width_s": None}, path))
+
+
+def _select_reader(
+    path: str | Path,
+) -> tuple[Callable[[str | Path], Streak], Callable[[str | Path], Record]]:
     with translate_read_errors(path), open(path, "rb") as file:
         start = file.read(8)
     if not start:
         raise FileFormatError(path, "is empty")
-    for signature, reader in READERS.items():
+    for signature, readers in READERS.items():
         if start.startswith(signature):
-            return reader
+            return readers
     size = os.path.getsize(path)
     raise FileFormatError(
         path,

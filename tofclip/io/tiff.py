@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.errors import FileFormatError, InputError
+from tofclip.errors import FileFormatError, InputError, TofclipError
+from tofclip.file_limits import MAX_COMPRESSION, BoundedFile
 from tofclip.io import hpdta
-from tofclip.shots import Streak
-from tofclip.storage import format_error_line, translate_read_errors
+from tofclip.shots import Streak, outline_streak
+from tofclip.storage import Record, format_error_line, translate_read_errors
 
 if TYPE_CHECKING:
     import tifffile
@@ -29,12 +32,9 @@ def read_tiff(path: str | Path) -> Streak:
     HPD-TA's text and time axis are used where present (`tofclip.io.hpdta`). Integer pixels at the
     sensor's limit are marked in ``Streak.saturated``; floating-point pictures have no such limit.
     """
-    pixels, text, date = _decode_page(path)
-    metadata: dict[str, str] = {"DateTime": date} if date else {}
-    times = None
-    if hpdta.is_hpdta(text):
-        metadata |= hpdta.parse_text(text)
-        times = hpdta.read_row_times(metadata, path, pixels.shape[0])
+    with _open_page(path) as page:
+        pixels = page.asarray()
+        metadata, times = _read_text(page, path)
     negative = int(np.count_nonzero(pixels < 0))
     if negative:
         raise InputError(
@@ -50,19 +50,38 @@ def read_tiff(path: str | Path) -> Streak:
     )
 
 
-def _decode_page(path: str | Path) -> tuple[NDArray[Any], str, str]:
-    """Return pixels, image description and date of the only picture in the file."""
+def outline_tiff(path: str | Path) -> Record:
+    """Describe what `read_tiff` would read, without reading a pixel."""
+    with _open_page(path) as page:
+        metadata, times = _read_text(page, path)
+        has_limit = page.dtype is not None and page.dtype.kind != "f"
+        return outline_streak(page.shape, times is not None, has_limit, metadata)
+
+
+def _read_text(
+    page: tifffile.TiffPage, path: str | Path
+) -> tuple[dict[str, str], NDArray[np.float64] | None]:
+    """Return what the file says in words, and the instants of the rows, s, where it has them."""
+    date = page.tags.get("DateTime")
+    metadata = {} if date is None or not date.value else {"DateTime": str(date.value)}
+    if not hpdta.is_hpdta(page.description):
+        return metadata, None
+    metadata |= hpdta.parse_text(page.description)
+    return metadata, hpdta.read_row_times(metadata, path, page.shape[0])
+
+
+@contextlib.contextmanager
+def _open_page(path: str | Path) -> Iterator[tifffile.TiffPage]:
+    """Open the only picture in the file."""
     import tifffile
 
     # Without a handler its complaints go to standard error, ahead of the one line that we raise.
     logging.getLogger("tifffile").addHandler(NULL_LOG_HANDLER)
-    with translate_read_errors(path), open(path, "rb") as file:
+    with translate_read_errors(path), BoundedFile(path) as file:
         try:
             with tifffile.TiffFile(file) as tiff:
-                page = _check_only_page(tiff, path)
-                date = page.tags.get("DateTime")
-                return page.asarray(), page.description, "" if date is None else str(date.value)
-        except FileFormatError:
+                yield _check_only_page(tiff, path)
+        except (TofclipError, MemoryError):
             raise
         except (
             Exception
@@ -74,20 +93,37 @@ def _decode_page(path: str | Path) -> tuple[NDArray[Any], str, str]:
 
 def _check_only_page(tiff: tifffile.TiffFile, path: str | Path) -> tifffile.TiffPage:
     """Hold what the header claims against the file before any memory is taken for it."""
-    page, size = tiff.pages.first, tiff.filehandle.size
+    page = tiff.pages.first
     if len(tiff.pages) != 1:
         raise FileFormatError(path, f"holds {len(tiff.pages)} pictures, expected one streak image")
     if page.ndim != 2 or page.dtype is None or page.dtype.kind not in "uif":
         raise FileFormatError(
             path, f"holds a picture of shape {page.shape}, expected grey (rows, columns)"
         )
+    require_bounded_page(page, path)
+    return page
+
+
+def require_bounded_page(page: tifffile.TiffPage, path: str | Path) -> None:
+    """Refuse a picture that claims more than its file can hold.
+
+    Parameters
+    ----------
+    page : tifffile.TiffPage
+    path : path-like
+
+    Raises
+    ------
+    FileFormatError
+    """
     if not 0 < page.size <= MAX_PIXELS:
         raise FileFormatError(path, f"claims an impossible size of {page.shape} pixels")
+    size, packed = page.parent.filehandle.size, page.compression != 1
     # Compressed strips may be shorter than the picture; uncompressed ones (TIFF compression 1) may
     # not.
     end = max(map(sum, zip(page.dataoffsets, page.databytecounts, strict=True)), default=0)
-    if end > size or (page.compression == 1 and sum(page.databytecounts) < page.nbytes):
+    held = sum(page.databytecounts) * (MAX_COMPRESSION if packed else 1)
+    if end > size or held < page.nbytes:
         raise FileFormatError(
             path, f"is truncated: {page.shape} pixels of {page.dtype} do not fit into {size} bytes"
         )
-    return page

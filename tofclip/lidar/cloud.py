@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError, ShapeError, require_type
+from tofclip.io.archive import ArchiveEntry
 from tofclip.lidar import export
 from tofclip.lidar.column import Column
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.notebook import plot_points, render_html, require_package
 from tofclip.records import Storable, stored_array, stored_provenance
 from tofclip.shots import Returns
-from tofclip.storage import Record
+from tofclip.storage import Field, Record, make_stand_in, read_outline
 
 COLUMN_UNITS = {
     "x": "m",
@@ -206,20 +207,30 @@ class PointCloud(Storable):
         """
         if Path(path).suffix.lower() == ".h5":
             return super().load(path)
-        table = export.read_table(path)
-        values = {OLD_NAMES.get(name, name): column for name, column in table.items()}
-        missing = [name for name in COLUMN_UNITS if name not in values]
-        if missing:
-            raise FileFormatError(
-                path, f"has no column '{missing[0]}': it was not written by tofclip"
-            )
-        values = {name: np.ravel(values[name]) for name in COLUMN_UNITS}
+        columns = _list_columns(path)
+        values = {name: np.ravel(entry.load()) for name, entry in columns.items()}
         positions = np.stack([values.pop(axis) for axis in "xyz"], axis=-1)
         # An organised cloud has a place for every pixel, with or without a point.
         there = np.isfinite(positions).all(axis=1)
         positions = positions[there]
         properties: dict[str, Any] = {name: column[there] for name, column in values.items()}
         return cls(xyz=positions, **properties)
+
+    @staticmethod
+    def read_outline(path: str | Path) -> Record:
+        """Describe a point cloud that `save` wrote, without reading its points; see
+        `tofclip.storage.read_outline`. An organised one has a place for every pixel.
+        """
+        if Path(path).suffix.lower() == ".h5":
+            return read_outline(path)
+        shape = _list_columns(path)["x"].shape
+        axes = ("point",) if len(shape) == 1 else ("y", "x")
+        fields = {"xyz": Field(make_stand_in((*shape, 3), np.float32), "m", (*axes, "xyz"))}
+        for name, units in COLUMN_UNITS.items():
+            if name not in "xyz":
+                dtype = np.uint8 if name == "return_number" else np.float32
+                fields[name] = Field(make_stand_in(shape, dtype), units, axes)
+        return Record("cloud", fields)
 
     @classmethod
     def from_record(cls, record: Record) -> PointCloud:
@@ -259,3 +270,13 @@ def point_cloud(returns: Returns) -> PointCloud:
         time=returns.time.astype(np.float32),
         provenance=returns.provenance,
     )
+
+
+def _list_columns(path: str | Path) -> dict[str, ArchiveEntry]:
+    """List the columns of a point cloud's table; refuse one that lacks any."""
+    listed = export.list_columns(path)
+    columns = {OLD_NAMES.get(name, name): entry for name, entry in listed.items()}
+    for name in COLUMN_UNITS:
+        if name not in columns:
+            raise FileFormatError(path, f"has no column '{name}': it was not written by tofclip")
+    return {name: columns[name] for name in COLUMN_UNITS}

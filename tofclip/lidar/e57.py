@@ -6,14 +6,19 @@ table of an extension beside it, ``tofclip:columns``, row by row in the same ord
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
-from tofclip.errors import FileFormatError, MissingDependencyError
+from tofclip.errors import FileFormatError, MissingDependencyError, TofclipError
+from tofclip.file_limits import require_bounded_size
+from tofclip.io.archive import ArchiveEntry
 from tofclip.lidar.column import Columns, Table
 
 EXTENSION = "tofclip"
@@ -64,22 +69,50 @@ def write_e57(path: Path, columns: Columns) -> None:
     file.close()
 
 
-def read_e57(path: Path) -> Table:
-    """Read what `write_e57` wrote: its columns by their names, without units."""
+def list_e57_columns(path: Path) -> dict[str, ArchiveEntry]:
+    """List the columns that `write_e57` wrote; the first that is loaded reads all points."""
+
+    @functools.cache
+    def read() -> Table:
+        with _open_tables(path) as (lib, tables):
+            return {
+                name: values
+                for image, table in tables
+                for name, values in _read_vector(lib, image, table)
+            }
+
+    def make_entry(name: str, dtype: DTypeLike, points: int) -> ArchiveEntry:
+        return ArchiveEntry((points,), np.dtype(dtype), lambda: read()[name])
+
+    size = path.stat().st_size
+    with _open_tables(path) as (lib, tables):
+        entries = {}
+        for _, table in tables:
+            points = table.childCount()
+            for _, name, dtype in _list_elements(lib, table):
+                claimed = points * np.dtype(dtype).itemsize
+                require_bounded_size(path, name, claimed, size, compressed=True)
+                entries[name] = make_entry(name, dtype, points)
+    return entries
+
+
+@contextlib.contextmanager
+def _open_tables(path: Path) -> Iterator[tuple[Any, list[tuple[Any, Any]]]]:
+    """Open the scan's points and the extension's columns, each with the file that it is in."""
     pye57 = _import_pye57()
     try:
         file = pye57.E57(str(path))
-        found = _read_vector(pye57.libe57, file.image_file, file.data3d[0]["points"])
+        tables = [(file.image_file, file.data3d[0]["points"])]
         if file.root.isDefined(EXTRA_COLUMNS):
-            found |= _read_vector(pye57.libe57, file.image_file, file.root[EXTRA_COLUMNS])
+            tables.append((file.image_file, file.root[EXTRA_COLUMNS]))
+        yield pye57.libe57, tables
         file.close()
-    except MemoryError:
+    except (TofclipError, MemoryError):
         raise
     except Exception as fault:  # the library raises whatever the damage happens to cause
         raise FileFormatError(
             path, f"is not an E57 file, or a damaged one ({type(fault).__name__})"
         ) from fault
-    return found
 
 
 def _prepare_vector(lib: Any, image: Any, columns: Columns) -> tuple[Any, Callable[[], None]]:
@@ -102,16 +135,24 @@ def _prepare_vector(lib: Any, image: Any, columns: Columns) -> tuple[Any, Callab
     return table, fill
 
 
-def _read_vector(lib: Any, image: Any, table: Any) -> Table:
+def _list_elements(lib: Any, table: Any) -> list[tuple[str, str, type]]:
+    """Label in the file, name and type of each column."""
     names = {element: name for name, element in STANDARD_NAMES.items()}
-    prototype, buffers = lib.StructureNode(table.prototype()), lib.VectorSourceDestBuffer()
-    found: Table = {}
+    prototype = lib.StructureNode(table.prototype())
+    found: list[tuple[str, str, type]] = []
     for number in range(prototype.childCount()):
         element = prototype.get(number)
         label = element.elementName()
         kind = np.uint8 if element.type() == lib.NodeType.E57_INTEGER else np.float32
+        found.append((label, names.get(label, label.removeprefix(f"{EXTENSION}:")), kind))
+    return found
+
+
+def _read_vector(lib: Any, image: Any, table: Any) -> list[tuple[str, NDArray[Any]]]:
+    found, buffers = [], lib.VectorSourceDestBuffer()
+    for label, name, kind in _list_elements(lib, table):
         values = np.empty(table.childCount(), kind)
-        found[names.get(label, label.removeprefix(f"{EXTENSION}:"))] = values
+        found.append((name, values))
         if values.size:
             buffers.append(lib.SourceDestBuffer(image, label, values, values.size, True, False))
     if table.childCount():

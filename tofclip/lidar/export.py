@@ -6,19 +6,27 @@ names (``x_m``).
 
 from __future__ import annotations
 
-import zipfile
+import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError
+from tofclip.io.archive import Archive, ArchiveEntry
 from tofclip.lidar.column import Columns, Table
-from tofclip.lidar.e57 import read_e57, write_e57
-from tofclip.lidar.las import read_las, write_las
+from tofclip.lidar.e57 import list_e57_columns, write_e57
+from tofclip.lidar.las import list_las_columns, write_las
 from tofclip.storage import atomic_path, translate_read_errors
 
+Entries = dict[str, ArchiveEntry]
+ColumnWriter = Callable[..., None]
+ColumnLister = Callable[[Path], Entries]
+
+PLY_WORDS = 3
+"""In a line of a header: what it is, type, name or number."""
 PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1"}
 PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8", ("U", "1"): "u1"}
 MAX_HEADER_BYTES = 1 << 16
@@ -50,16 +58,19 @@ def write_table(path: str | Path, columns: Columns, shape: tuple[int, int] | Non
             writer(temporary, columns)
 
 
+def list_columns(path: str | Path) -> dict[str, ArchiveEntry]:
+    """List the columns of a table that `write_table` wrote, by their names without units."""
+    lister = _look_up_format(path)[1]
+    with translate_read_errors(path):
+        return {_strip_unit(label): entry for label, entry in lister(Path(path)).items()}
+
+
 def read_table(path: str | Path) -> Table:
     """Read a table that `write_table` wrote: its columns by their names, without units."""
-    reader = _look_up_format(path)[1]
-    with translate_read_errors(path):
-        return reader(Path(path))
+    return {name: entry.load() for name, entry in list_columns(path).items()}
 
 
-def _look_up_format(
-    path: str | Path,
-) -> tuple[Callable[..., None], Callable[[Path], Table]]:
+def _look_up_format(path: str | Path) -> tuple[ColumnWriter, ColumnLister]:
     suffix = Path(path).suffix.lower()
     if suffix not in FORMATS:
         known = ", ".join([*FORMATS, ".h5"])
@@ -126,19 +137,22 @@ def _write_binary(path: Path, header: list[str], columns: Columns) -> None:
         file.write(rows.tobytes())
 
 
-def _read_ply(path: Path) -> Table:
+def _list_ply(path: Path) -> Entries:
     with open(path, "rb") as file:
         lines = _read_header(file, path, "ply", "end_header")
         if ["format", "binary_little_endian", "1.0"] not in lines:
             raise FileFormatError(path, "is no binary little-endian PLY file")
         elements = [line for line in lines if line[0] == "element"]
-        if len(elements) != 1 or elements[0][1] != "vertex":
+        if len(elements) != 1 or "vertex" not in elements[0]:
             raise FileFormatError(path, "must hold vertices and nothing else")
-        properties = [(line[-1], PLY_TYPES.get(line[1])) for line in lines if line[0] == "property"]
-        return _read_rows(file, path, properties, elements[0][2])
+        listed = [line for line in lines if line[0] == "property"]
+        if any(len(line) < PLY_WORDS for line in (*elements, *listed)):
+            raise FileFormatError(path, "has an incomplete PLY header")
+        properties = [(line[-1], PLY_TYPES.get(line[1])) for line in listed]
+        return _list_binary(path, file.tell(), properties, elements[0][2])
 
 
-def _read_pcd(path: Path) -> Table:
+def _list_pcd(path: Path) -> Entries:
     with open(path, "rb") as file:
         entries = {line[0]: line[1:] for line in _read_header(file, path, "#", "DATA")}
         if entries["DATA"] != ["binary"]:
@@ -149,28 +163,35 @@ def _read_pcd(path: Path) -> Table:
             points = entries["POINTS"][0]
         except (KeyError, ValueError, IndexError) as fault:
             raise FileFormatError(path, "has an incomplete PCD header") from fault
-        return _read_rows(file, path, properties, points)
+        return _list_binary(path, file.tell(), properties, points)
 
 
-def _read_csv(path: Path) -> Table:
+def _list_csv(path: Path) -> Entries:
     with open(path, encoding="ascii", errors="replace") as file:
-        labels = file.readline().strip().split(",")
-        lines = file.readlines()
+        labels = file.readline(MAX_HEADER_BYTES).strip().split(",")
+        points = sum(1 for _ in file)
+    read = functools.cache(lambda: _read_csv(path, labels))
+    return {
+        label: ArchiveEntry((points,), np.dtype(np.float64), lambda n=n: read()[:, n])  # type: ignore[misc]
+        for n, label in enumerate(labels)
+    }
+
+
+def _read_csv(path: Path, labels: list[str]) -> NDArray[np.float64]:
+    with open(path, encoding="ascii", errors="replace") as file:
+        lines = file.readlines()[1:]
     try:
         table = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.empty((0, len(labels)))
     except ValueError as fault:
         raise FileFormatError(path, f"holds something that is no number ({fault})") from fault
     if table.shape[1] != len(labels):
         raise FileFormatError(path, f"names {len(labels)} columns, holds {table.shape[1]}")
-    return {_strip_unit(label): column for label, column in zip(labels, table.T, strict=True)}
+    return table
 
 
-def _read_npz(path: Path) -> Table:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return {_strip_unit(label): arrays[label] for label in arrays.files}
-    except (ValueError, EOFError, zipfile.BadZipFile, AttributeError) as fault:
-        raise FileFormatError(path, "is no NumPy archive, or a damaged one") from fault
+def _list_npz(path: Path) -> Entries:
+    archive = Archive(path)
+    return {label: archive.describe(label) for label in sorted(archive.names)}
 
 
 def _strip_unit(label: str) -> str:
@@ -192,29 +213,39 @@ def _read_header(file: BinaryIO, path: Path, first: str, last: str) -> list[list
     return lines
 
 
-def _read_rows(
-    file: BinaryIO, path: Path, properties: list[tuple[str, str | None]], points: str
-) -> Table:
-    """Read the binary rows behind a header."""
+def _list_binary(
+    path: Path, start: int, properties: list[tuple[str, str | None]], points: str
+) -> Entries:
+    """List the columns of the binary rows from byte `start` on."""
     if any(code is None for _, code in properties) or not points.isdecimal():
         raise FileFormatError(path, "has columns of a type that tofclip does not write")
     layout = np.dtype([(name, str(code)) for name, code in properties])
-    content = file.read()
-    if len(content) != int(points) * layout.itemsize:
+    held = path.stat().st_size - start
+    if held != int(points) * layout.itemsize:
         raise FileFormatError(
-            path,
-            f"should hold {points} points of {layout.itemsize} bytes, found {len(content)} bytes",
+            path, f"should hold {points} points of {layout.itemsize} bytes, found {held} bytes"
         )
-    rows = np.frombuffer(content, layout)
-    return {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names or ()}
+
+    @functools.cache
+    def read() -> NDArray[Any]:
+        return np.fromfile(path, layout, offset=start)
+
+    return {
+        name: ArchiveEntry(
+            (int(points),),
+            layout[name],
+            lambda name=name: np.ascontiguousarray(read()[name]),  # type: ignore[misc]
+        )
+        for name in layout.names or ()
+    }
 
 
-FORMATS: dict[str, tuple[Callable[..., None], Callable[[Path], Table]]] = {
-    ".ply": (_write_ply, _read_ply),
-    ".pcd": (_write_pcd, _read_pcd),
-    ".csv": (_write_csv, _read_csv),
-    ".npz": (_write_npz, _read_npz),
-    ".las": (write_las, read_las),
-    ".laz": (write_las, read_las),
-    ".e57": (write_e57, read_e57),
+FORMATS: dict[str, tuple[ColumnWriter, ColumnLister]] = {
+    ".ply": (_write_ply, _list_ply),
+    ".pcd": (_write_pcd, _list_pcd),
+    ".csv": (_write_csv, _list_csv),
+    ".npz": (_write_npz, _list_npz),
+    ".las": (write_las, list_las_columns),
+    ".laz": (write_las, list_las_columns),
+    ".e57": (write_e57, list_e57_columns),
 }

@@ -2,14 +2,12 @@
 every pixel, and events.
 
 What a file holds is listed before a value is read, so that a damaged or malicious header costs no
-memory: a size is believed only if the file can hold it and if it stays below `MAX_ARRAY_BYTES`.
+memory: a size is believed only if the file can hold it and if it stays below a limit, see `tofclip.file_limits`.
 """
 
 from __future__ import annotations
 
-import io
 import math
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,17 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError, MissingDependencyError, TofclipError
+from tofclip.file_limits import BoundedFile, require_bounded_size
+from tofclip.io.archive import list_npz_entries, read_npy_header
+from tofclip.io.becker_hickl import require_bounded_sdt
 from tofclip.io.mat import list_mat_variables
 from tofclip.lidar.photons.photon_image import PhotonImage
 from tofclip.storage import HDF5_SIGNATURE, format_error_line, translate_read_errors
 
-MAX_ARRAY_BYTES = 1 << 32
-"""4 GiB: an array that claims more is not read."""
+MAX_IMAGE_BYTES = 1 << 32
+"""4 GiB, of a histogram that is made of a list of events."""
 
-MAX_DEFLATE_RATIO = 1032
-"""No stream of zlib's grows by more."""
+MAX_BINS = MAX_PIXELS = 1 << 26
+"""Events may claim any bin and any pixel; pictures and histograms are not larger than this."""
 
-MAX_SCALAR_BYTES = 1 << 10
 MIN_CONCENTRATION_RATIO = 1.3
 MIN_LENGTH_RATIO = 1.25
 MAX_SECONDS = 1e-3
@@ -184,10 +184,12 @@ def open_photons(path: Path) -> PhotonFile:
         )
     try:
         return reader(path)
-    except TofclipError:
+    except (TofclipError, MemoryError):
         raise
     except Exception as fault:  # whatever the decoder stumbles over, it is the file that is damaged
-        raise FileFormatError(path, f"is damaged ({format_error_line(fault)})") from fault
+        raise FileFormatError(
+            path, f"is damaged ({format_error_line(fault)}); {SUITABLE}"
+        ) from fault
 
 
 def _find_layout(opened: PhotonFile, path: Path) -> tuple[str, list[ArrayEntry]]:
@@ -229,14 +231,14 @@ def _read_layout(opened: PhotonFile, path: Path, bin_width: float, axes: str | N
         if not y.shape == x.shape == times.shape or min(y.min(), x.min()) < 0:
             raise FileFormatError(path, "its x, y and time are not lists of the same events")
         rows, columns = int(y.max()) + 1, int(x.max()) + 1
-        if rows * columns > MAX_ARRAY_BYTES // 64:
+        if rows * columns > MAX_PIXELS:
             raise FileFormatError(path, f"claims a picture of {rows} x {columns} pixels")
         pixel = y.astype(np.int64) * columns + x.astype(np.int64)
     if times.dtype.kind not in "uif":
         raise FileFormatError(path, f"its photon times are {times.dtype}, not numbers")
     seconds = times.dtype.kind == "f" and times.size and 0 < np.max(times) < MAX_SECONDS
     number = times / bin_width if seconds else times
-    if number.size and np.max(number) > MAX_ARRAY_BYTES // 64:
+    if number.size and np.max(number) > MAX_BINS:
         raise InputError(f"{path}: its photons come as late as bin {np.max(number):.3g}")
     return PhotonImage.from_events(pixel, number, (rows, columns), bin_width)
 
@@ -283,21 +285,11 @@ def recognise_axes(cube: NDArray[Any], path: Path) -> str:
     return {0: "tyx", 1: "ytx", 2: "yxt"}[time]
 
 
-def _require_size(path: Path, name: str, size: int, held: int) -> None:
-    """Refuse an array whose size in bytes the `held` bytes of its file cannot give."""
-    if size > MAX_ARRAY_BYTES:
-        raise FileFormatError(
-            path, f"'{name}' claims {size} bytes, more than the {MAX_ARRAY_BYTES} that are read"
-        )
-    if size > held:
-        raise FileFormatError(path, f"is truncated or damaged: '{name}' claims {size} bytes")
-
-
 def _open_npy(path: Path) -> PhotonFile:
-    with open(path, "rb") as file:
-        shape, dtype = _read_npy_header(file)
-        start = file.tell()
-    _require_size(path, "array", math.prod(shape) * dtype.itemsize, path.stat().st_size - start)
+    with BoundedFile(path) as file:
+        shape, dtype = read_npy_header(file)
+        held = path.stat().st_size - file.tell()
+    require_bounded_size(path, "array", math.prod(shape) * dtype.itemsize, held)
 
     def load() -> NDArray[Any]:
         return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
@@ -305,42 +297,13 @@ def _open_npy(path: Path) -> PhotonFile:
     return PhotonFile([ArrayEntry("array", shape, str(dtype), load)])
 
 
-def _read_npy_header(file: Any) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    version = np.lib.format.read_magic(file)
-    read = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    shape, _, dtype = read(file)
-    if dtype.hasobject:
-        raise ValueError(f"Python objects in a NumPy file; {SUITABLE}")
-    return shape, dtype
-
-
 def _open_npz(path: Path) -> PhotonFile:
     arrays, scalars = [], {}
-    with zipfile.ZipFile(path) as archive:
-        for entry in archive.infolist():
-            if not entry.filename.endswith(".npy"):
-                continue
-            name = entry.filename[:-4]
-            with archive.open(entry) as file:
-                shape, dtype = _read_npy_header(file)
-                size = math.prod(shape) * dtype.itemsize
-                held = min(entry.file_size, MAX_DEFLATE_RATIO * entry.compress_size)
-                _require_size(path, name, size, held)
-                if not shape and dtype.kind in "uif" and size <= MAX_SCALAR_BYTES:
-                    scalars[name] = float(np.frombuffer(file.read(size), dtype)[0])
-
-            def load(entry: zipfile.ZipInfo = entry) -> NDArray[Any]:
-                with zipfile.ZipFile(path) as again, again.open(entry) as opened:
-                    return np.asarray(
-                        np.lib.format.read_array(io.BytesIO(opened.read()), allow_pickle=False)
-                    )
-
-            if shape:
-                arrays.append(ArrayEntry(name, shape, str(dtype), load))
+    for name, entry in list_npz_entries(path).items():
+        if entry.shape:
+            arrays.append(ArrayEntry(name, entry.shape, str(entry.dtype), entry.load))
+        elif entry.dtype.kind in "uif":
+            scalars[name] = float(entry.load())
     return PhotonFile(arrays, _find_bin_width(scalars))
 
 
@@ -360,7 +323,7 @@ def _open_mat(path: Path) -> PhotonFile:
         if variable.name in BIN_WIDTH_NAMES and math.prod(variable.shape) == 1:
             scalars[variable.name] = variable.load()
         else:
-            kind = "cell" if variable.is_cell else "number"
+            kind = "cell" if variable.dtype.hasobject else str(variable.dtype)
             arrays.append(ArrayEntry(variable.name, variable.shape, kind, variable.load))
     return PhotonFile(arrays, _find_bin_width(scalars))
 
@@ -378,8 +341,8 @@ def _open_hdf5(path: Path) -> PhotonFile:
                 scalars[name.rpartition("/")[2]] = dataset[()]
             elif dataset.shape and (is_cell or dataset.dtype.kind in "uif"):
                 size = dataset.size * dataset.dtype.itemsize
-                held = dataset.id.get_storage_size()
-                _require_size(path, name, size, held * (MAX_DEFLATE_RATIO if dataset.chunks else 1))
+                held, packed = dataset.id.get_storage_size(), bool(dataset.chunks)
+                require_bounded_size(path, name, size, held, packed)
                 # MATLAB counts its axes from the other end.
                 matlab = "MATLAB_class" in dataset.attrs
                 shape = dataset.shape[::-1] if matlab else dataset.shape
@@ -397,7 +360,7 @@ def _iterate_datasets(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]
             continue
         item = group[name]
         if isinstance(item, h5py.Dataset):
-            if not item.external:
+            if not (item.external or item.is_virtual):
                 yield prefix + name, item
         elif isinstance(item, h5py.Group) and prefix.count("/") < 8:
             yield from _iterate_datasets(item, f"{prefix}{name}/")
@@ -414,7 +377,7 @@ def _make_hdf5_loader(path: Path, name: str, matlab: bool) -> Callable[[], NDArr
                 for place in np.ndindex(values.shape):
                     cell = file[values[place]]
                     total += cell.size * cell.dtype.itemsize
-                    _require_size(path, name, total, path.stat().st_size * MAX_DEFLATE_RATIO)
+                    require_bounded_size(path, name, total, path.stat().st_size, True)
                     empty = bool(cell.attrs.get("MATLAB_empty", 0))
                     cells[place] = np.zeros(0, np.uint8) if empty else cell[()]
                 values = cells
@@ -427,40 +390,47 @@ def _make_hdf5_loader(path: Path, name: str, matlab: bool) -> Callable[[], NDArr
 def _open_tiff(path: Path) -> PhotonFile:
     import tifffile
 
-    with tifffile.TiffFile(path) as tiff:
+    with BoundedFile(path) as file, tifffile.TiffFile(file) as tiff:
         series = tiff.series[0]
         if len(series.shape) != 3 or series.dtype is None:
             raise FileFormatError(
                 path, f"holds pictures of shape {series.shape}, not one page for each bin (t, y, x)"
             )
         packed = sum(sum(page.databytecounts) for page in series.pages if page is not None)
-        ratio = 1 if series.keyframe.compression == 1 else MAX_DEFLATE_RATIO
-        held = min(packed, path.stat().st_size) * ratio
-        _require_size(path, "pictures", math.prod(series.shape) * series.dtype.itemsize, held)
+        size = math.prod(series.shape) * series.dtype.itemsize
+        require_bounded_size(path, "pictures", size, packed, series.keyframe.compression != 1)
         shape, kind = tuple(series.shape), str(series.dtype)
 
     def load() -> NDArray[Any]:
-        with tifffile.TiffFile(path) as again:
+        with BoundedFile(path) as reopened, tifffile.TiffFile(reopened) as again:
             return np.asarray(again.series[0].asarray())
 
     return PhotonFile([ArrayEntry("pages", shape, kind, load)], axes="tyx")
 
 
+def _require_bounded_image(path: Path, size: int) -> None:
+    """Refuse a histogram of events that is too large; the file does not bound it, it is sparse."""
+    if size > MAX_IMAGE_BYTES:
+        raise FileFormatError(
+            path, f"'image' claims {size} bytes, more than the {MAX_IMAGE_BYTES} that are read"
+        )
+
+
 def _open_ptu(path: Path) -> PhotonFile:
     """PicoQuant's images: markers make lines and frames; frames and channels are summed."""
     ptufile = _import_library("ptufile")
-    with ptufile.PtuFile(path) as file:
+    with BoundedFile(path) as opened, ptufile.PtuFile(opened) as file:
         if not file.is_image or not file.is_t3:
             raise FileFormatError(
                 path,
                 "holds no image in T3 mode; tofclip recover reads lone pixels (file://run.ptu)",
             )
         _, rows, columns, _, bins = file.shape
-        _require_size(path, "image", rows * columns * bins * 4, MAX_ARRAY_BYTES)
+        _require_bounded_image(path, rows * columns * bins * 4)
         width = float(file.tcspc_resolution)
 
     def load() -> NDArray[Any]:
-        with ptufile.PtuFile(path) as again:
+        with BoundedFile(path) as reopened, ptufile.PtuFile(reopened) as again:
             cube = again.decode_image(frame=-1, channel=-1, dtype=np.uint32)
         summed: NDArray[Any] = np.asarray(cube).sum(axis=(0, 3), dtype=np.uint32)
         return summed
@@ -471,7 +441,7 @@ def _open_ptu(path: Path) -> PhotonFile:
 def _open_sdt(path: Path) -> PhotonFile:
     """Becker & Hickl's images."""
     sdtfile = _import_library("sdtfile")
-    _require_size(path, "image", path.stat().st_size, MAX_ARRAY_BYTES)
+    require_bounded_sdt(path)
     with sdtfile.SdtFile(path) as file:
         blocks = [np.asarray(block) for block in file.data]
         times = [np.asarray(axis) for axis in file.times]

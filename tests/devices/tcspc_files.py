@@ -1,0 +1,93 @@
+"""Files of photon-counting electronics, written byte by byte or by the libraries' own writers."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+RESOLUTION = 32e-12
+PERIOD = 25e-9
+
+
+def make_decays() -> NDArray[np.uint16]:
+    """Counts of two channels in 200 bins, (channels, bins)."""
+    decay = 20 * np.exp(-np.arange(200) / 30)
+    return np.random.default_rng(2).poisson([decay, np.roll(decay, 40)]).astype(np.uint16)
+
+
+def write_ptu(path: Path, decays: NDArray[Any]) -> None:
+    """One pixel of an image."""
+    import ptufile
+
+    image = decays[np.newaxis, np.newaxis, np.newaxis]  # frame, line, pixel, channel, bin
+    options = {"global_resolution": PERIOD, "tcspc_resolution": RESOLUTION, "pixel_time": 1e-3}
+    ptufile.imwrite(path, image, **options)
+
+
+def tag(name: str, kind: int, value: bytes) -> bytes:
+    return struct.pack("<32siI8s", name.encode(), -1, kind, value)
+
+
+def integer(name: str, value: int) -> bytes:
+    return tag(name, 0x10000008, struct.pack("<q", value))
+
+
+def real(name: str, value: float) -> bytes:
+    return tag(name, 0x20000008, struct.pack("<d", value))
+
+
+def write_phu(path: Path, decays: NDArray[Any]) -> None:
+    """Header, tags, histograms of uint32."""
+
+    def content(offset: int) -> bytes:
+        tags = [
+            integer("Measurement_Mode", 0),
+            integer("Measurement_SubMode", 1),
+            real("MeasDesc_Resolution", RESOLUTION),
+            integer("HistoResult_NumberOfCurves", len(decays)),
+            integer("HistoResult_BitsPerBin", 32),
+        ]
+        for number in range(len(decays)):
+            for name, value in (
+                ("HistResDscr_DataOffset", offset + number * decays.shape[1] * 4),
+                ("HistResDscr_HistogramBins", decays.shape[1]),
+            ):
+                tags.append(struct.pack("<32siIq", name.encode(), number, 0x10000008, value))
+        tags.append(tag("Header_End", 0xFFFF0008, bytes(8)))
+        return b"PQHISTO\0" + b"1.0".ljust(8, b"\0") + b"".join(tags)
+
+    path.write_bytes(content(len(content(0))) + decays.astype("<u4").tobytes())
+
+
+def write_sdt(path: Path, decays: NDArray[Any]) -> None:
+    """One block for each channel."""
+    import sdtfile
+
+    bins = decays.shape[1]
+    info = b"*IDENTIFICATION\r\n  ID        : SPC Setup & Data File\r\n  Title     : x\r\n*END\r\n"
+    header = np.zeros(1, np.dtype(sdtfile.sdtfile.FILE_HEADER).newbyteorder("<"))
+    measurement = np.zeros(1, np.dtype(sdtfile.sdtfile.MEASURE_INFO).newbyteorder("<"))
+    block = np.dtype(sdtfile.sdtfile.BLOCK_HEADER).newbyteorder("<")
+    measurement["adc_re"], measurement["tac_r"], measurement["tac_g"] = bins, RESOLUTION * bins, 1
+    at = header.nbytes + len(info)
+    header["revision"], header["chksum"], header["header_valid"] = 0x0F, 0x55AA, 0x5555
+    header["info_offs"], header["info_length"] = header.nbytes, len(info)
+    header["meas_desc_block_offs"], header["meas_desc_block_length"] = at, measurement.nbytes
+    header["no_of_meas_desc_blocks"], header["no_of_data_blocks"] = 1, len(decays)
+    at += measurement.nbytes
+    header["data_block_offs"], header["data_block_length"] = at, bins * 2
+    blocks = b""
+    for curve in decays:
+        one = np.zeros(1, block)
+        one["data_offs"], one["next_block_offs"] = (
+            at + block.itemsize,
+            at + block.itemsize + bins * 2,
+        )
+        one["block_length"] = bins * 2
+        blocks += one.tobytes() + curve.astype("<u2").tobytes()
+        at += block.itemsize + bins * 2
+    path.write_bytes(header.tobytes() + info + measurement.tobytes() + blocks)

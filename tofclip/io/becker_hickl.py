@@ -1,0 +1,49 @@
+"""Becker & Hickl's ``.sdt`` files: what their blocks claim, before the library `sdtfile` believes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tofclip.errors import FileFormatError
+from tofclip.file_limits import require_bounded_size
+
+LAST_OLD_REVISION = 14
+# `no_of_data_blocks` has 16 bits; where they do not suffice it says this, and the number is in
+# `reserved1`.
+EXTENDED_COUNT = 0x7FFF
+
+
+def require_bounded_sdt(path: Path) -> None:
+    """Refuse a file that claims more in its blocks than it can hold.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    FileFormatError
+    """
+    from sdtfile import sdtfile
+
+    layout = np.dtype(sdtfile.FILE_HEADER).newbyteorder("<")
+    size = path.stat().st_size
+    if size < layout.itemsize:
+        raise FileFormatError(path, "is truncated: it is shorter than an SDT header")
+    header = np.fromfile(path, layout, 1)[0]
+    revision = sdtfile.FileRevision(int(header["revision"])).revision
+    names = sdtfile.BLOCK_HEADER if revision > LAST_OLD_REVISION else sdtfile.BLOCK_HEADER_OLD
+    layout = np.dtype(names).newbyteorder("<")
+    number, place = int(header["no_of_data_blocks"]), int(header["data_block_offs"])
+    if number == EXTENDED_COUNT:
+        number = int(header["reserved1"])
+    require_bounded_size(path, "blocks", number * layout.itemsize, size)
+    for block in range(number):
+        if place + layout.itemsize > size:
+            raise FileFormatError(path, f"is truncated: block {block} lies beyond its end")
+        found = np.fromfile(path, layout, 1, offset=place)[0]
+        packed = bool(sdtfile.BlockType(int(found["block_type"])).compress)
+        require_bounded_size(path, f"block {block}", int(found["block_length"]), size, packed)
+        place = int(found["next_block_offs"])
