@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from nlos.geometry import Grid
 from nlos.volume import Volume
 from tofclip.errors import InputError, ShapeError
 
@@ -58,14 +60,7 @@ def score_points(volume: Volume, points: Any, radius: float = SCORE_RADIUS_M) ->
     InputError
         No voxel, or every one, lies near a point; or the volume is dark away from them.
     """
-    from scipy.spatial import cKDTree
-
-    points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ShapeError("hidden points", "(n, 3)", points.shape)
-    z, y, x = np.meshgrid(volume.grid.z, volume.grid.y, volume.grid.x, indexing="ij")
-    distance, _ = cKDTree(points).query(np.stack([x, y, z], axis=-1), distance_upper_bound=radius)
-    near = np.isfinite(distance)
+    near = find_near_voxels(volume.grid, points, radius)
     if not near.any() or near.all():
         raise InputError(f"some voxels must lie within {radius} m of a hidden point, and some not")
     magnitude = volume.magnitude.astype(np.float64)
@@ -79,3 +74,61 @@ def score_points(volume: Volume, points: Any, radius: float = SCORE_RADIUS_M) ->
         float(energy[near].sum() / energy.sum()),
         float(magnitude[near].mean() / magnitude[~near].mean()),
     )
+
+
+def find_near_voxels(grid: Grid, points: Any, radius: float = SCORE_RADIUS_M) -> NDArray[np.bool_]:
+    """Find the voxels whose centres lie near hidden points.
+
+    Parameters
+    ----------
+    grid : Grid
+    points : (n, 3) array_like
+        Metres.
+    radius : float
+        What counts as near, m.
+
+    Returns
+    -------
+    (z, y, x) bool array
+
+    Raises
+    ------
+    ShapeError
+        The points are not (n, 3).
+    """
+    from scipy.spatial import cKDTree
+
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ShapeError("hidden points", "(n, 3)", points.shape)
+    z, y, x = np.meshgrid(grid.z, grid.y, grid.x, indexing="ij")
+    distance, _ = cKDTree(points).query(np.stack([x, y, z], axis=-1), distance_upper_bound=radius)
+    return np.asarray(np.isfinite(distance))
+
+
+def score_brightest(volume: Volume, occupied: NDArray[np.bool_]) -> float:
+    """Of the K brightest voxels, the fraction that is occupied, where K voxels are.
+
+    Unlike a share of energy it does not depend on the scale of brightness.
+
+    Parameters
+    ----------
+    volume : Volume
+    occupied : (z, y, x) bool array
+        Voxels that hold something hidden, or lie near it.
+
+    Returns
+    -------
+    float
+        0 to 1.
+
+    Raises
+    ------
+    InputError
+        No voxel is occupied.
+    """
+    count = int(np.count_nonzero(occupied))
+    if count == 0:
+        raise InputError("no voxel is occupied: there is nothing to find")
+    brightest = np.argsort(-volume.magnitude, axis=None, kind="stable")[:count]
+    return float(np.mean(occupied.ravel()[brightest]))

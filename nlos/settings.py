@@ -170,13 +170,22 @@ class Settings:
 
     def prepare(self, capture: Capture) -> Capture:
         """Mirror coordinates, blank the wall's own light and put time bins together, as settings say."""
-        capture = join_near_lasers(capture)
-        if self.flip:
-            capture = flip_capture(capture, self.flip)
+        capture = self._orient(capture)
         if self.gate is not None:
             capture = remove_first_bounce(capture, self.gate, self.gate_ramp or 0.0)
         if self.fade:
             capture = fade_record_end(capture, self.fade)
+        return self._join_bins(capture)
+
+    def prepare_counts(self, capture: Capture) -> Capture:
+        """Do what `prepare` does but for the blanking: whatever is counted stays a count."""
+        return self._join_bins(self._orient(capture))
+
+    def _orient(self, capture: Capture) -> Capture:
+        capture = join_near_lasers(capture)
+        return flip_capture(capture, self.flip) if self.flip else capture
+
+    def _join_bins(self, capture: Capture) -> Capture:
         bins = 1 if self.bins_together is None else self.bins_together
         return capture if bins == 1 else rebin_capture(capture, bins)
 

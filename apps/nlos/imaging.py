@@ -11,7 +11,8 @@ from tofclip.errors import InputError
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
-    from nlos import Grid, Hybrid, Refinement, Settings
+    from nlos import Grid, Hybrid, Settings
+    from nlos.method import Method, PhasorMethod
 
 
 import sys
@@ -23,6 +24,7 @@ from typing import TYPE_CHECKING, Generic
 from apps.progress import show_progress
 from nlos import Refinement
 from nlos.illumination_groups import AliasingWarning
+from nlos.refinement.photons import PhotonRefinement
 from nlos.refinement.refine import build_total_variation
 from nlos.settings import METHOD_CLASSES, Settings, complete_settings, find_bright_box, scout_grid
 from tofclip.arrays import ComputeDevice, parse_device
@@ -277,10 +279,13 @@ def _to_mm(length: float | None) -> float | None:
 
 
 PRIORS = ("l1", "tv")
+PHOTONS = "photons"
+REFINEMENTS = (*PRIORS, PHOTONS)
 REFINED_METHOD = "hybrid"
-"""The method that is iterated."""
+"""The method that is iterated by l1 and tv."""
 
 DEFAULT_ITERATIONS, DEFAULT_PRIOR_WEIGHT = 60, 2e-2
+PHOTON_ITERATIONS, PHOTON_PRIOR_WEIGHT = 12, 1.0
 
 
 @dataclass(frozen=True)
@@ -289,23 +294,26 @@ class RefinementSettings(ImagingSettings):
 
     refine: str | None = setting_field(
         "NAME",
-        "Iterate the hybrid's image: l1 for few bright things, tv for even surfaces.",
+        "Iterate the image: photons by the statistics of counts; l1 for few bright things, tv for even surfaces.",
         shown="no",
-        choices=PRIORS,
+        choices=REFINEMENTS,
     )
     iterations: int | None = setting_field(
         "N",
-        "With --refine: steps at most; each costs some four images.",
-        shown=str(DEFAULT_ITERATIONS),
+        "With --refine: steps at most; of l1 and tv each costs some four images.",
+        shown=f"{DEFAULT_ITERATIONS}; photons: {PHOTON_ITERATIONS}",
     )
     prior_weight: float | None = setting_field(
         "SHARE",
-        "With --refine: how much the prior counts, of the weight that leaves nothing.",
-        shown=str(DEFAULT_PRIOR_WEIGHT),
+        "With --refine: weight of the prior, of that which leaves nothing; photons: of noise's standard deviation.",
+        shown=f"{DEFAULT_PRIOR_WEIGHT}; photons: {PHOTON_PRIOR_WEIGHT:g}",
     )
 
 
 Refining = TypeVar("Refining", bound=RefinementSettings)
+
+
+_NAMED_REFINEMENTS = f"{', '.join(REFINEMENTS[:-1])} or {REFINEMENTS[-1]}"
 
 
 def require_valid_refinement(settings: RefinementSettings, method: str | None) -> None:
@@ -325,40 +333,59 @@ def require_valid_refinement(settings: RefinementSettings, method: str | None) -
         for name in ("iterations", "prior_weight"):
             if getattr(settings, name) is not None:
                 raise InputError(
-                    f"{name} is a setting of --refine; tell --refine {' or '.join(PRIORS)} as well"
+                    f"{name} is a setting of --refine; give --refine {_NAMED_REFINEMENTS} as well"
                 )
         return
-    if settings.refine not in PRIORS:
-        raise InputError(f"unknown prior '{settings.refine}'; refine by {' or '.join(PRIORS)}")
-    if method not in (None, REFINED_METHOD):
+    if settings.refine not in REFINEMENTS:
+        raise InputError(f"unknown prior '{settings.refine}'; refine by {_NAMED_REFINEMENTS}")
+    by_photons = settings.refine == PHOTONS
+    if by_photons and method not in (None, *PORTABLE_METHODS):
+        raise InputError(
+            f"--refine photons begins with an image by {', '.join(PORTABLE_METHODS)}, not by "
+            f"{method}; leave --method out"
+        )
+    if not by_photons and method not in (None, REFINED_METHOD):
         raise InputError(
             f"--refine iterates the {REFINED_METHOD} method, not {method}; leave --method out"
         )
     if settings.iterations is not None and settings.iterations < 1:
         raise InputError(f"iterations must be 1 or more, got {settings.iterations}")
-    if settings.prior_weight is not None and not 0 <= settings.prior_weight < 1:
-        raise InputError(
-            f"prior_weight is a share from 0 to less than 1, got {settings.prior_weight}"
-        )
+    weight, most = settings.prior_weight, 10.0 if by_photons else 1.0
+    if weight is not None and not 0 <= weight < most:
+        raise InputError(f"prior_weight is a share from 0 to less than {most:g}, got {weight}")
 
 
-def build_refinement(
-    settings: Refining, imaging: Settings, grid: Grid
-) -> tuple[Refining, Refinement]:
+def build_refinement(settings: Refining, imaging: Settings, grid: Grid) -> tuple[Refining, Method]:
     """Build the refinement that settings ask for.
 
     Parameters
     ----------
     settings : RefinementSettings
     imaging : Settings
-        Of the hybrid that is iterated.
+        Of the method that is iterated.
     grid : Grid
 
     Returns
     -------
-    RefinementSettings, Refinement
+    RefinementSettings, Method
         The settings come back with what was not given.
     """
+    if settings.refine == PHOTONS:
+        found = replace(
+            settings,
+            prior_weight=PHOTON_PRIOR_WEIGHT
+            if settings.prior_weight is None
+            else settings.prior_weight,
+            iterations=settings.iterations or PHOTON_ITERATIONS,
+        )
+        linear = cast("PhasorMethod", imaging.make_method())
+        return found, PhotonRefinement(
+            linear,
+            found.iterations or PHOTON_ITERATIONS,
+            found.prior_weight or 0.0,
+            blank=imaging.gate or 0.0,
+            ramp=imaging.gate_ramp or 0.0,
+        )
     weight = DEFAULT_PRIOR_WEIGHT if settings.prior_weight is None else settings.prior_weight
     iterations = settings.iterations or DEFAULT_ITERATIONS
     prior = (
@@ -383,12 +410,15 @@ class PreparedImaging(Generic[Imaging]):
         As the library has them.
     shown : ImagingSettings
         As the command line has them; given back, they lead here again.
+    recorded : Capture
+        As it came.
     """
 
     capture: Capture
     grid: Grid
     settings: Settings
     shown: Imaging
+    recorded: Capture
 
 
 def prepare_imaging(
@@ -432,7 +462,7 @@ def prepare_imaging(
         found = find_bright_box(found, image_capture("looking over", plan, capture))
     found = replace(found, everywhere=True)
     shown = from_library(wanted, found, methods or [found.method or ""])
-    return PreparedImaging(capture, found.grid(), found, shown)
+    return PreparedImaging(capture, found.grid(), found, shown, recorded)
 
 
 def image_capture(title: str, plan: Plan, capture: Capture) -> Volume:

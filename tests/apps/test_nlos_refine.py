@@ -9,6 +9,8 @@ import pytest
 from hidden_point import POINT, object_of
 from small_instrument import Run
 
+from apps.nlos.measure import compare_with_truth
+from apps.nlos.truth import HiddenTruth
 from nlos import Volume
 
 BOX = ["--x-m", -0.15, 0.25, "--y-m", -0.2, 0.2, "--near-m", 0.4, "--far-m", 0.7, "--everywhere"]
@@ -37,6 +39,28 @@ def test_iterations_gather_the_light(run: Run, curved: Path, tmp_path: Path, pri
     assert f'refine = "{prior}"\niterations = 8\nprior_weight = 0.02\n' in told
 
 
+def test_photons_gather_the_light(run: Run, tmp_path: Path) -> None:
+    """One photon and a half for each wall point and thing hidden, and ten of background."""
+    words = ["--points", "0.1,0.05,0.7; -0.3,0.2,0.9", "--wall-points", 16, "--peak-counts", 4]
+    made = run("nlos", "simulate", *words, "--background", 0.03, "--out", tmp_path / "counts.h5")
+    assert made.status == 0
+    box = ["--x-m", -0.5, 0.5, "--y-m", -0.4, 0.4, "--near-m", 0.5, "--far-m", 1.1, "--everywhere"]
+    words = ["reconstruct", tmp_path / "counts.h5", *box, "--voxel-mm", 40]
+    object_of(run, *words, "--out", tmp_path / "plain.h5")
+    found = object_of(run, *words, "--refine", "photons", "--out", tmp_path / "refined.h5")
+    assert (found["refine"], found["iterations"]) == ("photons", 12)
+    truth = HiddenTruth(np.array([[0.1, 0.05, 0.7], [-0.3, 0.2, 0.9]]), 0.0)
+    plain, refined = (
+        compare_with_truth(Volume.load(tmp_path / f"{name}.h5"), truth)["energy_near_truth"]
+        for name in ("plain", "refined")
+    )
+    assert refined > 0.7 > 0.3 > plain
+    assert (
+        'refine = "photons"\niterations = 12\nprior_weight = 1.0\n'
+        in (tmp_path / "refined.toml").read_text()
+    )
+
+
 def test_its_settings_give_the_same_volume(run: Run, curved: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(
         "refine = 'l1'\niterations = 2\nprior_weight = 0.1\nvoxel_mm = 30\n"
@@ -59,7 +83,7 @@ def test_its_settings_give_the_same_volume(run: Run, curved: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (["--refine", "l2"], "unknown prior 'l2'; refine by l1 or tv"),
+        (["--refine", "l2"], "unknown prior 'l2'; refine by l1, tv or photons"),
         (["--iterations", 5], "iterations is a setting of --refine"),
         (["--prior-weight", 0.1], "prior_weight is a setting of --refine"),
         (["--refine", "l1", "--iterations", 0], "iterations must be 1 or more"),
@@ -68,6 +92,8 @@ def test_its_settings_give_the_same_volume(run: Run, curved: Path, tmp_path: Pat
             ["--refine", "l1", "--method", "backprojection"],
             "iterates the hybrid method, not backprojection",
         ),
+        (["--refine", "photons", "--method", "lct"], "begins with an image by rsd"),
+        (["--refine", "photons"], "not multiples of one step"),
         (["--refine", "l1", "--signal-to-noise", 1], "changes nothing for"),
         (["--refine", "l1", "--wavelength-mm", 100, "--voxel-mm", 50], "too coarse to refine"),
     ],

@@ -25,6 +25,7 @@ from apps.nlos.files import (
 )
 from apps.nlos.imaging import (
     METHODS,
+    PHOTONS,
     PORTABLE_METHODS,
     REFINED_METHOD,
     RefinementSettings,
@@ -139,8 +140,9 @@ def reconstruct(
     The settings that were told or found are written beside the volume (.toml); given back by
     --settings they make the same volume, on another --device to some hundred-thousandths.
 
-    --refine looks for the albedo that explains the capture best, at the cost of some four images
-      per iteration.
+    --refine photons looks for the albedo under which the photons that were counted are likeliest:
+    for captures of few photons, by time of flight, background included. --refine l1 or tv look for
+    the albedo that explains the wall's waves best, at the cost of some four images per iteration.
 
     With --device rsd, hybrid and backprojection compute elsewhere, on a graphics processor; the
     others cannot.
@@ -185,7 +187,7 @@ def _reconstruct_single(
     """Image one capture, write its results, and return the figures."""
     device = choose_device(order.device, order.settings)
     capture, wanted = read_capture(source), order.settings
-    if wanted.refine:
+    if wanted.refine and wanted.refine != PHOTONS:
         wanted = replace(wanted, method=REFINED_METHOD)
     started = time.perf_counter()
     with warnings_to_stderr():
@@ -245,6 +247,8 @@ def _image(
         plan = prepared.settings.make_method().plan(capture, grid)
         return found, image_capture("imaging", plan, capture)
     found, refinement = build_refinement(found, prepared.settings, grid)
+    if found.refine == PHOTONS:
+        capture = prepared.settings.prepare_counts(prepared.recorded)
     return found, image_capture("refining", refinement.plan(capture, grid), capture)
 
 

@@ -1,0 +1,176 @@
+"""Compiled inner loops between the albedo of voxels and the photons that a wall counts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from nlos.kernels import MIN_DISTANCE_M, compiled
+
+VOXELS_PER_RUN = 256
+"""Voxels whose light is placed in time together: their edges stay in the first cache level."""
+
+MIN_WIDTH_BINS = 1.0
+"""Light of one voxel is spread over at least a bin, so that its mean arrival is kept."""
+
+
+@compiled
+def _place_light(
+    wall, laser, cell, start, per_metre, obliquity, x, y, z, bins, begins, ends, rates
+):
+    """When and how strongly the light of some voxels arrives by way of one pair of spots.
+
+    A voxel's light is spread evenly over a time whose variance is that of the paths by way of its
+    whole volume.
+
+    Parameters
+    ----------
+    wall, laser : (3,) float32 array
+        m.
+    cell : (3,) float32 array
+        Extent of a voxel along x, y and z, m.
+    start : float32
+        Path at which the first bin begins, m.
+    per_metre : float32
+        Bins per metre of path.
+    obliquity : int
+        Power of the cosines of both legs with z that light falls by: 0, 1 or 2.
+    x, y, z : (n,) float32 array
+        Voxels.
+    bins : int
+    begins, ends : (n,) float32 array
+        Written: when the light begins and ends, in bins from the record's beginning, cut to it.
+    rates : (n,) float32 array
+        Written: light per bin between the edges, of a voxel of albedo 1.
+    """
+    nearest = np.float32(MIN_DISTANCE_M * MIN_DISTANCE_M)
+    for i in range(x.size):
+        out_x, out_y, out_z = x[i] - laser[0], y[i] - laser[1], z[i] - laser[2]
+        back_x, back_y, back_z = x[i] - wall[0], y[i] - wall[1], z[i] - wall[2]
+        outward = math.sqrt(max(out_x * out_x + out_y * out_y + out_z * out_z, nearest))
+        back = math.sqrt(max(back_x * back_x + back_y * back_y + back_z * back_z, nearest))
+        per_outward, per_back = np.float32(1) / outward, np.float32(1) / back
+        # the path's gradient, times the voxel's extent
+        along_x = (out_x * per_outward + back_x * per_back) * cell[0]
+        along_y = (out_y * per_outward + back_y * per_back) * cell[1]
+        along_z = (out_z * per_outward + back_z * per_back) * cell[2]
+        spread = math.sqrt(along_x * along_x + along_y * along_y + along_z * along_z)
+        width = max(spread * per_metre, np.float32(MIN_WIDTH_BINS))
+        middle = (outward + back - start) * per_metre
+        half = np.float32(0.5) * width
+        begins[i] = min(max(middle - half, np.float32(0)), np.float32(bins))
+        ends[i] = min(max(middle + half, np.float32(0)), np.float32(bins))
+        fall = per_outward * per_back
+        rates[i] = fall * fall / width
+        if obliquity > 0:
+            cosines = max(out_z * back_z, np.float32(0)) * fall
+            rates[i] *= cosines if obliquity == 1 else cosines * cosines
+
+
+@compiled
+def add_expected_light(walls, lasers, cell, start, per_metre, obliquity, voxels, albedo, changes):
+    """Add the light that voxels send to wall points, as changes from bin to bin.
+
+    Parameters
+    ----------
+    walls : (points, 3) float32 array
+    lasers : (1, 3) or (points, 3) float32 array
+    cell, start, per_metre, obliquity
+        As of `_place_light`.
+    voxels : (3, n) float32 array
+        m.
+    albedo : (n,) float32 array
+    changes : (points, bins + 2) float64 array
+        Added to; its running sum is the light in every bin.
+    """
+    bins = changes.shape[1] - 2
+    begins, ends, rates = (
+        np.empty(VOXELS_PER_RUN, np.float32),
+        np.empty(VOXELS_PER_RUN, np.float32),
+        np.empty(VOXELS_PER_RUN, np.float32),
+    )
+    for p in range(walls.shape[0]):
+        laser = lasers[min(p, lasers.shape[0] - 1)]
+        for first in range(0, voxels.shape[1], VOXELS_PER_RUN):
+            last = min(first + VOXELS_PER_RUN, voxels.shape[1])
+            _place_light(
+                walls[p],
+                laser,
+                cell,
+                start,
+                per_metre,
+                obliquity,
+                voxels[0, first:last],
+                voxels[1, first:last],
+                voxels[2, first:last],
+                bins,
+                begins,
+                ends,
+                rates,
+            )
+            for i in range(last - first):
+                light = np.float64(albedo[first + i] * rates[i])
+                begin, end = np.int32(begins[i]), np.int32(ends[i])
+                after = np.float64(begins[i] - np.float32(begin)) * light
+                changes[p, begin] += light - after
+                changes[p, begin + 1] += after
+                after = np.float64(ends[i] - np.float32(end)) * light
+                changes[p, end] -= light - after
+                changes[p, end + 1] -= after
+
+
+@compiled
+def add_backprojected_light(
+    walls, lasers, cell, start, per_metre, obliquity, voxels, sums, squared, total
+):
+    """Add to every voxel what the bins hold that its light arrives in: the adjoint of
+    `add_expected_light`.
+
+    Parameters
+    ----------
+    walls : (points, 3) float32 array
+    lasers : (1, 3) or (points, 3) float32 array
+    cell, start, per_metre, obliquity
+        As of `_place_light`.
+    voxels : (3, n) float32 array
+        m.
+    sums : (points, bins + 2) float32 array
+        Of every bin and all later ones; 0 behind the record.
+    squared : bool
+        Whether every bin counts by the square of the light that a voxel sends it.
+    total : (n,) float32 array
+        Added to.
+    """
+    bins = sums.shape[1] - 2
+    begins, ends, rates = (
+        np.empty(VOXELS_PER_RUN, np.float32),
+        np.empty(VOXELS_PER_RUN, np.float32),
+        np.empty(VOXELS_PER_RUN, np.float32),
+    )
+    for first in range(0, voxels.shape[1], VOXELS_PER_RUN):
+        last = min(first + VOXELS_PER_RUN, voxels.shape[1])
+        for p in range(walls.shape[0]):
+            laser = lasers[min(p, lasers.shape[0] - 1)]
+            _place_light(
+                walls[p],
+                laser,
+                cell,
+                start,
+                per_metre,
+                obliquity,
+                voxels[0, first:last],
+                voxels[1, first:last],
+                voxels[2, first:last],
+                bins,
+                begins,
+                ends,
+                rates,
+            )
+            for i in range(last - first):
+                begin, end = np.int32(begins[i]), np.int32(ends[i])
+                after = begins[i] - np.float32(begin)
+                value = sums[p, begin] + after * (sums[p, begin + 1] - sums[p, begin])
+                after = ends[i] - np.float32(end)
+                value -= sums[p, end] + after * (sums[p, end + 1] - sums[p, end])
+                total[first + i] += value * (rates[i] * rates[i] if squared else rates[i])

@@ -1,0 +1,163 @@
+"""`--refine photons`: albedo by the statistics of counts and the time of flight."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from nlos import Capture, Grid, Hybrid
+from nlos.capture import TimeAxis
+from nlos.refinement.photons import CountedPhotons, PhotonRefinement
+from nlos.refinement.time_of_flight import TimeOfFlight
+from nlos.score import find_near_voxels, score_brightest
+from nlos.simulate import HiddenScene, PointScene, Surface, add_poisson_noise, build_relay_wall
+from tofclip.errors import InputError
+
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+POINTS = np.array(
+    [[0.0, 0.05, 0.7], [0.3, -0.25, 0.8], [-0.35, 0.2, 0.85], [0.2, 0.4, 0.95], [-0.3, -0.4, 1.05]]
+)
+SIDE = np.linspace(-0.75, 0.75, 64)
+FINE = Grid(SIDE, SIDE, np.linspace(0.5, 1.25, 64))
+COARSE = Grid(SIDE[::2], SIDE[::2], FINE.z[::2])
+AXIS = TimeAxis(512, 32e-12)
+LINEAR = Hybrid(0.125, 4.243)
+BACKGROUND = 0.02
+
+
+@cache
+def expected(wall: str, scene: str, points: int) -> Capture:
+    """Light of five points, or of two letters, before noise; one laser spot."""
+    hidden = PointScene(POINTS) if scene == "points" else letters()
+    return hidden.simulate_capture(build_relay_wall(wall, points), np.zeros(3), AXIS, 20e-12)
+
+
+@cache
+def letters() -> HiddenScene:
+    height = 0.6
+    left = Surface.letters("L", (-0.3, 0.0, 0.8), height, 0.02)
+    return HiddenScene([left, Surface.letters("N", (0.3, 0.0, 1.0), height, 0.02)])
+
+
+def count(wall: str, scene: str, photons: float, points: int, seed: int) -> Capture:
+    """Draw counts: so many photons of hidden things per wall point of 64 x 64, and background."""
+    light = expected(wall, scene, points)
+    peak = photons * 64**2 * float(light.signal.max()) / float(light.signal.sum(dtype=float))
+    return add_poisson_noise(light, peak, BACKGROUND, seed)
+
+
+def mask_of(scene: str, grid: Grid) -> np.ndarray:
+    """Voxels within 4 cm of a point, or that hold a piece of a letter."""
+    if scene == "points":
+        return find_near_voxels(grid, POINTS, 0.04)
+    mask = np.zeros(grid.shape, bool)
+    for surface in letters().surfaces:
+        for position in surface.positions:
+            mask[grid.find_nearest(position)] = True
+    return mask
+
+
+def energy(values: np.ndarray, near: np.ndarray) -> float:
+    return float(np.sum(values[near].astype(float) ** 2) / np.sum(values.astype(float) ** 2))
+
+
+@pytest.mark.parametrize("obliquity", [0, 2])
+@pytest.mark.parametrize("laser", ["spot", "confocal"])
+def test_light_and_backprojection_are_adjoint(obliquity: int, laser: str) -> None:
+    wall, random = build_relay_wall("wavy", 6), np.random.default_rng(1)
+    spot = wall if laser == "confocal" else np.array([0.1, 0.0, -0.1])
+    capture = Capture(np.zeros((200, 6, 6)), wall, spot, 40e-12, 1.2)
+    grid = Grid(np.linspace(-0.4, 0.4, 9), np.linspace(-0.4, 0.4, 8), np.linspace(0.5, 1.4, 7))
+    model = TimeOfFlight(capture, grid, np.array([0.1, 0.3, 0.6]), obliquity)
+    voxels, points = np.arange(3, grid.size, 2), np.arange(1, 36)
+    albedo, values = random.random(voxels.size), random.random((points.size, 200))
+    light = model.compute_light(albedo, voxels, points)
+    assert light.min() > -1e-6
+    back = model.backproject(values, voxels, points)
+    assert np.sum(light * values) == pytest.approx(np.sum(albedo * back), rel=1e-5)
+
+
+def test_a_small_voxels_light_is_that_of_a_point() -> None:
+    capture = expected("cylinder", "points", 8)
+    x, y, z = POINTS[1]
+    grid = Grid(x + np.array([0.0, 1e-3]), y + np.array([0.0, 1e-3]), z + np.array([0.0, 1e-3]))
+    response = np.exp(-((np.arange(-4, 5) / (20 / 32)) ** 2) / 2)
+    model = TimeOfFlight(capture, grid, response / response.sum())
+    light = model.compute_light(np.ones(1), np.zeros(1, int), np.arange(64))
+    alone = PointScene(POINTS[1:2]).simulate_capture(capture.wall, capture.laser, AXIS, 20e-12)
+    true = alone.traces()
+    assert np.allclose(light.sum(axis=1), true.sum(axis=1), rtol=3e-4)
+    arrival, exact = ((one * AXIS.paths).sum(axis=1) / one.sum(axis=1) for one in (light, true))
+    # float32 paths
+    assert np.abs(arrival - exact).max() < 1e-3
+
+
+@pytest.mark.parametrize("wall", ["planar", "cylinder"])
+def test_few_photons_show_points(wall: str) -> None:
+    """1.15 photons per wall point of 64 x 64, on 24 x 24 points: as many in all."""
+    near = mask_of("points", COARSE)
+    capture = count(wall, "points", 1.15, 24, seed=0)
+    refined = PhotonRefinement(LINEAR, iterations=6).reconstruct(capture, COARSE)
+    linear = LINEAR.reconstruct(capture, COARSE)
+    assert refined.values.min() >= 0
+    assert energy(refined.values, near) >= 0.75  # the linear image has 0.23
+    assert score_brightest(refined, near) >= score_brightest(linear, near)
+    history = refined.provenance["imaging"]
+    assert history["obliquity"] == 0
+    assert history["background_per_bin"] == pytest.approx(BACKGROUND, rel=0.1)
+    # of 4,700 that there are, and some of the background's
+    assert history["photons_of_hidden_things"] == pytest.approx(1.15 * 64**2, rel=0.2)
+
+
+def test_few_photons_show_letters() -> None:
+    mask = mask_of("letters", COARSE)
+    capture = count("planar", "letters", 5.7, 24, seed=1)
+    refined = PhotonRefinement(LINEAR, iterations=6).reconstruct(capture, COARSE)
+    linear = LINEAR.reconstruct(capture, COARSE)
+    assert score_brightest(refined, mask) >= score_brightest(linear, mask) + 0.15
+    # flat letters that face a matte wall: the cosines of both legs, squared
+    assert refined.provenance["imaging"]["obliquity"] == 2
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("wall", ["planar", "cylinder"])
+@pytest.mark.parametrize(("photons", "least"), [(1147, 0.63), (5.7, 0.5), (1.15, 0.2)])
+def test_points_at_all_levels(wall: str, photons: float, least: float) -> None:
+    near = mask_of("points", FINE)
+    for seed in range(5):
+        capture = count(wall, "points", photons, 64, seed)
+        refined = PhotonRefinement(LINEAR).reconstruct(capture, FINE)
+        assert energy(refined.values, near) >= least
+        linear = score_brightest(LINEAR.reconstruct(capture, FINE), near)
+        assert score_brightest(refined, near) >= linear
+
+
+def test_the_walls_own_light_is_left_out_of_account() -> None:
+    """Glare in the first 0.2 m after the direct path changes nothing but what it blanks."""
+    capture = count("planar", "points", 20, 16, seed=2)
+    direct = np.linalg.norm(capture.wall - capture.laser, axis=-1)
+    glare = 1000 * (np.abs(AXIS.paths[:, None, None] - direct - 0.1) < 0.05)
+    method = PhotonRefinement(LINEAR, iterations=2, blank=0.2)
+    grid = Grid(COARSE.x[::2], COARSE.y[::2], COARSE.z[::2])
+    bright = Capture(capture.signal + glare, capture.wall, capture.laser, AXIS.bin_width)
+    plain, blanked = (method.reconstruct(one, grid).values for one in (capture, bright))
+    assert np.allclose(plain, blanked, atol=1e-6 * plain.max())
+
+
+def test_what_is_not_counted_is_refused() -> None:
+    capture = count("planar", "points", 20, 8, seed=0)
+    for change, reason in (
+        (lambda signal: signal - 1, "negative signals"),
+        (lambda signal: signal * np.pi + (signal > 1), "multiples of one step"),
+        (lambda signal: 0 * signal, "every signal is 0"),
+    ):
+        signal = change(capture.signal)
+        changed = Capture(signal, capture.wall, capture.laser, capture.bin_width)
+        with pytest.raises(InputError, match=reason) as refused:
+            CountedPhotons.of(changed)
+        assert "\n" not in str(refused.value)
+    # counts on another scale are counts
+    tenfold = Capture(capture.signal * 10, capture.wall, capture.laser, capture.bin_width)
+    assert np.array_equal(CountedPhotons.of(tenfold).counts, CountedPhotons.of(capture).counts)
