@@ -300,7 +300,9 @@ class CountedPhotons:
             direct = np.linalg.norm(capture.points - capture.lasers, axis=1)
             observed = capture.axis.paths > (direct + blank)[:, np.newaxis]
             capture = remove_first_bounce(capture, blank, ramp)
-        return cls(capture, np.where(observed, counts / float(lit.min()), 0).astype(np.float32), observed)
+        return cls(
+            capture, np.where(observed, counts / float(lit.min()), 0).astype(np.float32), observed
+        )
 
 
 class PhotonFit:
