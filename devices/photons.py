@@ -85,17 +85,43 @@ def read_photons(address: str) -> CountedPhotons:
         raise InputError(f"'{address}': scans and binning must be positive")
     with open_source(strip_options(uri, GATHERING_OPTIONS)) as source:
         known = source.calibration
-        if known is None or "gate_times" not in known.fields:
+        axis = _find_time_axis(known)
+        if known is None or axis is None:
             raise InputError(
                 f"'{address}': {source.info.instrument} counts no photons in time for each pixel; "
                 "a SPAD array does with mode=gated"
             )
-        times = known.array("gate_times", np.float64, 1, "s")
-        counts = _add_scans(source, len(times), scans, binning)
+        times = known.array(axis, np.float64, 1, "s")
+        pulse = None
+        if axis == "bin_times":
+            counts = _add_histograms(source, scans) * float(known.attribute("count_scale"))
+        else:
+            counts = _add_scans(source, len(times), scans, binning)
+            pulse = _make_gate_response(known, times)
         source.stop()
         while source.read() is not None:
             pass
-    return CountedPhotons(counts, times, _make_gate_response(known, times))
+    return CountedPhotons(counts, times, pulse)
+
+
+def _find_time_axis(known: Record | None) -> str | None:
+    """Return which of a calibration's fields is the photons' time axis."""
+    names = () if known is None else known.fields
+    return next((name for name in ("gate_times", "bin_times") if name in names), None)
+
+
+def _add_histograms(source: Source, scans: int) -> NDArray[np.float32]:
+    """Add up histograms (bins, zones) that the instrument has made; zones become one row."""
+    total: NDArray[np.float32] | None = None
+    done = 0
+    for batch in read_batches(source, inf):
+        for record in batch.records[: scans - done]:
+            counts = record["counts"][:, np.newaxis, :].astype(np.float32)
+            total = counts if total is None else total + counts
+            done += 1
+        if total is not None and done == scans:
+            return total
+    raise InputError(f"the source ended after {done} of {scans} whole scans")
 
 
 def _add_scans(source: Source, steps: int, scans: int, binning: int) -> NDArray[np.float32]:

@@ -28,6 +28,10 @@ OPENERS: dict[str, str] = {
     "sim+remoteex": "devices.remoteex.simulation:open_emulated",
     "sim+spad512": "devices.spad512.emulator:open_emulated",
     "timetag": "devices.timetag.source:open_timetag",
+    "sim+tmf8828": "devices.histogram_kits.emulator:open_tmf8828",
+    "sim+vl53l8": "devices.histogram_kits.emulator:open_vl53l8",
+    "tmf8828": "devices.histogram_kits.source:open_tmf8828",
+    "vl53l8": "devices.histogram_kits.source:open_vl53l8",
     "sim+timetag": "devices.emulation.source:open_timetag",
 }
 """Scheme of an address -> function ``(Uri) -> Source``."""

@@ -314,8 +314,9 @@ def _sum_frames(
             break
         batch = following
     times = None
-    if calibration is not None and "row_times" in calibration.fields:
-        times = calibration.array("row_times", np.float64, 1, "s")
+    for name in ("row_times", "bin_times"):  # of a sweep, or of histograms of zones
+        if calibration is not None and name in calibration.fields:
+            times = calibration.array(name, np.float64, 1, "s")
     streak = Streak(total.astype(np.float32), times, saturated)
     return streak if gathering.bin_width is None else streak.with_bin_width(gathering.bin_width)
 

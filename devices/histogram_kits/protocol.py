@@ -1,0 +1,262 @@
+"""The lines of text that the kits' public programs send, to histograms (bins, zones).
+
+TMF8828 (ams' Arduino program; single letters are its commands, e.g. ``m`` to measure): the bytes of
+each histogram's 128 bins come in three lines ``#Raw,ADDRESS,INDEX,b0,...,b127``. INDEX modulo 10 is
+the channel, of which 0 is the reference; 0..9 are the lowest bytes, 10..19 the middle ones, 20..29
+the highest, and in 8 x 8 mode 30 more follow for the second half. Then comes
+``#Obj,ADDRESS,NUMBER,TEMPERATURE,VALID,TICK,...`` with the sensor's own distances. In 8 x 8 mode
+four such captures make a frame; NUMBER modulo 4 is the capture's place.
+
+VL53L8CH (the Arduino library's example of compact histograms): for each zone a line ``Aggregate I,
+Ambient: A, Bins: v, v, ...``.
+
+Both are texts of programs that anybody may change, so lengths are checked and nothing is assumed of
+lines that are not known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from devices.frames import FrameCodec
+from tofclip.errors import InputError
+
+MAX_LINE_BYTES = 1 << 13
+TMF_BINS, TMF_CHANNELS, TMF_LANES = 128, 10, 30
+TMF_CAPTURES, TMF_NUMBERS = 4, 256
+TMF_TICK_S = 2e-7
+"""s; the sensor's clock of 5 MHz."""
+
+TMF_ZONES = (64, 9)
+VL53_NATIVE_BIN_S = 2 * 37.5348e-3 / 299_792_458
+"""s; of the 37.5348 mm that ST gives for a bin."""
+
+VL53_SCALE = 10
+"""Counts are sent with one digit after the point."""
+
+
+@dataclass(frozen=True)
+class KitFrame:
+    """What was sent for one frame.
+
+    Parameters
+    ----------
+    counts : (bins, zones) uint32 array or None
+        None where lines of it are missing.
+    missing : int
+        Frames that the kit took before it and never sent.
+    stamp : float or None
+        s of the kit's clock.
+    """
+
+    counts: NDArray[np.uint32] | None
+    missing: int = 0
+    stamp: float | None = None
+
+
+class Parser(Protocol):
+    """Puts frames together from lines."""
+
+    @property
+    def codec(self) -> FrameCodec:
+        """Histograms as pictures of one row for each bin, one column for each zone."""
+
+    @property
+    def scale(self) -> float:
+        """Photons, or whatever the kit counts, that one stored count stands for."""
+
+    def parse_line(self, line: bytes) -> KitFrame | None:
+        """Take the next line; return the frame that it completes, if it does."""
+
+
+@dataclass
+class Tmf8828Parser:
+    """See the module's text. Zones are in the order in which they come: captures, then halves, then
+    channels; where each of them looks is the optics' matter.
+
+    Parameters
+    ----------
+    zones : int
+        64, or 9 for the 3 x 3 mode.
+    """
+
+    zones: int = 64
+    scale: float = field(default=1.0, init=False)
+
+    def __post_init__(self) -> None:
+        if self.zones not in TMF_ZONES:
+            raise InputError(f"a TMF8828 has 64 zones or 9, not {self.zones}")
+        self._captures = TMF_CAPTURES if self.zones == 64 else 1
+        self._halves = 2 if self.zones == 64 else 1
+        self._last_number: int | None = None
+        self._counts = np.zeros((TMF_BINS, self.zones), np.uint32)
+        self._complete = 0
+        self._begin_capture()
+
+    @property
+    def codec(self) -> FrameCodec:
+        return FrameCodec(TMF_BINS, self.zones, 32)
+
+    def parse_line(self, line: bytes) -> KitFrame | None:
+        if line.startswith(b"#Raw,"):
+            self._add_lane(line)
+            return None
+        return self._end_capture(line) if line.startswith(b"#Obj,") else None
+
+    def _begin_capture(self) -> None:
+        self._lanes = np.zeros((self._halves, TMF_LANES, TMF_BINS), np.uint32)
+        self._seen = np.zeros((self._halves, TMF_LANES), bool)
+
+    def _add_lane(self, line: bytes) -> None:
+        numbers = _parse_integers(line.split(b",")[2:])
+        if numbers is None or len(numbers) != TMF_BINS + 1:
+            return
+        half, lane = divmod(int(numbers[0]), TMF_LANES)
+        # Some versions number both halves from 0.
+        if half == 0 and self._halves == 2 and self._seen[0, lane]:
+            half = 1
+        if half < self._halves:
+            self._lanes[half, lane] = numbers[1:]
+            self._seen[half, lane] = True
+
+    def _end_capture(self, line: bytes) -> KitFrame | None:
+        numbers = _parse_integers(line.split(b",")[2:6])
+        if numbers is None or len(numbers) != 4:
+            return None
+        number, tick = int(numbers[0]) % TMF_NUMBERS, int(numbers[3])
+        place = number % self._captures
+        if self._seen.all():
+            lanes = self._lanes.reshape(self._halves, 3, TMF_CHANNELS, TMF_BINS)
+            channels = lanes[:, 0] | lanes[:, 1] << 8 | lanes[:, 2] << 16
+            looking = channels[:, 1 : 1 + self.zones // (self._captures * self._halves)]
+            width = self.zones // self._captures
+            self._counts[:, place * width : (place + 1) * width] = looking.reshape(width, -1).T
+            self._complete |= 1 << place
+        self._begin_capture()
+        if place != self._captures - 1:
+            return None
+        return self._end_frame(number // self._captures, tick)
+
+    def _end_frame(self, number: int, tick: int) -> KitFrame:
+        is_whole = self._complete == (1 << self._captures) - 1
+        self._complete = 0
+        missing = 0
+        if self._last_number is not None:
+            missing = (number - self._last_number - 1) % (TMF_NUMBERS // self._captures)
+        self._last_number = number
+        counts = self._counts.copy() if is_whole else None
+        return KitFrame(counts, missing, tick * TMF_TICK_S if tick else None)
+
+
+@dataclass
+class Vl53l8Parser:
+    """See the module's text.
+
+    Parameters
+    ----------
+    zones, bins : int
+        As the kit's program was set.
+    """
+
+    zones: int = 16
+    bins: int = 24
+    scale: float = field(default=1 / VL53_SCALE, init=False)
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.zones <= 64 and 1 <= self.bins <= 144):
+            raise InputError(
+                f"a VL53L8CH has up to 64 zones and 144 bins, not {self.zones} and {self.bins}"
+            )
+        self._counts = np.zeros((self.bins, self.zones), np.uint32)
+        self._next = 0
+
+    @property
+    def codec(self) -> FrameCodec:
+        return FrameCodec(self.bins, self.zones, 32)
+
+    def parse_line(self, line: bytes) -> KitFrame | None:
+        if not line.startswith(b"Aggregate "):
+            return None
+        head, _, tail = line.partition(b"Bins:")
+        zone = _parse_integers([head.removeprefix(b"Aggregate ").split(b",")[0]])
+        values = _parse_floats([word for word in tail.split(b",") if word.strip()])
+        if zone is None:
+            return None
+        place = int(zone[0])
+        if place == 0:
+            self._next = 0
+        # Behind every value stands a comma: without the last one it may have lost digits.
+        is_ended = tail.rstrip().endswith(b",")
+        is_sound = is_ended and values is not None and len(values) == self.bins
+        is_sound = is_sound and place == self._next
+        if values is not None and is_sound:
+            # The sensor subtracts the ambient light itself, which may leave less than nothing.
+            self._counts[:, place] = np.rint(np.clip(values, 0, 4e8) * VL53_SCALE)
+            self._next += 1
+        else:
+            self._next = -1  # wait for the next beginning
+        if place != self.zones - 1:
+            return None
+        is_whole, self._next = self._next == self.zones, 0
+        return KitFrame(self._counts.copy() if is_whole else None)
+
+
+def _parse_integers(words: list[bytes]) -> NDArray[np.int64] | None:
+    if not all(word.strip().isdigit() and len(word) < 12 for word in words):
+        return None
+    return np.array([int(word) for word in words], np.int64)
+
+
+def _parse_floats(words: list[bytes]) -> NDArray[np.float64] | None:
+    try:
+        found = np.array([float(word) for word in words], np.float64)
+    except ValueError:
+        return None
+    return found if np.all(np.isfinite(found)) else None
+
+
+def format_tmf8828(counts: NDArray[Any], number: int, tick: int) -> list[bytes]:
+    """Return the lines that a TMF8828's program sends for a frame; the inverse of `Tmf8828Parser`.
+
+    Parameters
+    ----------
+    counts : (128, zones) array
+    number : int
+        Of the frame.
+    tick : int
+        0.2 us.
+
+    Returns
+    -------
+    list of bytes
+        With their ends.
+    """
+    captures, halves = (TMF_CAPTURES, 2) if counts.shape[1] == 64 else (1, 1)
+    width = counts.shape[1] // captures
+    lines = []
+    for place in range(captures):
+        some = counts[:, place * width : (place + 1) * width].T.reshape(halves, -1, TMF_BINS)
+        for half in range(halves):
+            for lane in range(TMF_LANES):
+                channel, shift = lane % TMF_CHANNELS, 8 * (lane // TMF_CHANNELS)
+                values = np.zeros(TMF_BINS, np.int64)
+                if 1 <= channel <= some.shape[1]:
+                    values = some[half, channel - 1].astype(np.int64) >> shift & 0xFF
+                words = ",".join(map(str, values.tolist()))
+                lines.append(f"#Raw,65,{half * TMF_LANES + lane},{words}\r\n".encode())
+        result = (number * captures + place) % TMF_NUMBERS
+        lines.append(f"#Obj,65,{result},25,{width},{tick}{',0' * 72}\r\n".encode())
+    return lines
+
+
+def format_vl53l8(counts: NDArray[Any]) -> list[bytes]:
+    """Return the lines that a VL53L8CH's program sends for a frame of counts (bins, zones)."""
+    lines = [b"Ranging Results:\r\n"]
+    for zone, column in enumerate(counts.T):
+        words = "".join(f"{value / VL53_SCALE:.1f}, " for value in column.tolist())
+        lines.append(f"Aggregate {zone}, Ambient: 0.5, Bins: {words}\r\n".encode())
+    return lines

@@ -1,0 +1,183 @@
+"""Histogram kits: their lines of text, and the driver against kits made of software behind a
+pseudo-terminal.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+import devices
+from devices.histogram_kits.emulator import compute_zone_ranges
+from devices.histogram_kits.protocol import (
+    KitFrame,
+    Parser,
+    Tmf8828Parser,
+    Vl53l8Parser,
+    format_tmf8828,
+    format_vl53l8,
+)
+from devices.photons import read_photons
+from devices.source import Source
+from devices.transients import read_transient
+from tofclip.errors import (
+    DeviceDisconnectedError,
+    DeviceNotFoundError,
+    InputError,
+    MissingDependencyError,
+)
+from tofclip.units import SPEED_OF_LIGHT
+
+pytest.importorskip("serial", reason="histogram kits need pyserial")
+
+
+def parse(parser: Parser, lines: list[bytes]) -> list[KitFrame]:
+    found = [parser.parse_line(line.rstrip()) for line in lines]
+    return [frame for frame in found if frame is not None]
+
+
+def draw_counts(zones: int, seed: int, bins: int = 128) -> Any:
+    return np.random.default_rng(seed).integers(0, 1 << 24, (bins, zones)).astype(np.uint32)
+
+
+@pytest.mark.parametrize("zones", [64, 9])
+def test_three_bytes_of_every_bin_come_together(zones: int) -> None:
+    parser = Tmf8828Parser(zones)
+    for number, seed in enumerate((1, 2, 3)):
+        counts = draw_counts(zones, seed)
+        (frame,) = parse(parser, format_tmf8828(counts, number, 5000))
+        np.testing.assert_array_equal(frame.counts, counts)
+        assert (frame.missing, frame.stamp) == (0, pytest.approx(1e-3))
+
+
+def test_halves_that_are_both_numbered_from_0() -> None:
+    counts = draw_counts(64, 4)
+    lines = []
+    for line in format_tmf8828(counts, 0, 0):
+        words = line.split(b",")
+        if words[0] == b"#Raw":
+            words[2] = b"%d" % (int(words[2]) % 30)
+        lines.append(b",".join(words))
+    (frame,) = parse(Tmf8828Parser(), lines)
+    np.testing.assert_array_equal(frame.counts, counts)
+    assert frame.stamp is None
+
+
+def test_what_is_missing_is_told() -> None:
+    """A line torn, frames not sent, and the beginning missed."""
+    parser = Tmf8828Parser()
+    frames = [format_tmf8828(draw_counts(64, seed), seed, 1) for seed in range(70)]
+    assert parse(parser, frames[0][100:])[0].counts is None
+    torn = frames[1].copy()
+    torn[7] = torn[7][:30]
+    assert parse(parser, torn)[0].counts is None
+    (after_gap,) = parse(parser, frames[5])
+    assert after_gap.counts is not None
+    assert after_gap.missing == 3
+    (wrapped,) = parse(parser, frames[66])  # numbers have eight bits, four for each frame
+    assert wrapped.missing == 60
+
+
+@given(st.binary(max_size=300))
+@settings(max_examples=60)
+def test_any_line_is_survived(line: bytes) -> None:
+    for parser in (Tmf8828Parser(), Vl53l8Parser()):
+        for head in (b"", b"#Raw,65,3,", b"#Obj,65,3,", b"Aggregate ", b"Aggregate 0, Bins: "):
+            parser.parse_line(head + line)
+
+
+def test_compact_histograms_of_each_zone() -> None:
+    parser = Vl53l8Parser(16, 24)
+    counts = draw_counts(16, 5, 24) % 100_000
+    lines = [b"Zone 3: No target\r\n", *format_vl53l8(counts), *format_vl53l8(counts)[:9]]
+    (frame,) = parse(parser, lines)
+    np.testing.assert_array_equal(frame.counts, counts)
+    # The next one is cut and begins anew: it is whole, and what was cut is not counted twice.
+    (again,) = parse(parser, format_vl53l8(counts))
+    np.testing.assert_array_equal(again.counts, counts)
+    torn = format_vl53l8(counts)
+    torn[5] = torn[5][:-9] + b"\r\n"
+    assert parse(parser, torn)[0].counts is None
+    less_than_nothing = torn[1].replace(b"Bins: ", b"Bins: -").strip()
+    assert parser.parse_line(less_than_nothing) is None
+
+
+def take(source: Source, frames: int) -> list[Any]:
+    found: list[Any] = []
+    while len(found) < frames:
+        batch = source.read(10)
+        assert batch is not None
+        found += list(batch.records)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("address", "bins", "zones"),
+    [
+        ("sim+tmf8828://?seed=1&rate=100", 128, 64),
+        ("sim+tmf8828://?seed=1&rate=100&zones=9&start=", 128, 9),
+        ("sim+vl53l8://?seed=1&rate=100&zones=64&sub_sample=1&bins=60", 60, 64),
+    ],
+)
+def test_the_peak_of_each_zone_is_where_the_wall_is(address: str, bins: int, zones: int) -> None:
+    counted = read_photons(f"{address}&scans=3")
+    assert counted.counts.shape == (bins, 1, zones)
+    ranges = counted.times[counted.counts[:, 0].argmax(axis=0)] * SPEED_OF_LIGHT / 2
+    bin_m = counted.bin_width * SPEED_OF_LIGHT / 2
+    assert np.abs(ranges - compute_zone_ranges(zones)).max() < bin_m
+    assert counted.to_image().photons > 100 * zones
+
+
+def test_zones_are_columns_of_a_transient() -> None:
+    streak = read_transient("sim+vl53l8://?rate=100&frames=2")
+    assert streak.counts.shape == (24, 16)
+    np.testing.assert_allclose(np.diff(streak.times), 4 * 250.4e-12, rtol=1e-4)
+
+
+def test_every_frame_is_accounted_for() -> None:
+    with devices.open("sim+tmf8828://?seed=1&rate=200&torn=4&lost=5") as source:
+        frames = take(source, 12)
+        info = source.info.as_dict()
+        source.stop()
+        while source.read(5) is not None:
+            pass
+    stats = source.stats
+    assert stats.is_balanced
+    # Of 20 frames 4 are lost, and of the others 4 torn.
+    assert [int(frame["number"]) for frame in frames[:6]] == [0, 1, 2, 5, 6, 8]
+    assert stats.lost_device >= 3
+    assert stats.malformed >= 3
+    assert info["zones"] == 64
+
+
+def test_a_kit_that_is_unplugged() -> None:
+    with devices.open("sim+tmf8828://?seed=1&rate=100&reconnect_s=0.2") as source:
+        take(source, 2)
+        source._feed._kit.close()  # type: ignore[attr-defined]
+        with pytest.raises(DeviceDisconnectedError, match="nobody answered"):
+            take(source, 1000)
+    assert source.stats.is_balanced
+    assert source.stats.delivered >= 2
+
+
+def test_what_cannot_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    for address in (
+        "tmf8828:///dev/null",  # without bin_ps
+        "tmf8828://?bin_ps=100",
+        "tmf8828:///dev/null?bin_ps=100&zones=5",
+        "sim+tmf8828://?rate=0",
+        "sim+vl53l8://?zones=65",
+        "sim+vl53l8://?sub_sample=0",
+    ):
+        with pytest.raises(InputError):
+            devices.open(address)
+    with pytest.raises(DeviceNotFoundError, match="is the kit connected"):
+        devices.open("vl53l8:///nowhere")
+    monkeypatch.setitem(sys.modules, "serial", None)
+    with pytest.raises(MissingDependencyError, match=r"tofclip\[serial\]"):
+        devices.open("vl53l8:///dev/null")
