@@ -10,12 +10,12 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any, cast
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand, TyperGroup, TyperOption
 
 PROGRAM = "tofclip"
 
@@ -66,6 +66,12 @@ def make_lazy_group(package: str, verbs: VerbTable) -> type[TyperGroup]:
             for name, line in verbs.items():
                 self.add_command(TyperCommand(name, help=line, rich_markup_mode=None))
 
+        def get_params(self, ctx: Any) -> list[Any]:
+            """Return the options, those of completion too, which typer adds later."""
+            params = super().get_params(ctx)
+            _hide_types_of_flags(params)
+            return params
+
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
             """Find the verb that is called; only this one is imported."""
             name, listed, further = super().resolve_command(ctx, args)
@@ -103,7 +109,23 @@ def load_command(module: str, name: str) -> Command:
     group.name = name
     # A verb on its own is taken out of the group that it was registered in.
     command: Command = group if is_group else cast("TyperCommand", group.commands[name])
+    show_flags_without_type(command)
     return command
+
+
+def show_flags_without_type(command: Command) -> None:
+    """Let the help of a command, and of those of a group, show an option that takes no value as one,
+    such as ``--json``, where typer writes ``--json <bool>``.
+    """
+    _hide_types_of_flags(command.get_params(typer.Context(command)))
+    for further in getattr(command, "commands", {}).values():
+        show_flags_without_type(further)
+
+
+def _hide_types_of_flags(params: Sequence[Any]) -> None:
+    for param in params:
+        if isinstance(param, TyperOption) and param.is_flag:
+            param.metavar = ""
 
 
 def walk_verbs(group: TyperGroup, words: tuple[str, ...] = ()) -> dict[str, TyperCommand]:

@@ -8,6 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+MAX_LISTED_VALUES = 12
+"""Values of a list that are printed one by one."""
+
 
 def report(figures: Mapping[str, Any], as_json: bool, written: Sequence[Path] = ()) -> None:
     """Print the figures of a run.
@@ -46,8 +49,26 @@ def to_json_value(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
+def summarise_list(values: Sequence[Any]) -> str:
+    """Return how many values there are, the first and the last, as a person reads a long list.
+
+    Parameters
+    ----------
+    values : sequence
+        Not empty.
+
+    Examples
+    --------
+    >>> summarise_list([1.5, *range(58), 0.25])
+    '60 values, 1.5 ... 0.25'
+    """
+    return f"{len(values)} values, {_format_value(values[0])} ... {_format_value(values[-1])}"
+
+
 def _format_value(value: Any) -> str:
     if isinstance(value, list):
+        if len(value) > MAX_LISTED_VALUES:
+            return summarise_list(value)
         return ", ".join(map(_format_value, value))
     if isinstance(value, dict):
         return ", ".join(f"{name} {_format_value(entry)}" for name, entry in value.items())

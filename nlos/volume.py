@@ -189,7 +189,8 @@ class Volume:
         -------
         matplotlib Axes
         """
-        return plot_picture(self.maximum_projection().brightness, "seen from the wall", ax)
+        picture, sides = self.maximum_projection().brightness, (self.grid.x, self.grid.y)
+        return plot_picture(picture, "seen from the wall", ax, unit="brightness", sides=sides)
 
     def to_xarray(self) -> Any:
         """Return an `xarray.DataArray` (z, y, x) with places in m as coordinates.

@@ -68,7 +68,14 @@ def render_html(title: str, rows: Mapping[str, str], picture: NDArray[np.floatin
     )
 
 
-def plot_picture(picture: NDArray[np.floating], title: str, ax: Axes | None = None) -> Axes:
+def plot_picture(
+    picture: NDArray[np.floating],
+    title: str,
+    ax: Axes | None = None,
+    *,
+    unit: str = "counts",
+    sides: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+) -> Axes:
     """Draw a picture with a scale of its brightness.
 
     Parameters
@@ -77,6 +84,10 @@ def plot_picture(picture: NDArray[np.floating], title: str, ax: Axes | None = No
     title : str
     ax : matplotlib Axes, optional
         Where to draw; by default the current figure's.
+    unit : str
+        Of the brightness.
+    sides : (x, y) of arrays, optional
+        Places of columns and rows, m; by default they are numbered.
 
     Returns
     -------
@@ -84,9 +95,11 @@ def plot_picture(picture: NDArray[np.floating], title: str, ax: Axes | None = No
     """
     pyplot = require_package("matplotlib.pyplot")
     ax = ax or pyplot.gca()
-    drawn = ax.imshow(picture, cmap=PICTURE_COLOURMAP)
-    ax.figure.colorbar(drawn, ax=ax, label="counts")
-    ax.set(title=title, xlabel="x (px)", ylabel="y (px)")
+    extent = None if sides is None else (*sides[0][[0, -1]], *sides[1][[-1, 0]])
+    drawn = ax.imshow(picture, cmap=PICTURE_COLOURMAP, extent=extent)
+    ax.figure.colorbar(drawn, ax=ax, label=unit)
+    length = "px" if sides is None else "m"
+    ax.set(title=title, xlabel=f"x ({length})", ylabel=f"y ({length})")
     return ax
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from apps.options import JsonOption
-from apps.report import report, to_json_value
+from apps.report import report, summarise_list, to_json_value
 from devices.recording.reader import read_head_if_recording
 from tofclip.errors import FileFormatError
 from tofclip.io.streaks import outline_streak_file
@@ -115,6 +115,8 @@ def _format_tree(found: Mapping[str, Any], depth: int = 0) -> Iterator[str]:
             yield lead
             for number, entry in enumerate(value, start=1):
                 yield from _format_tree({f"{number}": entry}, depth + 1)
+        elif isinstance(value, list) and len(value) > MAX_LISTED_VALUES:
+            yield f"{lead} {summarise_list(value)}"
         else:
             yield f"{lead} {value}"
 

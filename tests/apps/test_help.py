@@ -200,3 +200,10 @@ def test_a_page_keeps_the_headings_of_the_help() -> None:
         < text.index("## Settings")
         < text.index("`--cycles")
     )
+
+
+def test_a_flag_is_shown_without_a_type(run: Run) -> None:
+    for words in ((), ("recover",), ("lidar",), ("lidar", "sequence")):
+        shown = run(*words, "--help").out
+        assert "--help" in shown
+        assert "<bool>" not in shown

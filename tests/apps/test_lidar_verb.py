@@ -161,7 +161,8 @@ def test_a_sequence_is_made_and_goes_on(run: Run, tmp_path: Path) -> None:
     first = run("lidar", "sequence", shots, "--out", out, "--focus", "depth-locked", "--json")
     assert first.status == 0, first.err
     assert json.loads(first.out)["shots"] == 3
-    (out / "cloud_000002.ply").unlink()
+    assert sorted(path.name for path in out.glob("*.ply")) == ["0.ply", "1.ply", "2.ply"]
+    (out / "2.ply").unlink()
     again = json.loads(
         run("lidar", "sequence", shots, "--out", out, "--focus", "depth-locked", "--json").out
     )
@@ -183,8 +184,8 @@ def test_a_sequence_is_made_and_goes_on(run: Run, tmp_path: Path) -> None:
     assert run(*words).status == 2  # a stack carries no camera
     assert run(*words, "--camera", tmp_path / "camera.h5", "--bin-width-ps", "100").status == 0
     assert sorted(path.name for path in (tmp_path / "more").glob("*.npz")) == [
-        "cloud_000000.npz",
-        "cloud_000001.npz",
+        "stack_000000-stack_000001.npz",
+        "stack_000002.npz",
     ]
     (tmp_path / "empty").mkdir()
     for unusable in (

@@ -4,7 +4,7 @@ kept in a file.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
@@ -21,7 +21,6 @@ from tofclip.sequences.jobs import Job, lock_output_folder
 from tofclip.sequences.ranger import (
     JitterEstimator,
     RangingPipeline,
-    build_cloud_path,
     compute_light_curve,
     make_average_cloud,
 )
@@ -106,6 +105,7 @@ class RangingSettings:
         list of Job
         """
         plan, readers = folder.resolve() / PLAN_NAME, list(shots.values())
+        names = list(shots)
         # Made before the folder is claimed, and saved after: a first shot that cannot be used
         # leaves no folder behind, and a folder of other settings gets no plan.
         made = None if plan.exists() else self.plan(readers[0]())
@@ -118,8 +118,9 @@ class RangingSettings:
         version, jobs = compute_sha256(plan), []
         # Rounded up: what is left over at the end makes one more cloud.
         for number in range(-(-len(readers) // self.average)):
-            some = tuple(readers[number * self.average : (number + 1) * self.average])
-            result = build_cloud_path(folder.resolve(), number, suffix)
+            part = slice(number * self.average, (number + 1) * self.average)
+            some = tuple(readers[part])
+            result = folder.resolve() / f"{name_cloud(names[part])}{suffix}"
             jobs.append(
                 Job(result.stem, result, partial(write_average_cloud, plan, version, some, result))
             )
@@ -131,6 +132,23 @@ class RangingSettings:
         parse_focus(self.focus).check_camera(camera)
         light = compute_light_curve(first, camera) if self.steady else np.empty(0)
         return RangingPlan(camera, first.times, light, self.focus)
+
+
+def name_cloud(shots: Sequence[str]) -> str:
+    """Return the name of the cloud of some shots: theirs, or the first one's and the last one's.
+
+    Parameters
+    ----------
+    shots : sequence of str
+        At least one; of a shot in a folder inside the sequence's, the path with the folder.
+
+    Examples
+    --------
+    >>> name_cloud(["run2/shot_07"]), name_cloud(["a_03", "a_04", "a_05"])
+    ('run2_shot_07', 'a_03-a_05')
+    """
+    ends = shots[:1] if len(shots) == 1 else (shots[0], shots[-1])
+    return "-".join(name.replace("/", "_") for name in ends)
 
 
 def write_average_cloud(
