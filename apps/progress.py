@@ -1,4 +1,4 @@
-"""A progress bar where somebody is watching, and a quick end of the work when they press Ctrl-C."""
+"""A progress bar on a terminal, and a quick end of the work when Ctrl-C is pressed."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def run_with_progress(
 
 
 def resolve_device(device: str, cluster: str | None) -> str:
-    """Return which device a name stands for here; workers elsewhere look for it themselves.
+    """Return which device a name stands for here; workers on other machines look for it themselves.
 
     Parameters
     ----------

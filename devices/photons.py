@@ -135,7 +135,9 @@ def _add_scans(source: Source, steps: int, scans: int, binning: int) -> NDArray[
             rows, columns = (size // binning for size in counts.shape)
             if total is None or present is None:
                 if steps * rows * columns * 4 > MAX_CUBE_BYTES:
-                    raise InputError("so many photons do not fit into 4 GiB: choose binning=2 or 4")
+                    raise InputError(
+                        "that number of photons does not fit into 4 GiB: choose binning=2 or 4"
+                    )
                 total = np.zeros((steps, rows, columns), np.float32)
                 present = np.zeros_like(total)
             if int(record["number"]) % steps != step:  # cut: wait for the next beginning

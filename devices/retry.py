@@ -39,6 +39,6 @@ def retry_connect(connect: Callable[[], T], seconds: float) -> T:
             # Looked at after the attempt, so that there is always one.
             if monotonic() > deadline:
                 raise DeviceDisconnectedError(
-                    f"the connection broke and nobody answered for {seconds:g} s ({fault})"
+                    f"the connection broke and no answer came for {seconds:g} s ({fault})"
                 ) from fault
             sleep(RETRY_INTERVAL_S)

@@ -2,7 +2,7 @@
 
 ::
 
-    Source -> TransientStream (one image of so many pictures or photons) -> TrackedShots
+    Source -> TransientStream (one image of several pictures or photons) -> TrackedShots
            -> stages that make clouds -> consumer, which asks TrackedShots for the age of each and
                                          for the accounts of all
 """

@@ -99,7 +99,7 @@ class Source(abc.ABC):
 
     @property
     def is_live(self) -> bool:
-        """Whether the records come from an instrument, real or emulated, and go by if nobody reads
+        """Whether the records come from an instrument, real or emulated, and go by if they are not read
         them.
         """
         return False

@@ -132,7 +132,7 @@ class StreamSource(DecodedSource):
         return self._decode_piece(piece)
 
     def keep_newest(self) -> None:
-        """From now on, let whoever reads late have the newest piece; the others count as dropped by
+        """From now on, give a late reader the newest piece; the others count as dropped by
         the host.
         """
         self._ring.keep_newest()

@@ -52,7 +52,7 @@ class TcpLink:
             except OSError as fault:
                 reason = fault.strerror or fault
                 raise DeviceNotFoundError(
-                    f"nobody answers at {self.name} ({reason}); is its program running?"
+                    f"no program answers at {self.name} ({reason}); is its program running?"
                 ) from fault
         # Commands are short and wait for an answer: Nagle's algorithm would hold them back.
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -164,7 +164,7 @@ class TcpLink:
         return message
 
     def discard_available(self) -> int:
-        """Throw away what has come and nobody asked for, without waiting, and return how many bytes
+        """Throw away what has come unasked, without waiting, and return how many bytes
         that were.
         """
         thrown = len(self._buffer)

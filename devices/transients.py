@@ -135,7 +135,7 @@ class AccumulationSettings:
             return BinAxis(width, self.bins, self.start, period)
         if period is None:
             raise InputError(
-                "nobody knows the laser's period: add period_ps=... or bins=... to the address"
+                "the laser's period is not known: add period_ps=... or bins=... to the address"
             )
         if not 0 < width <= period:
             raise InputError(
@@ -278,7 +278,7 @@ def _make_histogram(
         return TimeHistogram(
             int(known.attribute("channels")), axis, float(known.attribute("resolution_s"))
         )
-    raise InputError(f"records of {', '.join(names)} are no photons of a line of pixels")
+    raise InputError(f"records of {', '.join(names)} are not photons of a line of pixels")
 
 
 def _stack_histograms(

@@ -49,7 +49,7 @@ class Uri:
         scheme, separator, rest = text.partition("://")
         if not separator or not scheme:
             raise InputError(
-                f"'{text}' is no address of a source; it looks like sim+timetag://?seed=1 or file://run.h5"
+                f"'{text}' is not the address of a source; it looks like sim+timetag://?seed=1 or file://run.h5"
             )
         place, _, query = rest.partition("?")
         try:

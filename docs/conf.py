@@ -45,5 +45,5 @@ def write_verb_pages(app: Sphinx) -> None:
 
 
 def setup(app: Sphinx) -> None:
-    """Tell Sphinx what to do first."""
+    """Register what Sphinx has to do first."""
     app.connect("builder-inited", write_verb_pages)

@@ -60,17 +60,17 @@ class CompressedCapture:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require_numpy("imaging straight from compressed readings", self.measurements)
+        require_numpy("imaging straight from compressed measurements", self.measurements)
         measurements, wall = (
             np.asarray(self.measurements, dtype=np.float32),
             np.asarray(self.wall, dtype=np.float64),
         )
         if measurements.ndim != 2 or measurements.shape[:1] != self.operator.shape_out:
-            raise ShapeError("readings", (*self.operator.shape_out, "t"), measurements.shape)
+            raise ShapeError("measurements", (*self.operator.shape_out, "t"), measurements.shape)
         if wall.shape != (*self.operator.shape_in, 3):
             raise ShapeError("wall", (*self.operator.shape_in, 3), wall.shape)
         if not np.all(np.isfinite(measurements)):
-            raise InputError("readings must not hold NaN or infinity; set bad ones to 0")
+            raise InputError("measurements must not hold NaN or infinity; set bad ones to 0")
         object.__setattr__(self, "measurements", np.ascontiguousarray(measurements))
         object.__setattr__(self, "wall", wall)
 

@@ -42,7 +42,7 @@ MAX_VOXELS_PER_SIDE = 256
 """A default voxel is not so small that more would fit along the longest side of the wall."""
 
 BINS_PER_WAVELENGTH = 16
-"""Time bins are put together while a wavelength keeps so many: 0.6 % of the carrier is lost."""
+"""Time bins are put together while a wavelength keeps this number: 0.6 % of the carrier is lost."""
 
 SIGMAS_PER_WAVELENGTH = 4
 """The Laplacian of filtered back-projection is a quarter of a wavelength wide."""
@@ -67,7 +67,7 @@ MAX_ALIASED_FRACTION = 0.2
 """Of a pulse's signal, what may be of waves finer than the wall samples."""
 
 MAX_LASER_WALL_WIDTHS = 5.0
-"""A laser spot farther from the wall than so many of its widths is a mistake."""
+"""A laser spot farther from the wall than this number of its widths is a mistake."""
 
 MAX_START_M = 1e3
 """A record that begins after a longer path, m, still holds the ways to the devices."""

@@ -168,7 +168,7 @@ def test_without_a_graphics_processor():
 
 @pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:one", "torch", "", "numpy:cpu"])
 def test_names_that_are_no_device(name):
-    with pytest.raises(InputError, match="is no device"):
+    with pytest.raises(InputError, match="is not a device"):
         parse_device(name)
 
 

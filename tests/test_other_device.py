@@ -74,7 +74,7 @@ def projection() -> LineProjection:
 
 
 def measured(frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Readings of a bright square with noise, and which of them are good."""
+    """Measurements of a bright square with noise, and which of them are good."""
     random = np.random.default_rng(5)
     picture = np.zeros((16, 15, 1))
     picture[4:11, 5:10] = 100
@@ -126,7 +126,7 @@ def test_operators(operator: LinearOperator, fetched: list[int]) -> None:
     ],
 )
 def test_recovery(method: Method, fetches: int, fetched: list[int]) -> None:
-    """The objective's history is fetched at the end, and which readings are dead before the inverse
+    """The objective's history is fetched at the end, and which measurements are dead before the inverse
     is prepared.
     """
     measurements, valid = measured(4)

@@ -33,7 +33,7 @@ _NAMESPACES: dict[type, Any] = {}
 
 
 def is_numpy(array: Array) -> bool:
-    """Say whether `array` is NumPy's, or something that NumPy makes an array of, such as a list of
+    """Return whether `array` is NumPy's, or something that NumPy makes an array of, such as a list of
     numbers.
     """
     return isinstance(array, np.ndarray | np.generic) or not hasattr(array, "__dlpack__")
@@ -85,7 +85,7 @@ def to_numpy(array: Array) -> NDArray[Any]:
 
 
 def is_complex(array: Array) -> bool:
-    """Say whether `array` is of a complex type."""
+    """Return whether `array` is of a complex type."""
     if is_numpy(array):
         return bool(array.dtype.kind == "c")
     return bool(namespace(array).isdtype(array.dtype, "complex floating"))
@@ -298,7 +298,7 @@ def parse_device(name: str) -> ComputeDevice:
         )
     if kind == "torch" and which:
         return _find_torch_device(which)
-    raise InputError(f"'{name}' is no device; use cpu, cuda, cuda:1, auto or torch:DEVICE")
+    raise InputError(f"'{name}' is not a device; use cpu, cuda, cuda:1, auto or torch:DEVICE")
 
 
 def _library_name(array: Array) -> str:

@@ -215,7 +215,7 @@ class StreakStack:
 
     @staticmethod
     def is_one(path: str | Path) -> bool:
-        """Say whether an HDF5 file holds a stack: dataset ``counts`` with one axis more than a
+        """Return whether an HDF5 file holds a stack: dataset ``counts`` with one axis more than a
         streak image.
         """
         import h5py

@@ -64,7 +64,7 @@ FLOOR_TEXT = "the products of its iterations alone"
 CASES = (
     Case(
         "clip-1d",
-        "CLIP-1D, half as many readings as pixels",
+        "CLIP-1D, half as many measurements as pixels",
         "pixels a side",
         SIDES_PX,
         "pictures",
@@ -73,7 +73,7 @@ CASES = (
     ),
     Case(
         "clip-0d",
-        "CLIP-0D, half as many readings as pixels",
+        "CLIP-0D, half as many measurements as pixels",
         "pixels a side",
         SIDES_PX,
         "pictures",
@@ -82,7 +82,7 @@ CASES = (
     ),
     Case(
         "clip-2d",
-        "CLIP-2D (diffuser), half as many readings as pixels; the peer takes as many iterations of one view",
+        "CLIP-2D (diffuser), half as many measurements as pixels; the peer takes as many iterations of one view",
         "pixels a side",
         SIDES_PX,
         "pictures",

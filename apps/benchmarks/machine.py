@@ -50,7 +50,7 @@ def read_memory_gib() -> float | None:
 
 def read_load() -> float | None:
     """Return how many other processes wanted a core, on average over the last minute; None where it
-    is not told.
+    is not reported.
     """
     try:
         return round(os.getloadavg()[0], 1)

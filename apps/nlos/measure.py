@@ -34,7 +34,7 @@ class MeasuredVolume:
         Wall-clock time of the imaging, without compiling.
     peak_bytes : int or None
         Most memory that the program took at a time beyond what it had before; None where the system
-        does not tell.
+        does not show.
     """
 
     volume: Volume
@@ -110,7 +110,7 @@ def measure_sharpness(volume: Volume) -> float:
 
     ``pixels * sum(I^2) / sum(I)^2``: the first sharpness of R. A. Muller and A. Buffington, J. Opt.
     Soc. Am. 64, 1200 (1974), made free of scale. It compares images of one scene on one grid; it
-    does not tell right from wrong.
+    does not separate right from wrong.
     """
     front = volume.maximum_projection().brightness.astype(np.float64)
     total = float(front.sum())

@@ -100,7 +100,7 @@ def simulate_scene(settings: SceneSettings) -> tuple[Capture, HiddenTruth]:
     if settings.scan not in SCANS:
         raise InputError(f"no scan is called '{settings.scan}'; choose {' or '.join(SCANS)}")
     if settings.background and settings.peak_counts is None:
-        raise InputError("a background goes with photon noise: tell the peak counts as well")
+        raise InputError("a background goes with photon noise: give the peak counts as well")
     scene, truth = build_hidden_scene(settings)
     wall = build_relay_wall(settings.wall, settings.wall_points, settings.wall_width_m)
     laser = wall if settings.scan == "confocal" else find_nearest_wall_point(wall, settings.laser_m)

@@ -63,7 +63,7 @@ class Library:
         return render_view(remove_occluder(make_scene(name, self.array)), self.array, (0.0, 0.0))
 
     def has_recording(self, name: str) -> bool:
-        """Tell whether the folder of recorded data holds a file."""
+        """Return whether the folder of recorded data holds a file."""
         return self.data is not None and (self.data / name).is_file()
 
     def recording(self, name: str) -> Path:

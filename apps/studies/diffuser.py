@@ -102,10 +102,14 @@ class DiffuserRecording:
     def __post_init__(self) -> None:
         if self.point_spread.ndim != 2 or self.measurements.shape != self.point_spread.shape:
             raise ShapeError(
-                "the readings", f"{self.point_spread.shape} like the PSF", self.measurements.shape
+                "the measurements",
+                f"{self.point_spread.shape} like the PSF",
+                self.measurements.shape,
             )
         if not (np.all(np.isfinite(self.measurements)) and self.measurements.max() > 0):
-            raise InputError("the readings must be finite and show something; check the background")
+            raise InputError(
+                "the measurements must be finite and show something; check the background"
+            )
 
 
 @dataclass(frozen=True)
@@ -249,7 +253,7 @@ HAND_STUDY = Study(
     (),
     "A hand behind the diffuser of DiffuserCam, recorded",
     "The paper shows its slanted target, of which no recording is at hand; this is another one from the same camera. "
-    "Nobody knows the true scene, so the figure is what the picture leaves unexplained of the readings.",
+    "The true scene is not known, so the figure is what the picture leaves unexplained of the measurements.",
     10,
     len(PITCHES_PX),
     run_lensless_hand,

@@ -15,6 +15,7 @@ from apps.studies.cases import BORDER_PX, CAMERA_NAMES, Case, Library, solve_cas
 from apps.studies.outcome import Advance, Outcome, Panel, Row, Study
 from tofclip.metrics import nmse
 from tofclip.occlusion import InactiveRegion
+from tofclip.occlusion.recovery import SeparatedImages
 from tofclip.threads import map_parallel
 from tofclip.units import MILLIMETRE
 
@@ -119,15 +120,15 @@ def run_flash_occlusion(library: Library, seeds: int, advance: Advance) -> Outco
         for ratio in FLASH_RATIOS
     ]
 
-    def seen(case: tuple[str, str, float]) -> list[Experiment]:
+    def seen(case: tuple[str, str, float]) -> list[tuple[Experiment, SeparatedImages]]:
         scene, encoder, ratio = case
         done = []
         for seed in range(seeds):
             settings = ExperimentSettings(
                 side, encoder, ratio, photons=DEFAULT_PHOTONS[encoder], seed=seed
             )
-            done.append(Experiment(make_occlusion_scene(scene), settings))
-            _ = done[-1].separated
+            experiment = Experiment(make_occlusion_scene(scene), settings)
+            done.append((experiment, experiment.separated))
             advance(1)
         return done
 
@@ -136,18 +137,21 @@ def run_flash_occlusion(library: Library, seeds: int, advance: Advance) -> Outco
     for (scene, encoder, ratio), found in zip(cases, map_parallel(seen, cases), strict=True):
         paper = PAPER_NMSE_PERCENT[encoder][FLASH_SCENES.index(scene)][FLASH_RATIOS.index(ratio)]
         target, plain = (
-            tuple(100 * nmse(getattr(one.separated, name), one.truth) for one in found)
+            tuple(
+                100 * nmse(getattr(images, name), experiment.truth) for experiment, images in found
+            )
             for name in ("target", "plain")
         )
-        labels = (CAMERA_NAMES[encoder], found[0].scene.title, f"{ratio:g}")
+        first, images = found[0]
+        labels = (CAMERA_NAMES[encoder], first.scene.title, f"{ratio:g}")
         rows += [Row((*labels, "what it hides"), target, paper), Row((*labels, "nothing"), plain)]
         if not panels[scene]:
             panels[scene] += [
-                Panel("one view", found[0].pictures[3].sum(axis=-1)),
-                Panel("truth", found[0].truth),
+                Panel("one view", first.pictures[3].sum(axis=-1)),
+                Panel("truth", first.truth),
             ]
         panels[scene].append(
-            Panel(f"{labels[0]}, SR = {labels[2]}\n{target[0]:.1f} %", found[0].separated.target)
+            Panel(f"{labels[0]}, SR = {labels[2]}\n{target[0]:.1f} %", images.target)
         )
     columns = ("camera", "scene", "SR", "the model knows of the occluder")
     return Outcome(
@@ -235,7 +239,7 @@ def run_inactive_region(library: Library, seeds: int, advance: Advance) -> Outco
                 )
             )
             pictures += (
-                [Panel("without occluder", found[0].truth)]
+                [Panel("without occluder", first.truth)]
                 if place.factor == DISTANCE_FACTORS[-1]
                 else []
             )
@@ -252,7 +256,8 @@ REGION_STUDY = Study(
     "Seven views in a row of 15 mm, a lamp beside each; cast rays, time gate, photon noise. A target is a letter 0.15 "
     "of the occluder's width wide: inside, at 0.8 of the region's length l, all of it is hidden from all views; from "
     "1.2 on the outermost views see all of it. Recovered means a correlation of at least 0.8; 0: no view got "
-    "significant light. Exposures give the brightest reading of the target alone 2000 photons, over 20 of background; "
+    "significant light. Exposures give the brightest measurement of the target alone 2000 photons, over 20 of "
+    "background; "
     "the prior's weight is fixed.",
     45,
     len(WIDTHS_MM) * len(DISTANCES_MM) * len(DISTANCE_FACTORS),

@@ -136,7 +136,7 @@ def run_invalid_measurements(library: Library, seeds: int, advance: Advance) -> 
         for share, percent in figures.items()
     ]
     return _make_outcome(
-        ("camera", "scene", "bad readings", "data term"),
+        ("camera", "scene", "bad measurements", "data term"),
         solve_cases(cases, library, seeds, advance),
     )
 
@@ -193,7 +193,7 @@ CORRUPTION_STUDIES = (
     Study(
         "table5",
         ("fig12",),
-        "Bad readings at SR = 1",
+        "Bad measurements at SR = 1",
         "The paper does not say its data term; its figures stand beside squares, Huber's is ours. Scenes are our own.",
         50,
         2 * sum(map(len, TABLE5_PERCENT.values())),
@@ -267,7 +267,7 @@ def run_angle_assignment(library: Library, seeds: int, advance: Advance) -> Outc
 ASSIGNMENT_STUDY = Study(
     "dealing",
     (),
-    "Angles dealt to views at random, and evenly over the aperture",
+    "Angles assigned to views at random, and evenly over the aperture",
     "Beyond the paper, which deals at random.",
     25,
     2 * len(ASSIGNMENT_SCENES) * len(ASSIGNMENT_RATIOS),

@@ -59,7 +59,7 @@ def simulate(
     ],
     out: Annotated[Path, typer.Option(metavar="H5", help="The measurements to write.")],
     sampling_ratio: Annotated[
-        float, typer.Option(metavar="SR", help="Readings over pixels of one picture.")
+        float, typer.Option(metavar="SR", help="Measurements over pixels of one picture.")
     ] = 0.5,
     seed: Annotated[
         int,
@@ -68,7 +68,7 @@ def simulate(
         ),
     ] = 0,
     bad_fraction: Annotated[
-        float, typer.Option(metavar="SHARE", help="Readings set to 0 or to the largest.")
+        float, typer.Option(metavar="SHARE", help="Measurements set to 0 or to the largest.")
     ] = 0.0,
     photons: Annotated[
         float | None,
@@ -105,7 +105,7 @@ def simulate(
 @app.command()
 def recover(
     measurement: Annotated[
-        Path, typer.Argument(metavar="H5", help="Readings made by clip simulate.")
+        Path, typer.Argument(metavar="H5", help="Measurements made by clip simulate.")
     ],
     shear: Annotated[
         float, typer.Option(metavar="S", help="Depth to focus on, pixels per view step.")

@@ -152,7 +152,7 @@ def scene(
         float, typer.Option(metavar="MM", help="Points this close belong together.")
     ] = 40.0,
     fewest_points: Annotated[
-        int, typer.Option(metavar="N", help="Smaller groups are no objects.")
+        int, typer.Option(metavar="N", help="Smaller groups are not objects.")
     ] = 40,
     as_json: JsonOption = False,
 ) -> None:

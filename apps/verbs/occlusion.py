@@ -22,6 +22,7 @@ from apps.report import report
 from tofclip.errors import InputError
 from tofclip.metrics import correlation_coefficient, nmse
 from tofclip.occlusion import InactiveRegion
+from tofclip.occlusion.recovery import SeparatedImages
 from tofclip.units import MILLIMETRE
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def region(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Tell how far behind a solid occluder nothing can be seen by any view.
+    """Report how far behind a solid occluder nothing can be seen by any view.
 
     An occluder as wide as the views are apart, or wider, hides what lies behind its middle at every
     distance: nothing is promised then, and inactive_length_m is null.
@@ -98,7 +99,7 @@ def demo(
     ] = "diodes",
     encoder: Annotated[str, typer.Option(metavar="NAME", help="line or single-pixel.")] = "line",
     sampling_ratio: Annotated[
-        float, typer.Option(metavar="SR", help="Readings over pixels of one picture.")
+        float, typer.Option(metavar="SR", help="Measurements over pixels of one picture.")
     ] = 0.5,
     side_px: Annotated[
         int, typer.Option(metavar="N", help="Rows and columns of the picture.")
@@ -135,9 +136,10 @@ def demo(
     usual = DEFAULT_PHOTONS[encoder] if photons is None else photons
     settings = ExperimentSettings(side_px, encoder, sampling_ratio, illumination, usual, seed)
     experiment = Experiment(make_occlusion_scene(scene), settings)
-    experiment.rig.camera  # noqa: B018 - refuses what no camera can be built from, before anything is written
+    # Before anything is written: this refuses settings of which no camera can be built.
+    measurement_count = experiment.rig.camera.measurements
     make_folder(out)
-    probes = _run_experiment(experiment)
+    separated, probes = _run_experiment(experiment)
     written = [out / "occlusion.png", out / "occlusion.gif"]
     save_figure(make_occlusion_figure(experiment, probes), written[0])
     save_flash_film(experiment, written[1])
@@ -146,55 +148,57 @@ def demo(
         with show_progress("walking", WALK_STEPS) as advance:
             save_walk_film(experiment, written[2], advance)
     report(
-        {**_collect_metrics(experiment, probes), "seconds": time.perf_counter() - started},
+        {
+            **_collect_metrics(experiment, separated, probes),
+            "readings": measurement_count,
+            "seconds": time.perf_counter() - started,
+        },
         as_json,
         written,
     )
 
 
-def _run_experiment(experiment: Experiment) -> list[ProbeResult]:
+def _run_experiment(experiment: Experiment) -> tuple[SeparatedImages, list[ProbeResult]]:
     """Cast the rays, recover, and try small targets inside the inactive region and beyond, if it
     ends.
     """
     scene, probes = experiment.scene, []
     # Without a bound there is no distance beyond the region to try.
     factors = DISTANCE_FACTORS if scene.region.is_bounded else ()
-    with show_progress("looking past", 2 + len(factors)) as advance:
-        experiment.measurements  # noqa: B018 - computed once and kept; the bar shows the time it takes
-        advance(1)
-        experiment.separated  # noqa: B018 - likewise
+    with show_progress("looking past", 1 + len(factors)) as advance:
+        separated = experiment.separated
         advance(1)
         for factor in factors:
             probes.append(
                 probe_target(scene.occluder, scene.region, factor, experiment.settings.seed)
             )
             advance(1)
-    return probes
+    return separated, probes
 
 
-def _collect_metrics(experiment: Experiment, probes: Sequence[ProbeResult]) -> dict[str, Any]:
+def _collect_metrics(
+    experiment: Experiment, separated: SeparatedImages, probes: Sequence[ProbeResult]
+) -> dict[str, Any]:
     """What is said about a run; correlations are with the target as seen with its occluder taken
     away.
     """
     scene, truth = experiment.scene, experiment.truth
     own = (
         scene.distance,
-        correlation_coefficient(experiment.separated.target, truth),
+        correlation_coefficient(separated.target, truth),
         experiment.expected_visible,
     )
     targets = [own, *((one.distance, one.correlation, one.expected_visible) for one in probes)]
     names = ("distance_m", "correlation", "expected_visible")
-    found = experiment.separated
     return {
         "scene": scene.name,
         "inactive_length_m": scene.region.length,
         "targets": [dict(zip(names, one, strict=True)) for one in sorted(targets)],
-        "nmse": nmse(found.target, truth),
+        "nmse": nmse(separated.target, truth),
         "correlation": own[1],
-        "correlation_without_model_of_occluder": correlation_coefficient(found.plain, truth),
+        "correlation_without_model_of_occluder": correlation_coefficient(separated.plain, truth),
         "correlation_single_view": correlation_coefficient(
             experiment.single_view, experiment.single_view_truth
         ),
         "correlation_light_field_camera": correlation_coefficient(experiment.conventional, truth),
-        "readings": experiment.rig.camera.measurements,
     }

@@ -126,7 +126,7 @@ def recover(
         _recover_sequence(recovery, (streak, width), out, sweep or [], (cluster, used, as_json))
         return
     _check_single_options(streak, cluster, sweep)
-    # An instrument's address is no file that an output could replace.
+    # An instrument's address is not a file that an output could replace.
     inputs = tuple(Path(name) for name in (streak, camera) if name and not _is_address(name))
     preview = preview or out.with_suffix(".png")
     _require_writable_results(inputs, out, preview, cloud)

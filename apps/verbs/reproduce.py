@@ -103,7 +103,7 @@ def _require_folder(data: Path | None) -> None:
 
 
 def _is_possible(study: Study, library: Library) -> bool:
-    """Tell whether the recording that a study needs is there; say what is left out."""
+    """Return whether the recording that a study needs is there; say what is left out."""
     if study.recording is None or library.has_recording(study.recording):
         return True
     print(

@@ -63,7 +63,9 @@ def stream(
     shots: Annotated[
         int | None,
         typer.Option(
-            metavar="N", help="Stop after so many clouds.", show_default="at the source's end"
+            metavar="N",
+            help="Stop after this number of clouds.",
+            show_default="at the source's end",
         ),
     ] = None,
     held: Annotated[int, typer.Option(metavar="N", help="Shots that may wait for their turn.")] = 1,
@@ -77,10 +79,10 @@ def stream(
     suffix: Annotated[str, typer.Option(metavar=".EXT", help="Format of the clouds.")] = ".ply",
     as_json: JsonOption = False,
 ) -> None:
-    """Make a cloud of each shot by the linear inverse while the next ones come, and tell rate and
+    """Make a cloud of each shot by the linear inverse while the next ones come, and report rate and
     latencies.
 
-    Photons become a shot for every so many of them, pictures one by one: see records= and frames=
+    Photons become a shot in batches, pictures one by one: see records= and frames=
     of an address. Of an instrument the newest shot is taken. acquired = delivered + dropped_device
     + dropped_host counts every shot that it took, and clouds bear its numbers. latency_median_s is
     the time from the instrument's own stamp until the cloud is there (latency_from says so;

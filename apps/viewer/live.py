@@ -151,7 +151,7 @@ class LiveShotSource(ShotSource):
                     self._latency = made.latency if age is None else age
                     self._lost = self._shots.count_dropped(stamp, self._count)
         except Exception as fault:
-            # Whatever ends it is shown on the page: an exception on this thread would reach nobody.
+            # Whatever ends it is shown on the page: an exception on this thread would be lost.
             self._failure_text = format_error_line(fault)
         finally:
             self._lost = self._shots.count_shots(self._count).dropped

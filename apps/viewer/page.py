@@ -37,7 +37,7 @@ SCENE_ASPECT = 0.9
 PANEL_PX, PICTURES_PANEL_PX = 352, 240
 
 MAX_MOVING_POINTS = 200_000
-"""Points of a larger cloud are thinned to about as many while somebody turns it."""
+"""Points of a larger cloud are thinned to about as many while it is turned."""
 
 STILL_AFTER_S = 0.25
 """s after the last movement of a camera at which all points are drawn again."""
@@ -153,7 +153,7 @@ class Page:
         )
 
     def _welcome(self, client: Any) -> None:
-        """Frame the scene for the window of a browser that has just come, as long as nobody moves."""
+        """Frame the scene for the window of a browser that has just come, until the first move."""
         framed: list[Viewpoint] = []
 
         def follow_window(camera: Any) -> None:
@@ -227,7 +227,7 @@ class Page:
         self._draw_thinned(points, colours)
 
     def _draw_thinned(self, points: NDArray[np.float32], colours: Any) -> None:
-        """Keep a part of a large cloud ready, to be drawn instead of it while somebody turns it."""
+        """Keep a part of a large cloud ready, to be drawn instead of it while it is turned."""
         scene, thinned = self.server.scene, self._thinned
         self._thinned = None
         if len(points) <= MAX_MOVING_POINTS:
@@ -244,7 +244,7 @@ class Page:
         self._thinned.visible = False
 
     def _choose_detail(self, now: float) -> None:
-        """Draw a large cloud thinned while somebody turns it."""
+        """Draw a large cloud thinned while it is turned."""
         if self._thinned is None:
             return
         moving = now - self._moved_at < STILL_AFTER_S

@@ -59,7 +59,7 @@ class Status:
     frame_name : str
         What a frame is: frame, slice, shot or cloud.
     depth_text : str
-        Where a slice lies; empty where frames are no slices.
+        Where a slice lies; empty where frames are not slices.
     notes : tuple of str
         What has to be known about the picture, such as that its ranges have no time zero.
     """

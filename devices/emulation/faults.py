@@ -70,7 +70,7 @@ class Fault:
         known = next((known for known in FAULT_KINDS if known == kind), None)
         if known is None or not transfer.isdecimal() or not (amount or "1").isdecimal():
             raise InputError(
-                f"'{word}' is no fault; write KIND@TRANSFER:AMOUNT with one of {', '.join(FAULT_KINDS)}"
+                f"'{word}' is not a fault; write KIND@TRANSFER:AMOUNT with one of {', '.join(FAULT_KINDS)}"
             )
         return cls(int(transfer), known, int(amount or 1))
 

@@ -20,7 +20,7 @@ PIXEL_MASKS = np.array([2, 4, 8], np.uint32)
 PERIOD_TICKS = 1 << 7
 PULSES_PER_BLOCK = 1 << 13
 SCENE_SCALE = 64
-"""The scene is so many times as large as a table-top one, and its light takes so many times as long: the counter's
+"""The scene is this many times as large as a table-top one, and its light takes as many times as long: the counter's
 ticks are 1.2 m of range."""
 
 BLOCK_TICKS = (

@@ -416,7 +416,7 @@ class EmulatedTimeTagger(VirtualDevice):
         if self._mark_lost:
             words[0] |= LOST << 5
             self._mark_lost = False
-        # Bits that have to be zero are set, by which a decoder can tell.
+        # Bits that have to be zero are set, by which a decoder can recognise them.
         garbled = min(self._records_to_corrupt, len(words) // RECORD_BYTES)
         words[: garbled * RECORD_BYTES] |= UNUSED_BITS
         self.truth.corrupted += garbled

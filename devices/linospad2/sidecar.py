@@ -108,7 +108,7 @@ def _parse_toml(path: Path, recording: str | Path) -> dict[str, Any]:
     try:
         return tomllib.loads(data.decode())
     except ValueError as fault:
-        raise FileFormatError(path, f"is no TOML ({fault})") from fault
+        raise FileFormatError(path, f"is not TOML ({fault})") from fault
 
 
 def _check_keys(found: dict[str, Any], path: Path) -> dict[str, Any]:

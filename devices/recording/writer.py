@@ -129,7 +129,7 @@ class RecordingWriter:
         Raises
         ------
         StorageError
-            It was removed or replaced, so that nobody will find what is being written.
+            It was removed or replaced, so that what is being written would not be found.
         """
         if monotonic() < self._checked_at + CHECK_INTERVAL_S:
             return

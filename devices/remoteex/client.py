@@ -27,7 +27,7 @@ from tofclip.errors import DeviceDisconnectedError, DeviceError, DeviceTimeoutEr
 MAX_TABLE_BYTES = 1 << 20
 _COMMANDS_WITH_DATA = ("ImgRingBufferGet", "ImgDataGet")
 MAX_MESSAGES = 4096
-"""Messages that are kept until somebody asks for them; the oldest go first."""
+"""Messages that are kept until they are asked for; the oldest go first."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class RemoteExClient:
     DeviceNotFoundError
         Nothing answers there.
     ProtocolError
-        Somebody else answers there.
+        Another program answers there.
     """
 
     def __init__(self, host: str, port: int, data_port: int, timeout: float = 5.0) -> None:
@@ -199,7 +199,7 @@ class RemoteExClient:
             return self._messages.popleft()
         answer = self._receive(timeout)
         if not answer.is_message:
-            raise ProtocolError(f"RemoteEx answered {answer.name}, which nobody asked")
+            raise ProtocolError(f"RemoteEx answered {answer.name}, unasked")
         return answer
 
     def read_frame(self, number: int) -> CameraFrame:
@@ -276,7 +276,7 @@ class RemoteExClient:
                     f"RemoteEx did not answer {self._owed[0]} for {self._timeout:g} s; it is not asked again"
                 ) from fault
             except ProtocolError:
-                self._owed.popleft()  # it was an answer, if one that nobody understands
+                self._owed.popleft()  # it was an answer, if one that cannot be understood
                 raise
             if not answer.is_message:
                 self._owed.popleft()

@@ -91,7 +91,7 @@ class Circumstances:
     stray_bytes : int
         That wait on the data port, right behind the greeting.
     restart_at : int or None
-        Number of the picture after which live mode is started anew, by somebody at the computer.
+        Number of the picture after which live mode is started anew, at the computer itself.
     """
 
     is_application_up: bool = True

@@ -100,7 +100,7 @@ class Command:
         text = _decode_text(message)
         found = _COMMAND.fullmatch(text)
         if found is None:
-            raise ProtocolError(f"{text[:80]!r} is no command Name(argument,...)")
+            raise ProtocolError(f"{text[:80]!r} is not a command Name(argument,...)")
         return cls(found[1], tuple(found[2].split(",")) if found[2] else ())
 
     def __str__(self) -> str:
@@ -164,7 +164,7 @@ class Answer:
             and int(code) in list(AnswerCode)
             and name
         ):
-            raise ProtocolError(f"{text[:80]!r} is no answer of RemoteEx")
+            raise ProtocolError(f"{text[:80]!r} is not an answer of RemoteEx")
         return cls(AnswerCode(int(code)), name, tuple(arguments))
 
     def require_done(self, command: Command) -> tuple[str, ...]:
@@ -214,7 +214,7 @@ def parse_integer(text: str, what: str) -> int:
 
 def _require_valid(name: str, arguments: tuple[str, ...]) -> None:
     if not _NAME.fullmatch(name):
-        raise InputError(f"'{name}' is no name of a RemoteEx command")
+        raise InputError(f"'{name}' is not the name of a RemoteEx command")
     for argument in arguments:
         if not _ARGUMENT.fullmatch(argument):
             raise InputError(f"RemoteEx cannot carry the argument {argument!r}")

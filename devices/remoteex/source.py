@@ -183,7 +183,7 @@ class RemoteExFeed:
     def stop(self) -> None:
         """Turn the gain down first, whatever the state of the connection, and stop the acquisition.
 
-        Live mode that somebody else had started goes on, with the gain that it had.
+        Live mode that another program had started goes on, with the gain that it had.
         """
         self._stopped = True
         # Live mode of an operator goes on with the operator's gain; otherwise 0 protects the tube.
@@ -242,7 +242,7 @@ class RemoteExFeed:
         self._newest = max(announced.number, self._first.number)
 
     def _prepare_live(self, link: RemoteExClient) -> None:
-        """Set what has to be set before live mode, and ask to be told of every picture."""
+        """Set what has to be set before live mode, and ask to be notified of every picture."""
         settings = self._settings
         if settings.gain is not None:
             with contextlib.suppress(ProtocolError):

@@ -157,7 +157,7 @@ class ExposureRequest:
         """
         found = _INTENSITY.fullmatch(line) or _GATED.fullmatch(line)
         if found is None:
-            raise ProtocolError(f"{line[:60]!r} is no request for pictures")
+            raise ProtocolError(f"{line[:60]!r} is not a request for pictures")
         said = found.groupdict()
         bits, images = int(said["bits"]), int(said["images"])
         unit = 1e-6 if bits in _MICROSECOND_DEPTHS else 1e-3

@@ -228,7 +228,7 @@ class Spad512Feed:
         self._gap = Gap.RESTART
 
     def _count_truncated(self) -> None:
-        """Enter a picture of which only a part came; of those that never began nobody knows whether
+        """Enter a picture of which only a part came; of those that never began it is not known whether
         they were taken.
         """
         if self._received:

@@ -127,7 +127,7 @@ def _read_file(path: str | Path) -> Capture:
     if start == HDF5_SIGNATURE:
         return read_native(path) or _read_fields(read_hdf5(path), HDF5_FORMATS)
     raise FileFormatError(
-        path, "is no capture of a known format (HDF5, .npz, .mat, or a folder of EXR files)"
+        path, "is not a capture of a known format (HDF5, .npz, .mat, or a folder of EXR files)"
     )
 
 

@@ -92,7 +92,7 @@ def _read_geometry(path: Path) -> Mapping[str, Any]:
     try:
         geometry = tomllib.loads(path.read_text())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as fault:
-        raise FileFormatError(path, f"is no TOML ({format_error_line(fault)})") from fault
+        raise FileFormatError(path, f"is not TOML ({format_error_line(fault)})") from fault
     if set(geometry) != GEOMETRY_KEYS:
         wrong = ", ".join(sorted(set(geometry) ^ GEOMETRY_KEYS))
         raise FileFormatError(

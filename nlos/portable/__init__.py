@@ -1,4 +1,4 @@
-"""Imaging on the arrays of other libraries and devices: whatever follows the array API standard.
+"""Imaging on the arrays of other libraries and devices: anything that follows the array API standard.
 
 A capture whose signal is an array of PyTorch, CuPy or another such library is imaged by that
 library, where the signal lives, and gives a volume there. What is planned on small arrays (bands,

@@ -123,7 +123,7 @@ class Surface:
                 vertices, faces = np.asarray(mesh.points), np.asarray(mesh.regular_faces)
             except Exception as fault:  # whatever the decoder stumbles over, the file is not a mesh
                 raise FileFormatError(
-                    path, f"is no triangle mesh ({format_error_line(fault)})"
+                    path, f"is not a triangle mesh ({format_error_line(fault)})"
                 ) from fault
         if not len(faces):
             raise FileFormatError(path, "holds no triangles")

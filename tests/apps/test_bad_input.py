@@ -46,7 +46,7 @@ STREAKS: dict[str, tuple[Maker, str]] = {
     "empty": (lambda files, new: of_bytes(new / "bad.tif", b""), "is empty"),
     "another format": (
         lambda files, new: of_bytes(new / "bad.tif", b"a letter to a friend"),
-        "is no TIFF",
+        "is not a TIFF",
     ),
     "another record": (lambda files, new: files / "camera.h5", "holds a camera record"),
     "all zero": (

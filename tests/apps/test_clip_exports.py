@@ -19,7 +19,7 @@ SHAPE = (24, 32)
 
 @pytest.fixture
 def measurements(run: Run, tmp_path: Path) -> Path:
-    """Readings of a slope without parallax: bright at the upper left, so that no turn or mirror
+    """Measurements of a slope without parallax: bright at the upper left, so that no turn or mirror
     goes unseen.
     """
     row, column = np.indices(SHAPE)

@@ -12,7 +12,7 @@ from apps.cli import main
 
 @pytest.mark.parametrize(("encoder", "worst"), [("line", 0.085), ("single-pixel", 0.043)])
 def test_letters_are_recovered(encoder, worst, shared_data, tmp_path, capsys):
-    """The bounds are the project's acceptance at half as many readings as pixels."""
+    """The bounds are the project's acceptance at half as many measurements as pixels."""
     scene = str(shared_data / "lightfields" / "render_letters.npz")
     measurements, picture = str(tmp_path / "meas.h5"), str(tmp_path / "image.exr")
     simulate = [
@@ -65,7 +65,7 @@ def test_another_file_than_a_measurement_is_refused(tmp_path, capsys):
 
 
 def simulated(shared_data, folder) -> list[str]:
-    """Write readings of the letters; return the beginning of a command that recovers them."""
+    """Write measurements of the letters; return the beginning of a command that recovers them."""
     scene, measurements = (
         str(shared_data / "lightfields" / "render_letters.npz"),
         str(folder / "meas.h5"),

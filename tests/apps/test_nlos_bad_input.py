@@ -50,7 +50,7 @@ def test_imaging_that_makes_no_sense(
         (["--wall", "cave"], "no wall is called 'cave'"),
         (["--scan", "spiral"], "no scan is called 'spiral'"),
         (["--material", "velvet"], "no material is called 'velvet'"),
-        (["--background", "1"], "tell the peak counts as well"),
+        (["--background", "1"], "give the peak counts as well"),
         (["--bin-width-ps", "0"], "bin width must be a positive number"),
         (["--jitter-ps", "0"], "jitter must be a positive number"),
         (["--facet-mm", "0"], "facets need a positive size"),
@@ -83,7 +83,7 @@ def test_names_that_cannot_be_written(run: Run, curved: Path, tmp_path: Path) ->
         "fk does not suit this capture",
     )
     refused(run(*compare, "--out", tmp_path / "c.png", "--methods", "hybrid,hybrid"), "named twice")
-    refused(run("nlos", "info", tmp_path / "mine.toml"), "is no capture of a known format")
+    refused(run("nlos", "info", tmp_path / "mine.toml"), "is not a capture of a known format")
     (tmp_path / "captures").mkdir()
     folder = ["nlos", "reconstruct", tmp_path / "captures"]
     refused(run(*folder, "--out", tmp_path / "captures"), "choose another one for the results")

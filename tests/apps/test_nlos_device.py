@@ -63,7 +63,7 @@ def test_what_has_compiled_loops_only_says_so(run: Run, confocal: Path, tmp_path
     [
         pytest.param("cuda", "no CUDA device 0 was found", marks=WITHOUT_A_GRAPHICS_PROCESSOR),
         pytest.param("cuda:3", "no CUDA device 3 was found", marks=WITHOUT_A_GRAPHICS_PROCESSOR),
-        ("abacus", "'abacus' is no device"),
+        ("abacus", "'abacus' is not a device"),
         ("torch:abacus", "PyTorch finds no device 'abacus'"),
     ],
 )

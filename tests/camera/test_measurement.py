@@ -93,7 +93,7 @@ def test_dead_columns_are_masked():
 def test_what_cannot_be_measured_is_refused():
     with pytest.raises(CalibrationError, match="61 columns but the camera's slit has 64"):
         measure(streak(), None, camera(slit_width_px=64))
-    with pytest.raises(InputError, match="no reading can be trusted"):
+    with pytest.raises(InputError, match="no measurement can be trusted"):
         measure(streak(), np.ones((ROWS, WIDTH), bool), camera())
     with pytest.raises(InputError, match="dark level"):
         measure(np.full((ROWS, WIDTH), 7, np.float32), None, camera())

@@ -135,7 +135,7 @@ def test_displacement_is_the_part_of_parallax_that_moves_the_picture():
 def test_shears_that_do_not_change_with_distance_are_refused(noise):
     distances = np.linspace(1.0, 4.0, 12)
     shears = 0.3 + noise * np.random.default_rng(1).standard_normal(12)
-    with pytest.raises(CalibrationError, match="do not tell a parallax"):
+    with pytest.raises(CalibrationError, match="do not determine a parallax"):
         fit_parallax_to_shears(shears, distances)
 
 

@@ -155,5 +155,5 @@ def test_scripts_are_drawn_from_their_seed_and_read_from_text() -> None:
     assert draw_fault_script(5, 30) == draw_fault_script(5, 30) != draw_fault_script(6, 30)
     assert Fault.parse("stall@3,unplug@10:2") == (Fault(3, "stall"), Fault(10, "unplug", 2))
     for text in ("boom@3", "stall", "stall@x", "stall@3:-1"):
-        with pytest.raises(InputError, match="is no fault"):
+        with pytest.raises(InputError, match="is not a fault"):
             Fault.parse(text)

@@ -134,7 +134,7 @@ def test_even_light_gives_even_bins_whatever_the_codes(board: BoardCalibration) 
 
 
 def test_a_pulse_comes_back_in_all_pixels_at_once(board: BoardCalibration) -> None:
-    """Pixels out of step by nanoseconds, and a laser whose period is no multiple of the clock's."""
+    """Pixels out of step by nanoseconds, and a laser whose period is not a multiple of the clock's."""
     random = np.random.default_rng(8)
     pixels = np.arange(256).repeat(300)
     pulse = 4.21e-9

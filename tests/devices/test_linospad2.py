@@ -292,8 +292,8 @@ def test_a_recording_without_a_sidecar_is_refused(recording: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("firmware = ", "is no TOML"),
-        ("\xff", "lacks the key|is no TOML"),
+        ("firmware = ", "is not TOML"),
+        ("\xff", "lacks the key|is not TOML"),
         ('firmware = "2212s"\n', "lacks the key 'timestamps_per_cycle'"),
         (NEEDED + "speed = 3\n", "unknown key 'speed'"),
         (NEEDED.replace("20", '"20"'), "timestamps_per_cycle must be a int"),

@@ -196,10 +196,10 @@ def test_sources_that_give_no_transient(canned: type[Canned]) -> None:
     with pytest.raises(InputError, match="ended before it gave anything"):
         read_transient("canned://")
     canned([Batch(np.zeros(3, [("temperature", "f4")]))])
-    with pytest.raises(InputError, match="records of temperature are no photons"):
+    with pytest.raises(InputError, match="records of temperature are not photons"):
         read_transient("canned://")
     canned([Batch(tags([(1, 1, 0)]))], Record("calibration", attributes={"tick_s": 1e-9}))
-    with pytest.raises(InputError, match="nobody knows the laser's period"):
+    with pytest.raises(InputError, match="the laser's period is not known"):
         read_transient("canned://")
 
 

@@ -129,7 +129,7 @@ def test_three_frames_are_enough_and_two_are_not(device):
 
 
 def test_from_readings_to_returns_without_leaving_the_device(device):
-    """A wall at one range in the readings of five views, recovered and ranged where the readings
+    """A wall at one range in the measurements of five views, recovered and ranged where the measurements
     are.
     """
     camera = Camera(

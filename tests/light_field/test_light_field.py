@@ -48,7 +48,7 @@ def test_another_reference_sees_the_card_where_that_view_does():
 @pytest.mark.parametrize("encoder", ["line", "single-pixel"])
 def test_the_model_predicts_the_readings_of_the_true_views(encoder):
     """A whole-pixel shear is exact for codes; for lines the shifted detector splits pixels where a shifted picture
-    does not, which on this scene of single pixels changes readings by up to a quarter."""
+    does not, which on this scene of single pixels changes measurements by up to a quarter."""
     camera = CameraSetup(encoder, 1.0, 3).camera(SHAPE, VIEWS)
     measurements = measure(light_field(), CameraSetup(encoder, 1.0, 3)).values
     predicted = camera.model(SHEAR)(scene())
@@ -60,7 +60,7 @@ def test_the_model_predicts_the_readings_of_the_true_views(encoder):
 
 @pytest.mark.parametrize("encoder", ["line", "single-pixel"])
 def test_a_card_is_recovered_sharply_at_its_own_depth_only(encoder):
-    """Trial seeds gave 1 to 6 % in focus; out of focus the wrong model cannot explain the readings."""
+    """Trial seeds gave 1 to 6 % in focus; out of focus the wrong model cannot explain the measurements."""
     measurement = measure(light_field(), CameraSetup(encoder, 0.8, 0))
 
     def error(shear: float) -> float:

@@ -73,7 +73,7 @@ def test_masked_wall_points_are_read_as_dark() -> None:
 def test_what_does_not_fit_is_refused() -> None:
     operator = build_tomography(24, 0.25)
     fitting = CompressedCapture.of(SCENE, operator)
-    with pytest.raises(ShapeError, match="readings"):
+    with pytest.raises(ShapeError, match="measurements"):
         CompressedCapture(fitting.measurements[:-1], operator, WALL, SCENE.laser, 1e-11)
     with pytest.raises(ShapeError, match="wall"):
         CompressedCapture(fitting.measurements, operator, WALL[:-1], SCENE.laser, 1e-11)

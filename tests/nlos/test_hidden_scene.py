@@ -205,7 +205,7 @@ def test_meshes_are_read_from_files(tmp_path: Path) -> None:
     assert surface.normals[0] == pytest.approx([0, 0, -1])
     (tmp_path / "none.obj").write_text("v 0 0 0\n")
     (tmp_path / "holiday.txt").write_text("sea")
-    with pytest.raises(FileFormatError, match="is no triangle mesh"):
+    with pytest.raises(FileFormatError, match="is not a triangle mesh"):
         Surface.load(tmp_path / "holiday.txt", 0.05)
     with pytest.raises(FileFormatError, match="no triangles"):
         Surface.load(tmp_path / "none.obj", 0.05)

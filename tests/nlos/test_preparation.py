@@ -72,5 +72,5 @@ def test_what_has_compiled_loops_refuses_other_arrays() -> None:
         remove_device_legs(moved, np.zeros(3), np.zeros(3))
     with pytest.raises(InputError, match="drawing photons works on NumPy arrays"):
         add_poisson_noise(moved, 10)
-    with pytest.raises(InputError, match="compressed readings works on NumPy arrays"):
+    with pytest.raises(InputError, match="compressed measurements works on NumPy arrays"):
         CompressedCapture(moved.signal, None, WALL, np.zeros(3), 1e-11)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Light-field cameras: how many readings they take, and that their two models agree where they
+"""Light-field cameras: how many measurements they take, and that their two models agree where they
 must.
 """
 
@@ -134,7 +134,7 @@ def test_a_measured_camera_without_a_lens_sees_beyond_its_sensor():
     ],
 )
 def test_every_camera_refocuses_the_letters(name, weight, worst, shared_data):
-    """Readings from the true views; bounds with a little room above what was seen. Mixed up depths
+    """Measurements from the true views; bounds with a little room above what was seen. Mixed up depths
     give twice that.
     """
     from tofclip.io.light_fields import read_light_field

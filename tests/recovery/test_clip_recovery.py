@@ -1,4 +1,4 @@
-"""Recovery of a light-field camera's readings by the names that a user types, on a scene made here."""
+"""Recovery of a light-field camera's measurements by the names that a user types, on a scene made here."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_readings_that_are_none_are_refused(scene):
 
 
 def test_a_light_field_comes_back_view_by_view(scene):
-    """With four times as many readings as pixels: each view gets a quarter of what its picture
+    """With four times as many measurements as pixels: each view gets a quarter of what its picture
     would need.
     """
     found = recover_light_field(measurements(scene, ratio=4.0))

@@ -73,7 +73,7 @@ def test_ranges_are_true(shot, frames):
 
 
 def test_fitting_the_camera_costs_no_accuracy(shot, frames):
-    """The fitted camera explains the readings as well as the true one, to within photon noise."""
+    """The fitted camera explains the measurements as well as the true one, to within photon noise."""
     with_truth = recover(shot.streak, shot.camera)
     assert frames.figures["relative_residual"] < 1.05 * with_truth.figures["relative_residual"]
 

@@ -1,4 +1,4 @@
-"""Data terms against their definitions: gradients by differences, curvature at most 1, bad readings
+"""Data terms against their definitions: gradients by differences, curvature at most 1, bad measurements
 left out.
 """
 

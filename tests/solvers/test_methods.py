@@ -113,7 +113,7 @@ def test_an_interruption_gets_through(operator, method):
 
 @every_method
 def test_unusable_readings_are_refused(operator, method):
-    with pytest.raises(ShapeError, match="readings"):
+    with pytest.raises(ShapeError, match="measurements"):
         method.recover(operator, np.ones((39, 2)))
     with pytest.raises(InputError, match="NaN"):
         method.recover(operator, np.full((40, 2), np.nan))

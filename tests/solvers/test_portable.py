@@ -56,7 +56,7 @@ def projection(dtype: type = np.float32) -> LineProjection:
 
 
 def letters(frames: int, dtype: type = np.float32) -> tuple[np.ndarray, np.ndarray]:
-    """Readings of bright rectangles with noise, and a mask with a bad reading here and there."""
+    """Measurements of bright rectangles with noise, and a mask with a bad reading here and there."""
     rng = np.random.default_rng(7)
     truth = np.zeros((24, 23, frames))
     for frame in range(frames):

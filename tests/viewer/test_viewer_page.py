@@ -333,7 +333,7 @@ def test_a_lost_connection_is_said_in_words(browser: Any) -> None:
     words = seen.tab.locator(".tofclip-lost")
     assert not words.is_visible()
     seen.page.close()
-    until(words.is_visible, "the page says that nobody answers")
+    until(words.is_visible, "the page says that no answer came")
     assert words.inner_text().startswith("Connection lost: tofclip view has ended")
     seen.close()
 

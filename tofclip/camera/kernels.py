@@ -83,7 +83,7 @@ def sample_bilinear(counts, dark, raw_row, raw_column, delay, measurements):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def mark_valid(bad, raw_row, raw_column, delay, valid):
-    """Tell the measurements that lie within the raw image and to which no bad pixel contributes.
+    """Mark the measurements that lie within the raw image and to which no bad pixel contributes.
 
     Parameters
     ----------

@@ -164,7 +164,7 @@ class Rectifier:
         )
         if not valid.any():
             raise InputError(
-                "no reading can be trusted: every pixel is saturated, dead or outside the sweep"
+                "no measurement can be trusted: every pixel is saturated, dead or outside the sweep"
             )
         measurements = self.rectify(counts, dark, delay)
         if not np.any((measurements > 0) & valid):

@@ -42,7 +42,7 @@ def read_lift(path: str | Path) -> Streak:
     counts = archive.array("streak_raw", None, None)
     if np.any(counts < 0):
         raise InputError(
-            f"{path}: streak_raw holds negative readings; a LIFT archive is clipped at zero"
+            f"{path}: streak_raw holds negative measurements; a LIFT archive is clipped at zero"
         )
     camera, metadata, attachments = _read_calibration(archive)
     streak = Streak(

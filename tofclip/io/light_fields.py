@@ -41,7 +41,7 @@ def read_light_field(path: str | Path) -> LightField:
     reader = _READERS.get(source.suffix.lower())
     if reader is None:
         raise FileFormatError(
-            source, f"is no light field; take a folder of pictures or {', '.join(_READERS)}"
+            source, f"is not a light field; take a folder of pictures or {', '.join(_READERS)}"
         )
     return reader(source)
 

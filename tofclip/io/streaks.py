@@ -106,5 +106,5 @@ def _select_reader(
     size = os.path.getsize(path)
     raise FileFormatError(
         path,
-        f"is no TIFF, ITEX (.img), LIFT archive (.npz) or HDF5 streak image ({size} bytes of something else)",
+        f"is not a TIFF, ITEX (.img), LIFT archive (.npz) or HDF5 streak image ({size} bytes of something else)",
     )

@@ -141,7 +141,7 @@ def _list_ply(path: Path) -> Entries:
     with open(path, "rb") as file:
         lines = _read_header(file, path, "ply", "end_header")
         if ["format", "binary_little_endian", "1.0"] not in lines:
-            raise FileFormatError(path, "is no binary little-endian PLY file")
+            raise FileFormatError(path, "is not a binary little-endian PLY file")
         elements = [line for line in lines if line[0] == "element"]
         if len(elements) != 1 or "vertex" not in elements[0]:
             raise FileFormatError(path, "must hold vertices and nothing else")
@@ -156,7 +156,7 @@ def _list_pcd(path: Path) -> Entries:
     with open(path, "rb") as file:
         entries = {line[0]: line[1:] for line in _read_header(file, path, "#", "DATA")}
         if entries["DATA"] != ["binary"]:
-            raise FileFormatError(path, "is no binary PCD file")
+            raise FileFormatError(path, "is not a binary PCD file")
         try:
             kinds = zip(entries["TYPE"], entries["SIZE"], strict=True)
             properties = list(zip(entries["FIELDS"], map(PCD_TYPES.get, kinds), strict=True))
@@ -183,7 +183,7 @@ def _read_csv(path: Path, labels: list[str]) -> NDArray[np.float64]:
     try:
         table = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.empty((0, len(labels)))
     except ValueError as fault:
-        raise FileFormatError(path, f"holds something that is no number ({fault})") from fault
+        raise FileFormatError(path, f"holds something that is not a number ({fault})") from fault
     if table.shape[1] != len(labels):
         raise FileFormatError(path, f"names {len(labels)} columns, holds {table.shape[1]}")
     return table
@@ -207,7 +207,7 @@ def _read_header(file: BinaryIO, path: Path, first: str, last: str) -> list[list
         words = line.decode("ascii", errors="replace").split()
         if not words or (not lines and words[0] != first) or file.tell() > MAX_HEADER_BYTES:
             raise FileFormatError(
-                path, f"is no {path.suffix[1:].upper()} file, or its header is damaged"
+                path, f"is not a {path.suffix[1:].upper()} file, or its header is damaged"
             )
         lines.append(words)
     return lines

@@ -105,7 +105,7 @@ def _read_points(path: Path) -> Any:
         points, table = reader.header.point_count, reader.read()
     if len(table.points) != points:
         raise FileFormatError(
-            path, f"is no complete LAS file: {len(table.points)} of {points} points are there"
+            path, f"is not a complete LAS file: {len(table.points)} of {points} points are there"
         )
     return table
 

@@ -101,7 +101,7 @@ class ClipMeasurement(Storable):
 
     def __post_init__(self) -> None:
         if not np.all(np.isfinite(self.values)):
-            raise InputError("the readings hold NaN or infinity")
+            raise InputError("the measurements hold NaN or infinity")
         if not self.values.any():
             raise InputError("every reading is zero; there is nothing to recover")
 
@@ -116,7 +116,7 @@ class ClipMeasurement(Storable):
         camera = self.setup.camera(self.image_shape, self.views)
         if self.values.shape != (camera.measurements,):
             raise ShapeError(
-                "the readings of this camera", (camera.measurements,), self.values.shape
+                "the measurements of this camera", (camera.measurements,), self.values.shape
             )
         return camera
 
@@ -130,7 +130,7 @@ class ClipMeasurement(Storable):
         """
         if self.photons_per_unit <= 0:
             raise InputError(
-                "these readings do not say how many photons they stand for; take squares or huber"
+                "these measurements do not say how many photons they stand for; take squares or huber"
             )
         counted: NDArray[Any] = self.values * np.float32(self.photons_per_unit)
         return counted
@@ -179,7 +179,9 @@ def corrupt_measurement(
         The fraction is outside 0 to 1, or the number of photons is not positive.
     """
     if not 0 <= bad_fraction <= 1:
-        raise InputError(f"the share of bad readings must lie between 0 and 1, got {bad_fraction}")
+        raise InputError(
+            f"the share of bad measurements must lie between 0 and 1, got {bad_fraction}"
+        )
     if photons is not None and not (np.isfinite(photons) and photons > 0):
         raise InputError(f"the number of photons must be positive, got {photons}")
     random = np.random.default_rng([measurement.setup.seed, 1])

@@ -2,7 +2,7 @@
 (supplement Note 10).
 
 Light that an occluder sends back arrives earlier than what comes from behind it. A time gate takes
-it away, and tells where the occluder stands, so that the recovery knows which view cannot have seen
+it away, and says where the occluder stands, so that the recovery knows which view cannot have seen
 what.
 """
 

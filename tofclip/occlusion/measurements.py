@@ -104,7 +104,7 @@ class TimedMeasurements:
     def __post_init__(self) -> None:
         expected = (self.rig.camera.measurements, self.time_axis.bins)
         if self.values.shape != expected:
-            raise ShapeError("the readings of this rig", expected, self.values.shape)
+            raise ShapeError("the measurements of this rig", expected, self.values.shape)
 
     @property
     def history(self) -> Array:

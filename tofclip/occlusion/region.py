@@ -63,7 +63,7 @@ class InactiveRegion:
         return self.distance * self.width / (self.baseline - self.width)
 
     def sees(self, place: ArrayLike, across: ArrayLike, behind: ArrayLike) -> NDArray[Any]:
-        """Tell whether the line of sight passes the occluder.
+        """Return whether the line of sight passes the occluder.
 
         Parameters
         ----------

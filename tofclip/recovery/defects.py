@@ -1,4 +1,4 @@
-"""Defective readings of a streak image: pixels that are hot or struck by a particle, and columns
+"""Defective measurements of a streak image: pixels that are hot or struck by a particle, and columns
 that are dead.
 
 Light of a scene comes in pulses, and no sum of pulses is sharper in time than the instrument's
@@ -21,13 +21,13 @@ FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 MIN_PULSE_ROWS = 2.0
-"""Full width of the shortest pulse that is told from a single row."""
+"""Full width of the shortest pulse that is distinguished from a single row."""
 
 MAX_PULSE_ROWS = 3.0
 """Longer responses are taken as this long: what an instrument says of its own is often too long."""
 
 MAX_DEFECT_FRACTION = 0.25
-"""Of the bright readings; where more are sharp, the response is sharper than it is said to be."""
+"""Of the bright measurements; where more are sharp, the response is sharper than it is said to be."""
 
 SHARPNESS_MARGIN = 1.5
 """By this factor a reading has to exceed what its neighbours in time allow; a response may rise
@@ -37,11 +37,11 @@ MIN_SIGNIFICANCE = 5.0
 """Standard deviations in favour of the neighbours."""
 
 MIN_PEAK_FRACTION = 0.2
-"""Of the image's bright pixels: weaker defects do no harm and are not told from noise."""
+"""Of the image's bright pixels: weaker defects do no harm and are not distinguished from noise."""
 
 BRIGHT_QUANTILE = 0.999
-LIT_DEVIATIONS, MIN_LIT_READINGS, DISCARDED_FRACTION = 4.0, 100, 0.01
-"""Readings that say how light fluctuates: this far above the noise, at least so many, and without
+LIT_DEVIATIONS, MIN_LIT_MEASUREMENTS, DISCARDED_FRACTION = 4.0, 100, 0.01
+"""Measurements that say how light fluctuates: this far above the noise, at least this number of them, and without
 the wildest of them, which may be defects themselves."""
 
 DEAD_COLUMN_FRACTION = 0.1
@@ -61,7 +61,7 @@ class Defects:
     Parameters
     ----------
     pixels : (rows, columns) bool array
-        Readings that are sharper in time than a pulse.
+        Measurements that are sharper in time than a pulse.
     columns : (columns,) bool array
         Columns that see nothing.
     """
@@ -71,17 +71,17 @@ class Defects:
 
     @property
     def mask(self) -> Mask:
-        """Readings that cannot be trusted, (rows, columns)."""
+        """Measurements that cannot be trusted, (rows, columns)."""
         return self.pixels | self.columns
 
     @property
     def count(self) -> int:
-        """Number of defective readings."""
+        """Number of defective measurements."""
         return int(np.count_nonzero(self.mask))
 
 
 def find_defects(streak: Streak, pulse_rows: float) -> Defects:
-    """Find readings that no light explains.
+    """Find measurements that no light explains.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def estimate_noise(counts: FloatImage) -> tuple[float, float, float]:
     noise = 1.4826 * float(np.median(changes))
     level = (counts[:-2] + counts[1:-1] + counts[2:]) / 3 - dark
     lit = level > max(LIT_DEVIATIONS * noise, float(np.finfo(np.float32).tiny))
-    if np.count_nonzero(lit) < MIN_LIT_READINGS:
+    if np.count_nonzero(lit) < MIN_LIT_MEASUREMENTS:
         return dark, noise, 1.0
     # What a pulse bends counts here as well, so that the estimate errs on the careful side.
     spread, light = np.maximum(rough[lit] ** 2 - noise**2, 0), level[lit]
@@ -173,7 +173,7 @@ def find_dead_columns(counts: FloatImage) -> Mask:
 
 
 def interpolate_rows(values: FloatImage, defects: Mask) -> FloatImage:
-    """Replace defective readings by what those before and after them say.
+    """Replace defective measurements by what those before and after them say.
 
     Parameters
     ----------

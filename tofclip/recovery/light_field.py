@@ -170,10 +170,10 @@ class ClipRecovery:
             )
         if not isinstance(weighting, Identity):
             raise InputError(
-                f"readings of a {camera.name} camera all have about the same photon noise; take squares"
+                f"measurements of a {camera.name} camera all have about the same photon noise; take squares"
             )
         counts = measurement.counts()
-        # dark readings count no more than a quarter of the mean: they would hold up the convergence
+        # dark measurements count no more than a quarter of the mean: they would hold up the convergence
         # of all others
         deviation = np.sqrt(np.maximum(counts, counts.mean() / 4) + 1)
         model = Diagonal(measurement.photons_per_unit / deviation) @ model

@@ -1,4 +1,4 @@
-"""The camera's parallax from an ordinary shot: time tells the range of each gate, agreement of the
+"""The camera's parallax from an ordinary shot: time gives the range of each gate, agreement of the
 views its shear.
 """
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 NEIGHBOUR_BINS = 1.6  # neighbouring pixels whose ranges differ by less lie on one surface
-MIN_PATCH_PX = 25  # fewer returns are no surface of their own
+MIN_PATCH_PX = 25  # fewer returns are not a surface of their own
 MERGE_BINS = 0.5  # misfit of either of two patches to one surface for both
 MERGE_REACH_BINS = 7.0  # of the larger's fit at the smaller: further off it is not tried
 FIT_ITERATIONS = 10

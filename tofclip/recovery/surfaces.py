@@ -46,7 +46,9 @@ REFINEMENTS, REFINEMENT_ITERATIONS = 3, 25
 PROX_ITERATIONS = 6  # of the dual, which is kept from step to step
 NORM_ITERATIONS = 10
 NORM_MARGIN = 1.1
-MODEL_ERROR_FRACTION = 0.015  # of the brightest reading: what the model leaves even without noise
+MODEL_ERROR_FRACTION = (
+    0.015  # of the brightest measurement: what the model leaves even without noise
+)
 PULSE_ROWS = 11  # a pulse of 60 ps on rows of 20 ps reaches 3 of them to either side
 EXTENT_SIGMAS = 3.5  # 5e-4 of a pulse lie outside
 SLIT_PIXELS, SUBROWS = 4, 3
@@ -57,7 +59,7 @@ POINTS_PER_BLOCK = 4096
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
 SURE_SIGMAS = 20.0  # points of which a surface certainly consists
 MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
-NEIGHBOURHOOD_PX = 7  # side of the square whose readings decide whether a point is there
+NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
 FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
 
 
@@ -118,7 +120,7 @@ class SurfaceModel:
         dark = estimate_dark_level(streak.counts)
         self.image = (streak.counts - np.float32(dark)).astype(np.float32)
         smooth = np.maximum(gaussian_filter(streak.counts.astype(np.float32), 1.0), 0)
-        # The variance of a reading is its photons; the floor stands for what the model cannot explain.
+        # The variance of a measurement is its photons; the floor stands for what the model cannot explain.
         weights = 1 / (smooth + MODEL_ERROR_FRACTION * smooth.max() + max(dark, 0.0))
         if streak.saturated is not None:
             weights[streak.saturated] = 0
@@ -276,7 +278,7 @@ class SurfaceModel:
 class AmplitudeSolver:
     """FISTA for the amplitudes, a step size for each surface.
 
-    Different surfaces hardly share readings, so that a step for each is as safe as one for all and
+    Different surfaces hardly share measurements, so that a step for each is as safe as one for all and
     does not hold the bright ones back.
 
     Parameters
@@ -356,7 +358,7 @@ def refine_state(model: SurfaceModel, amplitude: Image) -> FloatArray:
     -------
     (surfaces, 6, 6) float array
         Covariance of each surface's coefficients: the inverse of the data's Fisher information,
-        gains, delays and widths unknown, times the misfit per reading where that exceeds 1.
+        gains, delays and widths unknown, times the misfit per measurement where that exceeds 1.
     """
     state, before = model.state, model.misfit(amplitude)
     lit = model.render(amplitude, state.gains).max(axis=1) > 0
@@ -410,7 +412,7 @@ class SurfaceRecovery:
     Parameters
     ----------
     weight : float
-        Of total variation of the amplitudes, in photons' units: 1 is a count of a reading whose
+        Of total variation of the amplitudes, in photons' units: 1 is a count of a measurement whose
         variance is 1.
     iterations : int
         Of FISTA after the ranges are known; before that there are 115 more.

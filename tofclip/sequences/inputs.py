@@ -60,7 +60,7 @@ Shot = FileShot | StackShot
 
 
 def is_sequence(source: str | Path) -> bool:
-    """Tell whether `source` is a folder, a glob pattern or an HDF5 stack of streak images, and no
+    """Return whether `source` is a folder, a glob pattern or an HDF5 stack of streak images, and no
     single file.
     """
     text, path = str(source), Path(source)
@@ -102,7 +102,7 @@ def list_files(source: str | Path) -> dict[str, Path]:
     """Return the files of a folder or a glob pattern by name, in the order of their names.
 
     A file's name is its path from the folder that they have in common, without the ending. Paths
-    are absolute: a cluster's workers run elsewhere. Hidden files are left out, and the settings
+    are absolute: a cluster's workers run in other folders. Hidden files are left out, and the settings
     that a run leaves beside its results.
 
     Raises
@@ -157,7 +157,7 @@ def make_result_paths(names: Mapping[str, object], folder: Path, suffix: str) ->
 
 
 def _is_stack(path: Path) -> bool:
-    """Tell a stack from a single streak image: it has one more dimension."""
+    """Say a stack from a single streak image: it has one more dimension."""
     try:
         with open(path, "rb") as file:
             return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE and StreakStack.is_one(path)

@@ -131,8 +131,7 @@ class RangingPipeline:
         return self.search(self.recover(measurements))
 
     def recover(self, measurements: NDArray[np.float32]) -> Traces:
-        """Do what a shot needs as a whole before its pixels are recovered, a few at a time, by
-        whoever asks for them.
+        """Do what a shot needs as a whole before its pixels are recovered, a few at a time, as they are asked for.
 
         Parameters
         ----------
@@ -141,7 +140,7 @@ class RangingPipeline:
         """
         if measurements.shape != (self.camera.slit_width_px, self.times.size):
             raise ShapeError(
-                "readings", (self.camera.slit_width_px, self.times.size), measurements.shape
+                "measurements", (self.camera.slit_width_px, self.times.size), measurements.shape
             )
         return _ShotTraces(self, measurements, self._lit.bins(measurements))
 

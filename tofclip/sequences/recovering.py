@@ -114,8 +114,8 @@ class RecoverySettings:
 
 
 def normalise_device(device: str) -> str | None:
-    """Return the device as a setting that results depend on; the CPU is no news, as in
-    folders of old.
+    """Return the device as a setting that results depend on; the CPU is left out, as in
+    older folders.
     """
     return None if device == str(CPU) else device
 

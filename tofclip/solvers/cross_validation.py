@@ -132,7 +132,7 @@ def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
     runs = -(-count // run)
     if runs < 2:
         raise InputError(
-            "one reading alone cannot choose its own prior's weight; give the weight as a number"
+            "one measurement alone cannot choose its own prior's weight; give the weight as a number"
         )
     dealt = np.random.default_rng(seed).permutation(runs) % min(FOLD_COUNT, runs)
     used = 1 if runs >= SINGLE_FOLD_RUNS else min(FOLD_COUNT, runs)

@@ -31,7 +31,7 @@ class DataTerm(ABC):
     def __init__(self, measurements: Array, valid: Mask = None) -> None:
         if valid is not None and valid.shape != measurements.shape:
             raise ShapeError(
-                "the mask of good readings", tuple(measurements.shape), tuple(valid.shape)
+                "the mask of valid measurements", tuple(measurements.shape), tuple(valid.shape)
             )
         xp = namespace(measurements)
         self.measurements = measurements
@@ -224,5 +224,5 @@ def estimate_robust_deviation(residual: Array) -> float:
     # the median size of Gaussian numbers is 1 / 1.4826 of their standard deviation
     deviation = 1.4826 * float(np.median(np.abs(residual)))
     if not deviation > 0:
-        raise InputError("most readings are met exactly; there is nothing to be robust against")
+        raise InputError("most measurements are met exactly; there is nothing to be robust against")
     return deviation

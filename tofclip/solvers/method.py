@@ -295,7 +295,7 @@ def relative_residual(
         )
         energy += float(xp.sum((measurements[:, piece] * mask) ** 2, dtype=xp.float64))
     if energy == 0:
-        raise InputError("every good reading is zero; there is nothing to compare with")
+        raise InputError("every valid measurement is zero; there is nothing to compare with")
     return float(np.sqrt(misfit / energy))
 
 
@@ -325,10 +325,12 @@ def validate_measurements(operator: LinearOperator, measurements: Array, valid: 
     xp = namespace(measurements) if valid is None else namespace(measurements, valid)
     if measurements.ndim != 2 or measurements.shape[:1] != operator.shape_out:
         raise ShapeError(
-            "readings", f"({operator.shape_out[0]}, frames)", tuple(measurements.shape)
+            "measurements", f"({operator.shape_out[0]}, frames)", tuple(measurements.shape)
         )
     if valid is not None and valid.shape != measurements.shape:
-        raise ShapeError("the mask of good readings", tuple(measurements.shape), tuple(valid.shape))
+        raise ShapeError(
+            "the mask of valid measurements", tuple(measurements.shape), tuple(valid.shape)
+        )
     if not xp.all(xp.isfinite(measurements)):
-        raise InputError("readings must not hold NaN or infinity; mark bad ones in `valid`")
+        raise InputError("measurements must not hold NaN or infinity; mark bad ones in `valid`")
     return as_type(measurements, operator.dtype)

@@ -11,7 +11,7 @@ VERBS: VerbTable = {
     "film": "Film the hidden scene while the laser's flash passes through it.",
     "compare": "Image one capture by several methods, and show images, time, memory and figures of merit side by side.",
     "simulate": "Simulate the capture of a known hidden scene before a relay wall.",
-    "info": "Tell a capture's geometry and sampling, usable wavelengths, resolution, and which methods suit it.",
+    "info": "Report a capture's geometry and sampling, usable wavelengths, resolution, and which methods suit it.",
     "demo": "Hide two characters before a curved wall, simulate what the wall shows, and image them by two methods.",
 }
 """Each verb's module and its line in the list of commands."""

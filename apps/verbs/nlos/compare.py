@@ -79,9 +79,9 @@ def compare(
     The correlation is that of the front views with the first method's. The sharpness says how far
     the light of the front view is gathered, which is good only where it is gathered in the right
     place: captures of nlos simulate carry the truth, and for them the share of energy near hidden
-    things and the contrast against the rest are told.
+    things and the contrast against the rest are reported.
 
-    The settings that were told or found are written beside the picture (.toml) and give the same
+    The settings that were given or found are written beside the picture (.toml) and give the same
     comparison.
 
     Example: tofclip nlos compare capture.h5 --methods hybrid,backprojection --out compare.png

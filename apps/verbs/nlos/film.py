@@ -97,7 +97,7 @@ def film(
     light that met several things shows once more at the last of them. Needs a capture of one laser
     spot, and rsd or hybrid. Times count from the moment when the flash leaves its spot on the wall.
 
-    The part of the box that is bright is found as by nlos reconstruct. The settings that were told
+    The part of the box that is bright is found as by nlos reconstruct. The settings that were given
     or found are written beside the film (.toml) and give the same one.
 
     Example: tofclip nlos film capture.h5 --out flash.gif

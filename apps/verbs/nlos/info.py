@@ -47,7 +47,7 @@ def info(
     as_json: JsonOption = False,
     **flags: Any,
 ) -> None:
-    """Tell a capture's geometry and sampling, usable wavelengths, resolution, and which methods
+    """Report a capture's geometry and sampling, usable wavelengths, resolution, and which methods
     suit it.
 
     Resolution is the width of a point's image that a perfect instrument would give in the middle of

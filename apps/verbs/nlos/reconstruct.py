@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
 EXIT_SOME_FAILED = 1
 STOP_KEYS = ("iterations", "stopped_because")
-"""What is told of an iteration."""
+"""What is reported of an iteration."""
 
 SETTINGS_SUFFIX = ".toml"
 FOLDER_SETTINGS_NAME = ".settings.toml"
@@ -137,14 +137,14 @@ def reconstruct(
 
     The space in front of the wall is looked over with voxels of half a wavelength first, by the
     quickest of the first three; then the part that is bright is imaged with the voxels asked for.
-    The settings that were told or found are written beside the volume (.toml); given back by
+    The settings that were given or found are written beside the volume (.toml); given back by
     --settings they make the same volume, on another --device to some hundred-thousandths.
 
     --refine photons looks for the albedo under which the photons that were counted are likeliest:
     for captures of few photons, by time of flight, background included. --refine l1 or tv look for
     the albedo that explains the wall's waves best, at the cost of some four images per iteration.
 
-    With --device rsd, hybrid and backprojection compute elsewhere, on a graphics processor; the
+    With --device rsd, hybrid and backprojection compute on a GPU; the
     others cannot.
 
     Of a folder every capture is imaged into the folder --out. Captures whose results are there
@@ -317,7 +317,7 @@ def _plan_jobs(
 
 
 def _run_job(source: Path, results: ResultFiles, order: _ImagingRequest) -> dict[str, Any]:
-    """Image one capture, here or on a worker, and tell a person which one it is."""
+    """Image one capture, here or on a worker, and report which one it is."""
     if sys.stderr.isatty() and threading.current_thread() is threading.main_thread():
         print(source.name, file=sys.stderr)
     return _reconstruct_single(source, results, order)
@@ -348,6 +348,6 @@ def _check_folder_settings(file: Path, wanted: ReconstructSettings) -> None:
     for name in sorted(before.keys() | now.keys()):
         if before.get(name) != now.get(name):
             raise InputError(
-                f"{file.parent}: the results there were made with {name} = {before.get(name, 'not told')}, now it is "
-                f"{now.get(name, 'not told')}; choose another folder"
+                f"{file.parent}: the results there were made with {name} = {before.get(name, 'not given')}, now it is "
+                f"{now.get(name, 'not given')}; choose another folder"
             )

@@ -24,7 +24,7 @@ def test_every_method_of_the_table_is_there(costs):
 
 
 def test_readings_and_unknowns_are_those_of_the_paper(costs):
-    """r N^2, N^2 and m readings; n_a^2 N^2 unknowns of a light field, N^2 of a picture."""
+    """r N^2, N^2 and m measurements; n_a^2 N^2 unknowns of a light field, N^2 of a picture."""
     assert [cost.measurements for cost in costs] == [
         4 * 4096,
         4 * 4096,

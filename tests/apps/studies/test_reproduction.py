@@ -47,7 +47,7 @@ def test_white_noise_is_as_strong_as_asked(library):
         measure_case(Case((), "letters", "line", 2.0, 0.0, white_noise=n), library, 0)
         for n in (0.0, 0.1)
     )
-    # 80 x 40 readings: the standard deviation of a standard deviation is 1.3 %
+    # 80 x 40 measurements: the standard deviation of a standard deviation is 1.3 %
     deviation = np.std(noisy.values - quiet.values) / np.std(quiet.values)
     assert deviation == pytest.approx(0.1, rel=0.06)
 
@@ -156,7 +156,7 @@ def test_tables_have_a_row_for_each_case_and_count_their_steps(library, name, mo
 
 
 def test_a_light_field_recovered_from_many_readings_is_near_the_true_one(library):
-    """As many readings as unknowns would be SR 16; at 8 total variation has little to fill in."""
+    """As many measurements as unknowns would be SR 16; at 8 total variation has little to fill in."""
     case = Case((), "letters", "line", 8.0, 0.0)
     found = light_field_recovery.recover_light_field(case, library, 0)
     truth = library.light_field("letters")

@@ -136,8 +136,8 @@ def _require_signal(strength: float, design: FloatArray, squares: float) -> None
     change_px = abs(strength) * float(np.ptp(used[:, 0] / used[:, 1]))
     if abs(strength) <= SIGNIFICANCE * np.sqrt(covariance[0, 0]) or change_px < MIN_CHANGE_PX:
         raise CalibrationError(
-            f"the shears do not tell a parallax: they change by {change_px:.2g} px over the distances, no more than "
-            "their errors; take surfaces at distances that differ more, or a shot with more light"
+            f"the shears do not determine a parallax: they change by {change_px:.2g} px over the distances, "
+            "no more than their errors; take surfaces at distances that differ more, or a shot with more light"
         )
 
 

@@ -261,7 +261,7 @@ def recognise_axes(cube: NDArray[Any], path: Path) -> str:
     Raises
     ------
     InputError
-        Neither tells.
+        Neither says so.
     """
     concentration = []
     for axis in range(3):

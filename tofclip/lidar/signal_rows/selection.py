@@ -41,7 +41,7 @@ class RowBlock:
 
 
 class SignalRowFinder:
-    """Tells the rows of a shot that hold light from those where only noise is.
+    """Finds the rows of a shot that hold light, among those where only noise is.
 
     Measurements are summed over a pulse's length, once per pulse width, and each sum is brought to
     the noise of its column. Back-projection, which is the matched filter of a lone pixel in even

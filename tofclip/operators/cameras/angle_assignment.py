@@ -16,7 +16,7 @@ wide.
 
 A weight chosen by leaving out this number together comes nearer to the best one than by leaving out
 single pixels, which their neighbours betray, or whole lines, which nothing else measures (letters
-at SR 1 and 0.5: 1.6 and 3.0 % NMSE with angles dealt evenly, against 4.0 and 4.0 % from whole
+at SR 1 and 0.5: 1.6 and 3.0 % NMSE with angles assigned evenly, against 4.0 and 4.0 % from whole
 lines).
 """
 

@@ -22,7 +22,7 @@ MAX_LINE_ANGLE_RAD = np.pi / 4
 
 
 class CodedLineCamera(LightFieldCamera):
-    """Coded lines one pixel wide, their angles evenly from -45 to 45 degrees, dealt to the views at
+    """Coded lines one pixel wide, their angles evenly from -45 to 45 degrees, assigned to the views at
     random.
 
     Each line has a code and a 1D sensor of its own, as long as the picture is wide.

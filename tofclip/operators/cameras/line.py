@@ -22,7 +22,7 @@ from tofclip.operators.shear import View
 
 
 class LineCamera(LightFieldCamera):
-    """CLIP-1D: line projections, their angles dealt to the views at random (supplement Note 6).
+    """CLIP-1D: line projections, their angles assigned to the views at random (supplement Note 6).
 
     ``sampling_ratio * rows * columns / detector`` angles, evenly in [0, pi). A detector has as many
     pixels as the picture's longer side.
@@ -89,7 +89,7 @@ class LineCamera(LightFieldCamera):
 
 
 class EvenAngleLineCamera(LineCamera):
-    """CLIP-1D with angles dealt so that neighbouring ones look from places spread evenly over the
+    """CLIP-1D with angles assigned so that neighbouring ones look from places spread evenly over the
     aperture.
 
     What is out of focus is then blurred rather than torn into streaks, and which seed was drawn
