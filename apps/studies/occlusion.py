@@ -239,7 +239,7 @@ def run_inactive_region(library: Library, seeds: int, advance: Advance) -> Outco
                 )
             )
             pictures += (
-                [Panel("without occluder", first.truth)]
+                [Panel("without occluder", found[0].truth)]
                 if place.factor == DISTANCE_FACTORS[-1]
                 else []
             )

@@ -219,7 +219,7 @@ def test_a_wrong_command_is_not_answered(command: str) -> None:
         ("packet_bytes=64", "510 or 512"),
         ("memory_mib=0", "memory of 512 bytes"),
         ("colour=red", "'colour' is unknown"),
-        ("faults=boom", "no fault"),
+        ("faults=boom", "not a fault"),
     ],
 )
 def test_unusable_values_are_refused(wrong: str, said: str) -> None:

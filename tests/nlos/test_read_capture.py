@@ -504,7 +504,7 @@ def test_what_is_no_file_or_no_capture_says_so(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="is empty"):
         read_capture(tmp_path / "empty")
     (tmp_path / "text").write_text("once upon a time")
-    with pytest.raises(FileFormatError, match="no capture of a known format"):
+    with pytest.raises(FileFormatError, match="not a capture of a known format"):
         read_capture(tmp_path / "text")
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["holiday"] = np.ones(3)
