@@ -21,7 +21,7 @@ MAX_ARRAY_BYTES = 1 << 35
 """Largest array that is read from a file, 32 GiB; of a computer with less memory, its memory."""
 
 MAX_COMPRESSION = 1032
-"""Deflate makes at most so many bytes of one; other compressions are not believed to do better."""
+"""Deflate makes at most this number of bytes of one; other compressions are not believed to do better."""
 
 MAX_CHUNK_BYTES = 1 << 26
 """A chunk of an HDF5 dataset is unpacked whole, however little of it is wanted."""

@@ -242,7 +242,7 @@ def test_a_camera_that_goes_away(stand_in: Any) -> None:
         assert batch.after_gap
         assert source.stats.reconnects == 1
         library.gone_for = 99
-        with pytest.raises(DeviceDisconnectedError, match="nobody answered"):
+        with pytest.raises(DeviceDisconnectedError, match="no answer came"):
             take(source, 9)
     assert source.stats.is_balanced
 

@@ -73,8 +73,8 @@ def test_a_scheme_opens_its_source(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("run.h5", "no address"),
-        ("://x", "no address"),
+        ("run.h5", "not the address"),
+        ("://x", "not the address"),
         ("absent://x", "no source is called 'absent'"),
         ("file://notes.txt", "must end in"),
         ("file://run.h5?a", "name=value"),

@@ -123,7 +123,7 @@ def _open_reader(path: Path) -> Iterator[Any]:
     # what the points take is known to be there
     except Exception as fault:
         raise FileFormatError(
-            path, f"is no LAS or LAZ file, or a damaged one ({type(fault).__name__})"
+            path, f"is not a LAS or LAZ file, or a damaged one ({type(fault).__name__})"
         ) from fault
 
 
