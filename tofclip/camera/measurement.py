@@ -94,6 +94,7 @@ def estimate_dark_level(counts: FloatImage) -> float:
     scatter about it: the least value of a picture would turn noise into an offset.
     """
     row_sums = counts.sum(axis=1, dtype=np.float64)
+    # Rows, not pixels: choosing the darkest pixels would choose those whose noise is low.
     quiet = np.argsort(row_sums)[: max(1, round(DARK_ROW_FRACTION * row_sums.size))]
     return float(np.median(counts[quiet]))
 
@@ -122,6 +123,7 @@ class Rectifier:
         # An exact row must not become one that lies beyond the picture by a rounding error of
         # float32.
         self._raw_row = np.ascontiguousarray(np.broadcast_to(raw[0], shape).T, dtype=np.float32)
+        # A sweep that only delays keeps light in its column, and needs half of the look-ups.
         raw_column = np.broadcast_to(raw[1], shape).T
         own = np.broadcast_to(column.T.astype(np.float32), shape[::-1])
         self._stays_in_column = bool(np.all(raw_column == own))
@@ -167,6 +169,7 @@ class Rectifier:
                 "no measurement can be trusted: every pixel is saturated, dead or outside the sweep"
             )
         measurements = self.rectify(counts, dark, delay)
+        # Light that only saturated pixels show would let a recovery run on nothing.
         if not np.any((measurements > 0) & valid):
             raise InputError(NO_LIGHT_MESSAGE)
         return Measurement(measurements, valid)
@@ -199,6 +202,7 @@ class Rectifier:
             np.float32(delay),
         )
         measurements = np.empty(self._raw_row.shape, np.float32)
+        # Columns become contiguous, because each thread works on some of them.
         turned = None if self._stays_in_column else np.ascontiguousarray(counts.T)
 
         def work(piece: slice) -> None:
@@ -216,6 +220,7 @@ class Rectifier:
                 )
 
         run_blocks(work, len(measurements), COLUMNS_PER_BLOCK)
+        # Zero, not their raw value: methods that take no mask must not see a stuck column as light.
         measurements[self.camera.dead_columns] = 0
         if not measurements.max() > 0:
             raise InputError(NO_LIGHT_MESSAGE)
@@ -232,6 +237,7 @@ class Rectifier:
             )
 
         run_blocks(work, len(valid), COLUMNS_PER_BLOCK)
+        # Dead columns are invalid at every instant, whatever the sensor shows there.
         valid &= ~self.camera.dead_columns[:, np.newaxis]
         return valid
 

@@ -117,6 +117,7 @@ class Camera(Storable):
 
     def __post_init__(self) -> None:
         views = np.size(self.centres_px)
+        # The middle view is the reference, or the right one of the two in the middle.
         steps = np.arange(views, dtype=np.float64) - views // 2
         self._set_field("centres_px", self.centres_px)
         self._set_field("distortion", self.distortion)
@@ -138,6 +139,7 @@ class Camera(Storable):
         self._validate()
 
     def _set_field(self, name: str, value: Any) -> None:
+        # A copy that cannot be written to: operators made from it would go on with the old numbers.
         array = np.array(value, dtype=np.float64)
         array.flags.writeable = False
         object.__setattr__(self, name, array)
@@ -217,6 +219,8 @@ class Camera(Storable):
         return LineProjection(
             self.image_shape,
             self.slit_width_px,
+            # A shift along X only: line responses are straight, so that moving the picture by s u
+            # in X moves what falls on the slit by as much.
             self.centres_px + shear * self.view_positions,
             self.angles,
             self.gains,
@@ -236,6 +240,7 @@ class Camera(Storable):
             Pixels per view step; negative nearer than the focus; 0 everywhere where no lenslet
             pitch is known.
         """
+        # An infinite focus distance gives 0 here, so that views coincide at infinity.
         nearness = 1 / np.asarray(distance, dtype=np.float64) - 1 / self.focus_distance
         shear: FloatArray = -self.focal_length_px * self.lenslet_pitch * nearness
         return shear
@@ -249,8 +254,10 @@ class Camera(Storable):
         found here by least squares; only the rest defocuses. Where tan(angle) grows evenly along
         the views (the depth-of-field arrangement) hardly any does.
         """
+        # A single view has no parallax to fit; its picture moves as its slit position does.
         if self.views == 1:
             return 0.0, float(self.view_positions[0])
+        # What a view measures of a picture moved by (rows, columns): -rows tan(angle) + columns.
         design = np.stack([-np.tan(self.angles), np.ones(self.views)], axis=1)
         rows, columns = np.linalg.lstsq(design, self.view_positions, rcond=None)[0]
         return float(rows), float(columns)

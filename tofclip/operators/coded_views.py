@@ -44,6 +44,8 @@ class WeightedViews(LinearOperator):
         )
 
     def _forward(self, block: Array) -> Array:
+        # One dense product for all pixels and frames: a mask in the aperture treats every pixel
+        # alike.
         seen: Array = self.weights @ block.reshape(len(block), -1)
         return seen.reshape(*self.shape_out, -1)
 
@@ -81,6 +83,7 @@ class MaskedViews(LinearOperator):
         return seen.reshape(*self.shape_out, -1)
 
     def _adjoint(self, block: Array) -> Array:
+        # A diagonal matrix is its own transpose: light goes back through the same holes.
         plane = block.reshape(*self.shape_in[1:], -1)
         spread: Array = self.codes[..., np.newaxis] * plane
         return spread
@@ -147,6 +150,7 @@ def make_sheared_mask(
     -------
     (views, rows, columns) array
     """
+    # So much larger that no view looks past the edge of the mask.
     margin = int(np.ceil(abs(mask_shear) * np.abs(np.asarray(views)).max())) + 1
     large = (image_shape[0] + 2 * margin, image_shape[1] + 2 * margin)
     mask = random.random(large)

@@ -87,6 +87,7 @@ class CodedAperture:
             for place, size in zip((v, u), self.code.shape, strict=True)
         ]
         transmission = np.asarray(self.code, np.float64)[cells[0], cells[1]]
+        # A mask takes light away and bends none of it.
         straight = np.zeros_like(transmission)
         return transmission, straight, straight
 
@@ -180,9 +181,12 @@ class Diffuser:
         )  # four cells a grain, so that the spline adds no wiggles
         noise = np.random.default_rng(self.seed).standard_normal((cells, cells))
         places = np.linspace(-1, 1, cells)
+        # Wrapped around, so that grains at the rim are as strong as in the middle.
         phase = gaussian_filter(noise, self.grain / (places[1] - places[0]), mode="wrap")
         surface = RectBivariateSpline(places, places, phase)
         sampled = np.linspace(-1, 1, 4 * cells)
+        # Rays go where the slope of the phase sends them: the spread of the slopes is that of the
+        # spot.
         slopes = np.std([surface(sampled, sampled, dx=1), surface(sampled, sampled, dy=1)])
         return RectBivariateSpline(places, places, phase * (self.spread_px / slopes))
 
@@ -216,6 +220,7 @@ def trace_view_point_spreads(
     middle = (grid.max(axis=0) + grid.min(axis=0)) / 2
     # every view looks through a part one view step wide, hence the + 1
     half = (np.ptp(grid, axis=0) + 1) / 2
+    # Rays at the middles of even cells, the same for each view.
     within = (np.arange(rays) + 0.5) / rays - 0.5
     spreads = np.empty((len(grid), *shape))
     for spread, view in zip(spreads, grid, strict=True):
@@ -303,6 +308,7 @@ class MeasuredPointSpreads:
                 f"shear {shear} lies beyond the measured {self.shears[0]:g} ... {self.shears[-1]:g}; "
                 "measure a PSF there or refocus nearer"
             )
+        # Between two depths the PSFs are mixed: the shape changes slowly from one to the next.
         place = float(np.interp(shear, self.shears, np.arange(self.shears.size)))
         below = min(int(place), max(self.shears.size - 2, 0))
         above = min(below + 1, self.shears.size - 1)
@@ -317,6 +323,7 @@ def _accumulate_rays(
 ) -> NDArray[np.float64]:
     """Gather rays on pixels; each is shared between the four nearest."""
     total = np.zeros(shape[0] * shape[1])
+    # A ray that lands between pixels is shared out by its distance to each, which keeps the light.
     row, column = down + shape[0] // 2, right + shape[1] // 2
     top, left = np.floor(row).astype(int), np.floor(column).astype(int)
     for y, along_y in ((top, 1 - row + top), (top + 1, row - top)):

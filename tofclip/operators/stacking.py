@@ -36,6 +36,7 @@ class Stack(LinearOperator):
         return namespace(block).concat([operator._forward(block) for operator in self.operators])
 
     def _adjoint(self, block: Array) -> Array:
+        # The adjoint of a stack adds up: every part has looked at the same input.
         total = zeros((*self.shape_in, block.shape[-1]), block)
         for operator, part in _split_rows(self.operators, block):
             total += operator._adjoint(part)
@@ -57,6 +58,7 @@ class BlockDiagonal(LinearOperator):
         self._set_parts(*operators)
 
     def _forward(self, block: Array) -> Array:
+        # No part sees the input of another, so that there is nothing to add up in either direction.
         parts = [operator._forward(block[k, ...]) for k, operator in enumerate(self.operators)]
         return namespace(block).concat(parts)
 
@@ -96,6 +98,8 @@ class Integration(LinearOperator):
         return total
 
     def _adjoint(self, block: Array) -> Array:
+        # Every entry gets the whole of the measurements back: the sensor did not keep apart what
+        # fell on it.
         return namespace(block).stack([operator._adjoint(block) for operator in self.operators])
 
 

@@ -70,6 +70,7 @@ class StreakDetector:
             Photons, none above full scale.
         saturated : bool array
         """
+        # Background is light as well, so that it brings photon noise of its own.
         photons = noise.poisson(signal + self.background_photons)
         saturated = photons >= self.full_scale_photons
         return np.minimum(photons, self.full_scale_photons).astype(np.float32), saturated
@@ -116,6 +117,7 @@ class Instrument:
 
     def _samples(self, pixels: int) -> NDArray[np.float64]:
         side = self.rays_per_pixel_side
+        # Middles of the sub-pixels; pixel centres are whole numbers, hence the half taken off.
         samples: NDArray[np.float64] = (np.arange(pixels * side) + 0.5) / side - 0.5
         return samples
 
@@ -140,5 +142,6 @@ class Instrument:
         (n, 3) float64 array
         """
         focal = self.camera.focal_length_px
+        # Turned towards the point on the axis at the focus distance, where all views coincide.
         aside = self.camera.lenslet_pitch * position / self.camera.focus_distance
         return np.stack([x / focal - aside, y / focal, np.ones_like(x)], axis=-1)

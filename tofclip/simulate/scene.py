@@ -57,8 +57,10 @@ def make_plate(
     if min(size) <= 0 or not np.all(np.isfinite([*centre, *size, yaw, pitch])):
         raise InputError("a plate needs a finite position and a positive size")
     right = np.array([np.cos(yaw), 0.0, np.sin(yaw)])
+    # The plate is turned about the vertical first, so that its own horizontal axis stays level.
     ahead = np.array([-np.sin(yaw), 0.0, np.cos(yaw)])
     down = np.cos(pitch) * np.array([0.0, 1.0, 0.0]) - np.sin(pitch) * ahead
+    # A right-handed frame; its third axis is the normal, which points away from the camera.
     axes = np.stack([right, down, np.cross(right, down)], axis=-1)
     return Body(Rectangle(*size), material, np.asarray(centre, np.float64), axes)
 
@@ -124,6 +126,8 @@ class Scene:
         """
         first, lamp = cast_rays(self.bodies, viewpoint, directions), np.asarray(self.lamp)
         seen = first.body != NO_BODY
+        # Only what is seen is lit: a missed ray has an infinite distance, which would spread as
+        # NaN.
         points = viewpoint + first.distance[seen, np.newaxis] * directions[seen]
         lamp_distance = np.linalg.norm(points - lamp, axis=1)
         irradiance = compute_irradiance(self.bodies, lamp, points, first.normal[seen])
@@ -135,7 +139,11 @@ class Scene:
 
         return RayCast(
             first.body,
+            # Half of the way there and back, which is what a time of flight says of a co-located
+            # source.
             scatter((lamp_distance + np.linalg.norm(points - viewpoint, axis=1)) / 2),
             scatter(lamp_distance),
+            # The fall-off to the lamp is taken out of the irradiance: who renders puts it back with
+            # the whole path.
             look_up_reflectance(self.bodies, first) * scatter(irradiance * lamp_distance**2),
         )

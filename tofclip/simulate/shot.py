@@ -63,6 +63,7 @@ def simulate_shot(scene: Scene, instrument: Instrument, seed: int) -> SimulatedS
         No light of the scene reaches the streak image.
     """
     camera, detector = instrument.camera, instrument.detector
+    # In relative units: the exposure below decides what a unit is in photons.
     light = np.zeros((detector.rows, camera.slit_width_px))
     for view, position in enumerate(camera.view_positions):
         light += render_streak(cast_view_rays(scene, instrument, float(position)), view, instrument)
@@ -70,6 +71,8 @@ def simulate_shot(scene: Scene, instrument: Instrument, seed: int) -> SimulatedS
         raise InputError(
             "no light of the scene reaches the streak image: check positions, number of rows and time zero"
         )
+    # Scaled by the brightest pixel, as one opens the iris of a real camera until it almost
+    # saturates.
     exposure = detector.peak_photons / float(light.max())
     counts, saturated = detector.expose(exposure * light, np.random.default_rng(seed))
     streak = Streak(

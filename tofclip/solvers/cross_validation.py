@@ -93,6 +93,7 @@ def choose_weight(
     column = measurements[:, np.newaxis]
 
     def unpredicted(trial: ProximalMethod, out: NDArray[np.bool_]) -> float:
+        # Recovered without the measurements of this fold, judged by them alone.
         picture = trial.recover(operator, column, ~out).frames[0]
         return float(trial.data_term(column, out).value(operator(picture)[:, np.newaxis])[0])
 
@@ -127,6 +128,7 @@ def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
     InputError
         There is a single measurement.
     """
+    # Too few runs for the folds: shorter ones, although neighbours then know more of each other.
     if -(-count // run) < FOLD_COUNT:
         run = max(1, count // FOLD_COUNT)
     runs = -(-count // run)
@@ -135,6 +137,7 @@ def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
             "one measurement alone cannot choose its own prior's weight; give the weight as a number"
         )
     dealt = np.random.default_rng(seed).permutation(runs) % min(FOLD_COUNT, runs)
+    # This many runs in one fold already give the error to a few percent.
     used = 1 if runs >= SINGLE_FOLD_RUNS else min(FOLD_COUNT, runs)
     out: NDArray[np.bool_] = np.repeat(dealt, run)[:count, np.newaxis] == np.arange(used)
     return out
@@ -142,6 +145,7 @@ def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
 
 def _search_downhill(error: Callable[[float], float]) -> WeightChoice:
     """Try weights up or down from the first, whichever lowers the error, until it rises again."""
+    # On a logarithmic axis the error has one valley: two trials say which way it goes down.
     errors = {step: error(INITIAL_WEIGHT * WEIGHT_RATIO**step) for step in (0, 1)}
     direction = 1 if errors[1] < errors[0] else -1
     while len(errors) < MAX_TRIALS:
@@ -163,5 +167,6 @@ def _parabola_minimum(steps: list[int], errors: NDArray[np.float64]) -> float:
     best = int(np.argmin(errors))
     if not 0 < best < len(steps) - 1:
         return float(steps[best])
+    # The minimum of the parabola through three trials lies between the tried weights.
     left, middle, right = errors[best - 1 : best + 2]
     return steps[best] + float(0.5 * (left - right) / (left - 2 * middle + right))

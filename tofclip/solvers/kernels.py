@@ -126,6 +126,7 @@ def copy_lanes_to_frames(block, frames):
         Overwritten; not more frames than lanes.
     """
     pixels = block.shape[0]
+    # Tile by tile, as a transposition reads along one axis and writes along the other.
     for first in range(0, pixels, TILE_PIXELS):
         last = min(first + TILE_PIXELS, pixels)
         for lane in range(frames.shape[0]):
@@ -150,6 +151,7 @@ def compute_traces(tile_starts, columns, values, weights, traces, span):
     part = np.empty((traces.shape[0], LANES), traces.dtype)
     for block in range(weights.shape[0]):
         multiply_sparse_block(tile_starts, columns, values, weights[block], part)
+        # The last block may be filled up with frames that lie beyond the span.
         first = span[0] + block * LANES
         last = min(first + LANES, span[1])
         for row in range(part.shape[0]):
@@ -266,6 +268,8 @@ def descend_total_variation(
                 lanes, gradient[row], weight, dual[0, row], above, dual[1, row], primal[row % 2]
             )
         if row > 0:
+            # The dual of a row needs the primal of the row below it, so that it follows one row
+            # behind.
             done = row - 1
             made, below = primal[done % 2], primal[(row if row < rows else done) % 2]
             _update_dual_row(lanes, made, below, sweep, dual[0, done], dual[1, done], scratch)

@@ -242,6 +242,8 @@ class CompiledLoops:
         pictures: Array, momentum: Array, gradient: Array, step: Array, weight: float
     ) -> tuple[Array, Array, Array, Array]:
         """What each lane has, for every pixel of a row."""
+        # Numbers that a lane has for itself are repeated along the row, so that the loop over it
+        # has one index and is vectorised.
         columns = pictures.shape[1] // step.size
         scaled = step * pictures.dtype.type(weight)
         return (
@@ -328,6 +330,7 @@ class PortableLoops:
         total, distance : (frames,) float64 array
         """
         xp = namespace(current)
+        # In place as far as possible: on a GPU memory is what limits the size of a block.
         point = current + momentum * (current - previous)
         gradient += weight
         gradient *= -step
@@ -418,6 +421,7 @@ def _primal_block(noisy: Array, dual: Array, weight: Array) -> Array:
     """
     xp = namespace(noisy)
     down, across = dual[0, ...], dual[1, ...]
+    # What roll brings round from the far border is zero there, as the last difference is.
     divergence = down - xp.roll(down, 1, axis=0)
     divergence += across
     divergence -= xp.roll(across, 1, axis=1)
@@ -431,6 +435,7 @@ def _forward_differences(picture: Array) -> Array:
     border.
     """
     xp = namespace(picture)
+    # The border is repeated, so that the difference across it is zero.
     below = xp.concat([picture[1:, ...], picture[-1:, ...]], axis=0)
     right = xp.concat([picture[:, 1:, ...], picture[:, -1:, ...]], axis=1)
     return xp.stack([below, right]) - picture
@@ -597,6 +602,7 @@ class CompiledBatches:
         piece : slice
         """
         chosen = self._order[piece]
+        # A run of frames is written in place; scattered ones go by a copy.
         if chosen[-1] - chosen[0] == chosen.size - 1:
             write_frames(block, self.frames, slice(chosen[0], chosen[-1] + 1))
         else:

@@ -129,6 +129,7 @@ def iterate(
         Objective of the whole block before the first iteration and after each.
     """
     xp = namespace(solver.objective)
+    # Sums stay where the arrays are: reading one back from a GPU would make every iteration wait.
     objective = [xp.sum(solver.objective)]
     converged, gap = False, None
     for done in range(1, stopping.iterations + 1):
@@ -145,6 +146,7 @@ def iterate(
             if gap is not None:
                 converged |= bool(xp.all(gap <= stopping.gap * solver.objective))
         if converged:
+            # The iterations that were saved count as done, so that a progress bar ends at its end.
             progress(frames * (stopping.iterations - done + 1))
             break
         progress(frames)
@@ -285,10 +287,12 @@ def relative_residual(
     measurements : (measurements, frames) array
     valid : (measurements, frames) bool array, optional
     """
+    # Block by block: predictions of all frames at once would double the memory.
     misfit = energy = 0.0
     xp = namespace(frames, measurements)
     for piece in split_blocks(frames.shape[0], frames_per_block(operator, measurements)):
         block = xp.moveaxis(frames[piece, ...], 0, -1)
+        # Invalid measurements count neither as misfit nor as energy.
         mask = 1.0 if valid is None else xp.astype(valid[:, piece], measurements.dtype)
         misfit += float(
             xp.sum(((operator(block) - measurements[:, piece]) * mask) ** 2, dtype=xp.float64)

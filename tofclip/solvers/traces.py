@@ -48,6 +48,7 @@ class InverseTraces:
                 f"traces of single pixels need a sparse matrix, not {inverse.operator!r}"
             )
         self.inverse = inverse
+        # The transpose has one row per pixel, in the order in which they are wanted.
         self._tiles = Tiles.from_csr(inverse.operator.matrix.T.tocsr()[pixels])
 
     def peak_response(self, block: Array) -> Array:
@@ -74,6 +75,8 @@ class InverseTraces:
     def _scales(self) -> Array:
         """``1 / |a|`` of each pixel, 0 where nothing is seen."""
         starts, _, values = self._tiles
+        # Sums between the starts of neighbouring pixels, in float64: differences of a running sum
+        # lose digits.
         ends = np.concatenate([[0], np.cumsum(values.astype(np.float64) ** 2)])
         energy = (ends[starts[:, 1:]] - ends[starts[:, :-1]]).sum(axis=0)
         scales = np.divide(1, np.sqrt(energy), out=np.zeros(energy.size), where=energy > 0)

@@ -36,6 +36,8 @@ class NonnegativeWavelets:
     def __init__(self, weight: float, wavelet: str = "db4", seed: int = 0) -> None:
         self.weight = validate_weight(weight)
         self.wavelet = wavelet
+        # The same shifts in every iteration: new ones would be another penalty each time, and the
+        # objective could rise.
         self._shifts = np.random.default_rng(seed).integers(0, 64, (SHIFT_COUNT, 2))
 
     def proximal_step(
@@ -63,6 +65,7 @@ class NonnegativeWavelets:
 
         size = current.dtype.type(step[0])
         take_gradient_step(current, previous, momentum, gradient, size)
+        # Not needed any more after the gradient step; it gathers the average over the shifts.
         previous[:] = 0
         penalty = np.zeros(current.shape[-1])
         for shift in self._shifts:
@@ -81,6 +84,8 @@ class NonnegativeWavelets:
         """Shrink the details; return the picture and the sum of its details' sizes for each frame."""
         import pywt
 
+        # Periodic borders keep the transform orthogonal, so that shrinking is the exact proximal
+        # map.
         grid = {"wavelet": self.wavelet, "mode": "periodization", "axes": (0, 1)}
         coefficients = pywt.wavedec2(picture, level=_count_levels(picture), **grid)
         total = np.zeros(picture.shape[-1])
@@ -92,6 +97,7 @@ class NonnegativeWavelets:
             total += sum(np.abs(band).sum(axis=(0, 1), dtype=np.float64) for band in soft)
             kept.append(soft)
         rows, columns = picture.shape[:2]
+        # An odd side comes back one pixel longer.
         return pywt.waverec2(kept, **grid)[:rows, :columns], total
 
 

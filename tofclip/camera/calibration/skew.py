@@ -103,7 +103,9 @@ def sum_view_energies(counts: NDArray[np.float32], camera: Camera) -> FloatArray
         The image is not as wide as the camera's slit.
     """
     require_width(counts, camera)
+    # Without its dark level, which would swamp the correlation with a constant.
     signal = counts - np.float32(estimate_dark_level(counts))
+    # No wider than half the way to the neighbour, whose light comes at other rows.
     half = min(camera.image_shape[1] // 2, _half_pitch_px(camera))
     edges = [(max(0, round(c) - half), round(c) + half + 1) for c in camera.centres_px]
     return np.array([signal[:, first:last].sum(axis=1, dtype=np.float64) for first, last in edges])
@@ -120,6 +122,8 @@ def _extract_structure(energies: FloatArray) -> FloatArray:
     """Compress the range (near objects outshine far ones by 1/r^2) and take the slow trend away."""
     from scipy.ndimage import gaussian_filter1d
 
+    # The root gives bright and dim returns the same noise, so that a single bright one does not
+    # decide.
     compressed = np.sqrt(np.maximum(energies, 0))
     detail: FloatArray = compressed - gaussian_filter1d(compressed, TREND_ROWS, axis=1)
     return detail
@@ -139,7 +143,10 @@ def _match_curves(curve: FloatArray, reference: FloatArray) -> tuple[float, floa
         return -float(np.mean((shifted - shifted.mean()) * (reference - reference.mean()))) / spread
 
     reach = max(2, round(MAX_OFFSET_FRACTION * rows.size))
+    # The correlation has a maximum wherever two returns meet: whole rows first, or the search would
+    # stay at the nearest one.
     coarse = min(range(-reach, reach + 1), key=lambda offset: disagreement(np.array([offset, 0.0])))
+    # Small enough to stay on the hill that the coarse search found: 3 rows, 1 % of stretch.
     simplex = np.array([[coarse, 0.0], [coarse + 3.0, 0.0], [coarse, 0.01]])
     options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-8}
     best = minimize(disagreement, simplex[0], method="Nelder-Mead", options=options)

@@ -40,6 +40,7 @@ class PointSpreadCamera(LightFieldCamera):
         self.sensor = make_sparse_sensor(self.image_shape, self.sampling_ratio)
         (self.measurements,) = self.sensor.shape_out
         spreads = trace_view_point_spreads(self.make_element(), self.views, self.image_shape)
+        # Views behind closed cells are seen by no measurement; they are left out of the model.
         used = np.flatnonzero(spreads.any(axis=(1, 2)))
         if used.size == 0:
             raise InputError("the aperture lets no light through; take another seed")
@@ -94,6 +95,7 @@ class CodedApertureCamera(PointSpreadCamera):
         random = np.random.default_rng(self.seed)
         cells = tuple(len({view[axis] for view in self.views}) for axis in (0, 1))
         code = random.integers(0, 2, cells)
+        # At least one open cell, or a small aperture might let no light through.
         code.flat[random.integers(code.size)] = 1
         return CodedAperture(code)
 

@@ -42,6 +42,7 @@ def _keep_nearest(distances, corners, count, wanted):
     """Move the `wanted` nearest corners to the front; returns how many there are."""
     if count <= wanted:
         return count
+    # The limit alone, not the whole order: which of the nearest comes first does not matter.
     limit = np.partition(distances[:count], wanted - 1)[wanted - 1]
     kept = 0
     for candidate in range(count):
@@ -64,6 +65,8 @@ def _gather_patches(picture, corners, patch, group):
 def _wiener_gain(centred, variance):
     """Return ``(C + variance I)^-1 C`` of the group's covariance C."""
     covariance = np.dot(centred.T, centred) / np.float32(centred.shape[0])
+    # The pilot has no noise left, so that C is the signal alone; the noise is white and loads the
+    # diagonal.
     loaded = covariance.copy()
     for pixel in range(loaded.shape[0]):
         loaded[pixel, pixel] += variance
@@ -111,6 +114,7 @@ def filter_patch_groups(noisy, pilot, deviation, settings):
     # a noise level of zero would make the gain's matrix singular
     variance = max(deviation * deviation, np.float32(1e-12))
     for step_row in range((rows - patch + stride - 1) // stride + 1):
+        # The last patch ends at the border, so that no pixel is left without one.
         row = min(step_row * stride, rows - patch)
         for step_column in range((columns - patch + stride - 1) // stride + 1):
             column = min(step_column * stride, columns - patch)
@@ -122,10 +126,19 @@ def filter_patch_groups(noisy, pilot, deviation, settings):
             )
             _gather_patches(pilot, corners, patch, alike)
             _gather_patches(noisy, corners, patch, seen)
+            # The gain is found on the pilot and applied to the noisy patches: their own noise would
+            # look like signal.
             mean = alike.sum(axis=0) / np.float32(members)
             gain = _wiener_gain(alike - mean, variance)
             clean = np.dot(seen - mean, gain) + mean
             _scatter_patches(
-                clean, corners, patch, 1 / (np.trace(gain) + np.float32(1)), total, weights
+                # The trace is the number of unknowns that the filter lets through; the fewer, the
+                # less noise is left.
+                clean,
+                corners,
+                patch,
+                1 / (np.trace(gain) + np.float32(1)),
+                total,
+                weights,
             )
     return total / weights
