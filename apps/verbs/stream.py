@@ -79,7 +79,7 @@ def stream(
     suffix: Annotated[str, typer.Option(metavar=".EXT", help="Format of the clouds.")] = ".ply",
     as_json: JsonOption = False,
 ) -> None:
-    """Make a cloud of each shot by the linear inverse while the next ones come, and report rate and
+    """Make a cloud of each shot by the linear inverse while the next ones come; report rate and
     latencies.
 
     Photons become a shot in batches, pictures one by one: see records= and frames=
