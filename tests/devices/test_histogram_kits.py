@@ -159,7 +159,7 @@ def test_a_kit_that_is_unplugged() -> None:
     with devices.open("sim+tmf8828://?seed=1&rate=100&reconnect_s=0.2") as source:
         take(source, 2)
         source._feed._kit.close()  # type: ignore[attr-defined]
-        with pytest.raises(DeviceDisconnectedError, match="nobody answered"):
+        with pytest.raises(DeviceDisconnectedError, match="no answer came"):
             take(source, 1000)
     assert source.stats.is_balanced
     assert source.stats.delivered >= 2
