@@ -43,7 +43,7 @@ FILE_OPENERS: dict[str, str] = {
     ".tif": "devices.streak_file:open_streak_file",
     ".tiff": "devices.streak_file:open_streak_file",
     ".phu": "devices.tcspc:open_phu",
-    ".ptu": "devices.tcspc:open_ptu",
+    ".ptu": "devices.ptu:open_ptu",
     ".sdt": "devices.tcspc:open_sdt",
     ".h5": "devices.replay:open_recording",
     ".hdf5": "devices.replay:open_recording",

@@ -1,7 +1,7 @@
 """Files of time-correlated single-photon counting: PicoQuant's PTU and PHU, Becker & Hickl's SDT.
 
-The libraries `ptufile` and `sdtfile` read them (extra ``tcspc``). What they make of a file is
-handed on as records: photons one by one (PTU in T3 mode), or whole histograms (PHU, SDT).
+The libraries `ptufile` and `sdtfile` read them (extra ``tcspc``). Photons one by one come from
+`devices.ptu`; here are whole histograms (PHU, SDT).
 """
 
 from __future__ import annotations
@@ -43,8 +43,7 @@ FileContents = tuple[Records, dict[str, Scalar], Info]
 class TcspcFile(Source):
     """A file's records. Memory: four times the file, which the libraries read as a whole.
 
-    The calibration has ``resolution_s``, the width of a bin, ``channels``, and for photons
-    ``laser_period_s``.
+    The calibration has ``resolution_s``, the width of a bin, and ``channels``.
 
     Parameters
     ----------
@@ -57,7 +56,7 @@ class TcspcFile(Source):
     StorageError
         The file is absent or may not be read.
     FileFormatError
-        It is damaged, or of a kind that has no times after a laser's pulse.
+        It is damaged.
     """
 
     def __init__(self, path: str | Path, reader: Callable[[Path], FileContents]) -> None:
@@ -120,11 +119,6 @@ class TcspcFile(Source):
         self._closed = True
 
 
-def open_ptu(uri: Uri) -> TcspcFile:
-    """Open ``file://run.ptu``."""
-    return _open_file(uri, _read_photons)
-
-
 def open_phu(uri: Uri) -> TcspcFile:
     """Open ``file://run.phu``."""
     return _open_file(uri, _read_picoquant_histograms)
@@ -140,38 +134,8 @@ def _open_file(uri: Uri, reader: Callable[[Path], FileContents]) -> TcspcFile:
     return TcspcFile(uri.location, reader)
 
 
-def _read_photons(path: Path) -> FileContents:
-    ptufile = _import_library("ptufile")
-    with BoundedFile(path) as opened, ptufile.PtuFile(opened) as file:
-        # T2 mode tags every event, the laser included, by an absolute time.
-        if not file.is_t3:
-            raise FileFormatError(
-                path, "is in T2 mode, whose times are not counted from the laser; record in T3 mode"
-            )
-        decoded = file.decode_records()
-        resolution, rate = float(file.tcspc_resolution), float(file.syncrate)
-        kind = str(file.record_type.name)
-    photons = decoded[
-        (decoded["channel"] >= 0) & (decoded["dtime"] >= 0)
-    ]  # the others mark lines, frames, overflows
-    records = np.empty(len(photons), PHOTON_DTYPE)
-    records["sync"], records["bin"], records["channel"] = (
-        photons["time"],
-        photons["dtime"],
-        photons["channel"],
-    )
-    channels = int(records["channel"].max(initial=0)) + 1
-    attributes: dict[str, Scalar] = {
-        "resolution_s": _require_positive(resolution, path),
-        "channels": channels,
-    }
-    if rate > 0:
-        attributes["laser_period_s"] = 1 / rate
-    return records, attributes, Info(f"TCSPC file ({kind})", "", dict(attributes))
-
-
 def _read_picoquant_histograms(path: Path) -> FileContents:
-    ptufile = _import_library("ptufile")
+    ptufile = import_library("ptufile")
     with BoundedFile(path) as opened, ptufile.PhuFile(opened) as file:
         bins = np.ravel(file.tags["HistResDscr_HistogramBins"]).tolist()
         require_bounded_size(
@@ -183,7 +147,7 @@ def _read_picoquant_histograms(path: Path) -> FileContents:
 
 
 def _read_becker_hickl_histograms(path: Path) -> FileContents:
-    sdtfile = _import_library("sdtfile")
+    sdtfile = import_library("sdtfile")
     require_bounded_sdt(path)
     with sdtfile.SdtFile(path) as file:
         curves = [
@@ -209,19 +173,21 @@ def _make_histogram_records(
     records = np.zeros(len(counts), [("channel", "<u4"), ("histogram", "<u4", counts.shape[1:])])
     records["channel"], records["histogram"] = np.arange(len(counts)), counts
     attributes: dict[str, Scalar] = {
-        "resolution_s": _require_positive(resolution, path),
+        "resolution_s": require_positive(resolution, path),
         "channels": len(counts),
     }
     return records, attributes, Info(instrument, "", dict(attributes))
 
 
-def _require_positive(resolution: float, path: Path) -> float:
+def require_positive(resolution: float, path: Path) -> float:
+    """Return a bin's duration, s, if it can be one."""
     if not (np.isfinite(resolution) and resolution > 0):
         raise FileFormatError(path, f"says that its bins last {resolution} s")
     return resolution
 
 
-def _import_library(name: str) -> Any:
+def import_library(name: str) -> Any:
+    """Import what reads these files, or raise the line that says how to install it."""
     import importlib
 
     try:

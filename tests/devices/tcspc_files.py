@@ -91,3 +91,50 @@ def write_sdt(path: Path, decays: NDArray[Any]) -> None:
         blocks += one.tobytes() + curve.astype("<u2").tobytes()
         at += block.itemsize + bins * 2
     path.write_bytes(header.tobytes() + info + measurement.tobytes() + blocks)
+
+
+T2_TICK = 1e-12
+T2_OVERFLOW = 1 << 25
+
+
+def write_ptu_t2(path: Path, pulses: NDArray[Any], photons: NDArray[Any]) -> None:
+    """Events tagged by absolute times, as HydraHarps do (version 2).
+
+    Parameters
+    ----------
+    path : Path
+    pulses : (n,) int array
+        Ticks of the laser's pulses.
+    photons : (m, 2) int array
+        Tick and channel (from 0) of each photon.
+    """
+    lines = pulses[::10]  # a marker with every tenth pulse
+    ticks = np.concatenate([pulses, lines, photons[:, 0]])
+    # special events: the pulses on channel 0, markers on 1 to 15, overflows on 63
+    words = np.concatenate(
+        [
+            np.full(len(pulses), 1 << 31),
+            np.full(len(lines), 1 << 31 | 1 << 25),
+            photons[:, 1] << 25,
+        ]
+    )
+    order = np.argsort(ticks, kind="stable")
+    found: list[int] = []
+    turns = 0
+    for tick, word in zip(ticks[order].tolist(), words[order].tolist(), strict=True):
+        if tick // T2_OVERFLOW > turns:
+            found.append(1 << 31 | 63 << 25 | tick // T2_OVERFLOW - turns)
+            turns = tick // T2_OVERFLOW
+        found.append(word | tick % T2_OVERFLOW)
+    tags = [
+        integer("Measurement_Mode", 2),
+        integer("Measurement_SubMode", 0),
+        integer("TTResultFormat_TTTRRecType", 0x01010204),
+        integer("TTResultFormat_BitsPerRecord", 32),
+        integer("TTResult_NumberOfRecords", len(found)),
+        real("MeasDesc_GlobalResolution", T2_TICK),
+        real("MeasDesc_Resolution", T2_TICK),
+        tag("Header_End", 0xFFFF0008, bytes(8)),
+    ]
+    head = b"PQTTTR\0\0" + b"1.0.00".ljust(8, b"\0") + b"".join(tags)
+    path.write_bytes(head + np.array(found, "<u4").tobytes())

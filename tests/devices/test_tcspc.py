@@ -113,7 +113,9 @@ def test_damaged_files_raise_only_our_own_errors(request: pytest.FixtureRequest,
     assert not any("\n" in message for message in messages)
 
 
-def test_what_cannot_be_read(tmp_path: Path, ptu: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_read(
+    tmp_path: Path, ptu: Path, phu: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(StorageError, match="no such file"):
         devices.open(f"file://{tmp_path}/absent.sdt")
     (tmp_path / "other.phu").write_bytes(b"something else")
@@ -123,7 +125,7 @@ def test_what_cannot_be_read(tmp_path: Path, ptu: Path, monkeypatch: pytest.Monk
         devices.open(f"file://{ptu}?x=1")
     monkeypatch.setattr(tcspc, "MAX_FILE_BYTES", 100)
     with pytest.raises(FileFormatError, match="larger than 100 bytes"):
-        devices.open(f"file://{ptu}")
+        devices.open(f"file://{phu}")
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, "ptufile", None)
     with pytest.raises(MissingDependencyError, match=r"install tofclip\[tcspc\]"):
@@ -141,3 +143,51 @@ def test_what_cannot_be_read(tmp_path: Path, ptu: Path, monkeypatch: pytest.Monk
 def test_histograms_that_cannot_be(curves: list[Any], resolution: float, problem: str) -> None:
     with pytest.raises(FileFormatError, match=problem):
         tcspc._make_histogram_records(curves, resolution, "", Path("run.sdt"))
+
+
+def read_all(address: str) -> Any:
+    with devices.open(address) as source:
+        return np.concatenate([batch.records for batch in source])
+
+
+@pytest.mark.parametrize("pieces", [1, 7, 40])
+def test_a_ptu_is_the_same_in_pieces(
+    ptu: Path, pieces: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Photons that are read a piece at a time, as of a file that does not fit into memory."""
+    whole = read_all(f"file://{ptu}")
+    monkeypatch.setattr("devices.ptu.CHUNK_RECORDS", -(-len(whole) // pieces))
+    np.testing.assert_array_equal(read_all(f"file://{ptu}"), whole)
+    with devices.open(f"file://{ptu}") as source:
+        source.seek(len(whole) // 2)
+        batch = source.read()
+        assert batch is not None
+        np.testing.assert_array_equal(batch.records, whole[len(whole) // 2 :][: len(batch.records)])
+        assert batch.first == len(whole) // 2
+
+
+@pytest.mark.parametrize("chunk", [13, 1 << 20])
+def test_photons_of_a_file_in_t2_mode(
+    tmp_path: Path, chunk: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Times from the last pulse before each photon, over overflows and pieces."""
+    monkeypatch.setattr("devices.ptu.CHUNK_RECORDS", chunk)
+    random = np.random.default_rng(3)
+    pulses = 500 + 400_000 * np.arange(300)  # 120 us: over three overflows of 34 us
+    own = np.sort(random.integers(0, 300, 200))
+    delay, channel = random.integers(1, 399_000, 200), random.integers(0, 2, 200)
+    events = np.stack([pulses[own] + delay, channel], axis=1)
+    early = np.array([[100, 0]])  # before the first pulse: no time can be given
+    tcspc_files.write_ptu_t2(tmp_path / "t2.ptu", pulses, np.concatenate([early, events]))
+    with devices.open(f"file://{tmp_path}/t2.ptu") as source:
+        records = np.concatenate([batch.records for batch in source])
+        known = source.calibration
+    assert known is not None
+    order = np.argsort(events[:, 0], kind="stable")
+    np.testing.assert_array_equal(records["bin"], delay[order])
+    np.testing.assert_array_equal(records["sync"], own[order])
+    np.testing.assert_array_equal(records["channel"], channel[order])
+    assert known.attribute("laser_period_s") == pytest.approx(400e-9)
+    assert known.attribute("resolution_s") == tcspc_files.T2_TICK
+    with pytest.raises(FileFormatError, match="name their channel: sync="):
+        devices.open(f"file://{tmp_path}/t2.ptu?sync=9")
