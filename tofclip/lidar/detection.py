@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
 
 from tofclip.errors import InputError
 
@@ -116,5 +116,5 @@ def _find_local_maximum(time: FloatArray, intensity: FloatArray, width: float) -
     slot = np.round((time - time.min()) / (width / SLOTS_PER_WIDTH)).astype(np.intp)
     brightest = np.zeros(int(slot.max()) + 1)
     np.maximum.at(brightest, slot, intensity)
-    around: FloatArray = maximum_filter1d(brightest, 2 * SLOTS_PER_WIDTH + 1)[slot]
+    around: FloatArray = scipy.ndimage.maximum_filter1d(brightest, 2 * SLOTS_PER_WIDTH + 1)[slot]
     return around

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from tofclip.errors import InputError
 from tofclip.lidar.cloud import PointCloud
@@ -75,9 +73,11 @@ def find_objects(cloud: PointCloud, reach: float, min_points: int = 40) -> list[
         raise InputError("objects need a positive reach, and at least one point")
     if len(cloud) == 0:
         return []
-    pairs = cKDTree(cloud.xyz).query_pairs(reach, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(cloud), len(cloud)))
-    groups, label = connected_components(links, directed=False)
+    pairs = scipy.spatial.cKDTree(cloud.xyz).query_pairs(reach, output_type="ndarray")
+    links = scipy.sparse.coo_array(
+        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(cloud), len(cloud))
+    )
+    groups, label = scipy.sparse.csgraph.connected_components(links, directed=False)
     members = (np.flatnonzero(label == group) for group in range(groups))
     return sorted(
         (_measure_object(cloud, one) for one in members if one.size >= min_points),

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
 from tofclip.lidar.cloud import PointCloud
@@ -210,7 +210,7 @@ def find_outliers(
         return np.zeros(len(cloud), bool)
     xyz = cloud.xyz.astype(np.float64)
     # The nearest point to each is itself.
-    apart, near = cKDTree(xyz).query(xyz, neighbours + 1)
+    apart, near = scipy.spatial.cKDTree(xyz).query(xyz, neighbours + 1)
     spacing = apart[:, 1:].mean(axis=1)
     tiny = np.finfo(np.float64).tiny
     per_range = spacing / np.maximum(cloud.range, tiny)

@@ -24,8 +24,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, gaussian_filter, uniform_filter
 
 from tofclip.camera import Camera, measure
 from tofclip.camera.measurement import estimate_dark_level
@@ -119,7 +119,7 @@ class SurfaceModel:
         self.start = float(streak.times[0])
         dark = estimate_dark_level(streak.counts)
         self.image = (streak.counts - np.float32(dark)).astype(np.float32)
-        smooth = np.maximum(gaussian_filter(streak.counts.astype(np.float32), 1.0), 0)
+        smooth = np.maximum(scipy.ndimage.gaussian_filter(streak.counts.astype(np.float32), 1.0), 0)
         # The variance of a measurement is its photons; the floor stands for what the model cannot explain.
         weights = 1 / (smooth + MODEL_ERROR_FRACTION * smooth.max() + max(dark, 0.0))
         if streak.saturated is not None:
@@ -482,7 +482,7 @@ class SurfaceRecovery:
         for patch, mask, picture in zip(patches, masks, pictures, strict=True):
             mask.ravel()[patch.pixels] = True
             picture.ravel()[patch.pixels] = brightness[patch.pixels]
-            mask[...] = binary_dilation(mask, np.ones((3, 3)), MARGIN_PX)
+            mask[...] = scipy.ndimage.binary_dilation(mask, np.ones((3, 3)), MARGIN_PX)
         state = SurfaceState(
             np.stack([patch.coefficients for patch in patches]),
             camera.gains.copy(),
@@ -537,7 +537,7 @@ class SurfaceRecovery:
         # prior ties to it, count as well.
         information = np.zeros(model.masks.shape, np.float32)
         information[model.masks] = model.gather(model.weights, squared=True)
-        pooled = NEIGHBOURHOOD_PX**2 * uniform_filter(
+        pooled = NEIGHBOURHOOD_PX**2 * scipy.ndimage.uniform_filter(
             information, (0, NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), mode="constant"
         )
         significance = amplitude * np.sqrt(pooled[model.masks])

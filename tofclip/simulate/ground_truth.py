@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion
 
 from tofclip.shots import Frames
 from tofclip.simulate.instrument import Instrument
@@ -73,7 +73,9 @@ class GroundTruth:
             (path * own).sum(axis=-1), count, out=distance, where=count > 0, casting="same_kind"
         )
         firm = np.all(reflectance >= MIN_REFLECTANCE, axis=-1)
-        whole = (binary_erosion((share == 1) & firm, np.ones((3, 3))) for share in filled)
+        whole = (
+            scipy.ndimage.binary_erosion((share == 1) & firm, np.ones((3, 3))) for share in filled
+        )
         return cls(
             range=distance,
             reflectance=reflectance.mean(axis=-1).astype(np.float32),

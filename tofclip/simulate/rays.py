@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from tofclip.simulate.bodies import Body
 
@@ -187,7 +187,9 @@ def spread_pulse(position: Array, sigma: Array) -> tuple[NDArray[np.intp], Array
     half = int(np.ceil(EXTENT_SIGMAS * sigma.max() + 0.5))
     first = np.round(position).astype(np.intp) - half
     edges = first[:, np.newaxis] + np.arange(2 * half + 2) - 0.5
-    return first, np.diff(ndtr((edges - position[:, np.newaxis]) / sigma[:, np.newaxis]), axis=1)
+    return first, np.diff(
+        scipy.special.ndtr((edges - position[:, np.newaxis]) / sigma[:, np.newaxis]), axis=1
+    )
 
 
 def bin_by_time(

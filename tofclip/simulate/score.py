@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import binary_dilation
+import scipy
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Returns
@@ -52,7 +52,7 @@ def score_returns(returns: Returns, truth: GroundTruth) -> dict[str, float]:
     z = float(np.median(ratio) / MEDIAN_PER_SIGMA)
     bin_m = SPEED_OF_LIGHT * truth.bin_width / 2
     # a return beside a border may belong to either side
-    near_anything = binary_dilation(np.isfinite(truth.range), np.ones((3, 3)))
+    near_anything = scipy.ndimage.binary_dilation(np.isfinite(truth.range), np.ones((3, 3)))
     return {
         "median_depth_error_m": float(np.median(error[found])),
         "share_within_one_bin": float(np.mean(error <= bin_m)),

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from tofclip.errors import InputError
 from tofclip.lidar.photons.photon_image import FloatArray, PhotonImage
@@ -199,7 +199,9 @@ def learn_response(
     known = (number >= early[0]) & (number <= last)
     photons = np.bincount(number[known] - early[0], count[known], last - early[0] + 1)
     level = float(np.mean(photons[: early[1] - early[0]]))
-    shape = gaussian_filter1d(photons, SMOOTHING_WIDTHS * SAMPLES_PER_WIDTH)[first - early[0] :]
+    shape = scipy.ndimage.gaussian_filter1d(photons, SMOOTHING_WIDTHS * SAMPLES_PER_WIDTH)[
+        first - early[0] :
+    ]
     shape = np.maximum(shape - level, 0.0)
     if not shape.any():
         raise InputError("there is no light around the surface to learn the pulse from")

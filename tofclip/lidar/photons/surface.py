@@ -17,13 +17,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, uniform_filter, uniform_filter1d
-from scipy.optimize import minimize
-from scipy.stats import poisson
 
 from tofclip.camera import Camera
-from tofclip.lidar.photons import surface_kernels as kernels
 from tofclip.lidar.photons.detector import PhotonDetector
 from tofclip.lidar.photons.photon_image import FloatArray, PhotonImage
 from tofclip.lidar.photons.response import BinnedResponse, learn_response, measure_pulse_width
@@ -416,10 +413,16 @@ def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> F
         photons.pixel, photons.count * (np.abs(late) <= reach), layer[..., 0].size
     ).reshape(layer.shape[:2])
     expected = scene.background * (2 * reach + 1)
-    pooled = uniform_filter(seen, 3, mode="nearest") * 9
-    own = poisson.sf(seen - 1, expected) < MAX_OWN_CHANCE
-    around = poisson.sf(np.rint(pooled) - 1, 9 * expected) < MAX_POOLED_CHANCE
+    pooled = scipy.ndimage.uniform_filter(seen, 3, mode="nearest") * 9
+    own = _find_chance(seen, expected) < MAX_OWN_CHANCE
+    around = _find_chance(np.rint(pooled), 9 * expected) < MAX_POOLED_CHANCE
     return np.where((own & around)[..., np.newaxis], layer, np.nan)
+
+
+def _find_chance(seen: FloatArray, expected: FloatArray) -> FloatArray:
+    """Chance of that many photons or more where a Poisson law with that mean holds."""
+    found = scipy.special.gammainc(np.maximum(seen, 1), expected)  # scipy.stats loads for a second
+    return np.where(seen > 0, found, 1.0)
 
 
 def combine_layers(
@@ -576,7 +579,7 @@ def find_occupied_bins(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> N
     counts = np.bincount(number, photons.count, tiles * axis.coarse_bins)
     counts = counts.reshape(tiles, axis.coarse_bins)
     length = max(1, round(scene.response.width / axis.coarse))
-    pooled = uniform_filter1d(counts, length, axis=1, mode="constant") * length
+    pooled = scipy.ndimage.uniform_filter1d(counts, length, axis=1, mode="constant") * length
     # A tile may be brighter or darker than the others throughout.
     level = np.minimum(np.quantile(counts, 0.5, axis=1), counts.mean(axis=1))
     expected = length * np.maximum(
@@ -584,7 +587,7 @@ def find_occupied_bins(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> N
     )
     limit = expected + MIN_TILE_SIGNIFICANCE * np.sqrt(expected) + 2
     occupied = np.any(pooled > limit[:, np.newaxis], axis=0)
-    return np.asarray(binary_dilation(occupied, iterations=2 * LABELS_PER_WIDTH))
+    return np.asarray(scipy.ndimage.binary_dilation(occupied, iterations=2 * LABELS_PER_WIDTH))
 
 
 def compute_scores(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> NDArray[np.float32]:
@@ -600,6 +603,8 @@ def compute_scores(photons: PhotonImage, scene: Scene, axis: LabelAxis) -> NDArr
     -------
     (pixels, labels) float32 array
     """
+    from tofclip.lidar.photons import surface_kernels as kernels
+
     shares, first = scene.response.coarse_shares(axis.coarse)
     odds = scene.count_signal(photons) * shares / (scene.background * axis.coarse)
     weights = np.log1p(odds).astype(np.float32)
@@ -638,6 +643,8 @@ def match_labels(
     (rows, columns) int64 array, (rows, columns) float32 array
         Labels, and by how much each beats the next best that is not beside it.
     """
+    from tofclip.lidar.photons import surface_kernels as kernels
+
     cube = score.reshape(*image_shape, -1)
     total = np.zeros_like(cube)
     costs = np.float32(slope_cost), np.float32(slope_cost * JUMP_COST_RATIO)
@@ -697,6 +704,8 @@ def _measure_photons(
     photons: PhotonImage, scene: Scene, surface: FloatArray, brightness: FloatArray
 ) -> FloatArray:
     """Slope and information of each pixel's likelihood, and its signal; see `measure_events`."""
+    from tofclip.lidar.photons import surface_kernels as kernels
+
     response, sums = scene.response, np.empty((surface.size, 3))
     table = np.stack([response.log_slope, response.density / scene.background], axis=1)
 
@@ -726,6 +735,7 @@ def _fit_planes(
     fitted: FloatArray,
 ) -> None:
     """Fit a plane around every pixel, `fitted` and `slopes` are overwritten; see `fit_planes`."""
+    from tofclip.lidar.photons import surface_kernels as kernels
 
     def work(piece: slice) -> None:
         kernels.fit_planes(surface, sums, reach, gate, slopes, (piece.start, piece.stop), fitted)
@@ -750,6 +760,8 @@ def weigh_evidence(
     -------
     (pixels,) array
     """
+    from tofclip.lidar.photons import surface_kernels as kernels
+
     response = scene.response
     flat = np.ascontiguousarray(surface, dtype=np.float64).ravel()
     ahead = response.start
@@ -758,7 +770,9 @@ def weigh_evidence(
     length = response.width - 2 * ahead
     seen = np.bincount(train.pixel, train.count * inside, flat.size).reshape(surface.shape)
     whole = train.photons_per_pixel
-    pooled, total = (uniform_filter(part, SIGNAL_POOL_PX, mode="nearest") for part in (seen, whole))
+    pooled, total = (
+        scipy.ndimage.uniform_filter(part, SIGNAL_POOL_PX, mode="nearest") for part in (seen, whole)
+    )
     outside = np.maximum(total - pooled, 0) * length / max(train.bins - length, 1)
     signal = np.clip((pooled - outside) / np.maximum(total, 1e-9), 0.02, 0.98)
     evidence = np.empty(flat.size)
@@ -885,8 +899,10 @@ def estimate_bias(fitted: FloatArray, nested: FloatArray, reach: int) -> FloatAr
     known = np.isfinite(wide) & np.isfinite(narrow) & (apart < 25 * narrow)
     excess = np.zeros(apart.shape)
     excess[known] = (apart - narrow)[known] + wide[known]
-    number = uniform_filter(known.astype(float), 2 * reach + 1, mode="nearest")
-    mean = uniform_filter(excess, 2 * reach + 1, mode="nearest") / np.maximum(number, 1e-9)
+    number = scipy.ndimage.uniform_filter(known.astype(float), 2 * reach + 1, mode="nearest")
+    mean = scipy.ndimage.uniform_filter(excess, 2 * reach + 1, mode="nearest") / np.maximum(
+        number, 1e-9
+    )
     bias: FloatArray = NESTED_BIAS_RATIO**2 * np.maximum(mean, 0)
     return bias
 
@@ -915,7 +931,7 @@ def calibrate_outliers(
         wrong = _logistic(coefficients[0] - np.exp(coefficients[1]) * feature)
         return -float(np.mean(np.log((1 - wrong) * np.exp(ratio) + wrong)))
 
-    found = minimize(misfit, np.array([0.0, 0.0]), method="Nelder-Mead").x
+    found = scipy.optimize.minimize(misfit, np.array([0.0, 0.0]), method="Nelder-Mead").x
 
     def to_probability(value: NDArray[np.float32]) -> FloatArray:
         known = np.log1p(np.maximum(value, 0)).astype(np.float64)

@@ -40,7 +40,6 @@ from tofclip.camera import Camera
 from tofclip.errors import InputError, ShapeError, require_type
 from tofclip.lidar.detection import Detection
 from tofclip.lidar.geometry import compute_ray_directions
-from tofclip.lidar.neighbours import add_recovery_error
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.search.array_api import ArraySearch, ArrayTraces
 from tofclip.lidar.traces import FrameTraces, Traces
@@ -117,6 +116,9 @@ class ReturnSearch:
         -----
         Memory: 128 traces a thread, and 100 bytes a pixel.
         """
+        # the compiler takes as long to import as all else
+        from tofclip.lidar.neighbours import add_recovery_error
+
         pixel, time, signal, deviation = self._find_candidates(traces)
         distance = SPEED_OF_LIGHT * time / 2
         intensity = signal * (distance / REFERENCE_RANGE_M) ** 2
