@@ -76,13 +76,17 @@ def add_recovery_error(
     nearness = 1 / (distance * along_axis)
     metres = distance / nearness
     scatter = np.empty(total.size)
+    row, column = np.divmod(pixel, image_shape[1])
+    first = (row % STRIDE_PX == 0) & (column % STRIDE_PX == 0)
+    # neighbours have nearly the same returns around them: one plane in four does
+    for chosen, borrow in ((np.flatnonzero(first), False), (np.flatnonzero(~first), True)):
 
-    def work(piece: slice) -> None:
-        scatter_about_planes(
-            nearness, metres, pixel, starts, image_shape, gate, (piece.start, piece.stop), scatter
-        )
+        def work(piece: slice, some: NDArray[np.intp] = chosen, borrow: bool = borrow) -> None:
+            scatter_about_planes(
+                nearness, metres, pixel, starts, image_shape, gate, some[piece], borrow, scatter
+            )
 
-    run_blocks(work, total.size, RETURNS_PER_BLOCK)
+        run_blocks(work, chosen.size, RETURNS_PER_BLOCK)
     known = scatter >= 0
     if np.count_nonzero(known) < MIN_KNOWN:
         return total
@@ -95,7 +99,9 @@ def add_recovery_error(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def scatter_about_planes(nearness, metres, pixel, starts, image_shape, gate, span, scatter):
+def scatter_about_planes(
+    nearness, metres, pixel, starts, image_shape, gate, chosen, borrow, scatter
+):
     """Robust deviation of the returns around each from a plane through them, -1 if they are few.
 
     Parameters
@@ -111,35 +117,141 @@ def scatter_about_planes(nearness, metres, pixel, starts, image_shape, gate, spa
     image_shape : (int, int)
     gate : float
         m.
-    span : (int, int)
-        First return, and the one after the last.
+    chosen : (k,) int64 array
+        Numbers of the returns.
+    borrow : bool
+        Whether they take what is known of a return beside them, in a row and column that
+        `STRIDE_PX` divides, on the same surface.
     scatter : (n,) array
-        Overwritten in the span: m.
+        Overwritten at the chosen: m.
     """
     side = 2 * (REACH_PX // STRIDE_PX) + 1
     around, residual = np.empty((side * side, 3)), np.empty(side * side)
     used = np.empty(side * side, np.bool_)
-    for own in range(span[0], span[1]):
+    for own in chosen:
+        if borrow:
+            donor = find_donor(nearness, metres, pixel, starts, image_shape, own)
+            if donor[0] >= 0 and donor[1] < gate and scatter[donor[0]] >= 0:
+                scatter[own] = scatter[donor[0]]
+                continue
         number = collect_neighbours(nearness, metres, pixel, starts, image_shape, own, around)
+        scatter[own] = scatter_about_plane(around[:number], gate, used, residual)
+
+
+@compiled
+def scatter_about_plane(around, gate, used, residual):
+    """Robust deviation of neighbours from a plane through them, -1 if they are few.
+
+    Parameters
+    ----------
+    around : (neighbours, 3) array
+        Columns and rows away, and how much further off, in m.
+    gate : float
+        m.
+    used : (neighbours or more,) bool array
+    residual : (neighbours or more,) array
+        Room for what is worked out.
+
+    Returns
+    -------
+    float
+        m.
+    """
+    number, scatter = around.shape[0], -1.0
+    for t in range(number):
+        used[t] = abs(around[t, 2]) < gate
+    for _ in range(FIT_ROUNDS):
+        a, b, c, count = fit_plane_around(around, used)
+        if count < MIN_NEIGHBOURS:
+            return -1.0
+        left = 0
         for t in range(number):
-            used[t] = abs(around[t, 2]) < gate
-        scatter[own] = -1.0
-        for _ in range(FIT_ROUNDS):
-            a, b, c, count = fit_plane_around(around[:number], used)
-            if count < MIN_NEIGHBOURS:
-                scatter[own] = -1.0
-                break
-            left = 0
-            for t in range(number):
-                if used[t]:
-                    residual[left] = abs(around[t, 2] - a * around[t, 0] - b * around[t, 1] - c)
-                    left += 1
-            free = count / (count - 3.0)
-            scatter[own] = MAD_TO_SIGMA * np.median(residual[:left]) * np.sqrt(free)
-            limit = OUTLIER_DEVIATIONS * scatter[own]
-            for t in range(number):
-                off = around[t, 2] - a * around[t, 0] - b * around[t, 1] - c
-                used[t] = abs(off) <= limit
+            if used[t]:
+                residual[left] = abs(around[t, 2] - a * around[t, 0] - b * around[t, 1] - c)
+                left += 1
+        free = count / (count - 3.0)
+        scatter = MAD_TO_SIGMA * select_median(residual, left) * np.sqrt(free)
+        changed = False
+        for t in range(number):
+            off = around[t, 2] - a * around[t, 0] - b * around[t, 1] - c
+            near = abs(off) <= OUTLIER_DEVIATIONS * scatter
+            changed |= near != used[t]
+            used[t] = near
+        if not changed:  # further rounds would find the same
+            break
+    return scatter
+
+
+@compiled
+def select_median(values, count):
+    """Return the median of ``values[:count]``, which are put in another order.
+
+    By selection instead of sorting: most of the time of `scatter_about_planes` is spent here.
+
+    Parameters
+    ----------
+    values : (count or more,) array
+    count : int
+        At least one.
+
+    Returns
+    -------
+    float
+    """
+    middle, first, last = count // 2, 0, count - 1
+    while first < last:  # C. A. R. Hoare's FIND
+        pivot, low, high = values[middle], first, last
+        while low <= high:
+            while values[low] < pivot:
+                low += 1
+            while pivot < values[high]:
+                high -= 1
+            if low <= high:
+                values[low], values[high] = values[high], values[low]
+                low += 1
+                high -= 1
+        if high < middle:
+            first = low
+        if middle < low:
+            last = high
+    if count % 2 == 1:
+        return values[middle]
+    below = values[0]
+    for t in range(1, middle):
+        below = max(below, values[t])
+    return (below + values[middle]) / 2
+
+
+@compiled
+def find_donor(nearness, metres, pixel, starts, image_shape, own):
+    """Find the return nearest in range among those beside one whose row and column `STRIDE_PX`
+    divides.
+
+    Parameters
+    ----------
+    nearness, metres, pixel, starts, image_shape
+        As for `scatter_about_planes`.
+    own : int
+        Number of the return.
+
+    Returns
+    -------
+    number : int
+        -1: none.
+    off : float
+        By how much it is nearer or further, m.
+    """
+    rows, columns = image_shape
+    y, x = pixel[own] // columns, pixel[own] % columns
+    found, least = -1, np.inf
+    for j in range(y - y % STRIDE_PX, min(y + STRIDE_PX, rows), STRIDE_PX):
+        for i in range(x - x % STRIDE_PX, min(x + STRIDE_PX, columns), STRIDE_PX):
+            there = j * columns + i
+            for k in range(starts[there], starts[there + 1]):
+                off = abs((nearness[own] - nearness[k]) * metres[own])
+                if off < least:
+                    found, least = k, off
+    return found, least
 
 
 @compiled

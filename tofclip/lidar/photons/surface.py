@@ -419,7 +419,7 @@ def keep_significant(photons: PhotonImage, scene: Scene, layer: FloatArray) -> F
     return np.where((own & around)[..., np.newaxis], layer, np.nan)
 
 
-def _find_chance(seen: FloatArray, expected: FloatArray) -> FloatArray:
+def _find_chance(seen: NDArray[Any], expected: NDArray[Any] | float) -> FloatArray:
     """Chance of that many photons or more where a Poisson law with that mean holds."""
     found = scipy.special.gammainc(np.maximum(seen, 1), expected)  # scipy.stats loads for a second
     return np.where(seen > 0, found, 1.0)
