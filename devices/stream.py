@@ -7,11 +7,13 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import threading
 from dataclasses import dataclass
 from time import monotonic
 from typing import Protocol
+from weakref import WeakSet
 
 from devices.codec import Codec, as_bytes
 from devices.decoded_source import DecodedSource
@@ -107,11 +109,17 @@ class StreamSource(DecodedSource):
         self._feed = feed
         self._ring = RingBuffer(buffering.capacity, buffering.policy, ledger)
         self._stopping, self._closed = threading.Event(), False
-        feed.start()
-        # Asked before the thread starts, because a feed is used by one thread at a time.
-        self._info, self._calibration = feed.info, feed.calibration
         self._thread = threading.Thread(target=self._run_reader, name="device reader", daemon=True)
-        self._thread.start()
+        try:
+            feed.start()
+            # Asked before the thread starts, because a feed is used by one thread at a time.
+            self._info, self._calibration = feed.info, feed.calibration
+            _open_sources.add(self)
+            self._thread.start()
+        except BaseException:
+            # Also a signal to end: nobody else could switch the instrument off now.
+            feed.close()
+            raise
 
     @property
     def info(self) -> Info:
@@ -145,6 +153,7 @@ class StreamSource(DecodedSource):
         self._stopping.set()
         self._ring.end()
         self._thread.join(STOP_TIMEOUT_S)
+        _open_sources.discard(self)
 
     def _run_reader(self) -> None:
         """Move bytes from the instrument into the ring until the end; the thread's whole life.
@@ -160,6 +169,16 @@ class StreamSource(DecodedSource):
             except BaseException as fault:
                 self._ring.fail(fault)
         self._ring.end()
+
+
+_open_sources: WeakSet[StreamSource] = WeakSet()
+
+
+@atexit.register
+def _close_open_sources() -> None:
+    """Switch off what a program leaves open when it ends, whether it forgot or was interrupted."""
+    for source in list(_open_sources):
+        source.close()
 
 
 class _FeedReader:

@@ -137,10 +137,16 @@ class RemoteExFeed:
         self._clock = InstrumentClock()
         self._stamps: dict[int, float] = {}
         self._start_camera()
-        first = self._first
-        self.codec = FrameCodec(first.rows, first.columns, 8 * first.pixel_bytes)
-        self._parameters = self._read_parameters()
-        self._row_times = self._read_row_times()
+        try:
+            first = self._first
+            self.codec = FrameCodec(first.rows, first.columns, 8 * first.pixel_bytes)
+            self._parameters = self._read_parameters()
+            self._row_times = self._read_row_times()
+        except BaseException:
+            # Also a signal to end: nobody else could turn the gain down now.
+            with contextlib.suppress(DeviceError):
+                self.close()
+            raise
 
     @property
     def info(self) -> Info:
