@@ -69,6 +69,10 @@ MAX_ALIASED_FRACTION = 0.2
 MAX_LASER_WALL_WIDTHS = 5.0
 """A laser spot farther from the wall than this number of its widths is a mistake."""
 
+MAX_LASER_OFF_WALL_M, LASER_OFF_WALL_SLOPE = 0.05, 0.5
+"""A laser spot may stand so far before the foremost or behind the hindmost wall point, and farther
+by this part of how far aside it is, where nobody knows the wall."""
+
 MAX_START_M = 1e3
 """A record that begins after a longer path, m, still holds the ways to the devices."""
 
@@ -293,6 +297,7 @@ def complete_settings(capture: Capture, **given: Any) -> Settings:
         raise InputError(
             f"a gate of {found.gate or 0.0:.4g} m blanks the whole record; blank less (`gate`)"
         )
+    require_usable_wavelength(capture, found)
     if found.wavelength is None:
         wavelength, reason = choose_wavelength(gated, found.cycles)
         found = _add(found, "wavelength", wavelength, reason)
@@ -322,6 +327,14 @@ def require_plausible(capture: Capture) -> None:
         raise InputError(
             f"the laser spot lies {away:.3g} m from the wall, which is {extent:.3g} m wide: give the spot on the wall"
         )
+    outside = np.linalg.norm(beyond[:, :2], axis=1)
+    off = beyond[:, 2] - MAX_LASER_OFF_WALL_M - LASER_OFF_WALL_SLOPE * outside
+    if extent > 0 and off.max() > 0:
+        worst = int(np.argmax(off))
+        side = "behind" if capture.lasers[worst, 2] < low[2] else "in front of"
+        raise InputError(
+            f"the laser spot lies {beyond[worst, 2]:.3g} m {side} the wall: give the spot on the wall, in the wall's frame"
+        )
     if capture.start > MAX_START_M:
         raise InputError(
             f"the record begins at a path of {capture.start:.4g} m: take the ways to and from the devices off"
@@ -333,6 +346,30 @@ def require_plausible(capture: Capture) -> None:
         raise InputError("every signal is 0: there is nothing to image")
     if float(capture.signal.max()) == float(capture.signal.min()):
         raise InputError(f"every signal is {largest:.4g}, constant or saturated: nothing to image")
+
+
+def require_usable_wavelength(capture: Capture, settings: Settings) -> None:
+    """Refuse a given wavelength that shows nothing.
+
+    Parameters
+    ----------
+    capture : Capture
+    settings : Settings
+
+    Raises
+    ------
+    InputError
+        The wavelength is longer than the wall is wide, or its pulse longer than the record.
+    """
+    wavelength = settings.wavelength
+    extent = float(np.ptp(capture.points, axis=0).max())
+    record = float(np.ptp(capture.axis.paths))
+    longest = min(limit for limit in (extent, record / settings.cycles) if limit > 0)
+    if wavelength is not None and wavelength > longest * (1 + 1e-6):
+        raise InputError(
+            f"a wavelength of {wavelength:.3g} m shows nothing of this capture, with a wall {extent:.3g} m wide and a "
+            f"record of {record:.3g} m: use at most {longest / 2:.2g} m"
+        )
 
 
 def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str]:

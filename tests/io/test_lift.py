@@ -190,6 +190,15 @@ def test_a_missing_or_misshapen_field_is_named(write_lift: Any, name: str) -> No
         read_streak(write_lift(**{name: np.array("word")}))
 
 
+def test_noise_below_zero_is_kept(write_lift: Any) -> None:
+    """Background was taken off: a third of the pixels of a published archive is negative."""
+    noise = np.random.default_rng(1).normal(0.0, 1.0, (12, 60))
+    noise[5, 30] = 40.0
+    counts = read_streak(write_lift(streak_raw=noise)).counts
+    assert np.mean(counts < 0) > 0.3
+    assert np.array_equal(counts, noise.astype(np.float32)[: counts.shape[0], : counts.shape[1]])
+
+
 @pytest.mark.parametrize(
     ("changes", "fault", "problem"),
     [

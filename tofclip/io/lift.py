@@ -37,12 +37,11 @@ def read_lift(path: str | Path) -> Streak:
     from it the camera's focal length.
     """
     archive = _open_archive(path)
-    # The archive was clipped at zero when it was made, so that a negative value means another kind
-    # of file.
     counts = archive.array("streak_raw", None, None)
-    if np.any(counts < 0):
+    # Where background was taken off, noise is negative as often as not; light never is.
+    if counts.size and -float(np.min(counts)) > float(np.max(counts)):
         raise InputError(
-            f"{path}: streak_raw holds negative measurements; a LIFT archive is clipped at zero"
+            f"{path}: streak_raw is more negative than positive; give brightness, not its negative"
         )
     camera, metadata, attachments = _read_calibration(archive)
     streak = Streak(
