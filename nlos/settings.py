@@ -333,7 +333,7 @@ def require_plausible(capture: Capture) -> None:
         worst = int(np.argmax(off))
         side = "behind" if capture.lasers[worst, 2] < low[2] else "in front of"
         raise InputError(
-            f"the laser spot lies {beyond[worst, 2]:.3g} m {side} the wall: give the spot on the wall, in the wall's frame"
+            f"the laser spot lies {beyond[worst, 2]:.3g} m {side} the wall: give the spot on the wall"
         )
     if capture.start > MAX_START_M:
         raise InputError(
