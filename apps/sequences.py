@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from apps.conventions import report
 from apps.progress import show_progress
-from apps.report import report
 from tofclip.arrays import parse_device
 from tofclip.errors import MissingDependencyError
 from tofclip.sequences.jobs import run_jobs, select_unfinished

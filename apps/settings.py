@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin,
 import tomli_w
 import typer
 
-from apps.options import make_completer
+from apps.conventions import make_completer
 from tofclip.errors import FileFormatError, InputError
 from tofclip.storage import atomic_path, translate_read_errors
 

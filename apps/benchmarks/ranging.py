@@ -12,12 +12,12 @@ from tofclip.lidar import depth
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
 from tofclip.simulate import (
+    Instrument,
     make_default_instrument,
     make_default_scene,
     render_true_frames,
     simulate_shot,
 )
-from tofclip.simulate.instrument import Instrument
 from tofclip.threads import run_blocks
 
 ROWS = (254, 1016)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, build_provenance, require_writable
+from apps.conventions import PICTURE_SUFFIXES, RECORD_SUFFIXES, build_provenance, require_writable
 from nlos.export import POINT_SUFFIXES, WRITERS
 from tofclip.errors import InputError, StorageError
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from tofclip.light_field.measurement import CameraSetup
 from tofclip.metrics import correlation_coefficient
+from tofclip.occlusion import InactiveRegion
 from tofclip.occlusion.measurements import Rig, add_poisson_noise, measure_views
 from tofclip.occlusion.recovery import TV_WEIGHT
-from tofclip.occlusion.region import InactiveRegion
 from tofclip.recovery.light_field import MAX_ITERATIONS, OBJECTIVE_TOLERANCE
 from tofclip.simulate.light_fields import (
     Body,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import InputError
-from tofclip.occlusion.region import InactiveRegion
+from tofclip.occlusion import InactiveRegion
 from tofclip.simulate.light_fields import Body, Lambertian, Rectangle, Sphere
 from tofclip.simulate.patterns import (
     cut_pattern,

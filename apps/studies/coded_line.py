@@ -16,9 +16,8 @@ from apps.studies.cases import Library
 from apps.studies.outcome import Advance, Outcome, Panel, Row, Study
 from tofclip.errors import InputError
 from tofclip.light_field import LightField
-from tofclip.operators import LinearShear
-from tofclip.operators.coded_lines import SliceConvolution, make_coded_line
-from tofclip.operators.sparse import SparseMatrix
+from tofclip.operators import LinearShear, SliceConvolution, SparseMatrix
+from tofclip.operators.coded_lines import make_coded_line
 from tofclip.solvers import TotalVariation
 from tofclip.solvers.cross_validation import choose_weight
 from tofclip.threads import map_parallel

@@ -8,10 +8,8 @@ from typing import Annotated
 
 import typer
 
-from apps.files import require_writable
-from apps.options import JsonOption
+from apps.conventions import JsonOption, report, require_writable
 from apps.progress import show_progress
-from apps.report import report
 from apps.verbs.cloud import CLOUD_SUFFIXES
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud

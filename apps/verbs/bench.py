@@ -10,10 +10,8 @@ import typer
 from apps.benchmarks.page import render_page as made_page
 from apps.benchmarks.registry import find_cases
 from apps.benchmarks.run import count_processes, run_cases
-from apps.files import require_writable
-from apps.options import JsonOption
+from apps.conventions import JsonOption, report, require_writable
 from apps.progress import show_progress
-from apps.report import report
 from tofclip.storage import atomic_path
 
 if TYPE_CHECKING:

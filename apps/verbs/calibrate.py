@@ -8,11 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+from apps.conventions import (
+    PICTURE_SUFFIXES,
+    RECORD_SUFFIXES,
+    JsonOption,
+    PreviewOption,
+    TimeZeroOption,
+    report,
+    require_writable,
+)
 from apps.figures.calibration import make_calibration_figure
 from apps.figures.style import save_figure
-from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
-from apps.options import JsonOption, PreviewOption, TimeZeroOption
-from apps.report import report
 from tofclip.camera.calibration import calibrate_views as fit
 from tofclip.io import read_streak
 from tofclip.units import NANOSECOND, PICOSECOND

@@ -8,9 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.files import RECORD_SUFFIXES, build_provenance, require_writable
-from apps.options import JsonOption, make_completer
-from apps.report import report
+from apps.conventions import (
+    RECORD_SUFFIXES,
+    JsonOption,
+    build_provenance,
+    make_completer,
+    report,
+    require_writable,
+)
 from tofclip.errors import InputError
 from tofclip.io.light_fields import read_light_field
 from tofclip.light_field.measurement import (

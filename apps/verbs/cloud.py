@@ -8,9 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apps.files import build_provenance, require_writable
-from apps.options import ClusterOption, DeviceOption, JsonOption
-from apps.report import report
+from apps.conventions import (
+    ClusterOption,
+    DeviceOption,
+    JsonOption,
+    build_provenance,
+    report,
+    require_writable,
+)
 from apps.sequences import report_summary, resolve_device, run_with_progress
 from tofclip.errors import InputError
 from tofclip.lidar.organised import ORGANISED_SUFFIXES

@@ -7,9 +7,7 @@ from typing import Annotated
 
 import typer
 
-from apps.files import RECORD_SUFFIXES, require_writable
-from apps.options import JsonOption
-from apps.report import report
+from apps.conventions import RECORD_SUFFIXES, JsonOption, report, require_writable
 from tofclip.io import read_streak
 from tofclip.units import PICOSECOND
 

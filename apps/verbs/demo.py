@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from apps.conventions import JsonOption, build_provenance, make_folder, report
 from apps.figures.demo import make_demo_figure
 from apps.figures.style import save_figure
-from apps.files import build_provenance, make_folder
-from apps.options import JsonOption
 from apps.progress import show_progress
-from apps.report import report
 from tofclip.lidar import depth, point_cloud
 from tofclip.metrics import nmse
 from tofclip.recovery import open_shot, plan_recovery

@@ -9,9 +9,7 @@ from typing import Annotated, Any
 import typer
 
 import devices
-from apps.files import RECORD_SUFFIXES, require_writable
-from apps.options import JsonOption
-from apps.report import report
+from apps.conventions import RECORD_SUFFIXES, JsonOption, report, require_writable
 from apps.verbs.record import show_time_progress
 from devices import discover, registry
 from devices.recording.check import repair as repaired

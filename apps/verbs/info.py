@@ -8,8 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.options import JsonOption
-from apps.report import report, summarise_list, to_json_value
+from apps.conventions import (
+    MAX_LISTED_VALUES,
+    JsonOption,
+    report,
+    summarise_list,
+    to_json_value,
+)
 from devices.recording.reader import read_head_if_recording
 from tofclip.errors import FileFormatError
 from tofclip.io.streaks import outline_streak_file

@@ -10,12 +10,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from apps.conventions import (
+    PICTURE_SUFFIXES,
+    RECORD_SUFFIXES,
+    ClusterOption,
+    JsonOption,
+    TimeZeroOption,
+    report,
+    require_writable,
+)
 from apps.figures.scene import make_scene_figure
 from apps.figures.style import save_figure
-from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
-from apps.options import ClusterOption, JsonOption, TimeZeroOption
 from apps.progress import show_progress
-from apps.report import report
 from apps.sequences import report_summary, run_with_progress
 from apps.verbs.bag import bag
 from apps.verbs.cloud import require_format

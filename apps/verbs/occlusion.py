@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from apps.conventions import PICTURE_SUFFIXES, JsonOption, make_folder, report, require_writable
 from apps.figures.occlusion import make_occlusion_figure
 from apps.figures.occlusion_film import WALK_STEPS, save_flash_film, save_walk_film
 from apps.figures.style import save_figure
-from apps.files import PICTURE_SUFFIXES, make_folder, require_writable
 from apps.occlusion.experiment import DEFAULT_PHOTONS, Experiment, ExperimentSettings
 from apps.occlusion.probe import DISTANCE_FACTORS, probe_target
 from apps.occlusion.scenes import make_occlusion_scene
-from apps.options import JsonOption
 from apps.progress import show_progress
-from apps.report import report
 from tofclip.errors import InputError
 from tofclip.metrics import correlation_coefficient, nmse
 from tofclip.occlusion import InactiveRegion

@@ -10,11 +10,15 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
+from apps.conventions import (
+    PICTURE_SUFFIXES,
+    JsonOption,
+    build_provenance,
+    report,
+    require_writable,
+)
 from apps.figures.photons import make_range_figure
 from apps.figures.style import save_figure
-from apps.files import PICTURE_SUFFIXES, build_provenance, require_writable
-from apps.options import JsonOption
-from apps.report import report
 from apps.verbs.cloud import CLOUD_SUFFIXES, DEPTH_SUFFIX
 from devices.photons import read_photons as read_counted_photons
 from tofclip.errors import InputError

@@ -11,10 +11,8 @@ from typing import Annotated
 import typer
 
 import devices
-from apps.files import RECORD_SUFFIXES, build_provenance, require_writable
-from apps.options import JsonOption
+from apps.conventions import RECORD_SUFFIXES, JsonOption, build_provenance, report, require_writable
 from apps.progress import show_progress
-from apps.report import report
 from devices.recorder import record_source as recorded
 from tofclip.errors import InputError
 

@@ -8,19 +8,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from apps.figures.preview import make_preview_figure
-from apps.figures.style import save_figure
-from apps.files import PICTURE_SUFFIXES, RECORD_SUFFIXES, require_writable
-from apps.options import (
+from apps.conventions import (
+    PICTURE_SUFFIXES,
+    RECORD_SUFFIXES,
     ClusterOption,
     DeviceOption,
     JsonOption,
     PreviewOption,
     TimeZeroOption,
     make_completer,
+    report,
+    require_writable,
 )
+from apps.figures.preview import make_preview_figure
+from apps.figures.style import save_figure
 from apps.progress import show_progress
-from apps.report import report
 from apps.sequences import report_summary, resolve_device, run_with_progress
 from apps.verbs.cloud import CLOUD_SUFFIXES as CLOUD_SUFFIXES
 from tofclip.errors import InputError

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from apps.conventions import ClusterOption, JsonOption, make_completer, make_folder, report
 from apps.figures.reproduction import make_reproduction_figure
 from apps.figures.style import save_figure
-from apps.files import make_folder
-from apps.options import ClusterOption, JsonOption, make_completer
 from apps.progress import show_progress
-from apps.report import report
 from apps.reproduction import STUDY_FOLDER, load_result, make_result, write_page, write_result
 from apps.sequences import report_summary, run_with_progress
 from apps.studies.cases import Library

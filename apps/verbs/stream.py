@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import typer
 
-from apps.options import JsonOption, TimeZeroOption
-from apps.report import report
+from apps.conventions import JsonOption, TimeZeroOption, report
 from apps.verbs.cloud import require_format
 from devices.shot_stream import TrackedShots, read_transients
 from tofclip.errors import InputError
@@ -94,7 +93,7 @@ def stream(
     if shots is not None and shots < 1:
         raise InputError(f"--shots must be positive, got {shots}")
     if out is not None:
-        from apps.files import make_folder
+        from apps.conventions import make_folder
 
         make_folder(out)
     coming = TrackedShots(

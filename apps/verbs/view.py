@@ -11,10 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
-from apps.files import require_writable
-from apps.options import JsonOption, TimeZeroOption, make_completer
+from apps.conventions import JsonOption, TimeZeroOption, make_completer, report, require_writable
 from apps.progress import show_progress
-from apps.report import report
 from apps.viewer.desktop import open_window
 from apps.viewer.film import choose_frames, save_film
 from apps.viewer.page import Page

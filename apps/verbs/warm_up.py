@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from apps.cli import main
+from apps.conventions import JsonOption, report
 from apps.help import EXIT_INTERRUPTED
-from apps.options import JsonOption
 from apps.progress import show_progress
-from apps.report import report
 from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.shots import Streak

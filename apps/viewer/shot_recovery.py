@@ -14,8 +14,7 @@ from tofclip.lidar.detection import SCENE_BRIGHTNESS_QUANTILE
 from tofclip.lidar.processing import select_points
 from tofclip.sequences.cache import get_cached_camera, prepare_inverse
 from tofclip.shots import Frames
-from tofclip.solvers import LinearInverse, Method
-from tofclip.solvers.direct import PreparedInverse
+from tofclip.solvers import LinearInverse, Method, PreparedInverse
 
 Readings = NDArray[np.float32]
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tofclip.camera.sweep import FloatArray, Sweep, sweep_from_record
 from tofclip.errors import CalibrationError
-from tofclip.operators.sparse import LineProjection
+from tofclip.operators import LineProjection
 from tofclip.records import Storable, stored_array, stored_child, stored_value
 from tofclip.storage import Record
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from tofclip.errors import InputError
 from tofclip.occlusion.measurements import Rig, TimedMeasurements
-from tofclip.operators import Diagonal, LinearOperator, Stack
-from tofclip.operators.shear import LinearShear, View
+from tofclip.operators import Diagonal, LinearOperator, LinearShear, Stack
+from tofclip.operators.shear import View
 from tofclip.recovery.light_field import MAX_ITERATIONS, OBJECTIVE_TOLERANCE, ClipRecovery
 from tofclip.solvers import TotalVariation
 

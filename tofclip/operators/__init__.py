@@ -13,15 +13,19 @@ from tofclip.operators.base import (
 )
 from tofclip.operators.coded_lines import SliceConvolution
 from tofclip.operators.coded_views import MaskedViews, ShearedViews, WeightedViews
+from tofclip.operators.composition import (
+    BlockDiagonal,
+    Integration,
+    MeanWeighting,
+    Stack,
+    ViewSelection,
+)
 from tofclip.operators.convolution import PointSpreadConvolution
 from tofclip.operators.radon import RadonProjection
-from tofclip.operators.selection import ViewSelection
 from tofclip.operators.sensors import DenseSensor, MaskedSensor, PitchedSensor
 from tofclip.operators.shear import FourierShear, LinearShear
 from tofclip.operators.single_pixel import HadamardCodes, RandomCodes
 from tofclip.operators.sparse import LineProjection, SparseMatrix
-from tofclip.operators.stacking import BlockDiagonal, Integration, Stack
-from tofclip.operators.weighting import MeanWeighting
 
 __all__ = [
     "Adjoint",

@@ -5,14 +5,14 @@ a light field gets.
 from __future__ import annotations
 
 from tofclip.operators.cameras.base import LightFieldCamera
-from tofclip.operators.cameras.coded_line import CodedLineCamera
 from tofclip.operators.cameras.compressive import (
     AshokCamera,
     BabacanCamera,
     CompressiveCamera,
     MarwahCamera,
+    SinglePixelCamera,
 )
-from tofclip.operators.cameras.line import EvenAngleLineCamera, LineCamera
+from tofclip.operators.cameras.lines import CodedLineCamera, EvenAngleLineCamera, LineCamera
 from tofclip.operators.cameras.point_spread import (
     CodedApertureCamera,
     CubicPhaseCamera,
@@ -20,7 +20,6 @@ from tofclip.operators.cameras.point_spread import (
     MeasuredCamera,
     PointSpreadCamera,
 )
-from tofclip.operators.cameras.single_pixel import SinglePixelCamera
 
 __all__ = [
     "CAMERAS",

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.camera import Camera, Measurement
-from tofclip.camera.calibration.parallax import find_sharpest_shears
+from tofclip.camera.calibration import find_sharpest_shears
 from tofclip.errors import CalibrationError, InputError
 from tofclip.solvers import Progress, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT

@@ -17,19 +17,21 @@ from tofclip.errors import InputError
 from tofclip.light_field import LightField
 from tofclip.light_field.measurement import ClipMeasurement
 from tofclip.operators import Diagonal, Identity, LinearOperator, ViewSelection
-from tofclip.solvers import Sparse, TotalVariation, Wavelets
-from tofclip.solvers.cross_validation import INITIAL_WEIGHT, choose_weight
-from tofclip.solvers.data_terms import (
+from tofclip.solvers import (
     DataTermMaker,
     Huber,
     LeastSquares,
+    PlugAndPlay,
     Poisson,
-    estimate_robust_deviation,
+    ProximalMethod,
+    Sparse,
+    TotalVariation,
+    Wavelets,
 )
+from tofclip.solvers.cross_validation import INITIAL_WEIGHT, choose_weight
+from tofclip.solvers.data_terms import estimate_robust_deviation
 from tofclip.solvers.denoisers import BlockMatching, CollaborativeWiener, Denoiser, NonlocalMeans
-from tofclip.solvers.fista import ProximalMethod
 from tofclip.solvers.light_field_variation import LightFieldVariation
-from tofclip.solvers.plug_and_play import PlugAndPlay
 
 VARIATIONAL_PRIORS: dict[str, type[ProximalMethod]] = {
     kind.name: kind for kind in (TotalVariation, Wavelets, Sparse)

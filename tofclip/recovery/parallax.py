@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.camera import Camera, Measurement, measure
-from tofclip.camera.calibration.parallax import (
-    GATE_METHOD,
+from tofclip.camera.calibration import (
     FocusCurve,
     Parallax,
     find_sharpest_shears,
     fit_parallax_to_shears,
 )
+from tofclip.camera.calibration.parallax import GATE_METHOD
 from tofclip.camera.calibration.registration import count_registration_iterations
 from tofclip.errors import CalibrationError, InputError
 from tofclip.recovery.plan import Shot

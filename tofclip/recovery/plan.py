@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_numpy, zeros
 from tofclip.camera import Camera, Measurement, measure
-from tofclip.camera.calibration.registration import count_registration_iterations, register_views
-from tofclip.camera.calibration.skew import estimate_skew
+from tofclip.camera.calibration import estimate_skew, register_views
+from tofclip.camera.calibration.registration import count_registration_iterations
 from tofclip.errors import InputError, require_type
-from tofclip.io.streaks import read_streak
+from tofclip.io import read_streak
 from tofclip.operators import LinearOperator
 from tofclip.recovery.defects import mask_defects
 from tofclip.recovery.focus import (

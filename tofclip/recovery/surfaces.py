@@ -27,8 +27,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from tofclip.camera import Camera, measure
-from tofclip.camera.measurement import estimate_dark_level
+from tofclip.camera import Camera, estimate_dark_level, measure
 from tofclip.errors import InputError
 from tofclip.lidar import Detection, Returns, compute_ray_directions, depth
 from tofclip.recovery.surface_patches import COEFFICIENTS, Patch, evaluate_monomials, find_patches

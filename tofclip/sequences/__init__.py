@@ -8,8 +8,7 @@ take the same way.
 from tofclip.sequences.clouds import CloudSettings
 from tofclip.sequences.inputs import FileShot, Shot, StackShot, is_sequence, list_files, list_shots
 from tofclip.sequences.ranging import RangingPlan, RangingSettings
-from tofclip.sequences.recovering import RecoverySettings
-from tofclip.sequences.sweep import expand_sweep
+from tofclip.sequences.recovering import RecoverySettings, expand_sweep
 
 __all__ = [
     "CloudSettings",

@@ -17,10 +17,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from tofclip.arrays import Array, namespace, to_numpy
 from tofclip.camera import Camera
-from tofclip.operators import LinearOperator
-from tofclip.operators.sparse import LineProjection
-from tofclip.solvers import LinearInverse, Progress, Result, ignore_progress
-from tofclip.solvers.direct import PreparedInverse
+from tofclip.operators import LinearOperator, LineProjection
+from tofclip.solvers import LinearInverse, PreparedInverse, Progress, Result, ignore_progress
 from tofclip.storage import Record
 
 # Two, so that sequences of two cameras may alternate; operators of more would fill the memory.

@@ -181,7 +181,7 @@ def save_cloud(cloud: PointCloud, returns: Returns, path: Path, organised: bool 
         Write a point for every pixel.
     """
     if path.suffix.lower() == DEPTH_IMAGE_SUFFIX:
-        from tofclip.lidar.depth_exr import save_depth
+        from tofclip.lidar import save_depth
 
         save_depth(returns, path)
     elif organised:

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from tofclip.camera import Camera, Measurement, Rectifier
 from tofclip.errors import InputError, ShapeError
-from tofclip.lidar.cloud import PointCloud, point_cloud
-from tofclip.lidar.detection import Detection
+from tofclip.lidar import Detection, PointCloud, point_cloud
 from tofclip.lidar.search import ReturnSearch
 from tofclip.lidar.signal_rows.selection import RowBlock, SignalRowFinder
 from tofclip.lidar.traces import TraceBins, Traces
-from tofclip.recovery.focus import DEFAULT_FOCUS, Focus
-from tofclip.recovery.plan import open_shot
+from tofclip.recovery import Focus, open_shot
+from tofclip.recovery.focus import DEFAULT_FOCUS
 from tofclip.sequences.cache import get_cached_camera, prepare_inverse
 from tofclip.shots import Returns, Streak
 from tofclip.solvers import LinearInverse

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import InputError
-from tofclip.lidar.cloud import PointCloud, point_cloud
+from tofclip.lidar import PointCloud, point_cloud
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.shots import Returns, Streak
 from tofclip.threads import open_worker_pool, thread_count

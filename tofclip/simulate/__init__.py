@@ -3,10 +3,9 @@ recorded, and the truth.
 """
 
 from tofclip.simulate.demo import make_default_camera, make_default_instrument, make_default_scene
-from tofclip.simulate.ground_truth import GroundTruth, render_true_frames
+from tofclip.simulate.ground_truth import GroundTruth, render_true_frames, score_returns
 from tofclip.simulate.instrument import Instrument, StreakDetector
 from tofclip.simulate.scene import RayCast, Scene, make_plate
-from tofclip.simulate.score import score_returns
 from tofclip.simulate.shot import SimulatedShot, simulate_shot
 
 __all__ = [

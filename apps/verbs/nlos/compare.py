@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from apps.conventions import PICTURE_SUFFIXES, JsonOption, make_folder, report, require_writable
 from apps.figures.nlos_compare import make_comparison_figure
 from apps.figures.style import save_figure as save_figure
-from apps.files import PICTURE_SUFFIXES, make_folder, require_writable
 from apps.nlos.files import add_provenance
 from apps.nlos.imaging import (
     METHODS,
@@ -24,8 +24,6 @@ from apps.nlos.imaging import (
 )
 from apps.nlos.measure import compare_with_truth, measure_imaging, measure_sharpness
 from apps.nlos.truth import HiddenTruth
-from apps.options import JsonOption
-from apps.report import report
 from apps.settings import (
     SettingsOption,
     add_setting_flags,

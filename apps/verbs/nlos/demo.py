@@ -12,14 +12,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+from apps.conventions import (
+    PICTURE_SUFFIXES,
+    JsonOption,
+    build_provenance,
+    make_folder,
+    report,
+    require_writable,
+)
 from apps.figures.nlos_demo import make_demo_figure
 from apps.figures.style import save_figure
-from apps.files import PICTURE_SUFFIXES, build_provenance, make_folder, require_writable
 from apps.nlos.measure import compare_with_truth, measure_imaging
 from apps.nlos.scene import find_nearest_wall_point
 from apps.nlos.truth import HiddenTruth
-from apps.options import JsonOption
-from apps.report import report
 from apps.studies.hidden_scene_adjoint import correlate_views
 from nlos import Backprojection, Grid, Hybrid
 from nlos.capture import TimeAxis

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from apps.files import build_provenance, require_writable
+from apps.conventions import JsonOption, build_provenance, report, require_writable
 from apps.mp4 import import_opencv, open_film
 from apps.nlos.imaging import (
     ImagingSettings,
@@ -19,9 +19,7 @@ from apps.nlos.imaging import (
     require_valid_settings,
     warnings_to_stderr,
 )
-from apps.options import JsonOption
 from apps.progress import show_progress
-from apps.report import report
 from apps.settings import (
     SettingsOption,
     add_setting_flags,

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from apps.conventions import JsonOption, report
 from apps.nlos.imaging import METHODS, ImagingSettings, from_library, to_library
 from apps.nlos.truth import HiddenTruth
-from apps.options import JsonOption
-from apps.report import report
 from apps.settings import SettingsOption, add_setting_flags, load_settings
 from nlos.band import VirtualPulse
 from nlos.illumination_groups import group_by_illumination

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.files import make_folder
+from apps.conventions import ClusterOption, DeviceOption, JsonOption, make_folder, report
 from apps.nlos.files import (
     VOLUME_SUFFIXES,
     ResultFiles,
@@ -38,8 +38,6 @@ from apps.nlos.imaging import (
     require_valid_settings,
     warnings_to_stderr,
 )
-from apps.options import ClusterOption, DeviceOption, JsonOption
-from apps.report import report
 from apps.sequences import resolve_device, run_with_progress
 from apps.settings import (
     SettingsOption,

@@ -9,10 +9,8 @@ from typing import Annotated, Any
 
 import typer
 
-from apps.files import RECORD_SUFFIXES, build_provenance, require_writable
+from apps.conventions import RECORD_SUFFIXES, JsonOption, build_provenance, report, require_writable
 from apps.nlos.scene import SceneSettings, simulate_scene
-from apps.options import JsonOption
-from apps.report import report
 from apps.settings import (
     SettingsOption,
     add_setting_flags,

@@ -11,8 +11,8 @@ import numpy as np
 
 from tofclip.errors import InputError
 from tofclip.operators.base import Identity, LinearOperator
+from tofclip.operators.composition import BlockDiagonal
 from tofclip.operators.shear import View
-from tofclip.operators.stacking import BlockDiagonal
 
 
 class LightFieldCamera(ABC):

@@ -10,6 +10,7 @@ import numpy as np
 from tofclip.errors import InputError
 from tofclip.operators.base import LinearOperator
 from tofclip.operators.cameras.base import LightFieldCamera
+from tofclip.operators.composition import Integration
 from tofclip.operators.convolution import PointSpreadConvolution
 from tofclip.operators.point_spreads import (
     ApertureElement,
@@ -22,7 +23,6 @@ from tofclip.operators.point_spreads import (
 )
 from tofclip.operators.sensors import DenseSensor, PitchedSensor
 from tofclip.operators.shear import View
-from tofclip.operators.stacking import Integration
 
 
 class PointSpreadCamera(LightFieldCamera):

@@ -5,9 +5,8 @@ itself, once and whole. What is known to be finished is not done again, so that 
 stopped goes on where it was.
 """
 
-from tofclip.sequences.jobs.jobs import Failure, Job, Report, Summary, select_unfinished
+from tofclip.sequences.jobs.jobs import Failure, Job, Report, Summary, run_jobs, select_unfinished
 from tofclip.sequences.jobs.output_folder import lock_output_folder
-from tofclip.sequences.jobs.run import run_jobs
 
 __all__ = [
     "Failure",

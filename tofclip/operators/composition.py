@@ -1,8 +1,13 @@
-"""Several operators joined into one: on the same input, on parts of it, or adding up."""
+"""Operators made of others, and what is done to all views together: several joined into one, some
+views of a light field, and the part that all measurements of a view have in common weighed down.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import DTypeLike
 
 from tofclip.arrays import Array, namespace, zeros
 from tofclip.errors import InputError, ShapeError
@@ -112,3 +117,79 @@ def _split_rows(
         last = first + operator.shape_out[0]
         yield operator, block[first:last, ...]
         first = last
+
+
+class ViewSelection(LinearOperator):
+    """Keeps some of a light field's views; the adjoint leaves the others dark.
+
+    Parameters
+    ----------
+    light_field_shape : (int, int, int)
+        Views, rows, columns.
+    kept : sequence of int
+        Numbers of the views to keep, without repeats.
+    dtype : dtype
+        float32 or float64.
+    """
+
+    def __init__(
+        self,
+        light_field_shape: tuple[int, int, int],
+        kept: Sequence[int],
+        dtype: DTypeLike = np.float32,
+    ) -> None:
+        self.view_indices = np.asarray(kept, np.intp)
+        if np.unique(self.view_indices).size != self.view_indices.size or not np.all(
+            (self.view_indices >= 0) & (self.view_indices < light_field_shape[0])
+        ):
+            raise InputError(
+                f"views to keep must be different numbers from 0 to {light_field_shape[0] - 1}"
+            )
+        super().__init__(light_field_shape, (self.view_indices.size, *light_field_shape[1:]), dtype)
+
+    def _forward(self, block: Array) -> Array:
+        kept: Array = block[self.view_indices]
+        return kept
+
+    def _adjoint(self, block: Array) -> Array:
+        views = np.zeros((*self.shape_in, block.shape[-1]), self.dtype)
+        views[self.view_indices] = block
+        return views
+
+
+class MeanWeighting(LinearOperator):
+    """``W = I - (1 - w) 11' / m_k`` for each view's m_k measurements: their mean counts w times;
+    self-adjoint.
+
+    Codes of 0 and 1 all measure half the picture's sum, which swamps what tells them apart; apply W
+    to the measurements and to the operator alike.
+
+    Parameters
+    ----------
+    counts : sequence of int
+        m_k, measurements of each view, in the order of the measurements.
+    weight : float
+        w, between 0 and 1.
+    dtype : dtype
+        float32 or float64.
+    """
+
+    def __init__(
+        self, counts: Sequence[int], weight: float = 0.02, dtype: DTypeLike = np.float32
+    ) -> None:
+        if not counts or min(counts) < 1:
+            raise InputError("every view needs at least one reading")
+        if not 0 <= weight <= 1:
+            raise InputError(f"the weight of the mean must lie between 0 and 1, got {weight}")
+        super().__init__((sum(counts),), (sum(counts),), dtype)
+        self._counts = np.asarray(counts)
+        self._starts = np.cumsum(self._counts) - self._counts
+        self._removed = 1 - weight
+
+    def _forward(self, block: Array) -> Array:
+        means = np.add.reduceat(block, self._starts, axis=0) / self._counts[:, np.newaxis]
+        weighted: Array = block - np.repeat(self._removed * means, self._counts, axis=0)
+        return weighted.astype(self.dtype)
+
+    def _adjoint(self, block: Array) -> Array:
+        return self._forward(block)

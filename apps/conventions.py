@@ -1,0 +1,218 @@
+"""What every verb shares: how options are spelt, outputs are checked and results reported."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from tofclip.errors import InputError, StorageError
+from tofclip.storage import collect_provenance
+
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object of figures and nothing else.")
+]
+TimeZeroOption = Annotated[
+    float | None,
+    typer.Option(
+        "--time-zero-ns",
+        metavar="NS",
+        help="Reading of the time axis at which light of range 0 would arrive, in ns; e.g. -10.784.",
+        show_default="the camera's",
+    ),
+]
+PreviewOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--preview",
+        metavar="PNG",
+        help="Where the picture goes.",
+        show_default="beside --out, .png",
+    ),
+]
+
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="WHERE",
+        help="Share a sequence among workers: local, local:N or tcp://HOST:PORT.",
+        show_default="one after the other, here",
+    ),
+]
+
+DEVICE_NAMES = ("cpu", "cuda", "auto", "torch:cpu")
+"""Some of the names that `tofclip.arrays.parse_device` understands."""
+
+
+def make_completer(*names: str) -> Callable[[str], list[str]]:
+    """Return what completes an option's value in the shell: the names that begin as it does so far."""
+
+    def beginning(incomplete: str) -> list[str]:
+        return [name for name in names if name.startswith(incomplete)]
+
+    return beginning
+
+
+DeviceOption = Annotated[
+    str,
+    typer.Option(
+        "--device",
+        metavar="WHERE",
+        help="Where to compute: cpu (compiled loops), cuda or cuda:N (through CuPy or PyTorch), auto (cuda where there "
+        "is one), or any device of PyTorch such as torch:cpu.",
+        autocompletion=make_completer(*DEVICE_NAMES),
+    ),
+]
+
+
+RECORD_SUFFIXES = (".h5", ".hdf5")
+PICTURE_SUFFIXES = (".png", ".pdf", ".svg")
+
+
+def require_writable(out: Path, *suffixes: str, inputs: tuple[Path, ...] = ()) -> None:
+    """Refuse an output that cannot be written, or that would overwrite an input.
+
+    Finding out after minutes of work would be too late. The writing itself is all or nothing in any
+    case.
+
+    Parameters
+    ----------
+    out : Path
+    *suffixes : str
+        Endings that the name may have; none given: any.
+    inputs : tuple of Path
+        Files that must survive.
+
+    Raises
+    ------
+    InputError, StorageError
+    """
+    if suffixes and out.suffix.lower() not in suffixes:
+        raise InputError(f"{out}: the name must end in {' or '.join(suffixes)}")
+    if out.is_dir():
+        raise StorageError(f"{out}: cannot be written: it is a folder")
+    if not out.parent.is_dir():
+        raise StorageError(f"{out}: cannot be written: the folder does not exist; create it first")
+    if not os.access(out.parent, os.W_OK):
+        raise StorageError(f"{out}: cannot be written: writing is not permitted there")
+    for path in inputs:
+        if out.exists() and path.exists() and out.samefile(path):
+            raise InputError(
+                f"{out}: is an input too; choose another name, so that it is not overwritten"
+            )
+
+
+def build_provenance(
+    settings: Mapping[str, Any], *inputs: Path, earlier: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """Describe how a result came about, with what is known about its input's own past.
+
+    Parameters
+    ----------
+    settings : mapping
+        Options by name.
+    *inputs : Path
+        Files whose checksums are recorded.
+    earlier : mapping, optional
+        Provenance of the input.
+
+    Returns
+    -------
+    dict
+        Plain values only, for JSON.
+    """
+    described = collect_provenance(
+        {name: _to_plain_value(value) for name, value in settings.items()}, *inputs
+    )
+    if earlier:
+        described["earlier"] = dict(earlier)
+    return described
+
+
+def _to_plain_value(value: Any) -> Any:
+    return str(value) if isinstance(value, Path) else value
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder for results, with its parents."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise StorageError(f"{folder}: cannot be made: {fault.strerror or fault}") from fault
+    if not os.access(folder, os.W_OK):
+        raise StorageError(f"{folder}: writing is not permitted there")
+
+
+MAX_LISTED_VALUES = 12
+"""Values of a list that are printed one by one."""
+
+
+def report(figures: Mapping[str, Any], as_json: bool, written: Sequence[Path] = ()) -> None:
+    """Print the figures of a run.
+
+    Parameters
+    ----------
+    figures : mapping
+        Names to numbers, strings, and lists or mappings of these. NumPy's numbers and arrays are
+        understood.
+    as_json : bool
+        One JSON object on one line (NaN becomes null) instead of a table.
+    written : sequence of Path
+        Files to name in the table.
+    """
+    plain = to_json_value(figures)
+    if as_json:
+        print(json.dumps(plain, allow_nan=False))
+        return
+    width = max(map(len, plain), default=0)
+    for name, value in plain.items():
+        print(f"{name.replace('_', ' '):<{width}}  {_format_value(value)}")
+    for path in written:
+        print(f"wrote {path}")
+
+
+def to_json_value(value: Any) -> Any:
+    """Turn NumPy's numbers and arrays, paths and NaN into what JSON knows."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(name): to_json_value(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json_value(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def summarise_list(values: Sequence[Any]) -> str:
+    """Return how many values there are, the first and the last, as a person reads a long list.
+
+    Parameters
+    ----------
+    values : sequence
+        Not empty.
+
+    Examples
+    --------
+    >>> summarise_list([1.5, *range(58), 0.25])
+    '60 values, 1.5 ... 0.25'
+    """
+    return f"{len(values)} values, {_format_value(values[0])} ... {_format_value(values[-1])}"
+
+
+def _format_value(value: Any) -> str:
+    if isinstance(value, list):
+        if len(value) > MAX_LISTED_VALUES:
+            return summarise_list(value)
+        return ", ".join(map(_format_value, value))
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_format_value(entry)}" for name, entry in value.items())
+    if isinstance(value, float):
+        return f"{value:.4g}" if abs(value) < 1000 else f"{value:.0f}"
+    return "unknown" if value is None else str(value)
