@@ -1,6 +1,7 @@
 """Flash LiDAR: from a transient cube to returns, and from returns to a point cloud."""
 
 from tofclip.lidar.cloud import PointCloud, point_cloud
+from tofclip.lidar.column import Column
 from tofclip.lidar.depth_exr import save_depth
 from tofclip.lidar.detection import Detection
 from tofclip.lidar.geometry import compute_ray_directions
@@ -9,6 +10,7 @@ from tofclip.lidar.search import depth
 from tofclip.shots import Returns
 
 __all__ = [
+    "Column",
     "Detection",
     "PointCloud",
     "Pulse",

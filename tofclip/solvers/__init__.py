@@ -1,12 +1,14 @@
 """Solvers that know no physics: an operator, a data term and a prior in, pictures out."""
 
 from tofclip.solvers.data_terms import DataTerm, DataTermMaker, Huber, LeastSquares, Poisson
+from tofclip.solvers.denoisers import Denoiser
 from tofclip.solvers.direct import Backprojection, LinearInverse, PreparedInverse
 from tofclip.solvers.fista import (
     Fista,
     NonnegativeSparsity,
     NonnegativeTotalVariation,
     ProximalMethod,
+    ProximalStep,
     Regulariser,
     Sparse,
     TotalVariation,
@@ -29,6 +31,7 @@ __all__ = [
     "Backprojection",
     "DataTerm",
     "DataTermMaker",
+    "Denoiser",
     "Fista",
     "Huber",
     "IterationHistory",
@@ -43,6 +46,7 @@ __all__ = [
     "PreparedInverse",
     "Progress",
     "ProximalMethod",
+    "ProximalStep",
     "RegularisationByDenoising",
     "Regulariser",
     "Result",
