@@ -22,19 +22,25 @@ copyright = author  # noqa: A001 - Sphinx wants this name
 version = release = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["_build", "reproduction/*.md"]  # those are parts of reproduction.md
+exclude_patterns = [
+    "_build",
+    "notebooks/*.ipynb",
+    "reproduction/*.md",
+]  # those are parts of reproduction.md
 myst_enable_extensions = ["deflist"]
 myst_heading_anchors = 3
 
 smartquotes = False  # they would turn -- of an option into a dash
 default_role = "py:obj"
 autodoc_default_options = {"members": True}
-autodoc_typehints = "none"  # the docstrings give shapes and units, which types cannot
+autodoc_typehints = "signature"  # the docstrings add shapes and units
 napoleon_google_docstring = False
 napoleon_use_param = False
 napoleon_use_rtype = False
 
 html_theme = "furo"
+html_static_path = ["static"]
+html_js_files, html_css_files = ["copy.js"], ["copy.css"]
 html_title = f"ToF-CLIP {release}"
 html_show_sphinx = False
 

@@ -81,8 +81,12 @@ def test_the_python_example(files: Path, tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(tmp_path)
     code = re.search(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), flags=re.DOTALL)
     assert code is not None
+    (recover,) = commands("tofclip recover shot.tif")
+    zero = shlex.split(recover)[-1]
+    assert f"time_zero={zero}e-9" in code[1]  # the same ranges as by the commands
     names: dict[str, object] = {}
     exec(code[1], names)
+    assert names["frames"].camera.time_zero == pytest.approx(float(zero) * 1e-9)  # type: ignore[attr-defined]
     assert Path("scene.ply").stat().st_size > 0
     assert names["volume"].values.shape == names["grid"].shape  # type: ignore[attr-defined]
 
