@@ -1,4 +1,4 @@
-"""Bytes of instruments to records, and photons to histograms, against a copy of the same bytes."""
+"""Benchmarks: an instrument's bytes to records, photons to histograms; the floor is a copy of the bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the eye is, and where on the picture a point appears."""
+"""The viewer's virtual camera: where it stands, and where on the picture a point appears."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Time taggers by their addresses, and those that are connected."""
+"""Open time taggers by their addresses, and list those that are connected."""
 
 from __future__ import annotations
 

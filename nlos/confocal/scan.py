@@ -1,4 +1,4 @@
-"""What both methods need of a confocal capture: its lattice, and its signals from path 0 on."""
+"""What light-cone transform and f-k migration need of a capture: its lattice, and its signals from path 0 on."""
 
 from __future__ import annotations
 

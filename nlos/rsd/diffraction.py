@@ -1,5 +1,5 @@
-"""From a plane to the voxels of many depths: a periodic lattice, its plane waves, and the plan of
-them all.
+"""From a plane to the voxels of many depths: a periodic lattice, its plane waves, and the plan that
+holds both.
 """
 
 from __future__ import annotations

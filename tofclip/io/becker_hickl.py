@@ -1,4 +1,4 @@
-"""Becker & Hickl's ``.sdt`` files: what their blocks claim, before the library `sdtfile` believes it."""
+"""Becker & Hickl's ``.sdt`` files: what their blocks claim is checked before `sdtfile` reads them."""
 
 from __future__ import annotations
 
