@@ -121,7 +121,7 @@ def test_a_camera_without_a_sweep_is_not_late():
 def test_what_is_missing_is_asked_for(shot):
     with pytest.raises(InputError, match="carries no camera"):
         recover(replace(shot.streak, camera=None))
-    with pytest.raises(MissingTimeAxisError, match="bin-width-ps"):
+    with pytest.raises(MissingTimeAxisError, match="bin_width"):
         recover(replace(shot.streak, row_times=None))
     narrow = Streak(shot.streak.counts[:, :-1], shot.streak.times)
     for camera in (shot.camera, shot.camera.replace(sweep=None)):
