@@ -108,15 +108,19 @@ def _wiener_gain(centred, variance):
     gain = np.dot(centred.T, centred) / np.float32(centred.shape[0])
     factor = gain.copy()
     pixels = gain.shape[0]
+    greatest = np.float32(0)
     for i in range(pixels):
-        factor[i, i] += variance
+        greatest = max(greatest, gain[i, i])
+    # what rounding adds in this many sums would make the matrix indefinite
+    load = max(variance, pixels * np.float32(1e-7) * greatest)
+    for i in range(pixels):
+        factor[i, i] += load
     for i in range(pixels):
         for k in range(i + 1):
             rest = factor[i, k]
             for j in range(k):
                 rest -= factor[i, j] * factor[k, j]
-            # rounding may take a pivot below what the variance alone would leave of it
-            factor[i, k] = np.sqrt(max(rest, variance)) if i == k else rest / factor[k, k]
+            factor[i, k] = np.sqrt(max(rest, load)) if i == k else rest / factor[k, k]
     for i in range(pixels):
         for k in range(i):
             _subtract_row(gain, i, factor[i, k], k)
