@@ -145,7 +145,8 @@ def test_ranging_on_a_cluster(run, scheduler, recorded, tmp_path):
     status, out, err = run(*words, "--cluster", scheduler, "--json")
     assert (status, err) == (0, "")
     told = json.loads(out)
-    assert (told["shots"], told["results"], told["processes"]) == (6, 6, 2)
+    assert (told["shots"], told["results"]) == (6, 6)
+    assert told["processes"] in (1, 2)  # on a busy machine one worker may do all before the other
     assert told["jitter_rms_bins"] < 0.15
 
 
@@ -276,7 +277,7 @@ def test_ctrl_c_ends_the_workers_and_leaves_whole_results(recorded, tmp_path):
         time.sleep(1)
         workers = psutil.Process(process.pid).children(recursive=True)
         os.killpg(process.pid, signal.SIGINT)
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=300)  # a busy machine takes its time
     finally:
         process.kill()
     assert (process.returncode, err) == (
