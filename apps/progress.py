@@ -10,7 +10,15 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 Advance = Callable[[int], None]
 
@@ -52,7 +60,20 @@ def show_progress(title: str, total: int) -> Iterator[Advance]:
 
 
 @contextlib.contextmanager
-def _open_bar(title: str, total: int) -> Iterator[Advance]:
+def show_activity(title: str) -> Iterator[None]:
+    """Show that work whose amount is not known goes on, and for how long; as `show_progress`, on a
+    terminal only.
+
+    Parameters
+    ----------
+    title : str
+    """
+    with _open_bar(title, None):
+        yield
+
+
+@contextlib.contextmanager
+def _open_bar(title: str, total: int | None) -> Iterator[Advance]:
     watched = sys.stderr.isatty() and threading.current_thread() is threading.main_thread()
     if not watched or not _screen_lock.acquire(blocking=False):
         yield lambda _: None
@@ -65,13 +86,17 @@ def _open_bar(title: str, total: int) -> Iterator[Advance]:
 
 
 @contextlib.contextmanager
-def _draw_bar(title: str, total: int) -> Iterator[Advance]:
-    columns = (
+def _draw_bar(title: str, total: int | None) -> Iterator[Advance]:
+    columns: tuple[ProgressColumn, ...] = (
         TextColumn("{task.description}"),
         BarColumn(None),
         TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
         TimeRemainingColumn(),
     )
+    if total is None:
+        columns = columns[:2] + columns[3:4]  # nothing is known of what is left
     with Progress(*columns, console=Console(stderr=True), transient=True) as drawn:
         task = drawn.add_task(title, total=total)
         yield lambda amount: drawn.advance(task, amount)

@@ -19,6 +19,7 @@ from apps.conventions import (
 )
 from apps.figures.calibration import make_calibration_figure
 from apps.figures.style import save_figure
+from apps.progress import show_activity
 from tofclip.camera.calibration import calibrate_views as fit
 from tofclip.io import read_streak
 from tofclip.units import NANOSECOND, PICOSECOND
@@ -75,7 +76,8 @@ def calibrate(
     require_writable(out, *RECORD_SUFFIXES, inputs=pictures)
     require_writable(preview, *PICTURE_SUFFIXES, inputs=pictures)
     lines, no_lines, dots, no_dots = (read_streak(path).counts for path in pictures)
-    found = fit(lines, no_lines, dots, no_dots)
+    with show_activity("calibrating"):
+        found = fit(lines, no_lines, dots, no_dots)
     known = {
         "time_zero": None if time_zero_ns is None else time_zero_ns * NANOSECOND,
         "focal_length_px": focal_length_px,

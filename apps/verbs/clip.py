@@ -16,6 +16,7 @@ from apps.conventions import (
     report,
     require_writable,
 )
+from apps.progress import show_activity
 from tofclip.errors import InputError
 from tofclip.io.light_fields import read_light_field
 from tofclip.light_field.measurement import (
@@ -159,7 +160,8 @@ def recover(
     require_writable(out, ".h5", ".png", ".exr", inputs=inputs)
     settings = ClipRecovery(prior, preset, _parse_weight(weight), data_term)
     measurements = ClipMeasurement.load(measurement)
-    recovered = settings.recover(measurements, shear)
+    with show_activity("recovering" if weight != "auto" else "choosing the weight, recovering"):
+        recovered = settings.recover(measurements, shear)
     figures: dict[str, Any] = (
         {} if truth is None else _score_picture(recovered.picture, truth, shear)
     )

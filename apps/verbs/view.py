@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from apps.conventions import JsonOption, TimeZeroOption, make_completer, report, require_writable
-from apps.progress import show_progress
+from apps.progress import show_activity, show_progress
 from apps.viewer.desktop import open_window
 from apps.viewer.film import choose_frames, save_film
 from apps.viewer.page import Page
@@ -98,7 +98,9 @@ def view(
         method,
     )
     # Closing stops a live source and its threads, however the view ends.
-    with contextlib.closing(open_source(source, known)) as opened:
+    with show_activity(f"opening {source}"):
+        found = open_source(source, known)
+    with contextlib.closing(found) as opened:
         session = Session(opened)
         if png is not None:
             _draw_picture(session, png, started, as_json)

@@ -4,8 +4,10 @@ to show.
 
 from __future__ import annotations
 
+import io
 import json
 import signal
+import sys
 import threading
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +18,7 @@ import pytest
 from apps.conventions import build_provenance, make_folder, report, require_writable, to_json_value
 from apps.figures.preview import MAX_MOMENTS, choose_moments, make_preview_figure
 from apps.figures.style import make_figure, save_figure
-from apps.progress import show_progress
+from apps.progress import show_activity, show_progress
 from tofclip import Camera, Frames, Streak
 from tofclip.errors import StorageError
 from tofclip.storage import Record
@@ -54,7 +56,24 @@ class TestProgress:
     def test_silent_where_nobody_watches(self, capsys: pytest.CaptureFixture[str]) -> None:
         with show_progress("working", 10) as advance:
             advance(10)
+        with show_activity("working"):
+            pass
         assert capsys.readouterr() == ("", "")
+
+    def test_elapsed_and_left_are_on_a_terminal(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        terminal = io.StringIO()
+        terminal.isatty = lambda: True  # type: ignore[method-assign]
+        monkeypatch.setattr(sys, "stderr", terminal)
+        monkeypatch.setenv("TERM", "xterm")
+        with show_progress("working", 10) as advance:
+            advance(5)
+        with show_activity("waiting"):
+            pass
+        shown = terminal.getvalue()
+        assert "working" in shown
+        assert "0:00:00" in shown
+        assert "left" in shown
+        assert "waiting" in shown
 
     def test_after_ctrl_c_every_thread_stops(self) -> None:
         stopped = threading.Event()

@@ -25,6 +25,7 @@ from apps.figures.style import save_figure
 from apps.nlos.measure import compare_with_truth, measure_imaging
 from apps.nlos.scene import find_nearest_wall_point
 from apps.nlos.truth import HiddenTruth
+from apps.progress import show_activity
 from apps.studies.hidden_scene_adjoint import correlate_views
 from nlos import Backprojection, Grid, Hybrid
 from nlos.capture import TimeAxis
@@ -94,7 +95,8 @@ def demo(
     picture = out / "nlos_demo.png" if png is None else png
     # Before the simulation and three images, which take a while.
     require_writable(picture, *PICTURE_SUFFIXES)
-    run = _run_demo(seed)
+    with show_activity("simulating and imaging"):
+        run = _run_demo(seed)
     written = [out / f"{name}.h5" for name in ("capture", "hybrid", "backprojection")]
     run.truth.attach_to_record(run.capture).save(written[0])
     for path in written[1:]:
