@@ -45,28 +45,26 @@ def shrink_nonnegative(current, previous, momentum, gradient, step, threshold, t
         Overwritten with the result.
     momentum : (row,) array
     gradient : (rows, row) array
-        Overwritten.
     step, threshold : (row,) array
         Step size, and step size times weight.
-    total, distance : (row,) float64 array
+    total, distance : (row,) array
         Overwritten with sums over rows of the result, and of its squared difference from z.
     """
-    rows, width = current.shape
     total[:] = 0
     distance[:] = 0
-    for row in range(rows):
-        _shrink_row(current[row], previous[row], momentum, gradient[row], step, threshold)
-        _add_distance(current[row], previous[row], momentum, gradient[row], distance)
-        _put_row(gradient[row], previous[row])
-        for i in range(width):
-            total[i] += previous[row, i]
+    made = np.empty_like(step)  # a row that stays in cache
+    for row in range(current.shape[0]):
+        _shrink_row(current[row], previous[row], momentum, gradient[row], step, threshold, made)
+        _add_distance(current[row], previous[row], momentum, made, distance)
+        _put_row(made, previous[row])
+        _add_row(made, total)
 
 
 @helper_njit
-def _shrink_row(current, previous, momentum, gradient, step, threshold):
+def _shrink_row(current, previous, momentum, gradient, step, threshold, result):
     for i in range(current.size):
         point = current[i] + momentum[i] * (current[i] - previous[i])
-        gradient[i] = max(point - step[i] * gradient[i] - threshold[i], np.float32(0))
+        result[i] = max(point - step[i] * gradient[i] - threshold[i], np.float32(0))
 
 
 @helper_njit
@@ -82,6 +80,12 @@ def _add_distance(current, previous, momentum, result, distance):
     for i in range(current.size):
         moved = result[i] - (current[i] + momentum[i] * (current[i] - previous[i]))
         distance[i] += moved * moved
+
+
+@helper_njit
+def _add_row(row, total):
+    for i in range(row.size):
+        total[i] += row[i]
 
 
 @helper_njit
@@ -249,7 +253,7 @@ def descend_total_variation(
     dual : (2, rows, row) array
         Vertical and horizontal; updated in place. The last row of the one and the last column of
         the other stay zero: the difference across the border is.
-    total : (row,) float64 array
+    total : (row,) array
         Overwritten with the sum over rows of the result's isotropic total variation.
     """
     rows, width = current.shape

@@ -161,7 +161,7 @@ class CompiledLoops:
         step: Array,
         weight: float,
     ) -> tuple[Array, Sums, Sums]:
-        """Overwrite and return `previous`; `gradient` is overwritten too.
+        """Overwrite and return `previous`.
 
         Parameters
         ----------
@@ -184,7 +184,7 @@ class CompiledLoops:
             Its squared distance from the extrapolated point.
         """
         now, before, slope = (_join_lanes(array) for array in (current, previous, gradient))
-        total, distance = np.empty((2, now.shape[1]))
+        total, distance = np.empty((2, now.shape[1]), now.dtype)
         self._kernels.shrink_nonnegative(
             now, before, *self._repeat(now, momentum, slope, step, weight), total, distance
         )
@@ -226,7 +226,7 @@ class CompiledLoops:
         if dual is None:
             dual = np.zeros((2, *current.shape), current.dtype)
         now, before, slope = (_join_lanes(array) for array in (current, previous, gradient))
-        total = np.empty(now.shape[1])
+        total = np.empty(now.shape[1], now.dtype)
         self._kernels.descend_total_variation(
             step.size,
             now,
@@ -290,9 +290,9 @@ def _join_lanes(array: Array) -> Array:
     return array.reshape(-1, array.shape[-2] * array.shape[-1])
 
 
-def _sum_columns(row: Sums, step: Array) -> Sums:
+def _sum_columns(row: Array, step: Array) -> Sums:
     """Add up what belongs to the same lane."""
-    total: Sums = row.reshape(-1, step.size).sum(axis=0)
+    total: Sums = row.reshape(-1, step.size).sum(axis=0, dtype=np.float64)
     return total
 
 
