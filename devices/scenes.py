@@ -99,13 +99,15 @@ def make_line_scene() -> Scene:
     )
 
 
+@lru_cache(maxsize=1)
 def simulate_line_light() -> LineLight:
-    """Return the light of `make_line_scene` on the pixels of `make_line_instrument`."""
+    """Return, always the same object, the light of `make_line_scene` on the pixels of `make_line_instrument`."""
     return _simulate_light(make_line_scene(), make_line_instrument())
 
 
+@lru_cache(maxsize=1)
 def simulate_demonstration_light() -> LineLight:
-    """Return the demonstration's light; its camera is known as focus pictures would tell: without
+    """Return, always the same object, the demonstration's light; its camera is known as focus pictures would tell: without
     sweep and gains.
     """
     light = _simulate_light(make_default_scene(), make_default_instrument())
@@ -159,12 +161,9 @@ def _simulate_light(scene: Scene, instrument: Instrument) -> LineLight:
         scene, instrument, seed=0
     )  # the expected signal has no noise for a seed to draw
     detector = instrument.detector
-    return LineLight(
-        shot.signal.astype(np.float64) + detector.background_photons,
-        detector.row_times,
-        shot.camera,
-        shot.truth,
-    )
+    photons = shot.signal.astype(np.float64) + detector.background_photons
+    photons.flags.writeable = False  # it is shared by all who look at this scene
+    return LineLight(photons, detector.row_times, shot.camera, shot.truth)
 
 
 def _make_plate(
