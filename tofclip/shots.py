@@ -365,6 +365,8 @@ class Returns(Storable):
         How they came about.
     shear : (n,) float64 array, optional
         Shear at which the picture of that instant was recovered; 0 by default.
+    false_alarm : (n,) float64 array, optional
+        Probability that the return is noise; NaN, the default, where it is not known.
     """
 
     RECORD_KIND = "returns"
@@ -383,11 +385,25 @@ class Returns(Storable):
     shear: NDArray[np.float64] = field(
         default_factory=lambda: np.empty(0), metadata=stored_array("px", "return", optional=True)
     )
+    false_alarm: NDArray[np.float64] = field(
+        default_factory=lambda: np.empty(0), metadata=stored_array("", "return", optional=True)
+    )
 
     def __post_init__(self) -> None:
         if self.shear.size == 0:
             object.__setattr__(self, "shear", np.zeros(self.y.shape))
-        for name in ("x", "range", "intensity", "confidence", "return_number", "time", "shear"):
+        if self.false_alarm.size == 0:
+            object.__setattr__(self, "false_alarm", np.full(self.y.shape, np.nan))
+        for name in (
+            "x",
+            "range",
+            "intensity",
+            "confidence",
+            "return_number",
+            "time",
+            "shear",
+            "false_alarm",
+        ):
             if getattr(self, name).shape != self.y.shape:
                 raise ShapeError(f"{name} of the returns", self.y.shape, getattr(self, name).shape)
 

@@ -65,6 +65,14 @@ def cloud(
             "pixel's returns the strongest, unless --returns says which.",
         ),
     ] = False,
+    false_alarm: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P",
+            help="Drop points that are noise with a higher probability.",
+            show_default="0.5",
+        ),
+    ] = None,
     voxel_mm: Annotated[
         float | None,
         typer.Option(
@@ -96,6 +104,7 @@ def cloud(
         # A pixel has one place in an organised cloud.
         "strongest" if organised and returns == "all" else returns,
         organised,
+        false_alarm,
     )
     used = resolve_device(device, cluster)
     if is_sequence(frames):

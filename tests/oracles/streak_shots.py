@@ -146,10 +146,11 @@ def _by_pixel(points: np.ndarray) -> np.ndarray:
     return cells.reshape(PICTURE, PICTURE, SIDE * SIDE)
 
 
-def score(y, x, distance, scene: Scene, tolerance_m: float = 0.006) -> tuple[float, float]:
+def score(y, x, distance, scene: Scene, tolerance_m: float = 0.009) -> tuple[float, float]:
     """Fractions of the pixels that are missed, and of the returns that are false.
 
-    A return is true if some point of the scene within a pixel of it is as far away.
+    A return is true if some point of the scene within a pixel of it is as far away, to the pulse's
+    length in range.
     """
     expected = scene.pixel_range
     found = np.zeros(expected.shape, bool)

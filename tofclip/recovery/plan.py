@@ -22,8 +22,9 @@ from tofclip.camera.calibration import estimate_skew, register_views
 from tofclip.camera.calibration.registration import count_registration_iterations
 from tofclip.errors import InputError, require_type
 from tofclip.io import read_streak
+from tofclip.lidar.significance import FLOOR_FIGURE, GAIN_FIGURE
 from tofclip.operators import LinearOperator
-from tofclip.recovery.defects import mask_defects
+from tofclip.recovery.defects import estimate_noise, mask_defects
 from tofclip.recovery.focus import (
     DEFAULT_FOCUS,
     DepthLockedFocus,
@@ -52,6 +53,9 @@ from tofclip.units import PICOSECOND
 
 MAX_ROW_PER_PULSE = 100.0
 """Longest row, in widths of the pulse: beyond, the unit of one of them is wrong."""
+
+MIN_NOISE_COUNT = 0.3
+"""A dark image whose readings are whole counts still hides this much."""
 
 AnyMethod = Method | SurfaceRecovery
 
@@ -255,6 +259,7 @@ class RecoveryPlan:
             "frames_per_second": result.frames.shape[0] / (solved - solving - result.setup_seconds),
             "setup_seconds": result.setup_seconds,
             "device": str(self.device),
+            **_describe_noise(streak),
         }
         if np.isfinite(result.duality_gap):
             figures["duality_gap"] = result.duality_gap
@@ -434,6 +439,12 @@ def require_plausible_rows(streak: Streak, camera: Camera) -> None:
         f"{streak.source}: a row of {width / PICOSECOND:.4g} ps {fault} ({pulse / PICOSECOND:.3g} ps); "
         "check the unit of `bin_width`, or give the pulse to calibrate (`pulse`)"
     )
+
+
+def _describe_noise(streak: Streak) -> dict[str, Scalar]:
+    """Return how the measurements fluctuate, by which returns are judged later."""
+    _, floor, gain = estimate_noise(streak.counts)
+    return {FLOOR_FIGURE: max(float(floor), MIN_NOISE_COUNT), GAIN_FIGURE: float(gain)}
 
 
 def fit_camera_to_shot(

@@ -36,6 +36,8 @@ class CloudSettings:
         Which return of a pixel: ``"first"``, ``"strongest"``, ``"last"`` or ``"all"``.
     organised : bool
         Files have a place for every pixel of the picture, see `tofclip.lidar.organised`.
+    false_alarm : float, optional
+        See `tofclip.depth`.
 
     Raises
     ------
@@ -48,6 +50,7 @@ class CloudSettings:
     device: str = "cpu"
     returns: str = "all"
     organised: bool = False
+    false_alarm: float | None = None
 
     def __post_init__(self) -> None:
         if self.returns not in RETURN_CHOICES:
@@ -88,7 +91,10 @@ class CloudSettings:
         if returns is None:
             device = parse_device(self.device)
             with device.activate():
-                returns = depth(replace(frames, values=device.put(frames.values)))
+                returns = depth(
+                    replace(frames, values=device.put(frames.values)),
+                    false_alarm=self.false_alarm,
+                )
         if len(returns) == 0:
             raise InputError(f"{origin}: {_explain_empty_cloud(frames)}")
         returns = returns.select(self.returns)

@@ -29,6 +29,7 @@ an array of another library at once. `tests/lidar/test_search_backends.py` holds
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -42,6 +43,12 @@ from tofclip.lidar.detection import Detection
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.search.array_api import ArraySearch, ArrayTraces
+from tofclip.lidar.significance import (
+    CANDIDATES,
+    DEFAULT_FALSE_ALARM,
+    MeasurementNoise,
+    SignificanceJudge,
+)
 from tofclip.lidar.traces import FrameTraces, Traces
 from tofclip.shots import Frames, Returns
 from tofclip.threads import run_blocks, split_blocks
@@ -98,7 +105,10 @@ class ReturnSearch:
         self.shears = np.zeros(times.size) if shears is None else shears
 
     def find_returns(
-        self, traces: Traces | ArrayTraces, provenance: Mapping[str, Any] | None = None
+        self,
+        traces: Traces | ArrayTraces,
+        provenance: Mapping[str, Any] | None = None,
+        judge: SignificanceJudge | None = None,
     ) -> Returns:
         """Find the returns in the traces of all pixels.
 
@@ -107,6 +117,8 @@ class ReturnSearch:
         traces : Traces or ArrayTraces
         provenance : mapping, optional
             How they came about.
+        judge : SignificanceJudge, optional
+            Decides which candidates count; by default the fractions of `Detection`.
 
         Returns
         -------
@@ -122,7 +134,12 @@ class ReturnSearch:
         pixel, time, signal, deviation = self._find_candidates(traces)
         distance = SPEED_OF_LIGHT * time / 2
         intensity = signal * (distance / REFERENCE_RANGE_M) ** 2
-        kept = (time > 0) & self.detection.find_significant(pixel, time, intensity, self.pulse.fwhm)
+        doubt = np.empty(0)
+        if judge is None:
+            kept = self.detection.find_significant(pixel, time, intensity, self.pulse.fwhm)
+        else:
+            kept, doubt = judge.judge(pixel, time, signal)
+        kept &= time > 0
         y, x = np.divmod(pixel[kept], self.camera.image_shape[1])
         sigma = add_recovery_error(
             SPEED_OF_LIGHT / 2 * deviation[kept],
@@ -143,6 +160,7 @@ class ReturnSearch:
             camera=self.camera,
             shear=self._shear_at(time[kept]),
             provenance={} if provenance is None else provenance,
+            false_alarm=doubt[kept] if judge is not None else doubt,
         )
 
     def _shear_at(self, time: FloatArray) -> FloatArray:
@@ -224,8 +242,13 @@ def depth(
     camera: Camera | None = None,
     detection: Detection | None = None,
     pulse: Pulse | None = None,
+    false_alarm: float | None = None,
 ) -> Returns:
     """Find each pixel's returns in a transient cube.
+
+    Frames of a recovery know how noisy their measurements were: their returns are judged by that
+    (`tofclip.lidar.significance`). Those of other frames, or where `detection` is given, are judged
+    by its fractions.
 
     Parameters
     ----------
@@ -237,6 +260,8 @@ def depth(
         Takes the place of the camera inside `frames`.
     detection, pulse
         As for `ReturnSearch`.
+    false_alarm : float, optional
+        Probability of being noise up to which a candidate counts as a return; 0.5 by default.
 
     Returns
     -------
@@ -246,7 +271,8 @@ def depth(
     Raises
     ------
     InputError
-        Fewer than three frames, or a camera for another picture size.
+        Fewer than three frames, a camera for another picture size, or a probability of false alarms
+        for frames that do not know their measurements' noise.
 
     Examples
     --------
@@ -266,9 +292,21 @@ def depth(
         raise ShapeError(
             "frames", f"(time, y, x) with (y, x) = {camera.image_shape}", frames.values.shape
         )
-    search = ReturnSearch(camera, frames.times, detection, pulse, frames.shears)
+    noise = MeasurementNoise.of_frames(frames) if detection is None else None
+    if noise is None and false_alarm is not None:
+        raise InputError(
+            "these frames do not say how noisy their measurements were, as a probability of false "
+            "alarms needs it: recover them again"
+        )
+    search = ReturnSearch(
+        camera, frames.times, detection if noise is None else CANDIDATES, pulse, frames.shears
+    )
     traces = FrameTraces(frames) if is_numpy(frames.values) else ArrayTraces(frames)
-    return search.find_returns(traces, frames.provenance)
+    if noise is None:
+        return search.find_returns(traces, frames.provenance)
+    limit = DEFAULT_FALSE_ALARM if false_alarm is None else false_alarm
+    judge = SignificanceJudge(replace(frames, camera=camera), noise, search.pulse, limit)
+    return search.find_returns(traces, frames.provenance, judge)
 
 
 def _build_filter(times: FloatArray, pulse: Pulse, multiple: int) -> NDArray[np.float32]:
