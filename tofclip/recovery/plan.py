@@ -259,7 +259,7 @@ class RecoveryPlan:
             "frames_per_second": result.frames.shape[0] / (solved - solving - result.setup_seconds),
             "setup_seconds": result.setup_seconds,
             "device": str(self.device),
-            **_describe_noise(streak),
+            **(_describe_noise(streak) if isinstance(self.method, ProximalMethod) else {}),
         }
         if np.isfinite(result.duality_gap):
             figures["duality_gap"] = result.duality_gap
@@ -442,7 +442,11 @@ def require_plausible_rows(streak: Streak, camera: Camera) -> None:
 
 
 def _describe_noise(streak: Streak) -> dict[str, Scalar]:
-    """Return how the measurements fluctuate, by which returns are judged later."""
+    """Return how the measurements fluctuate, by which returns are judged later.
+
+    For frames with a prior, which fit the measurements as well as these allow: what a linear
+    inverse spreads over the picture has another cause.
+    """
     _, floor, gain = estimate_noise(streak.counts)
     return {FLOOR_FIGURE: max(float(floor), MIN_NOISE_COUNT), GAIN_FIGURE: float(gain)}
 
