@@ -331,3 +331,43 @@ def fit_plane_around(around, used):
     a = (cyy * cxv - cxy * cyv) / determinant
     b = (cxx * cyv - cxy * cxv) / determinant
     return a, b, (s - a * sx - b * sy) / count, count
+
+
+@njit(nogil=True, cache=True)
+def pool_significance(pixel, at, distance, own, starts, image_shape, limits, pooled):
+    """Add to each candidate's significance those of its neighbours at the same range.
+
+    Parameters
+    ----------
+    pixel : (n,) int64 array
+        Not decreasing.
+    at : (n,) array
+        Range at which neighbours are looked for, m.
+    distance : (n,) array
+        Range of each candidate, m.
+    own : (n,) array
+    starts : (pixels + 1,) int64 array
+        First candidate of each pixel.
+    image_shape : (int, int)
+    limits : (float, float)
+        Radius in pixels, and gate in m for each of them.
+    pooled : (n,) array
+        Overwritten.
+    """
+    rows, columns = image_shape
+    radius, gate = limits
+    reach = int(radius)
+    for number in range(pixel.size):
+        y, x = pixel[number] // columns, pixel[number] % columns
+        total = own[number]
+        for j in range(max(-reach, -y), min(reach, rows - 1 - y) + 1):
+            for i in range(max(-reach, -x), min(reach, columns - 1 - x) + 1):
+                left = radius * radius - j * j - i * i
+                if (j == 0 and i == 0) or left < 0:
+                    continue
+                most = gate * np.sqrt(left)
+                there = (y + j) * columns + x + i
+                for k in range(starts[there], starts[there + 1]):
+                    if abs(distance[k] - at[number]) <= most:
+                        total += own[k]
+        pooled[number] = total
