@@ -19,6 +19,7 @@ from tofclip.sequences.jobs import (
     run_jobs,
     select_unfinished,
 )
+from tofclip.sequences.jobs.output_folder import MAX_HASHED_BYTES
 from tofclip.sequences.jobs.workers import connect_workers, count_local_workers
 
 pytestmark = pytest.mark.xdist_group("cluster")  # one cluster for all of them
@@ -150,6 +151,21 @@ def test_a_scheduler_without_workers_is_refused(monkeypatch):
         connect_workers(nobody.scheduler_address),
     ):
         pass
+
+
+@pytest.mark.parametrize("size", [10, MAX_HASHED_BYTES + 1])
+def test_a_folder_belongs_to_the_content_of_its_inputs(tmp_path, size):
+    folder, settings = tmp_path / "results", {"method": "tv"}
+    shots = {name: tmp_path / f"{name}.tif" for name in ("a", "b")}
+    for path in shots.values():
+        path.write_bytes(bytes(size))
+    lock_output_folder(folder, settings, {"a": shots["a"]})
+    lock_output_folder(folder, settings, shots)  # more shots have come
+    lock_output_folder(folder, settings, {"b": shots["b"]})
+    shots["a"].write_bytes(bytes(size - 1) + b"x")
+    with pytest.raises(InputError, match=r"1 have changed since, the first is a\)"):
+        lock_output_folder(folder, settings, shots)
+    lock_output_folder(folder, settings, {"b": shots["b"]})
 
 
 def test_a_folder_belongs_to_its_settings(tmp_path):

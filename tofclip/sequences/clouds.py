@@ -126,7 +126,7 @@ class CloudSettings:
             "device": normalise_device(self.device),
         }
         # Before the paths are made: a folder of other settings stays untouched.
-        lock_output_folder(folder, settings)
+        lock_output_folder(folder, settings, frames)
         paths = make_result_paths(frames, folder, suffix)
         return [
             Job(name, paths[name], partial(write_cloud, self, file, paths[name]))

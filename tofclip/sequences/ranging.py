@@ -111,7 +111,8 @@ class RangingSettings:
         made = None if plan.exists() else self.plan(readers[0]())
         camera = None if self.camera is None else compute_sha256(self.camera)
         settings = {"verb": "lidar sequence", **asdict(self), "camera": camera, "suffix": suffix}
-        lock_output_folder(folder, settings | {"bin_width": readers[0].bin_width})
+        inputs = {name: shot.path for name, shot in shots.items()}
+        lock_output_folder(folder, settings | {"bin_width": readers[0].bin_width}, inputs)
         if made is not None:
             made.save(plan)
         # a worker that holds an older plan notices by the hash

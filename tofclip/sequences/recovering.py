@@ -93,7 +93,9 @@ class RecoverySettings:
         list of Job
         """
         lock_output_folder(
-            folder, self.settings() | {"bin_width": next(iter(shots.values())).bin_width}
+            folder,
+            self.settings() | {"bin_width": next(iter(shots.values())).bin_width},
+            {name: shot.path for name, shot in shots.items()},
         )
         # Workers have another working directory.
         here = self if self.camera is None else replace(self, camera=self.camera.resolve())

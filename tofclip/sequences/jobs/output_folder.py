@@ -4,20 +4,26 @@ another.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from tofclip.errors import FileFormatError, InputError, StorageError
-from tofclip.storage import atomic_path, translate_read_errors
+from tofclip.storage import atomic_path, compute_sha256, translate_read_errors
 
 SETTINGS_NAME = "settings.json"
+INPUTS_KEY = "inputs"
+MAX_HASHED_BYTES = 1 << 24
+"""Of larger files, size, time of change and the first so many bytes stand for the content."""
 
 
-def lock_output_folder(folder: Path, settings: Mapping[str, Any]) -> None:
+def lock_output_folder(
+    folder: Path, settings: Mapping[str, Any], inputs: Mapping[str, Path] | None = None
+) -> None:
     """Make a folder for the results of a run, or check that the one there holds results of the same
-    settings.
+    settings and inputs.
 
     Parameters
     ----------
@@ -25,11 +31,13 @@ def lock_output_folder(folder: Path, settings: Mapping[str, Any]) -> None:
         Made with its parents if it is missing.
     settings : mapping
         Whatever a result depends on, besides its input: names to strings, numbers and None.
+    inputs : mapping of str to Path, optional
+        Files by the names of their results. The folder may hold results of more, or of less.
 
     Raises
     ------
     InputError
-        The folder belongs to other settings.
+        The folder belongs to other settings, or a file has changed since its result was made.
     StorageError, FileFormatError
         It cannot be made, read or written.
     """
@@ -41,11 +49,12 @@ def lock_output_folder(folder: Path, settings: Mapping[str, Any]) -> None:
     wanted = {
         name: str(value) if isinstance(value, Path) else value for name, value in settings.items()
     }
+    marks = _identify_files(inputs or {})
     if not path.exists():
-        with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(wanted, indent=1) + "\n", encoding="utf-8")
+        _write_settings(path, wanted, marks)
         return
     known = _read_settings(path)
+    noted = known.pop(INPUTS_KEY, {})
     # Settings that only one side knows count as None on the other, so that a new setting with the
     # default None fits folders written before it.
     names = [name for name in {**known, **wanted} if known.get(name) != wanted.get(name)]
@@ -56,6 +65,38 @@ def lock_output_folder(folder: Path, settings: Mapping[str, Any]) -> None:
         raise InputError(
             f"{folder}: holds results of other settings ({told}); choose another folder or remove it"
         )
+
+    changed = [name for name, mark in marks.items() if noted.get(name, mark) != mark]
+    if changed:
+        raise InputError(
+            f"{folder}: holds results of other inputs ({len(changed)} have changed since, the first "
+            f"is {changed[0]}); choose another folder or remove it"
+        )
+    if not marks.keys() <= noted.keys():
+        _write_settings(path, known, {**noted, **marks})
+
+
+def _identify_files(inputs: Mapping[str, Path]) -> dict[str, str]:
+    # the shots of a stack share a file, which is read once
+    marks = {file: _identify(file) for file in set(inputs.values())}
+    return {name: marks[file] for name, file in inputs.items()}
+
+
+def _identify(file: Path) -> str:
+    """Say by which a file is known again."""
+    with translate_read_errors(file):
+        state = file.stat()
+        if state.st_size <= MAX_HASHED_BYTES:
+            return compute_sha256(file)
+        with open(file, "rb") as opened:
+            start = hashlib.sha256(opened.read(MAX_HASHED_BYTES)).hexdigest()
+    return f"{state.st_size} bytes, {state.st_mtime_ns} ns, {start}"
+
+
+def _write_settings(path: Path, settings: Mapping[str, Any], marks: Mapping[str, str]) -> None:
+    content = {**settings, INPUTS_KEY: dict(marks)} if marks else dict(settings)
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def _read_settings(path: Path) -> dict[str, Any]:
