@@ -18,15 +18,14 @@ SCORE_RADIUS_M = 0.04
 
 @dataclass(frozen=True)
 class PointScore:
-    """Share and contrast of what lies near hidden points.
+    """Energy fraction and contrast of what lies near hidden points.
 
     Parameters
     ----------
     energy : float
-        Share of the energy of the intensity ``|u|^2``, u the volume's values: of the sum of
-        ``|u|^4``. That of ``|u|`` itself would mostly tell how far the sidelobes of the virtual
-        pulse reach: for a wavelength of 0.125 m and a wall of 2 m it is 0.2 to 0.3 where the energy
-        of the intensity is 0.5 to 0.7.
+        Sum of ``|u|^2`` over the voxels near a point, over that of all voxels, u the volume's
+        values. It depends on the space imaged, and on how far the virtual pulse reaches: most of
+        what is not near is its sidelobes along the line of sight.
     contrast : float
         Mean magnitude of the voxels near a point, over that of all others. It grows with the empty
         space imaged.
@@ -68,8 +67,7 @@ def score_points(volume: Volume, points: Any, radius: float = SCORE_RADIUS_M) ->
         raise InputError(
             "the volume is dark away from the hidden points: their contrast has no measure"
         )
-    # energy is the square of the brightness, which is the square of the field's magnitude
-    energy = magnitude**4
+    energy = magnitude**2
     return PointScore(
         float(energy[near].sum() / energy.sum()),
         float(magnitude[near].mean() / magnitude[~near].mean()),

@@ -8,7 +8,7 @@ import pytest
 from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD, Volume
 from nlos.capture import TimeAxis
 from nlos.score import score_points
-from nlos.simulate import PointScene, build_relay_wall
+from nlos.simulate import PointScene, add_poisson_noise, build_relay_wall
 from tofclip.errors import InputError, ShapeError
 
 POINTS = np.array(
@@ -30,17 +30,20 @@ def seen(wall: str) -> Capture:
 
 
 @pytest.mark.parametrize(
-    ("wall", "energy", "contrast"), [("planar", 0.62, 37), ("cylinder", 0.60, 34)]
+    ("wall", "energy", "contrast"), [("planar", 0.3211, 66.8), ("cylinder", 0.2924, 59.4)]
 )
-def test_most_of_the_energy_lies_at_the_hidden_points(
+def test_as_much_energy_as_ever_lies_at_the_hidden_points(
     wall: str, energy: float, contrast: float
 ) -> None:
-    """What exact back-projection reaches with these waves, measured before on another scene, is met
-    on this one.
+    """With the noise of 20 counts in the brightest bin.
+
+    The values are means over four seeds; the tolerances, five times the spread over them, 0.00023
+    and 0.4.
     """
-    score = score_points(METHODS[wall].reconstruct(seen(wall), GRID), POINTS)
-    assert score.energy >= energy
-    assert score.contrast >= contrast
+    capture = add_poisson_noise(seen(wall), 20.0, seed=1)
+    score = score_points(METHODS[wall].reconstruct(capture, GRID), POINTS)
+    assert score.energy == pytest.approx(energy, abs=1.2e-3)
+    assert score.contrast == pytest.approx(contrast, abs=2.0)
 
 
 def test_the_score_is_that_of_back_projection() -> None:
@@ -55,7 +58,7 @@ def test_the_score_is_that_of_back_projection() -> None:
 def test_a_volume_whose_shares_are_known() -> None:
     grid = Grid([0.0, 0.03, 0.5], [0.0], [1.0])
     score = score_points(Volume(np.array([[[2.0, 1.0, 1.0]]]), grid), [[0.0, 0.0, 1.0]])
-    assert score.energy == pytest.approx(17 / 18)
+    assert score.energy == pytest.approx(5 / 6)
     assert score.contrast == pytest.approx(1.5)
     # A bright voxel in the wrong place scores badly, however bright.
     assert score_points(Volume(np.array([[[1.0, 1.0, 9.0]]]), grid), [[0.0, 0.0, 1.0]]).contrast < 1
