@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     from tofclip.storage import Field
 
 
-MAX_LISTED_VALUES = 9  # entries of a list that are shown one by one
-
-
 def info(
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="Any file of ours, or a streak image of others.")
