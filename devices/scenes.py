@@ -107,8 +107,8 @@ def simulate_line_light() -> LineLight:
 
 @lru_cache(maxsize=1)
 def simulate_demonstration_light() -> LineLight:
-    """Return, always the same object, the demonstration's light; its camera is known as focus pictures would tell: without
-    sweep and gains.
+    """Return, always the same object, the demonstration's light; its camera is known as focus
+    pictures would tell: without sweep and gains.
     """
     light = _simulate_light(make_default_scene(), make_default_instrument())
     return replace(
