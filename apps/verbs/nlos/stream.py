@@ -1,0 +1,286 @@
+"""`tofclip nlos stream`: captures to hidden volumes while they come, by one plan."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+import webbrowser
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, replace
+from itertools import chain, islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import numpy as np
+import typer
+
+from apps.files import make_folder
+from apps.nlos.files import CAPTURE_SUFFIXES, is_capture_folder, list_captures
+from apps.nlos.imaging import (
+    METHODS,
+    ImagingSettings,
+    parse_method_names,
+    prepare_imaging,
+    require_valid_settings,
+    warnings_to_stderr,
+)
+from apps.options import JsonOption
+from apps.report import report
+from apps.settings import (
+    SettingsOption,
+    add_setting_flags,
+    load_settings,
+    save_settings,
+    setting_field,
+)
+from nlos.io import read_capture
+from tofclip.errors import InputError, TofclipError
+from tofclip.sequences.streaming import run_in_order
+
+if TYPE_CHECKING:
+    from apps.nlos.imaging import PreparedImaging
+    from nlos import Capture, Plan, Volume
+
+POLL_INTERVAL_S = 0.02
+MAX_LATENCY_SAMPLES = 10_000
+"""Volumes over which medians are taken: a stream may run for days."""
+
+EXIT_SOME_FAILED = 1
+SETTINGS_NAME = "stream.toml"
+SETTINGS_HEADING = "tofclip nlos stream SOURCE --settings THIS --out FOLDER"
+
+
+@dataclass(frozen=True)
+class StreamSettings(ImagingSettings):
+    """How every capture of a stream is imaged."""
+
+    method: str | None = setting_field(
+        "NAME",
+        f"One of {', '.join(METHODS)}.",
+        shown="the quickest that suits the first capture",
+        choices=METHODS,
+    )
+
+
+class _NamedCapture(NamedTuple):
+    """A capture as it comes, or why it cannot be read."""
+
+    name: str
+    capture: Capture | None
+    problem: str = ""
+
+
+@add_setting_flags(StreamSettings)
+def stream(
+    source: Annotated[
+        Path, typer.Argument(metavar="SOURCE", help="A folder of captures, or a single one.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the volumes go, one .h5 each.")],
+    follow_s: Annotated[
+        float,
+        typer.Option(
+            metavar="S",
+            help="Wait for further captures until none has come for so long; what comes too fast is dropped.",
+        ),
+    ] = 0.0,
+    captures: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Stop after so many.", show_default="at the source's end"),
+    ] = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the volumes on a page as they come.")
+    ] = False,
+    settings: SettingsOption = None,
+    as_json: JsonOption = False,
+    **flags: Any,
+) -> None:
+    """Image every capture of a stream by one plan, and tell rate and latency.
+
+    The settings are found from the first capture and hold for all, which have its wall, laser and
+    time axis; what it has not is counted as failed. All of the box is imaged, since things move.
+    Every capture is accounted for: acquired = delivered + dropped + failed.
+
+    Example: tofclip nlos stream captures/ --out volumes/
+    """
+    wanted = replace(load_settings(StreamSettings, settings, flags), everywhere=True)
+    _check_settings(wanted, follow_s, captures)
+    coming = islice(_read_captures(source, follow_s), captures)
+    first = next((one for one in coming if one.capture is not None), None)
+    if first is None or first.capture is None:
+        raise InputError(f"{source}: the source ended before it gave a capture that can be read")
+    make_folder(out)
+    with warnings_to_stderr():
+        started = time.perf_counter()
+        prepared = prepare_imaging(first.capture, wanted)
+        plan = prepared.settings.make_method().plan(prepared.capture, prepared.grid)
+        planned = time.perf_counter() - started
+        save_settings(
+            replace(prepared.shown, method=prepared.settings.method),
+            out / SETTINGS_NAME,
+            SETTINGS_HEADING,
+        )
+        made = _VolumeStream(chain([first], coming), prepared, plan, out, follow_s > 0)
+        figures = _run_with_page(made, source) if view else made.run()
+    figures = {
+        "method": prepared.settings.method,
+        "voxels": prepared.grid.shape,
+        **figures,
+        "plan_s": planned,
+    }
+    report(figures, as_json, [out])
+    if figures["failed"]:
+        raise typer.Exit(EXIT_SOME_FAILED)
+
+
+def _check_settings(wanted: StreamSettings, follow_s: float, captures: int | None) -> None:
+    names = METHODS if wanted.method is None else parse_method_names(wanted.method)
+    if wanted.method is not None and len(names) > 1:
+        raise InputError(f"one method images a stream, got '{wanted.method}'")
+    require_valid_settings(wanted, names)
+    if not (np.isfinite(follow_s) and follow_s >= 0):
+        raise InputError(f"--follow-s must be 0 s or more, got {follow_s}")
+    if captures is not None and captures < 1:
+        raise InputError(f"--captures must be positive, got {captures}")
+
+
+def _read_captures(source: Path, follow_s: float) -> Iterator[_NamedCapture]:
+    """Read the captures of a folder in the order of their names, and those that come later."""
+    if not is_capture_folder(source):
+        yield _NamedCapture(source.stem, read_capture(source))
+        return
+    seen: set[Path] = set()
+    last = time.monotonic()
+    waiting = follow_s > 0
+    while True:
+        # A folder that is waited for may be empty yet.
+        found = _list_present(source) if waiting else list_captures(source)
+        for path in found:
+            if path in seen:
+                continue
+            seen.add(path)
+            try:
+                yield _NamedCapture(path.stem, read_capture(path))
+            except TofclipError as fault:
+                yield _NamedCapture(path.stem, None, str(fault))
+            last = time.monotonic()
+        if time.monotonic() - last >= follow_s:
+            return
+        time.sleep(POLL_INTERVAL_S)
+
+
+def _list_present(folder: Path) -> list[Path]:
+    return sorted(
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in CAPTURE_SUFFIXES and not path.name.startswith(".")
+    )
+
+
+class _VolumeStream:
+    """Captures imaged while others are read and written.
+
+    Parameters
+    ----------
+    coming : iterable of _NamedCapture
+    prepared : PreparedImaging
+        Of the first of them.
+    plan : Plan
+    out : Path
+    live : bool
+        Whether captures do not wait: then the oldest that waits is dropped.
+    """
+
+    def __init__(
+        self,
+        coming: Iterable[_NamedCapture],
+        prepared: PreparedImaging[StreamSettings],
+        plan: Plan,
+        out: Path,
+        live: bool,
+    ) -> None:
+        self._coming, self._prepared, self._plan, self._out = coming, prepared, plan, out
+        self._live, self._acquired = live, 0
+        self.latest: deque[Volume] = deque(maxlen=1)
+        self.latency, self.failed, self.delivered = float("nan"), 0, 0
+        self.ended, self.stopping = threading.Event(), threading.Event()
+
+    def run(self) -> dict[str, Any]:
+        """Image all that comes; return the figures."""
+        latencies: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
+        policy: Any = "drop_oldest" if self._live else "block"
+        started = time.perf_counter()
+        try:
+            # One capture at a time on all cores: the next is read meanwhile.
+            with (
+                ThreadPoolExecutor(1, "volumes") as worker,
+                closing(
+                    run_in_order(self._count(), self._work, worker, at_once=1, policy=policy)
+                ) as made,
+            ):
+                for item in made:
+                    if item.value:
+                        self.latency = item.latency
+                        latencies.append(item.latency)
+                    if self.stopping.is_set():
+                        break
+        finally:
+            self.ended.set()
+        seconds = time.perf_counter() - started
+        median, late = np.quantile(latencies, (0.5, 0.95)) if latencies else (None, None)
+        return {
+            "acquired": self._acquired,
+            "delivered": self.delivered,
+            "dropped": self._acquired - self.delivered - self.failed,
+            "failed": self.failed,
+            "volumes_per_second": self.delivered / seconds,
+            "latency_median_s": None if median is None else float(median),
+            "latency_p95_s": None if late is None else float(late),
+        }
+
+    def _count(self) -> Iterator[_NamedCapture]:
+        for one in self._coming:
+            self._acquired += 1
+            yield one
+
+    def _work(self, one: _NamedCapture) -> bool:
+        """Image a capture and write its volume; return whether that was possible."""
+        try:
+            if one.capture is None:
+                raise InputError(one.problem)
+            volume = self._plan.image(self._prepared.settings.prepare(one.capture))
+            volume.save(self._out / f"{one.name}.h5")
+        except TofclipError as fault:
+            self.failed += 1
+            print(f"tofclip: failed: {one.name}: {fault}", file=sys.stderr)
+            return False
+        self.latest.append(volume)
+        self.delivered += 1
+        return True
+
+
+def _run_with_page(made: _VolumeStream, source: Path) -> dict[str, Any]:
+    """Image on a thread of its own while the page shows the newest volume; ends with Ctrl-C."""
+    from apps.viewer.page import Page
+    from apps.viewer.session import Session
+    from apps.viewer.volume_stream import VolumeStreamSource
+
+    figures: dict[str, Any] = {}
+    thread = threading.Thread(target=lambda: figures.update(made.run()), daemon=True)
+    thread.start()
+    while not made.latest and not made.ended.wait(POLL_INTERVAL_S):
+        pass
+    if made.latest:
+        shown = VolumeStreamSource(str(source), made)
+        with closing(Page(Session(shown))) as page:
+            print(f"tofclip: {page.address}", file=sys.stderr)
+            webbrowser.open(page.address)
+            try:
+                page.run()
+            except KeyboardInterrupt:
+                made.stopping.set()
+    thread.join()
+    return figures

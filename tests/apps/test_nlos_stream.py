@@ -1,0 +1,107 @@
+"""`tofclip nlos stream`: captures of a moving scene by one plan."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hidden_point import object_of
+from small_instrument import Run
+
+import nlos.rsd.planar
+from nlos import Capture, Volume
+from nlos.capture import TimeAxis
+from nlos.simulate import PointScene, build_relay_wall
+
+BOX = ["--x-m", -0.3, 0.3, "--y-m", -0.3, 0.3, "--near-m", 0.5, "--far-m", 0.9]
+WORDS = [*BOX, "--voxel-mm", 50, "--wavelength-mm", 400]
+
+
+def moving(number: int) -> Capture:
+    """A point that goes to the right."""
+    place = [-0.2 + 0.1 * number, 0.05, 0.7]
+    wall = build_relay_wall("planar", 16, 1.2)
+    return PointScene([place]).simulate_capture(wall, [0.0, 0.0, 0.0], TimeAxis(160, 50e-12), 5e-11)
+
+
+def test_every_capture_becomes_a_volume_by_one_plan(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "in").mkdir()
+    for number in range(4):
+        moving(number).save(tmp_path / "in" / f"{number}.h5")
+    grids, plan = [], nlos.rsd.planar.PlanarRSD.plan
+    monkeypatch.setattr(
+        nlos.rsd.planar.PlanarRSD,
+        "plan",
+        lambda self, capture, grid: grids.append(grid.size) or plan(self, capture, grid),
+    )
+    out = tmp_path / "out"
+    found = object_of(run, "stream", tmp_path / "in", "--out", out, *WORDS)
+    counts = [found[name] for name in ("acquired", "delivered", "dropped", "failed")]
+    assert counts == [4, 4, 0, 0]
+    assert found["volumes_per_second"] > 0
+    assert 0 < found["latency_median_s"] <= found["latency_p95_s"]
+    # one that finds the method, and one for all captures
+    assert grids.count(int(np.prod(found["voxels"]))) <= 2
+    for number in range(4):
+        x, y, z = Volume.load(out / f"{number}.h5").find_brightest()
+        assert (x, y, z) == pytest.approx((-0.2 + 0.1 * number, 0.05, 0.7), abs=0.06)
+    again = object_of(
+        run, "stream", tmp_path / "in", "--out", tmp_path / "b", "--settings", out / "stream.toml"
+    )
+    assert again["voxels"] == found["voxels"]
+
+
+def test_captures_that_cannot_be_imaged_are_counted(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    for number in range(2):
+        moving(number).save(tmp_path / "in" / f"{number}.h5")
+    replace(moving(2), start=0.1).save(tmp_path / "in" / "2.h5")
+    (tmp_path / "in" / "3.h5").write_bytes(b"nothing")
+    outcome = run("nlos", "stream", tmp_path / "in", "--out", tmp_path / "out", *WORDS, "--json")
+    assert outcome.status == 1
+    assert '"acquired": 4, "delivered": 2, "dropped": 0, "failed": 2' in outcome.out
+    assert "failed: 2: planned for" in outcome.err
+    assert "failed: 3:" in outcome.err
+
+
+def test_a_folder_is_followed_and_its_accounts_balance(run: Run, tmp_path: Path) -> None:
+    """Captures come faster than they can be imaged, perhaps: none is lost without being counted."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    moving(0).save(folder / "0.h5")
+    capture = moving(1)
+
+    def write() -> None:
+        for number in range(1, 8):
+            capture.save(folder / f"{number}.h5")
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    found = object_of(
+        run, "stream", folder, "--out", tmp_path / "out", *WORDS, "--follow-s", 1, "--captures", 8
+    )
+    writer.join()
+    assert found["acquired"] == 8
+    assert found["delivered"] + found["dropped"] + found["failed"] == 8
+    assert found["delivered"] == len(list((tmp_path / "out").glob("?.h5"))) >= 1
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--captures", 0], "--captures must be positive"),
+        (["--follow-s", -1], "--follow-s must be 0 s or more"),
+        (["--method", "rsd,lct"], "one method images a stream"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(
+    run: Run, tmp_path: Path, words: list[object], reason: str
+) -> None:
+    refused = run("nlos", "stream", tmp_path, "--out", tmp_path / "out", *words)
+    assert refused.status == 2
+    assert reason in refused.err.splitlines()[-1]
