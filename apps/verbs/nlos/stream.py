@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
-from apps.files import make_folder
+from apps.conventions import JsonOption, make_folder, report
 from apps.nlos.files import CAPTURE_SUFFIXES, is_capture_folder, list_captures
 from apps.nlos.imaging import (
     METHODS,
@@ -28,8 +28,6 @@ from apps.nlos.imaging import (
     require_valid_settings,
     warnings_to_stderr,
 )
-from apps.options import JsonOption
-from apps.report import report
 from apps.settings import (
     SettingsOption,
     add_setting_flags,
