@@ -305,5 +305,5 @@ def require_numpy_signal(what: str, capture: Capture) -> None:
     if not is_numpy(capture.signal):
         raise InputError(
             f"{what} works on NumPy arrays only, and this capture's signal is on {capture.device}: "
-            "bring it back by capture.on(ComputeDevice()), or use rsd, hybrid or backprojection"
+            "take --device cpu or capture.on(ComputeDevice()), or use rsd, hybrid or backprojection"
         )

@@ -11,7 +11,6 @@ from apps.studies.outcome import Advance, Outcome, Panel, Row, Study
 from tofclip.simulate.light_fields.scenes import EDITS
 
 SAMPLING_RATIO = 0.5
-FLIP_SCENES = {"still-life": (-0.8, -0.1, 0.5), "blocks": (-0.6, 0.0, 0.8)}
 TABLE2_PERCENT = {  # NMSE in per cent: original, shift, flip, rotate
     ("line", "still-life", -0.8): (7.28, 8.75, 8.13, 7.26),
     ("line", "still-life", -0.1): (9.53, 7.10, 7.14, 7.59),

@@ -12,7 +12,6 @@ from devices.emulation.kernels import fill_poisson_words
 from devices.timetag.codec import RECORD_BYTES
 from tofclip.errors import InputError
 
-CHANNEL_COUNT = 4
 MAX_TICK = (1 << 62) - 1
 """A tick that never comes."""
 
