@@ -13,13 +13,10 @@ import pytest
 from tofclip import depth, nmse, point_cloud, recover
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
-from tofclip.recovery.surface_patches import evaluate_monomials, find_patches
-from tofclip.recovery.surfaces import (
-    SurfaceModel,
-    SurfaceRecovery,
-    SurfaceState,
-    refine_state,
-)
+from tofclip.recovery.surface_model import SurfaceModel, SurfaceState, make_pulse
+from tofclip.recovery.surface_patches import SmoothBasis, find_patches
+from tofclip.recovery.surface_solver import refine_state
+from tofclip.recovery.surfaces import SurfaceRecovery
 from tofclip.sequences import CloudSettings
 from tofclip.shots import Frames, Streak
 from tofclip.simulate import (
@@ -90,8 +87,8 @@ def make_model(streak: Streak) -> SurfaceModel:
     coefficients = np.zeros((2, 6))
     coefficients[:, 0] = 1 / 1.4, 1 / 1.7
     coefficients[:, 1] = 0.02, -0.03
-    state = SurfaceState(coefficients, CAMERA.gains.copy(), np.zeros(7), np.ones(7))
-    return SurfaceModel(streak, CAMERA, masks, state)
+    state = SurfaceState.start(list(coefficients), CAMERA)
+    return SurfaceModel(streak, CAMERA, masks, [SmoothBasis(SHAPE)] * 2, state)
 
 
 def test_the_adjoint_matches(shot):
@@ -99,42 +96,86 @@ def test_the_adjoint_matches(shot):
     random = np.random.default_rng(0)
     x = random.random(model.surface.size).astype(np.float32)
     y = random.standard_normal(model.image.shape).astype(np.float32)
-    there = np.vdot(model.render(x, model.state.gains).astype(np.float64), y)
+    there = np.vdot(model.render(x).astype(np.float64), y)
     assert there == pytest.approx(float(np.vdot(x.astype(np.float64), model.gather(y))), rel=1e-4)
 
 
+def test_squares_of_the_entries_are_those_of_single_points(shot):
+    model = make_model(shot.streak)
+    information = model.gather(np.ones_like(model.image), squared=True)
+    for point in (3, 200, 700):
+        alone = np.zeros(model.surface.size, np.float32)
+        alone[point] = 1
+        # what is between rows and columns is exact only on average
+        assert np.sum(model.render(alone) ** 2) == pytest.approx(information[point], rel=0.05)
+
+
+def test_a_pulse_between_rows_is_the_pulse_over_each_row():
+    """Three samples of a B-spline and the smoothing, against the Gaussian's integral over rows."""
+    from scipy.special import ndtr
+
+    from tofclip.recovery.surface_kernels import split_between_rows
+
+    sigma, places = 1.27, np.linspace(19.5, 20.5, 11)
+    first, shares = np.empty(places.size, np.int32), np.empty((places.size, 3), np.float32)
+    split_between_rows(places, first, shares)
+    edges = np.arange(42) - 0.5
+    for place, start, share in zip(places, first, shares, strict=True):
+        light = np.zeros(41)
+        light[start : start + 3] = share
+        smooth = np.convolve(light, make_pulse(sigma, 9), "same")
+        np.testing.assert_allclose(smooth, np.diff(ndtr((edges - place) / sigma)), atol=4e-3)
+
+
 def test_derivatives_are_those_of_the_image(shot):
-    """Central differences in every direction; of a float32 image."""
+    """Central differences in every direction. What is used is the derivative of the smooth pulse;
+    that of light between rows differs by (f / (1 - f))^2 at f cycles a row, 4 to 9 % where a pulse
+    of 1.3 rows changes most, to and fro with the place between rows.
+    """
     model = make_model(shot.streak)
     amplitude = np.random.default_rng(1).random(model.surface.size).astype(np.float32)
-    state = model.state
-    found = {(name, number): image for name, number, image in model.iterate_derivatives(amplitude)}
-    for name, number, step in (
-        ("coefficients", 0, 2e-4), ("coefficients", 8, 2e-4), ("gains", 2, 1e-2),
-        ("delays", 4, 2e-2), ("widths", 5, 2e-2),
+    state, found = model.state, {}
+    for group in model.iterate_derivatives(amplitude):
+        for name, image in zip(group.names, group.images, strict=True):
+            found[name] = np.zeros_like(model.image)
+            rows, columns = image.shape
+            area = np.s_[group.row : group.row + rows, group.column : group.column + columns]
+            found[name][area] = image
+    # time zero is the reference view's
+    assert ("delays", 0, 3) not in found
+    assert ("stretches", 0, 3) not in found
+    for name, step in (
+        (("coefficients", 0, 0), 2e-4), (("coefficients", 1, 2), 2e-4), (("gains", 0, 2), 1e-2),
+        (("delays", 0, 4), 2e-2), (("stretches", 0, 1), 5e-2), (("widths", 0, 5), 2e-2),
     ):  # fmt: skip
         images = []
         for sign in (1, -1):
-            moved = replace(
-                state, **{name: getattr(state, name).copy() for name in ("coefficients", name)}
+            moved = state.copy()
+            field, surface, number = name
+            values = (
+                moved.coefficients[surface] if field == "coefficients" else getattr(moved, field)
             )
-            values = getattr(moved, name).reshape(-1)
-            values[number] += sign * step * (values[number] if name in ("gains", "widths") else 1)
+            values[number] += sign * step * (values[number] if field in ("gains", "widths") else 1)
             model.place(moved)
-            images.append(model.render(amplitude, model.state.gains))
+            images.append(model.render(amplitude))
         model.place(state)
         difference = (images[0] - images[1]) / (2 * step)
-        image = found[name, number]
-        assert np.linalg.norm(image - difference) < 0.03 * np.linalg.norm(difference), name
+        assert np.linalg.norm(found[name] - difference) < 0.1 * np.linalg.norm(difference), name
 
 
 def test_a_refused_or_taken_step_never_raises_the_misfit(shot):
     model = make_model(shot.streak)
     amplitude = np.full(model.surface.size, 50, np.float32)
     before = model.misfit(amplitude)
-    refine_state(model, amplitude)
-    assert model.misfit(amplitude) <= before
+    refined = refine_state(model, amplitude)
+    assert model.misfit(refined.amplitude) <= before
     assert model.state.gains.mean() == pytest.approx(CAMERA.gains.mean())
+    assert model.state.delays[3] == model.state.stretches[3] == 0
+
+
+def find_patches_in(distance: np.ndarray, ray_length: np.ndarray):
+    pixels = np.flatnonzero(np.isfinite(distance))
+    return find_patches(pixels, distance.ravel()[pixels], ray_length, BIN_M)
 
 
 def test_patches_are_planes_to_rounding_and_halves_of_one_are_joined():
@@ -145,10 +186,26 @@ def test_patches_are_planes_to_rounding_and_halves_of_one_are_joined():
     distance[:, 18:21] = np.nan  # cut in two
     distance[5:12, 25:33] = 1.2 * ray_length[5:12, 25:33]
     distance[30, 30] = 1.0  # alone
-    patches = find_patches(distance, ray_length, BIN_M)
+    patches = find_patches_in(distance, ray_length)
     assert [patch.pixels.size for patch in patches] == [40 * 37 - 56 - 1, 56]
-    inverse = evaluate_monomials(np.arange(1600), (40, 40)) @ patches[0].coefficients
-    np.testing.assert_allclose(ray_length.ravel() / inverse, plane.ravel(), atol=1e-4)
+    everywhere = patches[0].basis.evaluate(np.arange(1600))
+    fitted = ray_length.ravel() / (everywhere @ patches[0].coefficients)
+    np.testing.assert_allclose(fitted, plane.ravel(), atol=1e-4)
+
+
+def test_a_ball_that_no_quadratic_follows_gets_splines():
+    y, x = np.indices((64, 64))
+    ray_length = np.sqrt(1 + ((x - 32) / 300) ** 2 + ((y - 32) / 300) ** 2)
+    square = 1 - ((x - 32) ** 2 + (y - 32) ** 2) / 27.0**2
+    ball = np.where(square > 0.1, 1.5 - 0.12 * np.sqrt(np.maximum(square, 0)), np.nan)
+    distance = ball + 3e-4 * np.random.default_rng(0).standard_normal(ball.shape)
+    (patch,) = find_patches_in(distance, ray_length)
+    assert patch.basis.pieces != (0, 0)
+    fitted = ray_length.ravel()[patch.pixels] / (
+        patch.basis.evaluate(patch.pixels) @ patch.coefficients
+    )
+    # noise of a tenth of a bin; the quadratic leaves 0.38 bins
+    assert np.median(np.abs(fitted - ball.ravel()[patch.pixels])) < 0.15 * BIN_M
 
 
 def test_surfaces_are_better_than_frames_in_picture_and_range(shot, found):
@@ -159,6 +216,8 @@ def test_surfaces_are_better_than_frames_in_picture_and_range(shot, found):
     score, before = (score_returns(one, shot.truth) for one in (found.returns, depth(by_frames)))
     assert score["median_depth_error_m"] < 0.5 * before["median_depth_error_m"]
     assert score["share_within_one_bin"] >= 0.95
+    # 0.8 to 1.3 with the demonstration's light; few surfaces make the figure uncertain here
+    assert 0.5 < score["range_z"] < 2.0
     assert score["false_return_share"] <= 0.05  # of 48 x 48 pixels; 0.005 of the demonstration
 
 

@@ -1,52 +1,44 @@
 """The compiled products of the surface model: amplitudes to a raw streak image, and back.
 
-Light of one surface point falls, in each view, on a few columns and on the rows of its pulse; its
-fraction of a measurement is the product of a share along the slit and one along time. Both are kept
-for each point and view, (points, views, ...), so that neither the matrix nor its transpose is
-stored.
+Light of one surface point falls, in each view, on a few columns of the slit and on the rows of its
+pulse. All points of a view have the same pulse, so that their light is first put between rows by
+three samples of a quadratic B-spline, and the rows are then smoothed with the rest of the pulse.
+Sum, middle and variance of such samples do not depend on where between two rows the point lies
+(M. Unser, IEEE Signal Process. Mag. 16(6), 22, 1999), and what is higher is gone after a pulse of a
+row or more. Three samples and one smoothing stand for the eleven or more of the pulse itself.
 """
 
 from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
 
 nogil_njit = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 
+SPLINE_SAMPLES = 3
+SPLINE_VARIANCE = 0.25  # rows^2, of the samples' spread
+
 
 @nogil_njit
-def split_over_time(row, sigma, first, shares, slopes):
-    """Share of a Gaussian pulse that falls on each row, and its derivative by the pulse's position.
+def split_between_rows(row, first, shares):
+    """Put positions between rows: samples of the quadratic B-spline.
 
     Parameters
     ----------
-    row, sigma : (points, views) float64 array
-        Middle and standard deviation of the pulse, raw rows; row i reaches from i - 1/2 to i + 1/2.
-    first : (points, views) int32 array, overwritten
-        First row of each pulse.
-    shares, slopes : (points, views, reach) float32 array, overwritten
+    row : (points,) float64 array
+        Position of each point; row i reaches from i - 1/2 to i + 1/2.
+    first : (points,) int32 array, overwritten
+        First of the three rows.
+    shares : (points, 3) float32 array, overwritten
     """
-    reach = shares.shape[2]
-    for point in range(row.shape[0]):
-        for view in range(row.shape[1]):
-            middle, width = row[point, view], sigma[point, view]
-            start = int(np.round(middle)) - reach // 2
-            first[point, view] = start
-            below, density = 0.0, 0.0
-            for edge in range(reach + 1):
-                z = (start + edge - 0.5 - middle) / width
-                # the Gaussian's integral up to the edge; its difference over a bin is the bin's
-                # fraction
-                upto = 0.5 * (1.0 + math.erf(z * 0.7071067811865476))
-                here = math.exp(-0.5 * z * z) * 0.3989422804014327 / width
-                if edge > 0:
-                    shares[point, view, edge - 1] = upto - below
-                    # derivative of that fraction with the arrival time
-                    slopes[point, view, edge - 1] = density - here
-                below = upto
-                density = here
+    for point in range(row.size):
+        middle = math.floor(row[point] + 0.5)
+        off = row[point] - middle
+        first[point] = int(middle) - 1
+        shares[point, 0] = 0.5 * (0.5 - off) ** 2
+        shares[point, 1] = 0.75 - off * off
+        shares[point, 2] = 0.5 * (0.5 + off) ** 2
 
 
 @nogil_njit
@@ -58,91 +50,106 @@ def split_over_slit(position, tangent, subrows, first, shares):
 
     Parameters
     ----------
-    position : (points, views) float64 array
+    position : (points,) float64 array
         Slit position of the pixel's middle.
-    tangent : (views,) float64 array
-        Of the views' line angles.
+    tangent : float
+        Of the view's line angle.
     subrows : int
-    first : (points, views) int32 array, overwritten
-    shares : (points, views, reach) float32 array, overwritten
+    first : (points,) int32 array, overwritten
+    shares : (points, reach) float32 array, overwritten
     """
-    reach = shares.shape[2]
-    for point in range(position.shape[0]):
-        for view in range(position.shape[1]):
-            # a row of the picture is projected to tan(angle) slit pixels
-            spread = abs(tangent[view])
-            start = int(np.floor(position[point, view] - 0.5 * spread))
-            first[point, view] = start
-            shares[point, view, :] = 0
-            for line in range(subrows):
-                place = position[point, view] + ((line + 0.5) / subrows - 0.5) * spread
-                column = int(np.floor(place))
-                weight = place - column
-                if column - start < reach:
-                    shares[point, view, column - start] += (1 - weight) / subrows
-                if column + 1 - start < reach:
-                    shares[point, view, column + 1 - start] += weight / subrows
+    reach = shares.shape[1]
+    # a row of the picture is projected to tan(angle) slit pixels
+    spread = abs(tangent)
+    for point in range(position.size):
+        start = math.floor(position[point] - 0.5 * spread)
+        first[point] = start
+        shares[point, :] = 0
+        for line in range(subrows):
+            place = position[point] + ((line + 0.5) / subrows - 0.5) * spread
+            column = math.floor(place)
+            weight = place - column
+            if column - start < reach:
+                shares[point, column - start] += (1 - weight) / subrows
+            if column + 1 - start < reach:
+                shares[point, column + 1 - start] += weight / subrows
 
 
 @nogil_njit
-def add_light(amplitude, gains, first_row, time_shares, first_column, slit_shares, image):
-    """Add the light of surface points to a raw streak image.
+def add_light(amplitude, row, row_shares, column, slit_shares, image):
+    """Add the light of surface points to the image of a view; all of it must fall inside.
 
     Parameters
     ----------
     amplitude : (points,) float32 array
-    gains : (views,) float64 array
-    first_row, first_column : (points, views) int32 array
-    time_shares, slit_shares : (points, views, reach) float32 array
+    row, column : (points,) int32 array
+        First of those that a point reaches.
+    row_shares : (points, 3) float32 array
+    slit_shares : (points, 4) float32 array
     image : (rows, columns) float32 array, added to
     """
-    rows, columns = image.shape
     for point in range(amplitude.size):
         # most points of a volume are dark
-        if amplitude[point] == 0:
+        light = amplitude[point]
+        if light == 0:
             continue
-        for view in range(gains.size):
-            light = np.float32(amplitude[point] * gains[view])
-            for i in range(time_shares.shape[2]):
-                row = first_row[point, view] + i
-                if row < 0 or row >= rows:
-                    continue
-                instant = light * time_shares[point, view, i]
-                for j in range(slit_shares.shape[2]):
-                    column = first_column[point, view] + j
-                    if 0 <= column < columns:
-                        image[row, column] += instant * slit_shares[point, view, j]
+        top, left = row[point], column[point]
+        for i in range(3):
+            instant = light * row_shares[point, i]
+            for j in range(4):
+                image[top + i, left + j] += instant * slit_shares[point, j]
 
 
 @nogil_njit
-def gather_light(image, gains, first_row, time_shares, first_column, slit_shares, amplitude):
+def gather_light(image, gain, row, row_shares, column, slit_shares, amplitude):
     """The adjoint of `add_light`: what each point's light would find in an image.
 
     Parameters
     ----------
     image : (rows, columns) float32 array
-    gains : (views,) float64 array
-    first_row, first_column : (points, views) int32 array
-    time_shares, slit_shares : (points, views, reach) float32 array
-    amplitude : (points,) float32 array, overwritten
+    gain : float
+    row, column : (points,) int32 array
+    row_shares : (points, 3) float32 array
+    slit_shares : (points, 4) float32 array
+    amplitude : (points,) float32 array, added to
     """
-    rows, columns = image.shape
     for point in range(amplitude.size):
+        top, left = row[point], column[point]
         total = 0.0
-        for view in range(gains.size):
-            found = np.float32(0)
-            for i in range(time_shares.shape[2]):
-                row = first_row[point, view] + i
-                if row < 0 or row >= rows:
-                    continue
-                instant = np.float32(0)
-                for j in range(slit_shares.shape[2]):
-                    column = first_column[point, view] + j
-                    if 0 <= column < columns:
-                        instant += slit_shares[point, view, j] * image[row, column]
-                found += time_shares[point, view, i] * instant
-            total += gains[view] * found
-        amplitude[point] = total
+        for i in range(3):
+            instant = 0.0
+            for j in range(4):
+                instant += slit_shares[point, j] * image[top + i, left + j]
+            total += row_shares[point, i] * instant
+        amplitude[point] += gain * total
+
+
+@nogil_njit
+def smooth_rows(image, kernel, rows, margin, result):
+    """Convolve an image with a kernel along its rows, for some of the rows.
+
+    Parameters
+    ----------
+    image : (rows, columns) float32 array
+    kernel : (2 half + 1,) float32 array
+    rows : (n,) int64 array
+        Of the result.
+    margin : int
+        Row 0 of the result is this row of the image; what lies outside the image counts as dark.
+    result : (rows, columns) float32 array, overwritten in those rows
+    """
+    half = kernel.size // 2
+    columns = image.shape[1]
+    for number in range(rows.size):
+        target = rows[number]
+        for column in range(columns):
+            result[target, column] = 0
+        for tap in range(kernel.size):
+            source = target + margin + half - tap
+            if 0 <= source < image.shape[0]:
+                weight = kernel[tap]
+                for column in range(columns):
+                    result[target, column] += weight * image[source, column]
 
 
 @nogil_njit
@@ -194,10 +201,12 @@ def ascend_dual(result, mask, weight, momentum, ahead, dual):
     rows, columns = result.shape
     for y in range(rows):
         for x in range(columns):
+            if not mask[y, x]:
+                continue
             down, right = 0.0, 0.0
-            if mask[y, x] and y + 1 < rows and mask[y + 1, x]:
+            if y + 1 < rows and mask[y + 1, x]:
                 down = result[y + 1, x] - result[y, x]
-            if mask[y, x] and x + 1 < columns and mask[y, x + 1]:
+            if x + 1 < columns and mask[y, x + 1]:
                 right = result[y, x + 1] - result[y, x]
             # 8 bounds the squared norm of the gradient of a picture
             p = ahead[0, y, x] + down / (8 * weight)

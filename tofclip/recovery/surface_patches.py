@@ -1,19 +1,21 @@
-"""Smooth surfaces in a picture of ranges: connected patches, and a robust quadratic fit to each.
+"""Smooth surfaces in the returns of frames: connected patches, and a robust smooth fit to each.
 
-A surface's inverse depth 1/z is a quadratic function of the picture's coordinates: a plane's is
-linear, exactly, and what is curved bends it gently. Range is ``length / (1/z)``, with the length of
-the ray ``(X/f, Y/f, 1)``.
+A surface's inverse depth 1/z is a smooth function of the picture's coordinates: a quadratic, which
+a plane's is exactly, or a spline where a quadratic does not follow the returns. Range is
+``length / (1/z)``, with the length of the ray ``(X/f, Y/f, 1)``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+Pixels = NDArray[np.intp]
 
+MARGIN_PX = 10  # how far a surface may reach beyond the returns that showed it
 NEIGHBOUR_BINS = 1.6  # neighbouring pixels whose ranges differ by less lie on one surface
 MIN_PATCH_PX = 25  # fewer returns are not a surface of their own
 MERGE_BINS = 0.5  # misfit of either of two patches to one surface for both
@@ -21,6 +23,62 @@ MERGE_REACH_BINS = 7.0  # of the larger's fit at the smaller: further off it is 
 FIT_ITERATIONS = 10
 CURVATURE_PENALTY = 1e-3  # keeps small patches from bending
 COEFFICIENTS = 6
+KNOT_SPACING_PX = 12
+MAX_PIECES = 8
+BEND_BINS = 0.3  # misfit of a quadratic from which on splines are tried
+EVIDENCE_ROUNDS = 2
+SPLINE_START_PENALTY, SPLINE_FLOOR = 1e-5, 1e-9  # per return, before the bending is known
+CORRELATED_PX = 30  # returns of a frame recovery that share their errors, about
+SPLINE_DEGREE = 3
+
+
+@dataclass(frozen=True)
+class SmoothBasis:
+    """Smooth functions over the picture, of which a surface's inverse depth is a sum.
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+    box : (int, int, int, int)
+        First row and column, and those after the last, over which splines run.
+    pieces : (int, int)
+        Of the splines along rows and columns; without any it is the six monomials of a quadratic.
+    bending : (n, n) float array
+        Half of ``c' bending c`` is added to the objective: what is known of coefficients c without
+        the shot. By default nothing is.
+    """
+
+    image_shape: tuple[int, int]
+    box: tuple[int, int, int, int] = (0, 0, 0, 0)
+    pieces: tuple[int, int] = (0, 0)
+    bending: FloatArray = field(default_factory=lambda: np.zeros((COEFFICIENTS, COEFFICIENTS)))
+
+    def evaluate(self, pixels: Pixels) -> FloatArray:
+        """Return the functions' values at raster numbers, (pixels, n)."""
+        if self.pieces == (0, 0):
+            return evaluate_monomials(pixels, self.image_shape)
+        y, x = np.divmod(pixels, self.image_shape[1])
+        top, left, bottom, right = self.box
+        down = _evaluate_splines((y - top + 0.5) / (bottom - top), self.pieces[0])
+        across = _evaluate_splines((x - left + 0.5) / (right - left), self.pieces[1])
+        return (down[:, :, np.newaxis] * across[:, np.newaxis]).reshape(pixels.size, -1)
+
+
+def _evaluate_splines(place: FloatArray, pieces: int) -> FloatArray:
+    """Uniform cubic B-splines over 0..1, (points, pieces + 3); beyond the ends as at the ends."""
+    from scipy.interpolate import BSpline
+
+    knots = np.arange(-SPLINE_DEGREE, pieces + SPLINE_DEGREE + 1) / pieces
+    inside = np.clip(place, 0.0, 1 - 1e-9)
+    found: FloatArray = BSpline.design_matrix(inside, knots, SPLINE_DEGREE).toarray()
+    return found
+
+
+def _make_second_differences(pieces: tuple[int, int]) -> FloatArray:
+    """Matrix of the second differences of neighbouring coefficients, along rows and columns."""
+    rows, columns = (number + SPLINE_DEGREE for number in pieces)
+    down, across = (np.diff(np.eye(number), 2, axis=0) for number in (rows, columns))
+    return np.concatenate([np.kron(down, np.eye(columns)), np.kron(np.eye(rows), across)])
 
 
 @dataclass(frozen=True)
@@ -31,15 +89,20 @@ class Patch:
     ----------
     pixels : (n,) int array
         Raster numbers.
-    coefficients : (6,) float array
-        Inverse depth, 1/m, over `evaluate_monomials`.
+    distance : (n,) float array
+        Ranges of the returns there, m.
+    basis : SmoothBasis
+    coefficients : (size,) float array
+        Inverse depth, 1/m, over the basis.
     """
 
-    pixels: NDArray[np.intp]
+    pixels: Pixels
+    distance: FloatArray
+    basis: SmoothBasis
     coefficients: FloatArray
 
 
-def evaluate_monomials(pixels: NDArray[np.intp], image_shape: tuple[int, int]) -> FloatArray:
+def evaluate_monomials(pixels: Pixels, image_shape: tuple[int, int]) -> FloatArray:
     """Return 1, x, y, x^2, xy and y^2 of pixels, (n, 6), in halves of the picture from its middle.
 
     Parameters
@@ -55,14 +118,16 @@ def evaluate_monomials(pixels: NDArray[np.intp], image_shape: tuple[int, int]) -
 
 
 def find_patches(
-    distance: NDArray[np.floating], ray_length: FloatArray, bin_m: float
+    pixels: Pixels, distance: FloatArray, ray_length: FloatArray, bin_m: float
 ) -> list[Patch]:
-    """Find the smooth surfaces in a picture of ranges, the largest first.
+    """Find the smooth surfaces in a picture's returns, the largest first.
 
     Parameters
     ----------
-    distance : (rows, columns) float array
-        Range of each pixel's strongest return, m; NaN where there is none.
+    pixels : (n,) int array
+        Raster number of each return; a pixel may have several.
+    distance : (n,) float array
+        Their ranges, m.
     ray_length : (rows, columns) float array
         Range over depth of each pixel.
     bin_m : float
@@ -73,79 +138,128 @@ def find_patches(
     list of Patch
     """
     patches = [
-        Patch(pixels, _fit_inverse_depth(pixels, ray_length / distance))
-        for pixels in _connect_neighbours(distance, NEIGHBOUR_BINS * bin_m)
+        _fit_quadratic(pixels[own], distance[own], ray_length)
+        for own in _connect_neighbours(pixels, distance, ray_length.shape, NEIGHBOUR_BINS * bin_m)
     ]
-    merged = True
-    while merged:
-        merged = False
-        for first, patch in enumerate(patches):
-            for second in range(first + 1, len(patches)):
-                joint = _merge(patch, patches[second], distance, ray_length, bin_m)
-                if joint is not None:
-                    patches[first] = joint
-                    del patches[second]
-                    merged = True
-                    break
-            if merged:
-                break
-    return patches
+    while _merge_some(patches, ray_length, bin_m):
+        pass
+    patches.sort(key=lambda patch: -patch.pixels.size)
+    return [_bend_where_needed(patch, ray_length, bin_m) for patch in patches]
 
 
-def _connect_neighbours(distance: NDArray[np.floating], tolerance: float) -> list[NDArray[np.intp]]:
-    """Connected pixels, eight neighbours each, whose ranges differ by less than a tolerance."""
+def _merge_some(patches: list[Patch], ray_length: FloatArray, bin_m: float) -> bool:
+    """Join patches, in place, that one surface fits; say whether there were any."""
+    before, first = len(patches), 0
+    while first < len(patches):
+        for second in range(len(patches) - 1, first, -1):
+            joint = _merge(patches[first], patches[second], ray_length, bin_m)
+            if joint is not None:
+                patches[first] = joint
+                del patches[second]
+        first += 1
+    return len(patches) < before
+
+
+def _connect_neighbours(
+    pixels: Pixels, distance: FloatArray, shape: tuple[int, ...], tolerance: float
+) -> list[Pixels]:
+    """Connected returns, of eight neighbouring pixels each, whose ranges differ by less than a
+    tolerance; the largest first.
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    rows, columns = distance.shape
-    number = np.arange(distance.size).reshape(distance.shape)
+    rows, columns = shape
+    order = np.lexsort((distance, pixels))
+    starts = np.flatnonzero(np.diff(pixels[order], prepend=-1))
+    rank = np.arange(order.size) - np.repeat(starts, np.diff(starts, append=order.size))
+    layers = np.full((int(rank.max(initial=0)) + 1, rows, columns), -1)
+    layers.reshape(len(layers), -1)[rank, pixels[order]] = order
     links = []
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        here = number[: rows - down, max(0, -right) : columns - max(0, right)]
-        there = number[down:, max(0, right) : columns + min(0, right)]
-        near = np.abs(distance.ravel()[here] - distance.ravel()[there]) < tolerance
-        links.append(np.stack([here[near], there[near]]))
+        here = layers[:, : rows - down, max(0, -right) : columns - max(0, right)]
+        there = layers[:, down:, max(0, right) : columns + min(0, right)]
+        for one in here.reshape(len(layers), -1):
+            for other in there.reshape(len(layers), -1):
+                near = (one >= 0) & (other >= 0)
+                near &= np.abs(distance[one] - distance[other]) < tolerance
+                links.append(np.stack([one[near], other[near]]))
     ends = np.concatenate(links, axis=1)
-    graph = coo_array((np.ones(ends.shape[1], np.int8), tuple(ends)), shape=(distance.size,) * 2)
+    graph = coo_array((np.ones(ends.shape[1], np.int8), tuple(ends)), shape=(pixels.size,) * 2)
     _, label = connected_components(graph, directed=False)
     sizes = np.bincount(label)
-    largest = np.argsort(sizes)[::-1]
+    largest = np.argsort(-sizes, kind="stable")
     return [np.flatnonzero(label == one) for one in largest[sizes[largest] >= MIN_PATCH_PX]]
 
 
-def _fit_inverse_depth(pixels: NDArray[np.intp], inverse: FloatArray) -> FloatArray:
-    """Fit the quadratic, outliers weighted down (Cauchy's weights)."""
-    shape = (inverse.shape[0], inverse.shape[1])
-    design, values = evaluate_monomials(pixels, shape), inverse.ravel()[pixels]
-    weights, coefficients = np.ones(pixels.size), np.zeros(COEFFICIENTS)
+def _fit_quadratic(pixels: Pixels, distance: FloatArray, ray_length: FloatArray) -> Patch:
+    basis = SmoothBasis((ray_length.shape[0], ray_length.shape[1]))
+    inverse = ray_length.ravel()[pixels] / distance
     penalty = CURVATURE_PENALTY * pixels.size * np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+    coefficients, _ = _fit_robustly(basis.evaluate(pixels), inverse, penalty)
+    return Patch(pixels, distance, basis, coefficients)
+
+
+def _fit_robustly(
+    design: FloatArray, values: FloatArray, penalty: FloatArray
+) -> tuple[FloatArray, float]:
+    """Coefficients and scale of the errors; outliers are weighted down (Cauchy's weights)."""
+    weights, coefficients, scale = np.ones(values.size), np.zeros(design.shape[1]), 0.0
     for _ in range(FIT_ITERATIONS):
         normal = design.T @ (design * weights[:, np.newaxis]) + penalty * weights.mean()
         coefficients = np.linalg.solve(normal, design.T @ (weights * values))
         error = values - design @ coefficients
         scale = max(1.4826 * float(np.median(np.abs(error))), float(np.finfo(np.float32).eps))
         weights = 1 / (1 + (error / (2 * scale)) ** 2)
-    return coefficients
+    return coefficients, scale
 
 
-def _merge(
-    large: Patch,
-    small: Patch,
-    distance: NDArray[np.floating],
-    ray_length: FloatArray,
-    bin_m: float,
-) -> Patch | None:
+def _bend_where_needed(patch: Patch, ray_length: FloatArray, bin_m: float) -> Patch:
+    """Give a patch splines where a quadratic does not follow its returns and they do."""
+    shape = (ray_length.shape[0], ray_length.shape[1])
+    length = ray_length.ravel()[patch.pixels]
+    plain = _compute_median_error(patch, patch.coefficients, length)
+    if plain < BEND_BINS * bin_m:
+        return patch
+    y, x = np.divmod(patch.pixels, shape[1])
+    top, left, bottom, right = int(y.min()), int(x.min()), int(y.max()) + 1, int(x.max()) + 1
+    box = (top - MARGIN_PX, left - MARGIN_PX, bottom + MARGIN_PX, right + MARGIN_PX)
+    down, across = (
+        min(MAX_PIECES, max(1, round(side / KNOT_SPACING_PX)))
+        for side in (box[2] - box[0], box[3] - box[1])
+    )
+    basis = SmoothBasis(shape, box, (down, across))
+    design, inverse = basis.evaluate(patch.pixels), length / patch.distance
+    differences = _make_second_differences(basis.pieces)
+    floor = SPLINE_FLOOR * patch.pixels.size * np.eye(design.shape[1])
+    penalty = floor + SPLINE_START_PENALTY * patch.pixels.size * differences.T @ differences
+    for _ in range(EVIDENCE_ROUNDS):
+        coefficients, scale = _fit_robustly(design, inverse, penalty)
+        # the bending that the fit itself shows is what is known about it (empirical Bayes)
+        usual = float(np.mean((differences @ coefficients) ** 2)) + float(np.finfo(np.float32).eps)
+        bending = differences.T @ differences / usual
+        penalty = scale**2 * CORRELATED_PX * bending + floor
+    bent = Patch(
+        patch.pixels, patch.distance, SmoothBasis(shape, box, basis.pieces, bending), coefficients
+    )
+    return bent if _compute_median_error(bent, coefficients, length) < plain / 2 else patch
+
+
+def _compute_median_error(patch: Patch, coefficients: FloatArray, length: FloatArray) -> float:
+    """Median distance of a patch's returns from a surface over its basis, m."""
+    fitted = length / (patch.basis.evaluate(patch.pixels) @ coefficients)
+    return float(np.median(np.abs(fitted - patch.distance)))
+
+
+def _merge(large: Patch, small: Patch, ray_length: FloatArray, bin_m: float) -> Patch | None:
     """Return both as one patch if one surface fits either as well as a surface of its own."""
-    shape = (distance.shape[0], distance.shape[1])
 
     def median_error(patch: Patch, coefficients: FloatArray) -> float:
-        inverse = evaluate_monomials(patch.pixels, shape) @ coefficients
-        fitted = ray_length.ravel()[patch.pixels] / inverse
-        return float(np.median(np.abs(fitted - distance.ravel()[patch.pixels])))
+        return _compute_median_error(patch, coefficients, ray_length.ravel()[patch.pixels])
 
     if median_error(small, large.coefficients) > MERGE_REACH_BINS * bin_m:
         return None
     pixels = np.concatenate([large.pixels, small.pixels])
-    joint = Patch(pixels, _fit_inverse_depth(pixels, ray_length / distance))
+    joint = _fit_quadratic(pixels, np.concatenate([large.distance, small.distance]), ray_length)
     errors = (median_error(one, joint.coefficients) for one in (large, small))
     return joint if max(errors) < MERGE_BINS * bin_m else None
