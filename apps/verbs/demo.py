@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from apps.conventions import JsonOption, build_provenance, make_folder, report
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from tofclip.shots import Frames, Streak
     from tofclip.simulate import SimulatedShot
 
+CENTRE_ERROR_PX = 0.4  # the calibration's, by which the recovery starts off
 BORDER_PX = 12  # views leave the slit there, so the picture's rim is not scored
 
 
@@ -42,7 +44,7 @@ def demo(
     """Simulate a scene of letters and plates, recover it from one streak image, and compare with
     the truth.
 
-    Skew and gains are found from the shot itself. Surfaces are recovered from the whole shot at
+    Skew, gains and slit centres are found from the shot itself. Surfaces are recovered from the whole shot at
     once; the picture shows them beside total variation of each frame. Writes streak.h5, frames.h5,
     cloud.ply and preview.png.
 
@@ -85,9 +87,15 @@ def _run_demo(seed: int) -> DemoRun:
     """The whole way, from a scene to a point cloud."""
     scene, instrument = make_default_scene(), make_default_instrument()
     shot = simulate_shot(scene, instrument, seed)
-    # What a calibration from focus pictures cannot know: sweep and gains have to be found from the
-    # shot.
-    nominal = replace(shot.camera, sweep=None, gains=1.0 + 0 * shot.camera.gains)
+    # What a calibration from focus pictures cannot know, sweep and gains, and what it knows to half
+    # a pixel only, the slit centres, have to be found from the shot.
+    errors_px = CENTRE_ERROR_PX * np.cos(np.pi * np.arange(shot.camera.views))
+    nominal = replace(
+        shot.camera,
+        sweep=None,
+        gains=np.ones(shot.camera.views),
+        centres_px=shot.camera.centres_px + errors_px,
+    )
     streak = replace(shot.streak, camera=nominal)
     surfaces = plan_recovery(open_shot(streak), "surfaces")
     with show_progress("recovering", surfaces.work) as advance:

@@ -10,7 +10,7 @@ import pytest
 
 from tofclip import Frames, Streak, depth, recover
 from tofclip.camera import Camera, ProjectiveSweep, measure
-from tofclip.camera.calibration import estimate_skew, register_views
+from tofclip.camera.calibration import estimate_skew, register_views, registration
 from tofclip.errors import CalibrationError, InputError, MissingTimeAxisError
 from tofclip.recovery import compute_view_delays_bins, make_method, open_shot, plan_recovery
 from tofclip.simulate import (
@@ -62,6 +62,44 @@ def test_registration_lowers_the_residual(shot, uncalibrated):
     coarse = uncalibrated.replace(sweep=estimate_skew(shot.streak.counts, uncalibrated).sweep)
     found = register_views(shot.streak.counts, shot.streak.saturated, coarse)
     assert found.residuals.min() < 0.7 * found.residuals[0]
+
+
+@pytest.mark.parametrize(
+    ("error_px", "frames"),
+    [
+        (3.0, 96),
+        pytest.param(0.4, registration.MAX_FRAMES, marks=pytest.mark.nightly),
+        pytest.param(1.0, registration.MAX_FRAMES, marks=pytest.mark.nightly),
+        pytest.param(3.0, registration.MAX_FRAMES, marks=pytest.mark.nightly),
+    ],
+)
+def test_slit_centres_are_found_from_the_shot(shot, error_px, frames, monkeypatch):
+    """Of a camera that knows its parallax, from centres that are off by as much at the worst view.
+
+    What shifts the pictures only, a common shift and one in proportion to tan(angle), no shot can
+    tell.
+    """
+    monkeypatch.setattr(registration, "MAX_FRAMES", frames)
+    true = shot.camera
+    shifts = np.stack([np.ones(7), np.tan(true.angles)], axis=1)
+
+    def leave_shifts_out(moves):
+        return moves - shifts @ np.linalg.lstsq(shifts, moves, rcond=None)[0]
+
+    errors = leave_shifts_out(np.random.default_rng(5).normal(size=7))
+    errors *= error_px / np.abs(errors).max()
+    nominal = true.replace(sweep=None, gains=np.ones(7), centres_px=true.centres_px + errors)
+    found = open_shot(shot.streak, nominal).fit_camera().camera
+    left = leave_shifts_out(found.centres_px - true.centres_px)
+    assert np.sqrt(np.mean(left**2)) < 0.1
+    # The pictures stay where the camera's own centres put them.
+    np.testing.assert_allclose(shifts.T @ (found.centres_px - nominal.centres_px), 0, atol=1e-9)
+
+
+def test_without_times_measured_centres_stay(shot):
+    coarse = shot.camera.replace(sweep=estimate_skew(shot.streak.counts, shot.camera).sweep)
+    found = register_views(shot.streak.counts, shot.streak.saturated, coarse)
+    np.testing.assert_array_equal(found.camera.centres_px, shot.camera.centres_px)
 
 
 def test_ranges_are_true(shot, frames):

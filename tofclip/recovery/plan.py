@@ -471,7 +471,8 @@ def fit_camera_to_shot(
     skew = estimate_skew(streak.counts, camera)
     # registration refines a skew that is right to a few rows, which the energy curves give
     coarse = replace(camera, sweep=skew.sweep)
-    return register_views(streak.counts, streak.saturated, coarse, progress).camera
+    times = streak.times - camera.time_zero
+    return register_views(streak.counts, streak.saturated, coarse, progress, times).camera
 
 
 def recover_segments(

@@ -4,31 +4,40 @@ residual.
 Recovering the pictures and registering the views to them alternate. Given the pictures, a view's
 measurements change to first order with its time offset, time stretch, gain and slit centre, so that
 one small least-squares problem a view yields all four; a few rounds suffice because the coarse
-calibration is within a pixel.
+calibration is within a few pixels.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.camera import Camera, Measurement, SkewSweep, measure
 from tofclip.errors import CalibrationError
-from tofclip.operators import LineProjection
-from tofclip.solvers import Progress, Sparse, ignore_progress, relative_residual
+from tofclip.solvers import Progress, Sparse, ignore_progress
+from tofclip.units import SPEED_OF_LIGHT
 
 Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
-ROUND_COUNT = 5
+MIN_ROUND_COUNT, MAX_ROUND_COUNT = 5, 10
+SETTLED_PX = 0.05  # no centre moves further in a round: enough rounds
 MAX_FRAMES = 320  # ten cache blocks, spread over the shot's energy
-REGISTRATION_METHOD = Sparse(weight=1e-3, iterations=20)
+# Too few iterations or too strong a prior pull the centres by some hundredths of a pixel.
+REGISTRATION_METHOD = Sparse(weight=3e-4, iterations=30)
 RELAXATION = (
     1.5  # alternating steps fall short of the joint minimum; a measured speed-up without overshoot
 )
-CENTRE_PRIOR_PX = 1.0  # how far a slit centre may plausibly be off its calibration
+# Centres fall shorter than the rest: pictures recovered at wrong centres agree with these in part.
+CENTRE_RELAXATION = 2.5
+CENTRE_PRIOR_PX = 3.0  # how far a slit centre may plausibly be off its calibration
+SHEAR_TOLERANCE_PX = 0.1  # of a view's place on the slit, where frames share an operator
+MIN_RANGE_M = 0.01
+MIN_VIEWS_TO_SHIFT = 3  # of two views, all that the centres say is where the picture lies
 FLOOR_FRACTION = 0.1  # frames dimmer than this share of the brightest count less, lest noise decide
 
 
@@ -53,8 +62,14 @@ def register_views(
     saturated: NDArray[np.bool_] | None,
     camera: Camera,
     progress: Progress = ignore_progress,
+    times: FloatArray | None = None,
 ) -> Registration:
     """Refine a camera whose sweep is a `SkewSweep`.
+
+    Of a camera that knows its lenslet pitch, every instant is modelled at the shear of its range:
+    surfaces at several ranges then agree about the centres. A shift of all centres alike, or in
+    proportion to tan(angle), only shifts the pictures, and no shot can tell; there the camera's own
+    centres hold.
 
     Parameters
     ----------
@@ -62,32 +77,41 @@ def register_views(
         Raw streak image.
     saturated : (rows, columns) bool array or None
     camera : Camera
-        Coarse calibration: centres within about a pixel, skew within a few rows.
+        Coarse calibration: centres within a few pixels, skew within a few rows.
     progress : callable
         Called with the number of frame iterations just done.
+    times : (rows,) array, optional
+        Times of flight of the rows, s. Without them, the centres of a camera that knows its lenslet
+        pitch stay as they are.
 
     Returns
     -------
     Registration
         The best camera of all rounds, and the residual of each.
     """
-    start, residuals, best = camera, [], (np.inf, camera)
-    for last in [False] * ROUND_COUNT + [True]:
+    start, residuals, best, moved_px = camera, [], (np.inf, camera), np.inf
+    for number in range(MAX_ROUND_COUNT + 1):
         measurement = measure(counts, saturated, camera)
         chosen = _select_frames(measurement)
         part = Measurement(measurement.values[:, chosen], measurement.valid[:, chosen])
-        operator = camera.operator()
-        pictures = REGISTRATION_METHOD.recover(operator, part.values, part.valid, progress).frames
-        residuals.append(relative_residual(operator, pictures, part.values, part.valid))
+        groups = _group_by_shear(camera, times, chosen)
+        pictures = _recover_groups(camera, part, groups, progress)
+        model = _predict(camera, pictures, groups)
+        residuals.append(_compute_residual(model, part))
         best = min(best, (residuals[-1], camera), key=lambda pair: pair[0])
-        if not last:
-            camera = _refine_camera(camera, start, measurement, chosen, pictures)
+        if number == MAX_ROUND_COUNT or (number >= MIN_ROUND_COUNT and moved_px < SETTLED_PX):
+            break
+        evidence = _Evidence(pictures, groups, part.values - model, part.valid, chosen)
+        slope = np.gradient(measurement.values, axis=1)[:, chosen]
+        before = camera.centres_px
+        camera = _refine_camera(camera, start, evidence, slope, times is not None)
+        moved_px = float(np.abs(camera.centres_px - before).max())
     return Registration(best[1], np.array(residuals))
 
 
 def count_registration_iterations() -> int:
-    """Frame iterations that `register_views` reports."""
-    return (ROUND_COUNT + 1) * REGISTRATION_METHOD.work(MAX_FRAMES)
+    """Frame iterations that `register_views` reports at most."""
+    return (MAX_ROUND_COUNT + 1) * REGISTRATION_METHOD.work(MAX_FRAMES)
 
 
 def _select_frames(measurement: Measurement) -> NDArray[np.intp]:
@@ -102,12 +126,65 @@ def _select_frames(measurement: Measurement) -> NDArray[np.intp]:
     return np.unique(np.searchsorted(share, wanted).clip(0, brightness.size - 1))
 
 
+@dataclass(frozen=True)
+class _Group:
+    """Consecutive ones of the chosen frames, recovered at one shear, pixels per view step."""
+
+    frames: slice
+    shear: float
+
+
+def _group_by_shear(
+    camera: Camera, times: FloatArray | None, chosen: NDArray[np.intp]
+) -> list[_Group]:
+    """Cut the chosen frames where the shear of their range has changed."""
+    if times is None or camera.lenslet_pitch <= 0:
+        return [_Group(slice(0, chosen.size), 0.0)]
+    distance = np.maximum(SPEED_OF_LIGHT * times[chosen] / 2, MIN_RANGE_M)
+    shears = camera.shear_at(distance)
+    step = 2 * SHEAR_TOLERANCE_PX / np.abs(camera.view_positions).max(initial=1.0)
+    changed = np.diff(np.floor((shears - shears[0]) / step)) != 0
+    cuts = np.flatnonzero(np.concatenate([[True], changed, [True]])).tolist()
+    return [
+        _Group(slice(first, last), float(shears[first:last].mean()))
+        for first, last in pairwise(cuts)
+    ]
+
+
+def _recover_groups(
+    camera: Camera, part: Measurement, groups: Sequence[_Group], progress: Progress
+) -> Array:
+    """Recover the chosen frames, (rows, columns, frames)."""
+    pictures = [
+        REGISTRATION_METHOD.recover(
+            camera.operator(group.shear),
+            np.ascontiguousarray(part.values[:, group.frames]),
+            np.ascontiguousarray(part.valid[:, group.frames]),
+            progress,
+        ).frames
+        for group in groups
+    ]
+    return np.ascontiguousarray(np.moveaxis(np.concatenate(pictures), 0, -1))
+
+
+def _predict(camera: Camera, pictures: Array, groups: Sequence[_Group]) -> Array:
+    """Return what the camera would measure of the pictures, (columns, frames)."""
+    return np.concatenate(
+        [
+            camera.operator(group.shear)(np.ascontiguousarray(pictures[..., group.frames]))
+            for group in groups
+        ],
+        axis=1,
+    )
+
+
+def _compute_residual(model: Array, part: Measurement) -> float:
+    valid = part.valid.astype(bool)
+    return float(np.linalg.norm((part.values - model)[valid]) / np.linalg.norm(part.values[valid]))
+
+
 def _refine_camera(
-    camera: Camera,
-    start: Camera,
-    measurement: Measurement,
-    chosen: NDArray[np.intp],
-    pictures: Array,
+    camera: Camera, start: Camera, evidence: _Evidence, slope: Array, knows_times: bool
 ) -> Camera:
     """Solve for every view's corrections and apply them; the reference view keeps its time, gains
     average 1.
@@ -117,20 +194,23 @@ def _refine_camera(
         raise CalibrationError(
             "only a skew per view can be refined; this camera's sweep was measured as a whole"
         )
-    blocks = np.ascontiguousarray(np.moveaxis(pictures, 0, -1))
-    misfit = measurement.values[:, chosen] - camera.operator()(blocks)
-    slope = np.gradient(measurement.values, axis=1)[:, chosen]
     drift = camera.centres_px - start.centres_px
-    evidence = _ViewResiduals(blocks, misfit, slope, measurement.valid[:, chosen], chosen)
     corrections = np.array(
-        [evidence.solve_corrections(camera, view, drift[view]) for view in range(camera.views)]
+        [
+            evidence.solve_corrections(camera, view, drift[view], slope)
+            for view in range(camera.views)
+        ]
     )
     offset, stretch, gain, centre = RELAXATION * corrections.T
+    centre = CENTRE_RELAXATION / RELAXATION * centre
     reference = int(np.argmin(np.abs(camera.view_positions)))
     gains = np.maximum(camera.gains * (1 + gain), 0.05)
-    # Where the parallax was measured so were the centres; a scene at several ranges would only pull
-    # them about.
-    centres = camera.centres_px + centre * (camera.lenslet_pitch == 0)
+    centres = camera.centres_px
+    if camera.lenslet_pitch == 0:
+        centres = centres + centre
+    elif knows_times:
+        # Without times, a scene at several ranges would only pull the centres about.
+        centres = centres + _remove_picture_shift(camera, centre)
     improved = SkewSweep(
         centres,
         sweep.offsets_bin + offset - offset[reference],
@@ -139,19 +219,28 @@ def _refine_camera(
     return camera.replace(centres_px=centres, gains=gains / gains.mean(), sweep=improved)
 
 
+def _remove_picture_shift(camera: Camera, moves: FloatArray) -> FloatArray:
+    """Leave out what would only shift the pictures: the part along 1 and tan(angle)."""
+    if camera.views < MIN_VIEWS_TO_SHIFT:
+        return moves
+    shifts = np.stack([np.ones(camera.views), np.tan(camera.angles)], axis=1)
+    rest: FloatArray = moves - shifts @ np.linalg.lstsq(shifts, moves, rcond=None)[0]
+    return rest
+
+
 @dataclass(frozen=True)
-class _ViewResiduals:
-    """What a round knows: pictures, the misfit they leave, the measurements' slope in time, all at
-    the chosen rows.
-    """
+class _Evidence:
+    """What a round knows: pictures, their groups, and the misfit they leave, at the chosen rows."""
 
     pictures: Array
+    groups: Sequence[_Group]
     misfit: Array
-    slope: Array
     valid: NDArray[np.bool_]
     rows: NDArray[np.intp]
 
-    def solve_corrections(self, camera: Camera, view: int, drift: float) -> FloatArray:
+    def solve_corrections(
+        self, camera: Camera, view: int, drift: float, slope: Array
+    ) -> FloatArray:
         """Offset (rows), stretch, relative gain and centre (px) that best explain one view's
         misfit.
 
@@ -165,13 +254,15 @@ class _ViewResiduals:
             Number of the view, from 0.
         drift : float
             How far the centre has moved from its calibration, px.
+        slope : (columns, frames) array
+            Of the measurements in time, a row.
 
         Returns
         -------
         (4,) float64 array
             Offset in rows, stretch, relative gain and centre in px.
         """
-        predicted = _make_view_projection(camera, view)(self.pictures)
+        predicted = _predict(_select_view(camera, view), self.pictures, self.groups)
         half = camera.image_shape[1] // 2
         middle = round(camera.centres_px[view])
         window = slice(max(0, middle - half), middle + half + 1)
@@ -181,7 +272,7 @@ class _ViewResiduals:
             # counting at all
             energy + FLOOR_FRACTION * energy.max() + np.finfo(np.float64).tiny
         )
-        slope, parallax = self.slope[window], np.gradient(predicted, axis=0)[window]
+        slope, parallax = slope[window], np.gradient(predicted, axis=0)[window]
         effects = [-slope, -slope * self.rows, predicted[window], -parallax]
         design = np.stack(
             [(effect * weight).ravel() for effect in effects], axis=1, dtype=np.float64
@@ -189,14 +280,16 @@ class _ViewResiduals:
         return _solve_least_squares(design, (self.misfit[window] * weight).ravel(), drift)
 
 
-def _make_view_projection(camera: Camera, view: int) -> LineProjection:
+def _select_view(camera: Camera, view: int) -> Camera:
     one = slice(view, view + 1)
-    return LineProjection(
-        camera.image_shape,
-        camera.slit_width_px,
-        camera.centres_px[one],
-        camera.angles[one],
-        camera.gains[one],
+    return camera.replace(
+        centres_px=camera.centres_px[one],
+        angles=camera.angles[one],
+        gains=camera.gains[one],
+        view_positions=camera.view_positions[one],
+        sweep=None,
+        angle_uncertainty=np.empty(0),
+        centre_uncertainty_px=np.empty(0),
     )
 
 
