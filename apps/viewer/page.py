@@ -39,8 +39,9 @@ PANEL_PX, PICTURES_PANEL_PX = 352, 240
 MAX_MOVING_POINTS = 200_000
 """Points of a larger cloud are thinned to about as many while it is turned."""
 
-STILL_AFTER_S = 0.25
-"""s after the last movement of a camera at which all points are drawn again."""
+STILL_AFTER_S = 2.0
+"""s after the last movement of a camera at which all points are drawn again: longer than the slow
+frame of a software renderer after which the next movement comes."""
 
 AMBIENT_INTENSITY = 2.0
 """Light from everywhere, so that no side of a surface is black."""
