@@ -56,7 +56,10 @@ NEEDED = {
     "matplotlib": ("matplotlib", RECOVER),
     "numba": ("numba", RECOVER),
     "numpy": ("numpy", ("info", "{files}/camera.h5")),
-    "open3d": ("open3d", (*CLOUD, "--drop-outliers")),
+    "open3d": (
+        None,
+        (*CLOUD, "--drop-outliers"),
+    ),  # it fits planes and finds normals, in Python only
     "OpenEXR": ("OpenEXR", ("cloud", "{frames}", "--out", "{new}/depth.exr")),
     "pyfftw": (None, ("info", "{files}/camera.h5")),  # images: tests/nlos/test_fourier_plans.py
     "pyvista": (None, ("view", "{frames}", "--png", "{new}/view.png")),

@@ -328,7 +328,15 @@ def test_every_verb_explains_itself_with_an_example(run: Run) -> None:
         assert outcome.status == 0
         for word in ("--json", "Exit status"):
             assert word in outcome.out
-    assert set(examples()) == {"reconstruct", "film", "compare", "simulate", "info", "demo"}
+    assert set(examples()) == {
+        "reconstruct",
+        "stream",
+        "film",
+        "compare",
+        "simulate",
+        "info",
+        "demo",
+    }
 
 
 def test_the_examples_run_one_after_the_other(

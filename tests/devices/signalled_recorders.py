@@ -32,8 +32,10 @@ def end_recorder(
     child = os.fork()
     if child == 0:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        # A shell's background jobs ignore it, and a program that was told to ignores it rightly.
+        # A shell's background jobs ignore the one and nohup's the other, and a program that was
+        # told to ignore a signal does so rightly.
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
         status = 70
         try:
             status = run_program(["record", address, "--out", str(path), "--json"])

@@ -353,8 +353,12 @@ def estimate_false_alarms(pool: CandidatePool, pooled: FloatArray) -> FloatArray
     noise, nearest = np.random.default_rng(DECOY_SEED), float(pool.distance.min())
     least = MIN_DISPLACEMENT_GATES * pool.gate
     decoys = []
+    # By pixel and order in it: one candidate more or less changes no other's displacement.
+    place = np.arange(pooled.size) - np.searchsorted(pool.pixel, pool.pixel)
+    slots = (*pool.image_shape, CANDIDATES.max_returns)
     for _ in range(DECOY_ROUNDS):
-        further = pool.distance - nearest + noise.uniform(least, span - least, pooled.size)
+        displacement = noise.uniform(least, span - least, slots).reshape(-1, slots[-1])
+        further = pool.distance - nearest + displacement[pool.pixel, place]
         decoys.append(pool.sum_around(POOL_RADIUS_PX, nearest + further % span))
     everything = np.concatenate([pooled, *decoys])
     weights = np.full(everything.size, 1 / DECOY_ROUNDS)

@@ -169,6 +169,8 @@ def _connect_neighbours(
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
+    if pixels.size == 0:
+        return []
     rows, columns = shape
     order = np.lexsort((distance, pixels))
     starts = np.flatnonzero(np.diff(pixels[order], prepend=-1))

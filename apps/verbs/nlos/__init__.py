@@ -8,7 +8,7 @@ from apps.help import VerbTable, make_lazy_group
 
 VERBS: VerbTable = {
     "reconstruct": "Image the hidden scene from the transients on a relay wall.",
-    "stream": "Image a stream of captures by one plan while they come, and tell rate and latency.",
+    "stream": "Image every capture of a stream by one plan, and tell rate and latency.",
     "film": "Film the hidden scene while the laser's flash passes through it.",
     "compare": "Image one capture by several methods, and show images, time, memory and figures of merit side by side.",
     "simulate": "Simulate the capture of a known hidden scene before a relay wall.",

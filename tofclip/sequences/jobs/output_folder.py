@@ -4,6 +4,7 @@ another.
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 from collections.abc import Mapping
@@ -66,13 +67,18 @@ def lock_output_folder(
             f"{folder}: holds results of other settings ({told}); choose another folder or remove it"
         )
 
-    changed = [name for name, mark in marks.items() if noted.get(name, mark) != mark]
+    # A file without a result may change: a damaged shot is replaced, and its run goes on.
+    changed = [
+        name
+        for name, mark in marks.items()
+        if noted.get(name, mark) != mark and any(folder.glob(f"{glob.escape(name)}.*"))
+    ]
     if changed:
         raise InputError(
             f"{folder}: holds results of other inputs ({len(changed)} have changed since, the first "
             f"is {changed[0]}); choose another folder or remove it"
         )
-    if not marks.keys() <= noted.keys():
+    if any(noted.get(name) != mark for name, mark in marks.items()):
         _write_settings(path, known, {**noted, **marks})
 
 
