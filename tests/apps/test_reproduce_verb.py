@@ -23,6 +23,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("small")
+@pytest.mark.nightly  # half a minute; tests of sequences run a quick study through the same folder
 def test_a_study_is_written_and_not_made_again(run: Run, tmp_path: Path) -> None:
     words = ("reproduce", "fig15", "--out", tmp_path / "made", "--seeds", "1", "--json")
     first = run(*words)

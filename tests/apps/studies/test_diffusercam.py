@@ -32,6 +32,7 @@ def test_the_hand_explains_the_readings(recoveries):
     assert [recovery.relative_residual < 0.01 for recovery in recoveries] == [True] * 3
 
 
+@pytest.mark.nightly
 def test_the_hand_lies_where_it_is_and_is_the_same_from_fewer_pixels(recoveries):
     full = recoveries[0].scene
     rows, columns = np.nonzero(full > 0.2 * full.max())
