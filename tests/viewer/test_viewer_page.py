@@ -87,6 +87,11 @@ class Seen:
         self.row(label).locator("input:not([type=hidden])").first.click()
         self.tab.get_by_role("option", name=option, exact=True).click()
 
+    def tick(self, label: str) -> None:
+        """Click a box, as soon as the panel that holds it stands still."""
+        box = self.row(label).locator("label, input").last
+        until(lambda: _succeeds(lambda: box.click(force=True)), f"'{label}' is there to be clicked")
+
     def press(self, button: str) -> None:
         self.tab.get_by_role("button", name=button, exact=True).click()
 
@@ -105,6 +110,15 @@ def until(met: Callable[[], bool], what: str) -> None:
     while not met():
         assert time.monotonic() < deadline, f"waited in vain until {what}"
         time.sleep(0.05)
+
+
+def _succeeds(act: Callable[[], Any]) -> bool:
+    """Say whether something could be done; the page may just have drawn its place anew."""
+    try:
+        act()
+    except playwright.Error:
+        return False
+    return True
 
 
 @pytest.fixture(scope="module")
@@ -133,9 +147,9 @@ def test_it_loads(seen: Seen) -> None:
     words = seen.tab.locator("#instant").inner_text()
     assert words == f"{1e9 * instant:.2f} ns, range {299792458 * instant / 2:.3f} m"
     whole = picture(seen)
-    seen.row("box").locator("label, input").last.click(force=True)
+    seen.tick("box")
     until(lambda: bool(np.abs(picture(seen) - whole).max() > 0.2), "the box disappears")
-    seen.row("box").locator("label, input").last.click(force=True)
+    seen.tick("box")
     until(lambda: seen.tab.locator("img").count() >= 3, "streak, intensity and depth are shown")
 
 
@@ -147,24 +161,20 @@ def test_the_cloud_fits_between_the_panels(seen: Seen, size: tuple[int, int]) ->
 
     def framed() -> bool:
         canvas = seen.tab.locator(SCENE).bounding_box()
-        fits = (client.camera.image_width, client.camera.image_height) == (
-            round(canvas["width"]),
-            round(canvas["height"]),
-        )
-        return fits and bool(
-            np.isclose(client.camera.fov, seen.page.viewpoint.field_of_view, rtol=1e-3)
-        )
+        shape = round(canvas["height"]), round(canvas["width"])
+        if (client.camera.image_height, client.camera.image_width) != shape:
+            return False
+        row, column, _ = seen.page.viewpoint.project(seen.page.session.latest.cloud.xyz, shape)
+        inside = 0 < row.min() < row.max() < shape[0] and 0 < column.min() < column.max() < shape[1]
+        fills = max(np.ptp(row) / shape[0], np.ptp(column) / shape[1]) > 0.6
+        same_view = np.isclose(client.camera.fov, seen.page.viewpoint.field_of_view, rtol=1e-3)
+        return bool(inside and fills and same_view)
 
     until(framed, "the page has framed the cloud for this window")
     canvas = seen.tab.locator(SCENE).bounding_box()
     panel = seen.tab.locator("#label").bounding_box()
     assert canvas["x"] >= 200  # right of the pictures
     assert canvas["x"] + canvas["width"] <= panel["x"]  # left of the controls
-    shape = round(canvas["height"]), round(canvas["width"])
-    row, column, _ = seen.page.viewpoint.project(seen.page.session.latest.cloud.xyz, shape)
-    assert 0 < row.min() < row.max() < shape[0]
-    assert 0 < column.min() < column.max() < shape[1]
-    assert max(np.ptp(row) / shape[0], np.ptp(column) / shape[1]) > 0.6
     seen.tab.set_viewport_size({"width": 1024, "height": 700})
 
 
@@ -224,7 +234,7 @@ def test_filter(seen: Seen) -> None:
 
 
 def test_the_clip_box_is_dragged_by_its_corners(seen: Seen) -> None:
-    seen.row("clip box").locator("label, input").last.click(force=True)
+    seen.tick("clip box")
     scene = seen.page.server.scene
     until(lambda: scene.get_handle_by_name("/clip/low") is not None, "there are handles")
     handle: Any = scene.get_handle_by_name("/clip/low")
@@ -241,7 +251,7 @@ def test_the_clip_box_is_dragged_by_its_corners(seen: Seen) -> None:
     until(lambda: seen.number("#points") < 85, "what lies outside of the box is left out")
     seen.press("reset filters")
     until(lambda: seen.number("#points") == 85, "it is back")
-    seen.row("clip box").locator("label, input").last.click(force=True)
+    seen.tick("clip box")
     until(lambda: scene.get_handle_by_name("/clip/low") is None, "the handles are gone")
 
 
@@ -258,12 +268,22 @@ def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
     words = seen.tab.locator("#picked")
     until(lambda: "range 1.58" in words.inner_text(), "the point is described")
     assert "pixel row 1" in words.inner_text()
-    until(lambda: seen.tab.locator(".uplot canvas").count() == 1, "its waveform is drawn")
-    plot = seen.tab.locator(".uplot canvas").bounding_box()
-    assert plot["y"] + plot["height"] <= 700  # without scrolling
-    drawn = imread(io.BytesIO(seen.tab.locator(".uplot canvas").screenshot()))
-    red = (drawn[..., 0] > 0.6) & (drawn[..., 1] < 0.5)
-    assert 0.002 < red.mean() < 0.2  # the return
+    plot = seen.tab.locator(".uplot canvas")
+
+    def shows_the_return() -> bool:
+        if plot.count() != 1:
+            return False
+        place = plot.bounding_box()
+        if place is None or not 0 < place["height"] <= 700 - place["y"]:  # without scrolling
+            return False
+        taken: list[bytes] = []
+        if not _succeeds(lambda: taken.append(plot.screenshot())):
+            return False
+        drawn = imread(io.BytesIO(taken[0]))
+        red = (drawn[..., 0] > 0.6) & (drawn[..., 1] < 0.5)
+        return bool(0.002 < red.mean() < 0.2)
+
+    until(shows_the_return, "its waveform is drawn, with the return")
     far = shown.cloud.xyz[shown.cloud.range > 1.63].mean(axis=0, keepdims=True)
     row, column, _ = seen.page.viewpoint.project(
         far, (round(canvas["height"]), round(canvas["width"]))
