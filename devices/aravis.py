@@ -12,7 +12,7 @@ import importlib.machinery
 import importlib.util
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from time import monotonic
 from typing import Any
@@ -59,8 +59,17 @@ PIXEL_BITS = {"Mono8": 8, "Mono10": 16, "Mono12": 16, "Mono14": 16, "Mono16": 16
 FRAME_ID_RANGE = 0xFFFF
 """GigE Vision's 16-bit identifiers go from 1 to this, and then to 1 again."""
 
+UNNUMBERED = (1 << 64) - 1
+"""An identifier that no frame has."""
+
+HELD_BYTES, HELD_FRAMES = 64 << 20, (16, 256)
+SOCKET_BUFFER_BYTES = 16 << 20
+"""What is asked for; the system gives less (``net.core.rmem_max`` of Linux)."""
+
+PACKET_HEADER_BYTES = 36
+"""Of IP, UDP and GVSP, in each packet."""
+
 SYSTEM_PACKAGES = ("/usr/lib/python3/dist-packages",)
-LOOPBACK = "127.0.0.1"
 NANOSECOND_S, PICOSECOND_S = 1e-9, 1e-12
 
 
@@ -81,8 +90,9 @@ class CameraSettings:
         Duration of a row, ps, where the camera looks at a streak tube's screen.
     gate : GateScan or None
         Where a gated intensifier stands before it, stepped by each frame.
-    buffers : int
-        Frames that Aravis holds.
+    buffers : int or None
+        Frames that Aravis holds while this program must wait; None: as many as fit into
+        `HELD_BYTES`, within `HELD_FRAMES`.
     timeout, reconnect : float
         s without any frame after which the camera is asked whether it is there, and for it to come
         back.
@@ -94,12 +104,12 @@ class CameraSettings:
     pixel_format: str = ""
     row_ps: float | None = None
     gate: GateScan | None = None
-    buffers: int = 16
+    buffers: int | None = None
     timeout: float = 5.0
     reconnect: float = 5.0
 
     def __post_init__(self) -> None:
-        if not 2 <= self.buffers <= 4096:
+        if self.buffers is not None and not 2 <= self.buffers <= 4096:
             raise InputError(f"the number of buffers must be within 2..4096, got {self.buffers}")
         for name in ("exposure_us", "frame_rate", "row_ps"):
             value = getattr(self, name)
@@ -125,7 +135,7 @@ class CameraSettings:
             uri.value("pixel_format", str, ""),
             number("row_ps"),
             gate,
-            uri.value("buffers", int, cls.buffers),
+            uri.value("buffers", int, 0) if "buffers" in uri.values else None,
             parse_seconds(uri, "timeout_s", cls.timeout),
             parse_seconds(uri, "reconnect_s", cls.reconnect),
         )
@@ -134,8 +144,10 @@ class CameraSettings:
 class AravisFeed:
     """Frames in the order of their identifiers; see `devices.stream.Feed`.
 
-    A gap in the identifiers is lost by the camera or on the wire, except for frames that found no
-    buffer in Aravis, which this program dropped. A frame of which packets are missing is malformed.
+    A frame of which packets are missing is malformed. A gap in the identifiers is lost by the camera
+    or on the wire, except for frames that found no buffer in Aravis, which this program dropped, and
+    for malformed ones whose first packet is missing: that is the one that brings the identifier, and
+    so they are counted with the next frame that has one.
 
     Parameters
     ----------
@@ -151,7 +163,7 @@ class AravisFeed:
         self._library, self._place = library, place
         self._ledger, self._settings = ledger, settings
         self._clock = InstrumentClock()
-        self._number = 0
+        self._number = self._unnumbered = 0
         self._gap = Gap.NONE
         self._camera: Any = None
         self._stream: Any = None
@@ -187,10 +199,11 @@ class AravisFeed:
 
     def start(self) -> None:
         with self._translate_errors():
-            for _ in range(self._settings.buffers):
-                self._stream.push_buffer(
-                    self._library.Buffer.new_allocate(self._camera.get_payload())
-                )
+            payload = self._camera.get_payload()
+            held = min(max(HELD_BYTES // payload, HELD_FRAMES[0]), HELD_FRAMES[1])
+            for _ in range(self._settings.buffers or held):
+                self._offer_buffer(self._library.Buffer.new_allocate(payload))
+            self._packets_per_frame = self._count_packets(payload)
             self._camera.start_acquisition()
         self._running = True
         self._heard_at = monotonic()
@@ -203,6 +216,7 @@ class AravisFeed:
             arrived_at = monotonic()
             if buffer is None:
                 if not self._running:
+                    self._count_unnumbered()
                     return None
                 self._check_presence(arrived_at)
                 raise DeviceTimeoutError("the camera sent nothing; is it triggered?")
@@ -210,7 +224,7 @@ class AravisFeed:
             try:
                 taken = self._take_frame(buffer, arrived_at)
             finally:
-                self._stream.push_buffer(buffer)
+                self._offer_buffer(buffer)
             if taken is not None:
                 return taken
 
@@ -220,6 +234,7 @@ class AravisFeed:
             self._camera.stop_acquisition()
 
     def close(self) -> None:
+        self._count_unnumbered()
         try:
             if self._running:
                 self.stop()
@@ -231,12 +246,13 @@ class AravisFeed:
         settings = self._settings
         self._running = False
         self._last_id: int | None = None
-        self._underruns = 0
+        self._dropped = 0
         self._clock.reset()
         with self._translate_errors(DeviceNotFoundError):
             self._camera = camera = self._library.Camera.new(self._place or None)
         with self._translate_errors(InputError):
             camera.set_acquisition_mode(self._library.AcquisitionMode.CONTINUOUS)
+            self._prepare_camera(camera)
             if settings.pixel_format:
                 camera.set_pixel_format_from_string(settings.pixel_format)
             if settings.frame_rate is not None:
@@ -247,6 +263,14 @@ class AravisFeed:
                 camera.set_gain(settings.gain)
         with self._translate_errors():
             self._stream = camera.create_stream(None, None)
+            if camera.is_gv_device():
+                # By default one frame's worth, which a reader that is late for one overflows.
+                fixed = self._library.GvStreamSocketBuffer.FIXED
+                self._stream.set_property("socket-buffer", fixed)
+                self._stream.set_property("socket-buffer-size", SOCKET_BUFFER_BYTES)
+
+    def _prepare_camera(self, camera: Any) -> None:
+        """Do what an emulated camera needs before its settings are made."""
 
     def _make_codec(self) -> FrameCodec:
         with self._translate_errors():
@@ -259,12 +283,28 @@ class AravisFeed:
             )
         return FrameCodec(height, width, bits)
 
+    def _offer_buffer(self, buffer: Any) -> None:
+        """Let Aravis fill a buffer; it keeps the identifier that it has if the frame brings none."""
+        buffer.set_frame_id(UNNUMBERED)
+        self._stream.push_buffer(buffer)
+
+    def _count_packets(self, payload: int) -> int:
+        """Return the packets of a frame, as of which Aravis counts what finds no buffer."""
+        if not self._camera.is_gv_device():
+            return 1
+        carried = int(self._camera.gv_get_packet_size()) - PACKET_HEADER_BYTES
+        return -(-payload // carried) + 2
+
     def _take_frame(self, buffer: Any, arrived_at: float) -> Transfer | None:
         """Enter a frame into the accounts; None where packets of it are missing."""
         status, frame_id = buffer.get_status(), buffer.get_frame_id()
         known = self._library.BufferStatus
         if status in (known.CLEARED, known.ABORTED):
             return None  # never filled: acquisition was stopped
+        if frame_id == UNNUMBERED:
+            self._unnumbered += 1
+            self._gap = max(self._gap, Gap.LOSS)
+            return None
         if not self._count_missing(frame_id):
             return None
         stamp = buffer.get_timestamp() * NANOSECOND_S
@@ -286,27 +326,40 @@ class AravisFeed:
         later one, which has been entered already, as lost or torn.
         """
         if self._last_id is None:
-            self._last_id = frame_id
-            return True
-        missing = frame_id - self._last_id - 1
-        if max(frame_id, self._last_id) <= FRAME_ID_RANGE:
-            # 65535 is followed by 1, and then frames from before may still be handed over.
-            half = FRAME_ID_RANGE // 2
-            missing = (missing + 1 + half) % FRAME_ID_RANGE - half - 1
+            missing = self._unnumbered
+        else:
+            missing = frame_id - self._last_id - 1
+            if max(frame_id, self._last_id) <= FRAME_ID_RANGE:
+                # 65535 is followed by 1, and then frames from before may still be handed over.
+                half = FRAME_ID_RANGE // 2
+                missing = (missing + 1 + half) % FRAME_ID_RANGE - half - 1
         if missing < 0:
             return False
         self._last_id = frame_id
         if missing == 0:
             return True
-        underruns = self._stream.get_info_uint64_by_name("n_underruns")
-        dropped = min(missing, max(0, underruns - self._underruns))
-        self._underruns += dropped
+        torn = min(missing, self._unnumbered)
+        self._unnumbered = 0
+        dropped = min(missing - torn, self._count_underruns() - self._dropped)
+        self._dropped += dropped
+        self._ledger.truncate(torn)
         self._ledger.receive(dropped)
         self._ledger.drop(dropped)
-        self._ledger.lose(missing - dropped)
+        self._ledger.lose(missing - torn - dropped)
         self._number += missing
         self._gap = max(self._gap, Gap.LOSS)
         return True
+
+    def _count_underruns(self) -> int:
+        """Return how many frames found no buffer so far; Aravis counts their packets."""
+        packets = int(self._stream.get_info_uint64_by_name("n_underruns"))
+        return max(self._dropped, -(-packets // self._packets_per_frame))
+
+    def _count_unnumbered(self) -> None:
+        """Enter frames without an identifier that no other frame comes after."""
+        self._ledger.truncate(self._unnumbered)
+        self._number += self._unnumbered
+        self._unnumbered = 0
 
     def _check_presence(self, now: float) -> None:
         """Where nothing came for long, ask the camera something; open it anew if it is gone."""
@@ -317,6 +370,7 @@ class AravisFeed:
             with self._translate_errors():
                 self._camera.get_exposure_time()
         except DeviceError:
+            self._count_unnumbered()
             retry_connect(self._reopen, self._settings.reconnect)
             self._ledger.reconnect()
             self._gap = Gap.RESTART
@@ -397,7 +451,7 @@ def find_cameras() -> list[DiscoveredInstrument]:
 
 
 def open_aravis(uri: Uri) -> StreamSource:
-    """Open ``aravis://NAME?exposure_us=1000&gain=0&frame_rate=25&pixel_format=Mono16&buffers=16``.
+    """Open ``aravis://NAME?exposure_us=1000&gain=0&frame_rate=25&pixel_format=Mono16&buffers=64``.
 
     NAME is a camera's identifier or address, or nothing for the first one. ``row_ps`` gives the
     duration of a row of a streak picture; ``mode=gated`` and `GATE_OPTIONS` say how an intensifier's
@@ -407,58 +461,4 @@ def open_aravis(uri: Uri) -> StreamSource:
     settings, held = CameraSettings.from_uri(uri), parse_buffer_settings(uri)
     ledger = Ledger()
     feed = AravisFeed(load_aravis(), uri.location, ledger, settings)
-    return StreamSource(feed, feed.codec, ledger, held)
-
-
-class EmulatedFeed(AravisFeed):
-    """Frames of Aravis' own emulated GigE Vision camera on this computer's loopback.
-
-    Parameters
-    ----------
-    library, ledger, settings
-        As for `AravisFeed`.
-    serial : str
-    lost_per_thousand : int
-        Packets of a thousand that are lost on the wire.
-    """
-
-    def __init__(
-        self,
-        library: Any,
-        ledger: Ledger,
-        settings: CameraSettings,
-        serial: str,
-        lost_per_thousand: int,
-    ) -> None:
-        self._camera_process = library.GvFakeCamera.new(LOOPBACK, serial)
-        if not self._camera_process.is_running():
-            raise DeviceNotFoundError(
-                f"an emulated camera cannot listen on {LOOPBACK}; another one does already"
-            )
-        self._camera_process.set_property("gvsp-lost-ratio", lost_per_thousand / 1000)
-        super().__init__(library, LOOPBACK, ledger, settings)
-
-    @property
-    def info(self) -> Info:
-        known = super().info
-        return replace(known, instrument=f"emulated {known.instrument}")
-
-    def close(self) -> None:
-        try:
-            super().close()
-        finally:
-            del self._camera_process
-
-
-def open_emulated(uri: Uri) -> StreamSource:
-    """Open ``sim+aravis://?frame_rate=100&lost_per_thousand=0``: Aravis' own emulated camera, which
-    shows moving stripes.
-    """
-    uri.reject_unknown(*OPTIONS, "lost_per_thousand")
-    settings, held = CameraSettings.from_uri(uri), parse_buffer_settings(uri)
-    lost = uri.value("lost_per_thousand", int, 0)
-    if not 0 <= lost <= 1000:
-        raise InputError(f"'{uri.text}': lost_per_thousand must be within 0..1000")
-    ledger = Ledger()
-    feed = EmulatedFeed(load_aravis(), ledger, settings, uri.location or "EMULATED", lost)
     return StreamSource(feed, feed.codec, ledger, held)

@@ -23,7 +23,7 @@ OPENERS: dict[str, str] = {
     "linospad2": "devices.linospad2.source:open_recording",
     "remoteex": "devices.remoteex.source:open_remoteex",
     "spad512": "devices.spad512.source:open_spad512",
-    "sim+aravis": "devices.aravis:open_emulated",
+    "sim+aravis": "devices.emulation.aravis:open_emulated",
     "sim+linospad2": "devices.linospad2.simulation:open_simulated",
     "sim+remoteex": "devices.remoteex.simulation:open_emulated",
     "sim+spad512": "devices.spad512.emulator:open_emulated",
@@ -37,7 +37,6 @@ OPENERS: dict[str, str] = {
 """Scheme of an address -> function ``(Uri) -> Source``."""
 
 FILE_OPENERS: dict[str, str] = {
-    "aravis": "devices.aravis:open_aravis",
     ".dat": "devices.linospad2.source:open_recording",
     ".img": "devices.streak_file:open_streak_file",
     ".tif": "devices.streak_file:open_streak_file",

@@ -59,6 +59,48 @@ class LineLight:
     truth: GroundTruth
 
 
+@dataclass(frozen=True)
+class EmulatedLight:
+    """What falls on the screen, and how it is swept.
+
+    Parameters
+    ----------
+    photons : (rows, columns) array
+        Expected photons of each pixel in one exposure.
+    row_times : (rows,) array
+        s.
+    full_scale : int
+        Reading at which a pixel saturates.
+    seed : int
+    """
+
+    photons: NDArray[np.float64]
+    row_times: NDArray[np.float64]
+    full_scale: int = 65535
+    seed: int = 0
+
+    def draw_frame(self, number: int) -> NDArray[np.uint16]:
+        """Draw picture `number`; the same number gives the same picture."""
+        drawn = np.random.default_rng([self.seed, number]).poisson(self.photons)
+        return np.minimum(drawn, self.full_scale).astype("<u2")
+
+    @classmethod
+    def of(cls, light: LineLight, seed: int) -> EmulatedLight:
+        """Let a scene's light fall on the screen.
+
+        Parameters
+        ----------
+        light : LineLight
+        seed : int
+            Of the photons.
+
+        Returns
+        -------
+        EmulatedLight
+        """
+        return cls(light.photons, light.row_times, seed=seed)
+
+
 def make_line_instrument() -> Instrument:
     """Return seven lenslets before a line of 256 pixels, as long as LinoSPAD2; nothing sweeps,
     nothing is skewed.

@@ -7,9 +7,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from devices.emulation.faults import Fault
 from devices.loopback import Connection, LoopbackServer
 from devices.remoteex.protocol import (
@@ -22,55 +19,13 @@ from devices.remoteex.protocol import (
     Command,
 )
 from devices.remoteex.source import GAIN_PARAMETER, STREAK_TUBE
-from devices.scenes import LineLight
+from devices.scenes import EmulatedLight
 from tofclip.errors import InputError, ProtocolError
 
 SUPPORTED_FAULTS = ("timeout", "short", "unplug", "corrupt", "lost", "overflow")
 UNLIMITED_FRAMES = 1 << 62
 FAULT_DELAY_S = 0.1
 """Seconds by which a fault of amount 1 delays an answer."""
-
-
-@dataclass(frozen=True)
-class EmulatedLight:
-    """What falls on the screen, and how it is swept.
-
-    Parameters
-    ----------
-    photons : (rows, columns) array
-        Expected photons of each pixel in one exposure.
-    row_times : (rows,) array
-        s.
-    full_scale : int
-        Reading at which a pixel saturates.
-    seed : int
-    """
-
-    photons: NDArray[np.float64]
-    row_times: NDArray[np.float64]
-    full_scale: int = 65535
-    seed: int = 0
-
-    def draw_frame(self, number: int) -> NDArray[np.uint16]:
-        """Draw picture `number`; the same number gives the same picture."""
-        drawn = np.random.default_rng([self.seed, number]).poisson(self.photons)
-        return np.minimum(drawn, self.full_scale).astype("<u2")
-
-    @classmethod
-    def of(cls, light: LineLight, seed: int) -> EmulatedLight:
-        """Let a scene's light fall on the screen.
-
-        Parameters
-        ----------
-        light : LineLight
-        seed : int
-            Of the photons.
-
-        Returns
-        -------
-        EmulatedLight
-        """
-        return cls(light.photons, light.row_times, seed=seed)
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from devices.emulation.faults import Fault
 from devices.ledger import Ledger
 from devices.loopback import HOST
 from devices.remoteex.client import RemoteExClient
-from devices.remoteex.emulator import UNLIMITED_FRAMES, EmulatedLight, EmulatedStreakCamera
+from devices.remoteex.emulator import UNLIMITED_FRAMES, EmulatedStreakCamera
 from devices.remoteex.source import OPTIONS, LiveSettings, RemoteExFeed, parse_live_settings
-from devices.scenes import simulate_demonstration_light, simulate_line_light
+from devices.scenes import EmulatedLight, simulate_demonstration_light, simulate_line_light
 from devices.source import Info
 from devices.stream import StreamSource
 from devices.stream_options import parse_buffer_settings

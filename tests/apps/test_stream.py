@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from apps.cli import main
-from devices.remoteex.emulator import EmulatedLight, EmulatedStreakCamera
-from devices.scenes import draw_exposure, simulate_line_light
+from devices.remoteex.emulator import EmulatedStreakCamera
+from devices.scenes import EmulatedLight, draw_exposure, simulate_line_light
 from devices.shot_stream import read_transients
 from devices.transients import read_transient
 from tofclip.lidar import PointCloud

@@ -14,10 +14,10 @@ import devices
 from devices.emulation.faults import Fault
 from devices.loopback import HOST, Connection, LoopbackServer
 from devices.remoteex.client import RemoteExClient
-from devices.remoteex.emulator import Circumstances, EmulatedLight, EmulatedStreakCamera
+from devices.remoteex.emulator import Circumstances, EmulatedStreakCamera
 from devices.remoteex.protocol import TERMINATOR
 from devices.remoteex.source import LiveSettings
-from devices.scenes import simulate_demonstration_light, simulate_line_light
+from devices.scenes import EmulatedLight, simulate_demonstration_light, simulate_line_light
 from devices.source import Source
 from tofclip.camera import Camera
 from tofclip.errors import (

@@ -11,8 +11,8 @@ import pytest
 
 from devices.loopback import HOST
 from devices.recording.check import verify
-from devices.remoteex.emulator import EmulatedLight, EmulatedStreakCamera
-from devices.scenes import simulate_line_light
+from devices.remoteex.emulator import EmulatedStreakCamera
+from devices.scenes import EmulatedLight, simulate_line_light
 
 SCRIPT = Path(__file__).with_name("signalled_recorders.py")
 INTERRUPTED = 130

@@ -18,7 +18,8 @@ import pytest
 import devices
 from devices.emulation.faults import Fault, FaultKind
 from devices.loopback import HOST
-from devices.remoteex.emulator import EmulatedLight, EmulatedStreakCamera
+from devices.remoteex.emulator import EmulatedStreakCamera
+from devices.scenes import EmulatedLight
 from devices.source import Source
 from devices.spad512.emulator import EmulatedSpadArray
 from devices.statistics import Stats
