@@ -18,12 +18,18 @@ settings.register_profile("anywhere", deadline=None, suppress_health_check=[Heal
 settings.load_profile("anywhere")
 
 
+ROOMS_OF_LONG_FILES = {"viewer", "apps"}
+"""Their tests run whole programs."""
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep the tests of a file on one worker, so that it makes what they share once.
+    """Keep the tests of a file on one worker, so that it makes what they share once; the longest
+    files come first, so that no worker has one left at the end.
 
     A mark ``xdist_group`` puts the tests of several files together, or splits a file.
     """
+    items.sort(key=lambda item: ROOMS_OF_LONG_FILES.isdisjoint(item.path.parts))
     for item in items:
         if item.get_closest_marker("xdist_group") is None:
             item.add_marker(pytest.mark.xdist_group(item.path.stem))

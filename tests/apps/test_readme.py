@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import shutil
@@ -96,6 +97,12 @@ def test_continuous_integration_runs_the_readmes_test_command() -> None:
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     assert promised[0] in script
     assert script.rstrip().endswith(promised[-1])  # last, so that its summary is the last line
+
+
+@pytest.mark.skipif("PYTEST_XDIST_WORKER" not in os.environ, reason="one process has no workers")
+def test_the_tests_of_a_file_stay_on_one_worker(request: pytest.FixtureRequest) -> None:
+    # what the scheduler of pytest-xdist goes by: not added with pytest 9.2
+    assert request.node.nodeid.endswith("@test_readme")
 
 
 def test_the_picture_is_there_and_small() -> None:
