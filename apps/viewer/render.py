@@ -69,18 +69,7 @@ class PyvistaRenderer:
     ) -> Image:
         """Return a picture, drawn by VTK.
 
-        Parameters
-        ----------
-        shown : DisplayedFrame
-        viewpoint : Viewpoint
-        shape : (int, int)
-            Rows and columns.
-        point_px : int
-            Width of a point, pixels.
-
-        Returns
-        -------
-        (rows, columns, 3) uint8 array
+        Arguments and result are those of `Renderer.draw`.
         """
         import pyvista
 
@@ -106,18 +95,7 @@ class RasterRenderer:
     ) -> Image:
         """Return a picture, drawn by NumPy; surfaces appear as their points.
 
-        Parameters
-        ----------
-        shown : DisplayedFrame
-        viewpoint : Viewpoint
-        shape : (int, int)
-            Rows and columns.
-        point_px : int
-            Width of a point, pixels.
-
-        Returns
-        -------
-        (rows, columns, 3) uint8 array
+        Arguments and result are those of `Renderer.draw`.
         """
         return rasterise_points(shown.cloud.xyz, shown.colours, viewpoint, shape, point_px)
 

@@ -73,16 +73,7 @@ class PoissonStream:
     def next_words(self, limit: int, last: int) -> ByteView:
         """Return the next words; see `TagStream`.
 
-        Parameters
-        ----------
-        limit : int
-            Words.
-        last : int
-            Tick.
-
-        Returns
-        -------
-        (6 * words,) uint8 array
+        Arguments and result are those of `TagStream.next_words`.
         """
         words = np.empty(limit * RECORD_BYTES, np.uint8)
         written = fill_poisson_words(

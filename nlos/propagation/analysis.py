@@ -81,17 +81,7 @@ class LatticeAnalysis:
     ) -> NDArray[np.complex64]:
         """Analyse ``values * weights[m]`` up to an index along x.
 
-        Parameters
-        ----------
-        values : (points,) complex64 array
-        weights : (terms, points) complex64 array
-        reach : int
-
-        Returns
-        -------
-        (terms, columns, rows) complex64 array
-            Columns and rows in the order of Fourier transforms, first 0 and last -1; an index
-            beyond them is found modulo their number. Valid until the next call.
+        Arguments and result are those of `PlaneWaveAnalysis.spectra`.
         """
         columns, (rows, wide) = self._count_columns(reach), self._lines.shape
         ends = (

@@ -78,12 +78,7 @@ class FrameTraces:
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
         """Write traces of neighbours in raster order.
 
-        Parameters
-        ----------
-        piece : slice
-            Of the pixels.
-        traces : (n, bins) float32 array
-            Overwritten.
+        Arguments and result are those of `Traces.fill`.
         """
         from tofclip.solvers.kernels import copy_lanes_to_frames
 

@@ -72,15 +72,7 @@ class CodedAperture:
     ) -> tuple[Coordinates, Coordinates, Coordinates]:
         """Return the rays; see `ApertureElement`. View u looks through the mask at -u, as in Eq. 6.
 
-        Parameters
-        ----------
-        v, u : (rays, 1) and (1, rays) array
-            Pupil coordinates from -1 to 1.
-
-        Returns
-        -------
-        transmission, down_px, right_px : (rays, rays) array
-            The code's value, and no deflection.
+        Arguments and result are those of `ApertureElement.trace_rays`.
         """
         cells = [
             np.clip(((1 - place) / 2 * size).astype(int), 0, size - 1)
@@ -113,15 +105,7 @@ class CubicPhasePlate:
     ) -> tuple[Coordinates, Coordinates, Coordinates]:
         """Return the rays; see `ApertureElement`.
 
-        Parameters
-        ----------
-        v, u : (rays, 1) and (1, rays) array
-            Pupil coordinates from -1 to 1.
-
-        Returns
-        -------
-        transmission, down_px, right_px : (rays, rays) array
-            All light, and the deflection in pixels.
+        Arguments and result are those of `ApertureElement.trace_rays`.
         """
         # 1/2 shifts the PSF as a whole, which lies about its own centre then
         down, right = np.broadcast_arrays(
@@ -152,15 +136,7 @@ class Diffuser:
     ) -> tuple[Coordinates, Coordinates, Coordinates]:
         """Return the rays; see `ApertureElement`.
 
-        Parameters
-        ----------
-        v, u : (rays, 1) and (1, rays) array
-            Pupil coordinates from -1 to 1, increasing.
-
-        Returns
-        -------
-        transmission, down_px, right_px : (rays, rays) array
-            All light, and the phase's slopes in pixels.
+        Arguments and result are those of `ApertureElement.trace_rays`.
         """
         phase = self._phase
         down, right = phase(v.ravel(), u.ravel(), dx=1), phase(v.ravel(), u.ravel(), dy=1)

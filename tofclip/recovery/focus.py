@@ -111,17 +111,7 @@ class FixedFocus:
     ) -> list[FrameSegment]:
         """Return a single piece.
 
-        Parameters
-        ----------
-        camera : Camera
-        times : (frames,) float array
-            Times of flight, s.
-        measurement : Measurement
-        progress : callable
-
-        Returns
-        -------
-        list of FrameSegment
+        Arguments and result are those of `Focus.plan_segments`.
         """
         return [FrameSegment(slice(0, times.size), self.shear)]
 
@@ -172,19 +162,7 @@ class DepthLockedFocus:
         """Cut where the shear has changed by twice the tolerance, or the light has become a third
         weaker.
 
-        Parameters
-        ----------
-        camera : Camera
-            Its parallax, ``shear_at``, and view positions.
-        times : (frames,) float array
-            Times of flight, s.
-        measurement : Measurement
-        progress : callable
-
-        Returns
-        -------
-        list of FrameSegment
-            Each with its mean shear and the mean of ``distance**-2``, which the light falls with.
+        Arguments and result are those of `Focus.plan_segments`.
         """
         distance = np.maximum(SPEED_OF_LIGHT * times / 2, MIN_RANGE_M)
         shears = camera.shear_at(distance)
@@ -245,19 +223,7 @@ class SharpestFocus:
     ) -> list[FrameSegment]:
         """Try all shears on each gate.
 
-        Parameters
-        ----------
-        camera : Camera
-        times : (frames,) float array
-            Times of flight, s.
-        measurement : Measurement
-            Of the same frames; it is recovered at every shear of the stack.
-        progress : callable
-            Called with the number of frame iterations just done.
-
-        Returns
-        -------
-        list of FrameSegment
+        Arguments and result are those of `Focus.plan_segments`.
         """
         starts = range(0, times.size, GATE_BINS)
         gates = [slice(start, min(start + GATE_BINS, times.size)) for start in starts]

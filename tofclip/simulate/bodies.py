@@ -83,15 +83,7 @@ class Rectangle(Shape):
     def intersect(self, origin: Array, directions: Array) -> Hits:
         """Return where rays meet the plate, from either side.
 
-        Parameters
-        ----------
-        origin : (3,) array
-            Metres, in the plate's coordinates.
-        directions : (rays, 3) array
-
-        Returns
-        -------
-        Hits
+        Arguments and result are those of `Shape.intersect`.
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = -origin[2] / directions[:, 2]
@@ -126,15 +118,7 @@ class Sphere(Shape):
     def intersect(self, origin: Array, directions: Array) -> Hits:
         """Return where rays from outside meet the ball.
 
-        Parameters
-        ----------
-        origin : (3,) array
-            Metres from the centre; outside.
-        directions : (rays, 3) array
-
-        Returns
-        -------
-        Hits
+        Arguments and result are those of `Shape.intersect`.
         """
         along, square = directions @ origin, np.einsum("ij,ij->i", directions, directions)
         # roots of |origin + t direction|^2 = radius^2; the smaller one is the near side
@@ -172,15 +156,7 @@ class Box(Shape):
         A ray is inside the block where it is inside all three pairs of faces: between the last
         entry and the first exit (slab method).
 
-        Parameters
-        ----------
-        origin : (3,) array
-            Metres from the centre; outside.
-        directions : (rays, 3) array
-
-        Returns
-        -------
-        Hits
+        Arguments and result are those of `Shape.intersect`.
         """
         half = self.half_extent
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -320,16 +296,7 @@ class Body:
     def intersect(self, origin: Array, directions: Array) -> Hits:
         """Return where rays meet the body; holes of its pattern let them pass.
 
-        Parameters
-        ----------
-        origin : (3,) array
-            Metres, in the scene's coordinates.
-        directions : (rays, 3) array
-
-        Returns
-        -------
-        Hits
-            Normals in the scene's coordinates.
+        Arguments and result are those of `Shape.intersect`.
         """
         found = self.shape.intersect((origin - self.centre) @ self.axes, directions @ self.axes)
         solid = self.material.is_solid(found.pattern_position)

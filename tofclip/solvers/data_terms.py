@@ -90,14 +90,7 @@ class _SquaredNearZero(DataTerm):
     def dual_value(self, slope: Array, scale: Array) -> Array:
         """Return ``-<dual, f> - 1/2 |dual|^2`` of the dual point; see `DataTerm.dual_value`.
 
-        Parameters
-        ----------
-        slope : (measurements, frames) array
-        scale : (frames,) float64 array
-
-        Returns
-        -------
-        (frames,) float64 array
+        Arguments and result are those of `DataTerm.dual_value`.
         """
         xp = namespace(slope)
         # the slope of an invalid measurement is zero

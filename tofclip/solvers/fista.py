@@ -118,20 +118,7 @@ class NonnegativeSparsity:
     ) -> ProximalStep:
         """Shift by ``step * weight`` and clip at zero; see `Regulariser`.
 
-        Parameters
-        ----------
-        current, previous : (rows, columns, lanes) array
-            The last two solutions; `previous` may be overwritten.
-        momentum : (lanes,) array
-        gradient : (rows, columns, lanes) array
-            May be overwritten.
-        step : (lanes,) array
-            Step sizes.
-
-        Returns
-        -------
-        ProximalStep
-            Its penalty is weight times the picture's sum.
+        Arguments and result are those of `Regulariser.proximal_step`.
         """
         loops = select_loops(current)
         picture, total, distance = loops.prox_l1(
@@ -175,20 +162,7 @@ class NonnegativeTotalVariation:
     ) -> ProximalStep:
         """Sweep the dual once and return the picture that belongs to it; see `Regulariser`.
 
-        Parameters
-        ----------
-        current, previous : (rows, columns, lanes) array
-            The last two solutions; `previous` may be overwritten.
-        momentum : (lanes,) array
-        gradient : (rows, columns, lanes) array
-            May be overwritten.
-        step : (lanes,) array
-            Step sizes.
-
-        Returns
-        -------
-        ProximalStep
-            Its penalty is weight times total variation.
+        Arguments and result are those of `Regulariser.proximal_step`.
         """
         loops = select_loops(current)
         picture, total, self._dual = loops.prox_tv(

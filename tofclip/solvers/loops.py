@@ -163,25 +163,7 @@ class CompiledLoops:
     ) -> tuple[Array, Sums, Sums]:
         """Overwrite and return `previous`.
 
-        Parameters
-        ----------
-        current, previous : (..., columns, frames) array
-            The last two solutions.
-        momentum : (frames,) array
-        gradient : (..., columns, frames) array
-            Of the data term at the extrapolated point.
-        step : (frames,) array
-            Step sizes, of the pictures' dtype.
-        weight : float
-            Of the prior.
-
-        Returns
-        -------
-        previous : (..., columns, frames) array
-        total : (frames,) float64 array
-            Sum of each frame's result.
-        distance : (frames,) float64 array
-            Its squared distance from the extrapolated point.
+        Arguments and result are those of `Loops.prox_l1`.
         """
         now, before, slope = (_join_lanes(array) for array in (current, previous, gradient))
         total, distance = np.empty((2, now.shape[1]), now.dtype)
@@ -202,26 +184,7 @@ class CompiledLoops:
     ) -> tuple[Array, Sums, Array]:
         """Overwrite and return `previous` and `dual`; `gradient` is overwritten too.
 
-        Parameters
-        ----------
-        current, previous : (rows, columns, frames) array
-            The last two solutions.
-        momentum : (frames,) array
-        gradient : (rows, columns, frames) array
-            Of the data term at the extrapolated point.
-        step : (frames,) array
-            Step sizes, of the pictures' dtype.
-        weight : float
-            Of the total variation.
-        dual : (2, rows, columns, frames) array, optional
-            None starts from zero.
-
-        Returns
-        -------
-        result : (rows, columns, frames) array
-        total : (frames,) float64 array
-            Isotropic total variation of each frame.
-        dual : (2, rows, columns, frames) array
+        Arguments and result are those of `Loops.prox_tv`.
         """
         if dual is None:
             dual = np.zeros((2, *current.shape), current.dtype)
@@ -261,17 +224,7 @@ class CompiledLoops:
     def restore_frames(self, values: Array, before: Array, rejected: NDArray[np.bool_]) -> Array:
         """Overwrite and return `values`; most often there is nothing to do.
 
-        Parameters
-        ----------
-        values : (..., columns, frames) array
-            Overwritten in the rejected frames.
-        before : (..., columns, frames) array
-        rejected : (frames,) bool array
-
-        Returns
-        -------
-        (..., columns, frames) array
-            `values`.
+        Arguments and result are those of `Loops.restore_frames`.
         """
         if rejected.any():
             self._kernels.restore_frames(
@@ -312,22 +265,7 @@ class PortableLoops:
     ) -> tuple[Array, Array, Array]:
         """Leave all arrays but `gradient` as they are.
 
-        Parameters
-        ----------
-        current, previous : (..., columns, frames) array
-            The last two solutions.
-        momentum : (frames,) array
-        gradient : (..., columns, frames) array
-            Overwritten.
-        step : (frames,) array
-            Step sizes, of the pictures' dtype.
-        weight : float
-            Of the prior.
-
-        Returns
-        -------
-        result : (..., columns, frames) array
-        total, distance : (frames,) float64 array
+        Arguments and result are those of `Loops.prox_l1`.
         """
         xp = namespace(current)
         # In place as far as possible: on a GPU memory is what limits the size of a block.
@@ -352,23 +290,7 @@ class PortableLoops:
     ) -> tuple[Array, Array, Array]:
         """Leave all arrays but `gradient` as they are.
 
-        Parameters
-        ----------
-        current, previous : (rows, columns, frames) array
-            The last two solutions.
-        momentum : (frames,) array
-        gradient : (rows, columns, frames) array
-            Overwritten.
-        step : (frames,) array
-            Step sizes, of the pictures' dtype.
-        weight : float
-        dual : (2, rows, columns, frames) array, optional
-
-        Returns
-        -------
-        result : (rows, columns, frames) array
-        total : (frames,) float64 array
-        dual : (2, rows, columns, frames) array
+        Arguments and result are those of `Loops.prox_tv`.
         """
         xp = namespace(current)
         gradient *= -step
@@ -393,15 +315,7 @@ class PortableLoops:
     def restore_frames(self, values: Array, before: Array, rejected: Array) -> Array:
         """Choose frame by frame, without asking the device whether there is anything to do.
 
-        Parameters
-        ----------
-        values : (..., frames) array
-        before : (..., frames) array
-        rejected : (frames,) bool array
-
-        Returns
-        -------
-        (..., frames) array
+        Arguments and result are those of `Loops.restore_frames`.
         """
         return namespace(values).where(rejected, before, values)
 
@@ -580,26 +494,14 @@ class CompiledBatches:
     def take_block(self, values: NDArray[Any], piece: slice) -> NDArray[Any]:
         """Copy, with zeros after the last frame; a lone frame stays alone.
 
-        Parameters
-        ----------
-        values : (measurements, frames) array
-        piece : slice
-            At most `LANES` frames.
-
-        Returns
-        -------
-        (measurements, LANES) array
-            A copy; (measurements, 1) where the batch has a single frame.
+        Arguments and result are those of `Batches.take_block`.
         """
         return pad_block(values, self._order[piece])
 
     def write_block(self, block: NDArray[Any], piece: slice) -> None:
         """Copy the block's frames without the zeros that fill it up.
 
-        Parameters
-        ----------
-        block : (rows, columns, LANES) array
-        piece : slice
+        Arguments and result are those of `Batches.write_block`.
         """
         chosen = self._order[piece]
         # A run of frames is written in place; scattered ones go by a copy.
@@ -613,9 +515,7 @@ class CompiledBatches:
     def leave_out(self, dark: NDArray[np.bool_]) -> None:
         """Make zero what is dark, and pieces of the other frames only.
 
-        Parameters
-        ----------
-        dark : (frames,) bool array
+        Arguments and result are those of `Batches.leave_out`.
         """
         self.frames[dark] = 0
         self._order = np.flatnonzero(~dark)
@@ -640,15 +540,7 @@ class PortableBatches:
     def take_block(self, values: Array, piece: slice) -> Array:
         """Choose the columns.
 
-        Parameters
-        ----------
-        values : (measurements, frames) array
-        piece : slice
-
-        Returns
-        -------
-        (measurements, frames of the piece) array
-            A view.
+        Arguments and result are those of `Batches.take_block`.
         """
         runs = [values[:, run] for run in self._runs(piece)]
         return runs[0] if len(runs) == 1 else namespace(values).concat(runs, axis=1)
@@ -656,10 +548,7 @@ class PortableBatches:
     def write_block(self, block: Array, piece: slice) -> None:
         """Copy with the frames as first axis.
 
-        Parameters
-        ----------
-        block : (rows, columns, frames of the piece) array
-        piece : slice
+        Arguments and result are those of `Batches.write_block`.
         """
         pictures, done = namespace(block).moveaxis(block, -1, 0), 0
         for run in self._runs(piece):
@@ -670,9 +559,7 @@ class PortableBatches:
     def leave_out(self, dark: NDArray[np.bool_]) -> None:
         """Make pieces of the other frames only; what is not written is zero.
 
-        Parameters
-        ----------
-        dark : (frames,) bool array
+        Arguments and result are those of `Batches.leave_out`.
         """
         self._order = np.flatnonzero(~dark)
 
