@@ -1,8 +1,9 @@
 """Study: the viewer in a headless chromium on this machine, drawn by a software renderer.
 
-From handing a cloud over until the page answers that it has it, against the answer alone; and from
-opening a PLY file until all of it is drawn, against reading the file's bytes. Needs playwright and
-chromium.
+From handing a cloud over until the page answers that it has it, against the answer alone; from
+turning a cloud until it is drawn from there, in as much detail as the page chooses and with all
+points; and from opening a PLY file until it is drawn, against reading the file's bytes. Needs
+playwright and chromium.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import itertools
 import shutil
 import tempfile
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ from viser import _messages
 
 from apps.benchmarks.case import Case, PreparedCase
 from apps.viewer.clouds import make_cloud
+from apps.viewer.drawing import DetailChooser
 from apps.viewer.page import Page
 from apps.viewer.session import Session
 from apps.viewer.source import Source, View
@@ -33,8 +36,9 @@ FLAGS = (
     "--disable-background-networking --disable-component-update --disable-sync"
 )
 WINDOW = {"width": 1100, "height": 640}
-FRAMES = 32
+FRAMES, MAX_POINTS_IN_MEMORY = 32, 8_000_000
 PATIENCE_S = 60.0
+TURN_RAD = np.deg2rad(2.0)
 
 
 class MovingSheet(Source):
@@ -44,10 +48,11 @@ class MovingSheet(Source):
         super().__init__("sheet", 60.0)
         side = round(points**0.5)
         x, y = np.meshgrid(np.linspace(-1, 1, side), np.linspace(-1, 1, side))
-        self._views = [View(_bend_sheet(x, y, number)) for number in range(FRAMES)]
+        frames = max(2, min(FRAMES, MAX_POINTS_IN_MEMORY // points))
+        self._views = [View(_bend_sheet(x, y, number)) for number in range(frames)]
 
     def __len__(self) -> int:
-        return FRAMES
+        return len(self._views)
 
     def view(self, number: int) -> View:
         return self._views[number]
@@ -57,6 +62,14 @@ def _bend_sheet(x: Any, y: Any, number: int) -> Any:
     z = 3 + 0.2 * np.sin(4 * x + 2 * np.pi * number / FRAMES) * np.cos(3 * y)
     xyz = np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
     return make_cloud(xyz, {"intensity": z.ravel()})
+
+
+class WholeDetail(DetailChooser):
+    """Draws all points, however slow that is."""
+
+    def count(self, points: int, moving: bool) -> int:
+        """Return all of them."""
+        return points
 
 
 def make_echo_request(server: Any, answered: Callable[[], None]) -> Callable[[], None]:
@@ -99,9 +112,11 @@ def open_browser(stack: contextlib.ExitStack) -> Any:
     return browser
 
 
-def serve_page(source: Source) -> tuple[Page, Callable[[], None]]:
+def serve_page(source: Source, whole: bool = False) -> tuple[Page, Callable[[], None]]:
     """A page that is served, and what waits until a browser has drawn all that was sent so far."""
     page, answered = Page(Session(source)), threading.Event()
+    if whole:
+        page.points.detail = WholeDetail()
     ask = make_echo_request(page.server, answered.set)
 
     def wait() -> None:
@@ -122,21 +137,42 @@ def make_stack() -> contextlib.ExitStack:
     return stack
 
 
-def prepare_frames(points: int) -> PreparedCase:
-    """Clouds of a moving sheet, one after the other, each when the one before is drawn."""
+def open_sheet(points: int, whole: bool) -> tuple[Page, Callable[[], None]]:
+    """A moving sheet in a tab, as soon as the page knows how quick the tab is."""
     stack = make_stack()
     tab = open_browser(stack).new_page(viewport=WINDOW)
-    page, wait = serve_page(MovingSheet(points))
+    page, wait = serve_page(MovingSheet(points), whole)
     stack.callback(page.close)
     tab.goto(page.address)
     tab.locator("#frame-number").wait_for(timeout=1e3 * PATIENCE_S)
+    deadline = time.monotonic() + PATIENCE_S
+    while not (whole or page.points.is_settled) and time.monotonic() < deadline:
+        time.sleep(0.1)
     wait()
-    numbers = itertools.cycle(range(FRAMES))
+    return page, wait
+
+
+def prepare_frames(points: int) -> PreparedCase:
+    """Clouds of a moving sheet, one after the other, each when the one before is drawn."""
+    return play_sheet(points, whole=False)
+
+
+def prepare_whole_frames(points: int) -> PreparedCase:
+    """The same with all points of each."""
+    return play_sheet(points, whole=True)
+
+
+def play_sheet(points: int, whole: bool) -> PreparedCase:
+    """Show frame after frame as if it were played, in as much detail as the page chooses or whole."""
+    page, wait = open_sheet(points, whole)
+    numbers = itertools.cycle(range(len(page.session.source)))
+    page.session.clock.rate = 1e-9  # this case says which frame is due
 
     def show_frame() -> None:
         number, sent = next(numbers), threading.Event()
 
         def move() -> None:
+            page.session.play()
             page.session.jump(number)
             sent.set()
 
@@ -145,6 +181,34 @@ def prepare_frames(points: int) -> PreparedCase:
         wait()
 
     return PreparedCase(show_frame, wait, 1)
+
+
+def prepare_orbit(points: int) -> PreparedCase:
+    """A sheet that is turned, step by step, each when the one before is drawn."""
+    return orbit_sheet(points, whole=False)
+
+
+def prepare_whole_orbit(points: int) -> PreparedCase:
+    """The same with all points at every step."""
+    return orbit_sheet(points, whole=True)
+
+
+def orbit_sheet(points: int, whole: bool) -> PreparedCase:
+    """Turn a sheet about its middle, in as much detail as the page chooses or whole."""
+    page, wait = open_sheet(points, whole)
+    (client,) = page.server.get_clients().values()
+    target = np.array(client.camera.look_at)
+    away = np.array(client.camera.position) - target
+    steps = itertools.count()
+
+    def turn() -> None:
+        angle = TURN_RAD * next(steps)
+        across = np.array([np.cos(angle), 0.0, np.sin(angle)]) * away[2] * 0.3
+        client.camera.position = target + away + across
+        client.camera.look_at = target
+        wait()
+
+    return PreparedCase(turn, wait, 1)
 
 
 def prepare_large_cloud(points: int) -> PreparedCase:
@@ -171,10 +235,37 @@ CASES = (
         "viewer-frames",
         "a moving cloud, frame after frame",
         "points",
-        (15_625, 125_000),
+        (15_625, 2_000_000),
         "frames",
         "a question and its answer",
         prepare_frames,
+    ),
+    Case(
+        "viewer-whole_frames",
+        "the same with all points of every frame",
+        "points",
+        (125_000, 2_000_000),
+        "frames",
+        "a question and its answer",
+        prepare_whole_frames,
+    ),
+    Case(
+        "viewer-orbit",
+        "a cloud that is turned, thinned meanwhile",
+        "points",
+        (15_625, 2_000_000),
+        "updates",
+        "a question and its answer",
+        prepare_orbit,
+    ),
+    Case(
+        "viewer-whole_orbit",
+        "a cloud that is turned, all points at every step",
+        "points",
+        (15_625, 2_000_000),
+        "updates",
+        "a question and its answer",
+        prepare_whole_orbit,
     ),
     Case(
         "viewer-file",

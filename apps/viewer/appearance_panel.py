@@ -37,6 +37,8 @@ class AppearancePanel:
     post : callable
     first : DisplayedFrame
         Its extent is that of the filters until they are narrowed.
+    resize : callable
+        Called when points are to have another size.
     """
 
     def __init__(
@@ -45,11 +47,11 @@ class AppearancePanel:
         session: Session,
         post: Callable[[Callable[[], None]], None],
         first: DisplayedFrame,
+        resize: Callable[[], None],
     ) -> None:
         self._gui, self._session, self._post = server.gui, session, post
-        self._points = server
         with self._gui.add_folder("colours"):
-            self._add_colours(first)
+            self._add_colours(first, resize)
         self._clip = ClipBox(server.scene, lambda box: post(lambda: self._take_clip_box(box)))
         with self._gui.add_folder("filters", expand_by_default=False):
             self._add_filters(first)
@@ -69,7 +71,7 @@ class AppearancePanel:
             low, high = shown.scale.limits
             self._limits.value = (round(low, 4), round(high, 4))
 
-    def _add_colours(self, first: DisplayedFrame) -> None:
+    def _add_colours(self, first: DisplayedFrame, resize: Callable[[], None]) -> None:
         gui, colouring = self._gui, self._session.colouring
         self._scale = gui.add_html(render_scale_html(first.scale))
         self._bind(
@@ -101,7 +103,7 @@ class AppearancePanel:
             _suggest_point_size(first),
             hint="mm",
         )
-        self._bind(self._size, lambda _: self._redraw())
+        self._bind(self._size, lambda _: resize())
 
     def _add_filters(self, first: DisplayedFrame) -> None:
         columns = {"range": first.cloud.range, "intensity": first.cloud.intensity}
@@ -166,11 +168,6 @@ class AppearancePanel:
 
     def _set_shaded(self, shaded: bool) -> None:
         self._session.colouring = replace(self._session.colouring, shaded=shaded)
-
-    def _redraw(self) -> None:
-        handle = self._points.scene.get_handle_by_name("/points")
-        if handle is not None:
-            handle.point_size = self.point_size  # type: ignore[attr-defined]
 
     def _bind(self, handle: Any, act: Callable[[Any], None]) -> None:
         from apps.viewer.controls import bind_user_input

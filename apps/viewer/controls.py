@@ -13,6 +13,7 @@ from apps.viewer.clock import MAX_SPEED, MIN_SPEED
 from apps.viewer.colouring import choose_round_values
 from apps.viewer.page_text import Status
 from apps.viewer.session import GATE_MODES, DisplayedFrame, Session
+from apps.viewer.source import Setting
 from tofclip.units import NANOSECOND
 
 if TYPE_CHECKING:
@@ -37,10 +38,17 @@ class Controls:
     post : callable
         Takes what is to be done by the thread that owns the session.
     first : DisplayedFrame
+    resize : callable
+        Called when points are to have another size.
     """
 
     def __init__(
-        self, server: viser.ViserServer, session: Session, post: Post, first: DisplayedFrame
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        post: Post,
+        first: DisplayedFrame,
+        resize: Callable[[], None],
     ) -> None:
         self._gui, self._session, self._post = server.gui, session, post
         self._status = self._gui.add_html("")
@@ -51,7 +59,9 @@ class Controls:
             self._add_refocus(*session.source.capabilities.shears)
         if session.source.display_modes.names:
             self._add_display_modes()
-        self._appearance_panel = AppearancePanel(server, session, post, first)
+        for setting in session.source.settings:
+            self._add_setting(setting)
+        self._appearance_panel = AppearancePanel(server, session, post, first, resize)
 
     @property
     def point_size(self) -> float:
@@ -127,6 +137,12 @@ class Controls:
             gui.add_slider("threshold", 0.02, 0.98, 0.01, display_modes.threshold, hint=hint),
             self._set_threshold,
         )
+
+    def _add_setting(self, setting: Setting) -> None:
+        slider = self._gui.add_slider(
+            setting.name, setting.low, setting.high, setting.step, setting.value, hint=setting.hint
+        )
+        self._bind(slider, lambda value: setattr(setting, "value", value))
 
     def _run_playback(self, word: str) -> None:
         {"play": self._session.play, "pause": self._session.pause, "live": self._session.follow}[

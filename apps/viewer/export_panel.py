@@ -7,6 +7,7 @@ from __future__ import annotations
 import io
 import tempfile
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     import viser
 
 Post = Callable[[Callable[[], None]], None]
-RENDER_TIMEOUT_S = 20.0  # s
+RENDER_TIMEOUT_S = 60.0  # s; a software renderer takes ten for millions of points
 MAX_SIDE_PX = 1600
 LEGEND_PX = 70  # below the picture
 
@@ -39,6 +40,8 @@ class ExportPanel:
     list_views : callable
         Takes a window's width over its height, returns where one can look from, by name; the first
         is where one looks from at first.
+    drawn_whole : callable
+        Returns what a screenshot is taken within, so that all points of a large cloud are on it.
     """
 
     def __init__(
@@ -47,9 +50,10 @@ class ExportPanel:
         session: Session,
         post: Post,
         list_views: Callable[[float], Mapping[str, Viewpoint]],
+        drawn_whole: Callable[[], AbstractContextManager[None]],
     ) -> None:
         self._server, self._session, self._post = server, session, post
-        self._list_views = list_views
+        self._list_views, self._drawn_whole = list_views, drawn_whole
         self._bookmarked_views: dict[str, Viewpoint] = {}
         self._bookmarks_made = 0
         gui = server.gui
@@ -75,7 +79,10 @@ class ExportPanel:
         height, width = (
             round(shrink * side) for side in (client.camera.image_height, client.camera.image_width)
         )
-        drawn = client.get_render(height, width, transport_format="png", timeout=RENDER_TIMEOUT_S)
+        with self._drawn_whole():
+            drawn = client.get_render(
+                height, width, transport_format="png", timeout=RENDER_TIMEOUT_S
+            )
         client.send_file_download(
             "tofclip.png", _encode_png(drawn, self._session), save_immediately=True
         )

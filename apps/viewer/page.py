@@ -9,13 +9,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apps.viewer.controls import Controls
+from apps.viewer.drawing import POINT_STYLE, FramePacer, Points, RateCounter
 from apps.viewer.export_panel import ExportPanel
 from apps.viewer.furniture import draw_furniture
 from apps.viewer.page_text import Status, format_page_title, render_page_html
-from apps.viewer.rates import FramePacer, RateCounter
 from apps.viewer.selection_panel import NO_SHADOWS, SelectionPanel
 from apps.viewer.server import LOOPBACK, get_address, start_server, stop_server
 from apps.viewer.session import DisplayedFrame, Session
@@ -36,21 +35,12 @@ SCENE_ASPECT = 0.9
 
 PANEL_PX, PICTURES_PANEL_PX = 352, 240
 
-MAX_MOVING_POINTS = 200_000
-"""Points of a larger cloud are thinned to about as many while it is turned."""
-
-STILL_AFTER_S = 2.0
-"""s after the last movement of a camera at which all points are drawn again: longer than the slow
-frame of a software renderer after which the next movement comes."""
+MANY_POINTS = 10**9
+"""More than any cloud has."""
 
 AMBIENT_INTENSITY = 2.0
 """Light from everywhere, so that no side of a surface is black."""
 
-POINT_STYLE: dict[str, Any] = {
-    "point_shape": "square",
-    "point_shading": "flat",
-    "precision": "float32",
-}
 SURFACE_COLOUR = (216, 210, 196)
 
 
@@ -81,17 +71,17 @@ class Page:
         self.server = start_server(port, host)
         self.address = get_address(self.server, host)
         self._pace, self._frames = FramePacer(), RateCounter()
-        self._moved_at = -np.inf
-        self._points: Any = None
-        self._thinned: Any = None
+        self.points = Points(self.server, self.post)
         self._set_up_scene()
         self._pictures_panel, self._pictures_tab = self._add_pictures_panel()
-        self.controls = Controls(self.server, session, self.post, first)
+        self.controls = Controls(self.server, session, self.post, first, self._resize_points)
         self._add_furniture(first)
         self._selection_panel = SelectionPanel(
             self.server, session, self.post, self._pictures_panel
         )
-        self._export_panel = ExportPanel(self.server, session, self.post, self._list_views)
+        self._export_panel = ExportPanel(
+            self.server, session, self.post, self._list_views, self.points.drawn_whole
+        )
         self.server.gui.add_html(render_page_html(session.source.title))
         self._pictures: dict[str, Any] = {}
         self._drawn: DisplayedFrame | None = None
@@ -123,10 +113,11 @@ class Page:
         try:
             while not self._commands.empty():
                 self._commands.get_nowait()()
+            self.session.max_playing_points = self.points.detail.count(MANY_POINTS, moving=True)
             shown = self.session.frame_at(now) if self._pace.can_send(now) else self._drawn
             if shown is not None and shown is not self._drawn:
                 self._draw(shown, now)
-            self._choose_detail(now)
+            self.points.update(now)
             self._update_status(now)
         except TofclipError as fault:
             self._notify_error(fault)
@@ -158,7 +149,7 @@ class Page:
         framed: list[Viewpoint] = []
 
         def follow_window(camera: Any) -> None:
-            self._moved_at = time.monotonic()
+            self.points.note_movement()
             aspect = camera.image_width / max(camera.image_height, 1)
             if framed and not np.allclose(camera.position, framed[-1].eye, atol=1e-4):
                 return  # moved by hand
@@ -216,41 +207,16 @@ class Page:
             )
         elif self._drawn is not None and self._drawn.surface is not None:
             scene.remove_by_name("/surface")
-        size, points = self.controls.point_size, shown.cloud.xyz
-        if shown.surface is not None:
-            points = points[:0]
-        colours: Any = (
-            shown.colours if len(points) else (0, 0, 0)
-        )  # the page complains about no colours at all
-        self._points = scene.add_point_cloud(
-            "/points", points, colours, point_size=size, **POINT_STYLE
-        )
-        self._draw_thinned(points, colours)
+        xyz = shown.cloud.xyz if shown.surface is None else shown.cloud.xyz[:0]
+        self.points.draw(xyz, shown.colours, self._size_points(shown))
 
-    def _draw_thinned(self, points: NDArray[np.float32], colours: Any) -> None:
-        """Keep a part of a large cloud ready, to be drawn instead of it while it is turned."""
-        scene, thinned = self.server.scene, self._thinned
-        self._thinned = None
-        if len(points) <= MAX_MOVING_POINTS:
-            if thinned is not None:
-                thinned.remove()
-            return
-        # drawn by lot: every n-th point of rows of pixels would make stripes
-        some = np.random.default_rng(0).choice(len(points), MAX_MOVING_POINTS, replace=False)
-        # surfaces stay closed with fewer, larger points
-        size = self.controls.point_size * float(np.sqrt(len(points) / MAX_MOVING_POINTS))
-        self._thinned = scene.add_point_cloud(
-            "/points_thinned", points[some], colours[some], point_size=size, **POINT_STYLE
-        )
-        self._thinned.visible = False
+    def _size_points(self, shown: DisplayedFrame) -> float:
+        """Side of a point, m: of a thinned frame they are larger, so that surfaces stay closed."""
+        return self.controls.point_size * float(np.sqrt(shown.points / max(len(shown.cloud), 1)))
 
-    def _choose_detail(self, now: float) -> None:
-        """Draw a large cloud thinned while it is turned."""
-        if self._thinned is None:
-            return
-        moving = now - self._moved_at < STILL_AFTER_S
-        if self._thinned.visible != moving:
-            self._thinned.visible, self._points.visible = moving, not moving
+    def _resize_points(self) -> None:
+        if self._drawn is not None:
+            self.points.resize(self._size_points(self._drawn))
 
     def _update_status(self, now: float) -> None:
         """Bring words and flat pictures up to date, now and then."""
@@ -271,7 +237,7 @@ class Page:
             self.session.label,
             shown.frame,
             len(source),
-            len(shown.cloud),
+            shown.points,
             source.data_rate,
             self._frames.per_second(now),
             source.latency,
@@ -281,6 +247,7 @@ class Page:
             source.frame_name,
             source.describe_frame(shown.frame),
             self.session.notes,
+            None if shown.surface is not None else self.points.drawn,
         )
 
     def _show_pictures(self, shown: DisplayedFrame) -> None:

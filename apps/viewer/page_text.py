@@ -62,6 +62,8 @@ class Status:
         Where a slice lies; empty where frames are not slices.
     notes : tuple of str
         What has to be known about the picture, such as that its ranges have no time zero.
+    drawn_points : int, optional
+        Of a large cloud, by a browser that would be slow with all of them.
     """
 
     label: str
@@ -77,6 +79,7 @@ class Status:
     frame_name: str = "frame"
     depth_text: str = ""
     notes: tuple[str, ...] = ()
+    drawn_points: int | None = None
 
     @property
     def html(self) -> str:
@@ -96,8 +99,10 @@ class Status:
             )
         if self.depth_text:
             lines.append(f"<span id='depth'>{html.escape(self.depth_text)}</span>")
+        drawn = self.points if self.drawn_points is None else self.drawn_points
+        part = f" ({drawn} drawn)" if drawn < self.points else ""
         lines.append(
-            f"<span id='points'>{self.points}</span> points, <span id='rates'>data "
+            f"<span id='points'>{self.points}</span> points{part}, <span id='rates'>data "
             f"{self.data_rate:.1f}/s, shown {self.frame_rate:.1f}/s</span>"
         )
         if self.label == "LIVE" or np.isfinite(self.cloud_latency):

@@ -47,6 +47,8 @@ class DisplayedFrame:
     pixels : (n, 2) int array, optional
     surface : TriangleMesh, optional
         Drawn instead of the points.
+    thinned_from : int
+        Points of which these were drawn by lot while frames pass; 0 where all are here.
     """
 
     frame: int
@@ -55,6 +57,12 @@ class DisplayedFrame:
     scale: Scale
     pixels: NDArray[np.int32] | None = None
     surface: TriangleMesh | None = None
+    thinned_from: int = 0
+
+    @property
+    def points(self) -> int:
+        """Number of points, of which some may be left out while frames pass."""
+        return self.thinned_from or len(self.cloud)
 
 
 class Session:
@@ -76,6 +84,7 @@ class Session:
         self.shear: float | None = None
         self.following = source.is_live
         self.picks: list[Pick] = []
+        self.max_playing_points: int | None = None
         self._key: tuple[Any, ...] = ()
         self._displayed: DisplayedFrame | None = None
         self._refocus_cache: tuple[tuple[Any, ...], View] | None = None
@@ -146,6 +155,8 @@ class Session:
             self.shear,
             display_modes.current,
             display_modes.threshold,
+            *(setting.value for setting in self.source.settings),
+            self._find_point_limit(),
         )
         if self._displayed is None or key != self._key:
             self._key, self._displayed = key, self._render_frame(frame)
@@ -218,7 +229,8 @@ class Session:
         )
 
     def _render_frame(self, frame: int) -> DisplayedFrame:
-        view = self._find_view(frame)
+        whole = self._find_view(frame)
+        view = _thin_view(whole, self._find_point_limit())
         kept = self._gate_filters(frame).select(view.cloud)
         cloud = view.cloud if kept.all() else select_points(view.cloud, kept)
         # The scale is that of all points, so that colours keep their meaning while time passes.
@@ -232,7 +244,12 @@ class Session:
             scale,
             pixels,
             self.source.surface(),
+            0 if view is whole else len(whole.cloud),
         )
+
+    def _find_point_limit(self) -> int | None:
+        """Most points of a frame, None for all: while frames pass, the next one has to come soon."""
+        return self.max_playing_points if self.clock.playing else None
 
     def _find_view(self, frame: int) -> View:
         if self.shear is None:
@@ -262,3 +279,13 @@ class Session:
             self.filters,
             time=(max(low, self.filters.time[0]), max(low, min(high, self.filters.time[1]))),
         )
+
+
+def _thin_view(view: View, most: int | None) -> View:
+    """Return a part of a view's points, drawn by lot; the view itself where it has few enough."""
+    points = len(view.cloud)
+    if most is None or points <= most:
+        return view
+    some = np.unique(np.random.default_rng(0).integers(0, points, most))
+    pixels = None if view.pixels is None else view.pixels[some]
+    return View(select_points(view.cloud, some), pixels)

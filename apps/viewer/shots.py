@@ -14,7 +14,7 @@ from apps.viewer.shot_recovery import SHEAR_LIMITS, Readings, ShotRecovery, list
 from apps.viewer.source import Capabilities, Gate, Source, View, Waveform
 from apps.viewer.transient import render_depth
 from tofclip.camera import Camera, Rectifier
-from tofclip.shots import Streak
+from tofclip.shots import Frames, Streak
 from tofclip.solvers import Method
 
 SHOT_RATE_HZ = 10.0
@@ -74,6 +74,10 @@ class ShotSource(Source):
                 self._views.popitem(last=False)
         return self._views[number]
 
+    def recover_frames(self, number: int) -> Frames:
+        """Return all frames of shot `number`."""
+        return self.recovery.frames(self.measurements(number), 0.0, self._full_gate)
+
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
         """Return streak image, intensity and depth of shot `number`; see `Source`.
 
@@ -109,7 +113,7 @@ class ShotSource(Source):
         -------
         Waveform
         """
-        frames = self.recovery.frames(self.measurements(number), 0.0, self._full_gate)
+        frames = self.recover_frames(number)
         return Waveform(frames.times, frames.values[:, pixel[0], pixel[1]].copy())
 
     def refocus(self, number: int, shear: float, gate: Gate) -> View:

@@ -86,6 +86,27 @@ class DisplayModes:
     threshold: float = 0.3
 
 
+@dataclass
+class Setting:
+    """A number that is set by a slider while one looks.
+
+    Parameters
+    ----------
+    name : str
+        With its unit.
+    low, high, step : float
+    value : float
+    hint : str
+    """
+
+    name: str
+    low: float
+    high: float
+    step: float
+    value: float
+    hint: str = ""
+
+
 @dataclass(frozen=True)
 class Capabilities:
     """What a source can do beyond showing its frames.
@@ -119,6 +140,8 @@ class Source(abc.ABC):
         What a frame is: an instant's frame, a slice, a shot or a cloud.
     notes : tuple of str
         What has to be known about everything that is shown, such as that ranges have no time zero.
+    settings : tuple of Setting
+        What is set by sliders, beyond what all sources have.
     """
 
     title: str
@@ -127,6 +150,7 @@ class Source(abc.ABC):
     display_modes: DisplayModes = field(default_factory=DisplayModes)
     frame_name: str = "frame"
     notes: tuple[str, ...] = ()
+    settings: tuple[Setting, ...] = ()
 
     @abc.abstractmethod
     def __len__(self) -> int:

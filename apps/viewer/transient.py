@@ -82,6 +82,10 @@ class TransientSource(Source):
     def view(self, number: int) -> View:
         return self._full_view
 
+    def recover_frames(self, number: int) -> Frames:
+        """Return the frames of the one shot that there is."""
+        return self.frames
+
     def pictures(self, number: int, gate: Gate) -> Mapping[str, NDArray[np.float32]]:
         """Return streak image, intensity in a gate and depth; see `Source`.
 
