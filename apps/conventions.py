@@ -7,12 +7,15 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tofclip.errors import InputError, StorageError
 from tofclip.storage import collect_provenance
+
+if TYPE_CHECKING:
+    from tofclip.shots import Frames
 
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON object of figures and nothing else.")
@@ -153,7 +156,9 @@ MAX_LISTED_VALUES = 12
 """Values of a list that are printed one by one."""
 
 
-def report(figures: Mapping[str, Any], as_json: bool, written: Sequence[Path] = ()) -> None:
+def report(
+    figures: Mapping[str, Any], as_json: bool, written: Sequence[Path] = (), note: str = ""
+) -> None:
     """Print the figures of a run.
 
     Parameters
@@ -165,6 +170,8 @@ def report(figures: Mapping[str, Any], as_json: bool, written: Sequence[Path] = 
         One JSON object on one line (NaN becomes null) instead of a table.
     written : sequence of Path
         Files to name in the table.
+    note : str
+        What has to be known about the figures of the table.
     """
     plain = to_json_value(figures)
     if as_json:
@@ -173,8 +180,16 @@ def report(figures: Mapping[str, Any], as_json: bool, written: Sequence[Path] = 
     width = max(map(len, plain), default=0)
     for name, value in plain.items():
         print(f"{name.replace('_', ' '):<{width}}  {_format_value(value)}")
+    if note:
+        print(f"note: {note}")
     for path in written:
         print(f"wrote {path}")
+
+
+def describe_ranges(frames: Frames) -> str:
+    """Return what has to be said about the ranges of frames; empty where they have a time zero."""
+    note = frames.time_zero_note
+    return f"ranges are right{note} (--time-zero-ns of recover)" if note else ""
 
 
 def to_json_value(value: Any) -> Any:

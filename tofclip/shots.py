@@ -596,7 +596,7 @@ class Frames(Storable):
         return self[int(first) : int(stop)]
 
     @property
-    def _time_zero_note(self) -> str:
+    def time_zero_note(self) -> str:
         """Said beside ranges, which are right up to a constant where no time zero was given."""
         return "" if self.camera.time_zero else " up to a constant, no time zero given"
 
@@ -605,7 +605,7 @@ class Frames(Storable):
         near, far = SPEED_OF_LIGHT * self.times[[0, -1]] / 2
         return (
             f"Frames({frames} frames of {rows} x {columns} pixels, range {near:.3g} to {far:.3g} m"
-            f"{self._time_zero_note})"
+            f"{self.time_zero_note})"
         )
 
     def _repr_html_(self) -> str:
@@ -613,7 +613,7 @@ class Frames(Storable):
         rows = {
             "values (time, y, x)": " x ".join(map(str, self.values.shape)),
             "time of flight": f"{1e9 * self.times[0]:.3f} to {1e9 * self.times[-1]:.3f} ns",
-            "range": f"{near:.3f} to {far:.3f} m{self._time_zero_note}",
+            "range": f"{near:.3f} to {far:.3f} m{self.time_zero_note}",
             "method": str(self.figures.get("method", "unknown")),
         }
         return render_html("Frames", rows, np.asarray(self).max(axis=0))
@@ -631,7 +631,7 @@ class Frames(Storable):
         matplotlib Axes
         """
         near, far = SPEED_OF_LIGHT * self.times[[0, -1]] / 2
-        title = f"{len(self)} frames, {near:.3g} to {far:.3g} m{self._time_zero_note}"
+        title = f"{len(self)} frames, {near:.3g} to {far:.3g} m{self.time_zero_note}"
         return plot_picture(np.asarray(self).sum(axis=0), title, ax)
 
     def to_xarray(self) -> Any:

@@ -52,6 +52,8 @@ def make_scene_figure(
     Figure
     """
     figure = make_figure(13, 7.5)
+    if frames.time_zero_note:
+        figure.suptitle(f"ranges are right{frames.time_zero_note}", fontsize=SMALL_FONT_PT + 2)
     axes = figure.subplots(2, 4)
     for panel in axes[0, 1:3]:
         panel.remove()

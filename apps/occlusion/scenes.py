@@ -70,6 +70,28 @@ class OcclusionScene:
         """Return the scene with its target moved to the right, m."""
         return replace(self, target=tuple(body.shift(across, 0.0) for body in self.target))
 
+    def widen_occluder(self, width: float) -> OcclusionScene:
+        """Return the scene with its occluder scaled about the axis until its solid part is as wide, m."""
+        factor = width / self.region.width
+        return replace(
+            self,
+            occluder=tuple(_scale_plate(body, factor) for body in self.occluder),
+            region=replace(self.region, width=width),
+        )
+
+
+def make_walking_scene(name: str) -> OcclusionScene:
+    """Return a scene of `SCENES` with a person behind its occluder, instead of what stands there.
+
+    Raises
+    ------
+    InputError
+        No scene has that name.
+    """
+    scene = make_occlusion_scene(name)
+    behind = scene.title.partition(" behind ")[2]
+    return replace(scene, title=f"a person behind {behind}", target=_make_figure())
+
 
 def make_occlusion_scene(name: str) -> OcclusionScene:
     """Return a scene of `SCENES`.
@@ -110,6 +132,12 @@ def _make_plate(
     z: float = 0.0,
 ) -> Body:
     return Body(Rectangle(width, height), Lambertian(pattern), np.array([x, y, z]))
+
+
+def _scale_plate(body: Body, factor: float) -> Body:
+    assert isinstance(body.shape, Rectangle)  # as all occluders are
+    shape = Rectangle(factor * body.shape.width, factor * body.shape.height)
+    return replace(body, shape=shape, centre=body.centre * (factor, factor, 1.0))
 
 
 def _make_region(width: float) -> InactiveRegion:

@@ -13,6 +13,7 @@ from apps.conventions import (
     DeviceOption,
     JsonOption,
     build_provenance,
+    describe_ranges,
     report,
     require_writable,
 )
@@ -150,11 +151,11 @@ def _convert_single(
     past = build_provenance({"verb": "cloud"}, frames, earlier=recovered.provenance)
     points, returns = clouds.make_cloud(replace(recovered, provenance=past), str(frames))
     save_cloud(points, returns, out, clouds.organised)
-    _report_cloud(points, returns, as_json, made)
+    _report_cloud(points, returns, as_json, made, describe_ranges(recovered))
 
 
 def _report_cloud(
-    points: PointCloud, returns: Returns, as_json: bool, made: tuple[Path, str]
+    points: PointCloud, returns: Returns, as_json: bool, made: tuple[Path, str], note: str
 ) -> None:
     (rows, columns), (out, device) = returns.camera.image_shape, made
     figures = {
@@ -163,4 +164,4 @@ def _report_cloud(
         "returns_per_pixel_mean": len(points) / (rows * columns),
         "device": device,
     }
-    report(figures, as_json, [out])
+    report(figures, as_json, [out], note)

@@ -16,6 +16,7 @@ from apps.conventions import (
     ClusterOption,
     JsonOption,
     TimeZeroOption,
+    describe_ranges,
     report,
     require_writable,
 )
@@ -182,7 +183,8 @@ def scene(
     if as_json:
         report({"points": len(cloud), "objects": rows}, as_json=True)
         return
-    report({f"object {number}": row for number, row in enumerate(rows, 1)}, as_json, [out])
+    table = {f"object {number}": row for number, row in enumerate(rows, 1)}
+    report(table, as_json, [out], describe_ranges(recovered))
 
 
 @app.command()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,25 +10,35 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.conventions import PICTURE_SUFFIXES, JsonOption, make_folder, report, require_writable
+from apps.conventions import (
+    PICTURE_SUFFIXES,
+    JsonOption,
+    TimeZeroOption,
+    make_folder,
+    report,
+    require_writable,
+)
 from apps.figures.occlusion import make_occlusion_figure
 from apps.figures.occlusion_film import WALK_STEPS, save_flash_film, save_walk_film
 from apps.figures.style import save_figure
 from apps.occlusion.experiment import DEFAULT_PHOTONS, Experiment, ExperimentSettings
 from apps.occlusion.probe import DISTANCE_FACTORS, probe_target
-from apps.occlusion.scenes import make_occlusion_scene
-from apps.progress import show_progress
+from apps.occlusion.scenes import make_occlusion_scene, make_walking_scene
+from apps.progress import show_activity, show_progress
 from tofclip.errors import InputError
 from tofclip.metrics import correlation_coefficient, nmse
 from tofclip.occlusion import InactiveRegion
 from tofclip.occlusion.recovery import SeparatedImages
-from tofclip.units import MILLIMETRE
+from tofclip.units import MILLIMETRE, NANOSECOND
 
 if TYPE_CHECKING:
     from apps.occlusion.probe import ProbeResult
 
 SCENE_NAMES = ("v-letter", "plate", "person", "tree", "bush", "trellis", "board")
 """Those of `apps.occlusion.scenes`, named here so that help appears without loading them."""
+
+SIDE_PX, LIVE_SIDE_PX = 128, 64
+"""Rows and columns of the picture, unless given: a page shows a step every second."""
 
 app = typer.Typer()
 
@@ -86,8 +97,13 @@ def region(
 @app.command()
 def demo(
     out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder for the results; made if missing.")
-    ],
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for the results; made if missing. Required without --live.",
+            show_default="nothing is written",
+        ),
+    ] = None,
     scene: Annotated[str, typer.Option(metavar="NAME", help=f"{', '.join(SCENE_NAMES)}.")] = "tree",
     illumination: Annotated[
         str,
@@ -100,8 +116,13 @@ def demo(
         float, typer.Option(metavar="SR", help="Measurements over pixels of one picture.")
     ] = 0.5,
     side_px: Annotated[
-        int, typer.Option(metavar="N", help="Rows and columns of the picture.")
-    ] = 128,
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Rows and columns of the picture.",
+            show_default="128; with --live 64",
+        ),
+    ] = None,
     photons: Annotated[
         float | None,
         typer.Option(
@@ -115,6 +136,37 @@ def demo(
         bool,
         typer.Option("--moving", help="A second film: the target walks past; half a minute more."),
     ] = False,
+    live: Annotated[
+        bool,
+        typer.Option(
+            "--live",
+            help="Open a page instead: a person walks behind the occluder, its width and the gate on sliders.",
+        ),
+    ] = False,
+    recording: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SOURCE",
+            help="With --live: your own shots, frames or instrument behind a gate, as for view.",
+            show_default="a simulated scene",
+        ),
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="H5",
+            help="With --recording: made by calibrate.",
+            show_default="the one inside SOURCE",
+        ),
+    ] = None,
+    time_zero_ns: TimeZeroOption = None,
+    port: Annotated[
+        int | None,
+        typer.Option(min=1, max=65535, metavar="N", help="Of the page.", show_default="a free one"),
+    ] = None,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Print the page's address; open nothing.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Simulate a scene behind an occluder, see through it, and compare with other cameras and with
@@ -125,14 +177,26 @@ def demo(
     the formula. Writes occlusion.png, occlusion.gif, a film of the flash, and with --moving
     occlusion_moving.gif.
 
+    With --live nothing is written: a page shows what one camera sees beside what CLIP sees, step by
+    step, and the sliders' occluder and gate hold from the next step on. With --recording it is your
+    own scene, and the gate takes away what stands in front.
+
     Example: tofclip occlusion demo --scene plate --out occlusion-output
+
+    Example: tofclip occlusion demo --live --scene bush
     """
     started = time.perf_counter()
+    _require_sense(live, recording is not None or camera is not None, out is None)
     if encoder not in DEFAULT_PHOTONS:
         raise InputError(f"unknown encoder '{encoder}'; take one of {', '.join(DEFAULT_PHOTONS)}")
     # A single pixel sums a whole picture and so needs more photons.
     usual = DEFAULT_PHOTONS[encoder] if photons is None else photons
-    settings = ExperimentSettings(side_px, encoder, sampling_ratio, illumination, usual, seed)
+    side = side_px or (LIVE_SIDE_PX if live else SIDE_PX)
+    settings = ExperimentSettings(side, encoder, sampling_ratio, illumination, usual, seed)
+    if live or out is None:
+        zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
+        _show_live(scene, settings, (recording, camera, zero), (port, no_browser, as_json))
+        return
     experiment = Experiment(make_occlusion_scene(scene), settings)
     # Before anything is written: this refuses settings of which no camera can be built.
     measurement_count = experiment.rig.camera.measurements
@@ -154,6 +218,43 @@ def demo(
         as_json,
         written,
     )
+
+
+def _require_sense(live: bool, recorded: bool, writes_nothing: bool) -> None:
+    """Refuse options that contradict each other."""
+    if live != writes_nothing:
+        raise InputError(
+            "--live writes nothing; leave --out out"
+            if live
+            else "give --out DIR, or --live for a page"
+        )
+    if recorded and not live:
+        raise InputError("--recording and --camera are for --live")
+
+
+def _show_live(
+    scene: str,
+    settings: ExperimentSettings,
+    recorded: tuple[str | None, Path | None, float | None],
+    served: tuple[int | None, bool, bool],
+) -> None:
+    """Serve a page with the walk, or with a recording behind a gate, until Ctrl-C."""
+    from apps.occlusion.live import GatedSource, WalkSource
+    from apps.verbs.view import serve_page
+    from apps.viewer.server import LOOPBACK
+    from apps.viewer.session import Session
+    from apps.viewer.source_factory import ShotOptions, open_source
+
+    recording, camera, time_zero = recorded
+    port, no_browser, as_json = served
+    with show_activity("looking past"):
+        source = (
+            WalkSource(make_walking_scene(scene), settings)
+            if recording is None
+            else GatedSource(open_source(recording, ShotOptions(camera, time_zero=time_zero)))
+        )
+    with contextlib.closing(source) as opened:
+        serve_page(Session(opened), LOOPBACK, port, no_browser, as_json)
 
 
 def _run_experiment(experiment: Experiment) -> tuple[SeparatedImages, list[ProbeResult]]:

@@ -109,7 +109,7 @@ def view(
         elif desktop:
             _open_window(session)
         else:
-            _serve_page(session, host, port, no_browser, as_json)
+            serve_page(session, host, port, no_browser, as_json)
 
 
 def _check_outputs(
@@ -147,9 +147,28 @@ def _open_window(session: Session) -> None:
     open_window(session)
 
 
-def _serve_page(
+def serve_page(
     session: Session, host: str, port: int | None, no_browser: bool, as_json: bool
 ) -> None:
+    """Serve a page until Ctrl-C.
+
+    Parameters
+    ----------
+    session : Session
+    host : str
+        A loopback address, or ``"localhost"``.
+    port : int, optional
+        A free one by default.
+    no_browser : bool
+        Whether the page is not opened here.
+    as_json : bool
+        Whether its address is reported as JSON.
+
+    Raises
+    ------
+    InputError, MissingDependencyError
+        It cannot be served.
+    """
     with contextlib.closing(Page(session, port, parse_loopback(host))) as page:
         report({"address": page.address}, as_json)
         sys.stdout.flush()  # a program that reads the address waits for it

@@ -210,4 +210,16 @@ def test_a_scene_is_listed_and_drawn(run: Run, tmp_path: Path) -> None:
     assert abs(first["width_m"] - 0.09) < 0.03
     assert (tmp_path / "scene.png").read_bytes()[:4] == b"\x89PNG"
     assert run(*words, "--fewest-points", "9999").status == 2
-    assert "object 2" in run(*words, "--reach-mm", "60").out
+    listed = run(*words, "--reach-mm", "60").out
+    assert "object 2" in listed
+    # ranges without a time zero are right up to a constant, which is said wherever they are
+    missing = "note: ranges are right up to a constant, no time zero given"
+    assert (missing in listed) == (CAMERA.time_zero == 0)
+    cloud = ("cloud", tmp_path / "frames.h5", "--out", tmp_path / "cloud.ply")
+    assert (missing in run(*cloud).out) == (CAMERA.time_zero == 0)
+    frames = Frames.load(tmp_path / "frames.h5")
+    other = frames.camera.replace(time_zero=0.0 if frames.camera.time_zero else -1e-9)
+    replace(frames, camera=other).save(tmp_path / "frames.h5")
+    assert (missing in run(*words, "--reach-mm", "60").out) == (other.time_zero == 0)
+    assert (missing in run(*cloud).out) == (other.time_zero == 0)
+    assert "note" not in json.loads(run(*cloud, "--json").out)

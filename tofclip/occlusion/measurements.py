@@ -132,6 +132,28 @@ class TimedMeasurements:
             for ends in pairwise([0, *between, self.time_axis.bins])
         )
 
+    def split_returns(self, distance: float) -> tuple[Return, ...]:
+        """Divide the light by a gate that opens when that of a distance arrives.
+
+        Parameters
+        ----------
+        distance : float
+            m along the axis.
+
+        Returns
+        -------
+        tuple of Return
+            What came before the gate opened, and what came after; dark parts are left out.
+        """
+        opens = float(self.rig.compute_flight_time(np.array([distance]))[0])
+        cut = int(np.searchsorted(self.time_axis.times, opens))
+        history = self.history
+        least = MIN_PROMINENCE * history.max()
+        parts = slice(0, cut), slice(cut, self.time_axis.bins)
+        return tuple(
+            self._locate_return(bins) for bins in parts if history[bins].max(initial=0.0) > least
+        )
+
     def _locate_return(self, bins: slice) -> Return:
         weight = np.maximum(self.history[bins], 0)
         time = float(weight @ self.time_axis.times[bins] / weight.sum())

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import InputError
-from tofclip.occlusion.measurements import Rig, TimedMeasurements
+from tofclip.occlusion.measurements import Return, Rig, TimedMeasurements
 from tofclip.operators import Diagonal, LinearOperator, LinearShear, Stack
 from tofclip.operators.shear import View
 from tofclip.recovery.light_field import MAX_ITERATIONS, OBJECTIVE_TOLERANCE, ClipRecovery
@@ -105,7 +105,9 @@ def build_occluded_model(
 
 
 def separate_occluder(
-    measurements: TimedMeasurements, weight: float = TV_WEIGHT
+    measurements: TimedMeasurements,
+    weight: float = TV_WEIGHT,
+    returns: tuple[Return, ...] | None = None,
 ) -> SeparatedImages:
     """Recover occluder and target from their returns.
 
@@ -114,6 +116,8 @@ def separate_occluder(
     measurements : TimedMeasurements
     weight : float
         Of total variation, relative to the largest value of A'f.
+    returns : tuple of Return, optional
+        Of the occluder, and of what stands behind; found in the measurements by default.
 
     Returns
     -------
@@ -125,7 +129,7 @@ def separate_occluder(
     InputError
         Nothing sends light back.
     """
-    returns = measurements.find_returns()
+    returns = measurements.find_returns() if returns is None else returns
     if not returns:
         raise InputError("no light comes back; is the clock set to the scene's distances?")
     distances = tuple(one.distance for one in returns)

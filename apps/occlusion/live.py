@@ -1,0 +1,369 @@
+"""Seeing past an occluder while one looks: a person who walks behind it, or a recording of one's own
+behind a time gate.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apps.occlusion.experiment import Experiment, ExperimentSettings
+from apps.occlusion.scenes import BASELINE_M, OCCLUDER_DISTANCE_M, OcclusionScene
+from apps.viewer.clouds import make_cloud
+from apps.viewer.shots import ShotSource
+from apps.viewer.source import Capabilities, Gate, Setting, Source, View
+from apps.viewer.transient import TransientSource
+from tofclip.errors import InputError
+from tofclip.lidar.processing import select_points
+from tofclip.occlusion.measurements import TimedMeasurements
+from tofclip.occlusion.recovery import separate_occluder
+from tofclip.shots import Frames
+from tofclip.simulate.light_fields import CameraArray
+from tofclip.storage import format_error_line
+from tofclip.units import MILLIMETRE, SPEED_OF_LIGHT
+
+Picture = NDArray[np.float32]
+
+WALK_REACH_M, WALK_STEPS = 18e-3, 14
+"""How far the person walks to either side, m, and in how many steps."""
+
+MAX_KEPT_FRAMES = 32
+BRIGHT_FRACTION, WHITE_QUANTILE = 0.2, 0.99
+"""Pixels brighter than this fraction of a picture's brightest hundredth are points of the scene."""
+
+STOP_TIMEOUT_S = 20.0
+
+ONE_CAMERA, ONE_CAMERA_GATED = "one camera", "one camera behind the gate"
+CLIP_GATED, TRUTH = "ToF-CLIP behind the gate", "truth: the occluder taken away"
+ALL_LIGHT, BEHIND_GATE = "all light, without a gate", "ToF-CLIP behind the gate"
+
+
+@dataclass(frozen=True)
+class WalkFrame:
+    """A step of the walk, as it was seen.
+
+    Parameters
+    ----------
+    view : View
+        Occluder and person, each at its own distance.
+    pictures : mapping of str to (rows, columns) array
+        By what each of them shows.
+    description : str
+        What the formula promises.
+    """
+
+    view: View
+    pictures: Mapping[str, Picture]
+    description: str
+
+
+class WalkSource(Source):
+    """A person walks to and fro behind an occluder. Each step is flashed, measured and recovered as
+    fast as the machine can, at the occluder's width and the gate that the sliders say.
+
+    Parameters
+    ----------
+    scene : OcclusionScene
+    settings : ExperimentSettings
+        Of the camera.
+
+    Notes
+    -----
+    Memory: the last 32 steps.
+    """
+
+    def __init__(self, scene: OcclusionScene, settings: ExperimentSettings) -> None:
+        near, far = OCCLUDER_DISTANCE_M / MILLIMETRE, scene.distance / MILLIMETRE
+        self._width = Setting(
+            "occluder width (mm)",
+            1.0,
+            20.0,
+            0.5,
+            scene.region.width / MILLIMETRE,
+            f"of its solid part; the views are {BASELINE_M / MILLIMETRE:g} mm apart",
+        )
+        self._gate = Setting(
+            "gate opens (mm)",
+            near - 15,
+            far + 15,
+            1.0,
+            round((near + far) / 2),
+            "light from nearer than this is kept out of the picture",
+        )
+        super().__init__(
+            f"{scene.title}, live", 2.0, frame_name="step", settings=(self._width, self._gate)
+        )
+        self._scene, self._settings = scene, settings
+        self._frames: deque[WalkFrame] = deque(maxlen=MAX_KEPT_FRAMES)
+        self._lock, self._stopping = threading.Lock(), threading.Event()
+        self._count, self._failure_text = 0, ""
+        places = np.linspace(-WALK_REACH_M, WALK_REACH_M, WALK_STEPS).tolist()
+        self._walk = itertools.cycle([*places, *places[-2:0:-1]])
+        self._take_step()
+        self._thread = threading.Thread(target=self._run, name="walk", daemon=True)
+        self._thread.start()
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def oldest(self) -> int:
+        return self._count - len(self._frames)
+
+    @property
+    def is_live(self) -> bool:
+        return self._thread.is_alive()
+
+    @property
+    def failure_text(self) -> str:
+        return self._failure_text
+
+    def describe_frame(self, number: int) -> str:
+        """Say what the formula of the inactive region promises."""
+        return self._find_frame(number).description
+
+    def view(self, number: int) -> View:
+        return self._find_frame(number).view
+
+    def pictures(self, number: int, gate: Gate) -> Mapping[str, Picture]:
+        """Return what one camera sees beside what CLIP sees; see `Source`.
+
+        Parameters
+        ----------
+        number : int
+        gate : Gate
+            Not used: the gate is one of the settings.
+
+        Returns
+        -------
+        mapping of str to (rows, columns) array
+        """
+        return self._find_frame(number).pictures
+
+    def close(self) -> None:
+        self._stopping.set()
+        self._thread.join(STOP_TIMEOUT_S)
+
+    def _find_frame(self, number: int) -> WalkFrame:
+        """Return a step, or the nearest that is kept."""
+        with self._lock:
+            place = number - (self._count - len(self._frames))
+            return self._frames[min(max(place, 0), len(self._frames) - 1)]
+
+    def _run(self) -> None:
+        try:
+            while not self._stopping.is_set():
+                self._take_step()
+        except Exception as fault:
+            # Whatever ends it is shown on the page: an exception on this thread would be lost.
+            self._failure_text = format_error_line(fault)
+
+    def _take_step(self) -> None:
+        scene = self._scene.widen_occluder(self._width.value * MILLIMETRE)
+        settings = replace(self._settings, seed=self._settings.seed + self._count)
+        there = Experiment(scene.move_target(next(self._walk)), settings)
+        made = look_behind(there, self._gate.value * MILLIMETRE)
+        with self._lock:
+            self._frames.append(made)
+            self._count += 1
+
+
+def look_behind(experiment: Experiment, opens: float) -> WalkFrame:
+    """Measure a scene and recover what stands before and behind a gate.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    opens : float
+        Distance from which on light passes the gate, m.
+
+    Returns
+    -------
+    WalkFrame
+    """
+    measurements = experiment.measurements
+    front, behind, distances = separate_at(measurements, opens)
+    middle = experiment.pictures[len(experiment.pictures) // 2]
+    cut = int(
+        np.searchsorted(
+            measurements.time_axis.times,
+            float(measurements.rig.compute_flight_time(np.array([opens]))[0]),
+        )
+    )
+    pictures = {
+        ONE_CAMERA: middle.sum(axis=-1),
+        ONE_CAMERA_GATED: middle[..., cut:].sum(axis=-1),
+        CLIP_GATED: behind,
+        TRUTH: experiment.truth,
+    }
+    layers = [front, behind]
+    view = _place_pictures(measurements.rig.array, layers, distances)
+    return WalkFrame(view, pictures, describe_region(experiment.scene))
+
+
+def separate_at(
+    measurements: TimedMeasurements, opens: float
+) -> tuple[Picture, Picture, tuple[float, float]]:
+    """Recover what sends light back before a gate opens, and after.
+
+    Parameters
+    ----------
+    measurements : TimedMeasurements
+    opens : float
+        Distance from which on light passes the gate, m.
+
+    Returns
+    -------
+    front, behind : (rows, columns) arrays
+        Dark where no light came.
+    distances : (float, float)
+        Of both, m; `opens` for one that is dark.
+    """
+    returns = measurements.split_returns(opens)
+    found = separate_occluder(measurements, returns=returns)
+    if found.sees_target:
+        return found.occluder, found.target, (found.distances[0], found.distances[1])
+    (distance,), dark = found.distances, np.zeros_like(found.occluder)
+    if returns[0].bins.stop == measurements.time_axis.bins:  # all light came through the gate
+        return dark, found.occluder, (opens, distance)
+    return found.occluder, dark, (distance, opens)
+
+
+def describe_region(scene: OcclusionScene) -> str:
+    """Say what the formula of the inactive region promises for a scene."""
+    width, behind = scene.region.width / MILLIMETRE, scene.behind / MILLIMETRE
+    if not scene.region.is_bounded:
+        return f"{width:g} mm wide, as the views are apart or wider: nothing is promised"
+    hidden = scene.region.length / MILLIMETRE
+    word = "seen" if behind > hidden else "hidden"
+    return f"hides {hidden:.0f} mm behind it; person at {behind:.0f} mm: {word}"
+
+
+def _place_pictures(
+    array: CameraArray, pictures: list[Picture], distances: tuple[float, float]
+) -> View:
+    """Put the bright pixels of each picture at its distance."""
+    places, light = [], []
+    for picture, distance in zip(pictures, distances, strict=True):
+        bright = picture > BRIGHT_FRACTION * max(float(np.quantile(picture, WHITE_QUANTILE)), 1e-12)
+        row, column = np.nonzero(bright)
+        middle = np.array(picture.shape) // 2
+        across = (column - middle[1]) / array.focal_length_px * distance
+        down = (row - middle[0]) / array.focal_length_px * distance
+        places.append(np.stack([across, down, np.full(len(row), distance)], axis=-1))
+        light.append(picture[bright])
+    xyz = np.concatenate(places).astype(np.float32)
+    return View(make_cloud(xyz, {"intensity": np.concatenate(light)}))
+
+
+class GatedSource(Source):
+    """Recorded or live shots behind a time gate: what comes back from nearer than a slider says is
+    kept out of the cloud and of the picture.
+
+    Parameters
+    ----------
+    shots : TransientSource or ShotSource
+
+    Raises
+    ------
+    InputError
+        The source is neither.
+    """
+
+    def __init__(self, shots: Source) -> None:
+        if not isinstance(shots, TransientSource | ShotSource):
+            raise InputError(
+                f"{shots.title}: a gate needs light over time: give shots, frames or an instrument"
+            )
+        self._shots = shots
+        self._last: tuple[int, Frames] | None = None
+        ranges = shots.view(0).cloud.range
+        low, high = (
+            (float(one) for one in np.percentile(ranges, (0, 100))) if len(ranges) else (0.0, 1.0)
+        )
+        low, high = np.floor(100 * low) / 100, np.ceil(100 * high) / 100
+        self._gate = Setting(
+            "gate opens (m)",
+            low,
+            high,
+            0.01,
+            low,
+            "light from nearer than this is kept out of cloud and picture",
+        )
+        super().__init__(
+            f"{shots.title}, behind a gate",
+            min(shots.rate, 10.0),
+            Capabilities(),
+            frame_name="shot",
+            notes=shots.notes,
+            settings=(self._gate,),
+        )
+
+    def __len__(self) -> int:
+        return 1 if isinstance(self._shots, TransientSource) else len(self._shots)
+
+    @property
+    def oldest(self) -> int:
+        return min(self._shots.oldest, len(self) - 1)
+
+    @property
+    def is_live(self) -> bool:
+        return self._shots.is_live
+
+    @property
+    def data_rate(self) -> float:
+        return self._shots.data_rate
+
+    @property
+    def latency(self) -> float:
+        return self._shots.latency
+
+    @property
+    def lost(self) -> int:
+        return self._shots.lost
+
+    @property
+    def failure_text(self) -> str:
+        return self._shots.failure_text
+
+    def view(self, number: int) -> View:
+        whole = self._shots.view(number)
+        behind = whole.cloud.range >= self._gate.value
+        pixels = None if whole.pixels is None else whole.pixels[behind]
+        return View(select_points(whole.cloud, behind), pixels)
+
+    def pictures(self, number: int, gate: Gate) -> Mapping[str, Picture]:
+        """Return all light, as a camera without time of flight has it, and what passes the gate.
+
+        Parameters
+        ----------
+        number : int
+        gate : Gate
+            Not used: the gate is one of the settings.
+
+        Returns
+        -------
+        mapping of str to (rows, columns) array
+        """
+        frames = self._recover(number)
+        distance: Any = SPEED_OF_LIGHT * frames.times / 2
+        return {
+            ALL_LIGHT: frames.values.sum(axis=0),
+            BEHIND_GATE: frames.values[distance >= self._gate.value].sum(axis=0),
+        }
+
+    def close(self) -> None:
+        self._shots.close()
+
+    def _recover(self, number: int) -> Frames:
+        # The gate is moved more often than the shot changes.
+        if self._last is None or self._last[0] != number:
+            self._last = number, self._shots.recover_frames(number)
+        return self._last[1]
