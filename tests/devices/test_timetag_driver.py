@@ -44,9 +44,9 @@ RATE = 12_800_000.0
 SMALL = "sim+timetag://?seed=3&transfer_kib=8"
 
 
-def tagger(**options: object) -> tuple[EmulatedTimeTagger, VirtualUsb]:
+def tagger(rate: float = RATE, **options: object) -> tuple[EmulatedTimeTagger, VirtualUsb]:
     instrument = EmulatedTimeTagger(
-        lambda _: PoissonStream(RATE, CLOCK_HZ, 1), "T1", EmulatorSettings(**options)
+        lambda _: PoissonStream(rate, CLOCK_HZ, 1), "T1", EmulatorSettings(**options)
     )  # type: ignore[arg-type]
     return instrument, VirtualUsb(instrument)
 
@@ -169,7 +169,8 @@ def test_photons_come_when_they_are_due() -> None:
 
 
 def test_a_full_memory_loses_photons_and_says_so() -> None:
-    instrument, bus = tagger(is_paced=True, memory_bytes=6000)
+    # Photons that a busy machine can draw faster than they fall: a memory for 1 ms of them.
+    instrument, bus = tagger(1e6, is_paced=True, memory_bytes=6000)
     with open_on_backend(Uri.parse("timetag://?transfer_kib=64"), "", bus) as source:
         first = source.read()
         while instrument.truth.lost_memory_full == 0:
