@@ -254,8 +254,8 @@ class TrackedShots(Iterator[Streak]):
         return self._stamps.pop(place, ShotStamp(place))
 
     def count_dropped(self, stamp: ShotStamp, delivered: int) -> int:
-        """Return how many shots up to a delivered one were lost, wherever that was. Of those behind
-        it nobody can say yet.
+        """Return how many shots up to a delivered one were lost, wherever that was. Those behind
+        it are not known yet.
 
         Parameters
         ----------

@@ -117,7 +117,7 @@ class StreamSource(DecodedSource):
             _open_sources.add(self)
             self._thread.start()
         except BaseException:
-            # Also a signal to end: nobody else could switch the instrument off now.
+            # Also a signal to end: nothing else could switch the instrument off now.
             feed.close()
             raise
 

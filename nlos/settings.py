@@ -71,7 +71,7 @@ MAX_LASER_WALL_WIDTHS = 5.0
 
 MAX_LASER_OFF_WALL_M, LASER_OFF_WALL_SLOPE = 0.05, 0.5
 """A laser spot may stand so far before the foremost or behind the hindmost wall point, and farther
-by this part of how far aside it is, where nobody knows the wall."""
+by this part of how far aside it is, where the wall is not known."""
 
 MAX_START_M = 1e3
 """A record that begins after a longer path, m, still holds the ways to the devices."""

@@ -175,8 +175,8 @@ def run_peer(script: str, name: str, *words: str) -> float:
         )
     except subprocess.TimeoutExpired as fault:
         raise PeerUnavailableError(f"{name}: takes more than {PEER_TIMEOUT_S} s") from fault
-    told = [line.split() for line in done.stdout.splitlines() if line.startswith("seconds ")]
-    if done.returncode or not told:
+    reported = [line.split() for line in done.stdout.splitlines() if line.startswith("seconds ")]
+    if done.returncode or not reported:
         problem = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
         raise PeerUnavailableError(f"{name}: {problem}")
-    return float(told[-1][1])
+    return float(reported[-1][1])

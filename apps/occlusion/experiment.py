@@ -43,8 +43,8 @@ OBLIQUE_LAMP_M = (-55e-3, -25e-3, 0.0)
 ILLUMINATIONS = ("diodes", "oblique", "co-located")
 
 DEFAULT_PHOTONS = {"line": 2e3, "single-pixel": 1e6}
-"""Of the brightest measurement: one of a single pixel gathers half the picture's light and tells
-little of it.
+"""Of the brightest measurement: one of a single pixel gathers half the picture's light and
+learns little of it.
 """
 
 

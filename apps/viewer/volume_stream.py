@@ -17,7 +17,7 @@ BRIGHT_FRACTION = 0.3
 
 
 class VolumeFeed(Protocol):
-    """What a stream of volumes tells while it runs."""
+    """What a stream of volumes reports while it runs."""
 
     latency: float
     delivered: int

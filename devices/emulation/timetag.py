@@ -206,7 +206,7 @@ class EmulatedTimeTagger(VirtualDevice):
         """
         if endpoint != COMMAND_ENDPOINT:
             raise make_usb_error(errno.EPIPE)
-        # Replies that nobody fetches block the register manager.
+        # Replies that are not fetched block the register manager.
         if len(self._replies) >= MAX_REPLIES:
             return  # swallowed
         for byte in data:

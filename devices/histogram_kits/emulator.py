@@ -64,7 +64,7 @@ class EmulatedKit:
     rate : float
         Frames per second.
     torn, lost : int
-        Every so many frames one has a line cut, or is not sent; 0 for none.
+        Of this number of frames one has a line cut, or is not sent; 0 for none.
     """
 
     def __init__(

@@ -121,7 +121,7 @@ def _check_keys(found: dict[str, Any], path: Path) -> dict[str, Any]:
                 path, f"has the unknown key '{key}'; known are {', '.join(_KEY_TYPES)}"
             )
         kind = _KEY_TYPES[key]
-        # TOML tells 50000 from 50000.0; a person does not. By exact type, because bool is an int in
+        # TOML distinguishes 50000 from 50000.0, which people do not. By exact type, because bool is an int in
         # Python.
         is_number = kind is float and type(value) is int
         if type(value) is not kind and not is_number:

@@ -143,7 +143,7 @@ class RemoteExFeed:
             self._parameters = self._read_parameters()
             self._row_times = self._read_row_times()
         except BaseException:
-            # Also a signal to end: nobody else could turn the gain down now.
+            # Also a signal to end: nothing else could turn the gain down now.
             with contextlib.suppress(DeviceError):
                 self.close()
             raise

@@ -37,7 +37,7 @@ MIN_CLOCK_HZ, MAX_CLOCK_HZ = 1_000_000, 1_000_000_000
 
 PACKET_INTERVAL_S = 0.015
 LATENCY_S = 0.02
-"""Seconds after which a transfer is ended, and a chip that holds part of a packet told to send."""
+"""Seconds after which a transfer is ended, and a chip that holds part of a packet is asked to send."""
 
 FULL_STREAM_BYTES_PER_S = 500_000
 

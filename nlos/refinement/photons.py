@@ -51,7 +51,7 @@ OBLIQUITIES = (0, 1, 2)
 """Instrument's responses, and falls of light with the angle, of which the likeliest are taken."""
 
 BACKGROUND_PHOTONS = 50.0
-"""Each wall point's background is drawn to the mean of all as by so many photons."""
+"""Each wall point's background is drawn to the mean of all as by this number of photons."""
 
 MIN_BACKGROUND = 1e-6
 """Photons per bin: nothing is impossible."""
@@ -63,7 +63,7 @@ STEP_TOLERANCE, ROUNDING = 1e-3, 2e-7
 """What a sample may be off by: of the step between counts, and of itself."""
 
 NOISE_SIGMAS = 3.0
-"""A voxel whose neighbourhood is brighter than noise by so many standard deviations pays little."""
+"""A voxel whose neighbourhood is brighter than noise by this number of standard deviations pays little."""
 
 MIN_BEAM_VOXELS = 0.5
 """Standard deviation of the least sharpness that is shown, voxels."""

@@ -68,13 +68,13 @@ def test_frames_and_cloud_are_those_of_the_compiled_loops(
 @pytest.mark.usefixtures("torch")
 def test_frames_of_a_file_to_a_cloud(run: Run, files: Path, streak: Streak, tmp_path: Path) -> None:
     recover(streak, method="l1").save(tmp_path / "frames.h5")
-    told = {}
+    reported = {}
     for device in ("cpu", "torch:cpu"):
         out = tmp_path / f"{device[:3]}.npz"
-        told[device] = object_of(
+        reported[device] = object_of(
             run, "cloud", tmp_path / "frames.h5", "--out", out, "--device", device
         )
-    there, here = told["torch:cpu"], told["cpu"]
+    there, here = reported["torch:cpu"], reported["cpu"]
     assert (there.pop("device"), here.pop("device")) == ("torch:cpu", "cpu")
     assert there["points"] == here["points"] > 50
     np.testing.assert_allclose(there["range_m"], here["range_m"], atol=1e-5)

@@ -65,7 +65,7 @@ def test_the_guide_to_ones_own_wall(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_the_guide_to_ones_own_light_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     there = walked("own_light_field.md", tmp_path, monkeypatch)
-    assert {"field.h5", "spoilt.png"} | set(find_pictures(GUIDES[3])) <= there
+    assert {"field.h5", "corrupted.png"} | set(find_pictures(GUIDES[3])) <= there
 
 
 def test_the_page_on_gpus(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

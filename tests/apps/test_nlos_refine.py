@@ -35,8 +35,8 @@ def test_iterations_gather_the_light(run: Run, curved: Path, tmp_path: Path, pri
     assert refined.values.min() >= 0
     assert energy_near_the_point(refined) > 1.5 * energy_near_the_point(plain)
     assert [found["peak_m"][axis] for axis in "xyz"] == pytest.approx(POINT, abs=0.03)
-    told = (tmp_path / "refined.toml").read_text()
-    assert f'refine = "{prior}"\niterations = 8\nprior_weight = 0.02\n' in told
+    reported = (tmp_path / "refined.toml").read_text()
+    assert f'refine = "{prior}"\niterations = 8\nprior_weight = 0.02\n' in reported
 
 
 def test_photons_gather_the_light(run: Run, tmp_path: Path) -> None:

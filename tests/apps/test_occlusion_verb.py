@@ -36,9 +36,9 @@ def test_the_inactive_length_of_the_papers_experiment(run: Run, tmp_path: Path) 
 
 
 def test_a_wide_occluder_promises_nothing_and_says_so(run: Run) -> None:
-    told = json.loads(run("occlusion", "region", "--width-mm", 15, "--json").out)
-    assert told["inactive_length_m"] is None
-    assert "nothing" in told["promised"]
+    reported = json.loads(run("occlusion", "region", "--width-mm", 15, "--json").out)
+    assert reported["inactive_length_m"] is None
+    assert "nothing" in reported["promised"]
 
 
 def test_lengths_that_make_no_sense_are_refused(run: Run, tmp_path: Path) -> None:
@@ -75,17 +75,17 @@ def demonstrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[s
 def test_the_demonstration_agrees_with_the_formula(
     demonstrated: tuple[Path, dict[str, Any]],
 ) -> None:
-    _, told = demonstrated
-    assert told["inactive_length_m"] == pytest.approx(0.1 / 3)
-    assert len(told["targets"]) == 4
-    for target in told["targets"]:
+    _, reported = demonstrated
+    assert reported["inactive_length_m"] == pytest.approx(0.1 / 3)
+    assert len(reported["targets"]) == 4
+    for target in reported["targets"]:
         assert (target["correlation"] >= 0.8) == target["expected_visible"]
         assert target["expected_visible"] == (
-            target["distance_m"] > 0.05 + told["inactive_length_m"]
+            target["distance_m"] > 0.05 + reported["inactive_length_m"]
         )
-    assert told["nmse"] < 0.3
+    assert reported["nmse"] < 0.3
     others = ("single_view", "light_field_camera", "without_model_of_occluder")
-    assert all(told["correlation"] > told[f"correlation_{name}"] for name in others)
+    assert all(reported["correlation"] > reported[f"correlation_{name}"] for name in others)
 
 
 def test_the_demonstration_leaves_a_picture_and_a_film(
@@ -117,9 +117,9 @@ def test_in_the_film_the_target_moves_from_left_to_right_and_the_occluder_stays(
 
 def test_behind_a_board_nothing_is_promised(run: Run, tmp_path: Path) -> None:
     words = ("--scene", "board", "--side-px", 32, "--out", tmp_path)
-    told = json.loads(run("occlusion", "demo", *words, "--json").out)
-    assert told["inactive_length_m"] is None
-    assert told["targets"] == [
+    reported = json.loads(run("occlusion", "demo", *words, "--json").out)
+    assert reported["inactive_length_m"] is None
+    assert reported["targets"] == [
         {"distance_m": pytest.approx(0.12), "correlation": 0.0, "expected_visible": False}
     ]
 

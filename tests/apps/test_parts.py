@@ -127,13 +127,13 @@ class TestFiles:
 
     def test_history_keeps_the_past(self, tmp_path: Path) -> None:
         (tmp_path / "in.txt").write_text("x")
-        told = build_provenance(
+        reported = build_provenance(
             {"verb": "test"}, tmp_path / "in.txt", earlier={"software": "older"}
         )
-        assert told["earlier"] == {"software": "older"}
+        assert reported["earlier"] == {"software": "older"}
         # SHA-256 of the letter x
         assert (
-            told["inputs"][0]["sha256"]
+            reported["inputs"][0]["sha256"]
             == "2d711642b726b04401627ca9fbac32f5c8530fb1903cc4db02258717921a4881"
         )
         assert "earlier" not in build_provenance({})

@@ -26,7 +26,7 @@ def shots(number: int) -> list[Streak]:
     return [draw_exposure(light, seed) for seed in range(number)]
 
 
-def told(capsys: pytest.CaptureFixture[str]) -> dict:
+def read_report(capsys: pytest.CaptureFixture[str]) -> dict:
     return json.loads(capsys.readouterr().out)
 
 
@@ -40,7 +40,7 @@ def test_a_streaming_camera_becomes_clouds(tmp_path: Path, capsys: pytest.Captur
         str(tmp_path),
     ]
     assert main([*words, "--json"]) == 0
-    figures = told(capsys)
+    figures = read_report(capsys)
     assert figures["clouds"] == 3
     assert set(figures["stages_s"]) == {"read", "wait", "rectify", "recover", "range", "place"}
     assert figures["latency_s"]["median"] > 0
@@ -88,7 +88,7 @@ def test_a_slow_consumer_gets_the_newest_shot_and_the_truth_about_the_others(
     address = "sim+remoteex://?seed=1&scene=small&frame_rate=200"
     words = ["stream", address, "--shots", str(clouds), "--out", str(tmp_path)]
     assert main([*words, "--json"]) == 0
-    figures = told(capsys)
+    figures = read_report(capsys)
     camera = cameras[0]
     assert camera.taken > 100 * pause * clouds  # the emulated camera kept its pace, about
     assert figures["acquired"] == camera.taken
@@ -103,7 +103,7 @@ def test_a_slow_consumer_gets_the_newest_shot_and_the_truth_about_the_others(
 
 def test_photons_become_shots_of_so_many(capsys: pytest.CaptureFixture[str]):
     assert main(["stream", "sim+linospad2://?seed=1&cycles=40&records=80000", "--json"]) == 0
-    figures = told(capsys)
+    figures = read_report(capsys)
     assert figures["clouds"] == 3  # 40 cycles of about 6000 photons
     assert figures["dropped"] == 0
     assert figures["points"] > 500
@@ -153,7 +153,7 @@ def test_files_are_streamed_too(kind: str, tmp_path: Path, capsys: pytest.Captur
         "-11.0",
     ]
     assert main([*words, "--json"]) == 0
-    assert told(capsys)["clouds"] == 3
+    assert read_report(capsys)["clouds"] == 3
 
 
 @pytest.mark.parametrize(

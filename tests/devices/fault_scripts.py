@@ -1,4 +1,4 @@
-"""Random faults against the emulated time tagger: what came, what was told, what really happened."""
+"""Random faults against the emulated time tagger: what came, what was reported, what really happened."""
 
 from __future__ import annotations
 

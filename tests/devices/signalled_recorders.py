@@ -1,4 +1,4 @@
-"""Recorders that are told to end at random moments; a script, because it forks.
+"""Recorders that are asked to end at random moments; a script, because it forks.
 
 ``signalled_recorders.py FOLDER NUMBER SEED ADDRESS`` lets `tofclip record` live for a while, sends
 it one of the signals that end a program, and prints one line for each: the signal, the file's name,
@@ -33,7 +33,7 @@ def end_recorder(
     if child == 0:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         # A shell's background jobs ignore the one and nohup's the other, and a program that was
-        # told to ignore a signal does so rightly.
+        # asked to ignore a signal does so rightly.
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
         status = 70
@@ -45,11 +45,11 @@ def end_recorder(
             os._exit(status)
     time.sleep(life)
     os.kill(child, number)
-    told = time.monotonic()
-    while time.monotonic() - told < PATIENCE_S:
+    reported = time.monotonic()
+    while time.monotonic() - reported < PATIENCE_S:
         ended, status = os.waitpid(child, os.WNOHANG)
         if ended:
-            return os.waitstatus_to_exitcode(status), time.monotonic() - told
+            return os.waitstatus_to_exitcode(status), time.monotonic() - reported
         time.sleep(0.01)
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)

@@ -141,7 +141,7 @@ class StandInBuffer:
 
 class StandInLibrary:
     """As much of Aravis as the driver needs; `frames` are sent when acquisition is started, and what
-    it was told is in `told`.
+    it was asked is in `reported`.
     """
 
     BufferStatus = SimpleNamespace(SUCCESS="success", CLEARED="cleared", ABORTED="aborted")
@@ -150,7 +150,7 @@ class StandInLibrary:
     Buffer = SimpleNamespace(new_allocate=lambda payload: StandInBuffer())
 
     def __init__(self, pictures: np.ndarray, frames: list[StandInBuffer]) -> None:
-        self.told: dict[str, Any] = {}
+        self.reported: dict[str, Any] = {}
         self.underruns = 0
         self.gone_for = 0
         self.is_gige = False
@@ -166,11 +166,11 @@ class StandInLibrary:
 
     def __getattr__(self, name: str) -> Any:
         if name == "set_property":
-            return self.told.__setitem__
+            return self.reported.__setitem__
         if name.startswith("set_"):
-            return lambda value: self.told.__setitem__(name, value)
+            return lambda value: self.reported.__setitem__(name, value)
         if name in ("start_acquisition", "stop_acquisition"):
-            return lambda: self.told.__setitem__(name, True)
+            return lambda: self.reported.__setitem__(name, True)
         known = {
             "get_vendor_name": "Stand-in",
             "get_model_name": "camera",
@@ -239,9 +239,9 @@ def test_identifiers_tell_what_is_missing(stand_in: Any) -> None:
     stats = source.stats
     assert (stats.delivered, stats.malformed, stats.acquired) == (5, 1, 11)
     assert (stats.dropped_host, stats.lost_device) == (2, 3)
-    assert library.told["set_exposure_time"] == 50
-    assert (library.told["set_gain"], library.told["set_frame_rate"]) == (3, 9)
-    assert library.told["stop_acquisition"]
+    assert library.reported["set_exposure_time"] == 50
+    assert (library.reported["set_gain"], library.reported["set_frame_rate"]) == (3, 9)
+    assert library.reported["stop_acquisition"]
 
 
 def test_a_frame_without_its_first_packet_is_counted_once(stand_in: Any) -> None:

@@ -135,7 +135,7 @@ class BoundlessFeed:
 
 @pytest.mark.parametrize("policy", ["block", "drop_oldest", "fail", "newest"])
 def test_a_reader_64_mib_behind(policy: OverflowPolicy) -> None:
-    """What it gets, what it is told, and that it is told how old it is."""
+    """What it gets, what is reported to it, and that the age is among it."""
     pictures = 80
     feed = BoundlessFeed(pictures)
     is_newest = policy == "newest"

@@ -2,7 +2,7 @@
 exception is the right one.
 
 In the suite it is a sample; ``python tests/devices/test_tcp_fault_scripts.py 1000`` runs as many as
-it is told.
+it is reported.
 """
 
 from __future__ import annotations

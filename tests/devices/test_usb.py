@@ -34,7 +34,7 @@ OUT, IN = 0x02, 0x86
 
 
 class Echo(VirtualDevice):
-    """Sends back what it got; raises what it is told to raise, once each."""
+    """Sends back what it got; raises what it is asked to raise, once each."""
 
     def __init__(self, serial: str = "A1", identity: UsbIdentity = KIND) -> None:
         super().__init__(identity, ("makers", "echo", serial), (OUT, IN))

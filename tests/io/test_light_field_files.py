@@ -55,7 +55,7 @@ def test_colour_parts_become_luminance(tmp_path):
 
 
 def pictures(rows: int, columns: int) -> np.ndarray:
-    """Each view is told by one bright pixel."""
+    """Each view is known by one bright pixel."""
     made = np.zeros((rows, columns, 8, 10), np.uint8)
     for v in range(rows):
         for u in range(columns):

@@ -1,4 +1,4 @@
-"""Rows with light told from rows without, and what leaving the dark ones out does to the returns."""
+"""Rows with light separated from rows without, and what leaving the dark ones out does to the returns."""
 
 from __future__ import annotations
 

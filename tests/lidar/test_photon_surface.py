@@ -57,11 +57,11 @@ def test_two_signal_photons_among_fifty_show_the_surface(dim) -> None:
     assert 0.8 < compute_robust_z(error, found.range_sigma / BIN_M) < 1.5
     assert found.settings["response"] == "given"
     # Where one in ten is said to be wrong, as many are.
-    wrong, told = np.abs(error) > 3, found.outlier_probability
-    doubtful = (told > 0.05) & (told < 0.2)
+    wrong, reported = np.abs(error) > 3, found.outlier_probability
+    doubtful = (reported > 0.05) & (reported < 0.2)
     assert doubtful.sum() > 100
-    assert 0.5 < wrong[doubtful].mean() / told[doubtful].mean() < 2
-    assert wrong[told < 0.05].mean() < 0.02
+    assert 0.5 < wrong[doubtful].mean() / reported[doubtful].mean() < 2
+    assert wrong[reported < 0.05].mean() < 0.02
 
 
 def test_the_width_of_the_pulse_is_recognised(dim) -> None:

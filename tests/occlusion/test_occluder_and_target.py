@@ -1,4 +1,4 @@
-"""Occluder and target told apart by time, and the model of what the one hides of the other."""
+"""Occluder and target separated by time, and the model of what the one hides of the other."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ def test_returns_are_found_and_few_are_false(room, light, kind, method) -> None:
 
 
 def test_the_probability_of_a_false_alarm_is_kept(room, light) -> None:
-    """In the dark, where noise is all there is; of the points told a third wrong a third are."""
+    """In the dark, where noise is all there is; a third of the points said to be wrong with probability 1/3 are."""
     streak = Streak(
         oracle.count_photons(light, 20.0),
         np.arange(oracle.ROWS) * oracle.ROW_S,

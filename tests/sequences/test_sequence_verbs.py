@@ -57,10 +57,10 @@ def test_shots_to_frames_to_clouds_on_a_cluster(run, scheduler, few, tmp_path):
     assert sorted(path.name for path in frames.glob("*.h5")) == ["shot0.h5", "shot2.h5"]
     shutil.copy(few / "shot0.h5", few / "shot1.h5")
     status, out, _ = run(*words, "--json")
-    told = json.loads(out)
+    reported = json.loads(out)
     assert status == 0
-    assert (told["results"], told["kept_from_before"], told["failures"]) == (1, 2, [])
-    assert told["peak_memory_mib_per_process"] > 10
+    assert (reported["results"], reported["kept_from_before"], reported["failures"]) == (1, 2, [])
+    assert reported["peak_memory_mib_per_process"] > 10
     status, out, _ = run(
         "cloud", frames / "*.h5", "--out", clouds, "--cluster", scheduler, "--json"
     )
@@ -144,10 +144,13 @@ def test_ranging_on_a_cluster(run, scheduler, recorded, tmp_path):
     )
     status, out, err = run(*words, "--cluster", scheduler, "--json")
     assert (status, err) == (0, "")
-    told = json.loads(out)
-    assert (told["shots"], told["results"]) == (6, 6)
-    assert told["processes"] in (1, 2)  # on a busy machine one worker may do all before the other
-    assert told["jitter_rms_bins"] < 0.15
+    reported = json.loads(out)
+    assert (reported["shots"], reported["results"]) == (6, 6)
+    assert reported["processes"] in (
+        1,
+        2,
+    )  # on a busy machine one worker may do all before the other
+    assert reported["jitter_rms_bins"] < 0.15
 
 
 def test_studies_on_a_cluster(run, scheduler, tmp_path):
@@ -172,8 +175,12 @@ def test_studies_on_a_cluster(run, scheduler, tmp_path):
     }
     assert "tofclip reproduce table1" in (tmp_path / "made" / "reproduction.md").read_text()
     made = (folder / "table1.json").stat().st_mtime_ns
-    told = json.loads(run(*words)[1])
-    assert (told["results"], told["kept_from_before"], told["table1"]["rows"] > 0) == (0, 1, True)
+    reported = json.loads(run(*words)[1])
+    assert (reported["results"], reported["kept_from_before"], reported["table1"]["rows"] > 0) == (
+        0,
+        1,
+        True,
+    )
     assert (folder / "table1.json").stat().st_mtime_ns == made
 
 
@@ -223,8 +230,8 @@ def test_captures_on_a_cluster_are_imaged_as_here(run, scheduler, tmp_path):
     here, there = tmp_path / "here", tmp_path / "there"
     assert run(*words, "--out", here)[0] == 1
     status, out, err = run(*words, "--out", there, "--cluster", scheduler, "--json")
-    told = json.loads(out)
-    assert (status, told["imaged"][0]["capture"], list(told["failed"])) == (
+    reported = json.loads(out)
+    assert (status, reported["imaged"][0]["capture"], list(reported["failed"])) == (
         1,
         "0.h5",
         ["broken.h5"],

@@ -155,11 +155,13 @@ def test_bad_readings_have_no_influence():
     measurements = np.tile(operator(truth)[:, np.newaxis], (1, 3))
     valid = np.ones(measurements.shape, bool)
     valid[10:14, 1] = False
-    spoilt = measurements.copy()
-    spoilt[10:14, 1] = 1e6
+    corrupted = measurements.copy()
+    corrupted[10:14, 1] = 1e6
     method = Sparse(1e-3, 50)
     expected = method.recover(operator, measurements, valid)
-    np.testing.assert_array_equal(method.recover(operator, spoilt, valid).frames, expected.frames)
+    np.testing.assert_array_equal(
+        method.recover(operator, corrupted, valid).frames, expected.frames
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -43,11 +43,11 @@ def test_linear_inverse_leaves_dead_readings_out(operator):
     measurements = np.random.default_rng(1).random((40, 4))
     alive = np.ones((40, 4), bool)
     alive[[3, 17]] = False
-    spoilt = measurements.copy()
-    spoilt[[3, 17]] = 1e5
+    corrupted = measurements.copy()
+    corrupted[[3, 17]] = 1e5
     method = LinearInverse()
     np.testing.assert_allclose(
-        method.recover(operator, spoilt, alive).frames,
+        method.recover(operator, corrupted, alive).frames,
         method.recover(operator, measurements, alive).frames,
         rtol=1e-10,
     )

@@ -66,11 +66,13 @@ def test_the_quadratic_step_is_the_dense_solution():
 def test_bad_readings_hardly_pull_with_huber_s_weights():
     operator = RadonProjection((7, 6), 7, np.arange(5) * np.pi / 5, np.zeros(5), dtype=np.float64)
     anchor = np.random.default_rng(2).random((7, 6))
-    spoilt = operator(anchor)[:, np.newaxis]
-    spoilt[3] += 1e4
-    pulled = solve_data_step(operator, Huber(spoilt, threshold=0.01), anchor, 1.0)
+    corrupted = operator(anchor)[:, np.newaxis]
+    corrupted[3] += 1e4
+    pulled = solve_data_step(operator, Huber(corrupted, threshold=0.01), anchor, 1.0)
     assert np.abs(pulled - anchor).max() < 0.01  # at most threshold / coupling
-    assert np.abs(solve_data_step(operator, LeastSquares(spoilt), anchor, 1.0) - anchor).max() > 100
+    assert (
+        np.abs(solve_data_step(operator, LeastSquares(corrupted), anchor, 1.0) - anchor).max() > 100
+    )
 
 
 def test_without_a_denoiser_the_data_are_met(projections, truth):

@@ -318,7 +318,7 @@ def test_pick_a_point_and_read_its_waveform(seen: Seen) -> None:
         far, (round(canvas["height"]), round(canvas["width"]))
     )
     seen.tab.mouse.click(canvas["x"] + column[0], canvas["y"] + row[0])
-    until(lambda: "distance 0." in words.inner_text(), "the distance of both is told")
+    until(lambda: "distance 0." in words.inner_text(), "the distance of both is shown")
     until(lambda: bool(np.abs(picture(seen) - before).max() > 0.3), "both are marked")
     assert np.abs(picture(seen) - before).mean() < 0.05  # marks are small: two balls and a line
 

@@ -1,6 +1,6 @@
 """How far ranges are off, by what their neighbours on the same surface show.
 
-A recovered frame's errors have two parts. Noise of the measurements is told by each pixel's own
+A recovered frame's errors have two parts. Noise of the measurements is known from each pixel's own
 trace, since it differs from bin to bin. What the recovery gets wrong (a prior that smooths, a
 resolution that mixes neighbours, directions that no view sees) is alike in all bins of a pulse: it
 moves the return without a trace in the fit's residual. On simulated shots it makes errors 1.7 to

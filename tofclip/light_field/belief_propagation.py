@@ -61,7 +61,7 @@ def find_smooth_labels(
         for towards, back, (pixels, neighbours) in zip(
             range(4), (1, 0, 3, 2), _NEIGHBOUR_SLICES, strict=True
         ):
-            # what a pixel tells a neighbour leaves out what that neighbour has told it
+            # what a pixel passes to a neighbour leaves out what came from that neighbour
             said = _pass_message(belief - messages[back], np.float32(smoothness))
             # half of the step: undamped messages may oscillate
             messages[towards][neighbours] += (said[pixels] - messages[towards][neighbours]) / 2

@@ -87,7 +87,11 @@ def stream(
     ] = 0.0,
     captures: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Stop after so many.", show_default="at the source's end"),
+        typer.Option(
+            metavar="N",
+            help="Stop after this number of captures.",
+            show_default="at the source's end",
+        ),
     ] = None,
     view: Annotated[
         bool, typer.Option("--view", help="Show the volumes on a page as they come.")

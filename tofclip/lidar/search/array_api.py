@@ -496,7 +496,7 @@ class PulseFitter:
             (pixels,) arrays for each return; seconds.
         """
         xp, times = namespace(noise), self._times.get(noise)
-        told = []
+        reported = []
         for k, (arrival, height) in enumerate(zip(fit.arrival, fit.height, strict=True)):
             pulse, slope, rest, inside = self._compute_residual(fit, k)
             energy, mixed, steep = (
@@ -507,13 +507,13 @@ class PulseFitter:
             height, energy = xp.where(proven, height, 1), xp.where(proven, energy, 1)
             across_energy = xp.where(proven, steep - mixed**2 / energy, 1)
             profile = pulse, slope - pulse * mixed / energy, rest - height * pulse, inside
-            told.append(
+            reported.append(
                 (
                     proven,
                     *_estimate_sum_and_deviation(profile, height, noise, energy, across_energy),
                 )
             )
-        return told
+        return reported
 
     def _check_overlap(self, fit: FitState, k: int) -> Array:
         """Return by how many bins return k, or one that it reaches or that reaches it, moved last."""

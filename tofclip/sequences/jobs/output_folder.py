@@ -17,7 +17,7 @@ from tofclip.storage import atomic_path, compute_sha256, translate_read_errors
 SETTINGS_NAME = "settings.json"
 INPUTS_KEY = "inputs"
 MAX_HASHED_BYTES = 1 << 24
-"""Of larger files, size, time of change and the first so many bytes stand for the content."""
+"""Of larger files, size, time of change and the first bytes, this number of them, stand for the content."""
 
 
 def lock_output_folder(
@@ -60,11 +60,11 @@ def lock_output_folder(
     # default None fits folders written before it.
     names = [name for name in {**known, **wanted} if known.get(name) != wanted.get(name)]
     if names:
-        told = ", ".join(
+        reported = ", ".join(
             f"{name} {known.get(name)} instead of {wanted.get(name)}" for name in names
         )
         raise InputError(
-            f"{folder}: holds results of other settings ({told}); choose another folder or remove it"
+            f"{folder}: holds results of other settings ({reported}); choose another folder or remove it"
         )
 
     # A file without a result may change: a damaged shot is replaced, and its run goes on.
