@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.capture import Capture
-from nlos.geometry import FloatArray, Grid
+from nlos.geometry import Grid
 from nlos.method import (
     MEMORY_LIMIT_BYTES,
     Method,
@@ -18,7 +18,8 @@ from nlos.method import (
     Progress,
     require_numpy_signal,
 )
-from nlos.preparation import remove_first_bounce
+from nlos.refinement.counts import CountedPhotons, LikelihoodGain, fit_brightness
+from nlos.refinement.photon_fit import PhotonFit, build_response, compute_beam
 from nlos.refinement.time_of_flight import TimeOfFlight
 from nlos.volume import Volume
 from tofclip.errors import InputError
@@ -34,8 +35,6 @@ COARSE_PASSES = 2
 MIN_COARSE_VOXELS = 8
 """Along every axis; smaller grids are not made coarser."""
 
-MIN_POINTS_PER_SUBSET = 16
-
 FAINT_FRACTION, FAINT_SIGMAS = 2e-3, 1.0
 """Coarse voxels fainter than this, of the brightest voxel's photons or in standard deviations of the
 noise, are not looked at more closely."""
@@ -43,27 +42,18 @@ noise, are not looked at more closely."""
 START_FRACTION = 1e-3
 """Of the brightest voxel, the least that the albedo starts from: 0 would stay 0."""
 
-MIN_GAIN = 1e-5
-"""Gain of likelihood, relative to that over a dark scene, at which the iteration ends."""
-
 RESPONSE_SIGMAS_BINS = (0.0, 0.6, 1.2, 2.5, 5.0)
-OBLIQUITIES = (0, 1, 2)
-"""Instrument's responses, and falls of light with the angle, of which the likeliest are taken."""
+"""Instrument's responses of which the likeliest is taken."""
 
-BACKGROUND_PHOTONS = 50.0
-"""Each wall point's background is drawn to the mean of all as by this number of photons."""
+HELD_OUT_FRACTION, HELD_OUT_SEED = 0.1, 0
+"""Of the photons, what is set aside to judge the refinement by, and the seed that chooses them."""
 
-MIN_BACKGROUND = 1e-6
-"""Photons per bin: nothing is impossible."""
+MIN_GAIN_SIGMAS = 3.0
+"""Gain of likelihood of the photons set aside, in standard deviations, with which the refined image
+is shown and not the linear one."""
 
-MAX_COUNT = 1 << 22
-"""Photons of a bin; more are not counted one by one."""
-
-STEP_TOLERANCE, ROUNDING = 1e-3, 2e-7
-"""What a sample may be off by: of the step between counts, and of itself."""
-
-NOISE_SIGMAS = 3.0
-"""A voxel whose neighbourhood is brighter than noise by this number of standard deviations pays little."""
+FINAL_PASSES = 2
+"""Passes over all photons, those that were set aside included."""
 
 MIN_BEAM_VOXELS = 0.5
 """Standard deviation of the least sharpness that is shown, voxels."""
@@ -72,8 +62,9 @@ UNDECIDED_FRACTION = 1e-2
 """Of the brightest voxel: below, where photons decide little, voxels stand in the order of the
 linear image."""
 
-FINE_SUBSETS = (4, 4, 4, 2, 2)
-"""Subsets of the first passes on fine voxels; later ones treat all of the wall at once."""
+LINEAR_SHOWN = (
+    "photons set aside are no likelier under the refined image: the linear image is shown"
+)
 
 VOLUME_COPIES = 6
 """float32 volumes held at once."""
@@ -95,11 +86,15 @@ class PhotonRefinement(Method):
     Of the instrument's responses and the falls with the angle that may be, the likeliest are
     taken.
 
+    A tenth of the photons is set aside first and judges the fit of the others: unless these are
+    likelier under it than under light as bright as in the linear image, and than under background
+    alone, the linear image is what comes back (`LINEAR_SHOWN`). Otherwise the last passes take all
+    photons.
+
     Parameters
     ----------
     linear : PhasorMethod
-        Gives the image to begin with; it is what comes back where no light stands out of the
-        noise.
+        Gives the image to begin with.
     iterations : int
         Passes over all photons at the end, at most.
     prior_weight : float
@@ -169,20 +164,33 @@ class PhotonPlan(Plan):
 
     @property
     def cost(self) -> int:
-        """The linear image's, and as much for each pass."""
-        return self.linear.cost * (1 + COARSE_PASSES + self.method.iterations)
+        """Two linear images, and as much for each pass."""
+        return self.linear.cost * (2 + COARSE_PASSES + self.method.iterations)
 
     @property
     def memory_bytes(self) -> int:
         signals = self._axis.bins * self._wall.size // 3
-        return self.linear.memory_bytes + 4 * VOLUME_COPIES * self.grid.size + 16 * signals
+        return self.linear.memory_bytes + 4 * VOLUME_COPIES * self.grid.size + 24 * signals
 
     def _image(self, capture: Capture, progress: Progress) -> Volume:
         photons = CountedPhotons.of(capture, self.method.blank, self.method.ramp)
-        image = self.linear.image(photons.capture, progress).magnitude
+        kept, held = photons.hold_out(HELD_OUT_FRACTION, HELD_OUT_SEED)
+        linear = self.linear.image(photons.capture, progress)
+        start = self.linear.image(kept.capture, progress).magnitude.astype(np.float32) ** 2
         passes = _PassProgress(progress, self.linear.cost, COARSE_PASSES + self.method.iterations)
-        fit = self._look_over(photons, image.astype(np.float32) ** 2, passes)
-        stopped = fit.run(self.method.iterations, passes)
+        fit, linear_light = self._look_over(kept, start, passes)
+        last = min(FINAL_PASSES, self.method.iterations - 1)
+        stopped = fit.run(self.method.iterations - last, passes.add)
+        gain = judge(fit, linear_light, held)
+        values = linear.magnitude.astype(np.float32)
+        if gain.nats > MIN_GAIN_SIGMAS * gain.sigma:
+            fit.take(photons)
+            for _ in range(last):
+                fit.improve(1)
+                passes.add()
+            values = show_with_beam(fit, values)
+        else:
+            stopped = LINEAR_SHOWN
         passes.finish()
         settings = {
             "method": "photon refinement",
@@ -192,17 +200,19 @@ class PhotonPlan(Plan):
             "background_per_bin": float(fit.background.mean()),
             "obliquity": fit.model.obliquity,
             "response_sigma_bins": fit.response_sigma,
+            "held_out_gain_nats": gain.nats,
+            "held_out_gain_sigma": gain.sigma,
+            "held_out_seed": HELD_OUT_SEED,
             "iterations": fit.passes,
             "stopped_because": stopped,
         }
-        values = show_with_beam(fit, image)
         return Volume(values, self.grid, {**capture.provenance, "imaging": settings})
 
     def _look_over(
         self, photons: CountedPhotons, start: Array, progress: _PassProgress
-    ) -> PhotonFit:
+    ) -> tuple[PhotonFit, Array]:
         """Fit coarse voxels, choose response and fall of light by them, and return a fit of the
-        fine voxels that hold light.
+        fine voxels that hold light, and the light (points, bins) of the linear image.
         """
         method, axis = self.method, photons.capture.axis
         sigmas: tuple[float, ...] = RESPONSE_SIGMAS_BINS
@@ -214,8 +224,9 @@ class PhotonPlan(Plan):
         albedo = _add_pairs(start) if halved else start
         if not albedo.any():
             raise InputError("the linear image is dark: there is nothing to refine")
-        albedo = np.maximum(albedo, START_FRACTION * albedo.max()).ravel()
-        model = TimeOfFlight(photons.capture, grid, _build_response(sigmas[len(sigmas) // 2]), 1)
+        seen = albedo.ravel()
+        albedo = np.maximum(seen, START_FRACTION * seen.max())
+        model = TimeOfFlight(photons.capture, grid, build_response(sigmas[len(sigmas) // 2]), 1)
         fit = PhotonFit(photons, model, np.arange(grid.size), albedo, 0.0)
         for number in range(COARSE_PASSES):
             fit.improve(SUBSETS, method.prior_weight if number else 0.0)
@@ -239,246 +250,35 @@ class PhotonPlan(Plan):
         fine = replace(fit.model, grid=self.grid)
         made = PhotonFit(photons, fine, voxels, albedo, method.prior_weight)
         made.background, made.response_sigma = fit.background, fit.response_sigma
-        return made
+        everyone = np.arange(len(photons.counts))
+        return made, fit.model.compute_light(seen, fit.voxels, everyone)
 
 
-@dataclass(frozen=True, eq=False)
-class CountedPhotons:
-    """What was counted, and where.
-
-    Parameters
-    ----------
-    capture : Capture
-        For the linear image: with the wall's own light blanked.
-    counts : (points, bins) float32 array
-        Photons.
-    observed : (points, bins) bool array
-        Bins whose counts are taken into account.
-    """
-
-    capture: Capture
-    counts: NDArray[np.float32]
-    observed: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, capture: Capture, blank: float = 0.0, ramp: float = 0.0) -> CountedPhotons:
-        """Read the counts of a capture.
-
-        Parameters
-        ----------
-        capture : Capture
-        blank, ramp : float
-            See `PhotonRefinement`.
-
-        Returns
-        -------
-        CountedPhotons
-
-        Raises
-        ------
-        InputError
-            The signals are not counts: some are negative, or not multiples of one step.
-        """
-        counts = np.ascontiguousarray(capture.traces())
-        if counts.min() < 0:
-            raise InputError(
-                "--refine photons needs photon counts, and this capture holds negative signals, as "
-                "where background was taken off: leave --refine out, or give the counts themselves"
-            )
-        lit = counts[counts > 0]
-        if lit.size == 0:
-            raise InputError("every signal is 0: there is nothing to image")
-        steps = lit.astype(np.float64) / float(lit.min())
-        off = np.abs(steps - np.round(steps))
-        if steps.max() > MAX_COUNT or np.any(off > STEP_TOLERANCE + ROUNDING * steps):
-            raise InputError(
-                "--refine photons needs photon counts, and this capture's signals are not multiples "
-                "of one step: leave --refine out, or give the counts themselves"
-            )
-        observed = np.ones(counts.shape, bool)
-        if blank > 0:
-            direct = np.linalg.norm(capture.points - capture.lasers, axis=1)
-            observed = capture.axis.paths > (direct + blank)[:, np.newaxis]
-            capture = remove_first_bounce(capture, blank, ramp)
-        return cls(
-            capture, np.where(observed, counts / float(lit.min()), 0).astype(np.float32), observed
-        )
-
-
-class PhotonFit:
-    """Albedo of some voxels, and background, fitted to photons.
+def judge(fit: PhotonFit, linear_light: Array, held: Array) -> LikelihoodGain:
+    """Compare a fit with light as bright as in the linear image, and with background alone, by
+    photons that neither has seen.
 
     Parameters
     ----------
-    photons : CountedPhotons
-    model : TimeOfFlight
-    voxels : (n,) int array
-        Flat indices into the model's grid.
-    albedo : (n,) array
-        To begin with, on any scale; nowhere 0.
-    prior_weight : float
-        See `PhotonRefinement`.
+    fit : PhotonFit
+        Of the photons that were kept.
+    linear_light : (points, bins) array
+        On any scale.
+    held : (points, bins) array
+        Photons that were set aside, `HELD_OUT_FRACTION` of all.
 
-    Attributes
-    ----------
-    albedo : (n,) float32 array
-    background : (points,) float32 array
-        Photons per bin.
-    likelihood : float
-        Logarithm of the likelihood before the last pass.
-    passes : int
+    Returns
+    -------
+    LikelihoodGain
+        Over the better of the two.
     """
-
-    def __init__(
-        self,
-        photons: CountedPhotons,
-        model: TimeOfFlight,
-        voxels: Array,
-        albedo: Array,
-        prior_weight: float,
-    ) -> None:
-        self.photons, self.model, self.voxels = photons, model, voxels
-        self.prior_weight, self.passes, self.likelihood = prior_weight, 0, -np.inf
-        self.response_sigma = 0.0
-        self._everyone = np.arange(len(photons.counts))
-        self._seen = photons.observed.sum(axis=1)
-        ones = photons.observed.astype(np.float32)
-        self._sensitivity = np.maximum(model.backproject(ones, voxels, self._everyone), 1e-30)
-        # As if half of all photons were background: either share is soon put right.
-        half = 0.5 * float(photons.counts.sum())
-        total = float(np.sum(self._sensitivity * albedo))
-        self.albedo = (albedo * (half / total)).astype(np.float32)
-        self.background = np.full(len(ones), half / max(self._seen.sum(), 1), np.float32)
-        self._price: Array = np.zeros(len(voxels), np.float32)
-
-    @property
-    def expected_photons(self) -> Array:
-        """Photons that every voxel sends to the wall, (n,)."""
-        return self.albedo * self._sensitivity
-
-    def place(self, values: Array) -> Array:
-        """Put values (n,) of the voxels into a volume (z, y, x)."""
-        volume = np.zeros(self.model.grid.size, np.float32)
-        volume[self.voxels] = values
-        return volume.reshape(self.model.grid.shape)
-
-    def run(self, iterations: int, progress: _PassProgress) -> str:
-        """Improve the albedo until the likelihood hardly grows; return why it ended.
-
-        Parameters
-        ----------
-        iterations : int
-            Passes at most.
-        progress : _PassProgress
-
-        Returns
-        -------
-        str
-        """
-        for number in range(iterations):
-            before = self.likelihood
-            self.improve(FINE_SUBSETS[number] if number < len(FINE_SUBSETS) else 1)
-            progress.add()
-            if number > len(FINE_SUBSETS) and self.likelihood - before < MIN_GAIN * abs(before):
-                return "converged"
-        return "iteration limit"
-
-    def improve(self, subsets: int, prior_weight: float | None = None) -> None:
-        """Improve albedo and background once by every subset of the wall points.
-
-        Parameters
-        ----------
-        subsets : int
-        prior_weight : float, optional
-            The fit's own by default.
-        """
-        subsets = max(1, min(subsets, len(self._everyone) // MIN_POINTS_PER_SUBSET))
-        weight = self.prior_weight if prior_weight is None else prior_weight
-        if weight > 0:
-            self._price = weight * self._compute_price()
-        self.likelihood = sum(
-            self._improve_by(self._everyone[first::subsets], subsets) for first in range(subsets)
-        )
-        self.passes += 1
-
-    def _improve_by(self, points: Array, subsets: int) -> float:
-        """One step of expectation maximisation on some wall points; return their likelihood."""
-        counts, observed = self.photons.counts[points], self.photons.observed[points]
-        expected = self._expect(points)
-        ratios = np.where(observed, counts / expected, 0).astype(np.float32)
-        seen = self.model.backproject(ratios, self.voxels, points)
-        own = self._sensitivity
-        if subsets > 1:
-            own = self.model.backproject(observed.astype(np.float32), self.voxels, points)
-        share = len(points) / len(self._everyone)
-        self.albedo *= seen / np.maximum(own + share * self._price, 1e-30)
-        # The background of every wall point, drawn to the mean of all.
-        mean = float(self.background.mean())
-        drawn = self.background[points] * ratios.sum(axis=1) + BACKGROUND_PHOTONS
-        fitted = drawn / (self._seen[points] + BACKGROUND_PHOTONS / mean)
-        self.background[points] = np.maximum(fitted, MIN_BACKGROUND)
-        return float(np.sum(np.where(observed, counts * np.log(expected) - expected, 0)))
-
-    def _expect(self, points: Array) -> Array:
-        light = self.model.compute_light(self.albedo, self.voxels, points)
-        return np.maximum(light, 0) + self.background[points, np.newaxis]
-
-    def _compute_price(self) -> Array:
-        """What a voxel pays for its albedo: one standard deviation of what noise brings it, and
-        less where its neighbourhood is bright.
-        """
-        from scipy.ndimage import gaussian_filter
-
-        sharpness = self.compute_sharpness()
-        around = gaussian_filter(self.place(self.albedo), 1.0).ravel()[self.voxels]
-        return np.asarray(sharpness / (1 + around * sharpness / NOISE_SIGMAS))
-
-    def compute_sharpness(self) -> Array:
-        """Return the inverse of the standard deviation that photon noise gives each voxel's albedo,
-        were it alone, (n,): the root of Fisher's information.
-        """
-        known = np.where(self.photons.observed, 1 / self._expect(self._everyone), 0)
-        information = self.model.backproject(known, self.voxels, self._everyone, squared=True)
-        return np.asarray(np.sqrt(np.maximum(information, 0)))
-
-    def with_likeliest_model(self, sigmas: tuple[float, ...]) -> PhotonFit:
-        """Return the same fit with the response and the fall with the angle under which the photons
-        are likeliest.
-
-        Parameters
-        ----------
-        sigmas : tuple of float
-            Standard deviations of responses, bins.
-
-        Returns
-        -------
-        PhotonFit
-        """
-        some = self._everyone[:: max(1, len(self._everyone) // 512)]
-        best: tuple[float, PhotonFit] | None = None
-        for obliquity in OBLIQUITIES:
-            bare = replace(self.model, response=np.ones(1), obliquity=obliquity)
-            fit = PhotonFit(self.photons, bare, self.voxels, self.albedo, self.prior_weight)
-            light = bare.compute_light(fit.albedo, fit.voxels, some)
-            # As much light as this fit found, whatever the angles.
-            light *= float(self.expected_photons.sum() / fit.expected_photons.sum())
-            for sigma in sigmas:
-                response = _build_response(sigma)
-                expected = bare.spread(light, response) + self.background[some, np.newaxis]
-                terms = self.photons.counts[some] * np.log(np.maximum(expected, MIN_BACKGROUND))
-                likelihood = float(np.sum((terms - expected)[self.photons.observed[some]]))
-                if best is None or likelihood > best[0]:
-                    chosen = fit
-                    chosen.model = replace(bare, response=response)
-                    chosen.response_sigma = sigma
-                    best = likelihood, chosen
-        assert best is not None
-        found = best[1]
-        found.albedo *= np.float32(
-            self.expected_photons.sum() / max(float(found.expected_photons.sum()), 1e-30)
-        )
-        found.background = self.background
-        return found
+    share, photons = HELD_OUT_FRACTION / (1 - HELD_OUT_FRACTION), fit.photons
+    expected = share * fit.expect()
+    gains = [
+        LikelihoodGain.of(held, expected, share * fit_brightness(photons, light), photons.observed)
+        for light in (linear_light, np.zeros_like(linear_light))
+    ]
+    return min(gains, key=lambda gain: gain.nats)
 
 
 def show_with_beam(fit: PhotonFit, linear: Array) -> Array:
@@ -511,34 +311,6 @@ def show_with_beam(fit: PhotonFit, linear: Array) -> Array:
     )
 
 
-def compute_beam(fit: PhotonFit) -> FloatArray:
-    """Return the standard deviations along z, y and x, m, to which arrival times tell the place of
-    a thing in the middle of the light.
-
-    Parameters
-    ----------
-    fit : PhotonFit
-
-    Returns
-    -------
-    (3,) array
-    """
-    capture, grid = fit.photons.capture, fit.model.grid
-    volume = fit.place(fit.expected_photons).astype(np.float64)
-    axes = (grid.z, grid.y, grid.x)
-    weights = [volume.sum(axis=tuple({0, 1, 2} - {i})) for i in range(3)]
-    middle = np.array([np.average(a, weights=w) for a, w in zip(axes, weights, strict=True)])
-    place = middle[::-1]
-    back, out = place - capture.points, place - capture.lasers
-    far, near = (np.linalg.norm(one, axis=1, keepdims=True) for one in (back, out))
-    gradients = back / far + out / near
-    light = ((far * near) ** -2.0).ravel()
-    spacing = capture.axis.spacing
-    path = spacing * np.hypot(fit.response_sigma, 12**-0.5)
-    slopes = np.sqrt(np.average(gradients**2, axis=0, weights=np.broadcast_to(light, len(back))))
-    return np.asarray(path / np.maximum(slopes[::-1], 1e-3))
-
-
 class _PassProgress:
     """Progress of passes, each of which counts as much as the linear image."""
 
@@ -554,17 +326,6 @@ class _PassProgress:
         """Report the passes that were not needed."""
         self._progress(self._cost * self._left)
         self._left = 0
-
-
-def _build_response(sigma: float) -> FloatArray:
-    """Return a Gaussian response, its standard deviation in bins."""
-    if sigma <= 0.1:
-        return np.ones(1)
-    from scipy.special import ndtr
-
-    reach = int(np.ceil(4 * sigma))
-    response = np.diff(ndtr((np.arange(-reach, reach + 2) - 0.5) / sigma))
-    return np.asarray(response / response.sum())
 
 
 def _merge_pairs_of_voxels(grid: Grid) -> Grid:
