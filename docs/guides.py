@@ -11,23 +11,18 @@ import contextlib
 import os
 import re
 import shlex
-import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
 from apps.cli import main
+from apps.figures.style import store_picture
 from apps.help import PROGRAM
-from tofclip.storage import atomic_path
 
 BLOCK_PATTERN = re.compile(r"^```(sh|python)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 PICTURE_PATTERN = re.compile(r"!\[[^\]]*\]\((pictures/[^)]+)\)")
-MAX_UNREDUCED_BYTES = 150_000  # bytes of a picture that is kept as it is
-PALETTE_SIZE = 256  # of a larger one: a quarter of the size, off by less than 16 of 255 anywhere
 
 
 def read_steps(guide: Path) -> list[tuple[str, str]]:
@@ -95,20 +90,8 @@ def make_pictures(guide: Path, inputs: Path) -> None:
             if status:
                 raise SystemExit(f"{step}: exit status {status}")
         for name, place in find_pictures(guide).items():
-            _store_picture(Path(name), place)
-
-
-def _store_picture(picture: Path, place: Path) -> None:
-    place.parent.mkdir(parents=True, exist_ok=True)
-    if picture.stat().st_size <= MAX_UNREDUCED_BYTES:
-        with atomic_path(place) as temporary:
-            shutil.copyfile(picture, temporary)
-        return
-    with Image.open(picture) as whole, atomic_path(place) as temporary:
-        few = whole.convert("RGB").quantize(
-            PALETTE_SIZE, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
-        )
-        few.save(temporary, format="PNG", optimize=True)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            store_picture(Path(name), place)
 
 
 if __name__ == "__main__":

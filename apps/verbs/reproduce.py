@@ -12,7 +12,7 @@ import typer
 
 from apps.conventions import ClusterOption, JsonOption, make_completer, make_folder, report
 from apps.figures.reproduction import make_reproduction_figure
-from apps.figures.style import save_figure
+from apps.figures.style import save_figure, store_picture
 from apps.progress import show_progress
 from apps.reproduction import STUDY_FOLDER, load_result, make_result, write_page, write_result
 from apps.sequences import report_summary, run_with_progress
@@ -170,7 +170,9 @@ def _run_study(
     seconds = time.perf_counter() - started
     recorded = "" if library.data is None else f" --data {library.data.name}"
     command = f"tofclip reproduce {study.name} --out {folder.parent.name or '.'}{recorded} --seeds {seeds}"
-    save_figure(make_reproduction_figure(study.title, outcome), folder / f"{study.name}.png")
+    picture = folder / f"{study.name}.png"
+    save_figure(make_reproduction_figure(study.title, outcome), picture)
+    store_picture(picture, picture)
     result = make_result(
         study, outcome, _describe_settings(study, library, seeds), command, seconds
     )

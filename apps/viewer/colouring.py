@@ -37,6 +37,9 @@ MAX_RANKED_POINTS = 100_000
 PALETTES = ("viridis", "cividis", "inferno", "magma", "plasma", "turbo", "grey")
 """All but turbo are perceptually uniform; turbo separates most ranges."""
 
+TURBO_ENDS = 0.09, 0.93
+"""Turbo's darkest blue and red are left out: shaded, the nearest and the farthest would be black."""
+
 
 @dataclass(frozen=True)
 class Quantity:
@@ -273,7 +276,8 @@ def load_palette(name: str) -> NDArray[np.uint8]:
     """Return the colours of a palette, (256, 3)."""
     from matplotlib import colormaps
 
-    table = colormaps["gray" if name == "grey" else name](np.linspace(0, 1, PALETTE_SIZE))
+    ends = TURBO_ENDS if name == "turbo" else (0.0, 1.0)
+    table = colormaps["gray" if name == "grey" else name](np.linspace(*ends, PALETTE_SIZE))
     return np.ascontiguousarray(np.rint(255 * table[:, :3]), dtype=np.uint8)
 
 

@@ -30,7 +30,7 @@ MAX_FRAMES_PER_S = 30.0
 MAX_POINTS_PER_S = 2e6
 """What a browser with a software renderer takes without falling behind."""
 
-MIN_DRAWN_POINTS = 15_000
+MIN_DRAWN_POINTS = 16_000
 """Every renderer takes so many 20 times a second; smaller clouds are always drawn whole."""
 
 MOVING_FRAME_S, STILL_FRAME_S = 0.08, 0.5

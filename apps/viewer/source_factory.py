@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 LOOK_METHODS = ("tv", "l1", "linear", "adjoint")
 """`tofclip.recovery` has one more, which takes half a minute."""
 
-FIRST_LOOK_METHOD, FIRST_LOOK_ITERATIONS = "l1", 40
-"""Enough to read what is written on a surface; `tofclip recover` takes 60."""
+FIRST_LOOK_METHOD, FIRST_LOOK_ITERATIONS = "l1", 25
+"""Enough to read what is written on a surface; `tofclip recover` takes 40."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class ShotOptions:
         Reading of the time axis at which light of range 0 would arrive, s; by default the camera's.
     method : str, optional
         How shots are recovered: a name of `tofclip.recovery.METHODS` but ``"surfaces"``. By default
-        a single one by a few iterations of ``"tv"``, and one after the other by ``"linear"``.
+        a single one by a few iterations of ``"l1"``, and one after the other by ``"linear"``.
     """
 
     camera: Path | None = None
