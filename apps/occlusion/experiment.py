@@ -66,6 +66,8 @@ class ExperimentSettings:
     photons : float
         Of the brightest measurement at its brightest instant.
     seed : int
+    samples : int
+        Rays on a side of each pixel.
 
     Raises
     ------
@@ -79,6 +81,7 @@ class ExperimentSettings:
     illumination: str = "diodes"
     photons: float = 2000.0
     seed: int = 0
+    samples: int = 2
 
     def __post_init__(self) -> None:
         if self.illumination not in ILLUMINATIONS:
@@ -115,6 +118,7 @@ class Experiment:
             focal_length_px=side / FIELD_OF_VIEW_RAD,
             view_step=self.scene.region.baseline / (VIEW_COUNT - 1),
             focus=2 / (1 / near + 1 / far),
+            samples=self.settings.samples,
             view_rows=1,
         )
         setup = CameraSetup(self.settings.encoder, self.settings.sampling_ratio, self.settings.seed)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -41,8 +42,10 @@ BRIGHT_FRACTION, WHITE_QUANTILE = 0.2, 0.99
 STOP_TIMEOUT_S = 20.0
 
 ONE_CAMERA, ONE_CAMERA_GATED = "one camera", "one camera behind the gate"
-CLIP_GATED, TRUTH = "ToF-CLIP behind the gate", "truth: the occluder taken away"
-ALL_LIGHT, BEHIND_GATE = "all light, without a gate", "ToF-CLIP behind the gate"
+CLIP_GATED, TRUTH = "ToF-CLIP behind the gate", "truth, no occluder"
+ALL_LIGHT = "all light"
+SHOWN_SIDE_PX, GAP_PX = 192, 6
+"""Of the pictures beside the scene, and between two of them."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,7 @@ class WalkSource(Source):
         self._scene, self._settings = scene, settings
         self._frames: deque[WalkFrame] = deque(maxlen=MAX_KEPT_FRAMES)
         self._lock, self._stopping = threading.Lock(), threading.Event()
-        self._count, self._failure_text = 0, ""
+        self._count, self._seconds, self._failure_text = 0, float("nan"), ""
         places = np.linspace(-WALK_REACH_M, WALK_REACH_M, WALK_STEPS).tolist()
         self._walk = itertools.cycle([*places, *places[-2:0:-1]])
         self._take_step()
@@ -120,6 +123,14 @@ class WalkSource(Source):
     @property
     def is_live(self) -> bool:
         return self._thread.is_alive()
+
+    @property
+    def data_rate(self) -> float:
+        return 1 / self._seconds if self.is_live else 0.0
+
+    @property
+    def latency(self) -> float:
+        return self._seconds
 
     @property
     def failure_text(self) -> str:
@@ -144,8 +155,13 @@ class WalkSource(Source):
         Returns
         -------
         mapping of str to (rows, columns) array
+            Two beside each other in each.
         """
-        return self._find_frame(number).pictures
+        pictures = self._find_frame(number).pictures
+        return {
+            f"{left} | {right}": pair_pictures(pictures[left], pictures[right])
+            for left, right in ((ONE_CAMERA, CLIP_GATED), (ONE_CAMERA_GATED, TRUTH))
+        }
 
     def close(self) -> None:
         self._stopping.set()
@@ -166,6 +182,7 @@ class WalkSource(Source):
             self._failure_text = format_error_line(fault)
 
     def _take_step(self) -> None:
+        started = time.monotonic()
         scene = self._scene.widen_occluder(self._width.value * MILLIMETRE)
         settings = replace(self._settings, seed=self._settings.seed + self._count)
         there = Experiment(scene.move_target(next(self._walk)), settings)
@@ -173,6 +190,7 @@ class WalkSource(Source):
         with self._lock:
             self._frames.append(made)
             self._count += 1
+        self._seconds = time.monotonic() - started
 
 
 def look_behind(experiment: Experiment, opens: float) -> WalkFrame:
@@ -234,6 +252,27 @@ def separate_at(
     if returns[0].bins.stop == measurements.time_axis.bins:  # all light came through the gate
         return dark, found.occluder, (opens, distance)
     return found.occluder, dark, (distance, opens)
+
+
+def pair_pictures(left: Picture, right: Picture) -> Picture:
+    """Put two pictures of one shape beside each other, each at its own brightness.
+
+    Parameters
+    ----------
+    left, right : (rows, columns) arrays
+
+    Returns
+    -------
+    (n, m) array
+        Enlarged, so that they can be looked at.
+    """
+    times = max(1, SHOWN_SIDE_PX // max(left.shape))
+    parts = [
+        np.maximum(one, 0) / max(float(np.quantile(one, 0.997)), 1e-12) for one in (left, right)
+    ]
+    first, second = (np.minimum(one, 1).repeat(times, 0).repeat(times, 1) for one in parts)
+    gap = np.ones((len(first), GAP_PX))
+    return np.hstack([first, gap, second]).astype(np.float32)
 
 
 def describe_region(scene: OcclusionScene) -> str:
@@ -351,13 +390,13 @@ class GatedSource(Source):
         Returns
         -------
         mapping of str to (rows, columns) array
+            Both beside each other.
         """
         frames = self._recover(number)
         distance: Any = SPEED_OF_LIGHT * frames.times / 2
-        return {
-            ALL_LIGHT: frames.values.sum(axis=0),
-            BEHIND_GATE: frames.values[distance >= self._gate.value].sum(axis=0),
-        }
+        behind = frames.values[distance >= self._gate.value].sum(axis=0)
+        pair = pair_pictures(frames.values.sum(axis=0), behind)
+        return {f"{ALL_LIGHT} | {CLIP_GATED}": pair}
 
     def close(self) -> None:
         self._shots.close()

@@ -192,7 +192,8 @@ def demo(
     # A single pixel sums a whole picture and so needs more photons.
     usual = DEFAULT_PHOTONS[encoder] if photons is None else photons
     side = side_px or (LIVE_SIDE_PX if live else SIDE_PX)
-    settings = ExperimentSettings(side, encoder, sampling_ratio, illumination, usual, seed)
+    rays = 1 if live else ExperimentSettings.samples
+    settings = ExperimentSettings(side, encoder, sampling_ratio, illumination, usual, seed, rays)
     if live or out is None:
         zero = None if time_zero_ns is None else time_zero_ns * NANOSECOND
         _show_live(scene, settings, (recording, camera, zero), (port, no_browser, as_json))
