@@ -26,7 +26,6 @@ def execute(name: str, folder: Path) -> tuple[str, list[float]]:
     return page.read_text(), contrasts
 
 
-@pytest.mark.nightly
 def test_the_notebook_of_a_light_field(tmp_path: Path) -> None:
     page, contrasts = execute("light_field", tmp_path)
     assert "2048 readings of 262144 pixels in 64 views" in page
