@@ -1,0 +1,42 @@
+"""Every instrument has a page, which names every value that its address takes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import tofclip
+from devices import aravis
+from devices.histogram_kits import source as kits
+from devices.linospad2 import simulation as linospad2
+from devices.registry import FILE_OPENERS, OPENERS
+from devices.remoteex import source as remoteex
+from devices.spad512 import source as spad512
+from devices.timetag import source as timetag
+
+DOCS = Path(tofclip.__file__).parents[1] / "docs"
+PAGES = {
+    "timetag": timetag.OPTIONS,
+    "remoteex": remoteex.OPTIONS,
+    "spad512": spad512.OPTIONS,
+    "aravis": aravis.OPTIONS,
+    "histogram_kits": (*kits.TMF8828_OPTIONS, *kits.VL53L8_OPTIONS),
+    "linospad2": linospad2.OPTIONS,
+}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_names_every_value_of_the_address(page: str) -> None:
+    text = (DOCS / "instruments" / f"{page}.md").read_text()
+    assert [name for name in PAGES[page] if f"`{name}`" not in text] == []
+    assert f"instruments/{page}" in (DOCS / "instruments.md").read_text()
+
+
+def test_every_address_is_on_a_page() -> None:
+    pages = {path.stem: path.read_text() for path in (DOCS / "instruments").glob("*.md")}
+    text = "\n".join(pages.values())
+    assert set(pages) == {*PAGES, "files"}
+    assert [scheme for scheme in OPENERS if f"{scheme}://" not in text] == []
+    endings = [ending for ending in FILE_OPENERS if ending.startswith(".")]
+    assert [one for one in endings if one not in (".tiff", ".hdf5") and one not in text] == []
