@@ -42,8 +42,9 @@ FILE_OPENERS: dict[str, str] = {
     ".tif": "devices.streak_file:open_streak_file",
     ".tiff": "devices.streak_file:open_streak_file",
     ".phu": "devices.tcspc:open_phu",
-    ".ptu": "devices.ptu:open_ptu",
+    ".ptu": "devices.tcspc:open_ptu",
     ".sdt": "devices.tcspc:open_sdt",
+    ".ttbin": "devices.tcspc:open_ttbin",
     ".h5": "devices.replay:open_recording",
     ".hdf5": "devices.replay:open_recording",
 }

@@ -1,14 +1,20 @@
-"""Files of time-correlated single-photon counting: PicoQuant's PTU and PHU, Becker & Hickl's SDT.
+"""Files of time-correlated single-photon counting: photons one by one (PicoQuant's PTU, Swabian
+Instruments' TTBIN) and whole histograms (PicoQuant's PHU, Becker & Hickl's SDT).
 
-The libraries `ptufile` and `sdtfile` read them (extra ``tcspc``). Photons one by one come from
-`devices.ptu`; here are whole histograms (PHU, SDT).
+::
+
+    file -> reader: pieces of records -> TcspcFile, a source
+
+The libraries `ptufile` and `sdtfile` (extra ``tcspc``) and Swabian Instruments' own read them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +24,11 @@ from devices.ledger import Ledger
 from devices.source import READ_TIMEOUT_S, Batch, Info, Source
 from devices.statistics import Stats
 from devices.uri import Uri
-from tofclip.errors import FileFormatError, InputError, MissingDependencyError, TofclipError
+from tofclip.dependencies import import_file_reader
+from tofclip.errors import FileFormatError, InputError, TofclipError
 from tofclip.file_limits import BoundedFile, require_bounded_size
-from tofclip.io.becker_hickl import require_bounded_sdt
+from tofclip.io.becker_hickl import read_sdt_blocks
+from tofclip.io.picoquant import TCSPC, Checkpoint, PtuEvents, PulseCount, require_pulses
 from tofclip.storage import Record, Scalar, format_error_line, translate_read_errors
 
 HISTOGRAM_BYTES = 4
@@ -32,61 +40,75 @@ from 0.
 """
 
 BATCH_RECORDS = 1 << 16
-MAX_FILE_BYTES = 1 << 31
-"""Larger files are not read: their photons would not fit into memory four times over."""
+MAX_HISTOGRAM_FILE_BYTES = 1 << 31
+"""Larger files of histograms are not read: they would not fit into memory four times over."""
 
 MAX_BINS = 1 << 20
+SWABIAN_CHUNK_TAGS = 1 << 20
+SWABIAN_TAG, SWABIAN_MISSED = 0, 4
+"""Types of Swabian Instruments' events: a time tag, and a number of tags that were lost."""
 
-FileContents = tuple[Records, dict[str, Scalar], Info]
+PICOSECOND_S = 1e-12
+
+
+class Reader(Protocol):
+    """A file as pieces of records."""
+
+    info: Info
+    attributes: dict[str, Scalar]
+    """Of the calibration."""
+    sizes: list[int]
+    """Records of each piece."""
+    lost: int
+    """Records that the electronics say they lost."""
+
+    def decode(self, piece: int) -> Records:
+        """Return the records of a piece."""
 
 
 class TcspcFile(Source):
-    """A file's records. Memory: four times the file, which the libraries read as a whole.
+    """A file's records. Memory: one piece of it, decoded.
 
-    The calibration has ``resolution_s``, the width of a bin, and ``channels``.
+    The calibration has ``resolution_s``, the width of a bin, and ``channels``; of photons also
+    ``laser_period_s``, of images ``rows`` and ``columns``.
 
     Parameters
     ----------
     path : path-like
-    reader : callable
-        Makes records, calibration and info of the file.
+    open_file : callable
+        Makes the file's reader.
 
     Raises
     ------
     StorageError
         The file is absent or may not be read.
     FileFormatError
-        It is damaged.
+        It is damaged, or has no pulses to count from.
     """
 
-    def __init__(self, path: str | Path, reader: Callable[[Path], FileContents]) -> None:
-        with translate_read_errors(path):
-            size = Path(path).stat().st_size
-        if size > MAX_FILE_BYTES:
-            raise FileFormatError(
-                path, f"is larger than {MAX_FILE_BYTES} bytes; export a part of it"
-            )
+    def __init__(self, path: str | Path, open_file: Callable[[Path], Reader]) -> None:
         try:
             with translate_read_errors(path):
-                self._records, self._attributes, self._info = reader(Path(path))
+                Path(path).stat()  # some libraries say of an absent file that it is damaged
+                self._reader = open_file(Path(path))
         except TofclipError:
             raise
-        except (
-            Exception
-        ) as fault:  # whatever the library stumbles over, it is the file that is damaged
+        except Exception as fault:  # whatever the library stumbles over, the file is damaged
             raise FileFormatError(
                 path, f"is a damaged or unsupported file ({format_error_line(fault)})"
             ) from fault
+        self._begins = [0, *accumulate(self._reader.sizes)]
         self._closed = False
+        self._decoded: tuple[int, Records] | None = None
         self.seek(0)
 
     @property
     def info(self) -> Info:
-        return self._info
+        return self._reader.info
 
     @property
     def calibration(self) -> Record:
-        return Record("tcspc_calibration", attributes=self._attributes)
+        return Record("tcspc_calibration", attributes=self._reader.attributes)
 
     @property
     def stats(self) -> Stats:
@@ -99,103 +121,184 @@ class TcspcFile(Source):
     def read(self, timeout: float = READ_TIMEOUT_S) -> Batch | None:
         """Return the next batch at once; `timeout` does not matter."""
         first = self._next
-        records = self._records[first : first + BATCH_RECORDS]
-        if self._closed or len(records) == 0:
+        if self._closed or first == self._begins[-1]:
             return None
+        piece = int(np.searchsorted(self._begins, first, "right")) - 1
+        if self._decoded is None or self._decoded[0] != piece:
+            self._decoded = None  # one at a time
+            self._decoded = piece, self._reader.decode(piece)
+        start = first - self._begins[piece]
+        records = self._decoded[1][start : start + BATCH_RECORDS]
         self._next += len(records)
         self._ledger.deliver(len(records), 0)
         return Batch(records, first)
 
     def seek(self, record: int) -> None:
-        if not 0 <= record <= len(self._records):
+        if not 0 <= record <= self._begins[-1]:
             raise InputError(
-                f"the file has {len(self._records)} records, there is no number {record}"
+                f"the file has {self._begins[-1]} records, there is no number {record}"
             )
         self._next, self._ledger = record, Ledger()
-        self._ledger.receive(len(self._records))
+        self._ledger.receive(self._begins[-1])
         self._ledger.deliver(record, 0)
+        self._ledger.lose(self._reader.lost)
 
     def close(self) -> None:
         self._closed = True
 
 
+@dataclass
+class Histograms:
+    """Whole histograms as one piece; see `Reader`."""
+
+    records: Records
+    info: Info
+    attributes: dict[str, Scalar]
+    sizes: list[int] = field(init=False)
+    lost: int = 0
+
+    def __post_init__(self) -> None:
+        self.sizes = [len(self.records)]
+
+    def decode(self, piece: int) -> Records:
+        """Return all of them."""
+        return self.records
+
+
+class PtuPhotons:
+    """Photons of a PTU file; see `Reader`. Opening reads the file once, to know its channels and
+    where each piece begins. Markers are passed over; pictures are read by `tofclip.lidar.photons`.
+
+    Parameters
+    ----------
+    path : Path
+    sync : int, optional
+        Channel of the laser's pulses in T2 mode; by default the electronics' own input for them.
+    """
+
+    lost = 0
+
+    def __init__(self, path: Path, sync: int | None = None) -> None:
+        self._events = events = PtuEvents(path, sync)
+        self._checkpoints, self.sizes, channels = [Checkpoint()], [], 1
+        for found, behind in events:
+            self._checkpoints.append(behind)
+            self.sizes.append(int(found.is_photon.sum()))
+            channels = max(channels, int(found.channel.max(initial=0, where=found.is_photon)) + 1)
+        period = events.period
+        if not events.is_t3:
+            count = self._checkpoints[-1].count
+            require_pulses(path, count)
+            period = count.period_ticks * events.tick
+        self.attributes = _describe_photons(events.resolution, channels, period, path)
+        self.info = Info(f"TCSPC file ({events.kind})", "", dict(self.attributes))
+
+    def decode(self, piece: int) -> Records:
+        """Return the photons of a million events."""
+        found = self._events.decode(piece, self._checkpoints[piece])[0]
+        columns = (found.pulse, found.delay, found.channel)
+        return _make_photons(*(column[found.is_photon] for column in columns))
+
+
+class SwabianPhotons:
+    """Photons of Swabian Instruments' files; see `Reader`. Their library reads forwards only, so
+    that stepping back begins anew.
+
+    Parameters
+    ----------
+    path : Path
+    sync : int
+        Channel of the laser's pulses, as the instrument numbers it: negative for falling edges. All
+        others become channels from 0, in the order of their numbers.
+    """
+
+    def __init__(self, path: Path, sync: int) -> None:
+        self._library = import_file_reader("Swabian.TimeTagger", "swabian-timetagger")
+        self._path, self._sync = path, sync
+        self._inputs: list[int] = []
+        self._rewind()
+        self.sizes, self.lost = [], 0
+        inputs: set[int] = set()
+        count = PulseCount()
+        while self._file.hasData():
+            (_, _, channel), lost = self._read_next()
+            inputs |= set(np.unique(channel).tolist())
+            self.sizes.append(len(channel))
+            self.lost += lost
+            count = self._count
+        if count.pulses < 2:
+            raise InputError(
+                f"{path}: has no laser's pulses on channel {sync}; name theirs: sync=..., other "
+                f"channels are {', '.join(map(str, sorted(inputs))) or 'none'}"
+            )
+        self._inputs = sorted(inputs)
+        self._rewind()
+        self.attributes = _describe_photons(
+            PICOSECOND_S, max(1, len(inputs)), count.period_ticks * PICOSECOND_S, path
+        )
+        details = {**self.attributes, "inputs": ",".join(map(str, self._inputs))}
+        self.info = Info("time tags (Swabian Instruments)", "", details)
+
+    def decode(self, piece: int) -> Records:
+        """Return the photons of a million tags."""
+        if piece < self._next:
+            self._rewind()
+        while True:
+            (pulse, delay, channel), _ = self._read_next()
+            if self._next == piece + 1:
+                return _make_photons(pulse, delay, np.searchsorted(self._inputs, channel))
+
+    def _rewind(self) -> None:
+        self._file = self._library.FileReader(str(self._path))
+        self._file.getConfiguration()  # which fails for a damaged file; opening it does not
+        self._count, self._next = PulseCount(), 0
+
+    def _read_next(
+        self,
+    ) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]], int]:
+        """Return number of the pulse, time after it and channel of the next photons, and how many
+        tags the instrument lost among them.
+        """
+        tags = self._file.getData(SWABIAN_CHUNK_TAGS)
+        kind, channel = np.asarray(tags.getEventTypes()), np.asarray(tags.getChannels(), np.int64)
+        time = np.asarray(tags.getTimestamps(), np.int64)
+        is_tag = kind == SWABIAN_TAG
+        is_pulse = is_tag & (channel == self._sync)
+        pulse, delay, self._count = self._count.find_pulses(time, is_pulse)
+        is_photon = is_tag & ~is_pulse & (pulse >= 0)
+        lost = int(np.asarray(tags.getMissedEvents())[kind == SWABIAN_MISSED].sum())
+        self._next += 1
+        return (pulse[is_photon], delay[is_photon], channel[is_photon]), lost
+
+
+def open_ptu(uri: Uri) -> TcspcFile:
+    """Open ``file://run.ptu``; ``sync=N`` where a file in T2 mode has the laser's pulses on an input
+    for photons.
+    """
+    uri.reject_unknown("sync")
+    sync = uri.value("sync", int, 0) if "sync" in uri.values else None
+    return TcspcFile(uri.location, lambda path: PtuPhotons(path, sync))
+
+
+def open_ttbin(uri: Uri) -> TcspcFile:
+    """Open ``file://run.ttbin?sync=1``; ``sync`` is the channel of the laser's pulses."""
+    uri.reject_unknown("sync")
+    if "sync" not in uri.values:
+        raise InputError(f"'{uri.text}': name the channel of the laser's pulses: sync=1")
+    sync = uri.value("sync", int, 0)
+    return TcspcFile(uri.location, lambda path: SwabianPhotons(path, sync))
+
+
 def open_phu(uri: Uri) -> TcspcFile:
     """Open ``file://run.phu``."""
-    return _open_file(uri, _read_picoquant_histograms)
+    uri.reject_unknown()
+    return TcspcFile(uri.location, _read_picoquant_histograms)
 
 
 def open_sdt(uri: Uri) -> TcspcFile:
-    """Open ``file://run.sdt``."""
-    return _open_file(uri, _read_becker_hickl_histograms)
-
-
-def _open_file(uri: Uri, reader: Callable[[Path], FileContents]) -> TcspcFile:
+    """Open ``file://run.sdt``; an image's pixels are its channels, row by row."""
     uri.reject_unknown()
-    return TcspcFile(uri.location, reader)
-
-
-def _read_picoquant_histograms(path: Path) -> FileContents:
-    ptufile = import_library("ptufile")
-    with BoundedFile(path) as opened, ptufile.PhuFile(opened) as file:
-        bins = np.ravel(file.tags["HistResDscr_HistogramBins"]).tolist()
-        require_bounded_size(
-            path, "histograms", sum(map(abs, bins)) * HISTOGRAM_BYTES, path.stat().st_size
-        )
-        return _make_histogram_records(
-            file.histograms(), float(file.tcspc_resolution), "PicoQuant histograms", path
-        )
-
-
-def _read_becker_hickl_histograms(path: Path) -> FileContents:
-    sdtfile = import_library("sdtfile")
-    require_bounded_sdt(path)
-    with sdtfile.SdtFile(path) as file:
-        curves = [
-            curve for block in file.data for curve in np.asarray(block).reshape(-1, block.shape[-1])
-        ]
-        steps = {float(times[1] - times[0]) for times in file.times if len(times) > 1}
-    if len(steps) != 1:
-        raise FileFormatError(
-            path, f"has blocks of {len(steps)} different resolutions, expected one"
-        )
-    return _make_histogram_records(curves, steps.pop(), "Becker & Hickl histograms", path)
-
-
-def _make_histogram_records(
-    curves: Any, resolution: float, instrument: str, path: Path
-) -> FileContents:
-    lengths = {len(curve) for curve in curves}
-    if len(lengths) != 1 or not 0 < max(lengths) <= MAX_BINS:
-        raise FileFormatError(
-            path, f"has histograms of {sorted(lengths) or 'no'} bins, expected one length"
-        )
-    counts = np.stack(list(curves))
-    records = np.zeros(len(counts), [("channel", "<u4"), ("histogram", "<u4", counts.shape[1:])])
-    records["channel"], records["histogram"] = np.arange(len(counts)), counts
-    attributes: dict[str, Scalar] = {
-        "resolution_s": require_positive(resolution, path),
-        "channels": len(counts),
-    }
-    return records, attributes, Info(instrument, "", dict(attributes))
-
-
-def require_positive(resolution: float, path: Path) -> float:
-    """Return a bin's duration, s, if it can be one."""
-    if not (np.isfinite(resolution) and resolution > 0):
-        raise FileFormatError(path, f"says that its bins last {resolution} s")
-    return resolution
-
-
-def import_library(name: str) -> Any:
-    """Import what reads these files, or raise the line that says how to install it."""
-    import importlib
-
-    try:
-        return importlib.import_module(name)
-    except ImportError as fault:
-        raise MissingDependencyError(
-            f"{name} is missing; install tofclip[tcspc] to read this file"
-        ) from fault
+    return TcspcFile(uri.location, _read_becker_hickl_histograms)
 
 
 def compute_photon_times(photons: Records, calibration: Record) -> NDArray[np.float64]:
@@ -214,3 +317,74 @@ def compute_photon_times(photons: Records, calibration: Record) -> NDArray[np.fl
     """
     times: NDArray[np.float64] = photons["bin"] * float(calibration.attribute("resolution_s"))
     return times
+
+
+def _make_photons(pulse: Any, delay: Any, channel: Any) -> Records:
+    photons = np.empty(len(pulse), PHOTON_DTYPE)
+    photons["sync"], photons["bin"], photons["channel"] = pulse, delay, channel
+    return photons
+
+
+def _describe_photons(
+    resolution: float, channels: int, period: float, path: Path
+) -> dict[str, Scalar]:
+    found: dict[str, Scalar] = {
+        "resolution_s": _require_positive(resolution, path),
+        "channels": channels,
+    }
+    return {**found, "laser_period_s": period} if period else found
+
+
+def _read_picoquant_histograms(path: Path) -> Histograms:
+    _require_moderate_size(path)
+    ptufile = import_file_reader("ptufile", TCSPC)
+    with BoundedFile(path) as opened, ptufile.PhuFile(opened) as file:
+        bins = np.ravel(file.tags["HistResDscr_HistogramBins"]).tolist()
+        require_bounded_size(
+            path, "histograms", sum(map(abs, bins)) * HISTOGRAM_BYTES, path.stat().st_size
+        )
+        return _make_histograms(
+            file.histograms(), float(file.tcspc_resolution), "PicoQuant histograms", path
+        )
+
+
+def _read_becker_hickl_histograms(path: Path) -> Histograms:
+    _require_moderate_size(path)
+    blocks, resolution = read_sdt_blocks(path)
+    curves = [curve for block in blocks for curve in block.reshape(-1, block.shape[-1])]
+    found = _make_histograms(curves, resolution, "Becker & Hickl histograms", path)
+    if len({block.shape for block in blocks}) == 1 and blocks[0].ndim == 3:
+        rows, columns, _ = blocks[0].shape
+        found.attributes |= {"rows": rows, "columns": columns}
+        found.info = Info(found.info.instrument, "", dict(found.attributes))
+    return found
+
+
+def _require_moderate_size(path: Path) -> None:
+    if path.stat().st_size > MAX_HISTOGRAM_FILE_BYTES:
+        raise FileFormatError(
+            path, f"is larger than {MAX_HISTOGRAM_FILE_BYTES} bytes; export a part of it"
+        )
+
+
+def _make_histograms(curves: Any, resolution: float, instrument: str, path: Path) -> Histograms:
+    lengths = {len(curve) for curve in curves}
+    if len(lengths) != 1 or not 0 < max(lengths) <= MAX_BINS:
+        raise FileFormatError(
+            path, f"has histograms of {sorted(lengths) or 'no'} bins, expected one length"
+        )
+    counts = np.stack(list(curves))
+    records = np.zeros(len(counts), [("channel", "<u4"), ("histogram", "<u4", counts.shape[1:])])
+    records["channel"], records["histogram"] = np.arange(len(counts)), counts
+    attributes: dict[str, Scalar] = {
+        "resolution_s": _require_positive(resolution, path),
+        "channels": len(counts),
+    }
+    return Histograms(records, Info(instrument, "", dict(attributes)), attributes)
+
+
+def _require_positive(resolution: float, path: Path) -> float:
+    """Return a bin's duration, s, if it can be one."""
+    if not (np.isfinite(resolution) and resolution > 0):
+        raise FileFormatError(path, f"says that its bins last {resolution} s")
+    return resolution

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from math import inf
+from pathlib import Path
 from time import monotonic
 from urllib.parse import quote, urlencode
 
@@ -340,7 +341,9 @@ def strip_options(uri: Uri, names: Collection[str] = ACCUMULATION_OPTIONS) -> st
     -------
     str
     """
-    values = {name: value for name, value in uri.values.items() if name not in names}
+    # Files of photon counters need the channel of the laser's pulses themselves.
+    own = {"sync"} if Path(uri.location).suffix.lower() in (".ptu", ".ttbin") else set()
+    values = {k: v for k, v in uri.values.items() if k not in names or k in own}
     place = quote(uri.location, safe="/:@[]~ ")
     return f"{uri.scheme}://{place}" + (f"?{urlencode(values)}" if values else "")
 

@@ -4,8 +4,12 @@ missing ones.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
+
+from tofclip.errors import MissingDependencyError
 
 OWN_PACKAGES = ("tofclip", "nlos", "devices", "apps")
 
@@ -51,3 +55,30 @@ def describe_missing_package(fault: ImportError) -> str | None:
     if isinstance(fault, ModuleNotFoundError):
         return f"the package '{distribution}' is missing: pip install {distribution}"
     return f"the package '{distribution}' does not load on this machine: {fault}"
+
+
+def import_file_reader(name: str, install: str) -> Any:
+    """Import a package that reads a kind of file.
+
+    Parameters
+    ----------
+    name : str
+        Of the module.
+    install : str
+        What pip is asked for.
+
+    Returns
+    -------
+    module
+
+    Raises
+    ------
+    MissingDependencyError
+        It is not installed, or does not load here.
+    """
+    try:
+        return importlib.import_module(name)
+    except (ImportError, OSError) as fault:
+        raise MissingDependencyError(
+            f"this file needs {name}: pip install '{install}' ({fault})"
+        ) from fault

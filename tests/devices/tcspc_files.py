@@ -64,32 +64,35 @@ def write_phu(path: Path, decays: NDArray[Any]) -> None:
 
 
 def write_sdt(path: Path, decays: NDArray[Any]) -> None:
-    """One block for each channel."""
+    """One block for each channel: (channels, bins), or images (channels, rows, columns, bins)."""
     import sdtfile
 
-    bins = decays.shape[1]
+    bins, shape = decays.shape[-1], decays.shape[1:-1]
+    size = int(np.prod(decays.shape[1:])) * 2
     info = b"*IDENTIFICATION\r\n  ID        : SPC Setup & Data File\r\n  Title     : x\r\n*END\r\n"
     header = np.zeros(1, np.dtype(sdtfile.sdtfile.FILE_HEADER).newbyteorder("<"))
     measurement = np.zeros(1, np.dtype(sdtfile.sdtfile.MEASURE_INFO).newbyteorder("<"))
     block = np.dtype(sdtfile.sdtfile.BLOCK_HEADER).newbyteorder("<")
     measurement["adc_re"], measurement["tac_r"], measurement["tac_g"] = bins, RESOLUTION * bins, 1
+    if shape:
+        measurement["scan_y"], measurement["scan_x"] = shape
     at = header.nbytes + len(info)
     header["revision"], header["chksum"], header["header_valid"] = 0x0F, 0x55AA, 0x5555
     header["info_offs"], header["info_length"] = header.nbytes, len(info)
     header["meas_desc_block_offs"], header["meas_desc_block_length"] = at, measurement.nbytes
     header["no_of_meas_desc_blocks"], header["no_of_data_blocks"] = 1, len(decays)
     at += measurement.nbytes
-    header["data_block_offs"], header["data_block_length"] = at, bins * 2
+    header["data_block_offs"], header["data_block_length"] = at, size
     blocks = b""
     for curve in decays:
         one = np.zeros(1, block)
         one["data_offs"], one["next_block_offs"] = (
             at + block.itemsize,
-            at + block.itemsize + bins * 2,
+            at + block.itemsize + size,
         )
-        one["block_length"] = bins * 2
+        one["block_length"] = size
         blocks += one.tobytes() + curve.astype("<u2").tobytes()
-        at += block.itemsize + bins * 2
+        at += block.itemsize + size
     path.write_bytes(header.tobytes() + info + measurement.tobytes() + blocks)
 
 
@@ -97,7 +100,13 @@ T2_TICK = 1e-12
 T2_OVERFLOW = 1 << 25
 
 
-def write_ptu_t2(path: Path, pulses: NDArray[Any], photons: NDArray[Any]) -> None:
+def write_ptu_t2(
+    path: Path,
+    pulses: NDArray[Any],
+    photons: NDArray[Any],
+    markers: NDArray[Any] | None = None,
+    scan: dict[str, float] | None = None,
+) -> None:
     """Events tagged by absolute times, as HydraHarps do (version 2).
 
     Parameters
@@ -107,14 +116,19 @@ def write_ptu_t2(path: Path, pulses: NDArray[Any], photons: NDArray[Any]) -> Non
         Ticks of the laser's pulses.
     photons : (m, 2) int array
         Tick and channel (from 0) of each photon.
+    markers : (k, 2) int array, optional
+        Tick and bits of each marker; by default one with every tenth pulse.
+    scan : dict, optional
+        Tags of a scanner's picture.
     """
-    lines = pulses[::10]  # a marker with every tenth pulse
-    ticks = np.concatenate([pulses, lines, photons[:, 0]])
+    if markers is None:
+        markers = np.stack([pulses[::10], np.ones_like(pulses[::10])], axis=1)
+    ticks = np.concatenate([pulses, markers[:, 0], photons[:, 0]])
     # special events: the pulses on channel 0, markers on 1 to 15, overflows on 63
     words = np.concatenate(
         [
             np.full(len(pulses), 1 << 31),
-            np.full(len(lines), 1 << 31 | 1 << 25),
+            1 << 31 | markers[:, 1] << 25,
             photons[:, 1] << 25,
         ]
     )
@@ -128,7 +142,11 @@ def write_ptu_t2(path: Path, pulses: NDArray[Any], photons: NDArray[Any]) -> Non
         found.append(word | tick % T2_OVERFLOW)
     tags = [
         integer("Measurement_Mode", 2),
-        integer("Measurement_SubMode", 0),
+        integer("Measurement_SubMode", 3 if scan else 0),
+        *(
+            real(name, value) if isinstance(value, float) else integer(name, value)
+            for name, value in (scan or {}).items()
+        ),
         integer("TTResultFormat_TTTRRecType", 0x01010204),
         integer("TTResultFormat_BitsPerRecord", 32),
         integer("TTResult_NumberOfRecords", len(found)),

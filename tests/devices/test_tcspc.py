@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -123,12 +124,12 @@ def test_what_cannot_be_read(
         devices.open(f"file://{tmp_path}/other.phu")
     with pytest.raises(InputError, match="'x' is unknown"):
         devices.open(f"file://{ptu}?x=1")
-    monkeypatch.setattr(tcspc, "MAX_FILE_BYTES", 100)
+    monkeypatch.setattr(tcspc, "MAX_HISTOGRAM_FILE_BYTES", 100)
     with pytest.raises(FileFormatError, match="larger than 100 bytes"):
         devices.open(f"file://{phu}")
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, "ptufile", None)
-    with pytest.raises(MissingDependencyError, match=r"install tofclip\[tcspc\]"):
+    with pytest.raises(MissingDependencyError, match=r"install 'tofclip\[tcspc\]'"):
         devices.open(f"file://{ptu}")
 
 
@@ -142,7 +143,7 @@ def test_what_cannot_be_read(
 )
 def test_histograms_that_cannot_be(curves: list[Any], resolution: float, problem: str) -> None:
     with pytest.raises(FileFormatError, match=problem):
-        tcspc._make_histogram_records(curves, resolution, "", Path("run.sdt"))
+        tcspc._make_histograms(curves, resolution, "", Path("run.sdt"))
 
 
 def read_all(address: str) -> Any:
@@ -156,7 +157,7 @@ def test_a_ptu_is_the_same_in_pieces(
 ) -> None:
     """Photons that are read a piece at a time, as of a file that does not fit into memory."""
     whole = read_all(f"file://{ptu}")
-    monkeypatch.setattr("devices.ptu.CHUNK_RECORDS", -(-len(whole) // pieces))
+    monkeypatch.setattr("tofclip.io.picoquant.CHUNK_EVENTS", -(-len(whole) // pieces))
     np.testing.assert_array_equal(read_all(f"file://{ptu}"), whole)
     with devices.open(f"file://{ptu}") as source:
         source.seek(len(whole) // 2)
@@ -171,7 +172,7 @@ def test_photons_of_a_file_in_t2_mode(
     tmp_path: Path, chunk: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Times from the last pulse before each photon, over overflows and pieces."""
-    monkeypatch.setattr("devices.ptu.CHUNK_RECORDS", chunk)
+    monkeypatch.setattr("tofclip.io.picoquant.CHUNK_EVENTS", chunk)
     random = np.random.default_rng(3)
     pulses = 500 + 400_000 * np.arange(300)  # 120 us: over three overflows of 34 us
     own = np.sort(random.integers(0, 300, 200))
@@ -191,3 +192,122 @@ def test_photons_of_a_file_in_t2_mode(
     assert known.attribute("resolution_s") == tcspc_files.T2_TICK
     with pytest.raises(FileFormatError, match="name their channel: sync="):
         devices.open(f"file://{tmp_path}/t2.ptu?sync=9")
+
+
+def test_the_pulses_channel_reaches_a_file_that_is_recovered(tmp_path: Path) -> None:
+    """Of a time tagger's recording ``sync`` says how photons are put together, of a PTU how it is read."""
+    pulses = 500 + 400_000 * np.arange(300)
+    photons = np.concatenate(
+        [
+            np.stack([pulses + 1, np.full(300, 1)], axis=1),
+            [[pulses[7] + 500, 0], [pulses[9] + 900, 0]],
+        ]
+    )
+    tcspc_files.write_ptu_t2(tmp_path / "t2.ptu", pulses, photons)
+    streak = read_transient(f"file://{tmp_path}/t2.ptu?sync=1&bins=100")
+    assert streak.counts.sum() == pytest.approx(2, abs=1e-3)
+
+
+class StandInTags:
+    """A block of tags as Swabian Instruments' library returns it: time in ps, channel, type and tags
+    that were lost.
+    """
+
+    def __init__(self, tags: Any) -> None:
+        self.getTimestamps = lambda: tags[:, 0].copy()
+        self.getChannels = lambda: tags[:, 1].astype(np.int32)
+        self.getEventTypes = lambda: tags[:, 2].astype(np.uint8)
+        self.getMissedEvents = lambda: tags[:, 3].astype(np.uint16)
+
+
+class StandInReader:
+    """Their reader of files; the file is an array."""
+
+    def __init__(self, path: str) -> None:
+        self._tags, self._next = np.load(path), 0
+
+    def getConfiguration(self) -> str:
+        return "{}"
+
+    def hasData(self) -> bool:
+        return self._next < len(self._tags)
+
+    def getData(self, tags: int) -> StandInTags:
+        self._next += tags
+        return StandInTags(self._tags[self._next - tags : self._next])
+
+
+@pytest.fixture
+def ttbin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A file with pulses on channel 2 and photons on rising edges of 1 and falling ones of 3; how
+    long after its pulse each photon came, and its channel.
+    """
+    random = np.random.default_rng(4)
+    pulses = 1000 + 12_500 * np.arange(2000)
+    own = np.sort(random.integers(0, 2000, 1500))
+    delay, channel = random.integers(1, 12_499, 1500), random.choice([-3, 1], 1500)
+    tags = np.concatenate(
+        [
+            [[10, 1, 0, 0], [5_000_000, 0, 4, 17]],  # before the first pulse; a loss of 17 tags
+            np.stack([pulses, np.full(2000, 2), np.zeros(2000), np.zeros(2000)], axis=1),
+            np.stack([pulses[own] + delay, channel, np.zeros(1500), np.zeros(1500)], axis=1),
+        ]
+    ).astype(np.int64)
+    order = np.argsort(tags[:, 0], kind="stable")
+    with open(tmp_path / "run.ttbin", "wb") as file:
+        np.save(file, tags[order])
+    library = SimpleNamespace(FileReader=StandInReader)
+    monkeypatch.setitem(sys.modules, "Swabian", SimpleNamespace(TimeTagger=library))
+    monkeypatch.setitem(sys.modules, "Swabian.TimeTagger", library)
+    by_time = np.lexsort((delay, own))
+    return tmp_path / "run.ttbin", own[by_time], delay[by_time], channel[by_time]
+
+
+@pytest.mark.parametrize("chunk", [100, 1 << 20])
+def test_photons_of_a_ttbin(ttbin: Any, chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tcspc, "SWABIAN_CHUNK_TAGS", chunk)
+    path, own, delay, channel = ttbin
+    with devices.open(f"file://{path}?sync=2") as source:
+        records = np.concatenate([batch.records for batch in source])
+        known, stats = source.calibration, source.stats
+        source.seek(700)
+        batch = source.read()
+        assert batch is not None
+        np.testing.assert_array_equal(batch.records, records[700 : 700 + len(batch)])
+        assert source.info.details["inputs"] == "-3,1"
+    np.testing.assert_array_equal(records["sync"], own)
+    np.testing.assert_array_equal(records["bin"], delay)
+    np.testing.assert_array_equal(records["channel"], channel == 1)
+    assert (stats.delivered, stats.lost_device, stats.is_balanced) == (1500, 17, True)
+    assert known is not None
+    assert known.attribute("laser_period_s") == pytest.approx(12.5e-9)
+    streak = read_transient(f"file://{path}?sync=2")
+    np.testing.assert_allclose(streak.counts.sum(axis=0), [sum(channel == -3), sum(channel == 1)])
+
+
+def test_a_ttbin_that_cannot_be_read(ttbin: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = ttbin[0]
+    with pytest.raises(InputError, match="name the channel of the laser's pulses: sync=1"):
+        devices.open(f"file://{path}")
+    with pytest.raises(InputError, match=r"sync=\.\.\., other channels are"):
+        devices.open(f"file://{path}?sync=9")
+    monkeypatch.setitem(sys.modules, "Swabian.TimeTagger", None)
+    with pytest.raises(MissingDependencyError, match="pip install 'swabian-timetagger'"):
+        devices.open(f"file://{path}?sync=2")
+
+
+def test_what_swabians_own_library_says_of_a_damaged_file(tmp_path: Path) -> None:
+    pytest.importorskip("Swabian.TimeTagger")
+    (tmp_path / "run.ttbin").write_bytes(b"SITT" + bytes(500))
+    with pytest.raises(FileFormatError, match="damaged or unsupported"):
+        devices.open(f"file://{tmp_path}/run.ttbin?sync=1")
+
+
+def test_the_shape_of_an_sdt_image(tmp_path: Path) -> None:
+    cube = np.random.default_rng(1).poisson(2, (1, 4, 6, 50)).astype(np.uint16)
+    tcspc_files.write_sdt(tmp_path / "image.sdt", cube)
+    with devices.open(f"file://{tmp_path}/image.sdt") as source:
+        records = np.concatenate([batch.records for batch in source])
+        assert source.calibration.attributes["rows"] == 4  # type: ignore[union-attr]
+        assert source.info.details["columns"] == 6
+    np.testing.assert_array_equal(records["histogram"].reshape(cube[0].shape), cube[0])

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from tofclip.dependencies import import_file_reader
 from tofclip.errors import FileFormatError
 from tofclip.file_limits import require_bounded_size
 
@@ -13,6 +16,38 @@ LAST_OLD_REVISION = 14
 # `no_of_data_blocks` has 16 bits; where they do not suffice it says this, and the number is in
 # `reserved1`.
 EXTENDED_COUNT = 0x7FFF
+
+
+def read_sdt_blocks(path: Path) -> tuple[list[NDArray[Any]], float]:
+    """Read all histograms of a file.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    list of arrays
+        (..., bins) counts of each block: (rows, columns, bins) of an image.
+    float
+        Duration of a bin, s.
+
+    Raises
+    ------
+    FileFormatError
+        It is damaged, or its blocks have different resolutions.
+    MissingDependencyError
+    """
+    sdtfile = import_file_reader("sdtfile", "tofclip[tcspc]")
+    require_bounded_sdt(path)
+    with sdtfile.SdtFile(path) as file:
+        blocks = [np.asarray(block) for block in file.data]
+        steps = {float(times[1] - times[0]) for times in file.times if len(times) > 1}
+    if len(steps) != 1:
+        raise FileFormatError(
+            path, f"has blocks of {len(steps)} different resolutions, expected one"
+        )
+    return blocks, steps.pop()
 
 
 def require_bounded_sdt(path: Path) -> None:

@@ -10,17 +10,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.errors import FileFormatError, InputError, MissingDependencyError, TofclipError
+from tofclip.dependencies import import_file_reader
+from tofclip.errors import FileFormatError, InputError, TofclipError
 from tofclip.file_limits import BoundedFile, require_bounded_size
 from tofclip.io.archive import list_npz_entries, read_npy_header
-from tofclip.io.becker_hickl import require_bounded_sdt
+from tofclip.io.becker_hickl import read_sdt_blocks
 from tofclip.io.mat import list_mat_variables
+from tofclip.io.picoquant import TCSPC, PtuEvents, get_scan_shape, read_scan
 from tofclip.lidar.photons.photon_image import PhotonImage
 from tofclip.storage import HDF5_SIGNATURE, format_error_line, translate_read_errors
 
@@ -87,11 +90,14 @@ class PhotonFile:
         Duration of a bin, s, where the file says it.
     axes : str
         Order of the axes of a cube where the format says it.
+    image_shape : (int, int) or None
+        Rows and columns of the picture of events where the format says them.
     """
 
     arrays: Sequence[ArrayEntry]
     bin_width: float | None = None
     axes: str = ""
+    image_shape: tuple[int, int] | None = None
 
 
 def read_photons(
@@ -228,9 +234,12 @@ def _read_layout(opened: PhotonFile, path: Path, bin_width: float, axes: str | N
         rows, columns = cells.shape
     else:
         y, x, times = (np.squeeze(entry.load()) for entry in arrays)
-        if not y.shape == x.shape == times.shape or min(y.min(), x.min()) < 0:
+        if not y.shape == x.shape == times.shape or min(y.min(initial=0), x.min(initial=0)) < 0:
             raise FileFormatError(path, "its x, y and time are not lists of the same events")
-        rows, columns = int(y.max()) + 1, int(x.max()) + 1
+        rows, columns = opened.image_shape or (
+            int(y.max(initial=0)) + 1,
+            int(x.max(initial=0)) + 1,
+        )
         if rows * columns > MAX_PIXELS:
             raise FileFormatError(path, f"claims a picture of {rows} x {columns} pixels")
         pixel = y.astype(np.int64) * columns + x.astype(np.int64)
@@ -418,51 +427,65 @@ def _require_bounded_image(path: Path, size: int) -> None:
 
 def _open_ptu(path: Path) -> PhotonFile:
     """PicoQuant's images: markers make lines and frames; frames and channels are summed."""
-    ptufile = _import_library("ptufile")
+    ptufile = import_file_reader("ptufile", TCSPC)
     with BoundedFile(path) as opened, ptufile.PtuFile(opened) as file:
-        if not file.is_image or not file.is_t3:
+        if not file.is_image:
             raise FileFormatError(
-                path,
-                "holds no image in T3 mode; tofclip recover reads lone pixels (file://run.ptu)",
+                path, "holds no image; tofclip recover reads lone pixels (file://run.ptu)"
             )
+        if not file.is_t3:
+            return _open_scan(path)
         _, rows, columns, _, bins = file.shape
         _require_bounded_image(path, rows * columns * bins * 4)
         width = float(file.tcspc_resolution)
+        # What was cut cannot be mapped.
+        is_whole = int(file.record_offset) + 4 * int(file.number_records) <= path.stat().st_size
 
     def load() -> NDArray[Any]:
         with BoundedFile(path) as reopened, ptufile.PtuFile(reopened) as again:
-            cube = again.decode_image(frame=-1, channel=-1, dtype=np.uint32)
+            words = again.read_records(memmap=is_whole)
+            cube = again.decode_image(records=words, frame=-1, channel=-1, dtype=np.uint32)
         summed: NDArray[Any] = np.asarray(cube).sum(axis=(0, 3), dtype=np.uint32)
         return summed
 
     return PhotonFile([ArrayEntry("image", (rows, columns, bins), "uint32", load)], width, "yxt")
 
 
+def _open_scan(path: Path) -> PhotonFile:
+    """PicoQuant's images in T2 mode: markers make lines and frames; frames are put together."""
+    events = PtuEvents(path)
+    rows, columns = get_scan_shape(events)
+    if rows * columns > MAX_PIXELS:
+        raise FileFormatError(path, f"claims a picture of {rows} x {columns} pixels")
+    scan = lru_cache(maxsize=1)(partial(read_scan, events))
+
+    def list_array(name: str, kind: str) -> ArrayEntry:
+        return ArrayEntry(name, (events.events,), kind, lambda: np.asarray(getattr(scan(), name)))
+
+    arrays = [list_array("x", "uint16"), list_array("y", "uint16"), list_array("time", "float64")]
+    return PhotonFile(arrays, events.tick, "", (rows, columns))
+
+
 def _open_sdt(path: Path) -> PhotonFile:
-    """Becker & Hickl's images."""
-    sdtfile = _import_library("sdtfile")
-    require_bounded_sdt(path)
-    with sdtfile.SdtFile(path) as file:
-        blocks = [np.asarray(block) for block in file.data]
-        times = [np.asarray(axis) for axis in file.times]
-    images = [n for n, block in enumerate(blocks) if block.ndim == 3]
+    """Becker & Hickl's images; those of several channels are summed."""
+    blocks, width = read_sdt_blocks(path)
+    # Before the last three axes some have those of routed detectors.
+    images = [
+        part for block in blocks if block.ndim >= 3 for part in block.reshape(-1, *block.shape[-3:])
+    ]
     if not images:
         raise FileFormatError(path, "holds no image, only single histograms; " + SUITABLE)
-    first = images[0]
-    image, width = blocks[first], float(times[first][1] - times[first][0])
-    entry = ArrayEntry("image", image.shape, str(image.dtype), lambda: image)
-    return PhotonFile([entry], width, "yxt")
+    shape = images[0].shape
+    if any(image.shape != shape for image in images):
+        shapes = ", ".join(" x ".join(map(str, image.shape)) for image in images)
+        raise FileFormatError(path, f"holds images of different shapes ({shapes})")
 
+    kind = "uint32" if len(images) > 1 else str(images[0].dtype)
 
-def _import_library(name: str) -> Any:
-    import importlib
+    def load() -> NDArray[Any]:
+        return np.asarray(np.sum(np.stack(images), axis=0, dtype=kind))
 
-    try:
-        return importlib.import_module(name)
-    except ImportError as fault:
-        raise MissingDependencyError(
-            f"this file needs {name}: pip install 'tofclip[tcspc]'"
-        ) from fault
+    return PhotonFile([ArrayEntry("image", shape, kind, load)], width, "yxt")
 
 
 READERS_BY_SIGNATURE: dict[bytes, PhotonReader] = {
