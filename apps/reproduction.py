@@ -22,8 +22,8 @@ STUDY_FOLDER = "reproduction"
 """Beside the page: what each study made."""
 
 Result = Mapping[str, Any]
-"""A finished study as it is kept: name, title, note, command, settings, columns, figure, rows,
-seconds.
+"""A finished study as it is kept: name, title, note, weight, command, settings, columns, figure,
+rows, seconds.
 """
 
 
@@ -52,6 +52,7 @@ def make_result(
         "also": study.aliases,
         "title": study.title,
         "note": study.note,
+        "weight": study.weight,
         "settings": dict(settings),
         "command": command,
         "columns": outcome.columns,
@@ -119,9 +120,9 @@ def write_page(results: Sequence[Result], folder: Path) -> Path:
         "# Tables and figures of the paper, made again\n\n"
         "Made by `tofclip reproduce`; do not edit. Ours is the mean over the seeds and its standard deviation; the "
         "paper gives single figures. Measurements come from the true views, never from the model; errors are NMSE "
-        "relative to the variance of shift-and-add of the true views, 12 pixels at the border left out; the prior's "
-        "weight is chosen by cross-validation with the first seed, without the truth. Most scenes of the paper are not "
-        "public: its figures stand beside ours for other scenes of the same kind, which may be easier or harder.\n"
+        "relative to the variance of shift-and-add of the true views, 12 pixels at the border left out; how the "
+        "prior's weight was chosen is said at each table. Most scenes of the paper are not public: its figures stand "
+        "beside ours for other scenes of the same kind, which may be easier or harder.\n"
     )
     sections = (render_section(result, f"{STUDY_FOLDER}/") for result in results)
     _write_text(folder / PAGE_NAME, "\n\n".join([head.rstrip(), *sections]) + "\n")
@@ -148,7 +149,8 @@ def render_section(result: Result, beside: str = "") -> str:
     table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
     made = f"`{result['command']}`, {result['seconds']:.0f} s"
     picture = f"![{result['title']}]({beside}{result['name']}.png)"
-    return f"## {result['title']} ({names})\n\n{result['note']} Made by {made}.\n\n{table}\n\n{picture}"
+    text = f"{result['note']} The prior's weight: {result['weight']}. Made by {made}."
+    return f"## {result['title']} ({names})\n\n{text}\n\n{table}\n\n{picture}"
 
 
 def _format_cells(row: Mapping[str, Any]) -> list[str]:

@@ -2,12 +2,15 @@
 ends.
 
 A target is so small that inside, at 0.8 of the region's length, all of it lies in the umbra, and
-beyond, at 1.2 and more, the outermost views see all of it. The camera looks closely at it.
+beyond, at 1.2 and more, the outermost views see all of it. A camera that is fitted to it looks
+closely, with a short pulse and a gate at the known distance, and so tests the formula alone; one
+fixed camera, with the instrument's pulse and gates that it finds in its own shot, tests what of
+that an instrument keeps.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +20,7 @@ from tofclip.light_field.measurement import CameraSetup
 from tofclip.metrics import correlation_coefficient
 from tofclip.occlusion import InactiveRegion
 from tofclip.occlusion.measurements import Rig, add_poisson_noise, measure_views
-from tofclip.occlusion.recovery import TV_WEIGHT
+from tofclip.occlusion.recovery import TV_WEIGHT, separate_occluder
 from tofclip.recovery.light_field import MAX_ITERATIONS, OBJECTIVE_TOLERANCE
 from tofclip.simulate.light_fields import (
     Body,
@@ -27,6 +30,7 @@ from tofclip.simulate.light_fields import (
     Rectangle,
     TimeAxis,
     render_flash,
+    render_flash_view,
 )
 from tofclip.simulate.patterns import cut_pattern, make_letter, make_plain_pattern
 from tofclip.solvers import TotalVariation
@@ -51,6 +55,14 @@ PEAK_PHOTONS = 2000.0  # of the brightest measurement, were there no occluder
 BACKGROUND_PHOTONS = 20.0  # photons of every measurement that come at any time
 SIGNIFICANCE_SIGMAS = 5.0  # standard deviations of the background
 MIN_VIEW_FRACTION = 0.5  # a view with less light than this share of the brightest view's is blocked
+
+FIXED_PICTURE_PX = 128
+FIXED_FIELD_OF_VIEW_RAD = 0.45
+FIXED_FOCUS_M = 0.1  # where pictures of all views agree; no target stands just there
+FIXED_BIN_WIDTH_S, FIXED_PULSE_FWHM_S = 20e-12, 60e-12  # the paper's streak camera
+FIXED_BACKGROUND_PHOTONS = BACKGROUND_PHOTONS * FIXED_BIN_WIDTH_S / MAX_GATE_S  # in every bin
+BOARD_ROWS = 32  # of cells, four pixels each
+RANGE_MARGIN_M = 20e-3  # of the sweep, before the occluder and behind the target
 
 
 @dataclass(frozen=True)
@@ -129,6 +141,82 @@ def probe_target(
     truth = free[VIEW_COUNT // 2, :, :, 0]
     return ProbeResult(
         distance, factor, correlation_coefficient(picture, truth), views, picture, truth
+    )
+
+
+def probe_with_fixed_camera(
+    occluder: tuple[Body, ...], region: InactiveRegion, factor: float, seeds: int
+) -> list[ProbeResult]:
+    """Put a board behind an occluder, and look at its middle with a camera that knows neither.
+
+    One focal length, one focus and one pulse for all boards; the exposure is that of the brightest
+    measurement, whoever it comes from. Returns, gates and depths are found in the shot
+    (`TimedMeasurements.find_returns`). Such a camera gets too little light from a speck, so that
+    the board fills the picture; what is judged is a strip of it, as wide as the target of
+    `probe_target`, whose pattern has nothing to do with that beside it.
+
+    Parameters
+    ----------
+    occluder : tuple of Body
+        Upright, and so tall that no view sees its ends.
+    region : InactiveRegion
+    factor : float
+        As of `probe_target`.
+    seeds : int
+        Shots of one scene, with line angles and photons of their own.
+
+    Returns
+    -------
+    list of ProbeResult
+        One for each seed, its pictures those of the strip; a correlation of 0 where no second
+        return was found.
+    """
+    distance = region.distance + factor * region.length
+    width = TARGET_WIDTH_FRACTION * region.width
+    focal_length_px = FIXED_PICTURE_PX / FIXED_FIELD_OF_VIEW_RAD
+    array = CameraArray(
+        (FIXED_PICTURE_PX, FIXED_PICTURE_PX),
+        VIEW_COUNT,
+        focal_length_px,
+        region.baseline / (VIEW_COUNT - 1),
+        focus=FIXED_FOCUS_M,
+        samples=1,
+        view_rows=1,
+    )
+    lamps = np.stack([array.position((v, u)) for v, u in array.views])
+    sweep = TimeAxis.for_ranges(
+        region.distance - RANGE_MARGIN_M,
+        distance + RANGE_MARGIN_M,
+        FIXED_BIN_WIDTH_S,
+        FIXED_PULSE_FWHM_S,
+    )
+    board = _make_board(width, FIXED_FIELD_OF_VIEW_RAD * distance, distance)
+    # Light does not depend on what the seeds draw: it is cast once.
+    pictures = render_flash(PulsedScene((board, *occluder), lamps), array, sweep)
+    free = render_flash_view(PulsedScene((board,), lamps), array, sweep, (0.0, 0.0)).sum(axis=-1)
+    half, axis = int(focal_length_px * width / distance / 2), FIXED_PICTURE_PX // 2
+    strip = slice(axis - half, axis + half + 1)
+    truth, found = free[:, strip], []
+    for seed in range(seeds):
+        clean = measure_views(pictures, Rig(array, lamps, CameraSetup("line", 1.0, seed)), sweep)
+        per_unit = PEAK_PHOTONS / float(clean.values.max())
+        dark = np.float32(FIXED_BACKGROUND_PHOTONS / per_unit)
+        noise = np.random.default_rng([seed, 4])
+        noisy = add_poisson_noise(clean.values + dark, per_unit, noise) - dark
+        picture = separate_occluder(replace(clean, values=noisy)).target[:, strip]
+        correlation = correlation_coefficient(picture, truth)
+        found.append(ProbeResult(distance, factor, correlation, VIEW_COUNT, picture, truth))
+    return found
+
+
+def _make_board(cell_width: float, side: float, distance: float) -> Body:
+    """A board of random bright and dark cells; one column of them lies on the axis."""
+    columns = 2 * round(side / cell_width / 2) + 1
+    bright = np.random.default_rng(0).random((BOARD_ROWS, columns)) < 0.5
+    return Body(
+        Rectangle(columns * cell_width, side),
+        Lambertian(np.where(bright, 0.9, 0.1)),
+        np.array([0.0, 0.0, distance]),
     )
 
 

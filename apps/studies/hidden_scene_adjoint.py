@@ -185,7 +185,7 @@ def run_study(capture: Capture, grid: Grid, solver: Method, seed: int = 0) -> li
     grid : Grid
     solver : Method
     seed : int
-        Of the photons.
+        Of the photons; those of the reference and of the compressed measurements are independent.
 
     Returns
     -------
@@ -195,14 +195,16 @@ def run_study(capture: Capture, grid: Grid, solver: Method, seed: int = 0) -> li
     clean = solver.reconstruct(capture, grid)
     rows = []
     for exposure, largest_count in EXPOSURES.items():
-        seen = add_poisson_noise(
-            capture, find_expected_peak(capture, largest_count, seed), seed=seed
+        peak = find_expected_peak(capture, largest_count, seed)
+        # Two exposures of one scene: noise that both shared would correlate the images by itself.
+        reference, compressible = (
+            add_poisson_noise(capture, peak, seed=2 * seed + number) for number in range(2)
         )
-        # All points at the same noise: what compression is measured against.
-        full = solver.reconstruct(seen, grid)
+        # All points at the same exposure: what compression is measured against.
+        full = solver.reconstruct(reference, grid)
         for ratio in SAMPLING_RATIOS:
             compressed = CompressedCapture.of(
-                seen, build_tomography(capture.signal.shape[1], ratio)
+                compressible, build_tomography(capture.signal.shape[1], ratio)
             )
             adjoint, linear = (
                 AdjointImaging(solver, method, 0.0).reconstruct(compressed, grid)

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 Advance = Callable[[int], None]
 
+CROSS_VALIDATED = "chosen by cross-validation with the first seed, without the truth"
+"""How most studies choose the weight of the prior; see `Study.weight`."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -89,6 +92,8 @@ class Study:
     title : str
     note : str
         What differs from the paper.
+    weight : str
+        How the weight of the prior was chosen: the end of a sentence.
     seconds : float
         About what a seed costs on two cores.
     seeded : bool
@@ -106,6 +111,7 @@ class Study:
     aliases: tuple[str, ...]
     title: str
     note: str
+    weight: str
     seconds: float
     steps: int
     work: Callable[[Library, int, Advance], Outcome]

@@ -7,7 +7,7 @@ from __future__ import annotations
 from itertools import groupby
 
 from apps.studies.cases import CAMERA_NAMES, Case, Library, SolvedCase, solve_cases
-from apps.studies.outcome import Advance, Outcome, Panel, Row, Study
+from apps.studies.outcome import CROSS_VALIDATED, Advance, Outcome, Panel, Row, Study
 from tofclip.simulate.light_fields.scenes import EDITS
 
 SAMPLING_RATIO = 0.5
@@ -80,6 +80,7 @@ FLIP_STUDY = Study(
     ("fig6", "fig7"),
     "Generalised flip test at SR = 0.5",
     "The paper's scenes are not public: its scene 1 and 2 stand beside our own 'still-life' and 'blocks'.",
+    CROSS_VALIDATED,
     40,
     len(FLIP_CASES),
     run_flip_test,
@@ -194,6 +195,7 @@ CORRUPTION_STUDIES = (
         ("fig12",),
         "Bad measurements at SR = 1",
         "The paper does not say its data term; its figures stand beside squares, Huber's is ours. Scenes are our own.",
+        CROSS_VALIDATED,
         50,
         2 * sum(map(len, TABLE5_PERCENT.values())),
         run_invalid_measurements,
@@ -203,6 +205,7 @@ CORRUPTION_STUDIES = (
         ("fig13",),
         "Few photons at SR = 1",
         "Scenes are our own.",
+        CROSS_VALIDATED,
         15,
         sum(map(len, TABLE6_PERCENT.values())),
         run_few_photons,
@@ -268,6 +271,7 @@ ASSIGNMENT_STUDY = Study(
     (),
     "Angles assigned to views at random, and evenly over the aperture",
     "Beyond the paper, which deals at random.",
+    CROSS_VALIDATED,
     25,
     2 * len(ASSIGNMENT_SCENES) * len(ASSIGNMENT_RATIOS),
     run_angle_assignment,

@@ -17,7 +17,7 @@ from apps.studies.cases import (
     measure_case,
     solve_cases,
 )
-from apps.studies.outcome import Advance, Outcome, Panel, Study
+from apps.studies.outcome import CROSS_VALIDATED, Advance, Outcome, Panel, Study
 from tofclip.light_field import FocalStack, estimate_depth_from_focus, make_focal_stack
 from tofclip.recovery.light_field import ClipRecovery
 from tofclip.threads import map_parallel
@@ -125,6 +125,7 @@ def _make_study(name: str, figure: str, title: str, table: RepresentationTable, 
         (figure,),
         title,
         note,
+        f"{CROSS_VALIDATED}; the depth maps take that of the first depth of their row",
         35,
         len(table.cases),
         partial(RepresentationTable.evaluate, table),

@@ -114,7 +114,13 @@ def _is_possible(study: Study, library: Library) -> bool:
 def _describe_settings(study: Study, library: Library, seeds: int) -> dict[str, Any]:
     """What a result depends on, as it comes back from JSON."""
     recorded = None if library.data is None else library.data.name
-    return {"name": study.name, "seeds": seeds, "data": recorded, "version": __version__}
+    return {
+        "name": study.name,
+        "weight": study.weight,
+        "seeds": seeds,
+        "data": recorded,
+        "version": __version__,
+    }
 
 
 def _run_on_cluster(

@@ -14,7 +14,7 @@ from apps.studies.hidden_scene_adjoint import (
     replace_between_marks,
     run_study,
 )
-from nlos import Backprojection, Capture, Grid, PlanarRSD
+from nlos import Backprojection, Capture, Grid, PlanarRSD, Volume
 from nlos.adjoint import AdjointImaging, CompressedCapture
 from nlos.capture import TimeAxis
 from nlos.simulate import PointScene, build_relay_wall
@@ -29,6 +29,7 @@ WALL = build_relay_wall("planar", 24, 1.2)
 SCENE = PointScene([HIDDEN]).simulate_capture(WALL, [0.0, 0.0, 0.0], TimeAxis(256, 24e-12), 20e-12)
 GRID = Grid.box((-0.3, 0.45), (-0.4, 0.2), (0.45, 0.85), 0.05)
 SOLVER = Backprojection(0.15)
+EMPTY = Volume(np.zeros(GRID.shape, np.float32), GRID)
 
 
 def test_with_every_point_read_for_itself_nothing_is_lost() -> None:
@@ -121,6 +122,37 @@ def test_the_study_on_a_small_office_reaches_the_papers_finding(
     document.write_text("no marks")
     with pytest.raises(InputError, match="twice"):
         replace_between_marks("", document)
+
+
+def test_reference_and_compressed_measurements_are_of_independent_photons(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Noise that both share correlates their images however poor the recovery is."""
+    exposed: dict[str, np.ndarray] = {}
+
+    class Spy(Backprojection):
+        def reconstruct(self, capture: Capture, grid: Grid, *rest: object) -> Volume:
+            exposed.setdefault("reference" if "clean" in exposed else "clean", capture.signal)
+            return EMPTY
+
+    def compress(capture: Capture, _: object) -> None:
+        exposed["compressed"] = capture.signal
+
+    monkeypatch.setattr(study_module, "EXPOSURES", {"20 ms": 19.0})
+    monkeypatch.setattr(study_module, "SAMPLING_RATIOS", (0.25,))
+    monkeypatch.setattr(study_module, "correlate_views", lambda *_: 1.0)
+    monkeypatch.setattr(study_module.CompressedCapture, "of", compress)
+    monkeypatch.setattr(study_module.AdjointImaging, "reconstruct", lambda *_: EMPTY)
+    run_study(SCENE, GRID, Spy(0.15))
+    lit = exposed["clean"] > 0.05 * exposed["clean"].max()
+    scale = exposed["reference"].sum() / exposed["clean"].sum()
+    expected = scale * exposed["clean"][lit]
+    residuals = [
+        (exposed[name][lit] - expected) / np.sqrt(expected) for name in ("reference", "compressed")
+    ]
+    correlation = float(np.corrcoef(residuals)[0, 1])
+    # Independent photons: a standard deviation of 1 / sqrt(n).
+    assert abs(correlation) < 5 / np.sqrt(np.count_nonzero(lit))
 
 
 def test_the_command_prints_and_writes(

@@ -4,6 +4,8 @@ recoveries.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -109,6 +111,19 @@ def test_every_study_can_be_called_by_its_tables_and_figures_names():
     assert find_studies("all") == STUDIES
     with pytest.raises(InputError, match="table2"):
         find_studies("table99")
+
+
+def test_the_page_says_of_every_table_how_its_weight_was_chosen():
+    """And nothing that the studies do not say: notes and page change together."""
+    page = Path(__file__).parents[3] / "docs" / "reproduction.md"
+    sections = page.read_text("utf-8").split("\n## ")[1:]
+    by_title = {study.title: study for study in STUDIES}
+    # What was flashed, and where the inactive region ends, is on the page about occluders.
+    assert len(sections) == len(STUDIES) - len({"table7-flash", "fig14"})
+    for section in sections:
+        heading, text = section.split("\n", 1)
+        study = by_title[heading.partition(" (")[0]]
+        assert text.strip().startswith(f"{study.note} The prior's weight: {study.weight}. Made by")
 
 
 def test_depth_and_viewpoints_of_true_light_fields_are_scored(monkeypatch):
