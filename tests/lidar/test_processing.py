@@ -275,7 +275,7 @@ def test_las_and_laz_are_read_by_laspy_and_by_us(tmp_path, suffix):
     content = path.read_bytes()
     for length in (0, 300, len(content) // 2, len(content) - 60):
         path.write_bytes(content[:length])
-        with pytest.raises(FileFormatError, match=r"LAS|truncated or damaged"):
+        with pytest.raises(FileFormatError, match="LAS"):
             PointCloud.load(path)
     far = cloud_of(np.array([[0.0, 0.0, 3000.0]]))
     with pytest.raises(InputError, match="2147 m"):

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from odd_jobs import die, refuse, squares, stumble
+from odd_jobs import die, meet, refuse, squares, stumble
 
 from tofclip.errors import FileFormatError, InputError, MissingDependencyError, StorageError
 from tofclip.sequences.jobs import (
@@ -57,9 +57,19 @@ def test_workers_do_what_is_done_here_however_many_jobs_there_are(scheduler, tmp
     run_jobs(squares(here, MANY))
     summary = run_jobs(squares(there, MANY), scheduler)
     assert (summary.done, summary.failures) == (MANY, ())
-    assert summary.processes == 2
     assert contents(there) == contents(here)
     assert run_jobs([], scheduler).done == 0
+
+
+def test_the_processes_that_took_part_are_counted(scheduler, tmp_path):
+    """Two jobs that wait for each other need two processes, however busy the machine is."""
+    one, other = tmp_path / "one.txt", tmp_path / "other.txt"
+    jobs = [
+        Job("one", one, partial(meet, one, other)),
+        Job("other", other, partial(meet, other, one)),
+    ]
+    summary = run_jobs(jobs, scheduler)
+    assert (summary.done, summary.failures, summary.processes) == (2, (), 2)
 
 
 def test_a_killed_worker_costs_at_most_the_job_that_kills_every_one(scheduler, tmp_path):

@@ -108,15 +108,19 @@ def test_few_things_are_alive(worker):
 
     def source() -> Iterator[Thing]:
         nonlocal highest
-        for _ in range(8):
+        for _ in range(30):
             thing = Thing()
             alive.add(thing)
-            gc.collect()
+            if len(alive) > 4:  # nothing but a cycle of references could keep them then
+                gc.collect()
             highest = max(highest, len(alive))
             yield thing
 
-    work = lambda thing: slow(1)  # noqa: E731
-    assert sum(item.value for item in run_in_order(source(), work, worker, at_once=1)) == 8
+    def work(_: Thing) -> int:
+        sleep(STEP / 10)  # slower than the source, so that things pile up if they can
+        return 1
+
+    assert sum(item.value for item in run_in_order(source(), work, worker, at_once=1)) == 30
     # one being worked on, one that waits, the one that the reader holds, and the one that it makes
     assert highest <= 4
 

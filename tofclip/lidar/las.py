@@ -82,7 +82,7 @@ def list_las_columns(path: Path) -> dict[str, ArchiveEntry]:
     with _open_reader(path) as reader:
         layout, points = reader.header.point_format, reader.header.point_count
         packed = path.suffix.lower() == ".laz"
-        require_bounded_size(path, "points", points * layout.size, path.stat().st_size, packed)
+        require_bounded_size(path, "LAS points", points * layout.size, path.stat().st_size, packed)
         for name in layout.extra_dimension_names:
             if name.startswith(DIMENSION_PREFIX):
                 names[name.removeprefix(DIMENSION_PREFIX)] = name
@@ -139,8 +139,10 @@ def _require_bounded_records(path: Path) -> None:
     if header[VERSION_PLACE] >= VERSION_WITH_EXTENDED_RECORDS:
         claimed += extended * RECORD_BYTES
     size = path.stat().st_size
-    require_bounded_size(path, "records of variable length", claimed, size)
-    require_bounded_size(path, "header", struct.unpack_from("<I", header, POINTS_PLACE)[0], size)
+    require_bounded_size(path, "LAS records of variable length", claimed, size)
+    require_bounded_size(
+        path, "LAS header", struct.unpack_from("<I", header, POINTS_PLACE)[0], size
+    )
 
 
 def _import_laspy() -> Any:
