@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 from apps.conventions import PICTURE_SUFFIXES, RECORD_SUFFIXES, build_provenance, require_writable
 from nlos.export import POINT_SUFFIXES, WRITERS
 from tofclip.errors import InputError, StorageError
+from tofclip.sequences.jobs.output_folder import identify_file
 
 if TYPE_CHECKING:
     from nlos import Volume
@@ -18,6 +20,26 @@ CAPTURE_SUFFIXES = (".h5", ".hdf5", ".npz", ".mat")
 VOLUME_SUFFIXES = (*RECORD_SUFFIXES, *WRITERS, *POINT_SUFFIXES)
 GEOMETRY_FILE = "geometry.toml"
 """Makes a folder of renderings one capture; see `nlos.io`."""
+
+
+CONTENT_MARK = "# the capture's content: "
+"""In the settings beside a volume: what the capture was that it was made of."""
+
+
+def note_content(source: Path) -> str:
+    """Return a comment for a TOML file by which a capture, or a folder of renderings, is known
+    again, whatever it is called and however old it is.
+
+    Raises
+    ------
+    StorageError
+        It cannot be read.
+    """
+    if not source.is_dir():
+        return CONTENT_MARK + identify_file(source)
+    files = sorted(path for path in source.rglob("*") if path.is_file())
+    marks = "\n".join(f"{path.relative_to(source)} {identify_file(path)}" for path in files)
+    return CONTENT_MARK + hashlib.sha256(marks.encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -51,10 +73,16 @@ class ResultFiles:
         require_writable(self.settings, inputs=inputs)
 
     def is_up_to_date(self, source: Path) -> bool:
-        """Whether all are there and younger than the capture that they came from."""
+        """Whether all are there and came from the capture as it is now.
+
+        Results of versions that did not note the capture's content have to be younger than it.
+        """
         if not all(path.is_file() for path in self.paths):
             return False
-        return self.settings.stat().st_mtime >= source.stat().st_mtime
+        text = self.settings.read_text("utf-8", errors="replace")
+        if CONTENT_MARK not in text:
+            return self.settings.stat().st_mtime >= source.stat().st_mtime
+        return note_content(source) in text.splitlines()
 
 
 def is_capture_folder(source: Path) -> bool:

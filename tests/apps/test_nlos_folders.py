@@ -13,7 +13,9 @@ import pytest
 from hidden_point import object_of
 from small_instrument import Run
 
-from apps.nlos.files import ResultFiles
+from apps.nlos.files import ResultFiles, note_content
+from apps.settings import load_settings, save_settings
+from apps.verbs.nlos.reconstruct import ReconstructSettings
 from nlos import Volume
 from tofclip.storage import HDF5_SIGNATURE
 
@@ -76,6 +78,33 @@ def test_what_is_finished_is_skipped(run: Run, folder: Path) -> None:
     later = (out / "a.toml").stat().st_mtime + 10
     os.utime(folder / "a.h5", (later, later))  # the capture was written anew
     assert [one["capture"] for one in object_of(run, *words(folder))["imaged"]] == ["a.h5"]
+
+
+def test_a_result_belongs_to_the_capture_s_content_not_to_its_age(tmp_path: Path) -> None:
+    source, settings = tmp_path / "a.h5", tmp_path / "out.toml"
+    source.write_bytes(b"one capture")
+    results = ResultFiles([tmp_path / "out.h5"], None, settings)
+    results.volumes[0].write_text("a result")
+    save_settings(ReconstructSettings(), settings, f"a heading\n{note_content(source)}")
+    assert load_settings(ReconstructSettings, settings, {}) == ReconstructSettings()
+    later, earlier = (settings.stat().st_mtime + sign * 100 for sign in (1, -1))
+    os.utime(source, (later, later))  # copied, or touched
+    assert results.is_up_to_date(source)
+    source.write_bytes(b"another one")
+    os.utime(source, (earlier, earlier))  # put in its place with its own, older time
+    assert not results.is_up_to_date(source)
+    settings.write_text("# of a version that noted no content\n")
+    assert results.is_up_to_date(source)
+
+
+def test_a_folder_of_renderings_is_known_by_all_that_is_in_it(tmp_path: Path) -> None:
+    for name in ("geometry.toml", "views/one.exr"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name)
+    before = note_content(tmp_path)
+    assert note_content(tmp_path) == before
+    (tmp_path / "views" / "one.exr").write_text("another")
+    assert note_content(tmp_path) != before
 
 
 @pytest.mark.usefixtures("_imaging_is_quick")

@@ -20,6 +20,7 @@ from apps.nlos.files import (
     add_provenance,
     is_capture_folder,
     list_captures,
+    note_content,
     require_separate_folder,
     write_volume,
 )
@@ -184,6 +185,8 @@ def _reconstruct_single(
 ) -> dict[str, Any]:
     """Image one capture, write its results, and return the figures."""
     device = choose_device(order.device, order.settings)
+    # Before it is read: a capture that is replaced meanwhile is imaged again next time.
+    content = note_content(source)
     capture, wanted = read_capture(source), order.settings
     if wanted.refine and wanted.refine != PHOTONS:
         wanted = replace(wanted, method=REFINED_METHOD)
@@ -211,7 +214,7 @@ def _reconstruct_single(
         write_volume(volume, path, found.point_fraction)
     if results.picture is not None:
         volume.save_picture(results.picture)
-    save_settings(found, results.settings, SETTINGS_HEADING)
+    save_settings(found, results.settings, f"{SETTINGS_HEADING}\n{content}")
     return {
         "method": found.method,
         "device": str(device),

@@ -84,12 +84,19 @@ def lock_output_folder(
 
 def _identify_files(inputs: Mapping[str, Path]) -> dict[str, str]:
     # the shots of a stack share a file, which is read once
-    marks = {file: _identify(file) for file in set(inputs.values())}
+    marks = {file: identify_file(file) for file in set(inputs.values())}
     return {name: marks[file] for name, file in inputs.items()}
 
 
-def _identify(file: Path) -> str:
-    """Say by which a file is known again."""
+def identify_file(file: Path) -> str:
+    """Say by what a file's content is known again: its hash, or for a large one what
+    `MAX_HASHED_BYTES` says.
+
+    Raises
+    ------
+    StorageError
+        It cannot be read.
+    """
     with translate_read_errors(file):
         state = file.stat()
         if state.st_size <= MAX_HASHED_BYTES:
