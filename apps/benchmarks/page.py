@@ -20,7 +20,7 @@ of the size with which the time grows between the first and the last size.
 
 GROUP_TITLES = {
     "recovery": "Recovery of shots (7 views, 1344 slit pixels, 174 x 174 pixels)",
-    "clip": "Light fields from few measurements (8 x 8 views)",
+    "clip": "Rendered light fields from few measurements of their true views (8 x 8 views)",
     "depth": "Ranges (the demo's instrument)",
     "streaming": "Shots to clouds (the demo's instrument)",
     "rsd": "Around the corner: phasor fields",

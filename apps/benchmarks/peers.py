@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from nlos import Capture, Grid
 
 PEERS_VARIABLE = "TOFCLIP_PEERS"
-PEER_TIMEOUT_S = 60
+PEER_TIMEOUT_S = 900
+"""A cube of 128^3 voxels, the page's largest, takes some of them minutes."""
 
 YTAL_SCRIPT = """
 import sys, time

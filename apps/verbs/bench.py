@@ -44,7 +44,8 @@ def bench(
 ) -> None:
     """Measure time and memory, each beside the least that the work needs.
 
-    All cases together take less than ten minutes. Other programs slow it down: close them.
+    All cases together take less than ten minutes, with --peers some half an hour more. Other
+    programs slow it down: close them.
     TOFCLIP_THREADS bounds the number of threads.
 
     Example: tofclip bench recovery

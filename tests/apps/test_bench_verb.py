@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -13,20 +14,35 @@ from small_instrument import Run
 
 from apps.benchmarks import registry
 from apps.benchmarks.case import Case, PeerUnavailableError, PreparedCase
+from apps.benchmarks.light_fields import render_scene
 from apps.benchmarks.machine import describe_machine
 from apps.benchmarks.measure import measure_case
 from apps.benchmarks.page import GROUP_TITLES, STUDY_TITLES, render_page
-from apps.benchmarks.peers import run_peer
+from apps.benchmarks.peers import PEER_TIMEOUT_S, run_peer
 from apps.benchmarks.run import run_cases
 from apps.verbs.bench import bench
 from tofclip.errors import InputError
+from tofclip.solvers.cross_validation import WeightChoice
 
 SMALL = {"recovery": 8, "clip": 16, "depth": 200, "streaming": 200, "decode": 1}
 """Sizes at which a case is over at once; 16 where none is given."""
 
 
+@pytest.fixture
+def weight_searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Sizes of the measurements for which a weight was looked for; the search itself takes long."""
+    searches: list[int] = []
+
+    def choose_quickly(_: object, __: object, measurements: np.ndarray, ___: int) -> WeightChoice:
+        searches.append(measurements.size)
+        return WeightChoice(2e-3, np.array([2e-3]), np.array([1.0]))
+
+    monkeypatch.setattr("tofclip.recovery.light_field.choose_weight", choose_quickly)
+    return searches
+
+
 @pytest.mark.parametrize("case", registry.CASES, ids=lambda case: case.name)
-def test_every_case_runs(case: Case) -> None:
+def test_every_case_runs(case: Case, weight_searches: list[int]) -> None:
     ready = case.prepare(16 if case.name == "recovery-projection" else SMALL.get(case.group, 16))
     ready.action()
     ready.floor()
@@ -42,6 +58,40 @@ def test_every_case_has_a_place_on_the_page() -> None:
         assert case.floor
         assert list(case.sizes) == sorted(set(case.sizes))
         assert len(case.sizes) >= 2  # otherwise there is no growth
+
+
+def test_light_fields_are_rendered_and_their_weight_is_part_of_the_work(
+    weight_searches: list[int],
+) -> None:
+    pictures = render_scene(24).pictures
+    assert np.abs(pictures[0] - pictures[-1]).max() > 0.1  # views see different sides of a scene
+    for case in registry.find_cases("clip"):
+        timed = case.prepare(24)
+        weight_searches.clear()
+        timed.action()
+        is_given = case.name == "clip-given"
+        assert len(weight_searches) == (0 if is_given else 1)
+        assert list(timed.peers) == (["LenslessPiCam"] if is_given else [])
+
+
+def test_the_time_of_other_programs_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cubes of 128^3 voxels take them minutes, and ours must be measured all the same."""
+    limits: list[float] = []
+
+    def slow(*_: object, timeout: float, **__: object) -> None:
+        limits.append(timeout)
+        time.sleep(0.02)
+        raise subprocess.TimeoutExpired("", timeout)
+
+    monkeypatch.setattr("apps.benchmarks.run.subprocess.run", slow)
+    monkeypatch.setattr("apps.benchmarks.run.TOTAL_TIMEOUT_S", 60)
+    monkeypatch.setenv("TOFCLIP_THREADS", "1")
+    run_cases([MADE_UP], "python", lambda _: None)
+    assert limits == [PEER_TIMEOUT_S + 60] * 2
+    limits.clear()
+    run_cases([MADE_UP], None, lambda _: None)
+    assert limits[0] == 60
+    assert 59 < limits[1] < 60 - 0.02
 
 
 def made_up(size: int) -> PreparedCase:
@@ -181,7 +231,12 @@ def test_peers_that_are_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_names() -> None:
     assert len(registry.find_cases("all")) == len(registry.CASES)
-    assert [case.name for case in registry.find_cases("clip")] == ["clip-1d", "clip-0d", "clip-2d"]
+    assert [case.name for case in registry.find_cases("clip")] == [
+        "clip-1d",
+        "clip-0d",
+        "clip-2d",
+        "clip-given",
+    ]
     assert all(group in str(bench.__annotations__["name"]) for group in GROUP_TITLES)
     with pytest.raises(InputError, match="recovery, clip"):
         registry.find_cases("nothing")
