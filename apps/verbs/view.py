@@ -14,10 +14,9 @@ import typer
 from apps.conventions import JsonOption, TimeZeroOption, make_completer, report, require_writable
 from apps.progress import show_activity, show_progress
 from apps.viewer.desktop import open_window
-from apps.viewer.film import choose_frames, save_film
 from apps.viewer.page import Page
 from apps.viewer.render import choose_renderer
-from apps.viewer.scene_figure import save_picture
+from apps.viewer.scene_figure import choose_frames, save_film, save_picture
 from apps.viewer.server import parse_loopback
 from apps.viewer.session import Session
 from apps.viewer.source_factory import LOOK_METHODS, ShotOptions, open_source

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from apps.viewer.raster import BACKGROUND
-from apps.viewer.render import add_to_plotter, has_working_graphics
+from apps.viewer.render import BACKGROUND, add_to_plotter, has_working_graphics
 from apps.viewer.scene_figure import choose_point_size
 from apps.viewer.session import Session
 from apps.viewer.viewpoint import DOWN, place_viewpoint

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from apps.figures.style import DOTS_PER_INCH, make_figure
 from apps.viewer.colouring import choose_ticks, format_length, load_palette
-from apps.viewer.raster import BACKGROUND
+from apps.viewer.render import BACKGROUND
 from apps.viewer.session import Session
 from apps.viewer.viewpoint import Box, Viewpoint, move_camera
 

@@ -1,10 +1,14 @@
-"""Hidden volumes: bright voxels, their surface, their brightest depth, or slice after slice."""
+"""Hidden volumes: bright voxels, their surface, their brightest depth, or slice after slice; and those
+that come in while one looks.
+"""
 
 from __future__ import annotations
 
+import threading
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,3 +136,57 @@ class VolumeSource(Source):
         cloud = make_cloud(xyz, {"brightness": brightness})
         # Depth behind the wall is more useful than the distance from the origin of its coordinates.
         return replace(cloud, range=cloud.xyz[:, 2])
+
+
+BRIGHT_FRACTION = 0.3
+"""Of the brightest voxel: brighter ones are shown."""
+
+
+class VolumeFeed(Protocol):
+    """What a stream of volumes reports while it runs."""
+
+    latency: float
+    delivered: int
+    failed: int
+    ended: threading.Event
+
+    latest: deque[Volume]
+    """The newest alone."""
+
+
+class VolumeStreamSource(Source):
+    """The newest volume of a stream; every volume is a frame, and only the last one is kept.
+
+    Parameters
+    ----------
+    title : str
+    feed : VolumeFeed
+        With a volume.
+    """
+
+    def __init__(self, title: str, feed: VolumeFeed) -> None:
+        super().__init__(title, 1.0, frame_name="volume")
+        self._feed = feed
+
+    def __len__(self) -> int:
+        return max(self._feed.delivered, 1)
+
+    @property
+    def oldest(self) -> int:
+        return len(self) - 1
+
+    @property
+    def is_live(self) -> bool:
+        return not self._feed.ended.is_set()
+
+    @property
+    def latency(self) -> float:
+        return self._feed.latency
+
+    @property
+    def lost(self) -> int:
+        return self._feed.failed
+
+    def view(self, number: int) -> View:
+        xyz, brightness = self._feed.latest[-1].points(BRIGHT_FRACTION)
+        return View(make_cloud(xyz, {"brightness": np.asarray(brightness)}))

@@ -23,8 +23,8 @@ from apps.viewer.colouring import (
     make_scale,
 )
 from apps.viewer.controls import mark_times
-from apps.viewer.filters import Filters
 from apps.viewer.picking import find_point_on_ray, make_pick, measure_distance
+from apps.viewer.session import Filters
 from apps.viewer.source import make_empty_cloud
 from apps.viewer.viewpoint import SCALE_BAR_FRACTION, Box, round_length_down
 from tofclip.errors import InputError

@@ -13,10 +13,14 @@ from viewer_scenes import PlaneSource, plane, volume
 
 from apps.viewer import render
 from apps.viewer.clouds import make_cloud
-from apps.viewer.film import save_film
-from apps.viewer.raster import BACKGROUND, rasterise_points
-from apps.viewer.render import PyvistaRenderer, RasterRenderer, has_working_graphics
-from apps.viewer.scene_figure import PICTURE_SHAPE_PX, SceneFigure, save_picture
+from apps.viewer.render import (
+    BACKGROUND,
+    PyvistaRenderer,
+    RasterRenderer,
+    has_working_graphics,
+    rasterise_points,
+)
+from apps.viewer.scene_figure import PICTURE_SHAPE_PX, SceneFigure, save_film, save_picture
 from apps.viewer.session import Session
 from apps.viewer.source import make_empty_cloud
 from apps.viewer.viewpoint import MAX_FIELD_OF_VIEW_RAD, Viewpoint, place_viewpoint

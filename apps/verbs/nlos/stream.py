@@ -268,7 +268,7 @@ def _run_with_page(made: _VolumeStream, source: Path) -> dict[str, Any]:
     """Image on a thread of its own while the page shows the newest volume; ends with Ctrl-C."""
     from apps.viewer.page import Page
     from apps.viewer.session import Session
-    from apps.viewer.volume_stream import VolumeStreamSource
+    from apps.viewer.volume import VolumeStreamSource
 
     figures: dict[str, Any] = {}
     thread = threading.Thread(target=lambda: figures.update(made.run()), daemon=True)
