@@ -16,6 +16,9 @@ from tofclip.errors import InputError
 NEAR_LASER_FRACTION = 0.03
 """Of the wall's width: a laser spot so near to its wall point makes a confocal pair."""
 
+NEAR_LASER_M, MAX_NEAR_LASER_FRACTION = 0.02, 0.1
+"""So does one as near as this, if that is less than this fraction of the wall's width."""
+
 
 def crop_capture(capture: Capture, nearest: float, farthest: float) -> Capture:
     """Keep the bins that hold paths from `nearest` to `farthest`.
@@ -136,14 +139,15 @@ def join_near_lasers(capture: Capture) -> Capture:
     Returns
     -------
     Capture
-        The same one where a pair is farther apart than `NEAR_LASER_FRACTION` of the wall's width,
-        or all are confocal already.
+        The same one where a pair is farther apart than `NEAR_LASER_FRACTION` of the wall's width
+        and than `NEAR_LASER_M`, or all are confocal already.
     """
     if capture.laser.ndim == 1 or is_confocal(capture) or len(capture.points) == 1:
         return capture
     extent = float(np.ptp(capture.points, axis=0).max())
     apart = float(np.linalg.norm(capture.lasers - capture.points, axis=1).max())
-    if apart > NEAR_LASER_FRACTION * extent:
+    near = min(NEAR_LASER_M, MAX_NEAR_LASER_FRACTION * extent)
+    if apart > max(NEAR_LASER_FRACTION * extent, near):
         return capture
     middle = (capture.wall + capture.laser) / 2
     return Capture(

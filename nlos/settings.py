@@ -38,6 +38,10 @@ from tofclip.errors import InputError
 Limits = tuple[float, float]
 
 VOXELS_PER_WAVELENGTH = 8
+VOXEL_BIN_FRACTION = 1 / 3
+"""Of the path of a bin, the voxel of transforms. Half of it is the bin's depth, but a surface that
+lies between two such voxels would be dimmed and drawn with stripes."""
+
 MAX_VOXELS_PER_SIDE = 256
 """A default voxel is not so small that more would fit along the longest side of the wall."""
 
@@ -78,6 +82,9 @@ MAX_START_M = 1e3
 
 MAX_SIGNAL = 1e30
 """Larger samples overflow once they are squared."""
+
+SCOUT_WAVELENGTHS = 2.0
+"""Waves by which the box is looked over are this number of times longer, if the wall is so wide."""
 
 WAVELENGTH_STEP_RATIO = 1.05
 """From one wavelength that is tried to the next."""
@@ -278,7 +285,9 @@ def settings_for(capture: Capture, **given: Any) -> Settings:
     found = complete_settings(capture, **given)
     if found.method is None:
         # Which walls a method takes does not depend on the voxels: coarse ones are planned quickly.
-        name, _ = found.plan_quickest(found.prepare(capture), scout_grid(found) or found.grid())
+        prepared = found.prepare(capture)
+        scout, grid = find_scout(prepared, found) or (found, found.grid())
+        name, _ = scout.plan_quickest(prepared, grid)
         found = found.with_method(name)
     return found
 
@@ -473,16 +482,30 @@ def find_sampling_step(capture: Capture) -> float:
     return swapped if math.isfinite(swapped) else 0.0
 
 
-def scout_grid(settings: Settings) -> Grid | None:
-    """Return coarse voxels for all of the box; None where the voxels asked for are no finer, or
-    all of the box is wanted.
+def find_scout(capture: Capture, settings: Settings) -> tuple[Settings, Grid] | None:
+    """Return settings and coarse voxels with which all of the box is looked over quickly.
 
-    Half a wavelength is coarse.
+    Waves twice as long have an eighth of the work, on voxels of their half.
+
+    Parameters
+    ----------
+    capture : Capture
+    settings : Settings
+        Complete but for the method.
+
+    Returns
+    -------
+    (Settings, Grid) or None
+        None where the voxels asked for are no finer, or all of the box is wanted.
     """
-    coarse = (settings.wavelength or 0.0) / 2
-    if settings.everywhere or (settings.voxel or 0.0) >= coarse:
+    wavelength = settings.wavelength or 0.0
+    usable = min(
+        find_longest_wavelength(capture), float(np.ptp(capture.axis.paths)) / settings.cycles
+    )
+    longer = max(wavelength, min(SCOUT_WAVELENGTHS * wavelength, usable))
+    if settings.everywhere or (settings.voxel or 0.0) >= longer / 2:
         return None
-    return settings.grid(coarse)
+    return replace(settings, wavelength=longer), settings.grid(longer / 2)
 
 
 def find_bright_box(settings: Settings, scouted: Volume) -> Settings:
@@ -492,7 +515,7 @@ def find_bright_box(settings: Settings, scouted: Volume) -> Settings:
     ----------
     settings : Settings
     scouted : Volume
-        On `scout_grid`. An image through a virtual pulse, whichever method images later: lct and fk
+        By `find_scout`. An image through a virtual pulse, whichever method images later: lct and fk
         make up for the loss of light with distance, and would take the noise of the farthest depths
         for the brightest things.
 
@@ -568,10 +591,9 @@ def _complete_sampling(capture: Capture, settings: Settings) -> Settings:
         settings = _add(settings, "bins_together", bins, reason)
     if settings.voxel is None:
         extent = float(np.ptp(capture.points, axis=0).max())
-        # Half the path of a bin is its depth.
-        depth = (settings.bins_together or 1) * capture.axis.spacing / 2
+        depth = (settings.bins_together or 1) * capture.axis.spacing * VOXEL_BIN_FRACTION
         wanted = depth if by_lattice else wavelength / VOXELS_PER_WAVELENGTH
-        reason = "half the path of a bin" if by_lattice else "an eighth of the wavelength"
+        reason = "a third of the path of a bin" if by_lattice else "an eighth of the wavelength"
         settings = _add(settings, "voxel", max(wanted, extent / MAX_VOXELS_PER_SIDE), reason)
     if settings.sigma is None:
         settings = replace(settings, sigma=wavelength / SIGMAS_PER_WAVELENGTH)

@@ -26,7 +26,7 @@ from nlos import Refinement
 from nlos.illumination_groups import AliasingWarning
 from nlos.refinement.photons import PhotonRefinement
 from nlos.refinement.refine import build_total_variation
-from nlos.settings import METHOD_CLASSES, Settings, complete_settings, find_bright_box, scout_grid
+from nlos.settings import METHOD_CLASSES, Settings, complete_settings, find_bright_box, find_scout
 from tofclip.arrays import ComputeDevice, parse_device
 from tofclip.solvers import Sparse
 
@@ -56,7 +56,7 @@ class ImagingSettings:
     voxel_mm: float | None = setting_field(
         "MM",
         "Distance of neighbouring voxels.",
-        shown="an eighth of the wavelength; lct, fk: half the path of a bin",
+        shown="an eighth of the wavelength; lct, fk: a third of the path of a bin",
     )
     near_m: float | None = setting_field(
         "M",
@@ -454,11 +454,12 @@ def prepare_imaging(
     if found.reasons.get("wavelength"):
         # It was chosen with the wall's sampling in mind.
         warnings.simplefilter("ignore", AliasingWarning)
-    coarse = scout_grid(found)
-    if coarse is not None or found.method is None:
-        quickest, plan = found.plan_quickest(capture, coarse or found.grid())
+    scout = find_scout(capture, found)
+    if scout is not None or found.method is None:
+        coarse, grid = scout or (found, found.grid())
+        quickest, plan = coarse.plan_quickest(capture, grid)
         found = found if found.method else found.with_method(quickest)
-    if coarse is not None:
+    if scout is not None:
         found = find_bright_box(found, image_capture("looking over", plan, capture))
     found = replace(found, everywhere=True)
     shown = from_library(wanted, found, methods or [found.method or ""])

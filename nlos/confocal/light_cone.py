@@ -189,7 +189,7 @@ def _transform_paraboloid(
     turn = np.exp(-2j * np.pi * np.arange(shape[2] // 2 + 1) / shape[2])
     # Impulses beyond the padded record would wrap around into it.
     height = (whole < shape[2] - 1) / np.sqrt(shape[0] * shape[1])
-    columns: NDArray[Any] = _tabulate_powers(turn, whole.astype(np.intp), shape[2]) * (
+    columns: NDArray[Any] = tabulate_powers(turn, whole.astype(np.intp), shape[2]) * (
         1 - weight + weight * turn
     )
     columns *= height[..., np.newaxis]
@@ -198,11 +198,23 @@ def _transform_paraboloid(
     )
 
 
-def _tabulate_powers(
-    turn: NDArray[np.complex128], power: NDArray[np.intp], period: int
+def tabulate_powers(
+    turn: NDArray[np.complex128], power: NDArray[np.intp], period: int, first: int = 0
 ) -> NDArray[np.complex64]:
-    """``turn[w] ** power`` from a table of one whole turn, shape (*power, w)."""
+    """``turn[w] ** power`` from a table of one whole turn.
+
+    Parameters
+    ----------
+    turn : (w,) array
+        ``exp(-2j * pi * (first + w) / period)``.
+    power : (...) int array
+    period, first : int
+
+    Returns
+    -------
+    (..., w) complex64 array
+    """
     # powers of a root of unity repeat: a table is quicker than exponentials, and as exact
     table = np.exp(-2j * np.pi * np.arange(period) / period).astype(np.complex64)
-    exponent = power[..., np.newaxis] * np.arange(turn.size)
+    exponent = power[..., np.newaxis] * np.arange(first, first + turn.size)
     return np.asarray(table[exponent % period])

@@ -1,0 +1,215 @@
+"""What stands first on every line of sight from the wall: its depth, albedo and normal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlos.geometry import FloatArray
+from nlos.plane import axis_step
+from nlos.volume import Volume
+from tofclip.errors import InputError
+from tofclip.storage import atomic_path
+
+GRADIENT_VOXELS = 2.0
+"""Standard deviation of the neighbourhood whose gradients give a normal, voxels."""
+
+MAX_STEP_VOXELS = 3.0
+"""Neighbouring pixels whose depths differ by more, in voxels, are of different things."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrontSurface:
+    """The hidden surface that is seen from the wall, one point per pixel of the front view.
+
+    Parameters
+    ----------
+    x, y : (n,) array
+        Pixels, m.
+    depth : (y, x) float32 array
+        m; NaN where nothing is seen.
+    albedo : (y, x) float32 array
+        Brightness, 0 where nothing is seen.
+    normals : (y, x, 3) float32 array
+        Unit vectors that point to the wall's side (z < 0); NaN where nothing is seen.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    depth: NDArray[np.float32]
+    albedo: NDArray[np.float32]
+    normals: NDArray[np.float32]
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Pixels with a surface, (y, x)."""
+        return np.isfinite(self.depth)
+
+    @property
+    def points(self) -> NDArray[np.float32]:
+        """Places of the pixels with a surface, (n, 3), m."""
+        rows, columns = np.nonzero(self.seen)
+        places: list[NDArray[Any]] = [self.x[columns], self.y[rows], self.depth[rows, columns]]
+        return np.stack(places, axis=-1).astype(np.float32)
+
+    @property
+    def faces(self) -> NDArray[np.int32]:
+        """Triangles between neighbouring pixels of one thing: (m, 3) indices into `points`,
+        counter-clockwise as seen from the wall.
+        """
+        index = np.full(self.depth.shape, -1, np.int32)
+        index[self.seen] = np.arange(int(self.seen.sum()))
+        corners = [part.ravel() for part in _list_corners(index)]
+        depths = np.stack([part.ravel() for part in _list_corners(self.depth)])
+        step = max(axis_step(axis) for axis in (self.x, self.y) if axis.size > 1)
+        # NaN, where a corner is not seen, is not near.
+        near = np.ptp(depths, axis=0) < MAX_STEP_VOXELS * step
+        a, b, c, d = (corner[near] for corner in corners)
+        return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).astype(np.int32)
+
+    def save(self, path: str | Path) -> None:
+        """Write an oriented cloud that is a mesh as well, as binary PLY, whole or not at all.
+
+        Parameters
+        ----------
+        path : path-like
+            Ends in .ply.
+
+        Raises
+        ------
+        InputError
+            Another suffix.
+        """
+        if Path(path).suffix.lower() != ".ply":
+            raise InputError(f"{path}: a surface with normals is written as .ply")
+        points, faces = self.points, self.faces if min(self.depth.shape) > 1 else np.empty((0, 3))
+        names = ("x", "y", "z", "nx", "ny", "nz", "brightness")
+        header = [
+            "ply",
+            "format binary_little_endian 1.0",
+            "comment units: m",
+            f"element vertex {len(points)}",
+            *(f"property float {name}" for name in names),
+            f"element face {len(faces)}",
+            "property list uchar int vertex_indices",
+            "end_header",
+        ]
+        columns = [points, self.normals[self.seen], self.albedo[self.seen][:, np.newaxis]]
+        rows = np.empty(len(faces), np.dtype([("corners", "u1"), ("faces", "<i4", 3)]))
+        rows["corners"], rows["faces"] = 3, faces
+        with atomic_path(path) as temporary, open(temporary, "wb") as file:
+            file.write(("\n".join(header) + "\n").encode())
+            file.write(np.concatenate(columns, axis=1).astype("<f4").tobytes())
+            file.write(rows.tobytes())
+
+
+def find_front_surface(volume: Volume, fraction: float = 0.3) -> FrontSurface:
+    """Find the front surface of a volume; its normals are the directions in which brightness
+    changes most.
+
+    Parameters
+    ----------
+    volume : Volume
+        At least 3 voxels along every axis.
+    fraction : float
+        A line of sight shows a surface where its brightest voxel has this fraction of the
+        brightest of all.
+
+    Returns
+    -------
+    FrontSurface
+
+    Raises
+    ------
+    InputError
+        The volume is too small or dark, or the fraction is not between 0 and 1.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    grid, magnitude = volume.grid, volume.magnitude.astype(np.float64)
+    require_surface(magnitude, fraction)
+    gradients = np.gradient(magnitude, grid.z, grid.y, grid.x)
+    rows, columns = np.indices(magnitude.shape[1:])
+    peak = magnitude.argmax(axis=0)
+    tensor = np.empty((*peak.shape, 3, 3))
+    for i in range(3):
+        for j in range(i, 3):
+            # z, y, x of the gradients are 2, 1, 0 of the normal.
+            mean = gaussian_filter(gradients[2 - i] * gradients[2 - j], GRADIENT_VOXELS)
+            tensor[..., i, j] = tensor[..., j, i] = mean[peak, rows, columns]
+    _, directions = np.linalg.eigh(tensor)
+    return build_front_surface(volume, directions[..., 2], fraction)
+
+
+def build_front_surface(volume: Volume, normals: NDArray[Any], fraction: float) -> FrontSurface:
+    """Put together the surface of the brightest voxel on every line of sight.
+
+    Parameters
+    ----------
+    volume : Volume
+    normals : (y, x, 3) array
+        Of that voxel, of any length and on either side.
+    fraction : float
+        As of `find_front_surface`.
+
+    Returns
+    -------
+    FrontSurface
+    """
+    grid, magnitude = volume.grid, volume.magnitude
+    albedo = magnitude.max(axis=0)
+    seen = albedo >= fraction * albedo.max()
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    towards = np.where(normals[..., 2:] > 0, -1.0, 1.0) / np.maximum(length, 1e-30)
+    return FrontSurface(
+        grid.x,
+        grid.y,
+        np.where(seen, _refine_peaks(magnitude, grid.z), np.nan).astype(np.float32),
+        np.where(seen, albedo, 0).astype(np.float32),
+        np.where(seen[..., np.newaxis], normals * towards, np.nan).astype(np.float32),
+    )
+
+
+def require_surface(magnitude: NDArray[np.floating], fraction: float) -> None:
+    """Refuse volumes that hold no surface, and fractions that are none.
+
+    Parameters
+    ----------
+    magnitude : (z, y, x) array
+    fraction : float
+
+    Raises
+    ------
+    InputError
+        One of these is the case.
+    """
+    if not 0 < fraction < 1:
+        raise InputError(
+            f"a surface lies where brightness is a fraction from 0 to 1, got {fraction}"
+        )
+    if min(magnitude.shape) < 3 or not magnitude.any():
+        raise InputError("a surface needs at least 3 voxels along every axis, and light")
+
+
+def _refine_peaks(magnitude: NDArray[np.floating], z: FloatArray) -> FloatArray:
+    """Depth (y, x) of the brightest voxel, between voxels by a parabola."""
+    peak = magnitude.argmax(axis=0)
+    inner = np.clip(peak, 1, z.size - 2)
+    below, middle, above = (
+        np.take_along_axis(magnitude, (inner + i)[np.newaxis], axis=0)[0].astype(np.float64)
+        for i in (-1, 0, 1)
+    )
+    curvature = below - 2 * middle + above
+    safe = np.where(curvature < 0, curvature, -np.inf)
+    offset = np.where(peak == inner, (below - above) / (2 * safe), 0.0)
+    step = float(np.median(np.diff(z)))
+    return np.asarray(z[peak] + np.clip(offset, -0.5, 0.5) * step)
+
+
+def _list_corners(values: NDArray[Any]) -> list[NDArray[Any]]:
+    """Upper left, upper right, lower left and lower right of every square of four pixels."""
+    return [values[:-1, :-1], values[:-1, 1:], values[1:, :-1], values[1:, 1:]]

@@ -1,0 +1,86 @@
+"""Surfaces with normals: depth, albedo and direction of what is seen from the wall."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from relay_walls import planar_wall
+
+from nlos import Capture, Grid, PlanarRSD, Volume
+from nlos.capture import TimeAxis
+from nlos.confocal.directional import DirectionalLightCone
+from nlos.front_surface import FrontSurface, find_front_surface
+from nlos.simulate import HiddenScene, Surface
+from tofclip.errors import InputError
+
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+WALL = planar_wall(32, 32)
+CENTRE = np.array([0.05, -0.05, 0.7])
+GRID = Grid.box((-0.25, 0.35), (-0.35, 0.25), (0.5, 0.9), 0.02)
+
+
+@cache
+def tilted(turn: float, confocal: bool) -> Capture:
+    """A matte square of 0.4 m, turned about y by so many degrees."""
+    angle = np.radians(turn)
+    u, v = 0.2 * np.array([np.cos(angle), 0, np.sin(angle)]), np.array([0, 0.2, 0])
+    corners = CENTRE + np.array([-u - v, u - v, u + v, -u + v])
+    # Counter-clockwise as seen from the wall.
+    square = Surface.mesh(corners, [[0, 2, 1], [0, 3, 2]], 0.02)
+    laser = WALL if confocal else [0.0, 0.0, 0.0]
+    return HiddenScene([square]).simulate_capture(WALL, laser, TimeAxis(200, 50e-12), 60e-12)
+
+
+def find_surface(turn: float, confocal: bool) -> FrontSurface:
+    capture = tilted(turn, confocal)
+    if confocal:
+        return DirectionalLightCone().find_front_surface(capture, GRID, 0.4)
+    return find_front_surface(PlanarRSD(0.12).reconstruct(capture, GRID), 0.2)
+
+
+@pytest.mark.parametrize("confocal", [True, False])
+@pytest.mark.parametrize("turn", [0.0, 30.0, -30.0])
+def test_a_tilted_square_has_its_depth_and_direction(turn: float, confocal: bool) -> None:
+    found, angle = find_surface(turn, confocal), np.radians(turn)
+    x, y, z = found.points.T
+    inner = (np.abs(x - CENTRE[0]) < 0.1) & (np.abs(y - CENTRE[1]) < 0.1)
+    assert inner.sum() > 60
+    plane = CENTRE[2] + (x[inner] - CENTRE[0]) * np.tan(angle)
+    # a bin, or a quarter of the wavelength
+    assert np.median(np.abs(z[inner] - plane)) < (0.005 if confocal else 0.03)
+    normals = found.normals[found.seen][inner]
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    true = [np.sin(angle), 0, -np.cos(angle)]
+    errors = np.degrees(np.arccos(np.clip(normals @ true, -1, 1)))
+    assert np.median(errors) < 12
+
+
+def test_a_surface_is_written_with_normals(tmp_path: Path) -> None:
+    import pyvista
+
+    found = find_surface(30.0, True)
+    found.save(tmp_path / "surface.ply")
+    read = pyvista.read(tmp_path / "surface.ply")
+    assert np.allclose(read.points, found.points, atol=1e-6)
+    assert read.n_cells == len(found.faces) > 60
+    # Faces look at the wall, as normals do.
+    corners = found.points[found.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert np.all(across[:, 2] < 0)
+    with pytest.raises(InputError, match=r"written as \.ply"):
+        found.save(tmp_path / "surface.vti")
+
+
+def test_what_shows_no_surface_is_refused() -> None:
+    dark = Volume(np.zeros(GRID.shape), GRID)
+    flat = Grid(GRID.x, GRID.y, GRID.z[:2])
+    for volume, fraction, reason in (
+        (dark, 0.3, "and light"),
+        (Volume(np.ones(flat.shape), flat), 0.3, "3 voxels along every axis"),
+        (dark, 1.5, "a fraction from 0 to 1"),
+    ):
+        with pytest.raises(InputError, match=reason):
+            find_front_surface(volume, fraction)
