@@ -11,6 +11,7 @@ from apps.studies import (
     occlusion,
     refocused_pictures,
     representation,
+    surfaces,
 )
 from apps.studies.outcome import Study
 from tofclip.errors import InputError
@@ -27,6 +28,7 @@ STUDIES: tuple[Study, ...] = (
     light_field_properties.GLOSSY_STUDY,
     light_field_properties.FOCUS_STUDY,
     refocused_pictures.ASSIGNMENT_STUDY,
+    *surfaces.STUDIES,
 )
 
 

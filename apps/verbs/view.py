@@ -19,7 +19,7 @@ from apps.viewer.render import choose_renderer
 from apps.viewer.scene_figure import choose_frames, save_film, save_picture
 from apps.viewer.server import parse_loopback
 from apps.viewer.session import Session
-from apps.viewer.source_factory import LOOK_METHODS, ShotOptions, open_source
+from apps.viewer.source_factory import LOOK_METHODS, SURFACES, ShotOptions, open_source
 from tofclip.errors import InputError
 from tofclip.units import NANOSECOND, PICOSECOND
 
@@ -49,9 +49,9 @@ def view(
         typer.Option(
             "--method",
             metavar="NAME",
-            help="For raw shots: tv, l1, linear or adjoint, with few iterations.",
+            help="For raw shots: tv, l1, linear or adjoint, with few iterations; surfaces for one shot.",
             show_default="l1 for one shot, linear for many",
-            autocompletion=make_completer(*LOOK_METHODS),
+            autocompletion=make_completer(*LOOK_METHODS, SURFACES),
         ),
     ] = None,
     port: Annotated[

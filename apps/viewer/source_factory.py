@@ -22,7 +22,7 @@ from devices.transients import read_transient
 from tofclip.camera import Camera, measure
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io import read_streak
-from tofclip.recovery import make_method, open_shot
+from tofclip.recovery import make_method, open_shot, plan_recovery
 from tofclip.shots import Frames
 from tofclip.solvers import Method
 from tofclip.storage import HDF5_SIGNATURE, Record, translate_read_errors
@@ -33,7 +33,10 @@ if TYPE_CHECKING:
 
 
 LOOK_METHODS = ("tv", "l1", "linear", "adjoint")
-"""`tofclip.recovery` has one more, which takes half a minute."""
+"""Quick enough for shots that come one after the other, and to refocus by."""
+
+SURFACES = "surfaces"
+"""Takes some ten seconds, for which a single shot has the time."""
 
 FIRST_LOOK_METHOD, FIRST_LOOK_ITERATIONS = "l1", 25
 """Enough to read what is written on a surface; `tofclip recover` takes 40."""
@@ -52,8 +55,9 @@ class ShotOptions:
     time_zero : float, optional
         Reading of the time axis at which light of range 0 would arrive, s; by default the camera's.
     method : str, optional
-        How shots are recovered: a name of `tofclip.recovery.METHODS` but ``"surfaces"``. By default
-        a single one by a few iterations of ``"l1"``, and one after the other by ``"linear"``.
+        How shots are recovered: a name of `tofclip.recovery.METHODS`, ``"surfaces"`` for a single
+        one. By default a single one by some iterations of ``"l1"``, and one after the other by
+        ``"linear"``.
     """
 
     camera: Path | None = None
@@ -140,6 +144,8 @@ def _open_folder(path: Path, options: ShotOptions) -> Source:
 def _open_shots(title: str, shots: Sequence[Callable[[], Streak]], options: ShotOptions) -> Source:
     """Shots in files. A single one becomes a transient, so that time can be walked through."""
     first = shots[0]()
+    if options.method == SURFACES and len(shots) == 1:
+        return _open_surfaces(title, first, options)
     camera = _find_camera(first, options)
     if len(shots) > 1:
         return StoredShotSource(title, shots, camera, _make_method(options.method))
@@ -150,12 +156,27 @@ def _open_shots(title: str, shots: Sequence[Callable[[], Streak]], options: Shot
     return TransientSource(title, frames, measured.values, method)
 
 
+def _open_surfaces(title: str, shot: Streak, options: ShotOptions) -> Source:
+    """A single shot by its surfaces; a refocus, which shows frames, is quick."""
+    opened = open_shot(shot, options.camera, options.time_zero)
+    frames = plan_recovery(opened, SURFACES).run()
+    measured = measure(shot.counts, shot.saturated, frames.camera)
+    return TransientSource(title, frames, measured.values, _make_method(FIRST_LOOK_METHOD))
+
+
 def _make_method(name: str | None) -> Method | None:
     """A method quick enough to look by; None where a source is to choose."""
     if name is None:
         return None
+    if name == SURFACES:
+        raise InputError(
+            "surfaces take too long for shots one after the other, and need a shot; choose one of "
+            f"{', '.join(LOOK_METHODS)}, or make frames by tofclip recover"
+        )
     if name not in LOOK_METHODS:
-        raise InputError(f"unknown method '{name}'; choose one of {', '.join(LOOK_METHODS)}")
+        raise InputError(
+            f"unknown method '{name}'; choose one of {', '.join((*LOOK_METHODS, SURFACES))}"
+        )
     iterations = FIRST_LOOK_ITERATIONS if name in ("tv", "l1") else None
     return cast(Method, make_method(name, iterations=iterations))
 

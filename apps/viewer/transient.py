@@ -152,7 +152,9 @@ class TransientSource(Source):
 
     @functools.cached_property
     def _full_view(self) -> View:
-        return make_view(depth(self.frames))
+        # Surfaces were found with their points; frames are searched for theirs.
+        found = self.frames.returns
+        return make_view(depth(self.frames) if found is None else found)
 
     @functools.cached_property
     def _measurements(self) -> Readings:

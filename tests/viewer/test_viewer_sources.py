@@ -219,7 +219,19 @@ def test_a_quick_look_is_called_one_and_another_method_can_be_asked_for(folder: 
     session.shear = 0.5
     assert session.notes == (LINEAR_NOTE,)
     with pytest.raises(InputError, match="choose one of tv, l1, linear, adjoint"):
-        open_source(shot, ShotOptions(method="surfaces"))
+        open_source(stack, replace(with_camera, method="surfaces"))
+
+
+def test_a_single_shot_can_be_looked_at_by_its_surfaces(folder: Path) -> None:
+    source = open_source(str(folder / "shot.h5"), ShotOptions(method="surfaces"))
+    view = source.view(0)
+    assert view.pixels is not None
+    near = view.pixels[:, 0] < 16
+    for side, frame in ((near, NEAR_FRAME), (~near, FAR_FRAME)):
+        assert side.sum() > 25
+        assert np.median(view.cloud.range[side]) == pytest.approx(range_of(frame), abs=3e-3)
+    # what is shown are the surfaces' own points, not what a search of frames would find
+    np.testing.assert_array_equal(np.sort(view.cloud.range), np.sort(source.frames.returns.range))
 
 
 def test_a_stack_of_shots_is_recovered_shot_by_shot(folder: Path) -> None:

@@ -108,10 +108,14 @@ class Shot:
         With a time axis.
     camera : Camera
         With the time zero that holds for this shot. Its sweep may be unknown; see `fit_camera`.
+    centre_error_px : float
+        How far off the calibration had each slit centre, as far as the shot shows it; 0 where the
+        camera was not fitted to it.
     """
 
     streak: Streak
     camera: Camera
+    centre_error_px: float = 0.0
 
     @property
     def times(self) -> NDArray[np.float64]:
@@ -122,7 +126,12 @@ class Shot:
         """Return this shot with a camera whose sweep is known, found from the shot if need be."""
         if self.camera.sweep is not None:
             return self
-        return replace(self, camera=fit_camera_to_shot(self.streak, self.camera, progress))
+        found = fit_camera_to_shot(self.streak, self.camera, progress)
+        moved_px = found.centres_px - self.camera.centres_px
+        # two combinations of the centres only displace the picture, which no shot shows
+        freedom = max(found.views - 2, 1)
+        error_px = float(np.sqrt(np.sum(moved_px**2) / freedom))
+        return replace(self, camera=found, centre_error_px=error_px)
 
 
 def open_shot(
@@ -281,7 +290,7 @@ class RecoveryPlan:
         """Recover frames, quickly, and then the surfaces in them."""
         focus = DepthLockedFocus() if shot.camera.lenslet_pitch > 0 else self.focus
         start = replace(self, shot=shot, method=method.start, focus=focus).run(progress)
-        found = method.recover_surfaces(shot.streak, start, progress)
+        found = method.recover_surfaces(shot.streak, start, progress, shot.centre_error_px)
         seconds = time.perf_counter() - started
         pace = {"seconds": seconds, "frames_per_second": found.times.size / seconds}
         return replace(found, figures={**found.figures, **pace})

@@ -146,8 +146,8 @@ def smooth_rows(image, kernel, rows, margin, result):
             result[target, column] = 0
         for tap in range(kernel.size):
             source = target + margin + half - tap
-            if 0 <= source < image.shape[0]:
-                weight = kernel[tap]
+            weight = kernel[tap]
+            if weight != 0 and 0 <= source < image.shape[0]:
                 for column in range(columns):
                     result[target, column] += weight * image[source, column]
 

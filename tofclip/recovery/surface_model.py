@@ -53,9 +53,10 @@ class SurfaceState:
         Inverse depths of each surface, 1/m, over its basis.
     gains : (views,) float array
     delays : (views,) float array
-        Rows by which the views are later than the camera's sweep says.
+        Rows by which light at the views' centres is later than the camera's sweep says. Between two
+        centres they are interpolated, as a sweep is a smooth function of the slit column.
     stretches : (views,) float array
-        Rows by which that delay grows over the streak image.
+        Rows by which those delays grow over the streak image.
     widths : (views,) float array
         Pulse widths, relative to the camera's.
     """
@@ -101,6 +102,13 @@ class ViewPlaces(NamedTuple):
     lit_rows: NDArray[np.int64]
     reached_rows: NDArray[np.int64]
     rows_per_instant: float
+    before: NDArray[np.intp]
+    fraction: FloatArray
+
+    def weigh_centre(self, view: int) -> FloatArray:
+        """How much of the sweep at a view's centre each point's place on the slit has."""
+        upto = np.where(self.before == view, 1 - self.fraction, 0.0)
+        return upto + np.where(self.before + 1 == view, self.fraction, 0.0)
 
 
 class Derivatives(NamedTuple):
@@ -150,7 +158,7 @@ class SurfaceModel:
     ) -> None:
         self.camera, self.masks, self.bases = camera, masks, list(bases)
         self.bin_width = float(np.mean(np.diff(streak.times)))
-        self.start = float(streak.times[0])
+        self.times = streak.times
         self.image, self.weights = weigh_measurements(streak, camera)
         self.surface, y, x = np.nonzero(masks)
         self.pixel = y * masks.shape[2] + x
@@ -181,6 +189,29 @@ class SurfaceModel:
         self._sigmas = sigma * np.array([one.rows_per_instant for one in self._views])
         self.kernels = [make_pulse(width, self._half) for width in self._sigmas * state.widths]
 
+    def compute_slopes(self) -> FloatArray:
+        """Return how steeply the ranges change along columns and rows, (2, points), m per pixel."""
+        rows, columns = self.camera.image_shape
+        y, x = np.divmod(self.pixel, columns)
+        steps = []
+        for down, right in ((0, 1), (1, 0)):
+            # at the picture's end the step goes back
+            sign = np.where((y + down < rows) & (x + right < columns), 1, -1)
+            below, beside = y + sign * down, x + sign * right
+            pixel = below * columns + beside
+            inverse = np.concatenate(
+                [
+                    basis.evaluate(pixel[part]) @ c
+                    for basis, part, c in zip(
+                        self.bases, self.parts, self.state.coefficients, strict=True
+                    )
+                ]
+            )
+            length = 1 / compute_ray_directions(self.camera, below, beside)[:, 2]
+            there = length / np.maximum(inverse, MIN_INVERSE_DEPTH)
+            steps.append(sign * (there - self.distance))
+        return np.stack(steps)
+
     def _map_views(self, work: Callable[[int], Result]) -> list[Result]:
         """Return ``work(view)`` of all views; each thread takes its share of them at once."""
         views = self.camera.views
@@ -195,7 +226,7 @@ class SurfaceModel:
             split_over_slit,
         )
 
-        row, column, pace = self._locate(view, points)
+        row, column, pace, before, fraction = self._locate(view, points)
         first, shares = (
             np.empty(row.size, np.int32),
             np.empty((row.size, SPLINE_SAMPLES), np.float32),
@@ -222,28 +253,49 @@ class SurfaceModel:
             np.flatnonzero(lit[self._margin : -self._margin] > 0),
             np.flatnonzero(reached),
             pace,
+            before,
+            fraction,
         )
 
-    def _locate(self, view: int, points: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """Raw row and column of every point in a view, and raw rows per instant there."""
+    def _locate(
+        self, view: int, points: FloatArray
+    ) -> tuple[FloatArray, FloatArray, float, NDArray[np.intp], FloatArray]:
+        """Raw row and column of every point in a view, raw rows per instant there, and between which
+        two centres the points lie, and where.
+        """
         camera, position = self.camera, self.camera.view_positions[view]
         viewpoint = np.array([camera.lenslet_pitch * position, 0.0, 0.0])
         back = np.linalg.norm(points - viewpoint, axis=1)
-        time = (self.distance + back) / SPEED_OF_LIGHT + camera.time_zero - self.start
+        time = (self.distance + back) / SPEED_OF_LIGHT + camera.time_zero
         column = (
             camera.centres_px[view]
             + self._x
             - self._y * np.tan(camera.angles[view])
             + camera.shear_at(points[:, 2]) * position
         )
-        row, pace = time / self.bin_width, 1.0
+        before, fraction = self._split_between_centres(column)
+        row, pace = find_rows(self.times, time), 1.0
         if camera.sweep is not None:
             later, _ = camera.sweep.raw_position(row + 0.5, column)
             row, raw_column = camera.sweep.raw_position(row, column)
             pace = 2 * float(np.mean(later - row)) if row.size else 1.0
             column = np.array(raw_column, np.float64)
-        late = self.state.delays[view] + self.state.stretches[view] * self._height(row)
-        return row + late, column, pace
+        after, state = np.minimum(before + 1, camera.views - 1), self.state
+        delay, stretch = (
+            (1 - fraction) * values[before] + fraction * values[after]
+            for values in (state.delays, state.stretches)
+        )
+        return row + delay + stretch * self._height(row), column, pace, before, fraction
+
+    def _split_between_centres(self, column: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+        """The centre before each place on the slit, and the way to the next one, 0 to 1; beyond the
+        outer centres the sweep goes on linearly.
+        """
+        centres = self.camera.centres_px
+        if centres.size == 1:
+            return np.zeros(column.size, np.intp), np.zeros(column.size)
+        before = np.clip(np.searchsorted(centres, column) - 1, 0, centres.size - 2)
+        return before, (column - centres[before]) / (centres[before + 1] - centres[before])
 
     def _height(self, row: NDArray[Any]) -> FloatArray:
         """Rows as fractions of the streak image from its middle."""
@@ -363,31 +415,51 @@ class SurfaceModel:
         and widths are by their logarithms.
         """
         reference = int(np.argmin(np.abs(self.camera.view_positions)))
+        views = range(self.camera.views)
+        yield from map_parallel(lambda view: self._differentiate_view(view, amplitude), views)
         yield from map_parallel(
-            lambda view: self._differentiate_view(view, amplitude, view == reference),
-            range(self.camera.views),
+            lambda view: self._differentiate_sweep(view, amplitude),
+            [view for view in views if view != reference],
         )
         yield from map_parallel(
             lambda surface: self._differentiate_surface(surface, amplitude),
             range(len(self.masks)),
         )
 
-    def _differentiate_view(self, view: int, amplitude: Image, reference: bool) -> Derivatives:
+    def _differentiate_view(self, view: int, amplitude: Image) -> Derivatives:
         kernel, own = self.kernels[view], self._overlap(view)
-        slope = differentiate_pulse(kernel)
         wider = make_pulse(
             self._sigmas[view] * self.state.widths[view] * (1 + WIDTH_STEP), self._half
         )
-        late = (amplitude * self._height(self._views[view].row)).astype(np.float32)
         images = {
             "gains": self.project(view, amplitude, kernel),
             "widths": self.project(view, amplitude, (wider - kernel) / np.float32(WIDTH_STEP)),
         }
-        if not reference:
-            images["delays"] = self.project(view, amplitude, slope)
-            images["stretches"] = self.project(view, late, slope)
         stacked = np.stack(list(images.values()))[:, :, own[0]] * np.float32(self.state.gains[view])
         return Derivatives([(name, 0, view) for name in images], 0, own[1].start, stacked)
+
+    def _differentiate_sweep(self, view: int, amplitude: Image) -> Derivatives:
+        """By delay and stretch at a view's centre, which the views beside it feel as well."""
+        felt = []
+        for other, place in enumerate(self._views):
+            weight = place.weigh_centre(view)
+            if not weight.any():
+                continue
+            slope = differentiate_pulse(self.kernels[other])
+            slope *= np.float32(self.state.gains[other])
+            light = amplitude * weight
+            late = light * self._height(place.row)
+            own, slit = self._overlap(other)
+            images = [
+                self.project(other, one.astype(np.float32), slope)[:, own] for one in (light, late)
+            ]
+            felt.append((slit, images))
+        first = min((slit.start for slit, _ in felt), default=0)
+        last = max((slit.stop for slit, _ in felt), default=first + 1)
+        total = np.zeros((2, self.image.shape[0], last - first), np.float32)
+        for slit, images in felt:
+            total[:, :, slit.start - first : slit.stop - first] += images
+        return Derivatives([("delays", 0, view), ("stretches", 0, view)], 0, first, total)
 
     def _differentiate_surface(self, surface: int, amplitude: Image) -> Derivatives:
         part, monomials = self.parts[surface], self.monomials[surface]
@@ -395,7 +467,8 @@ class SurfaceModel:
         last = max(int(one.row[part].max(initial=0)) for one in self._views) + self._half + 3
         first = min(max(first, 0), self.image.shape[0] - 1)
         last = max(min(last, self.image.shape[0]), first + 1)
-        rows_per_metre = 2 / SPEED_OF_LIGHT / self.bin_width
+        there = 2 * self.distance[part] / SPEED_OF_LIGHT + self.camera.time_zero
+        rows_per_metre = 2 / SPEED_OF_LIGHT / np.interp(there, self.times, np.gradient(self.times))
         # range = length / inverse depth
         by_inverse = -(self.distance[part] ** 2) / self.ray_length[part] * rows_per_metre
         in_range = (amplitude[part] * by_inverse)[:, np.newaxis] * monomials
@@ -410,6 +483,22 @@ class SurfaceModel:
                 images[number, :, slit] += image[:, own]
         names = [("coefficients", surface, number) for number in range(len(lights))]
         return Derivatives(names, first, 0, images)
+
+
+def find_rows(times: FloatArray, time: FloatArray) -> FloatArray:
+    """Return where instants lie on a time axis, which need not be even, in rows.
+
+    Parameters
+    ----------
+    times : (rows,) float array
+        Rising, s; beyond its ends the axis goes on as there.
+    time : float array
+        s.
+    """
+    first, last = times[1] - times[0], times[-1] - times[-2]
+    before, after = np.minimum(time - times[0], 0) / first, np.maximum(time - times[-1], 0) / last
+    rows: FloatArray = np.interp(time, times, np.arange(times.size)) + before + after
+    return rows
 
 
 def weigh_measurements(streak: Streak, camera: Camera) -> tuple[Image, Image]:
@@ -451,6 +540,7 @@ def make_pulse(sigma: float, half: int, variance: float = 1 / 6) -> Image:
     rest = max(sigma**2 - variance, MIN_VARIANCE)
     taps = np.arange(-half, half + 1)
     pulse = np.exp(-(taps**2) / (2 * rest))
+    pulse[np.abs(taps) > EXTENT_SIGMAS * np.sqrt(rest) + 1] = 0  # which smoothing skips
     found: Image = (pulse / pulse.sum()).astype(np.float32)
     return found
 

@@ -26,7 +26,12 @@ PROX_ITERATIONS = 6  # of the dual, which is kept from step to step
 NORM_ITERATIONS, FURTHER_NORM_ITERATIONS = 10, 2
 NORM_MARGIN = 1.1
 SMALLEST_STEP = 1 / 16  # of a Gauss-Newton step, halved until it lowers the misfit
-ELIMINATION_ITERATIONS = 6  # smooth changes of amplitude, which matter, converge first
+# Smooth changes of amplitude, which matter, converge first; those of the last step are nearly right.
+ELIMINATION_ITERATIONS, FURTHER_ELIMINATION_ITERATIONS = 6, 2
+# Rows by which each view's part of a sweep that was found from the shot is off: root mean squares of
+# the demonstration. Later views and farther surfaces look alike, so that the mean over the views is
+# what all ranges have in common.
+SWEEP_SIGMAS = {"delays": 0.015, "stretches": 0.05}
 RIDGE = 1e-6  # of each unknown's own information: for what the shot says nothing about
 CLUSTER_ROWS, CLUSTER_COLUMNS = 12, 48  # measurements whose misfits may depend on each other
 
@@ -157,13 +162,18 @@ class Refinement:
         Of each surface's coefficients; everything else that was solved for is unknown.
     amplitude : (points,) float32 array
         After the step.
+    explained : (6, points) float32 array
+        Changes of amplitude that look like a change of each coefficient of a quadratic.
     """
 
     covariances: list[FloatArray]
     amplitude: Image
+    explained: Image
 
 
-def refine_state(model: SurfaceModel, amplitude: Image) -> Refinement:
+def refine_state(
+    model: SurfaceModel, amplitude: Image, earlier: Refinement | None = None
+) -> Refinement:
     """Take a Gauss-Newton step on ranges, gains, delays, stretches and pulse widths, if it lowers
     the misfit.
 
@@ -176,6 +186,8 @@ def refine_state(model: SurfaceModel, amplitude: Image) -> Refinement:
     model : SurfaceModel
         Moved in place. The mean gain stays.
     amplitude : (points,) float32 array
+    earlier : Refinement, optional
+        The step before this one, which saves work.
 
     Returns
     -------
@@ -185,11 +197,17 @@ def refine_state(model: SurfaceModel, amplitude: Image) -> Refinement:
     error = model.image - model.render(amplitude)
     pull = model.weights * error
     groups = list(model.iterate_derivatives(amplitude))
-    changes = _eliminate_amplitude(model, amplitude, groups)
+    changes = _eliminate_amplitude(
+        model, amplitude, groups, None if earlier is None else earlier.explained
+    )
     names = [name for group in groups for name in group.names]
     normal = _multiply_groups(groups, model.weights)
     scores = _sum_scores(groups, pull)
     bending, moment = _bend(model, names)
+    for index, (name, _, view) in enumerate(names):
+        if name in SWEEP_SIGMAS:
+            bending[index, index] = 1 / SWEEP_SIGMAS[name] ** 2
+            moment[index] = getattr(state, name)[view] / SWEEP_SIGMAS[name] ** 2
     slope = scores.sum(axis=1) - moment
     scale = np.sqrt(np.diag(normal)) + np.finfo(np.float32).tiny
     whole = (normal + bending) / np.outer(scale, scale) + RIDGE * np.eye(scale.size)
@@ -218,10 +236,12 @@ def refine_state(model: SurfaceModel, amplitude: Image) -> Refinement:
     robust = inverse @ (scores @ scores.T + bending) @ inverse
     numbers = np.array([one if name == "coefficients" else -1 for name, one, _ in names])
     blocks = [np.flatnonzero(numbers == surface) for surface in range(len(model.masks))]
-    return Refinement([robust[block][:, block] for block in blocks], moved)
+    return Refinement([robust[block][:, block] for block in blocks], moved, changes)
 
 
-def _eliminate_amplitude(model: SurfaceModel, amplitude: Image, groups: list[Derivatives]) -> Image:
+def _eliminate_amplitude(
+    model: SurfaceModel, amplitude: Image, groups: list[Derivatives], start: Image | None
+) -> Image:
     """Take from derivatives by coefficients, in place, what amplitudes can explain of them.
 
     What is left of a derivative J is ``J - A x`` with the x that minimises its weighted norm, found
@@ -245,13 +265,19 @@ def _eliminate_amplitude(model: SurfaceModel, amplitude: Image, groups: list[Der
     scale = np.where(lit, 1 / np.sqrt(np.maximum(diagonal, np.finfo(np.float32).tiny)), 0)
     scale = scale.astype(np.float32)
     changes = np.zeros((COEFFICIENTS, model.surface.size), np.float32)
+    iterations = ELIMINATION_ITERATIONS
+    if start is not None:
+        changes[:, lit] = start[:, lit]
+        iterations = FURTHER_ELIMINATION_ITERATIONS
     for number, change in enumerate(changes):
         image = np.zeros_like(model.image)
         for group in plain:
             image[group.row : group.row + group.images.shape[1]] += group.images[number]
+        if start is not None:
+            image -= model.render(change)
         residual = scale * model.gather(model.weights * image)
         direction, energy = residual.copy(), float(np.sum(residual**2, dtype=np.float64))
-        for _ in range(ELIMINATION_ITERATIONS):
+        for _ in range(iterations):
             if energy == 0:
                 break
             product = scale * model.gather(model.weights * model.render(scale * direction))
@@ -273,7 +299,11 @@ def _objective(model: SurfaceModel, amplitude: Image) -> float:
         float(c @ basis.bending @ c) / 2
         for basis, c in zip(model.bases, model.state.coefficients, strict=True)
     )
-    return model.misfit(amplitude) + bent
+    swept = sum(
+        float(np.sum(getattr(model.state, name) ** 2)) / (2 * sigma**2)
+        for name, sigma in SWEEP_SIGMAS.items()
+    )
+    return model.misfit(amplitude) + bent + swept
 
 
 def _bend(model: SurfaceModel, names: list[tuple[str, int, int]]) -> tuple[FloatArray, FloatArray]:

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from tofclip.camera import Camera, measure
+from tofclip.camera import measure
 from tofclip.errors import InputError
 from tofclip.lidar import Detection, Returns, compute_ray_directions, depth
 from tofclip.recovery.surface_model import (
@@ -36,6 +36,7 @@ from tofclip.recovery.surface_model import (
     Image,
     SurfaceModel,
     SurfaceState,
+    find_rows,
 )
 from tofclip.recovery.surface_patches import MARGIN_PX, Patch, find_patches
 from tofclip.recovery.surface_solver import AmplitudeSolver, Refinement, refine_state
@@ -44,12 +45,8 @@ from tofclip.solvers import Method, Progress, Sparse, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
 
 START_ITERATIONS = 25
-REFINEMENTS, REFINEMENT_ITERATIONS = 4, 15
+REFINEMENTS, REFINEMENT_ITERATIONS = 2, 20
 MIN_SURFACE_SHARE = 0.5  # of the returns' light: below, the shot is not one of surfaces
-# Of every range, all in one direction: what the model leaves of the demonstration beside noise (5 to
-# 10 thousandths of a row in seeds 0 to 2), since views do not see the same parts of a surface at
-# borders.
-MODEL_ERROR_ROWS = 0.012
 SURE_SIGMAS = 20.0  # points of which a surface certainly consists
 MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
 NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
@@ -65,7 +62,7 @@ class SurfaceRecovery:
         Of total variation of the amplitudes, in standard deviations of what photon noise makes of
         the misfit's gradient. It needs no knowledge of the scene or of the light's amount.
     iterations : int
-        Of FISTA after the ranges are known; before that there are 85 more.
+        Of FISTA after the ranges are known; before that there are 65 more.
     start : Method
         Recovers the frames in whose returns the surfaces are looked for.
     detection : Detection
@@ -97,7 +94,11 @@ class SurfaceRecovery:
         return self.start.work(frames) + self.steps * frames
 
     def recover_surfaces(
-        self, streak: Streak, frames: Frames, progress: Progress = ignore_progress
+        self,
+        streak: Streak,
+        frames: Frames,
+        progress: Progress = ignore_progress,
+        centre_error_px: float = 0.0,
     ) -> Frames:
         """Recover the surfaces of a shot.
 
@@ -108,6 +109,8 @@ class SurfaceRecovery:
             A fast recovery of the same shot, with the camera to use.
         progress : callable
             Called with the number of frame iterations just done.
+        centre_error_px : float
+            How far off the calibration had each slit centre, as for `tofclip.recovery.Shot`.
 
         Returns
         -------
@@ -140,28 +143,36 @@ class SurfaceRecovery:
         model = SurfaceModel(streak, camera, masks, [patch.basis for patch in patches], state)
         solver = AmplitudeSolver(model, pictures[masks], self.weight)
         solver.run(START_ITERATIONS, progress, count)
-        for _ in range(REFINEMENTS):
-            before = model.distance
-            refinement = refine_state(model, solver.amplitude)
-            solver.amplitude = refinement.amplitude
-            solver.run(REFINEMENT_ITERATIONS, progress, count)
+        refinement, remainder = self._refine(model, solver, progress, count)
         solver.run(self.iterations, progress, count)
-        # What the last step still changed stands for what more of them would.
-        remainder = np.array(
-            [np.sqrt(np.mean((model.distance - before)[part] ** 2)) for part in model.parts]
-        )
-        return self._make_frames(frames, model, solver, refinement, remainder)
+        returns = self._list_returns(model, solver, refinement, remainder, centre_error_px)
+        return self._make_frames(frames, model, solver, returns)
+
+    @staticmethod
+    def _refine(
+        model: SurfaceModel, solver: AmplitudeSolver, progress: Progress, count: int
+    ) -> tuple[Refinement, FloatArray]:
+        """Steps on ranges and instrument; the last one, and what more would change of each surface."""
+        before, changes = model.distance, []
+        found = None
+        for _ in range(REFINEMENTS):
+            found = refine_state(model, solver.amplitude, found)
+            solver.amplitude = found.amplitude
+            solver.run(REFINEMENT_ITERATIONS, progress, count)
+            moved = model.distance - before
+            changes.append([np.sqrt(np.mean(moved[part] ** 2)) for part in model.parts])
+            before = model.distance
+        assert found is not None
+        return found, extrapolate_steps(np.array(changes))
 
     def _make_frames(
         self,
         start: Frames,
         model: SurfaceModel,
         solver: AmplitudeSolver,
-        refinement: Refinement,
-        remainder: FloatArray,
+        returns: Returns,
     ) -> Frames:
-        amplitude = solver.amplitude
-        camera = model.camera.replace(gains=model.state.gains)
+        amplitude, camera = solver.amplitude, returns.camera
         # Rectified like every other method's: its residual is of measurements, not of raw pixels.
         rendered = model.render(amplitude)
         predicted, measured = (
@@ -185,18 +196,19 @@ class SurfaceRecovery:
             camera=camera,
             figures={**start.figures, **figures},
             shears=np.asarray(camera.shear_at(distance)),
-            returns=self._list_returns(model, camera, solver, refinement, remainder),
+            returns=returns,
         )
 
     def _list_returns(
         self,
         model: SurfaceModel,
-        camera: Camera,
         solver: AmplitudeSolver,
         refinement: Refinement,
         remainder: FloatArray,
+        centre_error_px: float,
     ) -> Returns:
         """Points that stand out of the noise and of their neighbourhood, pixel by pixel."""
+        camera = model.camera.replace(gains=model.state.gains)
         distance, amplitude = model.distance, solver.amplitude
         # A pixel alone is hardly above the photons' noise: its neighbours on the surface, which the
         # prior ties to it, count as well.
@@ -207,14 +219,18 @@ class SurfaceRecovery:
         )
         significance = amplitude * np.sqrt(pooled[model.masks] / solver.variance)
         deviation = np.zeros(distance.size)
-        common = MODEL_ERROR_ROWS * model.bin_width * SPEED_OF_LIGHT / 2
         for part, monomials, own, rest in zip(
             model.parts, model.monomials, refinement.covariances, remainder, strict=True
         ):
             variance = np.einsum("pi,ij,pj->p", monomials, own, monomials)
             # range = length / inverse depth
             by_inverse = distance[part] ** 2 / model.ray_length[part]
-            deviation[part] = np.sqrt(by_inverse**2 * variance + rest**2 + common**2)
+            deviation[part] = np.sqrt(by_inverse**2 * variance + rest**2)
+        # What all centres have in common only displaces the picture, and no shot shows it: the mean of
+        # errors that alternate, as of neighbouring lenslets measured in turns. Independent ones would
+        # leave sqrt(views) as much.
+        displacement_px = centre_error_px / camera.views
+        deviation = np.hypot(deviation, displacement_px * np.hypot(*model.compute_slopes()))
         intensity = amplitude * distance**2
         usual = np.zeros(len(model.masks))
         for one in range(usual.size):
@@ -248,6 +264,25 @@ class SurfaceRecovery:
         )
 
 
+def extrapolate_steps(lengths: FloatArray) -> FloatArray:
+    """Return how far steps that shrink as the last two did would still go.
+
+    Parameters
+    ----------
+    lengths : (steps, n) float array
+        Two steps or more.
+
+    Returns
+    -------
+    (n,) float array
+        The sum of a geometric series; steps that do not shrink count as if they halved.
+    """
+    tiny = np.finfo(np.float64).tiny
+    ratio = np.minimum(lengths[-1] / np.maximum(lengths[-2], tiny), 0.5)
+    left: FloatArray = lengths[-1] * ratio / (1 - ratio)
+    return left
+
+
 def _require_surfaces(found: Returns, patches: list[Patch]) -> None:
     """Refuse a shot whose light does not come from surfaces."""
     on_surface = np.zeros(found.camera.image_shape, bool)
@@ -267,7 +302,7 @@ def _render_frames(start: Frames, model: SurfaceModel, amplitude: Image) -> Imag
     from scipy.special import ndtr
 
     lit = np.flatnonzero(amplitude)
-    row = (2 * model.distance[lit] / SPEED_OF_LIGHT - start.times[0]) / start.bin_width
+    row = find_rows(start.times, 2 * model.distance[lit] / SPEED_OF_LIGHT)
     sigma = model.camera.pulse_fwhm / FWHM_PER_SIGMA / start.bin_width
     half = int(np.ceil(EXTENT_SIGMAS * sigma + 0.5))
     rows = np.round(row).astype(np.intp)[:, np.newaxis] + np.arange(-half, half + 2)
