@@ -311,12 +311,15 @@ def run_scenes(
     return Outcome(columns, "see the rows", tuple(rows), tuple(panels))
 
 
+DEFAULT_WEIGHTS = "as each method has it, for all scenes"
+
 STUDIES = (
     Study(
         "surfaces",
         (),
         "Surfaces beside frames: the demonstration",
         "The paper has no such figures; all methods have the same camera, found from the shot.",
+        DEFAULT_WEIGHTS,
         100,
         1,
         run_demo,
@@ -327,6 +330,7 @@ STUDIES = (
         "Surfaces beside frames: slanted, thin and semi-transparent, at three amounts of light",
         "The paper has no such figures; the camera is known, and the light is the photons of the brightest "
         "streak pixel.",
+        DEFAULT_WEIGHTS,
         120,
         len(SCENES) * len(PHOTONS),
         partial(run_scenes, photons=PHOTONS),
