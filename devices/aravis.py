@@ -24,12 +24,16 @@ from devices.frames import FrameCodec
 from devices.gate_scan import GATE_OPTIONS, GateScan
 from devices.ledger import Ledger
 from devices.registry import DiscoveredInstrument
-from devices.retry import retry_connect
 from devices.ring import Gap
 from devices.source import Info
-from devices.stream import StreamSource, Transfer
-from devices.stream_options import OPTIONS as STREAM_OPTIONS
-from devices.stream_options import parse_buffer_settings, parse_seconds
+from devices.stream import (
+    STREAM_OPTIONS,
+    StreamSource,
+    Transfer,
+    parse_buffer_settings,
+    parse_seconds,
+    retry_connect,
+)
 from devices.uri import Uri
 from tofclip.errors import (
     DeviceDisconnectedError,

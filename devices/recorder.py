@@ -12,10 +12,9 @@ from time import monotonic
 from types import FrameType
 from typing import Any
 
-from devices.decoded_source import DecodedSource
+from devices.ledger import Stats
 from devices.recording.writer import RecordingWriter, make_head
-from devices.source import Source
-from devices.statistics import Stats
+from devices.source import DecodedSource, Source
 from tofclip.errors import DeviceTimeoutError, InputError, TofclipError
 
 POLL_INTERVAL_S = 0.25

@@ -32,7 +32,7 @@ OPENERS: dict[str, str] = {
     "sim+vl53l8": "devices.histogram_kits.emulator:open_vl53l8",
     "tmf8828": "devices.histogram_kits.source:open_tmf8828",
     "vl53l8": "devices.histogram_kits.source:open_vl53l8",
-    "sim+timetag": "devices.emulation.source:open_timetag",
+    "sim+timetag": "devices.timetag.simulation:open_timetag",
 }
 """Scheme of an address -> function ``(Uri) -> Source``."""
 

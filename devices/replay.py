@@ -8,11 +8,10 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import Any, NamedTuple
 
-from devices.decoded_source import DecodedSource
 from devices.ledger import Ledger
 from devices.recording.blocks import BlockKind
 from devices.recording.reader import Block, Damage, Ending, Recording
-from devices.source import READ_TIMEOUT_S, Batch, Info
+from devices.source import READ_TIMEOUT_S, Batch, DecodedSource, Info
 from devices.uri import Uri
 from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError
 from tofclip.storage import Record

@@ -18,9 +18,9 @@ from sys import maxsize
 from time import monotonic
 
 from devices.clock import InstrumentClock
+from devices.ledger import Stats
 from devices.registry import open as open_source
 from devices.source import Batch, Source
-from devices.statistics import Stats
 from devices.stream import StreamSource
 from devices.transients import (
     AccumulationSettings,

@@ -6,9 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from devices.ledger import Ledger
+from devices.ledger import Ledger, Stats
 from devices.source import READ_TIMEOUT_S, Batch, Info, Source
-from devices.statistics import Stats
 from devices.uri import Uri
 from tofclip.errors import InputError
 from tofclip.io import read_streak

@@ -3,6 +3,9 @@
 ::
 
     instrument -> Feed -> [thread: whole records] -> Ring -> (tap) -> Codec -> Batch
+
+At the end is what such sources share: values of their addresses, and trying again until an
+instrument that went away is back.
 """
 
 from __future__ import annotations
@@ -10,17 +13,23 @@ from __future__ import annotations
 import atexit
 import contextlib
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
-from time import monotonic
-from typing import Protocol
+from time import monotonic, sleep
+from typing import Protocol, TypeVar
 from weakref import WeakSet
 
 from devices.codec import Codec, as_bytes
-from devices.decoded_source import DecodedSource
 from devices.ledger import Ledger
-from devices.ring import Gap, OverflowPolicy, Piece, RingBuffer
-from devices.source import READ_TIMEOUT_S, Batch, Info
-from tofclip.errors import DeviceTimeoutError
+from devices.ring import OVERFLOW_POLICIES, Gap, OverflowPolicy, Piece, RingBuffer
+from devices.source import READ_TIMEOUT_S, Batch, DecodedSource, Info
+from devices.uri import Uri
+from tofclip.errors import (
+    DeviceDisconnectedError,
+    DeviceNotFoundError,
+    DeviceTimeoutError,
+    InputError,
+)
 from tofclip.storage import Record
 
 POLL_INTERVAL_S = 0.1
@@ -31,6 +40,15 @@ DRAIN_TIMEOUT_S = 3.0
 
 STOP_TIMEOUT_S = 15.0
 """Seconds that `StreamSource.close` waits for the thread, which never takes so long."""
+
+RETRY_INTERVAL_S = 0.1
+"""Seconds between two attempts to reach an instrument that went away."""
+
+STREAM_OPTIONS = ("buffer_mib", "policy")
+"""Values of an address that live sources share."""
+
+_MEBIBYTE = 1 << 20
+_Connected = TypeVar("_Connected")
 
 
 @dataclass(frozen=True)
@@ -231,3 +249,69 @@ class _FeedReader:
         if self._rest:
             self._ledger.truncate()
             self._rest = b""
+
+
+def parse_buffer_settings(uri: Uri) -> BufferSettings:
+    """Read ``buffer_mib=64&policy=block`` (or ``drop_oldest``, ``fail``)."""
+    capacity = uri.value("buffer_mib", float, BufferSettings().capacity / _MEBIBYTE) * _MEBIBYTE
+    if not 0 < capacity <= 1 << 36:
+        raise InputError(f"'{uri.text}': buffer_mib must be within 0 and 65536")
+    policy = next(
+        policy for policy in OVERFLOW_POLICIES if policy == uri.choice("policy", *OVERFLOW_POLICIES)
+    )
+    return BufferSettings(int(capacity), policy)
+
+
+def parse_seconds(uri: Uri, name: str, default: float) -> float:
+    """Read a time to wait, within 0 and 600 s.
+
+    Parameters
+    ----------
+    uri : Uri
+    name : str
+    default : float
+        Seconds.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    InputError
+        It is not a number, or outside 0 to 600 s.
+    """
+    found = uri.value(name, float, default)
+    if not 0 < found <= 600:
+        raise InputError(f"'{uri.text}': {name} must be above 0 and at most 600")
+    return found
+
+
+def retry_connect(connect: Callable[[], _Connected], seconds: float) -> _Connected:
+    """Return what `connect` returns, which is called again while the instrument does not answer.
+
+    Parameters
+    ----------
+    connect : callable
+    seconds : float
+
+    Returns
+    -------
+    object
+
+    Raises
+    ------
+    DeviceDisconnectedError
+        The instrument did not answer for `seconds`.
+    """
+    deadline = monotonic() + seconds
+    while True:
+        try:
+            return connect()
+        except (DeviceNotFoundError, DeviceDisconnectedError, DeviceTimeoutError) as fault:
+            # Looked at after the attempt, so that there is always one.
+            if monotonic() > deadline:
+                raise DeviceDisconnectedError(
+                    f"the connection broke and no answer came for {seconds:g} s ({fault})"
+                ) from fault
+            sleep(RETRY_INTERVAL_S)

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from devices.codec import Records
-from devices.ledger import Ledger
+from devices.ledger import Ledger, Stats
 from devices.source import READ_TIMEOUT_S, Batch, Info, Source
-from devices.statistics import Stats
 from devices.uri import Uri
 from tofclip.dependencies import import_file_reader
 from tofclip.errors import FileFormatError, InputError, TofclipError

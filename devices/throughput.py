@@ -7,10 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from time import monotonic
 
-from devices.decoded_source import DecodedSource
+from devices.ledger import Stats
 from devices.ring import Piece
-from devices.source import Batch, Source
-from devices.statistics import Stats
+from devices.source import Batch, DecodedSource, Source
 from tofclip.errors import DeviceTimeoutError, InputError
 
 POLL_INTERVAL_S = 0.25

@@ -1,5 +1,5 @@
-"""Instruments made of software, which stand where the real ones would: behind the USB, or behind a
-TCP port.
+"""What emulated instruments share: a USB of software and faults to order; and Aravis' own emulated
+camera. Emulations of one instrument are beside its driver.
 
 The drivers do not know the difference; all of their code runs.
 """

@@ -12,8 +12,7 @@ from devices.aravis import OPTIONS, AravisFeed, CameraSettings, load_aravis
 from devices.ledger import Ledger
 from devices.scenes import EmulatedLight, simulate_demonstration_light, simulate_line_light
 from devices.source import Info
-from devices.stream import StreamSource
-from devices.stream_options import parse_buffer_settings
+from devices.stream import StreamSource, parse_buffer_settings
 from devices.uri import Uri
 from tofclip.camera import Camera
 from tofclip.errors import DeviceNotFoundError, InputError, MissingDependencyError

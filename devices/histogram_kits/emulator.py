@@ -32,8 +32,7 @@ from devices.histogram_kits.source import (
 )
 from devices.ledger import Ledger
 from devices.source import Info
-from devices.stream import StreamSource
-from devices.stream_options import parse_buffer_settings
+from devices.stream import StreamSource, parse_buffer_settings
 from devices.uri import Uri
 from tofclip.errors import InputError
 from tofclip.units import SPEED_OF_LIGHT

@@ -21,12 +21,16 @@ from devices.histogram_kits.protocol import (
     Vl53l8Parser,
 )
 from devices.ledger import Ledger
-from devices.retry import retry_connect
 from devices.ring import Gap
 from devices.source import Info
-from devices.stream import StreamSource, Transfer
-from devices.stream_options import OPTIONS as STREAM_OPTIONS
-from devices.stream_options import parse_buffer_settings, parse_seconds
+from devices.stream import (
+    STREAM_OPTIONS,
+    StreamSource,
+    Transfer,
+    parse_buffer_settings,
+    parse_seconds,
+    retry_connect,
+)
 from devices.uri import Uri
 from tofclip.errors import (
     DeviceDisconnectedError,

@@ -21,9 +21,7 @@ from devices.linospad2.codec import FIRMWARES, PIXELS, LinoSpad2Codec
 from devices.linospad2.kernels import ADDRESSES
 from devices.scenes import LineLight, simulate_line_light
 from devices.source import Info
-from devices.stream import StreamSource, Transfer
-from devices.stream_options import OPTIONS as STREAM_OPTIONS
-from devices.stream_options import parse_buffer_settings
+from devices.stream import STREAM_OPTIONS, StreamSource, Transfer, parse_buffer_settings
 from devices.uri import Uri
 from tofclip.errors import InputError, ShapeError
 from tofclip.storage import Record

@@ -7,13 +7,12 @@ from bisect import bisect_right
 from pathlib import Path
 
 from devices.codec import as_bytes
-from devices.decoded_source import DecodedSource
 from devices.ledger import Ledger
 from devices.linospad2.codec import LinoSpad2Codec
 from devices.linospad2.sidecar import read_sidecar
 from devices.linospad2.simulation import make_calibration_record
 from devices.ring import Piece
-from devices.source import READ_TIMEOUT_S, Batch, Info
+from devices.source import READ_TIMEOUT_S, Batch, DecodedSource, Info
 from devices.uri import Uri
 from tofclip.errors import FileFormatError, InputError
 from tofclip.storage import Record, translate_read_errors

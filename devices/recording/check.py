@@ -6,11 +6,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from devices.codec import Codec, as_bytes
+from devices.ledger import Stats
 from devices.recording.blocks import BlockKind
 from devices.recording.reader import Block, BlockReader, Damage, Ending, Recording
 from devices.recording.writer import RecordingWriter
 from devices.ring import Gap, Piece
-from devices.statistics import Stats
 from tofclip.errors import FileFormatError
 
 

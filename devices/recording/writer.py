@@ -13,11 +13,11 @@ from time import monotonic, monotonic_ns, time_ns
 from typing import Any
 
 from devices.codec import Codec
+from devices.ledger import Stats
 from devices.recording.blocks import HEADER_BYTES, BlockHeader, BlockKind
 from devices.recording.reader import Ending
 from devices.ring import Gap, Piece
 from devices.source import Info
-from devices.statistics import Stats
 from tofclip.errors import InputError, StorageError
 from tofclip.storage import Record
 

@@ -16,12 +16,15 @@ from devices.frames import FrameCodec
 from devices.ledger import Ledger
 from devices.remoteex.client import CameraFrame, RemoteExClient
 from devices.remoteex.protocol import COMMAND_PORT, parse_integer
-from devices.retry import retry_connect
 from devices.ring import Gap
 from devices.source import Info
-from devices.stream import StreamSource, Transfer
-from devices.stream_options import OPTIONS as STREAM_OPTIONS
-from devices.stream_options import parse_buffer_settings
+from devices.stream import (
+    STREAM_OPTIONS,
+    StreamSource,
+    Transfer,
+    parse_buffer_settings,
+    retry_connect,
+)
 from devices.uri import Uri
 from tofclip.errors import (
     DeviceBusyError,

@@ -25,8 +25,7 @@ from devices.spad512.protocol import (
     ExposureRequest,
 )
 from devices.spad512.source import OPTIONS, Spad512Feed, parse_exposure, parse_timeouts
-from devices.stream import StreamSource
-from devices.stream_options import parse_buffer_settings
+from devices.stream import StreamSource, parse_buffer_settings
 from devices.tcp import TcpLink
 from devices.uri import Uri
 from tofclip.errors import InputError, ProtocolError, ShapeError

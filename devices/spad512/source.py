@@ -8,7 +8,6 @@ from time import monotonic
 
 from devices.gate_scan import GATE_OPTIONS, GateScan
 from devices.ledger import Ledger
-from devices.retry import retry_connect
 from devices.ring import Gap
 from devices.source import Info
 from devices.spad512.protocol import (
@@ -21,9 +20,14 @@ from devices.spad512.protocol import (
     ExposureRequest,
     find_error_text,
 )
-from devices.stream import StreamSource, Transfer
-from devices.stream_options import OPTIONS as STREAM_OPTIONS
-from devices.stream_options import parse_buffer_settings, parse_seconds
+from devices.stream import (
+    STREAM_OPTIONS,
+    StreamSource,
+    Transfer,
+    parse_buffer_settings,
+    parse_seconds,
+    retry_connect,
+)
 from devices.tcp import TcpLink
 from devices.uri import Uri
 from tofclip.errors import (

@@ -137,10 +137,9 @@ class TimeTaggerFeed:
 
     def pull(self, timeout: float) -> Transfer | None:
         while True:
-            begin = monotonic()
             try:
                 self._prepare_read(timeout)
-                begin = monotonic()
+                begin = self._window.clock()
                 wait = min(timeout, self._window.read_timeout)
                 length = self._link.read(DATA_ENDPOINT, self._buffer, wait)
             except TransferOverflowError:
@@ -152,7 +151,7 @@ class TimeTaggerFeed:
                     raise
                 self._ledger.time_out()
             else:
-                self._set_window(self._window.choose(length, monotonic() - begin))
+                self._set_window(self._window.choose(length, self._window.clock() - begin))
                 if not length:
                     continue  # an empty packet: the chip was asked to send, and had nothing
                 self._bytes_since_gap += length
@@ -268,6 +267,9 @@ class SendWindow:
     transfers or that time. A rate for which 512 bytes come sooner is read in packets of 512 bytes,
     which do not end a transfer.
     """
+
+    clock = staticmethod(monotonic)
+    """By which rates are measured, s."""
 
     def __init__(self) -> None:
         self.size = PACKET_BYTES

@@ -1,8 +1,10 @@
-"""Compiled loops over the words of the time tagger's stream; see `devices.timetag.codec` for what
-the bits mean.
+"""Compiled loops over the words of the time tagger's stream, and those that make them for its
+emulation; see `devices.timetag.codec` for what the bits mean.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numba import njit
@@ -14,6 +16,9 @@ TIME_BITS = 36
 TIME_MASK = (1 << TIME_BITS) - 1
 HALF_RANGE = 1 << (TIME_BITS - 1)
 DELTA, WRAP, LOST = 1, 2, 4
+
+# The 53 upper bits of a word fill the mantissa of a double.
+_DOUBLE_STEP = 2.0**-53
 
 
 @compiled
@@ -89,3 +94,75 @@ def encode_timetags(ticks, channels, flags, data):
         data[at + 3] = (time >> 16) & 0xFF
         data[at + 4] = (time >> 8) & 0xFF
         data[at + 5] = time & 0xFF
+
+
+@compiled
+def _next_random(state):
+    """One step of splitmix64 (Steele, Lea, Flood, OOPSLA 2014); returns the new state and 64 random
+    bits.
+    """
+    state = state + np.uint64(0x9E3779B97F4A7C15)
+    mixed = state
+    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return state, mixed ^ (mixed >> np.uint64(31))
+
+
+@compiled
+def fill_poisson_words(state, now, scale, weights, last, words):
+    """Write the words of photons that arrive at random on four channels, one at most per tick.
+
+    Parameters
+    ----------
+    state : (1,) uint64 array
+        Of the random numbers; changed in place.
+    now : (1,) int64 array
+        Tick of the last record; changed in place.
+    scale : float
+        Of the exponential distribution of which the whole part is the number of ticks between two
+        photons.
+    weights : (4,) float64 array
+        Of all photons, the fraction of each channel, added up.
+    last : int
+        No record is later than this tick.
+    words : bytes
+        Filled with as many records as fit.
+
+    Returns
+    -------
+    int
+        Records written.
+    """
+    written = 0
+    while written < words.size // RECORD_BYTES:
+        after, bits = _next_random(state[0])
+        # One is added before the logarithm, which zero would not have.
+        gap = -math.log(((bits >> np.uint64(11)) + np.uint64(1)) * _DOUBLE_STEP) * scale
+        tick = now[0] + 1 + np.int64(gap)
+        after, bits = _next_random(after)
+        where = (bits >> np.uint64(11)) * _DOUBLE_STEP
+        wrap = ((now[0] >> TIME_BITS) + 1) << TIME_BITS
+        # The counter wraps unless the photon comes first.
+        lines, kind = 0, WRAP
+        if tick < wrap:
+            lines, kind = 1, 0
+            for channel in range(3):
+                if where >= weights[channel]:
+                    lines <<= 1
+        else:
+            tick, after = wrap, state[0]
+        # State is not advanced: the next call draws this record again.
+        if tick > last:
+            break
+        state[0], now[0] = after, tick
+        at = written * RECORD_BYTES
+        time = tick & TIME_MASK
+        # Six bytes, the highest first; see devices.timetag.codec.
+        words[at] = kind << 5
+        words[at + 1] = (lines << 4) | (time >> 32)
+        words[at + 2] = (time >> 24) & 0xFF
+        words[at + 3] = (time >> 16) & 0xFF
+        words[at + 4] = (time >> 8) & 0xFF
+        words[at + 5] = time & 0xFF
+        written += 1
+    return written

@@ -7,9 +7,7 @@ from typing import Any
 
 from devices.ledger import Ledger
 from devices.registry import DiscoveredInstrument
-from devices.stream import StreamSource
-from devices.stream_options import OPTIONS as STREAM_OPTIONS
-from devices.stream_options import parse_buffer_settings
+from devices.stream import STREAM_OPTIONS, StreamSource, parse_buffer_settings
 from devices.timetag.codec import TimeTagCodec
 from devices.timetag.feed import AcquisitionSettings, TimeTaggerFeed
 from devices.timetag.registers import BARE_CHIP_IDENTITY, INSTRUMENT, USB_IDENTITY

@@ -16,14 +16,13 @@ import pytest
 
 import devices
 from devices.codec import Records, as_bytes
-from devices.decoded_source import DecodedSource
 from devices.linospad2.codec import LinoSpad2Codec
 from devices.linospad2.simulation import SimulatedBoard, draw_uneven_calibration
 from devices.recorder import record_source
 from devices.recording.check import verify
 from devices.scenes import simulate_line_light
-from devices.source import Batch, Source
-from devices.timetag import feed
+from devices.source import Batch, DecodedSource, Source
+from devices.timetag.feed import SendWindow
 from tofclip.errors import DeviceTimeoutError, InputError
 
 RECORDS = 4000
@@ -138,7 +137,7 @@ def own_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the time tagger's driver measure rates by its own work: the emulated instrument's time runs
     as fast as it is read, and does not while other programs have the processor.
     """
-    monkeypatch.setattr(feed, "monotonic", time.thread_time)
+    monkeypatch.setattr(SendWindow, "clock", staticmethod(time.thread_time))
 
 
 @pytest.fixture(scope="module")

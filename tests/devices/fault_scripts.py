@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from devices.emulation.faults import PERMANENT_ENUMERATIONS, Fault
-from devices.emulation.photons import PoissonStream
-from devices.emulation.timetag import CLOCK_HZ, EmulatedTimeTagger, EmulatorSettings, GroundTruth
 from devices.emulation.usb import VirtualUsb
+from devices.ledger import Stats
 from devices.source import Batch, Source
-from devices.statistics import Stats
+from devices.timetag.emulator import CLOCK_HZ, EmulatedTimeTagger, EmulatorSettings, GroundTruth
+from devices.timetag.light import PoissonStream
 from devices.timetag.source import open_on_backend
 from devices.uri import Uri
 from tofclip.errors import (

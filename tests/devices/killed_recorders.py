@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import random
+import select
 import signal
 import sys
 import time
@@ -20,6 +21,7 @@ from devices.ring import Piece
 
 ADDRESS = "sim+timetag://?seed={seed}&pace=realtime&rate=5e5&transfer_kib=2&faults=lost@20:50,corrupt@30:3"
 LONGEST_LIFE = 0.3
+PATIENCE_S = 20.0
 FLUSHED = 8
 
 
@@ -40,9 +42,9 @@ def live(path: Path, seed: int, pipe: int) -> None:
     recorder.record_source(devices.open(ADDRESS.format(seed=seed)), path)
 
 
-def killed(path: Path, seed: int, life: float) -> int:
-    """Let a recorder live for some seconds; return what it had written, -1 if it had not come so
-    far.
+def killed(path: Path, seed: int, life: float, has_begun: bool) -> int:
+    """Let a recorder live for some seconds, from the beginning or from its first report on; return
+    what it had written, -1 if it had not come so far.
     """
     reading, writing = os.pipe()
     child = os.fork()
@@ -50,6 +52,8 @@ def killed(path: Path, seed: int, life: float) -> int:
         os.close(reading)
         live(path, seed, writing)
     os.close(writing)
+    if has_begun:
+        select.select([reading], [], [], PATIENCE_S)
     time.sleep(life)
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
@@ -66,7 +70,8 @@ def main() -> None:
     moments = random.Random(seed)
     for victim in range(number):
         path = folder / f"run{victim}.h5"
-        print(path.name, killed(path, victim, moments.uniform(0, LONGEST_LIFE)), flush=True)
+        life = moments.uniform(0, LONGEST_LIFE)
+        print(path.name, killed(path, victim, life, victim % 2 == 1), flush=True)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from devices.ledger import Ledger
-from devices.statistics import Stats
+from devices.ledger import Ledger, Stats
 
 
 def test_every_change_moves_records_between_accounts() -> None:

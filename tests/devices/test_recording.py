@@ -17,8 +17,8 @@ from hypothesis import given, settings
 
 import devices
 from devices.codec import Records, as_bytes
-from devices.decoded_source import DecodedSource
 from devices.emulation.faults import draw_fault_script
+from devices.ledger import Stats
 from devices.recorder import record_source
 from devices.recording.blocks import HEADER_BYTES, BlockHeader, BlockKind
 from devices.recording.check import repair, verify
@@ -26,8 +26,7 @@ from devices.recording.reader import Block, Recording
 from devices.recording.writer import RecordingWriter, make_head
 from devices.replay import ReplaySource
 from devices.ring import Gap, Piece
-from devices.source import Batch, Info, Source
-from devices.statistics import Stats
+from devices.source import Batch, DecodedSource, Info, Source
 from devices.timetag.codec import RECORD_DTYPE, TimeTagCodec
 from tofclip.errors import (
     DeviceDisconnectedError,
@@ -187,13 +186,13 @@ def test_killed_recorders_leave_what_they_flushed(tmp_path: Path) -> None:
         require_true_records(path, int(name.removeprefix("run").removesuffix(".h5")))
         assert repair(path, tmp_path / "whole.h5").bytes >= found.bytes
         with_records += found.records > 0
-    assert with_records >= 12  # most moments are after the first flush
+    assert with_records >= 10  # every other one is killed after its first report
 
 
 def require_true_records(path: Path, seed: int) -> None:
     """Compare a recording with the photons that there were: all come in order, none is made up."""
-    from devices.emulation.photons import MAX_TICK, PoissonStream
-    from devices.emulation.timetag import CLOCK_HZ
+    from devices.timetag.emulator import CLOCK_HZ
+    from devices.timetag.light import MAX_TICK, PoissonStream
 
     ticks = joined(replayed(path))["time_ticks"]
     words = PoissonStream(5e5, CLOCK_HZ, seed).next_words(len(ticks) + 200, MAX_TICK)

@@ -8,8 +8,8 @@ import pytest
 
 import devices
 from devices import registry
+from devices.ledger import Stats
 from devices.source import Batch, Info, Source
-from devices.statistics import Stats
 from devices.uri import Uri
 from tofclip.errors import InputError
 

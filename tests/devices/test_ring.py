@@ -6,9 +6,8 @@ import threading
 
 import pytest
 
-from devices.ledger import Ledger
+from devices.ledger import Ledger, Stats
 from devices.ring import Gap, OverflowPolicy, Piece, RingBuffer
-from devices.statistics import Stats
 from tofclip.errors import BufferOverflowError, DeviceDisconnectedError, DeviceTimeoutError
 
 SOON = 0.02

@@ -17,12 +17,12 @@ import pytest
 
 import devices
 from devices.emulation.faults import Fault, FaultKind
+from devices.ledger import Stats
 from devices.loopback import HOST
 from devices.remoteex.emulator import EmulatedStreakCamera
 from devices.scenes import EmulatedLight
 from devices.source import Source
 from devices.spad512.emulator import EmulatedSpadArray
-from devices.statistics import Stats
 from tofclip.errors import DeviceError
 
 SUITE_SCRIPTS = 48

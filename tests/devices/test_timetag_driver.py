@@ -15,13 +15,13 @@ import pytest
 import devices
 from devices.codec import as_bytes
 from devices.emulation.faults import Fault
-from devices.emulation.photons import MAX_TICK, PoissonStream
-from devices.emulation.timetag import CLOCK_HZ, EmulatedTimeTagger, EmulatorSettings
 from devices.emulation.usb import VirtualUsb, make_usb_error
 from devices.ledger import Ledger
 from devices.source import Source
 from devices.timetag.codec import COUNTER_RANGE, WRAP, TimeTagCodec
+from devices.timetag.emulator import CLOCK_HZ, EmulatedTimeTagger, EmulatorSettings
 from devices.timetag.feed import AcquisitionSettings, TimeTaggerFeed
+from devices.timetag.light import MAX_TICK, PoissonStream
 from devices.timetag.registers import (
     COMMAND_ENDPOINT,
     REPLY_ENDPOINT,

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 from devices.codec import as_bytes
-from devices.emulation.photons import PoissonStream
-from devices.emulation.timetag import CLOCK_HZ, COMMAND, EmulatedTimeTagger, EmulatorSettings
 from devices.emulation.usb import VirtualUsb
 from devices.timetag.codec import TimeTagCodec
+from devices.timetag.emulator import CLOCK_HZ, COMMAND, EmulatedTimeTagger, EmulatorSettings
+from devices.timetag.light import PoissonStream
 from devices.timetag.registers import USB_IDENTITY, Capture, Register, TimeTagger
 from devices.usb import UsbLink
 

@@ -13,16 +13,16 @@ import pytest
 
 from devices.codec import Records
 from devices.emulation.faults import Fault
-from devices.emulation.photons import PoissonStream
-from devices.emulation.timetag import (
+from devices.emulation.usb import VirtualUsb
+from devices.source import Source
+from devices.timetag import feed
+from devices.timetag.emulator import (
     BOARD_MEMORY_BYTES,
     CLOCK_HZ,
     EmulatedTimeTagger,
     EmulatorSettings,
 )
-from devices.emulation.usb import VirtualUsb
-from devices.source import Source
-from devices.timetag import feed
+from devices.timetag.light import PoissonStream
 from devices.timetag.registers import Capture, Register, TimeTagger
 from devices.timetag.source import open_on_backend
 from devices.uri import Uri

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from devices.emulation.faults import Fault
-from devices.emulation.photons import PoissonStream, TagStream
-from devices.emulation.scene_light import PulsedSceneStream
-from devices.emulation.timetag import CLOCK_HZ, EmulatedTimeTagger, EmulatorSettings
 from devices.emulation.usb import VirtualUsb
 from devices.scenes import simulate_line_light
 from devices.stream import StreamSource
+from devices.timetag.emulator import CLOCK_HZ, EmulatedTimeTagger, EmulatorSettings
+from devices.timetag.light import PoissonStream, PulsedSceneStream, TagStream
 from devices.timetag.source import OPTIONS, open_on_backend
 from devices.uri import Uri
 from tofclip.errors import InputError

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from devices.codec import Records, as_bytes
-from devices.emulation.photons import MAX_TICK
-from devices.emulation.scene_light import (
+from devices.scenes import LineLight, simulate_line_light
+from devices.timetag.codec import COUNTER_RANGE, WRAP, TimeTagCodec
+from devices.timetag.emulator import CLOCK_HZ
+from devices.timetag.light import (
     BLOCK_TICKS,
+    MAX_TICK,
     PERIOD_TICKS,
     SCENE_SCALE,
     SYNC_MASK,
     PulsedSceneStream,
 )
-from devices.emulation.timetag import CLOCK_HZ
-from devices.scenes import LineLight, simulate_line_light
-from devices.timetag.codec import COUNTER_RANGE, WRAP, TimeTagCodec
 from devices.transients import read_transient
 from tofclip.errors import InputError
 

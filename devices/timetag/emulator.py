@@ -26,9 +26,9 @@ from usb.core import USBError
 from devices.codec import ByteView
 from devices.emulation.byte_queue import ByteQueue
 from devices.emulation.faults import REPLY_FAULTS, Fault
-from devices.emulation.photons import MAX_TICK, PoissonStream, TagStream
 from devices.emulation.usb import PACKET_BYTES, VirtualDevice, make_usb_error
 from devices.timetag.codec import LOST, RECORD_BYTES, WRAP
+from devices.timetag.light import MAX_TICK, PoissonStream, TagStream
 from devices.timetag.registers import (
     COMMAND_ENDPOINT,
     DATA_ENDPOINT,
