@@ -96,7 +96,9 @@ def test_markers_make_a_picture_of_a_file_in_t2_mode(
     np.testing.assert_allclose(
         found.bin[np.lexsort((found.bin, found.pixel))], scan["delay"][order], atol=0.01
     )
-    assert describe_photons(tmp_path / "scan.ptu")["layout"] == "events"
+    described = describe_photons(tmp_path / "scan.ptu")
+    assert described["layout"] == "events"
+    assert described["arrays"]["x"] == f"{len(scan['x'])} uint16"
 
 
 def test_every_other_line_of_a_scan_both_ways_is_turned(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -457,12 +457,12 @@ def _open_scan(path: Path) -> PhotonFile:
     rows, columns = get_scan_shape(events)
     if rows * columns > MAX_PIXELS:
         raise FileFormatError(path, f"claims a picture of {rows} x {columns} pixels")
-    scan = lru_cache(maxsize=1)(partial(read_scan, events))
-
-    def list_array(name: str, kind: str) -> ArrayEntry:
-        return ArrayEntry(name, (events.events,), kind, lambda: np.asarray(getattr(scan(), name)))
-
-    arrays = [list_array("x", "uint16"), list_array("y", "uint16"), list_array("time", "float64")]
+    scan = read_scan(events)  # only then it is known which events are photons in a line
+    found: dict[str, NDArray[Any]] = {"x": scan.x, "y": scan.y, "time": scan.time}
+    arrays = [
+        ArrayEntry(name, values.shape, str(values.dtype), partial(np.asarray, values))
+        for name, values in found.items()
+    ]
     return PhotonFile(arrays, events.tick, "", (rows, columns))
 
 
