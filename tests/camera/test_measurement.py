@@ -133,6 +133,23 @@ def test_a_single_row_or_column_is_sampled_too():
     np.testing.assert_array_equal(measure(counts.T, None, narrow, dark=0.0).values[0], counts[0])
 
 
+def test_the_dark_level_is_that_of_the_quietest_rows():
+    """Light in most of the rows does not raise it."""
+    counts = np.full((40, 30), 100, np.float32)
+    counts[4:] += 50
+    assert estimate_dark_level(counts) == 100
+
+
+def test_a_sweep_reads_the_picture_s_last_column_and_row():
+    """Mirrored, the first pixel lies exactly on the last: nothing of it comes from beyond."""
+    mirror = ProjectiveSweep(np.array([[-1.0, 0, 23], [0, -1.0, 19], [0, 0, 1.0]]))
+    mirrored = Camera(np.array([12.0]), np.array([0.0]), (8, 8), 24, sweep=mirror)
+    counts = np.random.default_rng(0).uniform(10, 200, (20, 24)).astype(np.float32)
+    found = measure(counts, None, mirrored, dark=0.0)
+    np.testing.assert_allclose(found.values, counts[::-1, ::-1].T, rtol=1e-5)
+    assert found.valid.all()
+
+
 def test_a_hot_column_does_not_raise_the_dark_level():
     counts = np.full((ROWS, WIDTH), 100.0, np.float32)
     counts[:, 7] = 60_000

@@ -229,9 +229,12 @@ FORMATS = {
     "PNG light fields": FileFormat("v_0_0.png", (_write_png,), (_read_folder,)),
     **{
         f"{suffix[1:].upper()} clouds": FileFormat(
-            f"a{suffix}", (lambda path: _cloud().save(path),), CLOUDS
+            f"a{suffix}",
+            (lambda path: _cloud().save(path),),
+            CLOUDS,
+            notices_all=suffix == ".e57",  # pages of 1024 bytes, each with its CRC-32C
         )
-        for suffix in (".ply", ".pcd", ".csv", ".las")
+        for suffix in (".ply", ".pcd", ".csv", ".las", ".e57")
     },
     **{
         f"{suffix[1:].upper()} counts": FileFormat(

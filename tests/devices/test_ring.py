@@ -51,6 +51,14 @@ def test_a_dropped_restart_stays_a_restart() -> None:
     assert numbers(ring) == [(ord("b"), Gap.RESTART)]
 
 
+def test_a_restart_stays_one_though_only_a_loss_was_dropped_before_it() -> None:
+    ring = RingBuffer(20, "drop_oldest", Ledger())
+    ring.put(Piece(b"a" * 10, 1))
+    ring.put(Piece(b"b" * 10, 1, Gap.RESTART))
+    ring.put(Piece(b"c" * 10, 1))
+    assert numbers(ring) == [(ord("b"), Gap.RESTART), (ord("c"), Gap.NONE)]
+
+
 def test_one_piece_always_fits() -> None:
     ring = RingBuffer(1, "fail", Ledger())
     ring.put(Piece(b"larger than that", 1))

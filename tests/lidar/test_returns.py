@@ -339,3 +339,15 @@ def test_an_echo_weaker_than_the_limit_of_its_pixel_is_left_out():
         found = depth(frames, detection=replace(EVERYTHING, min_pixel_fraction=limit))
         assert np.count_nonzero(found.return_number == returns) == 50
         assert found.return_number.max() == returns
+
+
+def test_the_brightest_at_an_instant_is_looked_for_within_a_pulse_width_to_either_side() -> None:
+    """To a quarter of a width: what comes 0.8 widths after something bright is its streak, what comes
+    1.4 widths after it is not.
+    """
+    width, pixel = 100e-12, np.array([0, 1, 2, 3])
+    time = width * np.array([10.0, 10.8, 8.6, 9.2])
+    intensity = np.array([100.0, 5.0, 5.0, 5.0])
+    detection = Detection(min_scene_fraction=0, min_time_bin_fraction=0.12, min_pixel_fraction=0)
+    found = detection.find_significant(pixel, time, intensity, width)
+    np.testing.assert_array_equal(found, [True, False, True, False])

@@ -9,6 +9,7 @@ import pytest
 
 from tofclip.errors import InputError
 from tofclip.operators import Integration
+from tofclip.operators.coded_views import make_sheared_mask
 from tofclip.operators.light_field_camera import (
     COMPRESSIVE_CAMERAS,
     AshokCamera,
@@ -61,6 +62,14 @@ def test_marwah_s_mask_is_the_same_for_all_views_but_moved():
     np.testing.assert_allclose(codes[1, :, 1:], codes[0, :, :-1])
     np.testing.assert_allclose(codes[:, 1, :, 1:], codes[:, 0, :, :-1])
     assert 0 <= codes.min() < codes.max() <= 1
+
+
+def test_no_view_looks_past_the_edge_of_the_mask():
+    """Beyond it all would be dark, and random transmissions never are; far views look furthest."""
+    views = [(float(v), float(u)) for v in (-4, 4) for u in (-4, 4)]
+    codes = make_sheared_mask((9, 11), views, 1.6, np.random.default_rng(0))
+    assert codes.shape == (4, 9, 11)
+    assert codes.min() > 0
 
 
 @every_camera

@@ -65,6 +65,9 @@ def test_a_pitched_sensor_reads_every_nth_pixel_from_its_offset():
 
 
 def test_a_pitch_that_is_no_whole_number_keeps_its_mean():
+    # 13 pitches of 30 / 26 pixels are 15, but for a rounding error downwards.
+    rounded = PitchedSensor((30, 15), (30 / 26, 1))
+    assert 15 * 15 in rounded.pixels
     sensor = PitchedSensor((128, 128), (128 / 91, 128 / 90))
     assert sensor.grid_shape == (91, 90)
     assert np.unique(sensor.pixels).size == sensor.pixels.size

@@ -13,7 +13,12 @@ import pytest
 from tofclip import depth, nmse, point_cloud, recover
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
-from tofclip.recovery.surface_model import SurfaceModel, SurfaceState, make_pulse
+from tofclip.recovery.surface_model import (
+    SurfaceModel,
+    SurfaceState,
+    make_pulse,
+    weigh_measurements,
+)
 from tofclip.recovery.surface_patches import SmoothBasis, find_patches
 from tofclip.recovery.surface_solver import refine_state
 from tofclip.recovery.surfaces import SurfaceRecovery
@@ -89,6 +94,18 @@ def make_model(streak: Streak) -> SurfaceModel:
     coefficients[:, 1] = 0.02, -0.03
     state = SurfaceState.start(list(coefficients), CAMERA)
     return SurfaceModel(streak, CAMERA, masks, [SmoothBasis(SHAPE)] * 2, state)
+
+
+def test_what_cannot_be_trusted_weighs_nothing(shot):
+    streak = shot.streak
+    saturated = np.zeros(streak.counts.shape, bool)
+    saturated[20:24, 100:110] = True
+    dead = np.zeros(CAMERA.slit_width_px, bool)
+    dead[[7, 200]] = True
+    _, weights = weigh_measurements(
+        replace(streak, saturated=saturated), CAMERA.replace(dead_columns=dead)
+    )
+    np.testing.assert_array_equal(weights == 0, saturated | dead)
 
 
 def test_the_adjoint_matches(shot):
