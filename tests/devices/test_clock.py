@@ -31,3 +31,12 @@ def test_a_stamp_that_goes_back_begins_anew() -> None:
     clock.observe(100.0, 5.0)
     clock.observe(0.0, 6.0)
     assert clock.to_host(1.0) == pytest.approx(7.0)
+
+
+def test_the_least_delay_is_known_for_a_window_and_the_one_before_it() -> None:
+    clock = InstrumentClock()
+    clock.observe(0.0, 1.0)
+    clock.observe(WINDOW_S, WINDOW_S + 1.5)  # a new window, late from its first message on
+    assert clock.to_host(40.0) == pytest.approx(41.0)
+    clock.observe(2 * WINDOW_S + 1, 2 * WINDOW_S + 2.8)
+    assert clock.to_host(80.0) == pytest.approx(81.5)  # the first window is forgotten

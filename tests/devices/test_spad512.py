@@ -11,12 +11,13 @@ import pytest
 from hypothesis import given
 
 import devices
+from devices import photons
 from devices.emulation.faults import Fault
 from devices.gate_scan import GateScan
 from devices.loopback import HOST, Connection, LoopbackServer
 from devices.photons import read_photons
 from devices.scenes import render_array_delays, render_array_light
-from devices.source import Source
+from devices.source import Batch, Source
 from devices.spad512.emulator import EmulatedSpadArray
 from devices.spad512.protocol import (
     BIT_DEPTHS,
@@ -305,6 +306,17 @@ def test_a_server_that_calibrates_itself_first_and_frames_nothing() -> None:
         assert len(taken(source, 2)) == 2
         finished(source)
     server.close()
+
+
+def test_pictures_of_a_cut_scan_are_not_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures 0 and 1 of a scan of three, then a loss, then a whole scan."""
+    dtype = np.dtype([("number", np.int64), ("counts", np.uint16, (2, 2))])
+    records = np.zeros(6, dtype)
+    records["number"] = [0, 1, 5, 6, 7, 8]
+    records["counts"] = np.array([100, 200, 300, 1, 2, 3])[:, np.newaxis, np.newaxis]
+    monkeypatch.setattr(photons, "read_batches", lambda *_: [Batch(records, 0)])
+    total = photons._add_scans(None, 3, 1, 1)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(total[:, 0, 0], [1, 2, 3])
 
 
 GATED = "mode=gated&gate_steps=30&gate_step_ps=700&binning=16"
