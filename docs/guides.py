@@ -80,6 +80,19 @@ def find_pictures(guide: Path) -> dict[str, Path]:
     return {place.name: place for place in places if place.parent.name == guide.stem}
 
 
+def find_written(name: str) -> Path:
+    """Return a picture that a guide's commands have written, here or in a folder of theirs.
+
+    Raises
+    ------
+    FileNotFoundError
+        None of them has.
+    """
+    for path in sorted(Path().rglob(name)):
+        return path
+    raise FileNotFoundError(f"no command of the guide has written {name}")
+
+
 def make_pictures(guide: Path, inputs: Path) -> None:
     """Run a guide with the files of a folder, and keep the pictures that it shows, in few colours."""
     guide, inputs = guide.resolve(), inputs.resolve()
@@ -91,7 +104,7 @@ def make_pictures(guide: Path, inputs: Path) -> None:
                 raise SystemExit(f"{step}: exit status {status}")
         for name, place in find_pictures(guide).items():
             place.parent.mkdir(parents=True, exist_ok=True)
-            store_picture(Path(name), place)
+            store_picture(find_written(name), place)
 
 
 if __name__ == "__main__":

@@ -24,9 +24,9 @@ EMPTY_COLOUR = "#20242c"  # where a picture has no value
 LINE_COLOUR = "#3dd6c8"  # drawn over a brightness map
 SMALL_FONT_PT = 8
 DOTS_PER_INCH = 100
-FEWER_COLOURS = {150_000: 256, 600_000: 64}
-"""Colours of pictures with more bytes. 256 make a quarter of the bytes, off by less than 16 of 255
-anywhere; 64 are enough for the greys of many small pictures.
+FEWER_COLOURS = {150_000: 0, 290_000: 256, 600_000: 64}
+"""Colours of pictures with more bytes; 0: all, without transparency. 256 make a quarter of the bytes,
+off by less than 16 of 255 anywhere; 64 are enough for the greys of many small pictures.
 """
 
 
@@ -62,7 +62,7 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def store_picture(picture: Path, place: Path) -> None:
-    """Store a PNG picture; a large one in `FEWER_COLOURS`.
+    """Store a picture; a large PNG in `FEWER_COLOURS`.
 
     Parameters
     ----------
@@ -75,14 +75,14 @@ def store_picture(picture: Path, place: Path) -> None:
 
     drawn = picture.read_bytes()
     for most, colours in FEWER_COLOURS.items():
-        if len(drawn) <= most:
+        if len(drawn) <= most or picture.suffix.lower() != ".png":
             break
-        with Image.open(picture) as whole:
-            few = whole.convert("RGB").quantize(
-                colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
-            )
+        with Image.open(picture) as opened:
+            whole = opened.convert("RGB")
+        if colours:
+            whole = whole.quantize(colours, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
         file = io.BytesIO()
-        few.save(file, format="PNG", optimize=True)
+        whole.save(file, format="PNG", optimize=True)
         drawn = file.getvalue()
     with atomic_path(place) as temporary:
         temporary.write_bytes(drawn)

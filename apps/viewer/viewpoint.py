@@ -197,8 +197,12 @@ def place_viewpoint(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
     aside = np.array([np.tan(SIDEWAYS_TILT_RAD), -np.tan(UPWARD_TILT_RAD), 0.0])
     direction = (backwards + aside) / np.linalg.norm(backwards + aside)
     near = Viewpoint(middle + max(away, 1e-3) * direction, middle)
-    if low[2] > 0 and (found := _fit_field_of_view(near, xyz, aspect)) <= MAX_FIELD_OF_VIEW_RAD:
-        return Viewpoint(near.eye, middle, found)
+    if low[2] > 0:
+        # the scale bar may lie lower in the picture than any point
+        bar = Box(low, high).scale_bar
+        found = max(_fit_field_of_view(near, one, aspect) for one in (xyz, bar))
+        if found <= MAX_FIELD_OF_VIEW_RAD:
+            return Viewpoint(near.eye, middle, found)
     half_width, half_height, half_depth = np.abs(near.axes) @ (
         (high - low) / 2
     )  # of the tilted box
@@ -219,7 +223,7 @@ def move_camera(camera: Any, viewpoint: Viewpoint) -> None:
     camera.fov = max(viewpoint.field_of_view, float(np.deg2rad(5.0)))
 
 
-def _fit_field_of_view(viewpoint: Viewpoint, xyz: NDArray[np.float32], aspect: float) -> float:
+def _fit_field_of_view(viewpoint: Viewpoint, xyz: NDArray[Any], aspect: float) -> float:
     """Return the field of view that holds nearly all points."""
     right, down, depth = np.abs(viewpoint.axes @ (xyz - viewpoint.eye).T)
     slopes = np.maximum(down, right / aspect) / np.maximum(depth, 1e-6)

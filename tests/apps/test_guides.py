@@ -8,12 +8,21 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 import pytest
-from guides import find_hardware_commands, find_pictures, make_pictures, read_steps, run_guide
+from guides import (
+    find_hardware_commands,
+    find_pictures,
+    find_written,
+    make_pictures,
+    read_steps,
+    run_guide,
+)
 from PIL import Image
 from verb_pages import collect_verbs
 
 import tofclip
+from apps.figures.style import store_picture
 
 DOCS = Path(tofclip.__file__).parents[1] / "docs"
 GUIDES = [DOCS / f"{name}.md" for name in ("tutorial", "own_camera", "own_wall", "own_light_field")]
@@ -116,13 +125,38 @@ def test_large_pictures_are_kept_in_few_colours(tmp_path: Path) -> None:
     guide = tmp_path / "large.md"
     guide.write_text(
         "```python\nimport numpy as np\nfrom matplotlib.image import imsave\n"
-        "imsave('noise.png', np.random.default_rng(0).random((256, 256, 3)))\n```\n\n"
+        "imsave('noise.png', np.random.default_rng(0).random((400, 400, 3)))\n```\n\n"
         "![Noise](pictures/large/noise.png)\n"
     )
     (tmp_path / "inputs").mkdir()
     make_pictures(guide, tmp_path / "inputs")
     with Image.open(tmp_path / "pictures" / "large" / "noise.png") as image:
-        assert (image.mode, image.size) == ("P", (256, 256))
+        assert (image.mode, image.size) == ("P", (400, 400))
+
+
+@pytest.mark.nightly
+def test_the_gallery(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every picture of its own is made by its commands, and shows something."""
+    pytest.importorskip("playwright", reason="photographs of the page: pip install playwright")
+    walked("gallery.md", tmp_path, monkeypatch)
+    own = find_pictures(DOCS / "gallery.md")
+    assert len(own) == 6
+    for name, place in own.items():
+        with Image.open(find_written(name)) as made, Image.open(place) as shown:
+            assert made.size == shown.size
+            assert np.asarray(made.convert("L")).std() > 10
+
+
+def test_a_gallerys_pictures_are_found_in_the_folders_of_its_commands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "film.gif").write_bytes(b"GIF89a" + bytes(200_000))
+    store_picture(find_written("film.gif"), tmp_path / "stored.gif")
+    assert (tmp_path / "stored.gif").stat().st_size == 200_006  # films keep their colours
+    with pytest.raises(FileNotFoundError, match=r"absent\.png"):
+        find_written("absent.png")
 
 
 def test_a_step_that_fails_is_named(tmp_path: Path) -> None:

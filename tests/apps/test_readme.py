@@ -106,6 +106,6 @@ def test_the_tests_of_a_file_stay_on_one_worker(request: pytest.FixtureRequest) 
 
 
 def test_the_picture_is_there_and_small() -> None:
-    with open(ROOT / "docs" / "pictures" / "demo.png", "rb") as file:
+    with open(ROOT / "docs" / "pictures" / "gallery" / "preview.png", "rb") as file:
         assert file.read(8) == b"\x89PNG\r\n\x1a\n"
-    assert (ROOT / "docs" / "pictures" / "demo.png").stat().st_size < 300_000
+    assert (ROOT / "docs" / "pictures" / "gallery" / "preview.png").stat().st_size < 300_000

@@ -26,7 +26,7 @@ from apps.viewer.controls import mark_times
 from apps.viewer.picking import find_point_on_ray, make_pick, measure_distance
 from apps.viewer.session import Filters
 from apps.viewer.source import make_empty_cloud
-from apps.viewer.viewpoint import SCALE_BAR_FRACTION, Box, round_length_down
+from apps.viewer.viewpoint import SCALE_BAR_FRACTION, Box, place_viewpoint, round_length_down
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
 
@@ -185,3 +185,16 @@ def test_a_time_line_has_round_instants_at_their_frames() -> None:
     times = 10.02e-9 + 20e-12 * np.arange(96)
     assert mark_times(times) == ((24, "10.5 ns"), (49, "11 ns"), (74, "11.5 ns"))
     assert mark_times(times[:1]) == ((0, "10.02 ns"),)
+
+
+@pytest.mark.parametrize("aspect", [0.6, 0.9, 1.6])
+def test_the_scale_bar_is_in_the_first_picture(aspect: float) -> None:
+    """Also of a deep cloud whose wide part is far away, so that the bar's place is the lowest."""
+    random = np.random.default_rng(0)
+    far = random.uniform((-0.5, -0.5, 3.0), (0.5, 0.5, 3.01), (400, 3))
+    near = random.uniform((-0.05, -0.05, 1.0), (0.05, 0.05, 1.01), (400, 3))
+    xyz = np.concatenate([far, near]).astype(np.float32)
+    shape = 600, round(600 * aspect)
+    row, column, _ = place_viewpoint(xyz, aspect).project(Box.around(xyz).scale_bar, shape)
+    assert 0 < row.min() < row.max() < 0.97 * shape[0]  # its length is written below
+    assert 0 < column.min() < column.max() < shape[1]
