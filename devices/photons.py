@@ -128,7 +128,7 @@ def _add_scans(source: Source, steps: int, scans: int, binning: int) -> NDArray[
     """Add up whole scans; pictures of one that was cut are left out."""
     total: NDArray[np.float32] | None = None
     present: NDArray[np.float32] | None = None
-    done = step = 0
+    done = step = begun = 0  # `begun`: number of the scan's first picture
     for batch in read_batches(source, inf):
         for record in batch.records:
             counts = record["counts"]
@@ -140,16 +140,18 @@ def _add_scans(source: Source, steps: int, scans: int, binning: int) -> NDArray[
                     )
                 total = np.zeros((steps, rows, columns), np.float32)
                 present = np.zeros_like(total)
-            if int(record["number"]) % steps != step:  # cut: wait for the next beginning
+            number = int(record["number"])
+            if number != begun + step:  # cut: wait for the next beginning
                 step = 0
-                if int(record["number"]) % steps:
+                if number % steps:
                     continue
+                begun = number
             whole = counts[: rows * binning, : columns * binning]
             present[step] = whole.reshape(rows, binning, columns, binning).sum(axis=(1, 3))
             step += 1
             if step == steps:
                 total += present
-                step, done = 0, done + 1
+                step, done, begun = 0, done + 1, begun + steps
                 if done == scans:
                     return total
     raise InputError(f"the source ended after {done} of {scans} whole scans")
