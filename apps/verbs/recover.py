@@ -111,7 +111,9 @@ def recover(
     Where the camera's sweep is not known, skew, gains and centres are found from the shot itself.
     frames_per_second is the pace of the iterations alone, frames_per_second_overall that of the
     whole run, from reading the shot to writing the frames. duality_gap (of l1): the objective is
-    above the least one by at most this fraction of it.
+    above the least one by at most this fraction of it. defective_readings are hot, dead or struck
+    by a particle and left out; clipped_readings are cut off at the sensor's limit and may be
+    brighter.
 
     Of a sequence, what is in the folder already is kept: started again, a run goes on where it
     stopped. Shots that cannot be recovered are listed at the end, and the exit status is 1.
@@ -213,8 +215,8 @@ def _open_source(
 def _report_frames(frames: Frames, seconds: float, as_json: bool, written: list[Path]) -> None:
     """Report a recovery that took `seconds` from reading the shot to writing the frames."""
     known = frames.figures
-    # methods that know how far they are from the best there is say so
-    gap = {"duality_gap": known["duality_gap"]} if "duality_gap" in known else {}
+    # methods that know how far they are from the best there is say so, and shots that are not clean
+    further = ("duality_gap", "defective_readings", "clipped_readings")
     report(
         {
             "frames": frames.values.shape[0],
@@ -231,7 +233,7 @@ def _report_frames(frames: Frames, seconds: float, as_json: bool, written: list[
             "stopped_because": known["stopped_because"],
             "device": known["device"],
         }
-        | gap,
+        | {name: known[name] for name in further if name in known},
         as_json,
         written,
     )

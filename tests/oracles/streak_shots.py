@@ -67,11 +67,31 @@ def make_room(wall: float = 0.3) -> Scene:
     return Scene(distance, reflectance)
 
 
-def add_retroreflector(scene: Scene, brightness: float = 40.0) -> Scene:
+def make_steps(wall: float = 0.25) -> Scene:
+    """A slanted wall, two steps, a disc and thin poles: no threshold was set on them."""
+    place = (np.arange(PICTURE * SIDE) + 0.5) / SIDE - 0.5 - PICTURE // 2
+    y, x = np.meshgrid(place, place, indexing="ij")
+    slant = np.sqrt(1 + (x / FOCAL_PX) ** 2 + (y / FOCAL_PX) ** 2)
+    distance, reflectance = (1.93 - 0.003 * x + 0.001 * y) * slant, np.full(x.shape, wall)
+    for inside, range_m, bright in (
+        ((x > 8) & (y > 2), 1.9 * slant, 0.45),
+        ((x > 18) & (y > 14), 1.7 * slant, 0.8),
+        (np.hypot(x + 16, y - 14) < 9, (1.6 - 0.003 * (y - 14)) * slant, 0.35),
+        ((np.abs(x + 4) < 2) & (y < 4), 1.8 * slant, 0.7),
+        ((np.abs(y + 20) < 2.5) & (np.abs(x - 14) < 14), 1.83 * slant, 0.6),
+    ):
+        distance = np.where(inside, range_m, distance)
+        reflectance = np.where(inside, bright, reflectance)
+    return Scene(distance, reflectance)
+
+
+def add_retroreflector(
+    scene: Scene, brightness: float = 40.0, corner: tuple[int, int] = (-22, -22)
+) -> Scene:
     """Two by two pixels that send back far more than anything else."""
     reflectance = scene.reflectance.copy()
-    first = (PICTURE // 2 - 22) * SIDE
-    reflectance[first : first + 2 * SIDE, first : first + 2 * SIDE] = brightness
+    y, x = ((PICTURE // 2 + place) * SIDE for place in corner)
+    reflectance[y : y + 2 * SIDE, x : x + 2 * SIDE] = brightness
     return Scene(scene.distance, reflectance)
 
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tofclip.errors import InputError, ShapeError
-from tofclip.solvers import Huber, LeastSquares, Poisson
+from tofclip.solvers import ClippedSquares, Huber, LeastSquares, Poisson
 from tofclip.solvers.data_terms import DataTermMaker, estimate_robust_deviation
 
 COUNTS = np.array([0.0, 1, 3, 20, 400, 1e4])
@@ -21,10 +21,15 @@ SCALED = (COUNTS / DEVIATION)[:, np.newaxis]
 
 
 def makers() -> list[DataTermMaker]:
-    return [LeastSquares, partial(Huber, threshold=0.7), partial(Poisson, deviation=DEVIATION)]
+    return [
+        LeastSquares,
+        partial(Huber, threshold=0.7),
+        partial(Poisson, deviation=DEVIATION),
+        partial(ClippedSquares, limit=50.0),
+    ]
 
 
-@pytest.mark.parametrize("make", makers(), ids=["squares", "huber", "poisson"])
+@pytest.mark.parametrize("make", makers(), ids=["squares", "huber", "poisson", "clipped"])
 @given(shift=st.floats(-30, 30), seed=st.integers(0, 99))
 def test_the_gradient_is_the_derivative_of_the_value(make, shift, seed):
     term = make(SCALED)
@@ -39,7 +44,7 @@ def test_the_gradient_is_the_derivative_of_the_value(make, shift, seed):
         assert slope == pytest.approx(term.gradient(at)[reading, 0], rel=1e-4, abs=1e-4)
 
 
-@pytest.mark.parametrize("make", makers(), ids=["squares", "huber", "poisson"])
+@pytest.mark.parametrize("make", makers(), ids=["squares", "huber", "poisson", "clipped"])
 @given(one=st.floats(-50, 50), other=st.floats(-50, 50))
 def test_the_gradient_is_lipschitz_with_constant_one(make, one, other):
     term = make(SCALED)
@@ -47,7 +52,7 @@ def test_the_gradient_is_lipschitz_with_constant_one(make, one, other):
     assert np.all(np.abs(change) <= abs(one - other) * (1 + 1e-9) + 1e-12)
 
 
-@pytest.mark.parametrize("make", makers(), ids=["squares", "huber", "poisson"])
+@pytest.mark.parametrize("make", makers(), ids=["squares", "huber", "poisson", "clipped"])
 def test_the_readings_themselves_fit_best(make):
     term = make(SCALED)
     assert term.value(SCALED)[0] == pytest.approx(0, abs=1e-9)
@@ -55,7 +60,7 @@ def test_the_readings_themselves_fit_best(make):
         assert term.value(np.maximum(SCALED + shift, 0) + 1e-3)[0] > 0
 
 
-@pytest.mark.parametrize("make", makers(), ids=["squares", "huber", "poisson"])
+@pytest.mark.parametrize("make", makers(), ids=["squares", "huber", "poisson", "clipped"])
 def test_readings_that_are_not_good_do_not_count(make):
     valid = np.ones(SCALED.shape, bool)
     valid[2] = False
@@ -63,6 +68,14 @@ def test_readings_that_are_not_good_do_not_count(make):
     far[2] += 9
     assert make(SCALED, valid).value(far)[0] == pytest.approx(0, abs=1e-9)
     assert make(SCALED, valid).gradient(far)[2, 0] == 0
+
+
+def test_what_is_cut_off_may_be_brighter_but_not_darker():
+    term = ClippedSquares(np.full((3, 1), 10.0), limit=10.0)
+    np.testing.assert_array_equal(term.gradient(np.array([[8.0], [10], [90]]))[:, 0], [-2, 0, 0])
+    assert term.value(np.array([[8.0], [10], [90]]))[0] == 2
+    with pytest.raises(InputError, match="must be positive"):
+        ClippedSquares(SCALED, limit=0.0)
 
 
 def test_huber_is_squares_within_and_straight_beyond_its_threshold():

@@ -1,5 +1,5 @@
-"""Defective measurements of a streak image: pixels that are hot or struck by a particle, and columns
-that are dead.
+"""Defective measurements of a streak image: pixels that are hot or struck by a particle, columns
+that are dead, and light that is cut off at the sensor's limit.
 
 Light of a scene comes in pulses, and no sum of pulses is sharper in time than the instrument's
 response: the logarithm of a Gaussian of full width w (rows) has the second difference
@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from tofclip.shots import Streak
@@ -39,16 +40,32 @@ MIN_SIGNIFICANCE = 5.0
 MIN_PEAK_FRACTION = 0.2
 """Of the image's bright pixels: weaker defects do no harm and are not distinguished from noise."""
 
+MIN_DEFECT_PHOTONS = 20.0
+"""With fewer photons than this, neighbours in time may well have none."""
+
 BRIGHT_QUANTILE = 0.999
-LIT_DEVIATIONS, MIN_LIT_MEASUREMENTS, DISCARDED_FRACTION = 4.0, 100, 0.01
-"""Measurements that say how light fluctuates: this far above the noise, at least this number of them, and without
-the wildest of them, which may be defects themselves."""
+LIT_DEVIATIONS, MIN_LIT_MEASUREMENTS = 4.0, 100
+"""Measurements that say how light fluctuates: this far above the noise, at least this number of
+them."""
+
+LIGHT_RATIO = 1.5
+"""Measurements as bright as that are looked at together."""
+
+MEDIAN_OF_SQUARES = 0.4549
+"""Of a Gaussian's squares, relative to their mean: a chi-squared law of one degree of freedom."""
 
 DEAD_COLUMN_FRACTION = 0.1
 """Of the usual column's fluctuation: a column that changes less is dead."""
 
+MEAN_CHANGE = 2 / np.sqrt(np.pi)
+"""Of the size of the difference of two Gaussian numbers, in their standard deviations."""
+
 MAX_CONSTANT_FRACTION = 0.1
 """Of the columns: where more never change, there is no noise by which a dead one is known."""
+
+MIN_CLIPPED_PIXELS, MIN_CLIPPED_RATIO, COMPARED_VALUES = 20, 3.0, 3
+"""Pixels at the highest value, and how many times as many they have to be as at any of the next
+lower values, to be a plateau: brightness falls off towards the highest otherwise."""
 
 MAX_ROUNDS = 40
 """Rows of a track that are taken off from either end."""
@@ -100,7 +117,10 @@ def find_defects(streak: Streak, pulse_rows: float) -> Defects:
         return Defects(defects, columns)
     dark, noise, gain = estimate_noise(counts)
     light = counts - np.float32(dark)
-    least = max(MIN_PEAK_FRACTION * float(np.quantile(light, BRIGHT_QUANTILE)), 0.0)
+    # As bright as the darker of its neighbours in time: defects do not say what is bright.
+    sound = np.minimum(light[:-2], light[2:])
+    usual = float(np.quantile(sound, BRIGHT_QUANTILE))
+    least = max(MIN_PEAK_FRACTION * usual, MIN_DEFECT_PHOTONS * gain)
     factor = SHARPNESS_MARGIN * 2.0 ** (4 / min(pulse_rows, MAX_PULSE_ROWS) ** 2)
     bright = np.count_nonzero(light > least)
     some = np.arange(light.shape[1])
@@ -125,6 +145,33 @@ def find_defects(streak: Streak, pulse_rows: float) -> Defects:
     return Defects(defects & ~columns, columns)
 
 
+def find_clipping_level(counts: FloatImage) -> float:
+    """Find the value at which a streak image is cut off.
+
+    What is cut off is at least as bright as it shows, which says more than nothing: it is not
+    masked, but fitted from below (`tofclip.solvers.ClippedSquares`).
+
+    Parameters
+    ----------
+    counts : (rows, columns) array
+
+    Returns
+    -------
+    float
+        Infinite where nothing is.
+    """
+    highest = float(counts.max())
+    number = np.count_nonzero(counts == highest)
+    if number < MIN_CLIPPED_PIXELS or highest == float(counts.min()):
+        return float("inf")
+    # a few times as many of the brightest are enough to see how many there are of each value
+    most = min(counts.size, 20 * number)
+    brightest = np.partition(counts, counts.size - most, axis=None)[counts.size - most :]
+    _, each = np.unique(brightest[brightest < highest], return_counts=True)
+    usual = int(each[-COMPARED_VALUES:].max()) if each.size else 1
+    return highest if number > MIN_CLIPPED_RATIO * usual else float("inf")
+
+
 def estimate_noise(counts: FloatImage) -> tuple[float, float, float]:
     """Estimate dark level, its noise, and the variance that a count of light adds.
 
@@ -147,10 +194,26 @@ def estimate_noise(counts: FloatImage) -> tuple[float, float, float]:
     lit = level > max(LIT_DEVIATIONS * noise, float(np.finfo(np.float32).tiny))
     if np.count_nonzero(lit) < MIN_LIT_MEASUREMENTS:
         return dark, noise, 1.0
-    # What a pulse bends counts here as well, so that the estimate errs on the careful side.
-    spread, light = np.maximum(rough[lit] ** 2 - noise**2, 0), level[lit]
-    kept = spread <= np.quantile(spread, 1 - DISCARDED_FRACTION)
-    return dark, noise, max(1.0, float(spread[kept].sum() / light[kept].sum()))
+    # Medians do not see defects as long as these are fewer than what is sound. What a pulse bends
+    # counts in `rough` as well, but grows with the square of the light.
+    light, square = level[lit], rough[lit] ** 2
+    group = np.asarray(np.floor(np.log(light) / np.log(LIGHT_RATIO)), dtype=np.int64)
+    group -= int(group.min())
+    rows, variances, weights = [], [], []
+    for number in range(int(group.max()) + 1):
+        if np.count_nonzero(group == number) < MIN_LIT_MEASUREMENTS / 2:
+            continue
+        usual = float(np.median(light[group == number]))
+        found = float(np.median(square[group == number])) / MEDIAN_OF_SQUARES - noise**2
+        # a median of n squares is known to about this fraction of itself
+        weights.append(np.sqrt(np.count_nonzero(group == number)) / max(found, noise**2, usual))
+        rows.append((usual, usual**2))
+        variances.append(found)
+    if not rows:
+        return dark, noise, 1.0
+    each = np.array(weights)
+    fitted, _ = scipy.optimize.nnls(np.array(rows) * each[:, None], np.array(variances) * each)
+    return dark, noise, max(1.0, float(fitted[0]))
 
 
 def find_dead_columns(counts: FloatImage) -> Mask:
@@ -166,7 +229,9 @@ def find_dead_columns(counts: FloatImage) -> Mask:
     """
     changes = np.abs(np.diff(counts, axis=0))
     rough = changes.mean(axis=0)
-    dead: Mask = rough < DEAD_COLUMN_FRACTION * float(np.median(rough))
+    # Of a bright scene the usual column is lit; a column that sees none of it is not dead.
+    usual = min(float(np.median(rough)), MEAN_CHANGE * estimate_noise(counts)[1])
+    dead: Mask = rough < DEAD_COLUMN_FRACTION * usual
     if not np.median(changes):  # no noise by which a column is known to be alive
         return np.zeros(dead.shape, bool)
     return dead if dead.mean() <= MAX_CONSTANT_FRACTION else np.zeros(dead.shape, bool)

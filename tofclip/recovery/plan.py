@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_numpy, zeros
-from tofclip.camera import Camera, Measurement, measure
+from tofclip.camera import Camera, Measurement, estimate_dark_level, measure
 from tofclip.camera.calibration import estimate_skew, register_views
 from tofclip.camera.calibration.registration import count_registration_iterations
 from tofclip.errors import InputError, require_type
 from tofclip.io import read_streak
-from tofclip.lidar.significance import FLOOR_FIGURE, GAIN_FIGURE
+from tofclip.lidar.significance import (
+    DAZZLE_FIGURE,
+    FLOOR_FIGURE,
+    GAIN_FIGURE,
+    MISFIT_FIGURE,
+    MeasurementNoise,
+)
 from tofclip.operators import LinearOperator
-from tofclip.recovery.defects import estimate_noise, mask_defects
+from tofclip.recovery.dazzle import find_dazzle_limit, find_dazzled, find_glints
+from tofclip.recovery.defects import estimate_noise, find_clipping_level, mask_defects
 from tofclip.recovery.focus import (
     DEFAULT_FOCUS,
     DepthLockedFocus,
@@ -36,6 +44,8 @@ from tofclip.recovery.surfaces import SurfaceRecovery
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import (
     Backprojection,
+    ClippedSquares,
+    LeastSquares,
     LinearInverse,
     Method,
     Progress,
@@ -53,6 +63,11 @@ from tofclip.units import PICOSECOND
 
 MAX_ROW_PER_PULSE = 100.0
 """Longest row, in widths of the pulse: beyond, the unit of one of them is wrong."""
+
+CLIPPED_FRACTION = 0.9
+"""Of the limit above the dark: rectifying mixes what is cut off with its neighbours."""
+
+DEFECTS_KEY, CLIPPED_KEY = "defective_readings", "clipped_readings"
 
 MIN_NOISE_COUNT = 0.3
 """A dark image whose readings are whole counts still hides this much."""
@@ -247,14 +262,18 @@ class RecoveryPlan:
             return self._recover_surfaces(shot, self.method, progress, started)
         streak, camera = shot.streak, shot.camera
         measurement = measure(streak.counts, streak.saturated, camera)
+        noise = describe_noise(streak, measurement) if self.has_prior else None
         solving = time.perf_counter()
         segments = self.focus.plan_segments(camera, shot.times, measurement, progress)
+        dazzled = None if noise is None else find_dazzled(measurement, noise)
+        used = measurement.valid if dazzled is None else measurement.valid & ~dazzled
         with self.device.activate():
-            on_device = Measurement(
-                self.device.put(measurement.values), self.device.put(measurement.valid)
-            )
-            result = recover_segments(self.method, camera, on_device, segments, progress)
+            on_device = Measurement(self.device.put(measurement.values), self.device.put(used))
+            method = adapt_to_clipping(self.method, streak)
+            result = recover_segments(method, camera, on_device, segments, progress)
             values = to_numpy(result.frames)
+            if dazzled is not None and dazzled.any():
+                values = self._add_glints(values, camera, measurement, segments, dazzled)
             solved = time.perf_counter()
             # measured with the frames where they were recovered: nothing is fetched twice
             residual = compute_segments_residual(camera, result.frames, on_device, segments)
@@ -268,7 +287,8 @@ class RecoveryPlan:
             "frames_per_second": result.frames.shape[0] / (solved - solving - result.setup_seconds),
             "setup_seconds": result.setup_seconds,
             "device": str(self.device),
-            **(_describe_noise(streak) if isinstance(self.method, ProximalMethod) else {}),
+            **count_defects(streak),
+            **({} if noise is None else _list_noise_figures(noise, measurement, used, residual)),
         }
         if np.isfinite(result.duality_gap):
             figures["duality_gap"] = result.duality_gap
@@ -283,6 +303,37 @@ class RecoveryPlan:
             attachments=streak.attachments,
             provenance={**streak.provenance, "objective": result.objective.tolist()},
         )
+
+    @property
+    def has_prior(self) -> bool:
+        """Whether the method has a prior, and fits the measurements as well as noise allows."""
+        return isinstance(self.method, ProximalMethod)
+
+    def _add_glints(
+        self,
+        values: NDArray[np.float32],
+        camera: Camera,
+        measurement: Measurement,
+        segments: Sequence[FrameSegment],
+        dazzled: NDArray[np.bool_],
+    ) -> NDArray[np.float32]:
+        """Return the frames with the pixels that dazzled measurements alone see."""
+        complete, method = values.copy(), self.method
+        assert not isinstance(method, SurfaceRecovery)
+        for segment in segments:
+            own = np.arange(dazzled.shape[1])[segment.frames]
+            some = own[dazzled[:, own].any(axis=0)]
+            if not some.size:
+                continue
+            operator = camera.operator(segment.shear)
+            whole = method.recover(
+                operator,
+                self.device.put(np.ascontiguousarray(measurement.values[:, some])),
+                self.device.put(np.ascontiguousarray(measurement.valid[:, some])),
+            )
+            glints = find_glints(operator, dazzled[:, some])
+            complete[some] = np.where(glints, to_numpy(whole.frames), complete[some])
+        return complete
 
     def _recover_surfaces(
         self, shot: Shot, method: SurfaceRecovery, progress: Progress, started: float
@@ -450,14 +501,74 @@ def require_plausible_rows(streak: Streak, camera: Camera) -> None:
     )
 
 
-def _describe_noise(streak: Streak) -> dict[str, Scalar]:
-    """Return how the measurements fluctuate, by which returns are judged later.
+def count_defects(streak: Streak) -> dict[str, Scalar]:
+    """Count the readings that are defective and those that are cut off, where there are any."""
+    clipped = int(np.count_nonzero(streak.counts >= find_clipping_level(streak.counts)))
+    defective = int(streak.metadata.get(DEFECTS_KEY, 0))
+    found: dict[str, Scalar] = {DEFECTS_KEY: defective, CLIPPED_KEY: clipped}
+    return {name: number for name, number in found.items() if number}
+
+
+def adapt_to_clipping(method: Method, streak: Streak) -> Method:
+    """Return a method with a prior that knows where a streak image is cut off.
+
+    Parameters
+    ----------
+    method : Method
+    streak : Streak
+
+    Returns
+    -------
+    Method
+        The same where nothing is cut off, or where it has a data term of its own.
+    """
+    if not isinstance(method, ProximalMethod) or method.data_term is not LeastSquares:
+        return method
+    level = find_clipping_level(streak.counts)
+    if not np.isfinite(level):
+        return method
+    limit = CLIPPED_FRACTION * (level - estimate_dark_level(streak.counts))
+    return replace(method, data_term=partial(ClippedSquares, limit=limit))
+
+
+def describe_noise(streak: Streak, measurement: Measurement) -> MeasurementNoise:
+    """Say how the measurements fluctuate, by which returns are judged later.
 
     For frames with a prior, which fit the measurements as well as these allow: what a linear
     inverse spreads over the picture has another cause.
+
+    Parameters
+    ----------
+    streak : Streak
+    measurement : Measurement
+        Made of it.
+
+    Returns
+    -------
+    MeasurementNoise
+        Its misfit is known only after the recovery.
     """
     _, floor, gain = estimate_noise(streak.counts)
-    return {FLOOR_FIGURE: max(float(floor), MIN_NOISE_COUNT), GAIN_FIGURE: float(gain)}
+    least = max(float(floor), MIN_NOISE_COUNT)
+    return MeasurementNoise(least, float(gain), dazzle=find_dazzle_limit(measurement, least))
+
+
+def _list_noise_figures(
+    noise: MeasurementNoise, measurement: Measurement, used: NDArray[np.bool_], residual: float
+) -> dict[str, Scalar]:
+    """List what the frames have to know of their measurements: noise, and what the model misses."""
+    light = np.where(used, measurement.values, 0)
+    energy = float(np.sum(light**2, dtype=np.float64))
+    explained = noise.floor**2 * np.count_nonzero(used) + noise.gain * float(
+        np.sum(np.maximum(light, 0), dtype=np.float64)
+    )
+    misfit = np.sqrt(max(residual**2 - explained / energy, 0.0)) if energy > 0 else 0.0
+    figures: dict[str, Scalar] = {
+        FLOOR_FIGURE: noise.floor,
+        GAIN_FIGURE: noise.gain,
+        MISFIT_FIGURE: float(misfit),
+    }
+    return figures | ({DAZZLE_FIGURE: noise.dazzle} if np.isfinite(noise.dazzle) else {})
 
 
 def fit_camera_to_shot(

@@ -1,6 +1,13 @@
 """Solvers that know no physics: an operator, a data term and a prior in, pictures out."""
 
-from tofclip.solvers.data_terms import DataTerm, DataTermMaker, Huber, LeastSquares, Poisson
+from tofclip.solvers.data_terms import (
+    ClippedSquares,
+    DataTerm,
+    DataTermMaker,
+    Huber,
+    LeastSquares,
+    Poisson,
+)
 from tofclip.solvers.denoisers import Denoiser
 from tofclip.solvers.direct import Backprojection, LinearInverse, PreparedInverse
 from tofclip.solvers.fista import (
@@ -29,6 +36,7 @@ from tofclip.solvers.plug_and_play import PlugAndPlay, RegularisationByDenoising
 
 __all__ = [
     "Backprojection",
+    "ClippedSquares",
     "DataTerm",
     "DataTermMaker",
     "Denoiser",

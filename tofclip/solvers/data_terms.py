@@ -117,6 +117,33 @@ class LeastSquares(_SquaredNearZero):
         return residual
 
 
+class ClippedSquares(DataTerm):
+    """Least squares of measurements that are cut off at a limit: those there may be brighter.
+
+    Parameters
+    ----------
+    measurements : (measurements, frames) array
+    valid : (measurements, frames) bool array, optional
+    limit : float
+        Measurements from here on count only while less is predicted.
+    """
+
+    def __init__(self, measurements: Array, valid: Mask = None, *, limit: float) -> None:
+        if not (np.isfinite(limit) and limit > 0):
+            raise InputError(f"the limit of measurements must be positive, got {limit}")
+        super().__init__(measurements, valid)
+        self._clipped = measurements >= scalar_like(limit, measurements)
+
+    def value(self, predicted: Array) -> Array:
+        residual = self.gradient(predicted)
+        return 0.5 * select_loops(residual).sum_squares(residual)
+
+    def weights(self, predicted: Array) -> Array:
+        xp = namespace(predicted)
+        counts = ~(self._clipped & (predicted > self.measurements))
+        return self._apply_mask(xp.astype(counts, predicted.dtype))
+
+
 class Huber(_SquaredNearZero):
     """Squares up to a threshold and straight lines beyond: a few wildly wrong measurements do no
     harm.
