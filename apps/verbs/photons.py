@@ -104,6 +104,23 @@ def photons(
     single_pixel: Annotated[
         bool, typer.Option("--single-pixel", help="Judge every pixel by its own photons alone.")
     ] = False,
+    background: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="NPY",
+            help="With --single-pixel: shape of the background over the bins, as of a dark frame.",
+            show_default="what the pixels have in common",
+        ),
+    ] = None,
+    cycles: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="With --single-pixel: laser cycles of each pixel, of a detector that counts the first photon of a "
+            "cycle only; pile-up is corrected.",
+            show_default="no pile-up",
+        ),
+    ] = None,
     returns: Annotated[
         int, typer.Option(metavar="N", help="Surfaces looked for in each pixel.")
     ] = 1,
@@ -117,7 +134,9 @@ def photons(
     """
     started = time.perf_counter()
     suffix = out.suffix.lower()
-    inputs = _list_inputs(file, pulse)
+    inputs = _list_inputs(file, pulse, background)
+    if not single_pixel and (background is not None or cycles is not None):
+        raise InputError("--background and --cycles go with --single-pixel")
     require_writable(out, *CLOUD_SUFFIXES, DEPTH_SUFFIX, *PICTURE_SUFFIXES, inputs=inputs)
     if pulse is not None and pulse_ps is not None:
         raise InputError("give the pulse's width (--pulse-ps) or its shape (--pulse), not both")
@@ -131,7 +150,7 @@ def photons(
     if pulse_ps is not None:
         shape = Pulse.gaussian(pulse_ps * PICOSECOND)
     found = (
-        estimate_pixels(image, shape)
+        estimate_pixels(image, shape, background=_load_background(background), cycles=cycles)
         if single_pixel
         else estimate_surface(image, shape, learn=pulse is None, max_returns=returns)
     )
@@ -150,6 +169,7 @@ def photons(
         "time_zero_ns": time_zero_ns,
         "single_pixel": single_pixel,
         "returns": returns,
+        **({} if cycles is None else {"cycles": cycles}),
         **found.settings,
     }
     past = build_provenance({"verb": "lidar photons", "source": file, **settings}, *inputs)
@@ -166,9 +186,9 @@ def photons(
     report(_make_figures(found, seen, time.perf_counter() - started, settings), as_json, [out])
 
 
-def _list_inputs(file: str, pulse: Path | None) -> tuple[Path, ...]:
+def _list_inputs(file: str, *further: Path | None) -> tuple[Path, ...]:
     named = () if "://" in file else (Path(file),)
-    return named if pulse is None else (*named, pulse)
+    return (*named, *(path for path in further if path is not None))
 
 
 def _read_photons(
@@ -202,16 +222,25 @@ def _load_pulse(path: Path | None, bin_width: float) -> Pulse | None:
     """Read a measured response, one value for each bin."""
     if path is None:
         return None
+    bright = _load_bins(path, "the pulse's bins")
+    return Pulse(bright, bin_width, float(np.argmax(bright)))
+
+
+def _load_background(path: Path | None) -> np.ndarray[Any, Any] | None:
+    return None if path is None else _load_bins(path, "the background's bins")
+
+
+def _load_bins(path: Path, what: str) -> np.ndarray[Any, Any]:
+    """Read one number for each bin."""
     try:
         samples = np.load(path, mmap_mode="r", allow_pickle=False)
     except OSError as fault:
         raise InputError(f"{path}: cannot be read: {fault.strerror or fault}") from fault
     except Exception as fault:  # whatever the decoder stumbles over
-        raise InputError(f"{path}: is not a NumPy file with the pulse's bins") from fault
+        raise InputError(f"{path}: is not a NumPy file with {what}") from fault
     if samples.ndim != 1 or samples.dtype.kind not in "uif" or not 3 <= samples.size <= 1 << 20:
         raise InputError(f"{path}: must hold one number for each bin, found {samples.shape}")
-    bright = np.asarray(samples, dtype=np.float64)
-    return Pulse(bright, bin_width, float(np.argmax(bright)))
+    return np.asarray(samples, dtype=np.float64)
 
 
 def save_range_image(found: SurfaceImage, path: Path) -> None:

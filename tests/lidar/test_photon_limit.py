@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import ndtr
 from scipy.stats import binom, exponnorm
 
 from tofclip.errors import InputError, ShapeError
@@ -17,6 +18,7 @@ from tofclip.lidar.photons import (
     Smoothness,
     compute_range_bound,
     correct_pile_up,
+    learn_background,
     locate_with_smoothness,
     measure_accuracy,
 )
@@ -138,6 +140,79 @@ def test_false_alarms_come_at_the_stated_rate_at_any_background(background, rate
         0.999, TRIALS, rate
     )  # eight cases: one in a hundred runs would fail one of them
     assert low - rate * silent * TRIALS <= alarms <= high
+
+
+def make_profile(name: str, bins: int) -> np.ndarray:
+    time = np.arange(bins)
+    return {
+        "step": np.where(time < bins // 2, 1.0, 3.0),
+        "fog": np.exp(-time / 64),
+        "ramp": np.exp(-time / 128),
+        "nearby": 1 + 10 * np.exp(-time / 10),
+        "hot bin": np.where(time == bins // 3, 5.0, 1.0),
+    }[name]
+
+
+@pytest.mark.parametrize(
+    ("name", "level"),
+    [
+        pytest.param(
+            name, level, marks=[] if (name, level) in {("nearby", 0.05)} else pytest.mark.nightly
+        )
+        for name in ("step", "fog", "ramp", "nearby", "hot bin")
+        for level in (0.05, 0.5)
+    ],
+)
+def test_false_alarms_come_at_the_stated_rate_on_an_uneven_background(name, level):
+    profile = make_profile(name, 256)
+    trials = 3000
+    counts = np.random.default_rng(3).poisson(profile / profile.mean() * level, (trials, 256))
+    low, high = binom.interval(0.999, trials, 0.01)
+    # thresholds are themselves known to 7 percent, a learnt shape to its own noise
+    low, high = low - 0.2 * trials * 0.01, high + 0.2 * trials * 0.01
+    for background in (None, profile):
+        detector = PhotonDetector(Pulse.gaussian(FWHM), BIN, 256, background=background)
+        assert low <= detector.locate(counts).detected.sum() <= high
+
+
+def test_what_pixels_have_in_common_is_background_but_a_wall_is_not():
+    noise, time = np.random.default_rng(1), np.arange(256)
+    dark = 0.2 * (1 + 4 * np.exp(-time / 30))
+    arrival = noise.uniform(60, 200, 2000)
+    wall = 20 * np.exp(-0.5 * ((time - 120) / 1.3) ** 2) / 3.3
+    own = 20 * np.exp(-0.5 * ((time - arrival[:, None]) / 1.3) ** 2) / 3.3
+    for light in (wall, own):
+        learnt = learn_background(noise.poisson(dark + light, (2000, 256)).astype(float), 3.0)
+        assert learnt is not None
+        wrong = np.abs(learnt * dark.mean() / dark - 1)
+        # a decay in blocks, and a mixture told apart: the wall alone would be ten times too much
+        assert np.median(wrong) < 0.1
+        assert wrong.max() < 0.6
+    even = noise.poisson(0.2 + own).astype(float)
+    assert learn_background(even[:100], 3.0) is None
+    with pytest.raises(ShapeError, match="background"):
+        PhotonDetector(Pulse.gaussian(FWHM), BIN, BINS, background=np.ones(3))
+    with pytest.raises(InputError, match="background"):
+        PhotonDetector(Pulse.gaussian(FWHM), BIN, BINS, background=np.zeros(BINS))
+
+
+@pytest.mark.parametrize(("signal", "dark"), [(0.5, 0.3), (5.0, 3.0)])
+def test_deviations_hold_what_pile_up_costs(detector, signal, dark):
+    """Of a detector that counts the first photon of each of 1000 cycles."""
+    noise = np.random.default_rng(2)
+    arrival = noise.uniform(30, 60, 300)
+    edges = np.arange(BINS + 1) - 0.5
+    light = signal * np.diff(ndtr((edges - arrival[:, None]) * BIN / SIGMA), axis=1)
+    hazard = np.cumsum(dark / BINS + light, axis=1)
+    missed = np.exp(-np.column_stack([np.zeros(arrival.size), hazard]))
+    first = np.column_stack([-np.diff(missed, axis=1), missed[:, -1]])
+    counts = np.stack([noise.multinomial(1000, one / one.sum())[:-1] for one in first])
+    found = detector.locate(counts, cycles=1000)
+    assert found.detected.all()
+    error = found.range[:, 0] - metres(arrival * BIN)
+    # 300 trials: 4 percent
+    assert 0.9 <= np.sqrt(np.mean((error / found.confidence[:, 0]) ** 2)) <= 1.2
+    assert abs(error.mean()) < metres(0.05 * BIN)
 
 
 def test_an_exponentially_modified_pulse_has_its_shape_and_is_located():

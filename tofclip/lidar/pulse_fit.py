@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numba.core.types import Array
+from numba.extending import overload
 
 from tofclip.lidar.detection import CONVERGENCE_STEP_BINS
 
@@ -74,6 +76,61 @@ def find_first_bin(times, near, instant):
     return near
 
 
+def get_level(background, i):
+    """Background of bin i: the same in all bins, or an array of them.
+
+    Parameters
+    ----------
+    background : float or (bins,) array
+    i : int
+
+    Returns
+    -------
+    float
+    """
+    return background if np.ndim(background) == 0 else background[i]
+
+
+@overload(get_level, inline="always")
+def _compile_get_level(background, i):
+    if isinstance(background, Array):
+        return lambda background, i: background[i]
+    return lambda background, i: background
+
+
+def get_variance(variance, i, expected):
+    """Variance of bin i: linear in what is expected there, or that of photons after the correction
+    of pile-up.
+
+    A bin in which the detector was ready in a fraction 1 / s of the cycles tells its rate, photons
+    in a cycle, with the variance ``s expm1(rate) / cycles`` (of a binomial law's logarithm).
+
+    Parameters
+    ----------
+    variance : (float, float) or ((bins,) array, float)
+        Constant and factor; or s of each bin and the number of cycles.
+    i : int
+    expected : float
+        Photons of all cycles.
+
+    Returns
+    -------
+    float
+    """
+    if np.ndim(variance[0]) == 0:
+        return variance[0] + variance[1] * expected
+    return variance[0][i] * variance[1] * np.expm1(expected / variance[1])
+
+
+@overload(get_variance, inline="always")
+def _compile_get_variance(variance, i, expected):
+    if isinstance(variance.types[0], Array):
+        return lambda variance, i, expected: (
+            variance[0][i] * variance[1] * np.expm1(expected / variance[1])
+        )
+    return lambda variance, i, expected: variance[0] + variance[1] * expected
+
+
 @inlined
 def interpolate_pulse(time, curve, scale):
     """Pulse and its slope at `time` after the arrival, by linear interpolation; zero outside the
@@ -111,7 +168,7 @@ def compute_residual(trace, times, background, curve, scale, estimate, i, withou
     ----------
     trace, times : (bins,) array
         Brightness, and seconds.
-    background : float
+    background : float or (bins,) array
     curve : (samples, 2) array
         Pulse and slope.
     scale : (4,) array or tuple
@@ -127,7 +184,7 @@ def compute_residual(trace, times, background, curve, scale, estimate, i, withou
     -------
     float
     """
-    rest = trace[i] - background
+    rest = trace[i] - get_level(background, i)
     for k in range(estimate.shape[0]):
         if k != without:
             rest -= estimate[k, 1] * interpolate_pulse(times[i] - estimate[k, 0], curve, scale)[0]
@@ -140,9 +197,9 @@ def refine_returns(trace, times, background, curve, scale, estimate, variance, r
     time.
 
     Taking turns, each against what the others leave, undoes the pull of returns that overlap. A bin
-    weighs as much as its variance, ``variance[0] + variance[1] * expected``, is small. With
-    `EVEN_VARIANCE` that is the plain fit; with ``(0, 1)`` and photon counts it is Fisher scoring,
-    which ends at the Poisson likelihood's maximum. A return that moved no more and that no moving
+    weighs as much as its variance (`get_variance`) is small. With `EVEN_VARIANCE` that is the plain
+    fit; with that of photon counts it is Fisher scoring, which ends at the Poisson likelihood's
+    maximum. A return that moved no more and that no moving
     one reaches is left alone.
 
     `estimate` is (returns, 5): arrival, height, first bin and the bin after the last one that it
@@ -152,15 +209,15 @@ def refine_returns(trace, times, background, curve, scale, estimate, variance, r
     ----------
     trace, times : (bins,) array
         Brightness, and seconds.
-    background : float
+    background : float or (bins,) array
     curve : (samples, 2) array
         Pulse and slope.
     scale : (4,) array or tuple
         Of the pulse.
     estimate : (returns, 5) array
         Updated in place.
-    variance : (float, float)
-        Of a bin: constant, and per unit of the expected brightness.
+    variance : (float, float) or ((bins,) array, float)
+        See `get_variance`.
     rounds : int
         Maximum number of steps for each return.
     """
@@ -225,7 +282,7 @@ def sum_normal_equations(trace, times, background, curve, scale, estimate, k, cr
     ----------
     trace, times : (bins,) array
         Brightness, and seconds.
-    background : float
+    background : float or (bins,) array
     curve : (samples, 2) array
         Pulse and slope.
     scale : (4,) array or tuple
@@ -250,11 +307,11 @@ def sum_normal_equations(trace, times, background, curve, scale, estimate, k, cr
     pp = pd = dd = pr = dr = 0.0
     for i in range(first, last):
         p, d = interpolate_pulse(times[i] - arrival, curve, scale)
-        rest = trace[i] - background
+        rest = trace[i] - get_level(background, i)
         if crowded:
             rest = compute_residual(trace, times, background, curve, scale, estimate, i, k)
         if variance[1] != 0:
-            weight = 1 / (variance[0] + variance[1] * (trace[i] - rest + height * p))
+            weight = 1 / get_variance(variance, i, trace[i] - rest + height * p)
             pp += weight * p * p
             pd += weight * p * d
             dd += weight * d * d

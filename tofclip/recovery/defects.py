@@ -160,15 +160,15 @@ def find_clipping_level(counts: FloatImage) -> float:
     float
         Infinite where nothing is.
     """
-    highest = float(counts.max())
+    highest = float(np.max(counts))
     number = np.count_nonzero(counts == highest)
     if number < MIN_CLIPPED_PIXELS or highest == float(counts.min()):
         return float("inf")
     # a few times as many of the brightest are enough to see how many there are of each value
-    most = min(counts.size, 20 * number)
+    most = min(int(counts.size), 20 * int(number))
     brightest = np.partition(counts, counts.size - most, axis=None)[counts.size - most :]
     _, each = np.unique(brightest[brightest < highest], return_counts=True)
-    usual = int(each[-COMPARED_VALUES:].max()) if each.size else 1
+    usual = max([1, *each[-COMPARED_VALUES:].tolist()])
     return highest if number > MIN_CLIPPED_RATIO * usual else float("inf")
 
 

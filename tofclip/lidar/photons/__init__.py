@@ -9,6 +9,7 @@ lets neighbours lend each other their photons.
 """
 
 from tofclip.lidar.photons.accuracy import Accuracy, measure_accuracy
+from tofclip.lidar.photons.background import learn_background
 from tofclip.lidar.photons.detector import Arrivals, PhotonDetector
 from tofclip.lidar.photons.limits import compute_range_bound
 from tofclip.lidar.photons.photon_image import PhotonImage
@@ -27,6 +28,7 @@ __all__ = [
     "correct_pile_up",
     "estimate_pixels",
     "estimate_surface",
+    "learn_background",
     "locate_with_smoothness",
     "measure_accuracy",
 ]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofclip.errors import InputError, ShapeError
+from tofclip.lidar.photons.background import learn_background
+from tofclip.lidar.photons.pile_up import count_live_cycles
 from tofclip.lidar.pulse import Pulse, Table
 from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
@@ -29,6 +31,12 @@ MAX_EXACT_PHOTONS = 40  # up to this number of photons every one has a threshold
 PHOTON_LEVEL_RATIO = 1.03  # beyond, numbers that differ by less share one
 PULSE_CUTOFF = 1e-4  # of its peak: what a pulse brings beyond it is not worth the bins
 HISTOGRAMS_PER_BLOCK = 256
+SHADE_RATIO = 1.1  # backgrounds that differ by less share a filter; thresholds hold for any filter
+MIN_RELATIVE_BACKGROUND = 1e-3  # of a usual bin; no bin is so dark that one photon decides
+NO_PILE_UP = 1e15  # cycles: the rate of any bin is as good as zero
+MIN_LIVE_CYCLES = (
+    0.5  # a bin that hardly any cycle reaches says nothing, but not with infinite surety
+)
 
 
 @dataclass(frozen=True)
@@ -60,9 +68,10 @@ class PhotonDetector:
     """Log-matched filter with a threshold for a stated false-alarm rate, then the maximum of the
     Poisson likelihood.
 
-    No background need be known. Without a return the photons of a histogram lie evenly over its
-    bins, however high the background; so a threshold for the number of photons found keeps the rate
-    at any background (a test of Neyman structure). Thresholds come from simulated histograms. With
+    Only the shape of the background need be known, not how bright it is. Without a return the
+    photons of a histogram lie over its bins as the background does, however high that is; so a
+    threshold for the number of photons found keeps the rate at any background (a test of Neyman
+    structure). Thresholds come from simulated histograms. With
     few photons the scores are so coarse that no threshold alone meets the rate; ties are then
     decided by chance (Neyman and Pearson's randomised test). An empty histogram never raises an
     alarm.
@@ -83,11 +92,15 @@ class PhotonDetector:
     min_photons : float
         The filter is the most powerful one for returns of this number of photons; stronger ones pass it
         anyway.
+    background : (bins,) array, optional
+        Shape of the background over the bins, in any unit: of a dark frame, of fog, of light that
+        comes back from nearby. Even by default; `learn_background` finds it from many histograms.
 
     Raises
     ------
     InputError
-        A parameter outside its range, or histograms shorter than two pulses.
+        A parameter outside its range, a background of another length or without light, or
+        histograms shorter than two pulses.
     """
 
     pulse: Pulse
@@ -96,6 +109,7 @@ class PhotonDetector:
     false_alarm_rate: float = 0.01
     max_returns: int = 1
     min_photons: float = 20.0
+    background: ArrayLike | None = None
 
     def __post_init__(self) -> None:
         if not (self.bin_width > 0 and self.min_photons > 0 and self.max_returns >= 1):
@@ -108,6 +122,12 @@ class PhotonDetector:
             raise InputError(
                 f"a histogram needs at least {2 * self._offsets.size} bins, two pulses long; got {self.bins}"
             )
+        if self.background is not None:
+            shape = np.asarray(self.background, dtype=np.float64)
+            if shape.shape != (self.bins,):
+                raise ShapeError("the background of a histogram", (self.bins,), shape.shape)
+            if not (np.all(np.isfinite(shape)) and shape.min() >= 0 and shape.any()):
+                raise InputError("a background must be finite, not negative, and somewhere above 0")
 
     @cached_property
     def shape(self) -> Pulse:
@@ -146,6 +166,27 @@ class PhotonDetector:
         return np.log1p(self.min_photons * share / background)
 
     @cached_property
+    def relative_background(self) -> FloatArray:
+        """Background of each bin, (bins,), relative to the mean."""
+        if self.background is None:
+            return np.ones(self.bins)
+        shape = np.asarray(self.background, dtype=np.float64)
+        relative = np.maximum(shape / shape.mean(), MIN_RELATIVE_BACKGROUND)
+        even: FloatArray = relative / relative.mean()
+        return even
+
+    @cached_property
+    def _shades(self) -> tuple[FloatArray, NDArray[np.int64]]:
+        """Backgrounds for which there is a filter, and which of them each bin has."""
+        step = np.rint(np.log(self.relative_background) / np.log(SHADE_RATIO)).astype(np.int64)
+        known, shade = np.unique(step, return_inverse=True)
+        return SHADE_RATIO ** known.astype(np.float64), shade.ravel()
+
+    def _build_filter(self, background: float) -> FloatArray:
+        """Log-matched filter for each shade of a background of so many photons in a usual bin."""
+        return np.array([self.weights(background * shade) for shade in self._shades[0]])
+
+    @cached_property
     def _threshold_cache(self) -> dict[int, float]:
         return {}
 
@@ -158,20 +199,50 @@ class PhotonDetector:
         if photons not in self._threshold_cache:
             best = np.empty(CALIBRATION_HISTOGRAMS)
             noise = np.random.default_rng(CALIBRATION_SEED + photons)
-            filtering = self.weights(photons / self.bins), self.first_offset
+            share = self.relative_background / self.bins
+            filtering = (
+                self._build_filter(photons / self.bins),
+                self._shades[1],
+                self.first_offset,
+            )
             if photons <= DENSE_PHOTONS_PER_BIN * self.bins:
-                simulate_best_scores(photons, self.bins, noise, *filtering, best)
+                arrived = np.cumsum(share)
+                arrived[-1] = 1.0  # whatever rounding left
+                simulate_best_scores(photons, arrived, noise, *filtering, best)
             else:
                 for piece in split_blocks(CALIBRATION_HISTOGRAMS, HISTOGRAMS_PER_BATCH):
-                    thrown = noise.multinomial(
-                        photons, np.full(self.bins, 1 / self.bins), best[piece].size
-                    )
+                    thrown = noise.multinomial(photons, share, best[piece].size)
                     find_best_scores(thrown.astype(np.float64), *filtering, best[piece])
             best += noise.uniform(0, DITHER, best.size)
             self._threshold_cache[photons] = float(np.quantile(best, 1 - self.false_alarm_rate))
         return self._threshold_cache[photons]
 
-    def locate(self, histograms: ArrayLike, seed: int = 0) -> Arrivals:
+    def adapt(self, histograms: FloatArray) -> PhotonDetector:
+        """Return a detector for the background that these histograms have in common.
+
+        Parameters
+        ----------
+        histograms : (n, bins) array
+            Photons counted in each bin.
+
+        Returns
+        -------
+        PhotonDetector
+            This one where its background is given already, or where the histograms are too few
+            to tell it from an even one; see `tofclip.lidar.photons.background`.
+        """
+        if self.background is not None:
+            return self
+        learnt = learn_background(histograms, self.shape.fwhm / self.bin_width)
+        return self if learnt is None else replace(self, background=learnt)
+
+    def locate(
+        self,
+        histograms: ArrayLike,
+        seed: int = 0,
+        cycles: int | None = None,
+        dead_bins: int | None = None,
+    ) -> Arrivals:
         """Find the returns of every histogram, below a bin.
 
         Parameters
@@ -180,6 +251,11 @@ class PhotonDetector:
             Photons counted in each bin.
         seed : int
             Of the chance that decides scores exactly at the threshold.
+        cycles : int, optional
+            Laser cycles that made a histogram, of a detector that is blind after a photon: pile-up
+            is corrected, and what it costs is in the deviations. Without, no photon was missed.
+        dead_bins : int, optional
+            See `correct_pile_up`.
 
         Returns
         -------
@@ -189,16 +265,28 @@ class PhotonDetector:
         Raises
         ------
         ShapeError, InputError
-            Histograms of another length, or with counts that are negative or not finite.
+            Histograms of another length, with counts that are negative or not finite, or with more
+            photons than the cycles allow.
 
         Notes
         -----
-        Memory beyond the result is one float64 copy of the histograms.
+        Memory beyond the result is one float64 copy of the histograms, with pile-up three.
         """
         counts = self.validate_histograms(histograms)
         dither = np.random.default_rng(seed).uniform(0, DITHER, size=counts.shape[:1])
-        peaks, numbers = self._detect(counts, dither)
-        return self.refine(counts, peaks, numbers)
+        detector = self.adapt(counts)
+        if cycles is None:
+            return detector.refine(counts, *detector._detect(counts, dither))
+        _, live = count_live_cycles(counts, cycles, dead_bins)
+        live = np.maximum(live, MIN_LIVE_CYCLES) / cycles
+        # Counts fall as fewer cycles are left, with and without a return. A background that was
+        # learnt from them falls with them, a given one does not.
+        ready = live.mean(axis=0)
+        if detector is self:
+            own, ramp = self, replace(self, background=self.relative_background * ready)
+        else:
+            own, ramp = replace(self, background=detector.relative_background / ready), detector
+        return own.refine(counts, *ramp._detect(counts, dither), live, cycles)
 
     def validate_histograms(self, histograms: ArrayLike) -> FloatArray:
         """Return histograms as float64, refusing what is none."""
@@ -215,11 +303,12 @@ class PhotonDetector:
         """Bins of the returns, (n, most returns), and how many there are."""
         from tofclip.lidar.photons.kernels import extract_strongest_returns
 
-        rest, free = counts.copy(), np.full(counts.shape[0], self.bins)
+        rest, free = counts.copy(), np.full(counts.shape[0], float(self.bins))
+        background = self.relative_background, self._shades[1]
         peaks = np.zeros((counts.shape[0], self.max_returns), np.int64)
         numbers = np.zeros(counts.shape[0], np.int64)
         for turn in range(self.max_returns):
-            sought = (numbers == turn) & (free > self.bins // 2)
+            sought = (numbers == turn) & (free > self.bins / 2)
             photons = _quantise_photons(rest.sum(axis=1) * self.bins / free)
             known, level = np.unique(photons[sought], return_inverse=True)
             if known.size == 0 or known[-1] == 0:
@@ -227,7 +316,7 @@ class PhotonDetector:
             rows = np.full(sought.size, -1)
             rows[sought] = np.where(photons[sought] > 0, level, -1)
             table = self._build_table(known)
-            arguments = table, self.first_offset, self.kernel_pulse[1], self.times
+            arguments = table, background, self.first_offset, self.kernel_pulse[1], self.times
             extract_strongest_returns(rest, free, dither, rows, *arguments, peaks, numbers)
         return peaks, numbers
 
@@ -236,10 +325,15 @@ class PhotonDetector:
         none to pass.
         """
         thresholds = np.array([self.threshold(int(n)) if n else np.inf for n in levels])
-        return thresholds, np.array([self.weights(max(n, 1) / self.bins) for n in levels])
+        return thresholds, np.array([self._build_filter(max(n, 1) / self.bins) for n in levels])
 
     def refine(
-        self, counts: FloatArray, peaks: NDArray[np.int64], numbers: NDArray[np.int64]
+        self,
+        counts: FloatArray,
+        peaks: NDArray[np.int64],
+        numbers: NDArray[np.int64],
+        live: FloatArray | None = None,
+        cycles: float = NO_PILE_UP,
     ) -> Arrivals:
         """Move returns from the bins where they were found to the likelihood's maximum.
 
@@ -250,6 +344,10 @@ class PhotonDetector:
             Bins of the returns.
         numbers : (n,) array
             How many of them there are.
+        live : (n, bins) array, optional
+            Fraction of the cycles in which the detector was ready; all by default.
+        cycles : float
+            Laser cycles of a histogram.
 
         Returns
         -------
@@ -261,10 +359,23 @@ class PhotonDetector:
         found = np.full((*peaks.shape, 3), np.nan)
 
         def work(piece: slice) -> None:
+            some = counts[piece]
+            ready, arrived = np.ones_like(some), some
+            if live is not None:
+                ready = live[piece]
+                # where every live cycle counted, half a cycle is taken not to have
+                counted = np.minimum(
+                    some / (ready * cycles), 1 - 0.5 / np.maximum(ready * cycles, 1)
+                )
+                arrived = -cycles * np.log1p(-counted)
             fit_histograms(
-                counts[piece],
+                some,
+                arrived,
+                ready,
+                float(cycles),
                 peaks[piece],
                 numbers[piece],
+                self.relative_background,
                 *self.kernel_pulse,
                 self.times,
                 found[piece],

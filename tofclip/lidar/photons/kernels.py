@@ -12,11 +12,11 @@ from numba import njit
 from tofclip.lidar.pulse_fit import (
     compute_residual,
     find_pulse_window,
+    get_variance,
     interpolate_pulse,
     refine_returns,
 )
 
-POISSON_VARIANCE = (0.0, 1.0)  # the variance of a bin is what is expected in it
 MAX_ITERATIONS = (
     16  # the weights change with the estimate, which takes some rounds more than the plain fit
 )
@@ -24,18 +24,20 @@ MIN_PHOTONS = 0.5  # lets an empty histogram have a background
 
 
 @njit(nogil=True, cache=True)
-def find_best_score(counts, weights, first):
+def find_best_score(counts, weights, shade, first):
     """Largest log-matched filter response over all bins, and its bin.
 
-    ``score[j] = sum_w weights[w] * counts[j + first + w]``; photons are few, so each one adds to
-    the bins it concerns.
+    ``score[j] = sum_w weights[shade[j + first + w], w] * counts[j + first + w]``; photons are few,
+    so each one adds to the bins it concerns. A photon where the background is bright says less.
 
     Parameters
     ----------
     counts : (bins,) array
         Photons.
-    weights : (width,) float array
-        Of the log-matched filter.
+    weights : (shades, width) float array
+        Of the log-matched filter, for each brightness of the background.
+    shade : (bins,) int array
+        Row of `weights` for each bin.
     first : int
         Bin of the first weight, counted from the return's.
 
@@ -47,62 +49,67 @@ def find_best_score(counts, weights, first):
     score = np.zeros(counts.size)
     for i in range(counts.size):
         if counts[i] > 0:
-            for w in range(weights.size):
+            own = weights[shade[i]]
+            for w in range(own.size):
                 j = i - first - w
                 if 0 <= j < counts.size:
-                    score[j] += counts[i] * weights[w]
+                    score[j] += counts[i] * own[w]
     best = np.argmax(score)
     return score[best], best
 
 
 @njit(nogil=True, cache=True)
-def find_best_scores(histograms, weights, first, best):
+def find_best_scores(histograms, weights, shade, first, best):
     """Fill `best` with the largest response of each histogram.
 
     Parameters
     ----------
     histograms : (n, bins) array
         Photons.
-    weights : (width,) float array
-        Of the log-matched filter.
-    first : int
-        Bin of the first weight, counted from the return's.
+    weights, shade, first
+        As for `find_best_score`.
     best : (n,) float64 array
         Overwritten.
     """
     for row in range(histograms.shape[0]):
-        best[row] = find_best_score(histograms[row], weights, first)[0]
+        best[row] = find_best_score(histograms[row], weights, shade, first)[0]
 
 
 @njit(nogil=True, cache=True)
-def simulate_best_scores(photons, bins, noise, weights, first, best):
-    """Fill `best` with the best scores of histograms over which `photons` are thrown evenly by a
-    random generator.
+def simulate_best_scores(photons, arrived, noise, weights, shade, first, best):
+    """Fill `best` with the best scores of histograms over which `photons` are thrown by a random
+    generator as the background is distributed.
 
     Parameters
     ----------
     photons : int
         In each histogram.
-    bins : int
+    arrived : (bins,) float64 array
+        Fraction of the background up to the end of each bin; the last is 1.
     noise : numpy.random.Generator
-    weights : (width,) float array
-        Of the log-matched filter.
-    first : int
-        Bin of the first weight, counted from the return's.
+    weights, shade, first
+        As for `find_best_score`.
     best : (trials,) float64 array
         Overwritten.
     """
+    bins = arrived.size
     counts = np.zeros(bins)
+    # where to begin the search for a photon's bin: hardly a step from where it ends
+    begin = np.searchsorted(arrived, np.arange(bins) / bins, side="right")
     for trial in range(best.size):
         counts[:] = 0
         for _ in range(photons):
-            counts[noise.integers(0, bins)] += 1
-        best[trial] = find_best_score(counts, weights, first)[0]
+            place = noise.random()
+            i = begin[int(place * bins)]
+            while arrived[i] <= place:
+                i += 1
+            counts[i] += 1
+        best[trial] = find_best_score(counts, weights, shade, first)[0]
 
 
 @njit(nogil=True, cache=True)
 def extract_strongest_returns(
-    rest, free, dither, level, table, first, scale, times, peaks, numbers
+    rest, free, dither, level, table, background, first, scale, times, peaks, numbers
 ):
     """Find the strongest return of each histogram and take its bins out, for the next one to be
     sought in the rest.
@@ -111,14 +118,16 @@ def extract_strongest_returns(
     ----------
     rest : (n, bins) float64 array, changed
         Photons that belong to no return yet.
-    free : (n,) int64 array, changed
-        Bins that belong to no return yet.
+    free : (n,) float64 array, changed
+        Background of the bins that belong to no return yet, relative to that of a usual bin.
     dither : (n,) array
         Added to the scores, to decide ties.
     level : (n,) int64 array
         Row of the table for each histogram; negative: nothing is sought.
-    table : (levels,), (levels, width) arrays
+    table : (levels,), (levels, shades, width) arrays
         Threshold and filter weights.
+    background : (bins,) float64 array, (bins,) int array
+        Relative brightness of each bin, and its row of the filter.
     first : int
         Bin of the first weight relative to the return's.
     scale, times
@@ -126,29 +135,39 @@ def extract_strongest_returns(
     peaks : (n, most returns) int64 array, changed
     numbers : (n,) int64 array, changed
     """
-    thresholds, weights = table
+    (thresholds, weights), (relative, shade) = table, background
     for row in range(rest.shape[0]):
         if level[row] < 0:
             continue
-        score, best = find_best_score(rest[row], weights[level[row]], first)
+        score, best = find_best_score(rest[row], weights[level[row]], shade, first)
         if score + dither[row] <= thresholds[level[row]]:
             continue
         peaks[row, numbers[row]] = best
         numbers[row] += 1
         begin, end = find_pulse_window(times, (best, best), times[best], scale)
         rest[row, begin:end] = 0
-        free[row] -= end - begin
+        free[row] -= relative[begin:end].sum()
 
 
 @njit(nogil=True, cache=True)
-def fit_histograms(histograms, peaks, numbers, curve, scale, times, found):
+def fit_histograms(
+    histograms, arrived, live, cycles, peaks, numbers, relative, curve, scale, times, found
+):
     """Refine the returns of each histogram to the likelihood's maximum.
 
     Parameters
     ----------
     histograms : (n, bins) float64 array
+        Photons counted.
+    arrived : (n, bins) float64 array
+        Photons with pile-up corrected.
+    live : (n, bins) float64 array
+        Fraction of the cycles in which the detector was ready.
+    cycles : float
     peaks, numbers
         As `extract_strongest_returns` left them.
+    relative : (bins,) float64 array
+        Background of each bin, relative to that of a usual one.
     curve, scale, times
         As in `tofclip.lidar.pulse_fit`.
     found : (n, most returns, 3) float64 array
@@ -157,8 +176,12 @@ def fit_histograms(histograms, peaks, numbers, curve, scale, times, found):
     """
     estimate = np.empty((peaks.shape[1], 5))
     for row in range(histograms.shape[0]):
-        trace, number = histograms[row], numbers[row]
-        background = estimate_background(trace, times, peaks[row, :number], scale)
+        trace, number = arrived[row], numbers[row]
+        # what was counted in the live cycles says more than a mean of corrected bins
+        level = estimate_background(
+            histograms[row], relative * live[row], times, peaks[row, :number], scale
+        )
+        background, variance = relative * level, (1 / live[row], cycles)
         for k in range(number):
             peak = peaks[row, k]
             estimate[k, 0], estimate[k, 2], estimate[k, 3] = times[peak], peak, peak
@@ -170,23 +193,33 @@ def fit_histograms(histograms, peaks, numbers, curve, scale, times, found):
             curve,
             scale,
             estimate[:number],
-            POISSON_VARIANCE,
+            variance,
             MAX_ITERATIONS,
         )
         for k in range(number):
             summarise_return(
-                trace, times, background, curve, scale, estimate[:number], k, found[row, k]
+                trace,
+                times,
+                background,
+                curve,
+                scale,
+                estimate[:number],
+                k,
+                variance,
+                found[row, k],
             )
 
 
 @njit(nogil=True, cache=True)
-def estimate_background(trace, times, peaks, scale):
-    """Background photons of a bin, from the bins that no return reaches.
+def estimate_background(trace, relative, times, peaks, scale):
+    """Background photons of a usual bin, from the bins that no return reaches.
 
     Parameters
     ----------
     trace : (bins,) array
         Photons.
+    relative : (bins,) array
+        Background of each bin, relative to that of a usual one.
     times : (bins,) array
         Seconds, increasing.
     peaks : sequence of int
@@ -207,7 +240,7 @@ def estimate_background(trace, times, peaks, scale):
     for i in range(trace.size):
         if free[i]:
             photons += trace[i]
-            bins += 1
+            bins += relative[i]
     # a background of exactly zero would make a single photon infinitely surprising
     return (photons + MIN_PHOTONS) / max(bins, 1.0)
 
@@ -222,7 +255,7 @@ def estimate_height(trace, times, background, curve, scale, peak):
         Photons.
     times : (bins,) array
         Seconds, increasing.
-    background : float
+    background : (bins,) array
         Photons per bin.
     curve : (samples, 2) array
         Pulse and slope.
@@ -241,12 +274,12 @@ def estimate_height(trace, times, background, curve, scale, peak):
     area = excess = 0.0
     for i in range(first, last):
         area += interpolate_pulse(times[i] - arrival, curve, scale)[0]
-        excess += trace[i] - background
+        excess += trace[i] - background[i]
     return max(excess, MIN_PHOTONS) / max(area, 1e-3)
 
 
 @njit(nogil=True, cache=True)
-def summarise_return(trace, times, background, curve, scale, estimate, k, found):
+def summarise_return(trace, times, background, curve, scale, estimate, k, variance, found):
     """Write arrival, photons and the arrival's Cramer-Rao deviation at the estimate to `found`.
 
     Parameters
@@ -255,7 +288,7 @@ def summarise_return(trace, times, background, curve, scale, estimate, k, found)
         Photons.
     times : (bins,) array
         Seconds, increasing.
-    background : float
+    background : (bins,) array
         Photons per bin.
     curve : (samples, 2) array
         Pulse and slope.
@@ -265,6 +298,8 @@ def summarise_return(trace, times, background, curve, scale, estimate, k, found)
         See `tofclip.lidar.pulse_fit.refine_returns`.
     k : int
         Number of the return.
+    variance : ((bins,) array, float)
+        See `tofclip.lidar.pulse_fit.get_variance`.
     found : (3,) float array
         Overwritten: arrival in seconds, photons, standard deviation in seconds (infinite where the
         fit says nothing).
@@ -276,10 +311,11 @@ def summarise_return(trace, times, background, curve, scale, estimate, k, found)
     pp = pd = dd = total = 0.0
     for i in range(first, last):
         p, d = interpolate_pulse(times[i] - arrival, curve, scale)
-        # Poisson: a bin's variance is its expected count, which trace less residual is
-        weight = 1 / (
-            trace[i] - compute_residual(trace, times, background, curve, scale, estimate, i, -1)
+        # the variance follows the expected count, which trace less residual is
+        expected = trace[i] - compute_residual(
+            trace, times, background, curve, scale, estimate, i, -1
         )
+        weight = 1 / get_variance(variance, i, expected)
         pp += weight * p * p
         pd += weight * p * d
         dd += weight * d * d

@@ -200,9 +200,11 @@ class PhotonImage:
 
     def histograms(self, pixels: slice) -> FloatArray:
         """Return the histograms of some pixels in raster order, (n, bins)."""
-        numbers = range(*pixels.indices(self.offsets.size - 1))
-        some = slice(self.offsets[numbers.start], self.offsets[numbers.stop])
-        table = np.zeros((len(numbers), self.bins))
+        start, stop, step = pixels.indices(self.offsets.size - 1)
+        some = slice(self.offsets[start], self.offsets[stop])
+        table = np.zeros((len(range(start, stop, step)), self.bins))
         whole = np.clip(np.rint(self.bin[some]).astype(np.int64), 0, self.bins - 1)
-        np.add.at(table, (self.pixel[some] - numbers.start, whole), self.count[some])
+        row, beside = np.divmod(self.pixel[some] - start, step)
+        taken = beside == 0
+        np.add.at(table, (row[taken], whole[taken]), self.count[some][taken])
         return table

@@ -45,6 +45,33 @@ def correct_pile_up(
     Phys. E 1, 878 (1968), Eq. 4; for a dead time shorter than the cycle the sum runs over the dead
     time only (S. Isbaner et al., Opt. Express 24, 9429, 2016).
     """
+    seen, live = count_live_cycles(counts, cycles, dead_bins)
+    fraction = np.divide(seen, live, out=np.ones_like(seen), where=live > 0)
+    arrived = np.full_like(seen, np.nan)
+    np.log1p(-fraction, out=arrived, where=fraction < 1)
+    return -cycles * arrived
+
+
+def count_live_cycles(
+    counts: NDArray[np.integer] | NDArray[np.floating], cycles: int, dead_bins: int | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Count the cycles in which the detector was ready, bin by bin.
+
+    Parameters
+    ----------
+    counts, cycles, dead_bins
+        As for `correct_pile_up`.
+
+    Returns
+    -------
+    counts, live : (..., bins) float64 array
+        Photons counted, and cycles that no photon before had blinded.
+
+    Raises
+    ------
+    InputError
+        As for `correct_pile_up`.
+    """
     seen = np.asarray(counts, dtype=np.float64)
     if cycles < 1 or not np.all(np.isfinite(seen) & (seen >= 0)):
         raise InputError(
@@ -61,7 +88,4 @@ def correct_pile_up(
         raise InputError(
             f"more photons were counted than {cycles} cycles with this dead time allow"
         )
-    fraction = np.divide(seen, live, out=np.ones_like(seen), where=live > 0)
-    arrived = np.full_like(seen, np.nan)
-    np.log1p(-fraction, out=arrived, where=fraction < 1)
-    return -cycles * arrived
+    return seen, live

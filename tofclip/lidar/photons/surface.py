@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tofclip.camera import Camera
 from tofclip.lidar.photons.detector import PhotonDetector
@@ -71,6 +71,9 @@ TILE_PX = 16
 MIN_TILE_SIGNIFICANCE = 5.0
 """Standard deviations above the background at which a tile of the picture says that some surface
 lies at an instant."""
+
+SAMPLED_PIXELS = 8192
+"""That say what the pixels' background has in common."""
 
 PIXELS_PER_BLOCK, ROWS_PER_BLOCK, DETECTED_PIXELS_PER_BLOCK = 1 << 14, 16, 1 << 10
 SIGNAL_POOL_PX = 5
@@ -462,7 +465,11 @@ def combine_layers(
 
 
 def estimate_pixels(
-    photons: PhotonImage, pulse: Pulse | None = None, false_alarm_rate: float = 0.01
+    photons: PhotonImage,
+    pulse: Pulse | None = None,
+    false_alarm_rate: float = 0.01,
+    background: ArrayLike | None = None,
+    cycles: int | None = None,
 ) -> SurfaceImage:
     """Find the strongest return of every pixel by its own photons alone.
 
@@ -473,6 +480,11 @@ def estimate_pixels(
         Shape of a return; by default as wide as pairs of photons say.
     false_alarm_rate : float
         Share of the pixels without a return in which one is announced; see `PhotonDetector`.
+    background : (bins,) array, optional
+        Shape of the background over the bins, as of a dark frame; by default what the pixels have
+        in common.
+    cycles : int, optional
+        Laser cycles of each pixel, of a detector that counts the first photon of a cycle only.
 
     Returns
     -------
@@ -485,11 +497,18 @@ def estimate_pixels(
         No pulse is given and none can be recognised, or the time axis is shorter than two pulses.
     """
     shape = Pulse.gaussian(measure_pulse_width(photons)) if pulse is None else pulse
-    detector = PhotonDetector(shape, photons.bin_width, photons.bins, false_alarm_rate)
+    detector = PhotonDetector(
+        shape, photons.bin_width, photons.bins, false_alarm_rate, background=background
+    )
     pixels = photons.offsets.size - 1
+    if background is None:
+        # once for the whole picture, from pixels all over it
+        some = photons.histograms(slice(0, pixels, -(-pixels // SAMPLED_PIXELS)))
+        learnt = detector.adapt(some).relative_background
+        detector = replace(detector, background=learnt)
     found = np.full((3, pixels), np.nan)
     for piece in split_blocks(pixels, DETECTED_PIXELS_PER_BLOCK):
-        arrivals = detector.locate(photons.histograms(piece), seed=piece.start)
+        arrivals = detector.locate(photons.histograms(piece), piece.start, cycles)
         found[:, piece] = (
             arrivals.range[:, 0],
             arrivals.confidence[:, 0],
@@ -508,6 +527,11 @@ def estimate_pixels(
             "response": "learnt" if pulse is None else "given",
             "pulse_fwhm_ps": detector.shape.fwhm * 1e12,
             "false_alarm_rate": false_alarm_rate,
+            "background": "given"
+            if background is not None
+            else "learnt"
+            if np.ptp(detector.relative_background)
+            else "even",
         },
     )
 
