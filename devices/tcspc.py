@@ -248,8 +248,18 @@ class SwabianPhotons:
                 return _make_photons(pulse, delay, np.searchsorted(self._inputs, channel))
 
     def _rewind(self) -> None:
-        self._file = self._library.FileReader(str(self._path))
-        self._file.getConfiguration()  # which fails for a damaged file; opening it does not
+        said: list[str] = []  # in lines of its own otherwise
+        self._library.setLogger(lambda level, message: said.append(message))
+        try:
+            self._file = self._library.FileReader(str(self._path))
+            self._file.getConfiguration()  # which fails for a damaged file; opening it does not
+        except Exception as fault:  # its own, which are not known before it is imported
+            why = said[0] if said else format_error_line(fault)
+            raise FileFormatError(
+                self._path, f"is a damaged or unsupported file ({why})"
+            ) from fault
+        finally:
+            self._library.setLogger(None)
         self._count, self._next = PulseCount(), 0
 
     def _read_next(
