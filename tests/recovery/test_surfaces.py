@@ -21,7 +21,11 @@ from tofclip.recovery.surface_model import (
 )
 from tofclip.recovery.surface_patches import SmoothBasis, find_patches
 from tofclip.recovery.surface_solver import refine_state
-from tofclip.recovery.surfaces import SurfaceRecovery
+from tofclip.recovery.surfaces import (
+    SurfaceRecovery,
+    extrapolate_steps,
+    find_usual_brightness,
+)
 from tofclip.sequences import CloudSettings
 from tofclip.shots import Frames, Streak
 from tofclip.simulate import (
@@ -190,6 +194,35 @@ def test_a_refused_or_taken_step_never_raises_the_misfit(shot):
     assert model.state.delays[3] == model.state.stretches[3] == 0
 
 
+def test_light_is_placed_on_an_uneven_time_axis(shot):
+    """As a sweep that is faster at one end; light of a point is where its time of flight says."""
+    even = shot.streak.times
+    times = even + 0.04 * even * (even / even[-1] - 1)  # 4 % slower at the end than at the start
+    uneven = replace(shot.streak, row_times=times)
+    model = make_model(uneven)
+    assert np.ptp(np.diff(model.times)) > 0.05 * BIN
+    point = 19  # on the optical axis' column, where the reference view's sweep is none
+    alone = np.zeros(model.surface.size, np.float32)
+    alone[point] = 1
+    light = model.project(3, alone, model.kernels[3]).sum(axis=1)
+    there = 2 * model.distance[point] / 299_792_458 + CAMERA.time_zero
+    expected = np.interp(there, times, np.arange(times.size))
+    assert np.average(np.arange(light.size), weights=light) == pytest.approx(expected, abs=0.03)
+
+
+def test_what_steps_leave_is_a_geometric_series():
+    lengths = np.array([[8.0, 4.0, 1.0], [2.0, 4.0, 0.0]])
+    np.testing.assert_allclose(extrapolate_steps(lengths), [2 / 3, 4.0, 0.0])
+
+
+def test_usual_brightness_is_that_of_the_surest_points():
+    amplitude = np.array([1, 1, 9, 10, 11], np.float32)
+    assert find_usual_brightness(amplitude, 3 * amplitude, 5.0) == 10
+    # in little light none is twenty deviations out, and half of the upper ones' counts
+    assert find_usual_brightness(amplitude, amplitude, 5.0) == 10
+    assert find_usual_brightness(amplitude, amplitude / 10, 5.0) == np.inf
+
+
 def find_patches_in(distance: np.ndarray, ray_length: np.ndarray):
     pixels = np.flatnonzero(np.isfinite(distance))
     return find_patches(pixels, distance.ravel()[pixels], ray_length, BIN_M)
@@ -262,6 +295,23 @@ def test_a_shot_that_is_not_of_surfaces_is_refused(shot):
     fog[60:180] = random.poisson(40 * random.random((120, fog.shape[1])))
     with pytest.raises(InputError, match='choose `method="tv"`'):
         recover(replace(shot.streak, counts=fog.astype(np.float32)), shot.camera, "surfaces")
+
+
+def test_smoke_is_refused():
+    """A cloud that scatters less and less light for a nanosecond and a half, wherever one looks."""
+    camera = CAMERA.replace(sweep=SkewSweep(CENTRES, np.zeros(7), np.zeros(7)))
+    y, x = np.indices(SHAPE)
+    smoke = np.exp(-((x - 24) ** 2 + (y - 20) ** 2) / 200) * (
+        1 + 0.4 * np.sin(x / 3) * np.cos(y / 4)
+    )
+    slit = camera.operator()(smoke.astype(np.float32))
+    decay = np.exp(-np.arange(75) / 40)
+    light = np.full((270, slit.size), 2.0)
+    light[80:155] += 800 * decay[:, np.newaxis] * slit / slit.max()
+    counts = np.random.default_rng(0).poisson(light).astype(np.float32)
+    streak = Streak(counts, np.arange(270) * BIN)
+    with pytest.raises(InputError, match='choose `method="tv"`'):
+        recover(streak, camera, "surfaces")
 
 
 def test_settings_that_make_no_sense_are_refused():

@@ -19,6 +19,7 @@ MARGIN_PX = 10  # how far a surface may reach beyond the returns that showed it
 NEIGHBOUR_BINS = 1.6  # neighbouring pixels whose ranges differ by less lie on one surface
 MIN_PATCH_PX = 25  # fewer returns are not a surface of their own
 MERGE_BINS = 0.5  # misfit of either of two patches to one surface for both
+MERGE_EXCESS = 1.1  # or of their misfit to a surface of their own
 MERGE_REACH_BINS = 7.0  # of the larger's fit at the smaller: further off it is not tried
 FIT_ITERATIONS = 10
 CURVATURE_PENALTY = 1e-3  # keeps small patches from bending
@@ -263,5 +264,10 @@ def _merge(large: Patch, small: Patch, ray_length: FloatArray, bin_m: float) -> 
         return None
     pixels = np.concatenate([large.pixels, small.pixels])
     joint = _fit_quadratic(pixels, np.concatenate([large.distance, small.distance]), ray_length)
-    errors = (median_error(one, joint.coefficients) for one in (large, small))
-    return joint if max(errors) < MERGE_BINS * bin_m else None
+    fits = all(
+        median_error(one, joint.coefficients)
+        # in little light returns scatter by more than that about a surface of their own
+        < max(MERGE_BINS * bin_m, MERGE_EXCESS * median_error(one, one.coefficients))
+        for one in (large, small)
+    )
+    return joint if fits else None

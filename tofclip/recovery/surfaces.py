@@ -47,7 +47,11 @@ from tofclip.units import SPEED_OF_LIGHT
 START_ITERATIONS = 25
 REFINEMENTS, REFINEMENT_ITERATIONS = 2, 20
 MIN_SURFACE_SHARE = 0.5  # of the returns' light: below, the shot is not one of surfaces
+# Of the measurements, both smoothed so that photons' noise does not count: above, most of the light is
+# not where the surfaces are. Smoke's first light looks like one surface, but only the first.
+MAX_UNEXPLAINED, SMOOTHING_PX = 0.5, 2.0
 SURE_SIGMAS = 20.0  # points of which a surface certainly consists
+UPPER_QUANTILE = 0.9
 MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
 NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
 
@@ -143,6 +147,7 @@ class SurfaceRecovery:
         model = SurfaceModel(streak, camera, masks, [patch.basis for patch in patches], state)
         solver = AmplitudeSolver(model, pictures[masks], self.weight)
         solver.run(START_ITERATIONS, progress, count)
+        _require_explained(model, solver.amplitude)
         refinement, remainder = self._refine(model, solver, progress, count)
         solver.run(self.iterations, progress, count)
         returns = self._list_returns(model, solver, refinement, remainder, centre_error_px)
@@ -232,13 +237,13 @@ class SurfaceRecovery:
         displacement_px = centre_error_px / camera.views
         deviation = np.hypot(deviation, displacement_px * np.hypot(*model.compute_slopes()))
         intensity = amplitude * distance**2
+        limit = self.detection.signal_to_noise
         usual = np.zeros(len(model.masks))
         for one in range(usual.size):
-            sure = amplitude[(model.surface == one) & (significance > SURE_SIGMAS)]
-            usual[one] = np.median(sure) if sure.size else np.inf  # no point of it is sure
+            own = model.surface == one
+            usual[one] = find_usual_brightness(amplitude[own], significance[own], limit)
         bright = np.flatnonzero(
-            (significance > self.detection.signal_to_noise)
-            & (amplitude > MIN_BRIGHTNESS_FRACTION * usual[model.surface])
+            (significance > limit) & (amplitude > MIN_BRIGHTNESS_FRACTION * usual[model.surface])
         )
         strong = self.detection.find_significant(
             model.pixel[bright],
@@ -283,6 +288,29 @@ def extrapolate_steps(lengths: FloatArray) -> FloatArray:
     return left
 
 
+def find_usual_brightness(amplitude: Image, significance: Image, limit: float) -> float:
+    """Return the usual amplitude of the points of which a surface certainly consists.
+
+    Parameters
+    ----------
+    amplitude, significance : (points,) float32 arrays
+        Of the surface; significance in standard deviations.
+    limit : float
+        Standard deviations below which there is no point.
+
+    Returns
+    -------
+    float
+        Infinite if no point is sure.
+    """
+    if amplitude.size == 0:
+        return float("inf")
+    # In little light no point is that far out of the noise, but some are further than others.
+    upper = float(np.quantile(significance, UPPER_QUANTILE))
+    sure = amplitude[significance > min(SURE_SIGMAS, max(limit, upper / 2))]
+    return float(np.median(sure)) if sure.size else float("inf")
+
+
 def _require_surfaces(found: Returns, patches: list[Patch]) -> None:
     """Refuse a shot whose light does not come from surfaces."""
     on_surface = np.zeros(found.camera.image_shape, bool)
@@ -294,6 +322,21 @@ def _require_surfaces(found: Returns, patches: list[Patch]) -> None:
         raise InputError(
             f"only {100 * share:.0f} % of this shot's light comes from surfaces; choose "
             '`method="tv"`'
+        )
+
+
+def _require_explained(model: SurfaceModel, amplitude: Image) -> None:
+    """Refuse a shot that surfaces do not explain."""
+    error, image = (
+        scipy.ndimage.gaussian_filter((one * (model.weights > 0)), SMOOTHING_PX)
+        for one in (model.image - model.render(amplitude), model.image)
+    )
+    signal = float(np.linalg.norm(image))
+    unexplained = float(np.linalg.norm(error)) / signal if signal else 1.0
+    if unexplained > MAX_UNEXPLAINED:
+        raise InputError(
+            f"surfaces leave {100 * unexplained:.0f} % of this shot's signal unexplained: its light "
+            'is not on surfaces (smoke, light in flight, a relay wall); choose `method="tv"`'
         )
 
 
