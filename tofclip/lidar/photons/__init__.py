@@ -14,8 +14,10 @@ from tofclip.lidar.photons.detector import Arrivals, PhotonDetector
 from tofclip.lidar.photons.limits import compute_range_bound
 from tofclip.lidar.photons.photon_image import PhotonImage
 from tofclip.lidar.photons.pile_up import correct_pile_up
+from tofclip.lidar.photons.pixels import estimate_pixels
 from tofclip.lidar.photons.smoothing import Smoothness, locate_with_smoothness
-from tofclip.lidar.photons.surface import SurfaceImage, estimate_pixels, estimate_surface
+from tofclip.lidar.photons.surface import estimate_surface
+from tofclip.lidar.photons.surface_image import SurfaceImage
 
 __all__ = [
     "Accuracy",
