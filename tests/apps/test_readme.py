@@ -40,6 +40,18 @@ def write_photons(path: Path) -> None:
     np.save(path, cube.astype(np.uint8))
 
 
+RATE = re.compile(r"(?<![\d.])(\d[\d.,]*)\s+(ms|us|a second|frames/s|shots/s|volumes/s|MB/s)\b")
+
+
+@pytest.mark.parametrize("name", ["README.md", "docs/scaling.md", "docs/many_shots.md"])
+def test_times_and_rates_are_those_of_the_benchmark_page(name: str) -> None:
+    """One place for measured times: what is said elsewhere has to be there, or goes."""
+    page = (ROOT / "docs" / "benchmarks.md").read_text("utf-8")
+    text = re.sub(r"```.*?```", "", (ROOT / name).read_text("utf-8"), flags=re.DOTALL)
+    claimed = [f"{number} {unit}" for number, unit in RATE.findall(text)]
+    assert [claim for claim in claimed if claim not in page] == []
+
+
 def test_the_walk_through(
     run: Run, files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
