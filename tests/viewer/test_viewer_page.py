@@ -31,6 +31,7 @@ FLAGS = (
     "--no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --disable-quic --no-first-run "
     "--disable-background-networking --disable-component-update --disable-sync"
 )
+LOADING_MS = 120_000  # a page and its first picture, while all cores compute something else
 PATIENCE_MS = 30_000  # a software renderer on a busy machine draws twice a second
 SCENE = "canvas[data-engine]"
 HARMLESS = ("THREE.Clock", "GPU stall", "GroupMarkerNotSet", "Automatic fallback to software WebGL")
@@ -58,14 +59,14 @@ class Seen:
         self.tab.on("console", self._listen)
         self.tab.on("pageerror", lambda fault: self.complaints.append(str(fault)))
         self.tab.goto(self.page.address)
-        self.tab.locator("#frame-number").wait_for()
+        self.tab.locator("#frame-number").wait_for(timeout=LOADING_MS)
         notice = self.tab.locator(
             "[class*=Notification-closeButton]"
         )  # that the renderer is a slow one
-        notice.first.wait_for()
+        notice.first.wait_for(timeout=LOADING_MS)
         notice.first.click()
-        until(self.is_framed, "the page has framed the cloud for this window")
-        until(lambda: picture(self).std() > 0.02, "the scene is drawn")
+        until(self.is_framed, "the page has framed the cloud for this window", LOADING_MS)
+        until(lambda: picture(self).std() > 0.02, "the scene is drawn", LOADING_MS)
 
     def _listen(self, line: Any) -> None:
         if line.type in ("error", "warning") and not any(word in line.text for word in HARMLESS):
@@ -139,9 +140,9 @@ class Seen:
         self._thread.join(10)
 
 
-def until(met: Callable[[], bool], what: str) -> None:
+def until(met: Callable[[], bool], what: str, patience_ms: float = PATIENCE_MS) -> None:
     """Wait for something to become so."""
-    deadline = time.monotonic() + PATIENCE_MS / 1e3
+    deadline = time.monotonic() + patience_ms / 1e3
     while not met():
         assert time.monotonic() < deadline, f"waited in vain until {what}"
         time.sleep(0.05)
