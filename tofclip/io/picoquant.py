@@ -32,6 +32,7 @@ PHOTON_BYTES = 12
 """Of a photon of a picture: its pixel and its time."""
 
 MILLISECOND_S = 1e-3
+MARKER_TAGS = ("LineStart", "LineStop", "Frame")
 
 
 @dataclass(frozen=True)
@@ -296,7 +297,7 @@ def read_scan(events: PtuEvents) -> ScannedPhotons:
         photons += len(x)
         if photons * PHOTON_BYTES > MAX_SCAN_BYTES:
             raise FileFormatError(
-                events.path, f"has more than {photons} photons in its lines; export a part of it"
+                events.path, f"has {photons} photons or more in its lines; export a part of it"
             )
     return ScannedPhotons(
         *(np.concatenate([getattr(one, name) for one in found]) for name in ("x", "y", "time"))
@@ -307,10 +308,8 @@ def _find_lines(events: PtuEvents, rows: int, columns: int) -> _Lines:
     """Read through the markers; lines beyond the picture's rows, and those without an end, are left
     out.
     """
-    start, stop, change = (
-        1 << int(number) - 1 if (number := events.tags.get(f"ImgHdr_{name}", 0)) else 0
-        for name in ("LineStart", "LineStop", "Frame")
-    )
+    numbers = (int(events.tags.get(f"ImgHdr_{name}", 0)) for name in MARKER_TAGS)
+    start, stop, change = (1 << number - 1 if 0 < number <= 8 else 0 for number in numbers)
     marked: dict[int, list[NDArray[np.int64]]] = {start: [], stop: [], change: []}
     count = PulseCount()
     for piece, at in events:
