@@ -9,7 +9,7 @@ import pytest
 
 from tofclip.lidar import depth
 from tofclip.recovery import open_shot, recover
-from tofclip.recovery.defects import estimate_noise, find_defects
+from tofclip.recovery.defects import estimate_noise, find_clipping_level, find_defects
 from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.demo import make_default_camera
@@ -124,3 +124,25 @@ def test_single_photons_are_light() -> None:
     counts += np.random.default_rng(1).poisson(5, (200, 300)) * (np.arange(200) == 90)[:, None]
     shot = Streak(counts, np.arange(200) * 20e-12)
     assert find_defects(shot, PULSE_ROWS).count < 0.001 * np.count_nonzero(counts)
+
+
+def test_a_plateau_is_the_sensors_limit_and_a_dim_shot_has_none(clean) -> None:
+    counts = clean.counts.astype(np.float32)
+    level = np.float32(0.3) * counts.max()
+    assert find_clipping_level(np.minimum(counts, level)) == level
+    dim = np.random.default_rng(0).poisson(0.5, (200, 300)).astype(np.float32)
+    for whole in (counts, dim, np.ones((20, 30), np.float32)):
+        assert find_clipping_level(whole) == np.inf
+
+
+def test_what_strikes_the_sensor_is_not_taken_for_the_lights_own_noise() -> None:
+    rows, columns = np.mgrid[:240, :300]
+    light = 900 * np.exp(-0.5 * ((rows - 60 - columns / 3) / 1.5) ** 2) * (columns / 300)
+    noise = np.random.default_rng(4)
+    counts = (3 * noise.poisson(light + 2.0)).astype(np.float32)
+    struck = counts.copy()
+    struck[noise.integers(0, 240, 300), noise.integers(0, 300, 300)] = 30 * counts.max()
+    gain, beside = (estimate_noise(image)[2] for image in (counts, struck))
+    # three counts for a photon; what a pulse bends may add to it, what strikes the sensor may not
+    assert gain >= 3
+    assert beside == pytest.approx(gain, rel=0.25)
