@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from apps.conventions import (
@@ -28,7 +29,8 @@ from apps.verbs.bag import bag
 from apps.verbs.cloud import require_format
 from apps.verbs.photons import photons
 from tofclip.errors import InputError
-from tofclip.lidar import Pulse, depth, point_cloud
+from tofclip.lidar import Detection, Pulse, depth, point_cloud
+from tofclip.lidar.detection import SCENE_BRIGHTNESS_QUANTILE
 from tofclip.lidar.objects import find_objects
 from tofclip.lidar.photons import PhotonDetector, measure_accuracy
 from tofclip.recovery import count_parallax_work, fit_parallax_to_shot, open_shot
@@ -165,11 +167,17 @@ def scene(
 ) -> None:
     """List the objects of a scene with range, size and confidence, and draw it from three sides.
 
+    Points fainter than a twentieth of the brightest are left out: most are rays that few views leave
+    around bright things. `cloud` has them all.
+
     Example: tofclip lidar scene frames.h5 --out scene.png
     """
     require_writable(out, *PICTURE_SUFFIXES, inputs=(frames,))
     recovered = Frames.load(frames)
     cloud = point_cloud(depth(recovered))
+    if len(cloud):
+        brightest = np.quantile(cloud.intensity, SCENE_BRIGHTNESS_QUANTILE)
+        cloud = cloud[cloud.intensity >= Detection().min_scene_fraction * brightest]
     objects = find_objects(cloud, reach_mm * MILLIMETRE, fewest_points)
     # Before the picture, which would show an empty scene.
     if not objects:

@@ -16,6 +16,7 @@ from apps.viewer.shot_recovery import (
     find_min_intensity,
     list_recovery_notes,
     make_view,
+    select_brighter,
 )
 from apps.viewer.source import (
     LINEAR_FRAMES_NOTE,
@@ -153,8 +154,11 @@ class TransientSource(Source):
     @functools.cached_property
     def _full_view(self) -> View:
         # Surfaces were found with their points; frames are searched for theirs.
-        found = self.frames.returns
-        return make_view(depth(self.frames) if found is None else found)
+        if self.frames.returns is not None:
+            return make_view(self.frames.returns)
+        # Of these the dim ones, rays that few views leave around bright things, would hide the others.
+        found = make_view(depth(self.frames))
+        return select_brighter(found, find_min_intensity(found))
 
     @functools.cached_property
     def _measurements(self) -> Readings:
