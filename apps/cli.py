@@ -109,9 +109,12 @@ VERBS: VerbTable = {
 }
 """Each verb's module in `apps.verbs` and its line in the list of commands."""
 
+FILE_READERS = ("recover", "cloud", "info")
+"""Verbs whose first argument has to be there."""
+
 app = typer.Typer(
     name="tofclip",
-    cls=make_lazy_group("apps.verbs", VERBS),
+    cls=make_lazy_group("apps.verbs", VERBS, FILE_READERS),
     pretty_exceptions_enable=False,
     epilog=EPILOG,
 )

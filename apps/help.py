@@ -10,12 +10,15 @@ from __future__ import annotations
 import inspect
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
+
+from tofclip.errors import StorageError
 
 PROGRAM = "tofclip"
 
@@ -42,7 +45,9 @@ VerbTable = Mapping[str, str]
 Command = TyperCommand | TyperGroup
 
 
-def make_lazy_group(package: str, verbs: VerbTable) -> type[TyperGroup]:
+def make_lazy_group(
+    package: str, verbs: VerbTable, readers: Collection[str] = ()
+) -> type[TyperGroup]:
     """Return the class of a group whose verbs are modules of a package.
 
     Parameters
@@ -52,6 +57,10 @@ def make_lazy_group(package: str, verbs: VerbTable) -> type[TyperGroup]:
         called ``app``.
     verbs : VerbTable
         In the order of the help.
+    readers : collection of str, optional
+        Verbs whose first argument is a file, a folder, a pattern or an address. A file that is not
+        there is refused before the verb and what it works with are imported, which takes longer
+        than all else.
 
     Returns
     -------
@@ -75,6 +84,8 @@ def make_lazy_group(package: str, verbs: VerbTable) -> type[TyperGroup]:
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
             """Find the verb that is called; only this one is imported."""
             name, listed, further = super().resolve_command(ctx, args)
+            if name in readers and not ctx.resilient_parsing:
+                _require_source(further)
             return name, (name and self.load_verb(name)) or listed, further
 
         def load_verb(self, name: str) -> Command:
@@ -82,6 +93,14 @@ def make_lazy_group(package: str, verbs: VerbTable) -> type[TyperGroup]:
             return load_command(f"{package}.{name.replace('-', '_')}", name)
 
     return LazyGroup
+
+
+def _require_source(words: Sequence[str]) -> None:
+    """Refuse a source that is plainly a file's name and not there."""
+    source = words[0] if words and not {"--help", "-h"} & set(words) else "-"
+    is_name = not source.startswith("-") and "://" not in source and not set("*?[") & set(source)
+    if is_name and not Path(source).exists():
+        raise StorageError(f"{source}: no such file")
 
 
 def load_command(module: str, name: str) -> Command:

@@ -1,8 +1,7 @@
 """Recovery of one picture of a rendered light field from few measurements of its true views, against
 the bare products of its model.
 
-What is timed is what a user waits for: the choice of the prior's weight is part of it. Another
-program's iterations, which are given a weight, stand beside ours at a given weight.
+What is timed is what a user waits for: the choice of the prior's weight is part of it.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from functools import cache, partial
 import numpy as np
 
 from apps.benchmarks.case import Case, PreparedCase
-from apps.benchmarks.peers import time_lensless
 from tofclip.light_field import LightField
 from tofclip.light_field.measurement import CameraSetup, measure
 from tofclip.metrics import nmse
@@ -74,12 +72,7 @@ def prepare_recovery(encoder: str, weight: float | None, side: int) -> PreparedC
         error = nmse(found.picture, light_field.refocus(SHEAR), side // 10)
         return {"nmse_percent": 100 * error, "weight_search_s": found.seconds_weight}
 
-    peers = {}
-    if weight is not None:
-        peers["LenslessPiCam"] = partial(time_lensless, side, found.iterations)
-    return PreparedCase(
-        lambda: method.recover(measurement, SHEAR), products, 1, peers, figures=judge
-    )
+    return PreparedCase(lambda: method.recover(measurement, SHEAR), products, 1, figures=judge)
 
 
 FLOOR_TEXT = "the products of its last recovery's iterations alone"
@@ -114,7 +107,7 @@ CASES = (
     ),
     Case(
         "clip-given",
-        "CLIP-2D at a given weight; the peer takes as many iterations of one view",
+        "CLIP-2D at a given weight",
         "pixels a side",
         SIDES_PX,
         "pictures",

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import importlib
 
-from apps.benchmarks import instruments, light_fields, nlos, ranging, recovery
+from apps.benchmarks import instruments, lensless, light_fields, nlos, ranging, recovery
 from apps.benchmarks.case import Case
 from tofclip.errors import InputError
 
 CASES: tuple[Case, ...] = (
     *recovery.CASES,
     *light_fields.CASES,
+    *lensless.CASES,
     *ranging.CASES,
     *nlos.CASES,
     *instruments.CASES,

@@ -16,6 +16,7 @@ from small_instrument import Run
 
 import tofclip
 from apps import cli
+from apps.help import Command, load_command
 
 PROGRAM = [sys.executable, "-m", "apps"]
 ROOT = Path(tofclip.__file__).parents[1]
@@ -199,3 +200,19 @@ def wait_for(terminal: int, text: str) -> str:
         except OSError:  # the other side is closed and everything has been read
             pytest.fail(f"'{text}' never appeared on the terminal: {seen!r}")
     return seen
+
+
+@pytest.mark.parametrize(
+    "words", [("recover",), ("cloud",), ("info",), ("nlos", "reconstruct"), ("nlos", "info")]
+)
+def test_a_missing_file_is_refused_before_its_verb_is_imported(
+    run: Run, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    def load_groups_only(module: str, name: str) -> Command:
+        assert name == "nlos"
+        return load_command(module, name)
+
+    monkeypatch.setattr("apps.help.load_command", load_groups_only)
+    outcome = run(*words, "absent.h5")
+    assert (outcome.status, outcome.out) == (2, "")
+    assert outcome.err == "tofclip: error: absent.h5: no such file\n"

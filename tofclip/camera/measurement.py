@@ -15,7 +15,7 @@ FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 DARK_ROW_FRACTION = 0.05
-COLUMNS_PER_BLOCK = 168
+ROWS_PER_BLOCK = 64
 NO_LIGHT_MESSAGE = "nothing rises above the dark level; was there any light?"
 
 
@@ -93,7 +93,7 @@ def estimate_dark_level(counts: FloatImage) -> float:
     Taken from whole rows, before or after the light came, so that it stays where the measurements
     scatter about it: the least value of a picture would turn noise into an offset.
     """
-    row_sums = counts.sum(axis=1, dtype=np.float64)
+    row_sums = counts.sum(axis=1)
     # Rows, not pixels: choosing the darkest pixels would choose those whose noise is low.
     quiet = np.argsort(row_sums)[: max(1, round(DARK_ROW_FRACTION * row_sums.size))]
     return float(np.median(counts[quiet]))
@@ -122,10 +122,10 @@ class Rectifier:
         shape = (rows, camera.slit_width_px)
         # An exact row must not become one that lies beyond the picture by a rounding error of
         # float32.
-        self._raw_row = np.ascontiguousarray(np.broadcast_to(raw[0], shape).T, dtype=np.float32)
+        self._raw_row = np.ascontiguousarray(np.broadcast_to(raw[0], shape), dtype=np.float32)
         # A sweep that only delays keeps light in its column, and needs half of the look-ups.
-        raw_column = np.broadcast_to(raw[1], shape).T
-        own = np.broadcast_to(column.T.astype(np.float32), shape[::-1])
+        raw_column = np.broadcast_to(raw[1], shape)
+        own = np.broadcast_to(column.astype(np.float32), shape)
         self._stays_in_column = bool(np.all(raw_column == own))
         self._raw_column = (
             own if self._stays_in_column else np.ascontiguousarray(raw_column, dtype=np.float32)
@@ -187,7 +187,8 @@ class Rectifier:
         Returns
         -------
         (columns, rows) float32 array
-            0 beyond the raw image and in dead columns.
+            0 beyond the raw image and in dead columns. All columns of a row lie side by side in
+            memory, as in the raw picture.
 
         Raises
         ------
@@ -201,30 +202,21 @@ class Rectifier:
             np.float32(estimate_dark_level(counts) if dark is None else dark),
             np.float32(delay),
         )
-        measurements = np.empty(self._raw_row.shape, np.float32)
-        # Columns become contiguous, because each thread works on some of them.
-        turned = None if self._stays_in_column else np.ascontiguousarray(counts.T)
+        measurements, raw = np.empty(self._raw_row.shape, np.float32), np.ascontiguousarray(counts)
 
         def work(piece: slice) -> None:
-            if turned is None:
-                raw = np.ascontiguousarray(counts[:, piece].T)
-                sample_in_time(raw, level, self._raw_row[piece], shift, measurements[piece])
+            rows, target = self._raw_row[piece], measurements[piece]
+            if self._stays_in_column:
+                sample_in_time(raw, level, rows, shift, target)
             else:
-                sample_bilinear(
-                    turned,
-                    level,
-                    self._raw_row[piece],
-                    self._raw_column[piece],
-                    shift,
-                    measurements[piece],
-                )
+                sample_bilinear(raw, level, rows, self._raw_column[piece], shift, target)
 
-        run_blocks(work, len(measurements), COLUMNS_PER_BLOCK)
+        run_blocks(work, len(measurements), ROWS_PER_BLOCK)
         # Zero, not their raw value: methods that take no mask must not see a stuck column as light.
-        measurements[self.camera.dead_columns] = 0
+        measurements[:, self.camera.dead_columns] = 0
         if not measurements.max() > 0:
             raise InputError(NO_LIGHT_MESSAGE)
-        return measurements
+        return measurements.T
 
     def _find_valid(self, bad: Mask, delay: float) -> Mask:
         from tofclip.camera.kernels import mark_valid
@@ -236,14 +228,12 @@ class Rectifier:
                 raw, self._raw_row[piece], self._raw_column[piece], np.float32(delay), valid[piece]
             )
 
-        run_blocks(work, len(valid), COLUMNS_PER_BLOCK)
+        run_blocks(work, len(valid), ROWS_PER_BLOCK)
         # Dead columns are invalid at every instant, whatever the sensor shows there.
-        valid &= ~self.camera.dead_columns[:, np.newaxis]
-        return valid
+        valid &= ~self.camera.dead_columns
+        return valid.T
 
     def _require_shape(self, counts: FloatImage) -> None:
         require_width(counts, self.camera)
-        if counts.shape != self._raw_row.shape[::-1]:
-            raise ShapeError(
-                "a streak image of this camera", self._raw_row.shape[::-1], counts.shape
-            )
+        if counts.shape != self._raw_row.shape:
+            raise ShapeError("a streak image of this camera", self._raw_row.shape, counts.shape)

@@ -94,27 +94,56 @@ class Detection:
         """
         if pixel.size == 0:
             return np.zeros(0, dtype=bool)
-        strongest = np.zeros(int(pixel.max()) + 1)
-        np.maximum.at(strongest, pixel, intensity)
-        scene = np.quantile(strongest[strongest > 0], SCENE_BRIGHTNESS_QUANTILE)
-        needed = np.maximum(
-            self.min_scene_fraction * scene, self.min_pixel_fraction * strongest[pixel]
-        )
-        np.maximum(
-            needed,
-            self.min_time_bin_fraction * _find_local_maximum(time, intensity, pulse_width),
-            out=needed,
-        )
+        needed = self.compute_least_intensity(pixel, time, intensity, pulse_width, time)
+        strongest = _find_strongest(pixel, intensity)
+        np.maximum(needed, self.min_pixel_fraction * strongest[pixel], out=needed)
         strong: NDArray[np.bool_] = intensity >= needed
         return strong
 
+    def compute_least_intensity(
+        self,
+        pixel: NDArray[np.int64],
+        time: FloatArray,
+        intensity: FloatArray,
+        pulse_width: float,
+        at: FloatArray,
+    ) -> FloatArray:
+        """Return what the scene and its other returns at the same instant ask of a return.
 
-def _find_local_maximum(time: FloatArray, intensity: FloatArray, width: float) -> FloatArray:
-    """Largest intensity among the candidates within `width` of each instant, to a quarter of a
+        Parameters
+        ----------
+        pixel, time, intensity, pulse_width
+            As for `find_significant`; at least one candidate.
+        at : (m,) array
+            Instants, s.
+
+        Returns
+        -------
+        (m,) float64 array
+            Brightness with the fall-off with range undone.
+        """
+        strongest = _find_strongest(pixel, intensity)
+        scene = np.quantile(strongest[strongest > 0], SCENE_BRIGHTNESS_QUANTILE)
+        local = _find_local_maximum(time, intensity, pulse_width, at)
+        return np.maximum(self.min_scene_fraction * scene, self.min_time_bin_fraction * local)
+
+
+def _find_strongest(pixel: NDArray[np.int64], intensity: FloatArray) -> FloatArray:
+    """Largest intensity of each pixel, 0 where there is no candidate."""
+    strongest = np.zeros(int(pixel.max()) + 1)
+    np.maximum.at(strongest, pixel, intensity)
+    return strongest
+
+
+def _find_local_maximum(
+    time: FloatArray, intensity: FloatArray, width: float, at: FloatArray
+) -> FloatArray:
+    """Largest intensity among the candidates within `width` of each instant `at`, to a quarter of a
     width.
     """
-    slot = np.round((time - time.min()) / (width / SLOTS_PER_WIDTH)).astype(np.intp)
-    brightest = np.zeros(int(slot.max()) + 1)
+    spacing, start = width / SLOTS_PER_WIDTH, min(time.min(), at.min())
+    slot, wanted = (np.round((one - start) / spacing).astype(np.intp) for one in (time, at))
+    brightest = np.zeros(int(max(slot.max(), wanted.max())) + 1)
     np.maximum.at(brightest, slot, intensity)
-    around: FloatArray = scipy.ndimage.maximum_filter1d(brightest, 2 * SLOTS_PER_WIDTH + 1)[slot]
+    around: FloatArray = scipy.ndimage.maximum_filter1d(brightest, 2 * SLOTS_PER_WIDTH + 1)[wanted]
     return around

@@ -29,6 +29,10 @@ FloatArray = NDArray[np.float64]
 REACH_PX, STRIDE_PX = 8, 2
 """Neighbours that share a plane, and their distance: errors of adjacent pixels are much alike."""
 
+PLANE_STEP_PX = 4
+"""Distance of the pixels whose returns have planes of their own; those between take over what is
+known of one within a plane's reach on the same surface."""
+
 PLANE_SHARE = 1.5
 """Variance of the recovery's errors, relative to what a plane of this reach leaves of it."""
 
@@ -77,8 +81,8 @@ def add_recovery_error(
     metres = distance / nearness
     scatter = np.empty(total.size)
     row, column = np.divmod(pixel, image_shape[1])
-    first = (row % STRIDE_PX == 0) & (column % STRIDE_PX == 0)
-    # neighbours have nearly the same returns around them: one plane in four does
+    first = (row % PLANE_STEP_PX == 0) & (column % PLANE_STEP_PX == 0)
+    # neighbours have nearly the same returns around them: one plane in sixteen does
     for chosen, borrow in ((np.flatnonzero(first), False), (np.flatnonzero(~first), True)):
 
         def work(piece: slice, some: NDArray[np.intp] = chosen, borrow: bool = borrow) -> None:
@@ -120,8 +124,8 @@ def scatter_about_planes(
     chosen : (k,) int64 array
         Numbers of the returns.
     borrow : bool
-        Whether they take what is known of a return beside them, in a row and column that
-        `STRIDE_PX` divides, on the same surface.
+        Whether they take what is known of a return near them, in a row and column that
+        `PLANE_STEP_PX` divides, on the same surface.
     scatter : (n,) array
         Overwritten at the chosen: m.
     """
@@ -224,8 +228,8 @@ def select_median(values, count):
 
 @compiled
 def find_donor(nearness, metres, pixel, starts, image_shape, own):
-    """Find the return nearest in range among those beside one whose row and column `STRIDE_PX`
-    divides.
+    """Find the return nearest in range among those within a plane's reach whose row and column
+    `PLANE_STEP_PX` divides.
 
     Parameters
     ----------
@@ -244,8 +248,9 @@ def find_donor(nearness, metres, pixel, starts, image_shape, own):
     rows, columns = image_shape
     y, x = pixel[own] // columns, pixel[own] % columns
     found, least = -1, np.inf
-    for j in range(y - y % STRIDE_PX, min(y + STRIDE_PX, rows), STRIDE_PX):
-        for i in range(x - x % STRIDE_PX, min(x + STRIDE_PX, columns), STRIDE_PX):
+    top, left = y - y % PLANE_STEP_PX - PLANE_STEP_PX, x - x % PLANE_STEP_PX - PLANE_STEP_PX
+    for j in range(max(top, 0), min(top + 4 * PLANE_STEP_PX, rows), PLANE_STEP_PX):
+        for i in range(max(left, 0), min(left + 4 * PLANE_STEP_PX, columns), PLANE_STEP_PX):
             there = j * columns + i
             for k in range(starts[there], starts[there + 1]):
                 off = abs((nearness[own] - nearness[k]) * metres[own])

@@ -153,10 +153,10 @@ def interpolate_pulse(time, curve, scale):
     position = time * scale[0] + scale[1]
     p = d = 0.0
     if 0 <= position < curve.shape[0] - 1:
-        left = int(position)
-        share = position - left
-        p = (1 - share) * curve[left, 0] + share * curve[left + 1, 0]
-        d = (1 - share) * curve[left, 1] + share * curve[left + 1, 1]
+        left = np.uintp(position)  # no index that might count from the end
+        share, right = position - left, left + np.uintp(1)
+        p = curve[left, 0] + share * (curve[right, 0] - curve[left, 0])
+        d = curve[left, 1] + share * (curve[right, 1] - curve[left, 1])
     return p, d
 
 
@@ -305,7 +305,7 @@ def sum_normal_equations(trace, times, background, curve, scale, estimate, k, cr
     )
     estimate[k, 2], estimate[k, 3] = first, last
     pp = pd = dd = pr = dr = 0.0
-    for i in range(first, last):
+    for i in range(np.uintp(first), np.uintp(last)):
         p, d = interpolate_pulse(times[i] - arrival, curve, scale)
         rest = trace[i] - get_level(background, i)
         if crowded:
@@ -399,7 +399,7 @@ def measure_returns(trace, times, background, noise, curve, scale, estimate, lea
             times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale
         )
         pp = pd = dd = 0.0
-        for i in range(first, last):
+        for i in range(np.uintp(first), np.uintp(last)):
             p, d = interpolate_pulse(times[i] - arrival, curve, scale)
             rest = trace[i] - background - height * p
             if crowded:

@@ -35,7 +35,7 @@ LANE_SELECTOR = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
 def _emit_row_product(
     typing_context: Any,
     result: Any,
-    row: Any,
+    start: Any,
     stride: Any,
     block: Any,
     columns: Any,
@@ -44,40 +44,38 @@ def _emit_row_product(
     last: Any,
     onto: Any,
 ) -> Any:
-    """``result[row, :LANES] = start + sum_q values[q] * block[columns[q], :LANES]`` for q in
-    [first, last).
+    """``result[start : start + LANES] = present + sum_q values[q] * block[columns[q], :LANES]`` for q
+    in [first, last), `result` flat.
 
-    `start` is 0, or what stands there already where the boolean `onto` says so. `stride` is the
-    length of a row of both blocks, which must be C-contiguous.
+    `present` is 0, or what stands there already where the boolean `onto` says so. `stride` is the
+    length of a row of the block. Both arrays must be C-contiguous.
     """
-    signature = types.void(result, row, stride, block, columns, values, first, last, onto)
+    signature = types.void(result, start, stride, block, columns, values, first, last, onto)
 
     def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         def data(k: int) -> Any:
             return context.make_array(sig.args[k])(context, builder, arguments[k]).data
 
         target, source, index, weight = data(0), data(3), data(4), data(5)
-        row_number, row_length, begin, end = (arguments[k] for k in (1, 2, 6, 7))
+        offset, row_length, begin, end = (arguments[k] for k in (1, 2, 6, 7))
         vector = ir.VectorType(target.type.pointee, LANES)
         undefined = ir.Constant(vector, ir.Undefined)
 
-        def lanes_at(base: Any, number: Any) -> Any:
-            start = builder.gep(base, [builder.mul(number, row_length)])
-            return builder.bitcast(start, vector.as_pointer())
+        def lanes_at(base: Any, place: Any) -> Any:
+            return builder.bitcast(builder.gep(base, [place]), vector.as_pointer())
 
         def accumulate(position: Any, accumulator: Any) -> None:
             column = builder.zext(builder.load(builder.gep(index, [position])), INDEX_TYPE)
             scalar = builder.load(builder.gep(weight, [position]))
             lone = builder.insert_element(undefined, scalar, ir.Constant(ir.IntType(32), 0))
             broadcast = builder.shuffle_vector(lone, undefined, LANE_SELECTOR)
-            product = builder.fmul(
-                broadcast, builder.load(lanes_at(source, column), align=4), flags=("contract",)
-            )
+            operand = lanes_at(source, builder.mul(column, row_length))
+            product = builder.fmul(broadcast, builder.load(operand, align=4), flags=("contract",))
             builder.store(
                 builder.fadd(product, builder.load(accumulator), flags=("contract",)), accumulator
             )
 
-        destination = lanes_at(target, row_number)
+        destination = lanes_at(target, offset)
         zero = ir.Constant(vector, [0.0] * LANES)
         present = builder.select(arguments[8], builder.load(destination, align=4), zero)
         starts = [present] + [zero] * (UNROLL_COUNT - 1)
@@ -134,7 +132,29 @@ def multiply_sparse_block(tile_starts, columns, values, block, result):
         for row in range(tile_starts.shape[1] - 1):
             first, last = tile_starts[tile, row], tile_starts[tile, row + 1]
             if first < last or not onto:
-                _emit_row_product(result, row, LANES, block, columns, values, first, last, onto)
+                _emit_row_product(
+                    result, row * LANES, LANES, block, columns, values, first, last, onto
+                )
+
+
+@njit(nogil=True, cache=True)
+def multiply_sparse_rows(tile_starts, columns, values, block, start, result):
+    """``result[:, start : start + LANES] = M @ block``; see `multiply_sparse_block`.
+
+    Parameters
+    ----------
+    tile_starts, columns, values, block
+        As for `multiply_sparse_block`.
+    start : int
+    result : (rows, at least start + LANES) C-contiguous array, overwritten in these columns
+    """
+    for tile in range(tile_starts.shape[0]):
+        onto = tile > 0
+        for row in range(tile_starts.shape[1] - 1):
+            first, last = tile_starts[tile, row], tile_starts[tile, row + 1]
+            if first < last or not onto:
+                place = row * result.shape[1] + start
+                _emit_row_product(result, place, LANES, block, columns, values, first, last, onto)
 
 
 fast_njit = njit(

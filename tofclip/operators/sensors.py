@@ -54,6 +54,12 @@ class DenseSensor(_Sensor):
     def __init__(self, plane_shape: tuple[int, int], dtype: DTypeLike = np.float32) -> None:
         super().__init__(plane_shape, np.arange(plane_shape[0] * plane_shape[1]), dtype)
 
+    def _forward(self, block: Array) -> Array:
+        return block.reshape(-1, block.shape[-1])
+
+    def _adjoint(self, block: Array) -> Array:
+        return block.reshape(*self.shape_in, -1)
+
 
 class PitchedSensor(_Sensor):
     """Small pixels far apart: every n-th pixel of the plane is read (supplement Note 3, sparse 2D

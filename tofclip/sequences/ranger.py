@@ -163,7 +163,8 @@ class _ShotTraces:
         for place in pipeline.places:
             first, last = np.searchsorted(bins.numbers, [place.rows.start, place.rows.stop])
             if first < last:
-                some = np.take(measurements, bins.numbers[first:last], axis=1)
+                # by rows, which is how measurements lie in memory
+                some = np.take(measurements.T, bins.numbers[first:last], axis=0).T
                 self._parts.append(
                     (place.inverse, slice(first, last), place.inverse.inverse.weights(some))
                 )

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tofclip.operators.kernels import multiply_sparse_block
+from tofclip.operators.kernels import multiply_sparse_block, multiply_sparse_rows
 from tofclip.threads import LANES
 
 TILE_PIXELS = 32
@@ -152,14 +152,17 @@ def compute_traces(tile_starts, columns, values, weights, traces, span):
         Overwritten from column ``span[0]`` to below ``span[1]``.
     span : (int, int)
     """
-    part = np.empty((traces.shape[0], LANES), traces.dtype)
-    for block in range(weights.shape[0]):
-        multiply_sparse_block(tile_starts, columns, values, weights[block], part)
-        # The last block may be filled up with frames that lie beyond the span.
-        first = span[0] + block * LANES
-        last = min(first + LANES, span[1])
+    whole = (span[1] - span[0]) // LANES
+    for block in range(whole):
+        start = span[0] + block * LANES
+        multiply_sparse_rows(tile_starts, columns, values, weights[block], start, traces)
+    if whole < weights.shape[0]:
+        # The last block is filled up with frames that lie beyond the span.
+        part = np.empty((traces.shape[0], LANES), traces.dtype)
+        multiply_sparse_block(tile_starts, columns, values, weights[whole], part)
+        first = span[0] + whole * LANES
         for row in range(part.shape[0]):
-            for column in range(first, last):
+            for column in range(first, span[1]):
                 traces[row, column] = part[row, column - first]
 
 

@@ -49,7 +49,7 @@ from tofclip.lidar.significance import (
     MeasurementNoise,
     SignificanceJudge,
 )
-from tofclip.lidar.traces import FrameTraces, Traces
+from tofclip.lidar.traces import FrameTraces, TraceBins, Traces
 from tofclip.shots import Frames, Returns
 from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
@@ -57,8 +57,12 @@ from tofclip.units import SPEED_OF_LIGHT
 FloatArray = NDArray[np.float64]
 
 REFERENCE_RANGE_M = 1.0  # m; an intensity is what the same surface would send back from here
-PIXELS_PER_BATCH = 128  # their traces fit the second-level cache
-PIXELS_PER_BLOCK = 4 * PIXELS_PER_BATCH
+BATCH_BYTES = 1 << 18  # traces that fit the second-level cache
+MAX_PIXELS_PER_BATCH, BATCHES_PER_BLOCK = 256, 2
+SAMPLE_THRESHOLD_FACTOR = (
+    0.85  # the response at the bin of a peak is up to 5 % below that at its top
+)
+MIN_SAMPLED_BATCHES, SAMPLING_STEP = 32, 7  # odd, or all of a sample might lie in one column
 # of the filter that looks for candidates; it costs a tenth of the matched filter's sensitivity
 SHARPENING_FACTOR = 2.0
 MIN_PULSE_BINS = 2.0  # anything shorter falls between the samples
@@ -126,14 +130,14 @@ class ReturnSearch:
 
         Notes
         -----
-        Memory: 128 traces a thread, and 100 bytes a pixel.
+        Memory: 256 KiB of traces a thread, and 100 bytes a pixel.
         """
         # the compiler takes as long to import as all else
         from tofclip.lidar.neighbours import add_recovery_error
 
-        pixel, time, signal, deviation = self._find_candidates(traces)
+        pixel, time, signal, deviation = self._find_candidates(traces, judge is not None)
         distance = SPEED_OF_LIGHT * time / 2
-        intensity = signal * (distance / REFERENCE_RANGE_M) ** 2
+        intensity = signal * _square_distance(time)
         doubt = np.empty(0)
         if judge is None:
             kept = self.detection.find_significant(pixel, time, intensity, self.pulse.fwhm)
@@ -178,9 +182,13 @@ class ReturnSearch:
         )  # the responses of a peak's neighbours tell where its top is
 
     def _find_candidates(
-        self, traces: Traces | ArrayTraces
+        self, traces: Traces | ArrayTraces, judged: bool
     ) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
-        """Pixel number, instant, counts and deviation of every candidate, in raster and time order."""
+        """Pixel number, instant, counts and deviation of every candidate, in raster and time order.
+
+        Unless all candidates are `judged`, those that are too weak beside what a sample of the
+        pixels shows are not fitted.
+        """
         if isinstance(traces, ArrayTraces):
             return self._portable.find_candidates(traces.values)
         from tofclip.lidar.search.compiled import find_returns
@@ -193,27 +201,69 @@ class ReturnSearch:
             matched[bins.numbers],
             gains,
         )
-        fixed = self.times[bins.numbers], bins.bin_weights, filters, self.pulse.kernel_table()
+        times = self.times[bins.numbers]
+        fixed = times, bins.bin_weights, filters, self.pulse.kernel_table()
         found = np.empty((total, self.detection.max_returns, 3))
         counts = np.zeros(total, np.int64)
         limits = (
             self.pulse.fwhm,
             float(self.detection.signal_to_noise),
             float(self.detection.min_pixel_fraction),
+            float(times[bins.search_mask].max(initial=0.0)),
         )
+        least = np.zeros(times.size, np.float32)
+        size = min(max(BATCH_BYTES // (4 * times.size), 1), MAX_PIXELS_PER_BATCH)
+        batches = list(split_blocks(total, size))
 
-        def work(piece: slice) -> None:
-            memory = np.empty((PIXELS_PER_BATCH, bins.numbers.size), np.float32)
-            for part in split_blocks(piece.stop - piece.start, PIXELS_PER_BATCH):
-                some = slice(piece.start + part.start, piece.start + part.stop)
+        def work(chosen: list[slice]) -> None:
+            memory = np.empty((size, times.size), np.float32)
+            lowest = float(least.min())
+            for some in chosen:
                 block = memory[: some.stop - some.start]
                 traces.fill(some, block)
-                find_returns(block, traces.pixels[some], *fixed, limits, found, counts)
+                find_returns(
+                    block, traces.pixels[some], *fixed, (*limits, lowest), least, found, counts
+                )
 
-        run_blocks(work, total, PIXELS_PER_BLOCK)
-        filled = np.flatnonzero(np.arange(found.shape[1]) < counts[:, np.newaxis])
-        time, signal, deviation = np.take(found.reshape(-1, found.shape[2]), filled, axis=0).T
-        return filled // found.shape[1], time, signal, deviation
+        def search(chosen: list[slice]) -> None:
+            run_blocks(lambda piece: work(chosen[piece]), len(chosen), BATCHES_PER_BLOCK)
+
+        if judged or len(batches) < MIN_SAMPLED_BATCHES:
+            search(batches)
+        else:
+            search(batches[::SAMPLING_STEP])
+            pixel, time, signal, _ = _list_found(found, counts)
+            least = self._compute_least_responses(pixel, time, signal, bins)
+            search([one for place, one in enumerate(batches) if place % SAMPLING_STEP])
+        return _list_found(found, counts)
+
+    def _compute_least_responses(
+        self, pixel: NDArray[np.int64], time: FloatArray, signal: FloatArray, bins: TraceBins
+    ) -> NDArray[np.float32]:
+        """Response of the matched filter below which no candidate can become a return.
+
+        Parameters
+        ----------
+        pixel, time, signal : (n,) array
+            What was found in some of the pixels. Those of all pixels are brighter or as bright, so
+            that nothing is lost.
+        bins : TraceBins
+
+        Returns
+        -------
+        (bins,) float32 array
+        """
+        at = self.times[bins.numbers]
+        if pixel.size == 0:
+            return np.zeros(at.size, np.float32)
+        needed = self.detection.compute_least_intensity(
+            pixel, time, signal * _square_distance(time), self.pulse.fwhm, at
+        )
+        # The response to a pulse is its sum, over that of the filter.
+        sums = np.maximum(self._filters[1][bins.numbers, -1], np.finfo(np.float32).tiny)
+        squares = np.maximum(_square_distance(at), np.finfo(np.float32).tiny)
+        least: NDArray[np.float32] = SAMPLE_THRESHOLD_FACTOR * needed / (squares * sums)
+        return least.astype(np.float32)
 
     @cached_property
     def _filters(self) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float]]:
@@ -317,7 +367,8 @@ def _build_filter(times: FloatArray, pulse: Pulse, multiple: int) -> NDArray[np.
     pulse the energy stays below one: little would be known of such a return.
     """
     before, after = pulse.support
-    reach = int(np.ceil(max(-before, after) / np.diff(times).min()))
+    # what lies between two bins is reached by neither: without it rows of zeros would be applied
+    reach = int(np.floor(max(-before, after) / np.diff(times).min()))
     half = multiple // 2 * (reach // (multiple // 2) + 1)
     filters = np.zeros((2 * half, times.size))
     for row, shift in enumerate(range(-half, half)):
@@ -326,6 +377,20 @@ def _build_filter(times: FloatArray, pulse: Pulse, multiple: int) -> NDArray[np.
     energy = np.sum(filters**2, axis=0)
     filters /= np.sqrt(np.maximum(energy, np.median(energy) / 2))
     return filters.astype(np.float32)
+
+
+def _list_found(
+    found: NDArray[np.float64], counts: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
+    """Pixel, instant, counts and deviation of all that was found, in raster and time order."""
+    filled = np.flatnonzero(np.arange(found.shape[1]) < counts[:, np.newaxis])
+    time, signal, deviation = np.take(found.reshape(-1, found.shape[2]), filled, axis=0).T
+    return filled // found.shape[1], time, signal, deviation
+
+
+def _square_distance(time: FloatArray) -> FloatArray:
+    """Square of the range of a return, relative to `REFERENCE_RANGE_M`."""
+    return (SPEED_OF_LIGHT / 2 / REFERENCE_RANGE_M * time) ** 2
 
 
 def _rank_within_pixel(pixel: NDArray[np.int64]) -> NDArray[np.uint8]:

@@ -21,13 +21,14 @@ from tofclip.lidar.pulse_fit import (
 )
 
 BINS_PER_GROUP = 32  # bins of which the highest peak is kept
+NEIGHBOUR_FRACTION = 0.5  # of what is of interest: weaker peaks do not move a return beside them
 WEIGHTS_PER_PASS = 4  # weights of a filter that are applied in one pass
 
 vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy", _nrt=False)
 
 
 @njit(nogil=True, cache=True)
-def find_returns(traces, pixels, times, bin_weights, filters, pulse, limits, found, counts):
+def find_returns(traces, pixels, times, bin_weights, filters, pulse, limits, least, found, counts):
     """Find the returns of each trace.
 
     Candidates are the peaks of the trace under a sharp filter, which still shows two returns where
@@ -50,9 +51,13 @@ def find_returns(traces, pixels, times, bin_weights, filters, pulse, limits, fou
         the sum over the others. Then the largest sum of either.
     pulse : tuple
         See `Pulse.kernel_table`.
-    limits : (float, float, float)
-        Smallest distance between two returns, s, smallest signal-to-noise, and smallest fraction of
-        the strongest return, with the fall-off with range undone.
+    limits : (float, float, float, float, float)
+        Smallest distance between two returns, s, smallest signal-to-noise, smallest fraction of
+        the strongest return, with the fall-off with range undone, the last instant at which a
+        return may lie, s, and the lowest of `least`.
+    least : (bins,) float32 array
+        Response that a return at each bin must exceed to be of interest; weaker peaks are fitted
+        only where such a return overlaps them. 0 where nothing is known.
     found : (all pixels, most returns, 3) float64 array, overwritten where `pixels` says
         Instant, sum of the fitted pulse over the bins, standard deviation of the instant; nearest
         first.
@@ -72,12 +77,12 @@ def find_returns(traces, pixels, times, bin_weights, filters, pulse, limits, fou
     for place in range(traces.shape[0]):
         pixel = pixels[place]
         counts[pixel] = find_trace_returns(
-            traces[place], times, bin_weights, filters, pulse, limits, memory, found[pixel]
+            traces[place], times, bin_weights, filters, pulse, limits, least, memory, found[pixel]
         )
 
 
 @compiled
-def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, memory, found):
+def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, least, memory, found):
     """Find the returns of one trace and return their number; `memory` is overwritten.
 
     Parameters
@@ -92,9 +97,10 @@ def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, memory
         See `tofclip.lidar.search`.
     pulse : (curve, scale)
         See `tofclip.lidar.pulse_fit`.
-    limits : (3,) floats
-        Least distance of two returns in s, least response over noise, and least strength relative
-        to the strongest return, both referred to one range.
+    limits : (5,) floats
+        See `find_returns`.
+    least : (bins,) array
+        See `find_returns`.
     memory : seven arrays
         Overwritten.
     found : (returns, 3) array
@@ -107,19 +113,36 @@ def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, memory
     (sharp, matched, gains), (curve, scale) = filters, pulse
     score, maxima, bounds, free, peaks, estimate, profile = memory
     correlate_trace(trace, sharp, score)
-    copy_local_maxima(score, maxima)
+    total, square, bins = sum_moments(trace, bin_weights)
+    # the sharp filter's response to the background, below which nothing of interest can lie
+    level = gains[0] * total / bins if limits[4] > 0 else 0.0
+    copy_local_maxima(score, least, gains[0] / gains[1] * NEIGHBOUR_FRACTION, level, maxima)
     number, background, noise = find_strongest_peaks(
-        trace, times, bin_weights, matched, gains, scale, limits, maxima, bounds, free, peaks
+        (total, square, bins),
+        trace,
+        times,
+        bin_weights,
+        matched,
+        gains,
+        scale,
+        limits,
+        maxima,
+        bounds,
+        free,
+        peaks,
     )
-    needed, least, kept = 0.0, limits[1] * noise, 0
+    needed, above_noise, kept = 0.0, limits[1] * noise, 0
     for k in range(number):
         j = int(peaks[k, 0])
         peaks[k, 1] = max(peaks[k, 1] - background * matched[j, -1], 0.0)
         # light falls with the square of the range, so strengths are compared as if all stood at one
         needed = max(needed, PREFIT_THRESHOLD_FACTOR * limits[2] * peaks[k, 1] * times[j] ** 2)
+    reach = 2 * (scale[3] - scale[2])
     for k in range(number):
         j, strength = int(peaks[k, 0]), peaks[k, 1]
-        if strength > least and strength * times[j] ** 2 >= needed:
+        if strength > above_noise and strength * times[j] ** 2 >= needed:
+            if not is_wanted(peaks[:number], k, times, least, reach):
+                continue
             estimate[kept, 0] = interpolate_peak_time(
                 trace, times, matched, background, j, strength
             )
@@ -130,10 +153,35 @@ def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, memory
         trace, times, background, curve, scale, estimate[:kept], EVEN_VARIANCE, MAX_FIT_ROUNDS
     )
     number = measure_returns(
-        trace, times, background, noise, curve, scale, estimate[:kept], least, profile, found
+        trace, times, background, noise, curve, scale, estimate[:kept], above_noise, profile, found
     )
     sort_rows(found[:number])
     return number
+
+
+@compiled
+def is_wanted(peaks, k, times, least, reach):
+    """Whether a peak, or one within `reach` of it, exceeds what is of interest there.
+
+    Parameters
+    ----------
+    peaks : (returns, 4) array
+        Bin and response.
+    k : int
+        Number of the peak.
+    times : (bins,) array
+        Seconds.
+    least : (bins,) array
+        See `find_returns`.
+    reach : float
+        Seconds.
+    """
+    own = times[int(peaks[k, 0])]
+    for other in range(peaks.shape[0]):
+        j = int(peaks[other, 0])
+        if peaks[other, 1] >= least[j] and abs(times[j] - own) <= reach:
+            return True
+    return False
 
 
 @vectorised
@@ -197,10 +245,10 @@ def compute_response(trace, matched, j):
     """
     width = matched.shape[1] - 1
     start = j - width // 2
-    total = 0.0
-    for w in range(max(0, -start), min(width, trace.size - start)):
-        total += float(matched[j, w]) * float(trace[start + w])
-    return total
+    weights, total = matched[j], np.float32(0)
+    for w in range(np.uintp(max(0, -start)), np.uintp(min(width, trace.size - start))):
+        total += weights[w] * trace[np.uintp(start + w)]
+    return float(total)
 
 
 @compiled
@@ -236,7 +284,7 @@ def interpolate_peak_time(trace, times, matched, background, j, here):
 
 @compiled
 def find_strongest_peaks(
-    trace, times, bin_weights, matched, gains, scale, limits, maxima, bounds, free, peaks
+    moments, trace, times, bin_weights, matched, gains, scale, limits, maxima, bounds, free, peaks
 ):
     """Fill `peaks` with the highest maxima that might count, in the order of time: bin, response,
     and bins they claim.
@@ -252,6 +300,8 @@ def find_strongest_peaks(
 
     Parameters
     ----------
+    moments : three floats
+        Of `sum_moments`.
     trace, times : (bins,) array
         Brightness, and seconds.
     bin_weights : (bins,) array
@@ -262,8 +312,8 @@ def find_strongest_peaks(
         Gains of the sharp filter and of the matched one.
     scale : (4,) array or tuple
         Of the pulse.
-    limits : (3,) floats
-        As for `find_trace_returns`.
+    limits : (5,) floats
+        See `find_returns`.
     maxima, bounds : float32 array
         Local maxima of the score, and the largest of each group; used up.
     free : (bins,) array
@@ -275,7 +325,7 @@ def find_strongest_peaks(
     number : int
     background, noise : float
     """
-    total, square, bins = sum_moments(trace, bin_weights)
+    total, square, bins = moments
     left, number, needed, claiming = bins, 0, 0.0, True
     background, noise = compute_mean_and_deviation(total, square, left)
     update_group_maxima(maxima, 0, bounds.size, bounds)
@@ -284,8 +334,8 @@ def find_strongest_peaks(
         brightest = gains[1] * (bounds[group] / gains[0] - background)
         if (
             bounds[group] <= 0
-            or brightest <= limits[1] * noise
-            or brightest * times[-1] ** 2 < needed
+            or brightest <= max(limits[1] * noise, limits[4])
+            or brightest * limits[3] ** 2 < needed
         ):
             break
         best = find_bin_in_group(maxima, group, bounds[group])
@@ -301,7 +351,7 @@ def find_strongest_peaks(
         clear_maxima_around(best, times, limits[0], maxima, bounds)
         claiming = claiming and 2 * (left - (last - first)) >= bins
         if claiming:
-            for i in range(first, last):
+            for i in range(np.uintp(first), np.uintp(last)):
                 value = free[i] * float(trace[i])
                 total, square, left = total - value, square - value * trace[i], left - free[i]
                 free[i] = 0
@@ -321,22 +371,27 @@ def find_strongest_peaks(
 
 
 @vectorised
-def copy_local_maxima(score, maxima):
-    """Copy the inner local maxima above zero, and zero for all other scores; of a level top the
-    last bin.
+def copy_local_maxima(score, least, factor, level, maxima):
+    """Copy the inner local maxima above zero that may be of interest, and zero for all other
+    scores; of a level top the last bin.
 
     Parameters
     ----------
     score : (bins,) float32 array
+    least : (bins,) float32 array
+        Scores of interest exceed ``factor * least + level``.
+    factor, level : float
     maxima : (groups * BINS_PER_GROUP,) float32 array
         Overwritten up to the last bin.
     """
-    zero = np.float32(0)
+    zero, factor, level = np.float32(0), np.float32(factor), np.float32(level)
     maxima[0] = maxima[score.size - 1] = zero
     before, here, after, kept = score[:-2], score[1:-1], score[2:], maxima[1 : score.size - 1]
+    wanted = least[1:-1]
     for j in range(here.size):
+        floor = max(factor * wanted[j] + level, zero)
         kept[j] = (
-            here[j] if here[j] > zero and here[j] >= before[j] and here[j] > after[j] else zero
+            here[j] if here[j] > floor and here[j] >= before[j] and here[j] > after[j] else zero
         )
 
 

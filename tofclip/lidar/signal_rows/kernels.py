@@ -15,28 +15,31 @@ vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 
 
 @vectorised
-def sum_boxes(measurements, starts, length, columns, sums):
-    """``sums[b, c, lane] = measurements[c, starts[b, lane] : starts[b, lane] + length].sum()`` for the
-    columns given.
+def sum_boxes(measurements, starts, length, blocks, sums):
+    """``sums[b, c, lane] = measurements[starts[b, lane] : starts[b, lane] + length, c].sum()`` for the
+    blocks given.
 
     Parameters
     ----------
-    measurements : (columns, rows) float32 array
+    measurements : (rows, columns) float32 array
     starts : (blocks, LANES) int64 array
     length : int
-    columns : (int, int)
-        First column, and the one after the last.
-    sums : (blocks, columns, LANES) float32 array, overwritten in these columns
+    blocks : (int, int)
+        First block, and the one after the last.
+    sums : (blocks, columns, LANES) float32 array, overwritten in these blocks
     """
-    for column in range(columns[0], columns[1]):
-        reading = measurements[column]
-        for block in range(starts.shape[0]):
-            for lane in range(LANES):
-                first = np.uintp(starts[block, lane])
-                total = reading[first]
-                for late in range(1, length):
-                    total += reading[first + np.uintp(late)]
-                sums[block, column, lane] = total
+    total = np.empty(measurements.shape[1], np.float32)
+    for block in range(blocks[0], blocks[1]):
+        for lane in range(LANES):
+            first = starts[block, lane]
+            total[:] = measurements[first]
+            for late in range(first + 1, first + length):
+                row = measurements[late]
+                for column in range(total.size):
+                    total[column] += row[column]
+            target = sums[block]
+            for column in range(total.size):
+                target[column, lane] = total[column]
 
 
 @vectorised

@@ -125,12 +125,13 @@ class SignalRowFinder:
 
         sums = np.empty((len(self._starts), measurements.shape[0], LANES), np.float32)
         energy = np.empty(self._starts.shape, np.float32)
+        by_rows = np.ascontiguousarray(measurements.T)  # as the rectifier leaves them: no copy
         run_blocks(
             lambda piece: sum_boxes(
-                measurements, self._starts, self._length, (piece.start, piece.stop), sums
+                by_rows, self._starts, self._length, (piece.start, piece.stop), sums
             ),
-            measurements.shape[0],
-            COLUMNS_PER_BLOCK,
+            len(sums),
+            1,
         )
         compute_energies(sums, energy)
         measured = self._taken & (energy > 0)
