@@ -98,6 +98,8 @@ def make_lazy_group(
 def _require_source(words: Sequence[str]) -> None:
     """Refuse a source that is plainly a file's name and not there."""
     source = words[0] if words and not {"--help", "-h"} & set(words) else "-"
+    if len(words) > 1 and not words[1].startswith("-"):
+        return  # one name too many, about which the verb itself complains
     is_name = not source.startswith("-") and "://" not in source and not set("*?[") & set(source)
     if is_name and not Path(source).exists():
         raise StorageError(f"{source}: no such file")

@@ -83,8 +83,10 @@ MAX_START_M = 1e3
 MAX_SIGNAL = 1e30
 """Larger samples overflow once they are squared."""
 
-SCOUT_WAVELENGTHS = 2.0
-"""Waves by which the box is looked over are this number of times longer, if the wall is so wide."""
+SCOUT_WAVELENGTHS, QUICK_SCOUT_VOXELS = 2.0, 1 << 13
+"""Waves by which the box is looked over are this number of times longer, if the wall is so wide and
+the voxels more than can be imaged in no time: longer waves see less of few photons.
+"""
 
 WAVELENGTH_STEP_RATIO = 1.05
 """From one wavelength that is tried to the next."""
@@ -485,7 +487,8 @@ def find_sampling_step(capture: Capture) -> float:
 def find_scout(capture: Capture, settings: Settings) -> tuple[Settings, Grid] | None:
     """Return settings and coarse voxels with which all of the box is looked over quickly.
 
-    Waves twice as long have an eighth of the work, on voxels of their half.
+    Waves twice as long have an eighth of the work, on voxels of their half; small boxes are looked
+    over with the waves themselves.
 
     Parameters
     ----------
@@ -503,8 +506,11 @@ def find_scout(capture: Capture, settings: Settings) -> tuple[Settings, Grid] | 
         find_longest_wavelength(capture), float(np.ptp(capture.axis.paths)) / settings.cycles
     )
     longer = max(wavelength, min(SCOUT_WAVELENGTHS * wavelength, usable))
-    if settings.everywhere or (settings.voxel or 0.0) >= longer / 2:
+    if settings.everywhere or (settings.voxel or 0.0) >= wavelength / 2:
         return None
+    quick = settings.grid(wavelength / 2)
+    if math.prod(quick.shape) <= QUICK_SCOUT_VOXELS:
+        return settings, quick
     return replace(settings, wavelength=longer), settings.grid(longer / 2)
 
 

@@ -180,7 +180,8 @@ def test_ctrl_c_while_the_program_starts_shows_no_traceback(tmp_path: Path) -> N
 
 def test_ctrl_c_while_a_verb_is_imported_shows_no_traceback(tmp_path: Path) -> None:
     (tmp_path / "h5py.py").write_text("raise KeyboardInterrupt\n")
-    done = started_elsewhere(tmp_path, "info", "absent.h5")
+    (tmp_path / "there.h5").touch()
+    done = started_elsewhere(tmp_path, "info", "there.h5")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (130, "", 1)
 
 

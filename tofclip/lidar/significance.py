@@ -28,11 +28,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 from tofclip.arrays import to_numpy
+from tofclip.camera.measurement import MeasurementNoise
 from tofclip.errors import InputError
 from tofclip.lidar.detection import Detection
 from tofclip.lidar.neighbours import pool_significance
@@ -78,97 +78,6 @@ MIN_RANGE_GATES = 4 * MIN_DISPLACEMENT_GATES
 
 DECOY_SEED = 20220614
 FRAMES_PER_BLOCK = 32
-FLOOR_FIGURE, GAIN_FIGURE = "noise_floor_count", "noise_gain_count"
-MISFIT_FIGURE, DAZZLE_FIGURE = "noise_misfit_fraction", "noise_dazzle_count"
-DAZZLE_REACH_COLUMNS = 2
-"""Columns beside light above `MeasurementNoise.dazzle` that it dazzles: the model's error and the
-slit's blur."""
-
-USUAL_QUANTILE, FRAME_DAZZLE_RATIO = 0.75, 5.0
-"""Of the lit measurements of a frame; light that dazzles is that many times as bright."""
-
-LIT_DEVIATIONS = 4.0
-DAZZLE_MISFIT = 0.3
-"""Of such light, that the model has in a neighbouring column."""
-
-
-@dataclass(frozen=True)
-class MeasurementNoise:
-    """Variance of a measurement: ``floor^2 + gain * signal + (misfit * usual)^2``.
-
-    The last is what the model does not explain, which falls beside the light, on measurements that
-    should be dark; `usual` is the root mean square of a frame's signal. Beside light that dazzles
-    there is `DAZZLE_MISFIT` of that light in addition.
-
-    Parameters
-    ----------
-    floor : float
-        Standard deviation in the dark, counts.
-    gain : float
-        Counts of variance for a count of signal.
-    misfit : float
-        Of the recovery's residual, what noise does not explain, relative to the signal.
-    dazzle : float
-        Light above this, counts, dazzles the columns beside it.
-    """
-
-    floor: float
-    gain: float
-    misfit: float = 0.0
-    dazzle: float = np.inf
-
-    @classmethod
-    def of_frames(cls, frames: Frames) -> MeasurementNoise | None:
-        """Return what the recovery wrote down of its measurements; None if it did not."""
-        known = frames.figures
-        if FLOOR_FIGURE not in known or GAIN_FIGURE not in known:
-            return None
-        return cls(
-            float(known[FLOOR_FIGURE]),
-            float(known[GAIN_FIGURE]),
-            float(known.get(MISFIT_FIGURE, 0.0)),
-            float(known.get(DAZZLE_FIGURE, np.inf)),
-        )
-
-    def compute_variance(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the variance of each measurement, (columns, frames).
-
-        Parameters
-        ----------
-        light : (columns, frames) float32 array
-            What the frames predict, not negative.
-        """
-        variance = self.floor**2 + self.gain * light
-        if light.max(initial=0) <= self.dazzle:
-            variance += self.misfit**2 * np.mean(light**2, axis=0)
-        else:
-            dazzling = self.find_dazzling(light)
-            variance += self.misfit**2 * np.mean(np.where(dazzling, 0, light) ** 2, axis=0)
-            glare, size = np.where(dazzling, light, 0), 2 * DAZZLE_REACH_COLUMNS + 1
-            beside = scipy.ndimage.maximum_filter1d(glare, size, axis=0, mode="constant")
-            variance += (DAZZLE_MISFIT * beside) ** 2
-        return np.asarray(variance, dtype=np.float32)
-
-    def find_dazzling(self, light: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Find light that is too bright for what else there is at the same instant.
-
-        Where a bright object is alone, there is nothing that it could dazzle.
-
-        Parameters
-        ----------
-        light : (columns, frames) float32 array
-            Counts.
-
-        Returns
-        -------
-        (columns, frames) bool array
-        """
-        dazzling = light > self.dazzle
-        for frame in np.flatnonzero(dazzling.any(axis=0)):
-            lit = light[light[:, frame] > LIT_DEVIATIONS * self.floor, frame]
-            usual = float(np.quantile(lit, USUAL_QUANTILE)) if lit.size else 0.0
-            dazzling[:, frame] &= light[:, frame] > FRAME_DAZZLE_RATIO * usual
-        return np.asarray(dazzling)
 
 
 @dataclass(frozen=True)

@@ -21,17 +21,15 @@ from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_num
 from tofclip.camera import Camera, Measurement, estimate_dark_level, measure
 from tofclip.camera.calibration import estimate_skew, register_views
 from tofclip.camera.calibration.registration import count_registration_iterations
+from tofclip.camera.measurement import (
+    MeasurementNoise,
+    find_dazzle_limit,
+    find_dazzled,
+    find_glints,
+)
 from tofclip.errors import InputError, require_type
 from tofclip.io import read_streak
-from tofclip.lidar.significance import (
-    DAZZLE_FIGURE,
-    FLOOR_FIGURE,
-    GAIN_FIGURE,
-    MISFIT_FIGURE,
-    MeasurementNoise,
-)
 from tofclip.operators import LinearOperator
-from tofclip.recovery.dazzle import find_dazzle_limit, find_dazzled, find_glints
 from tofclip.recovery.defects import estimate_noise, find_clipping_level, mask_defects
 from tofclip.recovery.focus import (
     DEFAULT_FOCUS,
@@ -563,12 +561,7 @@ def _list_noise_figures(
         np.sum(np.maximum(light, 0), dtype=np.float64)
     )
     misfit = np.sqrt(max(residual**2 - explained / energy, 0.0)) if energy > 0 else 0.0
-    figures: dict[str, Scalar] = {
-        FLOOR_FIGURE: noise.floor,
-        GAIN_FIGURE: noise.gain,
-        MISFIT_FIGURE: float(misfit),
-    }
-    return figures | ({DAZZLE_FIGURE: noise.dazzle} if np.isfinite(noise.dazzle) else {})
+    return replace(noise, misfit=float(misfit)).list_figures()
 
 
 def fit_camera_to_shot(

@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import is_numpy
 from tofclip.camera import Camera
+from tofclip.camera.measurement import MeasurementNoise
 from tofclip.errors import InputError, ShapeError, require_type
 from tofclip.lidar.detection import Detection
 from tofclip.lidar.geometry import compute_ray_directions
@@ -46,7 +47,6 @@ from tofclip.lidar.search.array_api import ArraySearch, ArrayTraces
 from tofclip.lidar.significance import (
     CANDIDATES,
     DEFAULT_FALSE_ALARM,
-    MeasurementNoise,
     SignificanceJudge,
 )
 from tofclip.lidar.traces import FrameTraces, TraceBins, Traces
@@ -342,7 +342,7 @@ def depth(
         raise ShapeError(
             "frames", f"(time, y, x) with (y, x) = {camera.image_shape}", frames.values.shape
         )
-    noise = MeasurementNoise.of_frames(frames) if detection is None else None
+    noise = MeasurementNoise.from_figures(frames.figures) if detection is None else None
     if noise is None and false_alarm is not None:
         raise InputError(
             "these frames do not say how noisy their measurements were, as a probability of false "
