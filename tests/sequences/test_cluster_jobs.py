@@ -19,6 +19,7 @@ from tofclip.sequences.jobs import (
     run_jobs,
     select_unfinished,
 )
+from tofclip.sequences.jobs import jobs as jobs_module
 from tofclip.sequences.jobs.output_folder import MAX_HASHED_BYTES
 from tofclip.sequences.jobs.workers import connect_workers, count_local_workers
 
@@ -161,6 +162,25 @@ def test_a_scheduler_without_workers_is_refused(monkeypatch):
         connect_workers(nobody.scheduler_address),
     ):
         pass
+
+
+def test_workers_that_are_gone_for_good_are_not_waited_for_for_ever(monkeypatch, tmp_path):
+    class Finished:
+        """A job that was given out, and never comes back."""
+
+        def is_empty(self):
+            return False
+
+        has_ready = is_empty
+
+    class Scheduler:
+        def nthreads(self):
+            return {}
+
+    monkeypatch.setattr(jobs_module, "RECOUNT_INTERVAL_S", 0.01)
+    monkeypatch.setattr(jobs_module, "MAX_WORKERLESS_S", 0.1)
+    with pytest.raises(InputError, match="no worker for"):
+        next(jobs_module.JobPool(Scheduler())._iterate_finished(Finished()))
 
 
 @pytest.mark.parametrize("size", [10, MAX_HASHED_BYTES + 1])

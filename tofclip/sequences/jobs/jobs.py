@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tofclip.errors import TofclipError
+from tofclip.errors import InputError, TofclipError
 from tofclip.sequences.jobs.workers import connect_workers
 from tofclip.storage import format_error_line, remove_temporary_files
 from tofclip.threads import limit_blas_threads
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client, Future, as_completed
 
 
 @dataclass(frozen=True)
@@ -170,6 +170,9 @@ JOBS_PER_THREAD = 2
 """For each thread of the workers: one under way, and one so that it need not wait for the next."""
 
 RECOUNT_INTERVAL_S = 1.0
+POLL_INTERVAL_S = 0.01
+MAX_WORKERLESS_S = 120.0
+"""Workers that died are started again within seconds, or by a queue of a computing centre."""
 
 
 class JobPool:
@@ -190,7 +193,13 @@ class JobPool:
         self._slots, self._counted_at_s = 1, 0.0
 
     def run_all(self, jobs: Sequence[Job]) -> Iterator[Report]:
-        """Do all jobs, and yield the reports as they come."""
+        """Do all jobs, and yield the reports as they come.
+
+        Raises
+        ------
+        InputError
+            For `MAX_WORKERLESS_S` there was no worker that could do the rest.
+        """
         from distributed import as_completed
 
         waiting = iter(jobs)
@@ -206,7 +215,7 @@ class JobPool:
 
         submit()
         try:
-            for future in finished:
+            for future in self._iterate_finished(finished):
                 report = self._collect_report(future, running.pop(future))
                 submit()
                 if report is not None:
@@ -216,6 +225,25 @@ class JobPool:
             # left.
             if running:
                 self._client.cancel(list(running))
+
+    def _iterate_finished(self, finished: as_completed) -> Iterator[Future[Any]]:
+        """Yield futures as they finish, while there are workers to finish them."""
+        counted_at_s = had_workers_at_s = time.monotonic()
+        while not finished.is_empty():
+            now = time.monotonic()
+            if finished.has_ready():
+                had_workers_at_s = now
+                yield next(finished)
+                continue
+            if now > counted_at_s + RECOUNT_INTERVAL_S:
+                counted_at_s = now
+                had_workers_at_s = now if self._client.nthreads() else had_workers_at_s
+            if now > had_workers_at_s + MAX_WORKERLESS_S:
+                raise InputError(
+                    f"the cluster has had no worker for {MAX_WORKERLESS_S:.0f} s; start some and "
+                    "run this again: what is done stays"
+                )
+            time.sleep(POLL_INTERVAL_S)
 
     def _count_slots(self) -> int:
         """Return how many jobs may be under way; workers are counted once a second."""
