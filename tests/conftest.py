@@ -35,18 +35,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
-def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
-    """Let ``-n auto`` be half as many workers again as there are cores: a fifth of the time, tests
-    wait for instruments, browsers and programs of their own.
-    """
-    if "PYTEST_XDIST_AUTO_NUM_WORKERS" in os.environ:
-        return None  # said by hand
-    cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
-    return cores + (cores + 1) // 2
-
-
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder with the instruments' recorded data; tests that need it are skipped where it is

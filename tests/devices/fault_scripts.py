@@ -25,7 +25,7 @@ from tofclip.errors import (
 RECORDS = 8000
 TRANSFERS = 36
 """Of 512 bytes each: by then the instrument is not dark, even if six faults lose 600 records each."""
-ADDRESS = "timetag://?transfer_kib=0.5&reconnect_s=0.5"
+ADDRESS = "timetag://?transfer_kib=0.5&reconnect_s=2"
 LONGEST_RUN = 60.0
 
 

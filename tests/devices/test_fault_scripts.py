@@ -144,7 +144,7 @@ def test_an_instrument_that_lost_its_power_begins_anew() -> None:
 def test_gone_for_good() -> None:
     outcome = run([Fault(10, "unplug", PERMANENT_ENUMERATIONS)], 4)
     assert isinstance(outcome.fault, DeviceDisconnectedError)
-    assert "did not come back within 0.5 s" in str(outcome.fault)
+    assert "did not come back within 2 s" in str(outcome.fault)
     assert outcome.stats.delivered == 10 * 512 // 6  # all that came before was read first
     outcome = run([Fault(10, "stall", 2)], 4)
     assert isinstance(outcome.fault, DeviceStalledError)
