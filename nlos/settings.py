@@ -502,15 +502,15 @@ def find_scout(capture: Capture, settings: Settings) -> tuple[Settings, Grid] | 
         None where the voxels asked for are no finer, or all of the box is wanted.
     """
     wavelength = settings.wavelength or 0.0
-    usable = min(
-        find_longest_wavelength(capture), float(np.ptp(capture.axis.paths)) / settings.cycles
-    )
-    longer = max(wavelength, min(SCOUT_WAVELENGTHS * wavelength, usable))
     if settings.everywhere or (settings.voxel or 0.0) >= wavelength / 2:
         return None
     quick = settings.grid(wavelength / 2)
     if math.prod(quick.shape) <= QUICK_SCOUT_VOXELS:
         return settings, quick
+    usable = min(
+        find_longest_wavelength(capture), float(np.ptp(capture.axis.paths)) / settings.cycles
+    )
+    longer = max(wavelength, min(SCOUT_WAVELENGTHS * wavelength, usable))
     return replace(settings, wavelength=longer), settings.grid(longer / 2)
 
 

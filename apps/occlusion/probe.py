@@ -150,7 +150,7 @@ def probe_with_fixed_camera(
     """Put a board behind an occluder, and look at its middle with a camera that knows neither.
 
     One focal length, one focus and one pulse for all boards; the exposure is that of the brightest
-    measurement, whoever it comes from. Returns, gates and depths are found in the shot
+    measurement, of whatever body it is. Returns, gates and depths are found in the shot
     (`TimedMeasurements.find_returns`). Such a camera gets too little light from a speck, so that
     the board fills the picture; what is judged is a strip of it, as wide as the target of
     `probe_target`, whose pattern has nothing to do with that beside it.

@@ -24,6 +24,7 @@ from tofclip.simulate import (
     StreakDetector,
     make_default_instrument,
     make_default_scene,
+    make_nominal_camera,
     make_plate,
     render_true_frames,
     score_returns,
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
 
 METHODS = ("l1", "tv", "surfaces")
 PHOTONS = (2000, 200, 50)  # of the brightest streak pixel
-CENTRE_ERROR_PX = 0.4  # of the demonstration's calibration, as in tofclip demo
 BORDER_FRACTION = 12 / 128  # of the picture's side, not scored: views leave the slit there
 FOCAL_LENGTH_PX = 280.0
 FIGURES = {  # what a row says: key, unit's factor
@@ -194,14 +194,8 @@ def score_methods(scene: Scene, instrument: Instrument, seed: int, fit: bool) ->
     shot = simulate_shot(scene, instrument, seed)
     streak = shot.streak
     if fit:
-        errors_px = CENTRE_ERROR_PX * np.cos(np.pi * np.arange(shot.camera.views))
-        nominal = shot.camera.replace(
-            sweep=None,
-            gains=np.ones(shot.camera.views),
-            centres_px=shot.camera.centres_px + errors_px,
-        )
-        streak = replace(streak, camera=nominal)
-    # fitted once; its time is nobody's
+        streak = replace(streak, camera=make_nominal_camera(shot.camera))
+    # fitted once; its time counts for none of the methods
     opened: Shot = open_shot(streak).fit_camera()
     truth = render_true_frames(scene, instrument, shot.exposure).values.sum(axis=0)
     border = round(BORDER_FRACTION * truth.shape[0])

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from apps.conventions import JsonOption, build_provenance, make_folder, report
@@ -20,6 +19,7 @@ from tofclip.recovery import open_shot, plan_recovery
 from tofclip.simulate import (
     make_default_instrument,
     make_default_scene,
+    make_nominal_camera,
     render_true_frames,
     score_returns,
     simulate_shot,
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from tofclip.shots import Frames, Streak
     from tofclip.simulate import SimulatedShot
 
-CENTRE_ERROR_PX = 0.4  # the calibration's, by which the recovery starts off
 BORDER_PX = 12  # views leave the slit there, so the picture's rim is not scored
 
 
@@ -87,16 +86,7 @@ def _run_demo(seed: int) -> DemoRun:
     """The whole way, from a scene to a point cloud."""
     scene, instrument = make_default_scene(), make_default_instrument()
     shot = simulate_shot(scene, instrument, seed)
-    # What a calibration from focus pictures cannot know, sweep and gains, and what it knows to half
-    # a pixel only, the slit centres, have to be found from the shot.
-    errors_px = CENTRE_ERROR_PX * np.cos(np.pi * np.arange(shot.camera.views))
-    nominal = replace(
-        shot.camera,
-        sweep=None,
-        gains=np.ones(shot.camera.views),
-        centres_px=shot.camera.centres_px + errors_px,
-    )
-    streak = replace(shot.streak, camera=nominal)
+    streak = replace(shot.streak, camera=make_nominal_camera(shot.camera))
     surfaces = plan_recovery(open_shot(streak), "surfaces")
     with show_progress("recovering", surfaces.work) as advance:
         frames = surfaces.run(advance)

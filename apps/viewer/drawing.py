@@ -31,7 +31,7 @@ MAX_POINTS_PER_S = 2e6
 """What a browser with a software renderer takes without falling behind."""
 
 MIN_DRAWN_POINTS = 16_000
-"""Every renderer takes so many 20 times a second; smaller clouds are always drawn whole."""
+"""Every renderer takes this number 20 times a second; smaller clouds are always drawn whole."""
 
 MOVING_FRAME_S, STILL_FRAME_S = 0.08, 0.5
 """s that a browser may take to draw a large cloud while it moves, and while it stands still: browsers
@@ -39,7 +39,7 @@ draw what stands still once a second.
 """
 
 WORTHWHILE_FACTOR = 1.5
-"""A cloud is sent again where so many times as many points could be drawn, or as few."""
+"""A cloud is sent again where more points by this factor could be drawn, or have to be fewer by it."""
 
 WARM_UP_FRAMES, TIMED_FRAMES = 3, 3
 """Browsers answer before they have drawn, and up to three frames are under way."""
@@ -243,7 +243,7 @@ class Points:
                 node.point_size = self._widen(count)
 
     def note_movement(self) -> None:
-        """Note that someone looks from elsewhere now."""
+        """Note that the viewpoint has changed."""
         # a busy machine may have become an idle one
         self._moved_at, self._has_to_time = time.monotonic(), True
 

@@ -137,18 +137,9 @@ class PulsedSceneStream:
         self._words: ByteView = np.empty(0, np.uint8)
 
     def next_words(self, limit: int, last: int) -> ByteView:
-        """Return the next words, as `TagStream.next_words` says.
+        """Return the next words; see `TagStream`.
 
-        Parameters
-        ----------
-        limit : int
-            Words.
-        last : int
-            Tick.
-
-        Returns
-        -------
-        (6 * words,) uint8 array
+        Arguments and result are those of `TagStream.next_words`.
         """
         taken, left = [], limit
         while left:

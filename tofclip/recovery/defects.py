@@ -112,10 +112,10 @@ def find_defects(streak: Streak, pulse_rows: float) -> Defects:
     """
     counts = streak.counts.astype(np.float32)
     defects = np.zeros(counts.shape, bool)
-    columns = find_dead_columns(counts)
+    dark, noise, gain = estimate_noise(counts)
+    columns = find_dead_columns(counts, noise)
     if pulse_rows < MIN_PULSE_ROWS or counts.shape[0] < 5:
         return Defects(defects, columns)
-    dark, noise, gain = estimate_noise(counts)
     light = counts - np.float32(dark)
     # As bright as the darker of its neighbours in time: defects do not say what is bright.
     sound = np.minimum(light[:-2], light[2:])
@@ -216,12 +216,14 @@ def estimate_noise(counts: FloatImage) -> tuple[float, float, float]:
     return dark, noise, max(1.0, float(fitted[0]))
 
 
-def find_dead_columns(counts: FloatImage) -> Mask:
+def find_dead_columns(counts: FloatImage, noise: float) -> Mask:
     """Find columns that do not even show the noise of the others.
 
     Parameters
     ----------
     counts : (rows, columns) array
+    noise : float
+        Standard deviation in the dark, counts.
 
     Returns
     -------
@@ -230,7 +232,7 @@ def find_dead_columns(counts: FloatImage) -> Mask:
     changes = np.abs(np.diff(counts, axis=0))
     rough = changes.mean(axis=0)
     # Of a bright scene the usual column is lit; a column that sees none of it is not dead.
-    usual = min(float(np.median(rough)), MEAN_CHANGE * estimate_noise(counts)[1])
+    usual = min(float(np.median(rough)), MEAN_CHANGE * noise)
     dead: Mask = rough < DEAD_COLUMN_FRACTION * usual
     if not np.median(changes):  # no noise by which a column is known to be alive
         return np.zeros(dead.shape, bool)

@@ -267,7 +267,8 @@ class RecoveryPlan:
         used = measurement.valid if dazzled is None else measurement.valid & ~dazzled
         with self.device.activate():
             on_device = Measurement(self.device.put(measurement.values), self.device.put(used))
-            method = adapt_to_clipping(self.method, streak)
+            clipping = find_clipping_level(streak.counts)
+            method = adapt_to_clipping(self.method, streak, clipping)
             result = recover_segments(method, camera, on_device, segments, progress)
             values = to_numpy(result.frames)
             if dazzled is not None and dazzled.any():
@@ -285,7 +286,7 @@ class RecoveryPlan:
             "frames_per_second": result.frames.shape[0] / (solved - solving - result.setup_seconds),
             "setup_seconds": result.setup_seconds,
             "device": str(self.device),
-            **count_defects(streak),
+            **count_defects(streak, clipping),
             **({} if noise is None else _list_noise_figures(noise, measurement, used, residual)),
         }
         if np.isfinite(result.duality_gap):
@@ -499,21 +500,34 @@ def require_plausible_rows(streak: Streak, camera: Camera) -> None:
     )
 
 
-def count_defects(streak: Streak) -> dict[str, Scalar]:
-    """Count the readings that are defective and those that are cut off, where there are any."""
-    clipped = int(np.count_nonzero(streak.counts >= find_clipping_level(streak.counts)))
+def count_defects(streak: Streak, clipping: float) -> dict[str, Scalar]:
+    """Count the readings that are defective and those that are cut off, where there are any.
+
+    Parameters
+    ----------
+    streak : Streak
+    clipping : float
+        Value at which it is cut off, see `find_clipping_level`.
+
+    Returns
+    -------
+    dict of str to int
+    """
+    clipped = int(np.count_nonzero(streak.counts >= clipping))
     defective = int(streak.metadata.get(DEFECTS_KEY, 0))
     found: dict[str, Scalar] = {DEFECTS_KEY: defective, CLIPPED_KEY: clipped}
     return {name: number for name, number in found.items() if number}
 
 
-def adapt_to_clipping(method: Method, streak: Streak) -> Method:
+def adapt_to_clipping(method: Method, streak: Streak, clipping: float) -> Method:
     """Return a method with a prior that knows where a streak image is cut off.
 
     Parameters
     ----------
     method : Method
     streak : Streak
+    clipping : float
+        Value at which it is cut off, see `find_clipping_level`.
 
     Returns
     -------
@@ -522,10 +536,9 @@ def adapt_to_clipping(method: Method, streak: Streak) -> Method:
     """
     if not isinstance(method, ProximalMethod) or method.data_term is not LeastSquares:
         return method
-    level = find_clipping_level(streak.counts)
-    if not np.isfinite(level):
+    if not np.isfinite(clipping):
         return method
-    limit = CLIPPED_FRACTION * (level - estimate_dark_level(streak.counts))
+    limit = CLIPPED_FRACTION * (clipping - estimate_dark_level(streak.counts))
     return replace(method, data_term=partial(ClippedSquares, limit=limit))
 
 

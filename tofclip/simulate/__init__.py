@@ -2,7 +2,12 @@
 recorded, and the truth.
 """
 
-from tofclip.simulate.demo import make_default_camera, make_default_instrument, make_default_scene
+from tofclip.simulate.demo import (
+    make_default_camera,
+    make_default_instrument,
+    make_default_scene,
+    make_nominal_camera,
+)
 from tofclip.simulate.ground_truth import GroundTruth, render_true_frames, score_returns
 from tofclip.simulate.instrument import Instrument, StreakDetector
 from tofclip.simulate.scene import RayCast, Scene, make_plate
@@ -18,6 +23,7 @@ __all__ = [
     "make_default_camera",
     "make_default_instrument",
     "make_default_scene",
+    "make_nominal_camera",
     "make_plate",
     "render_true_frames",
     "score_returns",

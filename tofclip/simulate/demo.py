@@ -29,6 +29,7 @@ GAINS = (0.92, 1.08, 1.02, 0.90, 1.02, 0.96, 1.10)
 OFFSETS_BINS = (-16.3, -10.4, -4.8, 0.0, 3.9, 8.2, 12.0)
 STRETCHES = (0.009, 0.008, 0.004, 0.0, -0.001, -0.006, -0.006)
 TIME_ZERO_S = -10.784e-9
+CENTRE_ERROR_PX = 0.4  # the calibration's, by which a recovery starts off
 FOCAL_LENGTH_PX = 560.0
 LENSLET_PITCH_M = 2.3e-3
 FOCUS_DISTANCE_M = 2.3
@@ -48,6 +49,18 @@ def make_default_camera() -> Camera:
         focal_length_px=FOCAL_LENGTH_PX,
         lenslet_pitch=LENSLET_PITCH_M,
         focus_distance=FOCUS_DISTANCE_M,
+    )
+
+
+def make_nominal_camera(camera: Camera) -> Camera:
+    """Return a camera as focus pictures would give it.
+
+    They cannot know sweep and gains, and know the slit centres to half a pixel only: these have to
+    be found from the shot.
+    """
+    errors_px = CENTRE_ERROR_PX * np.cos(np.pi * np.arange(camera.views))
+    return camera.replace(
+        sweep=None, gains=np.ones(camera.views), centres_px=camera.centres_px + errors_px
     )
 
 

@@ -183,7 +183,7 @@ class PhotonDetector:
         return SHADE_RATIO ** known.astype(np.float64), shade.ravel()
 
     def _build_filter(self, background: float) -> FloatArray:
-        """Log-matched filter for each shade of a background of so many photons in a usual bin."""
+        """Log-matched filter for each shade of a background of this many photons in a usual bin."""
         return np.array([self.weights(background * shade) for shade in self._shades[0]])
 
     @cached_property
