@@ -16,7 +16,7 @@ CASES: tuple[Case, ...] = (
     *nlos.CASES,
     *instruments.CASES,
 )
-"""The page's cases: all of them take less than ten minutes."""
+"""The page's cases: all of them take some ten minutes."""
 
 STUDIES = {
     "camera": "light_field_cameras",

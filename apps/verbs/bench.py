@@ -44,9 +44,8 @@ def bench(
 ) -> None:
     """Measure time and memory, each beside the least that the work needs.
 
-    All cases together take less than ten minutes, with --peers some half an hour more. Other
-    programs slow it down: close them.
-    TOFCLIP_THREADS bounds the number of threads.
+    All cases together take some ten minutes on two cores and are cut short after twenty, with
+    --peers half an hour more. Other programs slow it down: close them. TOFCLIP_THREADS bounds the number of threads.
 
     Example: tofclip bench recovery
 

@@ -13,6 +13,11 @@ import pytest
 from small_instrument import Run
 
 import tofclip
+from devices import aravis
+from nlos import backprojection
+from nlos.portable import diffraction, library
+from tofclip.lidar.search import array_api
+from tofclip.solvers import loops
 
 ROOT = Path(tofclip.__file__).parents[1]
 README = ROOT / "README.md"
@@ -40,16 +45,57 @@ def write_photons(path: Path) -> None:
     np.save(path, cube.astype(np.uint8))
 
 
-RATE = re.compile(r"(?<![\d.])(\d[\d.,]*)\s+(ms|us|a second|frames/s|shots/s|volumes/s|MB/s)\b")
+RATE = re.compile(
+    r"(?<![\d.])(\d[\d.,]*)\s+(ms|us|s|a second|frames/s|shots/s|volumes/s|MB/s)\b"
+)
+MEMORY = re.compile(r"(?<![\d.])(\d[\d.,]*)\s+([KMG]i?B)\b(?!/s)")
+LIMITS = {
+    "docs/gpu.md": {"2 GiB": loops.WORKING_BYTES, "1 GiB": array_api.WORKING_BYTES},
+    "docs/nlos.md": {
+        "32 MiB": backprojection.TABLE_BYTES,
+        "8 MiB": library.CPU_CHUNK_BYTES,
+        "256 MiB": library.GPU_CHUNK_BYTES,
+        "1 GiB": diffraction.MAX_CACHE_BYTES,
+    },
+    "docs/instruments/aravis.md": {"64 MiB": aravis.HELD_BYTES},
+}
+"""Memory that a page does not measure but promises never to exceed: what the code has for it."""
+BYTES = {"MiB": 1 << 20, "GiB": 1 << 30}
+
+
+def read_prose(name: str) -> str:
+    """A page without its commands."""
+    return re.sub(r"```.*?```", "", (ROOT / name).read_text("utf-8"), flags=re.DOTALL)
+
+
+def find_claims(pattern: re.Pattern[str], text: str) -> set[str]:
+    return {f"{number} {unit}" for number, unit in pattern.findall(text)}
 
 
 @pytest.mark.parametrize("name", ["README.md", "docs/scaling.md", "docs/many_shots.md"])
 def test_times_and_rates_are_those_of_the_benchmark_page(name: str) -> None:
     """One place for measured times: what is said elsewhere has to be there, or goes."""
-    page = (ROOT / "docs" / "benchmarks.md").read_text("utf-8")
-    text = re.sub(r"```.*?```", "", (ROOT / name).read_text("utf-8"), flags=re.DOTALL)
-    claimed = [f"{number} {unit}" for number, unit in RATE.findall(text)]
-    assert [claim for claim in claimed if claim not in page] == []
+    measured = find_claims(RATE, read_prose("docs/benchmarks.md"))
+    assert find_claims(RATE, read_prose(name)) - measured == set()
+
+
+PAGES = sorted(
+    str(path.relative_to(ROOT))
+    for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("docs/instruments/*.md"))
+)
+
+
+def test_memory_is_that_of_the_benchmark_page_or_a_limit_of_the_code() -> None:
+    page = read_prose("docs/benchmarks.md")
+    measured = find_claims(MEMORY, page) | {f"{own} MiB" for own in re.findall(r"own (\d+)", page)}
+    claims = {name: find_claims(MEMORY, read_prose(name)) for name in PAGES}
+    known = {name: measured | set(LIMITS.get(name, {})) for name in PAGES}
+    assert {name: claims[name] - known[name] for name in PAGES if claims[name] - known[name]} == {}
+    for name, limits in LIMITS.items():
+        assert set(limits) <= claims[name]  # a limit that is not stated any more leaves the table
+        for claim, limit in limits.items():
+            number, unit = claim.split()
+            assert int(number) * BYTES[unit] == limit, (name, claim)
 
 
 def test_the_walk_through(
