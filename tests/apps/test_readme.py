@@ -45,9 +45,7 @@ def write_photons(path: Path) -> None:
     np.save(path, cube.astype(np.uint8))
 
 
-RATE = re.compile(
-    r"(?<![\d.])(\d[\d.,]*)\s+(ms|us|s|a second|frames/s|shots/s|volumes/s|MB/s)\b"
-)
+RATE = re.compile(r"(?<![\d.])(\d[\d.,]*)\s+(ms|us|s|a second|frames/s|shots/s|volumes/s|MB/s)\b")
 MEMORY = re.compile(r"(?<![\d.])(\d[\d.,]*)\s+([KMG]i?B)\b(?!/s)")
 LIMITS = {
     "docs/gpu.md": {"2 GiB": loops.WORKING_BYTES, "1 GiB": array_api.WORKING_BYTES},
