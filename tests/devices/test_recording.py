@@ -189,6 +189,30 @@ def test_killed_recorders_leave_what_they_flushed(tmp_path: Path) -> None:
     assert with_records >= 10  # every other one is killed after its first report
 
 
+def test_a_killed_recorder_of_a_stream_that_pauses_has_all_that_came(tmp_path: Path) -> None:
+    """Nothing waits for more to come: the recorder is the product's, without a hook of the test."""
+    path, count = tmp_path / "run.h5", 1700
+    address = f"sim+timetag://?seed=6&pace=realtime&rate=5e5&records={count}"  # then it is dark
+    script = (
+        "import sys, pathlib, devices; from devices.recorder import record_source;"
+        "record_source(devices.open(sys.argv[1]), pathlib.Path(sys.argv[2]))"
+    )
+    root = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    recorder = subprocess.Popen([sys.executable, "-c", script, address, str(path)], env=root)
+    try:
+        deadline = time.monotonic() + 60
+        while not path.exists() or verify(path).records < count:
+            assert time.monotonic() < deadline, verify(path) if path.exists() else "no file"
+            assert recorder.poll() is None
+            time.sleep(0.05)
+    finally:
+        recorder.kill()
+        recorder.wait()
+    found = verify(path)
+    assert (found.is_sound, found.complete, found.records) == (True, False, count)
+    require_true_records(path, 6)
+
+
 def require_true_records(path: Path, seed: int) -> None:
     """Compare a recording with the photons that there were: all come in order, none is made up."""
     from devices.timetag.emulator import CLOCK_HZ
