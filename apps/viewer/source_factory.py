@@ -41,6 +41,13 @@ SURFACES = "surfaces"
 FIRST_LOOK_METHOD, FIRST_LOOK_ITERATIONS = "l1", 25
 """Enough to read what is written on a surface; `tofclip recover` takes 40."""
 
+FIRST_LOOK_ROUNDS = 2
+"""Refinements of a camera whose sweep the shot itself has to tell; `tofclip recover` takes up to ten,
+which is most of its time. Two leave 0.2 rows and 0.6 px of them on a recorded shot: no letter moves.
+"""
+
+FIRST_LOOK_NOTE = f"first look ({FIRST_LOOK_METHOD}, {FIRST_LOOK_ITERATIONS} iterations): tofclip recover measures"
+
 
 @dataclass(frozen=True)
 class ShotOptions:
@@ -153,7 +160,10 @@ def _open_shots(title: str, shots: Sequence[Callable[[], Streak]], options: Shot
     method = _make_method(options.method or FIRST_LOOK_METHOD)
     recovery = ShotRecovery(camera, first.times - camera.time_zero, method)
     frames = recovery.frames(measured.values, 0.0, Gate(0, first.times.size))
-    return TransientSource(title, frames, measured.values, method)
+    source = TransientSource(title, frames, measured.values, method)
+    if options.method is None:
+        source.notes = (FIRST_LOOK_NOTE, *source.notes)
+    return source
 
 
 def _open_surfaces(title: str, shot: Streak, options: ShotOptions) -> Source:
@@ -195,7 +205,8 @@ def _open_instrument(address: str, options: ShotOptions) -> Source:
 
 def _find_camera(shot: Streak, options: ShotOptions) -> Camera:
     """The camera of a row of shots; a sweep that is not known is found from the first one."""
-    return open_shot(shot, options.camera, options.time_zero).fit_camera().camera
+    opened = open_shot(shot, options.camera, options.time_zero)
+    return opened.fit_camera(max_rounds=FIRST_LOOK_ROUNDS).camera
 
 
 def _read_shot(path: Path, options: ShotOptions) -> Streak:

@@ -33,9 +33,10 @@ from apps.viewer.live import LiveShotSource
 from apps.viewer.session import GATE_ALL_TIMES, GATE_AROUND_FRAME, GATE_UP_TO_FRAME, Session
 from apps.viewer.side_pictures import project_front, render_pictures
 from apps.viewer.source import LINEAR_NOTE, NO_TIME_ZERO_NOTE, Gate, Source
-from apps.viewer.source_factory import ShotOptions, open_source
+from apps.viewer.source_factory import FIRST_LOOK_NOTE, ShotOptions, open_source
 from apps.viewer.volume import PROJECTION_MODE, SLICE_MODE, SURFACE_MODE
 from tofclip.camera import Rectifier
+from tofclip.camera.calibration import registration
 from tofclip.errors import DeviceTimeoutError, FileFormatError, InputError, StorageError
 from tofclip.shots import Streak, save_stack
 
@@ -192,11 +193,28 @@ def test_a_single_shot_is_recovered_as_a_transient(folder: Path) -> None:
         assert close.sum() > 25
 
 
+def test_a_first_look_refines_the_camera_twice(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a camera whose sweep the shot has to tell, the whole search takes longer than the frames."""
+    camera().replace(sweep=None).save(folder / "coarse.h5")
+    refined = []
+    refine = registration._refine_camera
+    monkeypatch.setattr(
+        registration, "_refine_camera", lambda *known: refined.append(1) or refine(*known)
+    )
+    source = open_source(str(folder / "shot.h5"), ShotOptions(camera=folder / "coarse.h5"))
+    assert len(refined) == 2
+    ranges = source.view(0).cloud.range
+    for frame in (NEAR_FRAME, FAR_FRAME):
+        assert np.sum(np.abs(ranges - range_of(frame)) < 3e-3) > 25  # a bin
+
+
 def test_a_quick_look_is_called_one_and_another_method_can_be_asked_for(folder: Path) -> None:
     """A single shot is recovered by iterations; what is linear says so, as does a missing time zero."""
     shot, stack = str(folder / "shot.h5"), str(folder / "stack.h5")
     with_camera = ShotOptions(camera=folder / "camera.h5")
-    assert open_source(shot).notes == ()
+    assert open_source(shot).notes == (FIRST_LOOK_NOTE,)
     assert open_source(shot, ShotOptions(method="linear")).notes == (LINEAR_NOTE,)
     assert open_source(stack, with_camera).notes == (LINEAR_NOTE,)
     sharp = open_source(stack, replace(with_camera, method="l1"))
@@ -213,7 +231,7 @@ def test_a_quick_look_is_called_one_and_another_method_can_be_asked_for(folder: 
     assert fractions[0] > 2 * fractions[1]  # 0.78 and 0.2: far from noise of a per cent
     assert sharp.view(0).cloud.range.min() == pytest.approx(range_of(NEAR_FRAME), abs=3e-3)
     no_zero = open_source(shot, ShotOptions(time_zero=0.0))
-    assert no_zero.notes == (NO_TIME_ZERO_NOTE,)
+    assert no_zero.notes == (FIRST_LOOK_NOTE, NO_TIME_ZERO_NOTE)
     session = Session(open_source(str(folder / "frames.h5")))
     assert session.notes == ()
     session.shear = 0.5
@@ -289,6 +307,9 @@ def test_a_volume_as_voxels_surface_projection_and_slices(folder: Path) -> None:
 def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
     def shots():  # type: ignore[no-untyped-def]
         yield streak(1)
+        deadline = time.monotonic() + 20
+        while len(source) < 2 and time.monotonic() < deadline:  # or it may be dropped for the next
+            time.sleep(0.01)
         yield streak(2)
         raise DeviceTimeoutError("nothing came")
 

@@ -28,8 +28,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import isotonic_regression
 
 from tofclip.arrays import to_numpy
 from tofclip.camera.measurement import MeasurementNoise
@@ -330,7 +330,7 @@ def estimate_false_alarms(pool: CandidatePool, pooled: FloatArray) -> FloatArray
     is_decoy = np.arange(everything.size) >= pooled.size
     order = np.argsort(everything)
     # The stronger, the less probable a decoy is.
-    fitted: Any = isotonic_regression(
+    fitted: Any = scipy.optimize.isotonic_regression(
         is_decoy[order].astype(np.float64), weights=weights[order], increasing=False
     )
     share = np.empty(everything.size)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_numpy, zeros
 from tofclip.camera import Camera, Measurement, estimate_dark_level, measure
 from tofclip.camera.calibration import estimate_skew, register_views
-from tofclip.camera.calibration.registration import count_registration_iterations
+from tofclip.camera.calibration.registration import MAX_ROUND_COUNT, count_registration_iterations
 from tofclip.camera.measurement import (
     MeasurementNoise,
     find_dazzle_limit,
@@ -135,11 +135,24 @@ class Shot:
         """Time of flight of each row, (rows,), s: the camera's time zero is taken off."""
         return self.streak.times - self.camera.time_zero
 
-    def fit_camera(self, progress: Progress = ignore_progress) -> Shot:
-        """Return this shot with a camera whose sweep is known, found from the shot if need be."""
+    def fit_camera(
+        self, progress: Progress = ignore_progress, max_rounds: int = MAX_ROUND_COUNT
+    ) -> Shot:
+        """Return this shot with a camera whose sweep is known, found from the shot if need be.
+
+        Parameters
+        ----------
+        progress : callable
+        max_rounds : int
+            Refinements at most, see `tofclip.camera.calibration.register_views`.
+
+        Returns
+        -------
+        Shot
+        """
         if self.camera.sweep is not None:
             return self
-        found = fit_camera_to_shot(self.streak, self.camera, progress)
+        found = fit_camera_to_shot(self.streak, self.camera, progress, max_rounds)
         moved_px = found.centres_px - self.camera.centres_px
         # two combinations of the centres only displace the picture, which no shot shows
         freedom = max(found.views - 2, 1)
@@ -578,7 +591,10 @@ def _list_noise_figures(
 
 
 def fit_camera_to_shot(
-    streak: Streak, camera: Camera, progress: Progress = ignore_progress
+    streak: Streak,
+    camera: Camera,
+    progress: Progress = ignore_progress,
+    max_rounds: int = MAX_ROUND_COUNT,
 ) -> Camera:
     """Return `camera` with sweep, gains and centres found from the shot itself.
 
@@ -589,6 +605,8 @@ def fit_camera_to_shot(
         Where the search starts.
     progress : callable
         Called as the search for the views goes on.
+    max_rounds : int
+        Refinements at most, see `tofclip.camera.calibration.register_views`.
 
     Returns
     -------
@@ -598,7 +616,9 @@ def fit_camera_to_shot(
     # registration refines a skew that is right to a few rows, which the energy curves give
     coarse = replace(camera, sweep=skew.sweep)
     times = streak.times - camera.time_zero
-    return register_views(streak.counts, streak.saturated, coarse, progress, times).camera
+    return register_views(
+        streak.counts, streak.saturated, coarse, progress, times, max_rounds
+    ).camera
 
 
 def recover_segments(

@@ -66,6 +66,7 @@ def register_views(
     camera: Camera,
     progress: Progress = ignore_progress,
     times: FloatArray | None = None,
+    max_rounds: int = MAX_ROUND_COUNT,
 ) -> Registration:
     """Refine a camera whose sweep is a `SkewSweep`.
 
@@ -86,6 +87,9 @@ def register_views(
     times : (rows,) array, optional
         Times of flight of the rows, s. Without them, the centres of a camera that knows its lenslet
         pitch stay as they are.
+    max_rounds : int
+        Refinements at most. Two leave a tenth of the first misfit's excess: enough to read what is
+        written on a surface, not to measure.
 
     Returns
     -------
@@ -93,7 +97,7 @@ def register_views(
         The best camera of all rounds, and the residual of each.
     """
     start, residuals, best, moved_px = camera, [], (np.inf, camera), np.inf
-    for number in range(MAX_ROUND_COUNT + 1):
+    for number in range(max_rounds + 1):
         measurement = measure(counts, saturated, camera)
         chosen = _select_frames(measurement)
         part = Measurement(measurement.values[:, chosen], measurement.valid[:, chosen])
@@ -103,7 +107,7 @@ def register_views(
         model = _predict(operators, pictures, groups)
         residuals.append(_compute_residual(model, part))
         best = min(best, (residuals[-1], camera), key=lambda pair: pair[0])
-        if number == MAX_ROUND_COUNT or (number >= MIN_ROUND_COUNT and moved_px < SETTLED_PX):
+        if number == max_rounds or (number >= MIN_ROUND_COUNT and moved_px < SETTLED_PX):
             break
         evidence = _Evidence(pictures, groups, part.values - model, part.valid, chosen)
         slope = np.gradient(measurement.values, axis=1)[:, chosen]
