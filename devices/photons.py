@@ -94,7 +94,7 @@ def read_photons(address: str) -> CountedPhotons:
         times = known.array(axis, np.float64, 1, "s")
         pulse = None
         if axis == "bin_times":
-            counts = _add_histograms(source, scans) * float(known.attribute("count_scale"))
+            counts = _add_histograms(source, scans) * known.number("count_scale")
         else:
             counts = _add_scans(source, len(times), scans, binning)
             pulse = _make_gate_response(known, times)
@@ -161,7 +161,7 @@ def _make_gate_response(known: Record, times: NDArray[np.float64]) -> Pulse:
     """Return how one instant shows while a gate moves over it: it is seen from when the gate still
     closes behind it until it opens after it, which is the instant itself.
     """
-    width = float(known.attribute("gate_width_s"))
+    width = known.number("gate_width_s")
     step = float(times[1] - times[0])
     spacing = min(step, EDGE_S) / 4
     margin = 5 * EDGE_S

@@ -324,7 +324,7 @@ def compute_photon_times(photons: Records, calibration: Record) -> NDArray[np.fl
     -------
     (n,) float64 array
     """
-    times: NDArray[np.float64] = photons["bin"] * float(calibration.attribute("resolution_s"))
+    times: NDArray[np.float64] = photons["bin"] * calibration.number("resolution_s")
     return times
 
 

@@ -269,16 +269,14 @@ def _make_histogram(
     """Return an empty histogram for records of this kind."""
     known = calibration or Record("none")
     if names[-2:] == ("code", "pixel"):
-        period = float(known.attribute("laser_period_s", 0.0)) or None
+        period = known.number("laser_period_s", 0.0) or None
         return StampHistogram(gathering.axis(period), BoardCalibration.from_record(known))
     if "time_ticks" in names:
-        tick = float(known.attribute("tick_s"))
+        tick = known.number("tick_s")
         return TagHistogram(gathering.axis(None), gathering.sync, gathering.pixels, tick)
     if "bin" in names:
-        axis = gathering.axis(float(known.attribute("laser_period_s", 0.0)) or None)
-        return TimeHistogram(
-            int(known.attribute("channels")), axis, float(known.attribute("resolution_s"))
-        )
+        axis = gathering.axis(known.number("laser_period_s", 0.0) or None)
+        return TimeHistogram(int(known.number("channels")), axis, known.number("resolution_s"))
     raise InputError(f"records of {', '.join(names)} are not photons of a line of pixels")
 
 
@@ -287,8 +285,8 @@ def _stack_histograms(
 ) -> Streak:
     """Return histograms that the instrument has made itself, a channel in each column."""
     counts = np.concatenate([batch.records["histogram"] for batch in batches]).T
-    times: NDArray[np.float64] = (np.arange(len(counts)) + 0.5) * np.float64(
-        calibration.attribute("resolution_s")
+    times: NDArray[np.float64] = np.float64(calibration.number("resolution_s")) * (
+        np.arange(len(counts)) + 0.5
     )
     streak = Streak(counts.astype(np.float32), times)
     return streak if gathering.bin_width is None else streak.with_bin_width(gathering.bin_width)

@@ -329,8 +329,8 @@ class Capture:
             signal=record.array("signal", np.float32, dimensions.get("signal", 0), "count"),
             wall=record.array("wall", np.float64, dimensions.get("wall", 0), "m"),
             laser=record.array("laser", np.float64, dimensions.get("laser", 0), "m"),
-            bin_width=float(record.attribute("bin_width_s")),
-            start=float(record.attribute("start_m")),
+            bin_width=record.number("bin_width_s"),
+            start=record.number("start_m"),
             provenance=record.provenance,
         )
 

@@ -36,7 +36,7 @@ def extract_wall_capture(frames: Frames) -> Capture:
     laser = record.array("laser", np.float64, 1, "m")
     bin_width = _require_even_bin_width(frames)
     seen = _cut_wall_window(frames.values, record, wall.shape)
-    delay = float(record.attribute("receive_delay_bins"))
+    delay = record.number("receive_delay_bins")
     return Capture(
         signal=unwarp_signal(seen, wall, camera, laser, bin_width),
         wall=wall,
@@ -154,7 +154,7 @@ def _require_even_bin_width(frames: Frames) -> float:
 def _cut_wall_window(
     values: NDArray[np.float32], record: Record, wall_shape: tuple[int, ...]
 ) -> NDArray[np.float32]:
-    row, column = int(record.attribute("row_offset")), int(record.attribute("column_offset"))
+    row, column = int(record.number("row_offset")), int(record.number("column_offset"))
     rows, columns = wall_shape[:2]
     fits = (
         row >= 0

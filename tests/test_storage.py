@@ -201,6 +201,35 @@ def test_attributes_and_children_are_checked(record: Record) -> None:
             parent.child(name, kind)
 
 
+@pytest.mark.parametrize(
+    "value",
+    [np.zeros(5), np.zeros((2, 3), np.int32), h5py.Empty("f8"), 1j, np.bytes_(b"\xff\xfe z")],
+    ids=["list", "table", "empty", "complex", "no text"],
+)
+@pytest.mark.parametrize("name", ["format_version", "kind", "value.number"])
+def test_an_attribute_is_text_or_a_number(name: str, value: object, tmp_path: Path) -> None:
+    path = tmp_path / "odd.h5"
+    Record("thing", {}, {"number": 3}).save(path)
+    with h5py.File(path, "r+") as file:
+        file.attrs[name] = value
+    for read in (Record.load, read_outline):
+        with pytest.raises(FileFormatError) as caught:
+            read(path)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_number_is_finite_and_what_is_found_stays_on_one_line() -> None:
+    record = Record(
+        "thing", {}, {"text": "a\nb", "none": np.inf, "some": np.int64(3)}, origin="x.h5"
+    )
+    assert record.number("some") == record.number("absent", 3.0) == 3.0
+    for name in ("text", "none"):
+        with pytest.raises(FileFormatError, match=r"must be a number, found (a b|inf)$"):
+            record.number(name)
+    with pytest.raises(FileFormatError, match="has no attribute 'absent'"):
+        record.number("absent")
+
+
 @pytest.mark.parametrize("fault", [ValueError, KeyboardInterrupt, OSError, StorageError])
 def test_an_interrupted_write_leaves_the_old_file(
     fault: type[BaseException], tmp_path: Path

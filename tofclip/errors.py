@@ -95,7 +95,8 @@ class FileFormatError(TofclipError, ValueError):
     """
 
     def __init__(self, path: str | Path, problem: str) -> None:
-        super().__init__(f"{path}: {problem}")
+        # What was found in a file may hold line breaks; a message is one line.
+        super().__init__(f"{path}: {' '.join(problem.split())}")
         self.path = Path(path)
 
 

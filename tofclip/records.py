@@ -336,7 +336,7 @@ class _StoredValue:
             return MISSING
         try:
             values = tuple(self.dtype(record.attribute(name)) for name in names)
-        except (TypeError, ValueError) as fault:
+        except (TypeError, ValueError, OverflowError) as fault:
             if isinstance(fault, FileFormatError):
                 raise
             raise FileFormatError(

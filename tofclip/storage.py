@@ -16,6 +16,7 @@ import hashlib
 import io
 import json
 import math
+import numbers
 import os
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -181,6 +182,31 @@ class Record:
             raise FileFormatError(self.origin, f"{self.kind} record has no attribute '{name}'")
         return default
 
+    def number(self, name: str, default: float | None = None) -> float:
+        """Return scalar attribute `name` as a finite number.
+
+        Parameters
+        ----------
+        name : str
+        default : float, optional
+            Returned where the attribute is absent.
+
+        Returns
+        -------
+        float
+
+        Raises
+        ------
+        FileFormatError
+            It is something else, or absent and there is no default.
+        """
+        found = self.attribute(name, default)
+        if not isinstance(found, numbers.Real) or not math.isfinite(found):
+            raise FileFormatError(
+                self.origin, f"attribute '{name}' must be a number, found {found}"
+            )
+        return float(found)
+
     def child(self, name: str, kind: str) -> Record:
         """Return the record that travels inside this one under `name`.
 
@@ -278,6 +304,18 @@ def read_outline(path: str | Path) -> Record:
     return _read_file(path, _read_few_values)
 
 
+def is_own_file(path: str | Path) -> bool:
+    """Whether a file says that it is one of our HDF5 files, be it damaged otherwise."""
+    import h5py
+
+    with (
+        contextlib.suppress(OSError, RuntimeError, TypeError, ValueError),
+        h5py.File(path, "r") as file,
+    ):
+        return _read_text(file, "format") == FORMAT_NAME
+    return False
+
+
 def make_stand_in(shape: Sequence[int], dtype: DTypeLike) -> NDArray[Any]:
     """Return an array of that shape and type that takes no memory; all its values are the same."""
     return np.broadcast_to(np.zeros((), dtype), tuple(shape))
@@ -319,13 +357,13 @@ def _open_file(path: str | Path) -> Iterator[h5py.File]:
         with h5py.File(path, "r") as file:
             if _read_text(file, "format") != FORMAT_NAME:
                 raise FileFormatError(path, "is an HDF5 file, but not one of tofclip's")
-            version = int(file.attrs.get("format_version", 0))
+            version = int(_to_scalar(file.attrs.get("format_version", 0)))
             if version > FORMAT_VERSION:
                 raise FileFormatError(
                     path, f"has format version {version}; this program reads {FORMAT_VERSION}"
                 )
             yield file
-    except (OSError, KeyError, RuntimeError) as fault:
+    except (OSError, KeyError, RuntimeError, TypeError, ValueError, OverflowError) as fault:
         if isinstance(fault, FileFormatError):
             raise
         raise FileFormatError(
@@ -424,10 +462,18 @@ def _read_text(item: h5py.Group | h5py.Dataset, name: str) -> str:
 
 
 def _to_scalar(value: Any) -> Scalar:
-    """Turn an HDF5 attribute into a Python scalar."""
+    """Turn an HDF5 attribute into a Python scalar.
+
+    Raises
+    ------
+    TypeError
+        It is an array, complex, or empty.
+    """
     plain = value.item() if isinstance(value, np.generic) else value
-    text_or_number: Scalar = plain.decode() if isinstance(plain, bytes) else plain
-    return text_or_number
+    found = plain.decode() if isinstance(plain, bytes) else plain
+    if not isinstance(found, str | int | float | bool):
+        raise TypeError(f"an attribute holds {type(found).__name__}, not text or a number")
+    return found
 
 
 def _parse_provenance(text: str, path: str | Path) -> dict[str, Any]:

@@ -63,9 +63,7 @@ class HiddenTruth:
             return None
         if found is None:
             return None
-        return cls(
-            found.array("positions", np.float64, 2, "m"), float(found.attribute("spacing_m"))
-        )
+        return cls(found.array("positions", np.float64, 2, "m"), found.number("spacing_m"))
 
     def mask_near(self, grid: Grid, reach: float) -> NDArray[np.bool_]:
         """Voxels (z, y, x) whose centres lie within `reach` m of something hidden.

@@ -21,7 +21,13 @@ from tofclip.io.streaks import outline_streak_file
 from tofclip.lidar import PointCloud
 from tofclip.lidar.photons.files import describe_photons
 from tofclip.loading import CLOUD_SUFFIXES, HDF5_SIGNATURE
-from tofclip.storage import Record, is_stand_in, read_outline, translate_read_errors
+from tofclip.storage import (
+    Record,
+    is_own_file,
+    is_stand_in,
+    read_outline,
+    translate_read_errors,
+)
 
 if TYPE_CHECKING:
     from tofclip.storage import Field
@@ -52,6 +58,8 @@ def _describe_file(file: Path) -> dict[str, Any]:
     try:
         return _describe_record(_read_outline(file))
     except FileFormatError as refusal:
+        if is_own_file(file):
+            raise  # a damaged record, not counted photons
         try:
             return describe_photons(file)
         except FileFormatError:

@@ -354,7 +354,7 @@ def read_head_if_recording(path: Path) -> Record | None:
         kind: Any = b""
         with contextlib.suppress(OSError), h5py.File(path, "r", locking=False) as opened:
             kind = opened.attrs.get("kind", b"")
-        if kind != RECORD_KIND.encode():
+        if not isinstance(kind, bytes) or kind != RECORD_KIND.encode():
             return None
     elif path.suffix.lower() not in RECORDING_SUFFIXES:
         return None

@@ -236,6 +236,16 @@ def test_a_small_file_that_claims_a_tebibyte(
     assert_refused(run(verb, bad, *flags), "'huge' claims")
 
 
+@pytest.mark.parametrize(("name", "value"), [("kind", np.zeros(3)), ("provenance", "[" * 60000)])
+def test_a_damaged_file_of_ours_is_not_taken_for_something_else(
+    run: Run, files: Path, tmp_path: Path, name: str, value: object
+) -> None:
+    bad = of_bytes(tmp_path / "bad.h5", (files / "streak.h5").read_bytes())
+    with h5py.File(bad, "r+") as file:
+        file.attrs[name] = value
+    assert_refused(run("info", bad), "bad.h5: ")
+
+
 def test_frames_without_any_return(run: Run, camera: Camera, tmp_path: Path, folder: Path) -> None:
     from tofclip import Frames
 

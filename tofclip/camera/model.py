@@ -133,6 +133,8 @@ class Camera(Storable):
         if dead.size == 0:
             dead = np.zeros(self.slit_width_px, dtype=bool)
         object.__setattr__(self, "dead_columns", dead)
+        if np.size(self.image_shape) != 2:
+            raise CalibrationError(f"a picture has two sides, got {self.image_shape}")
         object.__setattr__(
             self, "image_shape", (int(self.image_shape[0]), int(self.image_shape[1]))
         )
