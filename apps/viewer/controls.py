@@ -17,7 +17,7 @@ from apps.viewer.furniture import ClipBox
 from apps.viewer.page_text import Status, render_scale_html
 from apps.viewer.session import GATE_MODES, NO_LIMITS, DisplayedFrame, Filters, Limits, Session
 from apps.viewer.source import Setting
-from apps.viewer.viewpoint import Box
+from apps.viewer.viewpoint import Box, measure_point_spacing
 from tofclip.units import NANOSECOND
 
 if TYPE_CHECKING:
@@ -56,7 +56,9 @@ class Controls:
     ) -> None:
         self._gui, self._session, self._post = server.gui, session, post
         self._status = self._gui.add_html("")
-        self._add_playback()
+        self._frame: Any = None
+        if session.source.is_live or len(session.source) > 1:
+            self._add_playback()
         if session.source.capabilities.times is not None:
             self._add_time_gate()
         if session.source.capabilities.shears is not None:
@@ -83,10 +85,11 @@ class Controls:
         """
         if self._status.content != status.html:
             self._status.content = status.html
-        last = max(1, len(self._session.source) - 1)
-        if self._frame.max != last:
-            self._frame.max = last
-        self._frame.value = shown.frame
+        if self._frame is not None:
+            last = max(1, len(self._session.source) - 1)
+            if self._frame.max != last:
+                self._frame.max = last
+            self._frame.value = shown.frame
         self._appearance_panel.show(shown)
 
     def _add_playback(self) -> None:
@@ -94,7 +97,7 @@ class Controls:
         # A slider needs two different ends, even for a single frame.
         last = max(1, len(session.source) - 1)
         times = session.source.capabilities.times
-        self._frame: Any = gui.add_slider(
+        self._frame = gui.add_slider(
             session.source.frame_name,
             0,
             last,
@@ -126,7 +129,7 @@ class Controls:
         self._bind(half, self._set_half_gate)
 
     def _add_refocus(self, least: float, most: float) -> None:
-        hint = "recovers the gate once more by the linear inverse, at this shear in pixels per view step; 0: as it was"
+        hint = "recovers the gate once more, at this shear in pixels per view step; 0: as it was"
         slider = self._gui.add_slider("refocus", least, most, 0.1, 0.0, hint=hint)
         self._bind(slider, self._set_shear)
 
@@ -222,9 +225,6 @@ def bind_user_input(handle: Any, post: Post, act: Callable[[Any], None]) -> None
 
 MIN_POINT_SIZE_MM, MAX_POINT_SIZE_MM = 0.1, 50.0
 """mm."""
-
-MAX_NEIGHBOUR_POINTS = 20_000
-"""Points among which neighbours are looked for."""
 
 FILTER_NAMES = ("range", "intensity", "x", "y", "z")
 
@@ -379,12 +379,7 @@ def _suggest_point_size(first: DisplayedFrame) -> float:
     """Side of a point, mm, at which neighbours about touch."""
     if len(first.cloud) < 2:
         return 5.0
-    from scipy.spatial import cKDTree
-
-    thinned = first.cloud.xyz[:: max(1, len(first.cloud) // MAX_NEIGHBOUR_POINTS)]
-    apart, _ = cKDTree(thinned).query(thinned, 2)
-    # Of points on surfaces, n times as many are sqrt(n) times closer.
-    side = 1e3 * float(np.median(apart[:, 1]) * np.sqrt(len(thinned) / len(first.cloud)))
+    side = 1e3 * measure_point_spacing(first.cloud.xyz)
     return round(min(max(side, MIN_POINT_SIZE_MM), MAX_POINT_SIZE_MM), 1)
 
 

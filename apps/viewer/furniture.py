@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apps.viewer.colouring import format_length
-from apps.viewer.scene_figure import LABELLED_EDGES
 from apps.viewer.viewpoint import Box
 
 if TYPE_CHECKING:
@@ -45,10 +44,10 @@ def draw_furniture(scene: viser.SceneApi, box: Box) -> list[Any]:
         To be shown and hidden together.
     """
     drawn: list[Any] = [_add_lines(scene, "/box", box.corners[np.array(box.edges)], BOX_COLOUR)]
-    for axis, edge in enumerate(LABELLED_EDGES):
-        length = format_length(float(box.high[axis] - box.low[axis]))
-        middle = box.corners[list(edge)].mean(axis=0)
-        drawn.append(_add_label(scene, f"/box_{'xyz'[axis]}", f"{'xyz'[axis]} {length}", middle))
+    for name, length_m, place in zip("xyz", box.high - box.low, box.length_marks, strict=True):
+        words = f"{name} {format_length(float(length_m))}"
+        anchor = "top-right" if name == "z" else "top-left"  # z is written at the right
+        drawn.append(_add_label(scene, f"/box_{name}", words, place, anchor))
     bar = box.scale_bar
     if (length_m := float(bar[1, 0] - bar[0, 0])) > 0:
         drawn.append(_add_lines(scene, "/scale", bar[np.newaxis], SCALE_BAR_COLOUR, SCALE_BAR_PX))

@@ -101,10 +101,10 @@ class Status:
             lines.append(f"<span id='depth'>{html.escape(self.depth_text)}</span>")
         drawn = self.points if self.drawn_points is None else self.drawn_points
         part = f" ({drawn} drawn)" if drawn < self.points else ""
-        lines.append(
-            f"<span id='points'>{self.points}</span> points{part}, <span id='rates'>data "
-            f"{self.data_rate:.1f}/s, shown {self.frame_rate:.1f}/s</span>"
-        )
+        lines.append(f"<span id='points'>{self.points}</span> points{part}")
+        if self.frames > 1 or self.label == "LIVE":
+            coming = f"data {self.data_rate:.1f}/s, " if self.data_rate > 0 else ""
+            lines.append(f"<span id='rates'>{coming}shown {self.frame_rate:.1f}/s</span>")
         if self.label == "LIVE" or np.isfinite(self.cloud_latency):
             delay = (
                 f"{1e3 * self.cloud_latency:.0f} ms"

@@ -13,7 +13,7 @@ from apps.mp4 import open_film
 from apps.viewer.colouring import PALETTE_SIZE, choose_ticks, format_length, load_palette
 from apps.viewer.render import Renderer
 from apps.viewer.session import Session
-from apps.viewer.viewpoint import Box, Viewpoint, place_viewpoint
+from apps.viewer.viewpoint import Box, Viewpoint, measure_point_spacing, place_viewpoint
 from tofclip.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,11 +28,8 @@ DOTS_PER_INCH = 100
 COLOUR_BAR_TICKS = 7
 BOX_COLOUR, SCALE_BAR_COLOUR = "#8b93a3", "#ebeef5"
 SCALE_LABEL_PX = 4
-LABELLED_EDGES = ((6, 7), (4, 6), (2, 6))
-"""Edges of the box, by corners, that carry their length: those of its far side, which is always in
-the picture.
-"""
 
+MAX_POINT_PX = 16
 FEW_POINTS, MANY_POINTS = 20_000, 200_000
 
 Image = NDArray[np.uint8]
@@ -64,7 +61,7 @@ class SceneFigure:
     def draw(self, shown: DisplayedFrame) -> Figure:
         """Put what is shown into the figure, and return it."""
         image = self._renderer.draw(
-            shown, self.viewpoint, PICTURE_SHAPE_PX, choose_point_size(len(shown.cloud))
+            shown, self.viewpoint, PICTURE_SHAPE_PX, self._choose_point_size(shown)
         )
         self._image.set_data(image)
         note = (
@@ -96,6 +93,18 @@ class SceneFigure:
         drawn = np.asarray(self._canvas.buffer_rgba())[..., :3]
         rows, columns = (side - side % 2 for side in drawn.shape[:2])
         return np.ascontiguousarray(drawn[:rows, :columns])
+
+    def _choose_point_size(self, shown: DisplayedFrame) -> int:
+        """Return the side of a drawn point, pixels: such that half of the neighbours on surfaces
+        touch, and no less than few points need to be seen.
+        """
+        least, xyz = choose_point_size(len(shown.cloud)), shown.cloud.xyz
+        if len(xyz) < 2:
+            return least
+        _, _, depth = self.viewpoint.project(xyz, PICTURE_SHAPE_PX)
+        focal_px = PICTURE_SHAPE_PX[0] / 2 / np.tan(self.viewpoint.field_of_view / 2)
+        touching = focal_px * measure_point_spacing(xyz) / float(np.nanmedian(depth))
+        return int(min(max(np.ceil(touching), least), MAX_POINT_PX))
 
     def _draw_colours(self, scale: Scale) -> None:
         from matplotlib.cm import ScalarMappable
@@ -147,10 +156,10 @@ def _draw_box(axes: Any, viewpoint: Viewpoint, xyz: NDArray[np.float32]) -> None
     for edge in box.edges:
         ends = list(edge)
         axes.plot(column[ends], row[ends], color=BOX_COLOUR, linewidth=0.6, alpha=0.6)
-    for axis, (first, second) in enumerate(LABELLED_EDGES):
-        ends = [first, second]
-        length = float(box.high[axis] - box.low[axis])
-        _label_length(axes, column[ends], row[ends], "xyz"[axis], length)
+    row, column, _ = viewpoint.project(box.length_marks, PICTURE_SHAPE_PX)
+    for name, length_m, x, y in zip("xyz", box.high - box.low, column, row, strict=True):
+        words = f"{name} {format_length(float(length_m))}"
+        axes.text(x, y, words, color=BOX_COLOUR, fontsize=7, ha="center", va="bottom", clip_on=True)
     bar = box.scale_bar
     row, column, _ = viewpoint.project(bar, PICTURE_SHAPE_PX)
     axes.plot(column, row, color=SCALE_BAR_COLOUR, linewidth=2.5, solid_capstyle="butt")
@@ -166,13 +175,6 @@ def _draw_box(axes: Any, viewpoint: Viewpoint, xyz: NDArray[np.float32]) -> None
     )
     axes.set_xlim(-0.5, PICTURE_SHAPE_PX[1] - 0.5)
     axes.set_ylim(PICTURE_SHAPE_PX[0] - 0.5, -0.5)
-
-
-def _label_length(
-    axes: Any, column: NDArray[Any], row: NDArray[Any], name: str, length: float
-) -> None:
-    words = {"color": BOX_COLOUR, "fontsize": 7, "ha": "center", "va": "bottom", "clip_on": True}
-    axes.text(float(column.mean()), float(row.mean()), f"{name} {format_length(length)}", **words)
 
 
 def choose_point_size(points: int) -> int:

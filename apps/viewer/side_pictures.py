@@ -67,7 +67,20 @@ def project_front(cloud: PointCloud) -> dict[str, Picture]:
     light = np.zeros_like(depth)
     column, row = place[order].T
     depth[row, column], light[row, column] = cloud.xyz[order, 2], cloud.intensity[order]
+    _close_seams(depth, light)
     return {"intensity": light, "depth": depth}
+
+
+def _close_seams(depth: Picture, light: Picture) -> None:
+    """Fill, in place, empty pixels between two seen ones of a row or a column: a camera with fewer
+    pixels than the picture leaves such seams.
+    """
+    for deep, bright in ((depth, light), (depth.T, light.T)):
+        before, here, after = deep[:-2], deep[1:-1], deep[2:]
+        seam = np.isnan(here) & np.isfinite(before) & np.isfinite(after)
+        nearer = before <= after
+        here[seam] = np.where(nearer, before, after)[seam]
+        bright[1:-1][seam] = np.where(nearer, bright[:-2], bright[2:])[seam]
 
 
 def colour_brightness(picture: Picture, palette: str) -> Image:

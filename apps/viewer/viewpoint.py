@@ -90,6 +90,9 @@ class Viewpoint:
 SCALE_BAR_FRACTION = 0.4
 """The scale bar is at most as long as this fraction of the box's width."""
 
+SCALE_BAR_DEPTH, Z_MARK_DEPTH = 0.7, 0.85
+"""Fractions of the box's depth, from its front: there neither hides the other's words from any side."""
+
 
 @dataclass(frozen=True)
 class Box:
@@ -123,12 +126,41 @@ class Box:
 
     @property
     def scale_bar(self) -> FloatArray:
-        """Ends of a bar of a round length across the floor, half way to the back, (2, 3) in m."""
+        """Ends of a bar of a round length across the floor, near the back, (2, 3) in m."""
         width = float(self.high[0] - self.low[0])
         length = round_length_down(SCALE_BAR_FRACTION * width) if width > 0 else 0.0
         middle = (self.low + self.high) / 2
-        start = np.array([middle[0] - length / 2, self.high[1], middle[2]])
+        depth = (1 - SCALE_BAR_DEPTH) * self.low[2] + SCALE_BAR_DEPTH * self.high[2]
+        start = np.array([middle[0] - length / 2, self.high[1], depth])
         return np.stack([start, start + np.array([length, 0.0, 0.0])])
+
+    @property
+    def length_marks(self) -> FloatArray:
+        """Where the lengths of the sides along x, y and z are written, (3, 3) in m: at edges of the
+        far side, which is always in the picture, and of the floor close to it.
+        """
+        (left, ceiling, front), (right, floor, back) = self.low, self.high
+        middle = (self.low + self.high) / 2
+        near_back = (1 - Z_MARK_DEPTH) * front + Z_MARK_DEPTH * back
+        return np.array(
+            [[middle[0], ceiling, back], [left, middle[1], back], [right, floor, near_back]]
+        )
+
+
+MAX_NEIGHBOUR_POINTS = 20_000
+"""Points among which neighbours are looked for."""
+
+
+def measure_point_spacing(xyz: NDArray[np.float32]) -> float:
+    """Return the median distance, m, of the points (n, 3) of surfaces from their neighbours; two
+    points at least.
+    """
+    from scipy.spatial import cKDTree
+
+    thinned = xyz[:: max(1, len(xyz) // MAX_NEIGHBOUR_POINTS)]
+    apart, _ = cKDTree(thinned).query(thinned, 2)
+    # Of points on surfaces, n times as many are sqrt(n) times closer.
+    return float(np.median(apart[:, 1]) * np.sqrt(len(thinned) / len(xyz)))
 
 
 def round_length_down(length: float) -> float:
@@ -168,9 +200,8 @@ def make_presets(xyz: NDArray[np.float32], aspect: float = 1.5) -> dict[str, Vie
     }
     if np.linalg.norm(middle) > reach:  # the camera is outside of the cloud
         camera = Viewpoint(np.zeros(3), middle)
-        views["camera"] = Viewpoint(
-            np.zeros(3), middle, min(_fit_field_of_view(camera, xyz, aspect), np.deg2rad(120.0))
-        )
+        wide = max(_fit_field_of_view(camera, one, aspect) for one in (xyz, box.scale_bar))
+        views["camera"] = Viewpoint(np.zeros(3), middle, min(wide, np.deg2rad(120.0)))
     return views
 
 

@@ -26,7 +26,13 @@ from apps.viewer.controls import mark_times
 from apps.viewer.picking import find_point_on_ray, make_pick, measure_distance
 from apps.viewer.session import Filters
 from apps.viewer.source import make_empty_cloud
-from apps.viewer.viewpoint import SCALE_BAR_FRACTION, Box, place_viewpoint, round_length_down
+from apps.viewer.viewpoint import (
+    SCALE_BAR_DEPTH,
+    SCALE_BAR_FRACTION,
+    Box,
+    place_viewpoint,
+    round_length_down,
+)
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud
 
@@ -178,7 +184,9 @@ def test_a_scale_bar_is_one_two_or_five(longest: float, bar: float) -> None:
     box = Box(np.zeros(3), np.array([longest / SCALE_BAR_FRACTION, 1.0, 2.0]))
     ends = box.scale_bar
     assert np.diff(ends, axis=0)[0] == pytest.approx([bar, 0, 0])
-    assert ends.mean(axis=0) == pytest.approx([longest / SCALE_BAR_FRACTION / 2, 1.0, 1.0])
+    assert ends.mean(axis=0) == pytest.approx(
+        [longest / SCALE_BAR_FRACTION / 2, 1.0, 2.0 * SCALE_BAR_DEPTH]
+    )
 
 
 def test_a_time_line_has_round_instants_at_their_frames() -> None:

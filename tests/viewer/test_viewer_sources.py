@@ -29,11 +29,15 @@ from viewer_scenes import (
     volume,
 )
 
+from apps.viewer.clouds import make_cloud
 from apps.viewer.live import LiveShotSource
+from apps.viewer.render import RasterRenderer
+from apps.viewer.scene_figure import SceneFigure
 from apps.viewer.session import GATE_ALL_TIMES, GATE_AROUND_FRAME, GATE_UP_TO_FRAME, Session
 from apps.viewer.side_pictures import project_front, render_pictures
-from apps.viewer.source import LINEAR_NOTE, NO_TIME_ZERO_NOTE, Gate, Source
+from apps.viewer.source import LINEAR_NOTE, NO_TIME_ZERO_NOTE, Gate, Source, View
 from apps.viewer.source_factory import FIRST_LOOK_NOTE, ShotOptions, open_source
+from apps.viewer.viewpoint import Box, measure_point_spacing, place_viewpoint
 from apps.viewer.volume import PROJECTION_MODE, SLICE_MODE, SURFACE_MODE
 from tofclip.camera import Rectifier
 from tofclip.camera.calibration import registration
@@ -400,3 +404,50 @@ def test_panes_have_a_handy_size_and_dark_holes() -> None:
     assert (empty == (32, 36, 44)).all(axis=-1).mean() > 0.9
     tall = render_pictures({"streak": np.ones((1016, 1344), np.float32)}, scale)["streak"]
     assert max(tall.shape) <= 420
+
+
+def test_a_camera_with_few_pixels_leaves_no_seams_in_the_panes() -> None:
+    """A surface of 90 x 90 points in a picture of 128 x 128 pixels, but for a hole in it."""
+    across = np.linspace(-0.5, 0.5, 90)
+    x, y = (side.ravel() for side in np.meshgrid(across, across))
+    whole = np.hypot(x, y) > 0.15
+    xyz = np.column_stack([x, y, np.full(x.size, 2.0)])[whole].astype(np.float32)
+    made = project_front(make_cloud(xyz, {"intensity": np.ones(len(xyz), np.float32)}))
+    side = (np.arange(128) / 127 - 0.5) * 1.0
+    radius = np.hypot(*np.meshgrid(side, side))
+    inside = np.s_[2:-2, 2:-2]  # the outermost points lie outside of the percentiles
+    assert np.isfinite(made["depth"])[inside][radius[inside] > 0.17].all()
+    assert np.isnan(made["depth"])[radius < 0.12].all()
+    assert (made["intensity"][np.isfinite(made["depth"])] == 1).all()
+
+
+@pytest.mark.parametrize("direction", [0, 1, 2])
+def test_lengths_of_the_box_are_written_apart_from_the_scale_bar(direction: int) -> None:
+    """Seen along any axis, no two words stand within a twentieth of the box."""
+    box = Box(np.array([-1.0, -0.5, 1.5]), np.array([1.0, 0.7, 4.0]))
+    places = np.vstack([box.length_marks, box.scale_bar.mean(axis=0)])
+    seen = np.delete((places - box.low) / (box.high - box.low), direction, axis=1)
+    apart = np.linalg.norm(seen[:, np.newaxis] - seen, axis=-1)
+    assert apart[np.triu_indices(4, 1)].min() > 0.05
+
+
+def test_points_of_a_picture_touch_however_few_they_are() -> None:
+    """A surface of 41 x 41 points is drawn without seams."""
+    across = np.linspace(-0.5, 0.5, 41)
+    x, y = (side.ravel() for side in np.meshgrid(across, across))
+    xyz = np.column_stack([x, y, np.full(x.size, 2.0)]).astype(np.float32)
+    assert measure_point_spacing(xyz) == pytest.approx(0.025, rel=1e-3)
+    cloud = make_cloud(xyz, {"intensity": np.ones(len(xyz), np.float32)})
+
+    class OnePlane(PlaneSource):
+        def view(self, number: int) -> View:
+            return View(cloud)
+
+    shown = Session(OnePlane(1)).frame_at(0.0)
+    drawn = SceneFigure("plane", shown, RasterRenderer()).draw(shown).axes[0].images[0]
+    rows, columns, _ = place_viewpoint(xyz, 1.5).project(xyz, (640, 960))
+    inside = np.asarray(drawn.get_array())[
+        int(rows.min()) + 12 : int(rows.max()) - 12,
+        int(columns.min()) + 12 : int(columns.max()) - 12,
+    ]
+    assert (inside.sum(axis=-1) > 200).mean() > 0.97  # the dark ground adds up to 87
