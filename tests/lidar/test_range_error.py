@@ -7,6 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from tofclip.lidar.neighbours import (
+    NEIGHBOURS,
     add_recovery_error,
     pool_significance,
     scatter_about_plane,
@@ -107,8 +108,9 @@ def test_the_scatter_about_a_plane_counts_the_three_numbers_that_the_plane_took(
     found = []
     for _ in range(2000):
         off = 0.3 * right - 0.2 * down + random.normal(0, 1, right.shape)
-        around = np.stack([right.ravel(), down.ravel(), off.ravel()], axis=1)
-        used, residual = np.empty(12, bool), np.empty(12)
-        found.append(scatter_about_plane(around, 1e3, used, residual))
+        around = np.zeros((3, NEIGHBOURS), np.float32)
+        around[:, :12] = right.ravel(), down.ravel(), off.ravel()
+        used, residual = np.empty(NEIGHBOURS, np.float32), np.empty(NEIGHBOURS, np.float32)
+        found.append(scatter_about_plane(around, 12, 1e3, used, residual))
     # Medians of so few are 3 or 4 % off by themselves.
     assert np.mean(found) == pytest.approx(1, abs=0.07)

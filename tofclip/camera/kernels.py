@@ -50,6 +50,38 @@ def sample_in_time(counts, dark, raw_row, delay, measurements):
             first = end
 
 
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy", _nrt=False)
+def sample_runs(counts, dark, raw_row, runs, measurements):
+    """Sample as `sample_in_time` does without a delay, between rows that were looked up beforehand.
+
+    Parameters
+    ----------
+    counts : (raw rows, columns) float32 array
+    dark : float32
+    raw_row : (rows, columns) float32 array
+        Where each rectified pixel lies in the raw image.
+    runs : (n, 4) uint64 array
+        Rectified row, first column, the one after the last, and the upper of the two raw rows
+        between which all of them lie; from the number of raw rows on, they lie beyond the image.
+    measurements : (rows, columns) float32 array, overwritten where the runs say
+        0 beyond the raw image.
+    """
+    rows = np.uintp(counts.shape[0])
+    below = np.uintp(min(1, counts.shape[0] - 1))
+    for k in range(runs.shape[0]):
+        row, first, end, top = runs[k, 0], runs[k, 1], runs[k, 2], runs[k, 3]
+        # slices by unsigned numbers, in which no index can count from the end: they become vectors
+        reading = measurements[row, first:end]
+        if top >= rows:
+            for i in range(reading.size):
+                reading[i] = np.float32(0)
+            continue
+        upper, lower = counts[top, first:end], counts[top + below, first:end]
+        position, height = raw_row[row, first:end], np.float32(top)
+        for i in range(reading.size):
+            reading[i] = upper[i] + (position[i] - height) * (lower[i] - upper[i]) - dark
+
+
 @fast_njit
 def sample_bilinear(counts, dark, raw_row, raw_column, delay, measurements):
     """Sample bilinearly; see `sample_in_time`.

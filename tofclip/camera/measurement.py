@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -123,7 +124,8 @@ class Rectifier:
 
     Notes
     -----
-    Memory: as much as a raw picture, twice if the sweep moves light across columns.
+    Memory: as much as a raw picture, twice if the sweep moves light across columns, and at first
+    use four times as much for a moment.
     """
 
     def __init__(self, camera: Camera, rows: int) -> None:
@@ -207,7 +209,7 @@ class Rectifier:
         CalibrationError, InputError
             As for `measure`, but for measurements that cannot be trusted.
         """
-        from tofclip.camera.kernels import sample_bilinear, sample_in_time
+        from tofclip.camera.kernels import sample_bilinear, sample_in_time, sample_runs
 
         self._require_shape(counts)
         level, shift = (
@@ -218,7 +220,10 @@ class Rectifier:
 
         def work(piece: slice) -> None:
             rows, target = self._raw_row[piece], measurements[piece]
-            if self._stays_in_column:
+            if self._stays_in_column and delay == 0:
+                first, last = np.searchsorted(self._runs[:, 0], [piece.start, piece.stop])
+                sample_runs(raw, level, self._raw_row, self._runs[first:last], measurements)
+            elif self._stays_in_column:
                 sample_in_time(raw, level, rows, shift, target)
             else:
                 sample_bilinear(raw, level, rows, self._raw_column[piece], shift, target)
@@ -229,6 +234,19 @@ class Rectifier:
         if not measurements.max() > 0:
             raise InputError(NO_LIGHT_MESSAGE)
         return measurements.T
+
+    @cached_property
+    def _runs(self) -> NDArray[np.uint64]:
+        """Neighbours in a row that come from the same two raw rows; see `sample_runs`."""
+        rows, columns = self._raw_row.shape
+        top = np.clip(self._raw_row.astype(np.int64), 0, max(rows - 2, 0))
+        top[(self._raw_row < 0) | (self._raw_row > rows - 1)] = rows
+        starts = np.ones(top.shape, bool)
+        np.not_equal(top[:, 1:], top[:, :-1], out=starts[:, 1:])
+        row, first = np.nonzero(starts)
+        # a run ends where the next one of its row begins
+        last = np.where(np.append(row[1:], -1) == row, np.append(first[1:], 0), columns)
+        return np.stack([row, first, last, top[row, first]], axis=1).astype(np.uint64)
 
     def _find_valid(self, bad: Mask, delay: float) -> Mask:
         from tofclip.camera.kernels import mark_valid

@@ -43,7 +43,13 @@ MIN_KNOWN = 20
 """Returns with enough neighbours that say how far the others are off."""
 
 MAD_TO_SIGMA = 1.4826
+MEDIAN_PRECISION = 1e-4
 RETURNS_PER_BLOCK = 512
+
+NEIGHBOURS = 96
+"""Room for the (2 * 8 / 2 + 1)^2 = 81 neighbours, in whole vectors."""
+
+vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy", _nrt=False)
 
 
 def add_recovery_error(
@@ -76,7 +82,8 @@ def add_recovery_error(
         One standard deviation, m. Returns with few neighbours get what is usual for the others.
     """
     total = np.asarray(sigma, dtype=np.float64).copy()
-    starts = np.searchsorted(pixel, np.arange(image_shape[0] * image_shape[1] + 1))
+    starts = np.zeros(image_shape[0] * image_shape[1] + 1, np.int64)
+    np.cumsum(np.bincount(pixel, minlength=starts.size - 1), out=starts[1:])
     nearness = 1 / (distance * along_axis)
     metres = distance / nearness
     scatter = np.empty(total.size)
@@ -129,9 +136,8 @@ def scatter_about_planes(
     scatter : (n,) array
         Overwritten at the chosen: m.
     """
-    side = 2 * (REACH_PX // STRIDE_PX) + 1
-    around, residual = np.empty((side * side, 3)), np.empty(side * side)
-    used = np.empty(side * side, np.bool_)
+    around = np.zeros((3, NEIGHBOURS), np.float32)
+    used, residual = np.empty(NEIGHBOURS, np.float32), np.empty(NEIGHBOURS, np.float32)
     for own in chosen:
         if borrow:
             donor = find_donor(nearness, metres, pixel, starts, image_shape, own)
@@ -139,21 +145,22 @@ def scatter_about_planes(
                 scatter[own] = scatter[donor[0]]
                 continue
         number = collect_neighbours(nearness, metres, pixel, starts, image_shape, own, around)
-        scatter[own] = scatter_about_plane(around[:number], gate, used, residual)
+        scatter[own] = scatter_about_plane(around, number, gate, used, residual)
 
 
 @compiled
-def scatter_about_plane(around, gate, used, residual):
+def scatter_about_plane(around, number, gate, used, residual):
     """Robust deviation of neighbours from a plane through them, -1 if they are few.
 
     Parameters
     ----------
-    around : (neighbours, 3) array
+    around : (3, NEIGHBOURS) float32 array
         Columns and rows away, and how much further off, in m.
+    number : int
+        Of neighbours; what follows them does not count.
     gate : float
         m.
-    used : (neighbours or more,) bool array
-    residual : (neighbours or more,) array
+    used, residual : (NEIGHBOURS,) float32 array
         Room for what is worked out.
 
     Returns
@@ -161,69 +168,95 @@ def scatter_about_plane(around, gate, used, residual):
     float
         m.
     """
-    number, scatter = around.shape[0], -1.0
-    for t in range(number):
-        used[t] = abs(around[t, 2]) < gate
+    scatter = -1.0
+    measure_offsets(around, 0.0, 0.0, 0.0, residual)
+    mark_near(residual, number, gate, used)
     for _ in range(FIT_ROUNDS):
         a, b, c, count = fit_plane_around(around, used)
         if count < MIN_NEIGHBOURS:
             return -1.0
-        left = 0
-        for t in range(number):
-            if used[t]:
-                residual[left] = abs(around[t, 2] - a * around[t, 0] - b * around[t, 1] - c)
-                left += 1
+        measure_offsets(around, a, b, c, residual)
         free = count / (count - 3.0)
-        scatter = MAD_TO_SIGMA * select_median(residual, left) * np.sqrt(free)
-        changed = False
-        for t in range(number):
-            off = around[t, 2] - a * around[t, 0] - b * around[t, 1] - c
-            near = abs(off) <= OUTLIER_DEVIATIONS * scatter
-            changed |= near != used[t]
-            used[t] = near
-        if not changed:  # further rounds would find the same
+        scatter = MAD_TO_SIGMA * find_median(residual, used, count) * np.sqrt(free)
+        # further rounds would find the same
+        if not mark_near(residual, number, OUTLIER_DEVIATIONS * scatter, used):
             break
     return scatter
 
 
-@compiled
-def select_median(values, count):
-    """Return the median of ``values[:count]``, which are put in another order.
-
-    By selection instead of sorting: most of the time of `scatter_about_planes` is spent here.
+@vectorised
+def measure_offsets(around, a, b, c, residual):
+    """Distance of each neighbour from the plane ``a * right + b * down + c``.
 
     Parameters
     ----------
-    values : (count or more,) array
+    around : (3, NEIGHBOURS) float32 array
+    a, b, c : float
+    residual : (NEIGHBOURS,) float32 array
+        Overwritten, m.
+    """
+    right, down, off = around[0], around[1], around[2]
+    a, b, c = np.float32(a), np.float32(b), np.float32(c)
+    for t in range(NEIGHBOURS):
+        residual[t] = abs(off[t] - a * right[t] - b * down[t] - c)
+
+
+@vectorised
+def mark_near(residual, number, most, used):
+    """Use the neighbours that are off by at most so much; return whether others were used before.
+
+    Parameters
+    ----------
+    residual : (NEIGHBOURS,) float32 array
+    number : int
+        Of neighbours.
+    most : float
+        m.
+    used : (NEIGHBOURS,) float32 array
+        Overwritten: 1 or 0.
+
+    Returns
+    -------
+    bool
+    """
+    most, count, changed = np.float32(most), np.int32(number), np.float32(0)
+    for t in range(NEIGHBOURS):
+        near = np.float32(1) if residual[t] <= most and np.int32(t) < count else np.float32(0)
+        changed += abs(near - used[t])
+        used[t] = near
+    return changed > 0
+
+
+@vectorised
+def find_median(residual, used, count):
+    """Return the median of what is used, by halving an interval: each step is one look at all.
+
+    Parameters
+    ----------
+    residual, used : (NEIGHBOURS,) float32 array
     count : int
-        At least one.
+        Of those used, at least one.
 
     Returns
     -------
     float
+        To `MEDIAN_PRECISION` of the largest.
     """
-    middle, first, last = count // 2, 0, count - 1
-    while first < last:  # C. A. R. Hoare's FIND
-        pivot, low, high = values[middle], first, last
-        while low <= high:
-            while values[low] < pivot:
-                low += 1
-            while pivot < values[high]:
-                high -= 1
-            if low <= high:
-                values[low], values[high] = values[high], values[low]
-                low += 1
-                high -= 1
-        if high < middle:
-            first = low
-        if middle < low:
-            last = high
-    if count % 2 == 1:
-        return values[middle]
-    below = values[0]
-    for t in range(1, middle):
-        below = max(below, values[t])
-    return (below + values[middle]) / 2
+    high = low = np.float32(0)
+    for t in range(NEIGHBOURS):
+        high = max(high, used[t] * residual[t])
+    precision = np.float32(MEDIAN_PRECISION) * high
+    while high - low > precision:
+        middle, below = np.float32(0.5) * (low + high), np.float32(0)
+        for t in range(NEIGHBOURS):
+            below += used[t] if residual[t] <= middle else np.float32(0)
+        if 2 * below == count:
+            return float(middle)
+        if 2 * below > count:
+            high = middle
+        else:
+            low = middle
+    return float(high)
 
 
 @compiled
@@ -271,7 +304,7 @@ def collect_neighbours(nearness, metres, pixel, starts, image_shape, own, around
         As for `scatter_about_planes`.
     own : int
         Number of the return.
-    around : (neighbours, 3) array
+    around : (3, NEIGHBOURS) float32 array
         Overwritten.
 
     Returns
@@ -292,19 +325,19 @@ def collect_neighbours(nearness, metres, pixel, starts, image_shape, own, around
                 if abs(off) < abs(best):
                     best = off
             if best < np.inf:
-                around[number, 0], around[number, 1], around[number, 2] = i, j, best
+                around[0, number], around[1, number], around[2, number] = i, j, best
                 number += 1
     return number
 
 
-@compiled
+@vectorised
 def fit_plane_around(around, used):
     """Least-squares plane ``a * right + b * down + c`` through the neighbours that are used.
 
     Parameters
     ----------
-    around : (neighbours, 3) array
-    used : (neighbours,) bool array
+    around : (3, NEIGHBOURS) float32 array
+    used : (NEIGHBOURS,) float32 array
 
     Returns
     -------
@@ -312,30 +345,30 @@ def fit_plane_around(around, used):
     count : int
         Neighbours used; 0 if they lie in one line, which says nothing of the slope across it.
     """
-    count = 0
-    s = sx = sy = sxx = sxy = syy = sxv = syv = 0.0
-    for t in range(around.shape[0]):
-        if used[t]:
-            right, down, off = around[t]
-            count += 1
-            s += off
-            sx += right
-            sy += down
-            sxx += right * right
-            sxy += right * down
-            syy += down * down
-            sxv += right * off
-            syv += down * off
-    if count < MIN_NEIGHBOURS:
+    right, down, off = around[0], around[1], around[2]
+    zero = np.float32(0)
+    n = s = sx = sy = sxx = sxy = syy = sxv = syv = zero
+    for t in range(NEIGHBOURS):
+        x, y, v = used[t] * right[t], used[t] * down[t], used[t] * off[t]
+        n += used[t]
+        s += v
+        sx += x
+        sy += y
+        sxx += x * right[t]
+        sxy += x * down[t]
+        syy += y * down[t]
+        sxv += x * off[t]
+        syv += y * off[t]
+    if n < MIN_NEIGHBOURS:
         return 0.0, 0.0, 0.0, 0
-    cxx, cxy, cyy = sxx - sx * sx / count, sxy - sx * sy / count, syy - sy * sy / count
-    cxv, cyv = sxv - sx * s / count, syv - sy * s / count
+    cxx, cxy, cyy = sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n
+    cxv, cyv = sxv - sx * s / n, syv - sy * s / n
     determinant = cxx * cyy - cxy * cxy
-    if determinant <= 1e-6 * cxx * cyy:
+    if determinant <= np.float32(1e-5) * cxx * cyy:  # in single precision
         return 0.0, 0.0, 0.0, 0
     a = (cyy * cxv - cxy * cyv) / determinant
     b = (cxx * cyv - cxy * cxv) / determinant
-    return a, b, (s - a * sx - b * sy) / count, count
+    return float(a), float(b), float((s - a * sx - b * sy) / n), int(n)
 
 
 @njit(nogil=True, cache=True)

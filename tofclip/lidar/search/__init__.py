@@ -31,7 +31,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,9 @@ from tofclip.lidar.traces import FrameTraces, TraceBins, Traces
 from tofclip.shots import Frames, Returns
 from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
+
+if TYPE_CHECKING:
+    from tofclip.lidar.search.lone_fit import PhaseTable
 
 FloatArray = NDArray[np.float64]
 
@@ -202,7 +205,9 @@ class ReturnSearch:
             gains,
         )
         times = self.times[bins.numbers]
-        fixed = times, bins.bin_weights, filters, self.pulse.kernel_table()
+        table = self._phase_table
+        phases = table.find_even_bins(bins), table.shapes, table.slopes, table.sums, table.half
+        fixed = times, bins.bin_weights, filters, self.pulse.kernel_table(), phases
         found = np.empty((total, self.detection.max_returns, 3))
         counts = np.zeros(total, np.int64)
         limits = (
@@ -281,6 +286,12 @@ class ReturnSearch:
         return _build_filter(self.times, self.pulse.compress(SHARPENING_FACTOR), 4), _build_filter(
             self.times, self.pulse, 2
         )
+
+    @cached_property
+    def _phase_table(self) -> PhaseTable:
+        from tofclip.lidar.search.lone_fit import PhaseTable
+
+        return PhaseTable.tabulate(self.pulse, self.times)
 
     @cached_property
     def _portable(self) -> ArraySearch:

@@ -19,6 +19,7 @@ from tofclip.lidar.pulse_fit import (
     refine_returns,
     sort_rows,
 )
+from tofclip.lidar.search.lone_fit import fit_lone_returns
 
 BINS_PER_GROUP = 32  # bins of which the highest peak is kept
 NEIGHBOUR_FRACTION = 0.5  # of what is of interest: weaker peaks do not move a return beside them
@@ -28,7 +29,9 @@ vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy", _n
 
 
 @njit(nogil=True, cache=True)
-def find_returns(traces, pixels, times, bin_weights, filters, pulse, limits, least, found, counts):
+def find_returns(
+    traces, pixels, times, bin_weights, filters, pulse, phases, limits, least, found, counts
+):
     """Find the returns of each trace.
 
     Candidates are the peaks of the trace under a sharp filter, which still shows two returns where
@@ -51,6 +54,8 @@ def find_returns(traces, pixels, times, bin_weights, filters, pulse, limits, lea
         the sum over the others. Then the largest sum of either.
     pulse : tuple
         See `Pulse.kernel_table`.
+    phases : tuple
+        Even bins, and shapes, slopes, sums and half of a `tofclip.lidar.search.lone_fit.PhaseTable`.
     limits : (float, float, float, float, float)
         Smallest distance between two returns, s, smallest signal-to-noise, smallest fraction of
         the strongest return, with the fall-off with range undone, the last instant at which a
@@ -73,16 +78,28 @@ def find_returns(traces, pixels, times, bin_weights, filters, pulse, limits, lea
         np.empty((found.shape[1], 4)),
         np.empty((found.shape[1], 5)),
         np.empty((times.size, 3)),
+        np.zeros(phases[1].shape[1], np.float32),
     )
     for place in range(traces.shape[0]):
         pixel = pixels[place]
         counts[pixel] = find_trace_returns(
-            traces[place], times, bin_weights, filters, pulse, limits, least, memory, found[pixel]
+            traces[place],
+            times,
+            bin_weights,
+            filters,
+            pulse,
+            phases,
+            limits,
+            least,
+            memory,
+            found[pixel],
         )
 
 
 @compiled
-def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, least, memory, found):
+def find_trace_returns(
+    trace, times, bin_weights, filters, pulse, phases, limits, least, memory, found
+):
     """Find the returns of one trace and return their number; `memory` is overwritten.
 
     Parameters
@@ -97,11 +114,12 @@ def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, least,
         See `tofclip.lidar.search`.
     pulse : (curve, scale)
         See `tofclip.lidar.pulse_fit`.
+    phases : tuple
     limits : (5,) floats
         See `find_returns`.
     least : (bins,) array
         See `find_returns`.
-    memory : seven arrays
+    memory : eight arrays
         Overwritten.
     found : (returns, 3) array
         Overwritten: seconds, sum over the bins, standard deviation in seconds.
@@ -111,7 +129,8 @@ def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, least,
     int
     """
     (sharp, matched, gains), (curve, scale) = filters, pulse
-    score, maxima, bounds, free, peaks, estimate, profile = memory
+    even, shapes, slopes, sums, half = phases
+    score, maxima, bounds, free, peaks, estimate, profile, rest = memory
     correlate_trace(trace, sharp, score)
     total, square, bins = sum_moments(trace, bin_weights)
     # the sharp filter's response to the background, below which nothing of interest can lie
@@ -147,8 +166,28 @@ def find_trace_returns(trace, times, bin_weights, filters, pulse, limits, least,
                 trace, times, matched, background, j, strength
             )
             estimate[kept, 1] = max(trace[j] - background, 0.0)
-            estimate[kept, 2], estimate[kept, 3] = peaks[k, 2], peaks[k, 3]
+            estimate[kept, 2], estimate[kept, 3], estimate[kept, 4] = peaks[k, 2], peaks[k, 3], j
             kept += 1
+    # light that ends before the other's begins, whatever both of them move
+    distance = 2 * half + 1
+    number = fit_lone_returns(
+        trace,
+        times,
+        background,
+        noise,
+        above_noise,
+        estimate[:kept],
+        distance,
+        even,
+        shapes,
+        slopes,
+        sums,
+        half,
+        rest,
+        found,
+    )
+    if number >= 0:
+        return number
     refine_returns(
         trace, times, background, curve, scale, estimate[:kept], EVEN_VARIANCE, MAX_FIT_ROUNDS
     )

@@ -1,0 +1,66 @@
+"""The fit of returns that stand alone, by a table of the pulse."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofclip.camera import Camera
+from tofclip.lidar import Detection, Pulse, depth
+from tofclip.lidar.search.lone_fit import MAX_OFFSET_BINS, PHASES_PER_BIN, PhaseTable
+from tofclip.lidar.traces import TraceBins
+from tofclip.shots import Frames
+
+BIN, FWHM = 20e-12, 60e-12
+SIDE, BINS = 8, 60
+TIMES = 10e-9 + BIN * np.arange(BINS)
+
+
+def look(arrivals_bins: np.ndarray, times: np.ndarray, noise: float = 0.0) -> Frames:
+    """One return in each pixel, so many bins after the first."""
+    after = times[:, np.newaxis] - (times[0] + BIN * arrivals_bins)
+    values = 100 * Pulse.gaussian(FWHM)(after) + 3.0
+    values += np.random.default_rng(0).normal(0, 1, values.shape) * noise
+    camera = Camera([20.0], [0.1], (SIDE, SIDE), 41, pulse_fwhm=FWHM)
+    return Frames(values.reshape(-1, SIDE, SIDE).astype(np.float32), times, camera)
+
+
+def test_a_return_is_where_it_arrives_whatever_part_of_a_bin_that_is():
+    arrivals = 30 + np.linspace(-0.5, 0.5, SIDE * SIDE)
+    found = depth(look(arrivals, TIMES), detection=Detection(min_time_bin_fraction=0))
+    assert len(found) == SIDE * SIDE
+    # (1 / 128)^2 of a bin, and the background's 3 counts in single precision
+    np.testing.assert_allclose((found.time - TIMES[0]) / BIN, arrivals, atol=2e-4)
+
+
+def test_it_agrees_with_the_exact_fit_which_an_uneven_axis_needs():
+    arrivals = np.random.default_rng(1).uniform(20, 40, SIDE * SIDE)
+    # a last bin that is longer, far from all light: the axis is uneven, and the fit exact
+    uneven = np.append(TIMES[:-1], TIMES[-1] + 0.3 * BIN)
+    assert PhaseTable.tabulate(Pulse.gaussian(FWHM), uneven).half == 0
+    by_table, exact = (depth(look(arrivals, times, 3.0)) for times in (TIMES, uneven))
+    assert len(by_table) == len(exact) == SIDE * SIDE
+    apart = np.abs(by_table.time - exact.time) / BIN
+    assert np.median(apart) < 1 / 128**2 * 10
+    # where the last step is shorter than 5e-3 bins, one more would be a part of that
+    assert apart.max() < 5e-3
+    np.testing.assert_allclose(by_table.intensity, exact.intensity, rtol=1e-3)
+
+
+def test_the_table_holds_the_sums_of_its_pulse():
+    table = PhaseTable.tabulate(Pulse.gaussian(FWHM), TIMES)
+    shape, slope = table.shapes.astype(float), table.slopes.astype(float)
+    np.testing.assert_allclose(table.sums[:, 0], (shape**2).sum(axis=1), rtol=1e-6)
+    np.testing.assert_allclose(table.sums[:, 2], (slope**2).sum(axis=1), rtol=1e-6)
+    # with a pulse in the middle of its bin, no change of height looks like a shift
+    middle = round(MAX_OFFSET_BINS * PHASES_PER_BIN)
+    assert abs(table.sums[middle, 1]) < 1e-9
+    assert shape[middle].argmax() == table.half
+
+
+def test_bins_whose_neighbours_are_not_held_are_left_to_the_exact_fit():
+    table = PhaseTable.tabulate(Pulse.gaussian(FWHM), TIMES)
+    numbers = np.r_[0:20, 22:60]
+    bins = TraceBins(numbers, np.ones(58, bool), np.ones(58, np.float32))
+    even = table.find_even_bins(bins)
+    half = table.half
+    assert np.flatnonzero(even).tolist() == [*range(half, 20 - half), *range(20 + half, 58 - half)]
