@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from apps.nlos.imaging import image_capture
+from apps.progress import show_activity
 from nlos import Grid
 
 if TYPE_CHECKING:
@@ -68,7 +69,8 @@ def measure_imaging(name: str, imaging: Method, capture: Capture, grid: Grid) ->
         Seconds, and bytes where the system reports them.
     """
     few = slice(WARM_UP_VOXELS)
-    imaging.reconstruct(capture, Grid(grid.x[few], grid.y[few], grid.z[:1]))
+    with show_activity(f"{name}: loading its loops"):
+        imaging.reconstruct(capture, Grid(grid.x[few], grid.y[few], grid.z[:1]))
     before = _reset_peak_memory()
     started = time.perf_counter()
     volume = image_capture(name, imaging.plan(capture, grid), capture)

@@ -16,7 +16,7 @@ from apps.conventions import (
     report,
     require_writable,
 )
-from apps.progress import show_activity
+from apps.progress import show_progress
 from tofclip.errors import InputError
 from tofclip.io.light_fields import read_light_field
 from tofclip.light_field.measurement import (
@@ -160,8 +160,9 @@ def recover(
     require_writable(out, ".h5", ".png", ".exr", inputs=inputs)
     settings = ClipRecovery(prior, preset, _parse_weight(weight), data_term)
     measurements = ClipMeasurement.load(measurement)
-    with show_activity("recovering" if weight != "auto" else "choosing the weight, recovering"):
-        recovered = settings.recover(measurements, shear)
+    title = "recovering" if settings.weight is not None else "choosing the weight"
+    with show_progress(title, settings.work) as advance:
+        recovered = settings.recover(measurements, shear, advance)
     figures: dict[str, Any] = (
         {} if truth is None else _score_picture(recovered.picture, truth, shear)
     )

@@ -16,6 +16,7 @@ from tofclip.solvers import TotalVariation
 from tofclip.solvers.cross_validation import (
     FOLD_COUNT,
     INITIAL_WEIGHT,
+    MAX_WEIGHT_WORK,
     SINGLE_FOLD_RUNS,
     WEIGHT_RATIO,
     _search_downhill,
@@ -85,4 +86,8 @@ def test_the_picture_is_nearly_as_good_as_with_the_best_weight(noise):
 
     best = min(error(weight) for weight in 10.0 ** np.arange(-3, -0.5, 0.25))
     # 20 % is the project's acceptance for a weight chosen without the truth
-    assert error(choose_weight(method, operator, measurements, 40).weight) < 1.2 * best
+    done: list[int] = []
+    found = choose_weight(method, operator, measurements, 40, progress=done.append)
+    assert error(found.weight) < 1.2 * best
+    assert sum(done) == MAX_WEIGHT_WORK  # a bar ends at its end
+    assert len(done) == 1 + found.errors.size * FOLD_COUNT  # and moves with every recovery

@@ -23,12 +23,14 @@ from tofclip.solvers import (
     LeastSquares,
     PlugAndPlay,
     Poisson,
+    Progress,
     ProximalMethod,
     Sparse,
     TotalVariation,
     Wavelets,
+    ignore_progress,
 )
-from tofclip.solvers.cross_validation import INITIAL_WEIGHT, choose_weight
+from tofclip.solvers.cross_validation import INITIAL_WEIGHT, MAX_WEIGHT_WORK, choose_weight
 from tofclip.solvers.data_terms import estimate_robust_deviation
 from tofclip.solvers.denoisers import BlockMatching, CollaborativeWiener, Denoiser, NonlocalMeans
 from tofclip.solvers.light_field_variation import LightFieldVariation
@@ -132,7 +134,14 @@ class ClipRecovery:
         if self.weight is not None and not (np.isfinite(self.weight) and self.weight > 0):
             raise InputError(f"the prior's weight must be positive, got {self.weight}")
 
-    def recover(self, measurement: ClipMeasurement, shear: float) -> ClipResult:
+    @property
+    def work(self) -> int:
+        """Recoveries that `recover` reports: those of the choice of the weight, and the last one."""
+        return 1 + (MAX_WEIGHT_WORK if self.weight is None else 0)
+
+    def recover(
+        self, measurement: ClipMeasurement, shear: float, progress: Progress = ignore_progress
+    ) -> ClipResult:
         """Recover the picture refocused at `shear`, pixels per view step.
 
         Parameters
@@ -140,6 +149,8 @@ class ClipRecovery:
         measurement : ClipMeasurement
         shear : float
             Pixels per view step.
+        progress : callable
+            Called with the number of recoveries just done, of `work`.
 
         Returns
         -------
@@ -149,9 +160,10 @@ class ClipRecovery:
         begin = perf_counter()
         problem = self._make_problem(measurement, shear)
         ready = perf_counter()
-        method = self._choose_method(problem)
+        method = self._choose_method(problem, progress)
         chosen = perf_counter()
         result = self._add_denoiser(method).recover(problem.model, problem.measurements)
+        progress(1)
         return ClipResult(
             result.frames[0],
             method.weight,
@@ -184,7 +196,7 @@ class ClipRecovery:
             model, measurements, camera.correlation_length, partial(Poisson, deviation=deviation)
         )
 
-    def _choose_method(self, problem: _InverseProblem) -> ProximalMethod:
+    def _choose_method(self, problem: _InverseProblem, progress: Progress) -> ProximalMethod:
         """Return the prior's method with its data term and weight."""
         first = INITIAL_WEIGHT if self.weight is None else self.weight
         method = VARIATIONAL_PRIORS.get(self.prior, TotalVariation)(
@@ -196,7 +208,11 @@ class ClipRecovery:
             return method
         # neighbours on a detector are left out together, or they would predict each other
         weight = choose_weight(
-            method, problem.model, problem.measurements[:, 0], problem.correlation_length
+            method,
+            problem.model,
+            problem.measurements[:, 0],
+            problem.correlation_length,
+            progress=progress,
         ).weight
         return replace(
             method, weight=weight * HUBER_WEIGHT_FACTOR if self.data_term == "huber" else weight

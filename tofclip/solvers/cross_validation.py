@@ -15,6 +15,7 @@ from tofclip.arrays import Array, require_numpy
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator
 from tofclip.solvers.fista import ProximalMethod
+from tofclip.solvers.method import Progress, ignore_progress
 from tofclip.threads import map_parallel
 
 INITIAL_WEIGHT = 10**-1.75
@@ -52,8 +53,17 @@ class WeightChoice:
     errors: NDArray[np.float64]
 
 
+MAX_WEIGHT_WORK = MAX_TRIALS * FOLD_COUNT
+"""Recoveries that a choice of a weight takes at most, and that it reports when it is done."""
+
+
 def choose_weight(
-    method: ProximalMethod, operator: LinearOperator, measurements: Array, run: int, seed: int = 0
+    method: ProximalMethod,
+    operator: LinearOperator,
+    measurements: Array,
+    run: int,
+    seed: int = 0,
+    progress: Progress = ignore_progress,
 ) -> WeightChoice:
     """Choose the weight at which measurements left out of the recovery are predicted best
     (eight-fold cross-validation).
@@ -77,6 +87,9 @@ def choose_weight(
         that single ones would be predicted by their neighbours' errors.
     seed : int
         Of the assignment.
+    progress : callable
+        Called with the number of recoveries just done, of `MAX_WEIGHT_WORK`; those that are not
+        needed count as done at the end.
 
     Returns
     -------
@@ -95,13 +108,17 @@ def choose_weight(
     def unpredicted(trial: ProximalMethod, out: NDArray[np.bool_]) -> float:
         # Recovered without the measurements of this fold, judged by them alone.
         picture = trial.recover(operator, column, ~out).frames[0]
+        progress(FOLD_COUNT // len(parts))
         return float(trial.data_term(column, out).value(operator(picture)[:, np.newaxis])[0])
 
     def error(weight: float) -> float:
         # the compiled loops of one picture keep one core busy and release the interpreter
         return sum(map_parallel(partial(unpredicted, replace(method, weight=weight)), parts))
 
-    return _search_downhill(error)
+    choice = _search_downhill(error)
+    done = choice.errors.size * (FOLD_COUNT // len(parts)) * len(parts)
+    progress(MAX_WEIGHT_WORK - done)
+    return choice
 
 
 def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:

@@ -95,8 +95,7 @@ def demo(
     picture = out / "nlos_demo.png" if png is None else png
     # Before the simulation and three images, which take a while.
     require_writable(picture, *PICTURE_SUFFIXES)
-    with show_activity("simulating and imaging"):
-        run = _run_demo(seed)
+    run = _run_demo(seed)
     written = [out / f"{name}.h5" for name in ("capture", "hybrid", "backprojection")]
     run.truth.attach_to_record(run.capture).save(written[0])
     for path in written[1:]:
@@ -111,7 +110,8 @@ def demo(
 
 def _run_demo(seed: int) -> DemoRun:
     """The whole way, from a scene to three images."""
-    capture, truth = _simulate_capture(seed)
+    with show_activity("simulating"):
+        capture, truth = _simulate_capture(seed)
     capture = replace(
         capture,
         provenance=build_provenance(
@@ -132,7 +132,6 @@ def _run_demo(seed: int) -> DemoRun:
 
 
 def _simulate_capture(seed: int) -> tuple[Capture, HiddenTruth]:
-
     from apps.nlos.truth import HiddenTruth
 
     surfaces = [
