@@ -73,6 +73,9 @@ def test_unusable_numbers_end_in_one_line(run: Run) -> None:
         ("--bins", "5"),
         ("--trials", "0"),
         ("--pulse-ps", "nan"),
+        ("--pulse-ps", "1e300"),
+        ("--bin-width-ps", "1e-6"),
+        ("--photons", "1e300"),
     ):
         outcome = run("lidar", "accuracy", *words)
         assert outcome.status == 2

@@ -108,7 +108,8 @@ def test_the_bound_is_that_of_the_whole_fisher_matrix(decay, width_ps, backgroun
 
 
 @pytest.mark.parametrize(
-    ("width", "photons", "background"), [(0, 1, 1), (BIN, 0, 1), (BIN, 1, -1), (BIN, np.nan, 1)]
+    ("width", "photons", "background"),
+    [(0, 1, 1), (BIN, 0, 1), (BIN, 1, -1), (BIN, np.nan, 1), (BIN, 1e300, 1), (BIN, 1, 1e19)],
 )
 def test_a_bound_of_nothing_is_refused(width, photons, background):
     with pytest.raises(InputError, match="must be positive"):

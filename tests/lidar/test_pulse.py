@@ -58,6 +58,17 @@ def test_unusable_shapes_are_refused(samples, spacing, origin):
         Pulse(samples, spacing, origin)
 
 
+@pytest.mark.parametrize("times", [1e300, 1e-300, 1e6, 1e-6])
+def test_widths_of_different_units_are_refused_before_memory_is_taken(times):
+    """A slip in a unit asked for terabytes: the finer of the two decides how many samples there are."""
+    pulse = Pulse.gaussian(60e-12)
+    with pytest.raises(InputError, match="check their units"):
+        pulse.integrate_bins(60e-12 * times)
+    if times > 1:
+        with pytest.raises(InputError, match="check their units"):
+            Pulse.exponentially_modified(60e-12, 60e-12 * times)
+
+
 @pytest.mark.parametrize("fwhm", [0.0, -1e-12, np.nan, np.inf])
 def test_unusable_widths_are_refused(fwhm):
     with pytest.raises(InputError, match="positive time"):

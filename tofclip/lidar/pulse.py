@@ -14,6 +14,8 @@ EXTENT_FWHM = 2.0  # a Gaussian is 1.5e-5 of its peak there
 EXTENT_DECAYS = 11.0  # an exponential is 1.7e-5 of its start there
 FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
 SAMPLES_PER_BIN = 64  # of a pulse that was summed over bins
+MAX_SAMPLES = 1 << 23
+"""Of a pulse: 10,000 times as long as a bin and as long as its tail may be."""
 SUPPORT_THRESHOLD = 0.01  # below this fraction of its peak a pulse says nothing about where it is
 
 Table = tuple[NDArray[np.float64], tuple[float, float, float, float]]
@@ -93,13 +95,17 @@ class Pulse:
         Raises
         ------
         InputError
-            A width or decay that is not a positive time.
+            A width or decay that is not a positive time, or a decay that is thousands of widths.
         """
         from scipy.stats import exponnorm
 
         if not (np.isfinite(fwhm) and fwhm > 0 and np.isfinite(decay) and decay > 0):
             raise InputError(
                 f"width and decay of a pulse must be positive times, got {fwhm} and {decay}"
+            )
+        if not EXTENT_DECAYS * decay * SAMPLES_PER_FWHM <= MAX_SAMPLES * fwhm:
+            raise InputError(
+                f"a decay of {decay:g} s does not go with a width of {fwhm:g} s; check their units"
             )
         before = int(EXTENT_FWHM * SAMPLES_PER_FWHM)
         after = before + int(EXTENT_DECAYS * decay / fwhm * SAMPLES_PER_FWHM)
@@ -112,10 +118,20 @@ class Pulse:
         before to half after.
 
         Sampled at the middles of bins it is, up to one factor, each bin's fraction of the light.
+
+        Raises
+        ------
+        InputError
+            A width that is not positive, or so far from the pulse's that one of the units is wrong.
         """
         if not (np.isfinite(bin_width) and bin_width > 0):
             raise InputError(f"the width of a bin must be a positive time, got {bin_width}")
         spacing = min(self.spacing, bin_width / SAMPLES_PER_BIN)
+        length = (self.samples.size - 1) * self.spacing + bin_width
+        if not length <= MAX_SAMPLES * spacing:
+            raise InputError(
+                f"a bin of {bin_width:g} s does not go with a pulse of {self.fwhm:g} s; check their units"
+            )
         before = int(np.ceil((self.origin * self.spacing + bin_width / 2) / spacing))
         after = int(
             np.ceil(

@@ -73,10 +73,6 @@ def measure_accuracy(
     -------
     Accuracy
 
-    Returns
-    -------
-    Accuracy
-
     Raises
     ------
     InputError

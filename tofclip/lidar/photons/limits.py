@@ -9,6 +9,8 @@ from tofclip.lidar.pulse import Pulse
 from tofclip.units import SPEED_OF_LIGHT
 
 BIN_PHASES = 16  # positions of the arrival within a bin that the bound is averaged over
+MAX_PHOTONS = 1e15
+"""Sums of counts up to here are exact in double precision, and generators of chance take them."""
 
 
 def compute_range_bound(pulse: Pulse, bin_width: float, photons: float, background: float) -> float:
@@ -36,12 +38,13 @@ def compute_range_bound(pulse: Pulse, bin_width: float, photons: float, backgrou
     Raises
     ------
     InputError
-        A bin width or number of photons that is not positive, or a negative background.
+        A bin width or number of photons that is not positive, a negative background, or more than
+        `MAX_PHOTONS` of either.
     """
-    if not (bin_width > 0 and 0 < photons < np.inf and 0 <= background < np.inf):
+    if not (bin_width > 0 and 0 < photons <= MAX_PHOTONS and 0 <= background <= MAX_PHOTONS):
         raise InputError(
-            "bin width and photons must be positive and the background not negative, got "
-            f"{bin_width}, {photons} and {background}"
+            "bin width and photons must be positive, the background not negative, and either at most "
+            f"{MAX_PHOTONS:g}; got {bin_width}, {photons} and {background}"
         )
     shape = pulse.integrate_bins(bin_width)
     first, last = shape.extent(0.0)
