@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import asdict
 from itertools import islice
@@ -22,11 +22,18 @@ from tofclip.recovery import SharpestFocus, parse_focus
 from tofclip.sequences import list_shots
 from tofclip.sequences.ranger import RangingPipeline, build_cloud_path
 from tofclip.sequences.streaming import stream_clouds
+from tofclip.solvers import LinearInverse, ProximalMethod, Sparse, TotalVariation
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
     from tofclip.sequences.streaming import StreamedCloud
     from tofclip.shots import Streak
+
+STREAM_METHODS: Mapping[str, Callable[[], LinearInverse | ProximalMethod]] = {
+    "linear": LinearInverse,
+    "l1": Sparse,
+    "tv": TotalVariation,
+}
 
 MAX_LATENCY_SAMPLES = 10_000  # shots over which medians are taken: a stream may run for days
 
@@ -59,6 +66,14 @@ def stream(
     focus: Annotated[
         str, typer.Option(metavar="SHEAR", help="depth-locked or fixed:S.")
     ] = "fixed:0",
+    method: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="linear, which is the fastest and draws rays around bright objects, or l1 or tv, "
+            "which leave them out: few iterations that begin at the last shot's pictures.",
+        ),
+    ] = "linear",
     shots: Annotated[
         int | None,
         typer.Option(
@@ -78,8 +93,7 @@ def stream(
     suffix: Annotated[str, typer.Option(metavar=".EXT", help="Format of the clouds.")] = ".ply",
     as_json: JsonOption = False,
 ) -> None:
-    """Make a cloud of each shot by the linear inverse while the next ones come; report rate and
-    latencies.
+    """Make a cloud of each shot while the next ones come; report method, rate and latencies.
 
     Photons become a shot in batches, pictures one by one: see records= and frames=
     of an address. Of an instrument the newest shot is taken. acquired = delivered + dropped_device
@@ -104,7 +118,7 @@ def stream(
     if first is None:
         raise InputError(f"{source}: the source ended before it gave a shot")
     pipeline = _make_ranger(
-        first, camera, None if time_zero_ns is None else time_zero_ns * NANOSECOND, focus
+        first, camera, None if time_zero_ns is None else time_zero_ns * NANOSECOND, focus, method
     )
     # Instruments do not wait: the newest shot counts. Files do, and lose nothing.
     policy: Literal["drop_oldest", "block"] = "drop_oldest" if drop or coming.is_live else "block"
@@ -112,7 +126,7 @@ def stream(
         figures = _consume_clouds(islice(made, shots), out, suffix, coming)
     # Counted last: only when the instrument has been stopped are its accounts final.
     accounts = coming.count_shots(figures["clouds"])
-    figures |= {"dropped": accounts.dropped, **asdict(accounts)}
+    figures |= {"method": method, "dropped": accounts.dropped, **asdict(accounts)}
     report(figures, as_json, [] if out is None else [out])
 
 
@@ -124,12 +138,14 @@ def _read_shots(source: str, bin_width: float | None) -> Iterator[Streak]:
 
 
 def _make_ranger(
-    first: Streak, camera: Path | None, time_zero: float | None, focus: str
+    first: Streak, camera: Path | None, time_zero: float | None, focus: str, method: str
 ) -> RangingPipeline:
     chosen = parse_focus(focus)
     if isinstance(chosen, SharpestFocus):
         raise InputError("a stream has one focus for all shots: depth-locked or fixed:S")
-    return RangingPipeline.for_shot(first, camera, chosen, time_zero)
+    if method not in STREAM_METHODS:
+        raise InputError(f"a stream's method is one of {', '.join(STREAM_METHODS)}, not '{method}'")
+    return RangingPipeline.for_shot(first, camera, chosen, time_zero, STREAM_METHODS[method]())
 
 
 def _consume_clouds(

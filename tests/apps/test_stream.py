@@ -42,6 +42,7 @@ def test_a_streaming_camera_becomes_clouds(tmp_path: Path, capsys: pytest.Captur
     assert main([*words, "--json"]) == 0
     figures = read_report(capsys)
     assert figures["clouds"] == 3
+    assert figures["method"] == "linear"
     assert set(figures["stages_s"]) == {"read", "wait", "rectify", "recover", "range", "place"}
     assert figures["latency_s"]["median"] > 0
     assert figures["clouds_per_second"] > 0
@@ -53,6 +54,17 @@ def test_a_streaming_camera_becomes_clouds(tmp_path: Path, capsys: pytest.Captur
     assert numbers[-1] >= 2
     cloud = PointCloud.load(saved[0])
     assert 1.6 < np.median(cloud.range) < 3.3  # where the simulated scene stands
+
+
+def test_a_stream_by_a_prior_says_so_and_its_rate(capsys: pytest.CaptureFixture[str]):
+    address = "sim+remoteex://?seed=1&scene=small&frame_rate=40"
+    assert main(["stream", address, "--shots", "3", "--method", "l1", "--json"]) == 0
+    figures = read_report(capsys)
+    assert (figures["method"], figures["clouds"]) == ("l1", 3)
+    assert figures["clouds_per_second"] > 0
+    assert figures["points"] > 0
+    assert main(["stream", address, "--shots", "1", "--method", "wavelet"]) == 2
+    assert "linear, l1, tv, not 'wavelet'" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_slow_consumer_gets_the_newest_shot_and_the_truth_about_the_others(

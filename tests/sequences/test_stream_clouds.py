@@ -8,12 +8,13 @@ import pytest
 from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.lidar import depth, point_cloud
-from tofclip.recovery import recover
+from tofclip.recovery import DepthLockedFocus, recover
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.patterns import make_plain_pattern
+from tofclip.solvers import Sparse
 
 CENTRES = 30.0 + 45 * np.arange(4)
 
@@ -67,6 +68,23 @@ def test_a_ranger_of_ones_own_is_used():
     (first, second) = stream_clouds(iter(made), pipeline, queue_size=2)
     np.testing.assert_array_equal(first.cloud.xyz, next(stream_clouds(made)).cloud.xyz)
     assert second.shot == 1
+
+
+def test_a_prior_begins_at_the_last_shot_and_leaves_rays_out():
+    made = shots(1) * 3
+    linear = next(stream_clouds(made))
+    pipelines = [RangingPipeline(made[0].camera, made[0].times, Sparse()) for _ in "12"]
+    one, other = (list(stream_clouds(made, pipeline)) for pipeline in pipelines)
+    for mine, again in zip(one, other, strict=True):
+        np.testing.assert_array_equal(mine.cloud.xyz, again.cloud.xyz)
+    # the plate is 0.8 of a picture of 24 x 24 wide; the linear inverse smears it over its rays
+    assert 100 < len(one[-1].cloud) < 0.8 * len(linear.cloud)
+    # the first shot had forty iterations: four more leave it where it was, to a tenth of a percent
+    assert len(one[-1].cloud) == pytest.approx(len(one[0].cloud), rel=0.05)
+    optics = {"focal_length_px": 100.0, "lenslet_pitch": 2e-3, "focus_distance": 1.3}
+    known = made[0].camera.replace(**optics)
+    with pytest.raises(InputError, match="one shear for all shots"):
+        RangingPipeline(known, made[0].times, Sparse(), DepthLockedFocus())
 
 
 def test_no_shot_is_no_cloud_and_faults_come_through():

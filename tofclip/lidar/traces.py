@@ -62,18 +62,19 @@ class Traces(Protocol):
         ...
 
 
-class FrameTraces:
-    """Traces of a transient cube that is there already.
+class PictureTraces:
+    """Traces of pictures at some bins that are there already.
 
     Parameters
     ----------
-    frames : Frames
+    pictures : (bins, rows, columns) array
+    bins : TraceBins
+        Which ones they show.
     """
 
-    def __init__(self, frames: Frames) -> None:
-        self._pictures = frames.values.reshape(frames.times.size, -1).astype(np.float32, copy=False)
-        self.pixels = np.arange(self._pictures.shape[1])
-        self.bins = TraceBins.all_bins(frames.times.size)
+    def __init__(self, pictures: NDArray[np.float32], bins: TraceBins) -> None:
+        self._pictures = pictures.reshape(len(pictures), -1).astype(np.float32, copy=False)
+        self.pixels, self.bins = np.arange(self._pictures.shape[1]), bins
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
         """Write traces of neighbours in raster order.
@@ -83,3 +84,15 @@ class FrameTraces:
         from tofclip.solvers.kernels import copy_lanes_to_frames
 
         copy_lanes_to_frames(self._pictures[:, piece], traces)
+
+
+class FrameTraces(PictureTraces):
+    """Traces of a transient cube.
+
+    Parameters
+    ----------
+    frames : Frames
+    """
+
+    def __init__(self, frames: Frames) -> None:
+        super().__init__(frames.values, TraceBins.all_bins(frames.times.size))

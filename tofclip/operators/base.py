@@ -11,7 +11,7 @@ answer in kind; the others refuse them.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,9 @@ from tofclip.arrays import (
 from tofclip.errors import InputError, ShapeError
 
 Shape = tuple[int, ...]
+
+NORM_ITERATIONS = 15
+"""Of `LinearOperator.squared_norm`: enough for a percent, which a test checks for every camera."""
 
 REAL_TYPES = (np.dtype(np.float32), np.dtype(np.float64))
 
@@ -77,6 +80,11 @@ class LinearOperator(ABC):
     @abstractmethod
     def _adjoint(self, block: Array) -> Array:
         """Apply the adjoint to a block of shape ``shape_out + (batch,)``."""
+
+    @cached_property
+    def squared_norm(self) -> float:
+        """Largest eigenvalue of A'A as `NORM_ITERATIONS` products tell it, from below."""
+        return estimate_squared_norm(self, NORM_ITERATIONS)
 
     def __call__(self, x: Array) -> Array:
         """Apply the operator to an array of shape `shape_in`, or `shape_in` and a batch axis."""

@@ -21,8 +21,9 @@ from tofclip.lidar.traces import TraceBins, Traces
 from tofclip.recovery import Focus, open_shot
 from tofclip.recovery.focus import DEFAULT_FOCUS
 from tofclip.sequences.cache import get_cached_camera, prepare_inverse
+from tofclip.sequences.warm_start import WarmStartedRecovery
 from tofclip.shots import Returns, Streak
-from tofclip.solvers import LinearInverse
+from tofclip.solvers import LinearInverse, ProximalMethod
 from tofclip.solvers.traces import InverseTraces, order_by_patch
 
 FloatArray = NDArray[np.float64]
@@ -32,7 +33,11 @@ MAX_JITTER_BINS = 32
 
 
 class RangingPipeline:
-    """Makes clouds of shots of one camera by the linear inverse, which needs no iterations.
+    """Makes clouds of shots of one camera, by the linear inverse or by a method with a prior.
+
+    The linear inverse needs no iterations and knows nothing of the shots before; it draws streaks
+    ("rays") around bright objects. A prior (l1) leaves these out. It begins at the pictures of the
+    shot before and takes its shots in order (`tofclip.sequences.warm_start`).
 
     Sweep, operators, inverted Gram matrices and filters are worked out once. No transient cube is
     made: pixels are recovered a few at a time, and their returns are sought at once
@@ -46,7 +51,8 @@ class RangingPipeline:
         (`fit_camera_to_shot`) beforehand.
     row_times : (rows,) array
         Instant of each row, s.
-    method : LinearInverse, optional
+    method : LinearInverse or ProximalMethod, optional
+        The linear inverse by default.
     focus : Focus, optional
         One that needs no look at the shot: `FixedFocus` or `DepthLockedFocus`.
     detection : Detection, optional
@@ -54,19 +60,26 @@ class RangingPipeline:
     Notes
     -----
     Memory: a (columns, columns) matrix for each shear, and for a shot as much again as its
-    measurements.
+    measurements; with a prior, four times the pictures of all rows that hold light.
+
+    Raises
+    ------
+    InputError
+        A prior with a focus that has several shears.
     """
 
     def __init__(
         self,
         camera: Camera,
         row_times: FloatArray,
-        method: LinearInverse | None = None,
+        method: LinearInverse | ProximalMethod | None = None,
         focus: Focus = DEFAULT_FOCUS,
         detection: Detection | None = None,
     ) -> None:
         focus.check_camera(camera)
-        method = LinearInverse() if method is None else method
+        self.method = LinearInverse() if method is None else method
+        # Rows with light are told by the filter matched to the operator, whatever recovers them.
+        inverse = self.method if isinstance(self.method, LinearInverse) else LinearInverse()
         self.camera = camera
         self.times = np.asarray(row_times, dtype=np.float64) - camera.time_zero
         self.rectifier = Rectifier(camera, self.times.size)
@@ -79,11 +92,20 @@ class RangingPipeline:
             RowBlock(
                 piece.frames,
                 InverseTraces(
-                    prepare_inverse(method, cached.operator(piece.shear), alive), self.pixels
+                    prepare_inverse(inverse, cached.operator(piece.shear), alive), self.pixels
                 ),
             )
             for piece in pieces
         ]
+        self._warm_start: WarmStartedRecovery | None = None
+        if isinstance(self.method, ProximalMethod):
+            if len(pieces) > 1:
+                raise InputError(
+                    f"{self.method.name} of a stream has one shear for all shots: use fixed:S"
+                )
+            self._warm_start = WarmStartedRecovery(
+                self.method, cached.operator(pieces[0].shear), alive
+            )
         shears = np.repeat([piece.shear for piece in pieces], [piece.size for piece in pieces])
         self._search = ReturnSearch(camera, self.times, detection, shears=shears)
         # mean duration of a row: the sweep is nearly even
@@ -98,6 +120,7 @@ class RangingPipeline:
         camera: Path | Camera | None = None,
         focus: Focus = DEFAULT_FOCUS,
         time_zero: float | None = None,
+        method: LinearInverse | ProximalMethod | None = None,
     ) -> RangingPipeline:
         """Prepare for shots like this one; a sweep that is not known is found from it.
 
@@ -111,6 +134,7 @@ class RangingPipeline:
         time_zero : float, optional
             Reading of the time axis at which light of range 0 would arrive, s; the camera's by
             default.
+        method : LinearInverse or ProximalMethod, optional
 
         Returns
         -------
@@ -123,7 +147,12 @@ class RangingPipeline:
         """
         opened = open_shot(shot, camera, time_zero)
         focus.check_camera(opened.camera)
-        return cls(opened.fit_camera().camera, shot.times, focus=focus)
+        return cls(opened.fit_camera().camera, shot.times, method, focus)
+
+    @property
+    def in_order(self) -> bool:
+        """Whether what comes out of a shot depends on those before it."""
+        return self._warm_start is not None
 
     def find_returns(self, measurements: NDArray[np.float32]) -> Returns:
         """Find the returns in one shot's rectified measurements, (columns, rows)."""
@@ -141,7 +170,10 @@ class RangingPipeline:
             raise ShapeError(
                 "measurements", (self.camera.slit_width_px, self.times.size), measurements.shape
             )
-        return _ShotTraces(self, measurements, self._lit.bins(measurements))
+        bins = self._lit.bins(measurements)
+        if self._warm_start is not None:
+            return self._warm_start.recover(measurements, bins)
+        return _ShotTraces(self, measurements, bins)
 
     def search(self, traces: Traces) -> Returns:
         """Find the returns in what `recover` returned."""

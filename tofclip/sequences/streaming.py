@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures import Executor, Future
-from contextlib import closing, nullcontext
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -326,7 +326,7 @@ def stream_clouds(
     executor: Executor | None = None,
     at_once: int | None = None,
 ) -> Generator[StreamedCloud, None, None]:
-    """Yield the cloud of every shot by the linear inverse, as soon as it is made.
+    """Yield the cloud of every shot, as soon as it is made.
 
     A shot is rectified and recovered, its returns are found and placed in space, while other shots
     are worked on and the next ones are read.
@@ -343,7 +343,8 @@ def stream_clouds(
         What happens when shots come faster than the clouds are taken; see `run_in_order`.
     executor : concurrent.futures.Executor, optional
         Where the work is done. By default a thread for each core, each of which keeps a shot to
-        itself; NumPy's products keep to one thread until the stream ends.
+        itself; NumPy's products keep to one thread until the stream ends. With a method that takes
+        shots in order, all cores work on one shot.
     at_once : int, optional
         Shots that the executor has at a time; by default one more than there are cores.
 
@@ -368,10 +369,17 @@ def stream_clouds(
         pipeline, coming = RangingPipeline.for_shot(first), _prepend_shot(first, coming)
     # A core for each shot: shared out among all, a shot would be done sooner, but cores would wait
     # for each other.
-    with open_worker_pool() if executor is None else nullcontext(executor) as workers:
+    pool: AbstractContextManager[Executor]
+    if executor is None:
+        # Where a shot begins at what the last one showed, all cores work on it.
+        pool = ThreadPoolExecutor(1, "tofclip") if pipeline.in_order else open_worker_pool()
+    else:
+        pool = nullcontext(executor)
+    with pool as workers:
         # One more than cores: results are taken in order, and a core whose shot was done before its
         # turn has the next one at hand.
-        room = thread_count() + 1 if at_once is None else at_once
+        cores = 1 if pipeline.in_order else thread_count()
+        room = cores + 1 if at_once is None else at_once
         work = partial(_make_cloud, pipeline)
         with closing(run_in_order(coming, work, workers, room, queue_size, policy)) as items:
             for item in items:

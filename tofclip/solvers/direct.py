@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import Array, ComputeDevice, PerDevice, is_numpy, namespace, to_numpy
 from tofclip.errors import InputError
-from tofclip.operators import LinearOperator, SparseMatrix, estimate_squared_norm
+from tofclip.operators import LinearOperator, SparseMatrix
 from tofclip.solvers.loops import PortableBatches, make_batches, write_frames
 from tofclip.solvers.method import Mask, Progress, Result, ignore_progress, validate_measurements
 from tofclip.threads import LANES, limit_blas_threads, run_blocks, split_blocks
 
 DENSE_BLOCK_ROWS = 336  # of the dense matrix, which are read from memory once for all frames
-NORM_ITERATIONS = 15  # the damping need not be known better than to a percent
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class LinearInverse:
             raise InputError(f"damping must be positive, got {self.damping}")
         if alive is None:
             alive = np.ones(operator.shape_out, bool)
-        mu = self.damping * estimate_squared_norm(operator, NORM_ITERATIONS)
+        mu = self.damping * operator.squared_norm
         # in float64: a Cholesky factor loses digits with the condition number
         seen = operator.matrix[alive].astype(np.float64)
         gram = (seen @ seen.T).toarray()

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.arrays import Array, namespace, require_numpy, to_numpy, zeros
-from tofclip.errors import InputError
-from tofclip.operators import LinearOperator, estimate_squared_norm
+from tofclip.errors import InputError, ShapeError
+from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTerm, DataTermMaker, LeastSquares
 from tofclip.solvers.loops import Batches, make_batches, select_loops
 from tofclip.solvers.method import (
@@ -254,6 +254,25 @@ class Fista:
         self._level_before = self._level
         self.rejected = self._age < 1
 
+    def start_from(self, pictures: Array) -> None:
+        """Begin at these pictures instead of at darkness.
+
+        Parameters
+        ----------
+        pictures : (rows, columns, frames) array
+            Not negative.
+        """
+        xp = namespace(pictures)
+        self.seen = self.operator(pictures)
+        self.current, self.previous, self._seen_before = pictures, pictures * 1, self.seen * 1
+        # a step of length zero leaves them as they are and says what the prior thinks of them
+        none = xp.zeros_like(self.objective)
+        still = xp.astype(none, pictures.dtype)
+        step = self.regulariser.proximal_step(
+            pictures * 1, pictures * 1, still, xp.zeros_like(pictures), still
+        )
+        self.objective = self.data_term.value(self.seen) + step.penalty
+
     @property
     def step_sizes(self) -> Array:
         """Of the next step, (frames,) float64."""
@@ -319,7 +338,6 @@ class Fista:
         return None if bound is None else self.objective - bound
 
 
-NORM_ITERATIONS = 15
 NORM_MARGIN = 1.02
 """What 15 Lanczos iterations may lack of the largest eigenvalue; a test checks every camera."""
 
@@ -346,6 +364,7 @@ class ProximalMethod(ABC):
 
     Attributes
     ----------
+    name : str
     portable : bool
         Whether arrays of any library are taken, or NumPy's only.
     """
@@ -355,6 +374,7 @@ class ProximalMethod(ABC):
     tolerance: float = 0.0
     data_term: DataTermMaker = LeastSquares
     gap: float = 1e-3
+    name = ""
     portable = False
 
     @abstractmethod
@@ -367,6 +387,7 @@ class ProximalMethod(ABC):
         measurements: Array,
         valid: Mask = None,
         progress: Progress = ignore_progress,
+        start: Array | None = None,
     ) -> Result:
         """Recover one picture per column of `measurements`; see `Method`.
 
@@ -379,6 +400,8 @@ class ProximalMethod(ABC):
             Measurements that are False are left out.
         progress : callable
             Called with the number of frame iterations just done.
+        start : (frames, rows, columns) array, optional
+            Pictures to begin at, such as those of the shot before; dark ones by default.
 
         Returns
         -------
@@ -388,25 +411,38 @@ class ProximalMethod(ABC):
         Raises
         ------
         ShapeError
-            `measurements` or `valid` do not fit the operator.
+            `measurements`, `valid` or `start` do not fit the operator.
         InputError
             A measurement is NaN or infinite, or the arrays are not NumPy's and the prior is not
             portable.
         """
+        if start is not None and start.shape != (measurements.shape[1], *operator.shape_in):
+            raise ShapeError(
+                "pictures to begin at", (measurements.shape[1], *operator.shape_in), start.shape
+            )
         if not self.portable:
             require_numpy(f"recovery with the prior {type(self).__name__}", measurements)
         # Blocks share the cores already, and a lone picture's products are too small to share.
         with limit_blas_threads():
             return self._recover_batches(
-                operator, validate_measurements(operator, measurements, valid), valid, progress
+                operator,
+                validate_measurements(operator, measurements, valid),
+                valid,
+                progress,
+                start,
             )
 
     def _recover_batches(
-        self, operator: LinearOperator, measurements: Array, valid: Mask, progress: Progress
+        self,
+        operator: LinearOperator,
+        measurements: Array,
+        valid: Mask,
+        progress: Progress,
+        start: Array | None,
     ) -> Result:
         stopping = StoppingRule(self.iterations, self.tolerance, self.gap)
         started = time.perf_counter()
-        step = 1 / (NORM_MARGIN * estimate_squared_norm(operator, NORM_ITERATIONS))
+        step = 1 / (NORM_MARGIN * operator.squared_norm)
         batches = make_batches(operator, measurements)
         self._warm_up_loops(operator, step, batches.zero_measurements())
         setup_seconds = time.perf_counter() - started
@@ -426,6 +462,11 @@ class ProximalMethod(ABC):
             solver = Fista(
                 operator, data, self._make_regulariser(weight), step, data.measurements.shape[1]
             )
+            if start is not None:
+                begun = batches.take_block(_list_pixels(start), piece)
+                solver.start_from(
+                    namespace(begun).reshape(begun, (*operator.shape_in, begun.shape[-1]))
+                )
             histories[piece.start] = iterate(solver, stopping, progress, piece.stop - piece.start)
             batches.write_block(solver.current, piece)
 
@@ -546,6 +587,12 @@ class _ZeroPictures:
                 "no view sees anything positive; was too high a background subtracted?"
             )
         return peak
+
+
+def _list_pixels(pictures: Array) -> Array:
+    """Return pictures (frames, ...) as (pixels, frames), the way of measurements."""
+    xp = namespace(pictures)
+    return xp.moveaxis(xp.reshape(pictures, (pictures.shape[0], -1)), 0, -1)
 
 
 def _max_of_frames(pictures: Array) -> NDArray[np.float64]:

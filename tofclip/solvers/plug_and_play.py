@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import Array, require_numpy
 from tofclip.errors import InputError
-from tofclip.operators import LinearOperator, estimate_squared_norm
+from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTerm
 from tofclip.solvers.denoisers import CollaborativeWiener, Denoiser
-from tofclip.solvers.fista import NORM_ITERATIONS, ProximalMethod
+from tofclip.solvers.fista import ProximalMethod
 from tofclip.solvers.method import Mask, Progress, Result, ignore_progress
 from tofclip.threads import limit_blas_threads
 
@@ -91,7 +91,7 @@ class PlugAndPlay:
         """
         require_numpy("recovery with a denoiser", measurements)
         started = self.start.recover(operator, measurements, valid, progress)
-        coupling = self.coupling * estimate_squared_norm(operator, NORM_ITERATIONS)
+        coupling = self.coupling * operator.squared_norm
         frames = np.empty_like(started.frames)
         with limit_blas_threads():  # the products of small groups of patches are too small to share
             for number, picture in enumerate(started.frames):
