@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apps.figures.style import LINE_COLOUR, SMALL_FONT_PT, draw_image, label_axes, make_figure
+from apps.figures.style import (
+    LINE_COLOUR,
+    SMALL_FONT_PT,
+    add_panels,
+    draw_image,
+    label_axes,
+    make_figure,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,24 +24,25 @@ if TYPE_CHECKING:
 
 ZOOM_HALF_WIDTH_PX = 20
 MARGIN_ROWS = 25
+HEIGHT_INCHES, WHOLE_INCHES = 8.5, 5.1
+ZOOM_ROOM_INCHES = (0.5, 0.1, 0.4, 0.3)
 WHITE_PERCENTILE = 99.8  # percent: a glint does not darken the rest
 
 
 def make_calibration_figure(found: FocusCalibration) -> Figure:
     """Draw both pictures whole with the fits, and a zoom into every view's slit centre."""
     views = found.centres_px.size
-    figure = make_figure(12, 8.5)
-    parts: Any = figure.subfigures(2, 1, height_ratios=(1.5, 1))
-    whole, zooms = parts
-    upper, lower = whole.subplots(2, 1, sharex=True)
+    figure = make_figure(12, HEIGHT_INCHES)
+    upper, lower = add_panels(figure, 2, 1, (0, WHOLE_INCHES))[:, 0]
+    lower.sharex(upper)
     _draw_picture(upper, found, found.signal, "slit open: the lines and their fitted angles")
     _draw_picture(lower, found, found.dots, "slit closed: where the lines cross the slit")
-    panels = zooms.subplots(2, views, squeeze=False)
+    panels = add_panels(figure, 2, views, (WHOLE_INCHES, HEIGHT_INCHES), ZOOM_ROOM_INCHES)
     for view in range(views):
         _draw_line_zoom(panels[0, view], found, view)
         _draw_dot_profile(panels[1, view], found, view)
     panels[0, 0].set_ylabel("row (px)", fontsize=SMALL_FONT_PT)
-    panels[1, 0].set_ylabel("counts", fontsize=SMALL_FONT_PT)
+    panels[1, 0].set_ylabel("1000 counts", fontsize=SMALL_FONT_PT)
     return figure
 
 
@@ -92,12 +100,11 @@ def _draw_dot_profile(axes: Axes, found: FocusCalibration, view: int) -> None:
     centre, error = found.centres_px[view], found.centre_uncertainty_px[view]
     window, extent = _cut_window(found.dots, round(found.dot_rows_px[view]), round(centre))
     columns = np.arange(window.shape[1]) + extent[0] + 0.5
-    axes.plot(columns, window.sum(axis=0), color="#444444", linewidth=1, drawstyle="steps-mid")
+    thousands = window.sum(axis=0) / 1000
+    axes.plot(columns, thousands, color="#444444", linewidth=1, drawstyle="steps-mid")
     axes.axvspan(centre - error, centre + error, color=LINE_COLOUR, alpha=0.4, linewidth=0)
     axes.axvline(centre, color=LINE_COLOUR, linewidth=1)
     label_axes(axes, f"{centre:.2f} \N{PLUS-MINUS SIGN} {error:.2f} px", "column (px)", "")
-    axes.ticklabel_format(axis="y", style="sci", scilimits=(0, 3))
-    axes.yaxis.get_offset_text().set_fontsize(SMALL_FONT_PT)
 
 
 def _cut_window(

@@ -16,6 +16,7 @@ from apps.figures.style import (
     DEPTH_COLOURMAP,
     SMALL_FONT_PT,
     add_colour_bar,
+    add_panels,
     draw_image,
     label_axes,
     make_figure,
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
 PANEL_COLUMNS = 4
 MAX_MOMENTS = 3 * PANEL_COLUMNS
 OVERVIEW_INCHES, ROW_INCHES = 4.2, 2.45
+OVERVIEW_WIDTHS = (1, 1, 1.2)  # the last picture has a colour scale beside it
+STRIP_TITLE_INCHES = 0.25
+STRIP_ROOM_INCHES = (0.45, 0.1, 0.25, 0.25)  # its panels have ticks and a title, no labels
 MIN_PEAK_DISTANCE_BINS = 12
 MIN_PEAK_PROMINENCE = 0.01  # of the highest
 CROP_THRESHOLD = 0.35  # of a frame's brightest pixel: what is dimmer is mostly artefacts
@@ -68,21 +72,26 @@ def make_preview_figure(streak: Streak, frames: Frames) -> Figure:
     """
     moments = choose_moments(frames)
     lines = math.ceil(len(moments) / PANEL_COLUMNS)
-    figure = make_figure(12, OVERVIEW_INCHES + ROW_INCHES * lines)
-    parts: Any = figure.subfigures(2, 1, height_ratios=(OVERVIEW_INCHES, ROW_INCHES * lines))
-    overview, strip = parts
-    left, middle, right = overview.subplots(1, 3)
+    height = OVERVIEW_INCHES + ROW_INCHES * lines
+    figure = make_figure(12, height)
+    (overview,) = add_panels(figure, 1, 3, (0, OVERVIEW_INCHES), widths=OVERVIEW_WIDTHS)
+    left, middle, right = overview
     brightness = frames.values * _compute_compensation(frames)[:, np.newaxis, np.newaxis]
     _draw_streak(left, streak)
     draw_image(middle, _tone_map(brightness.sum(axis=0)))
     label_axes(middle, "summed brightness" + _format_compensation(frames), "x (px)", "y (px), down")
     _draw_distance(right, brightness, frames)
-    _draw_moments(
-        strip.subplots(lines, PANEL_COLUMNS, sharex=True, sharey=True).ravel(),
-        brightness,
-        moments,
-        frames,
+    strip = (OVERVIEW_INCHES + STRIP_TITLE_INCHES, height)
+    figure.text(
+        0.5,
+        1 - OVERVIEW_INCHES / height,
+        "frames, each scaled to its own brightness; x and y in px",
+        fontsize=SMALL_FONT_PT + 2,
+        ha="center",
+        va="top",
     )
+    panels = add_panels(figure, lines, PANEL_COLUMNS, strip, STRIP_ROOM_INCHES)
+    _draw_moments(panels, brightness, moments, frames)
     return figure
 
 
@@ -191,13 +200,13 @@ def _draw_distance(axes: Axes, brightness: NDArray[Any], frames: Frames) -> None
 
 
 def _draw_moments(
-    panels: Any, brightness: NDArray[Any], moments: list[Moment], frames: Frames
+    panels: NDArray[Any], brightness: NDArray[Any], moments: list[Moment], frames: Frames
 ) -> None:
     """One averaged picture for each moment, scaled to its own brightness."""
     pictures = [brightness[moment.first : moment.last + 1].mean(axis=0) for moment in moments]
     rows, columns = _crop_to_bright(pictures)
     extent = (columns.start - 0.5, columns.stop - 0.5, rows.stop - 0.5, rows.start - 0.5)
-    for axes, moment, picture in zip(panels, moments, pictures, strict=False):
+    for axes, moment, picture in zip(panels.ravel(), moments, pictures, strict=False):
         draw_image(axes, picture[rows, columns], extent, vmin=0)
         where = f"{frames.times[moment.frame] / NANOSECOND:.2f} ns"
         if _has_known_range(frames):
@@ -208,11 +217,13 @@ def _draw_moments(
             else f"frames {moment.first} to {moment.last}"
         )
         label_axes(axes, f"{where}  ({which})", "", "")
-    for axes in panels[len(moments) :]:
+    for axes in panels.ravel()[len(moments) :]:
         axes.set_axis_off()
-    panels[0].figure.suptitle(
-        "frames, each scaled to its own brightness; x and y in px", fontsize=SMALL_FONT_PT + 2
-    )
+    # Ticks at the left and below are those of the whole column and row.
+    for axes in panels[:, 1:].ravel():
+        axes.tick_params(labelleft=False)
+    for axes in panels[:-1].ravel():
+        axes.tick_params(labelbottom=False)
 
 
 def _crop_to_bright(pictures: list[NDArray[Any]]) -> tuple[slice, slice]:

@@ -5,6 +5,7 @@ nothing.
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,10 @@ off by less than 16 of 255 anywhere; 64 are enough for the greys of many small p
 """
 
 
+LABEL_ROOM_INCHES = (0.6, 0.12, 0.45, 0.3)
+"""What ticks and labels take at the left, right, bottom and top of a panel."""
+
+
 def make_figure(width: float, height: float) -> Figure:
     """Make an empty figure, in inches. It draws with Agg: no display is needed and pyplot is left
     alone.
@@ -48,6 +53,53 @@ def make_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), dpi=DOTS_PER_INCH, layout="constrained")
 
 
+def add_panels(
+    figure: Figure,
+    rows: int,
+    columns: int,
+    band: tuple[float, float],
+    room: tuple[float, float, float, float] = LABEL_ROOM_INCHES,
+    widths: Sequence[float] | None = None,
+) -> NDArray[Any]:
+    """Put a grid of panels across a figure, at places known beforehand.
+
+    To search for places that fit around the labels takes longer than to draw a figure of many
+    panels; with this the figure's own search is off.
+
+    Parameters
+    ----------
+    figure : Figure
+    rows, columns : int
+    band : (float, float)
+        Where the grid begins and ends, inches from the top of the figure.
+    room : (left, right, bottom, top)
+        Inches that ticks and labels take around each panel.
+    widths : sequence of float, optional
+        Of the columns, relative to each other; equal by default.
+
+    Returns
+    -------
+    (rows, columns) array of Axes
+    """
+    figure.set_layout_engine(None)
+    width, height = figure.get_size_inches()
+    left, right, bottom, top = room
+    shares = np.ones(columns) if widths is None else np.asarray(widths, np.float64)
+    edges = width * np.concatenate([[0.0], np.cumsum(shares) / np.sum(shares)])
+    cell_height = (band[1] - band[0]) / rows
+    panels = np.empty((rows, columns), object)
+    for row, column in np.ndindex(rows, columns):
+        panels[row, column] = figure.add_axes(
+            (
+                (edges[column] + left) / width,
+                1 - (band[0] + (row + 1) * cell_height - bottom) / height,
+                (edges[column + 1] - edges[column] - left - right) / width,
+                (cell_height - bottom - top) / height,
+            )
+        )
+    return panels
+
+
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure in the format that the name's ending says, whole or not at all.
 
@@ -57,6 +109,14 @@ def save_figure(figure: Figure, path: Path) -> None:
     path : Path
         Its suffix names the format.
     """
+    engine, panels = figure.get_layout_engine(), figure.get_axes()
+    if engine is not None and panels:
+        # Saving would draw all twice, the first time only to find the places of the axes.
+        for axes in panels:
+            for spine in axes.spines.values():
+                spine.set_in_layout(False)  # ticks and labels reach further
+        engine.execute(figure)
+        figure.set_layout_engine(None)
     with atomic_path(path) as temporary:
         figure.savefig(temporary)
 
@@ -124,7 +184,8 @@ def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
     title, x, y : str
         With units.
     """
-    axes.set_title(title, fontsize=SMALL_FONT_PT + 2)
+    # A place of its own, or matplotlib looks for free space above the ticks at every drawing.
+    axes.set_title(title, fontsize=SMALL_FONT_PT + 2, y=1.0)
     axes.set_xlabel(x, fontsize=SMALL_FONT_PT)
     axes.set_ylabel(y, fontsize=SMALL_FONT_PT)
     axes.tick_params(labelsize=SMALL_FONT_PT)
