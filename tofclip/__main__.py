@@ -7,12 +7,7 @@ path cannot take the program's place.
 from __future__ import annotations
 
 import gc
-import importlib
-import importlib.util
 import sys
-from pathlib import Path
-
-from tofclip.dependencies import describe_missing_package
 
 PROGRAM_PACKAGE = "apps"
 EXIT_MISSING, EXIT_INTERRUPTED = 2, 130
@@ -26,9 +21,14 @@ def main() -> int:
     """Run the program and return its exit status; Ctrl-C ends it in one line even while it starts."""
     gc.set_threshold(OBJECTS_PER_COLLECTION)
     try:
+        # Not above: while modules are loaded there, nothing would catch a Ctrl-C.
+        import importlib
+
         _put_own_packages_first()
         status: int = importlib.import_module(f"{PROGRAM_PACKAGE}.cli").main()
     except ImportError as fault:  # typer and rich are needed before any verb
+        from tofclip.dependencies import describe_missing_package
+
         missing = describe_missing_package(fault)
         if missing is None:
             raise
@@ -42,6 +42,9 @@ def main() -> int:
 
 def _put_own_packages_first() -> None:
     """Search the folder of this package first if its neighbour would not be found otherwise."""
+    import importlib.util
+    from pathlib import Path
+
     root = Path(__file__).resolve().parents[1]
     found = importlib.util.find_spec(PROGRAM_PACKAGE)
     own = root / PROGRAM_PACKAGE / "__init__.py"

@@ -67,7 +67,7 @@ def show_time_progress(title: str, seconds: float | None) -> Iterator[Callable[[
     """Show a bar that fills while time passes; yield a function to call with the seconds that have
     passed.
     """
-    if seconds is None:
+    if seconds is None or not math.isfinite(seconds):
         yield lambda _: None
         return
     with show_progress(title, round(seconds * PROGRESS_STEPS_PER_S)) as advance:

@@ -171,8 +171,9 @@ def started_elsewhere(folder: Path, *words: str) -> subprocess.CompletedProcess[
     )
 
 
-def test_ctrl_c_while_the_program_starts_shows_no_traceback(tmp_path: Path) -> None:
-    (tmp_path / "typer.py").write_text("raise KeyboardInterrupt\n")
+@pytest.mark.parametrize("module", ["pathlib", "typer"])  # the first of all, and a later one
+def test_ctrl_c_while_the_program_starts_shows_no_traceback(tmp_path: Path, module: str) -> None:
+    (tmp_path / f"{module}.py").write_text("raise KeyboardInterrupt\n")
     done = started_elsewhere(tmp_path, "--version")
     assert (done.returncode, done.stdout) == (130, "")
     assert done.stderr == "tofclip: interrupted\n"
