@@ -94,7 +94,7 @@ VERBS: VerbTable = {
     "recover": "Recover every transient frame of a raw streak image, or of each one of a sequence.",
     "cloud": "Find each pixel's returns and place them in space: x right, y down, z forward, in metres.",
     "view": "Look at a source: on a page of the browser, in a window, as a picture or as a film.",
-    "stream": "Make a cloud of each shot by the linear inverse while the next ones come; report rate and latencies.",
+    "stream": "Make a cloud of each shot while the next ones come; report method, rate and latencies.",
     "lidar": "How well a range can be known, and how the views' parallax grows with it; many shots in a row.",
     "nlos": "Image the scene hidden around a corner.",
     "clip": "Light fields from few nonlocal measurements.",
