@@ -24,6 +24,7 @@ from tofclip.storage import (
     Record,
     atomic_path,
     collect_provenance,
+    format_error_line,
     is_stand_in,
     read_outline,
 )
@@ -216,6 +217,12 @@ def test_an_attribute_is_text_or_a_number(name: str, value: object, tmp_path: Pa
         with pytest.raises(FileFormatError) as caught:
             read(path)
         assert "\n" not in str(caught.value)
+
+
+def test_another_librarys_message_is_one_line_of_readable_length() -> None:
+    assert format_error_line(ValueError("a\n b")) == "a b"
+    assert format_error_line(ValueError()) == "ValueError"
+    assert len(format_error_line(ValueError("(" * 6000))) < 210
 
 
 def test_a_number_is_finite_and_what_is_found_stays_on_one_line() -> None:

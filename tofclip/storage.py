@@ -72,6 +72,8 @@ MIN_COMPRESSED_BYTES = 1 << 16
 
 MAX_DEPTH = 16
 """Of records within records."""
+MAX_MESSAGE_LENGTH = 200
+"""Of another library's message that is part of ours."""
 MAX_OUTLINE_VALUES = 9
 """Arrays up to this size are part of a record's outline."""
 
@@ -599,5 +601,8 @@ def _explain_os_error(fault: OSError) -> str:
 
 
 def format_error_line(fault: BaseException) -> str:
-    """Return an exception's message without line breaks, or its name where it has none."""
-    return " ".join(str(fault).split()) or type(fault).__name__
+    """Return an exception's message without line breaks, cut where it repeats a whole file, or its
+    name where it has none.
+    """
+    text = " ".join(str(fault).split()) or type(fault).__name__
+    return text if len(text) <= MAX_MESSAGE_LENGTH else f"{text[:MAX_MESSAGE_LENGTH]} ..."
