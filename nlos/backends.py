@@ -13,6 +13,7 @@ import numpy as np
 
 from nlos.band import Band
 from nlos.capture import Capture
+from nlos.geometry import FloatArray
 from nlos.illumination_groups import IlluminationGroup
 from nlos.method import Progress, ignore_progress
 from nlos.plane import Plane, WallLattice
@@ -56,6 +57,10 @@ class Diffraction(Protocol):
         progress : callable
             Called with the number of voxels just done.
         """
+        ...
+
+    def for_laser(self, laser: FloatArray | None) -> Diffraction:
+        """Return the same for the light of another spot (3,), m, sharing what both need."""
         ...
 
 

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from nlos.backends import Backend, choose_backend
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
-from nlos.geometry import Grid
+from nlos.geometry import FloatArray, Grid
 from nlos.illumination_groups import (
     IlluminationGroup,
     build_waves,
     choose_unaliased_band,
+    gather_by_points,
     group_by_illumination,
     require_few_spots,
 )
-from nlos.method import PhasorMethod, Progress, require_imageable
+from nlos.method import PhasorMethod, PhasorPlan, Progress, require_imageable
 from nlos.plane import choose_virtual_plane
 from nlos.propagation.propagate import (
     Propagation,
@@ -25,6 +28,7 @@ from nlos.propagation.propagate import (
     require_propagation,
     require_tolerance,
 )
+from nlos.reciprocity import ReciprocalPlan, choose_roles
 from nlos.rsd.diffraction import DiffractionPlan
 from nlos.rsd.planar import require_even_grid
 from nlos.wave_plan import GroupPlan, WavePlan
@@ -91,15 +95,39 @@ class Hybrid(PhasorMethod):
         require_tolerance(self.tolerance)
         require_propagation(self.propagation)
 
-    def plan(self, capture: Capture, grid: Grid) -> WavePlan:
+    def plan(self, capture: Capture, grid: Grid) -> PhasorPlan:
         """Make the method ready for captures like `capture` on `grid`.
 
         Parameters
         ----------
         capture : Capture
-            Of few laser spots.
+            Of few laser spots, or of few wall points.
         grid : Grid
             Evenly spaced along x and y.
+
+        Returns
+        -------
+        WavePlan or ReciprocalPlan
+
+        Raises
+        ------
+        InputError
+            The method cannot image such a capture on the grid, or not within memory, or the virtual
+            plane would not stand in front of the wall.
+        """
+        quicker = choose_roles(capture)
+        if quicker is not capture:
+            return ReciprocalPlan(capture, grid, self.plan_waves(quicker, grid))
+        return self.plan_waves(capture, grid)
+
+    def plan_waves(self, capture: Capture, grid: Grid) -> WavePlan:
+        """Make the method ready for captures like `capture`, a wave for every laser spot; see
+        `plan`.
+
+        Parameters
+        ----------
+        capture : Capture
+        grid : Grid
 
         Returns
         -------
@@ -108,8 +136,7 @@ class Hybrid(PhasorMethod):
         Raises
         ------
         InputError
-            The method cannot image such a capture on the grid, or not within memory, or the virtual
-            plane would not stand in front of the wall.
+            As of `plan`.
         """
         require_imageable(capture, grid)
         require_even_grid(grid)
@@ -148,35 +175,50 @@ class Hybrid(PhasorMethod):
             raise InputError(
                 f"the virtual plane must lie in front of the wall, which reaches up to z = {foremost:.4g} m"
             )
-        return [self._plan_group(capture, group, grid, band, backend) for group in groups]
+        plans: list[GroupPlan] = []
+        for same in gather_by_points(capture, groups):
+            plane_to_depths = self._plan_depths(
+                capture.points[same[0].indices], same[0], grid, band
+            )
+            plans += self._plan_groups_at(capture, same, plane_to_depths, band, backend)
+        return plans
 
-    def _plan_group(
-        self,
-        capture: Capture,
-        group: IlluminationGroup,
-        grid: Grid,
-        band: Band,
-        backend: Backend,
-    ) -> GroupPlan:
+    def _plan_depths(
+        self, points: FloatArray, group: IlluminationGroup, grid: Grid, band: Band
+    ) -> DiffractionPlan:
+        """Plan the way from a virtual plane before the points (n, 3) of a group to the voxels."""
         zones = STRICT_FRESNEL_ZONES if self.tolerance < STRICT_TOLERANCE else FRESNEL_ZONES
         waves = build_waves(group, band, continued=True)
-        plane = choose_virtual_plane(
-            capture.points[group.indices], grid, waves, zones, self.plane_z
-        )
+        plane = choose_virtual_plane(points, grid, waves, zones, self.plane_z)
         plane_to_depths = DiffractionPlan(plane, grid, waves, self.tolerance)
         plane_to_depths.require_memory()
+        return plane_to_depths
+
+    def _plan_groups_at(
+        self,
+        capture: Capture,
+        groups: Sequence[IlluminationGroup],
+        plane_to_depths: DiffractionPlan,
+        band: Band,
+        backend: Backend,
+    ) -> list[GroupPlan]:
+        """Plan groups of the same wall points, whose ways differ in the laser spot only."""
+        plane = plane_to_depths.plane
         tolerance = WALL_TO_PLANE_ERROR_FRACTION * self.tolerance
-        propagate = plan_wall_to_plane(
-            capture, group, plane, band, backend, self.propagation, tolerance
+        carry = plan_wall_to_plane(
+            capture, groups[0], plane, band, backend, self.propagation, tolerance
         )
         # The Rayleigh-Sommerfeld integral over the plane, as a sum over its points.
         area = float(np.float32(np.prod(plane.steps)))
 
-        def wall_to_plane(one: Capture, progress: Progress) -> Array:
-            return propagate(one, progress) * area
+        def wall_to_plane(one: Capture, progress: Progress, group: IlluminationGroup) -> Array:
+            return carry(one, progress, group) * area
 
         fraction = WALL_TO_PLANE_TIME_FRACTIONS[self.propagation]
-        return GroupPlan(group, wall_to_plane, plane_to_depths, fraction)
+        return [
+            GroupPlan(group, partial(wall_to_plane, group=group), plane_to_depths, fraction)
+            for group in groups
+        ]
 
     @property
     def settings(self) -> dict[str, str | float]:

@@ -9,15 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from nlos.capture import Capture
-from nlos.illumination_groups import is_confocal
 from tofclip.arrays import namespace
 from tofclip.errors import InputError
-
-NEAR_LASER_FRACTION = 0.03
-"""Of the wall's width: a laser spot so near to its wall point makes a confocal pair."""
-
-NEAR_LASER_M, MAX_NEAR_LASER_FRACTION = 0.02, 0.1
-"""So does one as near as this, if that is less than this fraction of the wall's width."""
 
 
 def crop_capture(capture: Capture, nearest: float, farthest: float) -> Capture:
@@ -123,35 +116,6 @@ def remove_first_bounce(capture: Capture, margin: float, ramp: float = 0.0) -> C
         signal = signal * capture.device.put(rising.astype(np.float32))
     return Capture(
         signal, capture.wall, capture.laser, capture.bin_width, capture.start, capture.provenance
-    )
-
-
-def join_near_lasers(capture: Capture) -> Capture:
-    """Take pairs of a laser spot and a wall point close by for confocal ones at their midpoint.
-
-    The path by way of a point at distance R then errs by at most ``d^2 / (4 R)``, d the distance of
-    the two: 0.1 mm for 15 mm and half a metre.
-
-    Parameters
-    ----------
-    capture : Capture
-
-    Returns
-    -------
-    Capture
-        The same one where a pair is farther apart than `NEAR_LASER_FRACTION` of the wall's width
-        and than `NEAR_LASER_M`, or all are confocal already.
-    """
-    if capture.laser.ndim == 1 or is_confocal(capture) or len(capture.points) == 1:
-        return capture
-    extent = float(np.ptp(capture.points, axis=0).max())
-    apart = float(np.linalg.norm(capture.lasers - capture.points, axis=1).max())
-    near = min(NEAR_LASER_M, MAX_NEAR_LASER_FRACTION * extent)
-    if apart > max(NEAR_LASER_FRACTION * extent, near):
-        return capture
-    middle = (capture.wall + capture.laser) / 2
-    return Capture(
-        capture.signal, middle, middle, capture.bin_width, capture.start, capture.provenance
     )
 
 

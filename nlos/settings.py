@@ -19,13 +19,14 @@ from nlos.capture import Capture
 from nlos.geometry import Grid
 from nlos.illumination_groups import is_confocal
 from nlos.method import Method, Plan
+from nlos.moveout import join_near_lasers
 from nlos.preparation import (
     fade_record_end,
     flip_capture,
-    join_near_lasers,
     rebin_capture,
     remove_first_bounce,
 )
+from nlos.reciprocity import choose_roles
 from nlos.signal_analysis import (
     SignalSpectrum,
     find_brightest_path,
@@ -110,6 +111,10 @@ METHOD_CLASSES = {
 METHODS_BY_SPEED = ("rsd", "hybrid", "backprojection")
 """They give the same picture; the later one takes more walls and lasers, and more time."""
 
+MIN_PAIRS_PER_IMAGE = 250
+"""An image by waves takes as long as to back-project so many pairs of spots; measured. One is made
+for every laser spot, or two for every wall point that sees many."""
+
 TRANSFORM_METHODS = ("lct", "fk")
 """They see no finer than the wall's lattice and the time bins, whatever the wavelength."""
 
@@ -183,7 +188,7 @@ class Settings:
 
     def prepare(self, capture: Capture) -> Capture:
         """Mirror coordinates, blank the wall's own light and put time bins together, as settings say."""
-        capture = self._orient(capture)
+        capture = self._orient(join_near_lasers(capture))
         if self.gate is not None:
             capture = remove_first_bounce(capture, self.gate, self.gate_ramp or 0.0)
         if self.fade:
@@ -191,11 +196,10 @@ class Settings:
         return self._join_bins(capture)
 
     def prepare_counts(self, capture: Capture) -> Capture:
-        """Do what `prepare` does but for the blanking: whatever is counted stays a count."""
+        """Do what `prepare` does but for blanking and midpoints: whatever is counted stays a count."""
         return self._join_bins(self._orient(capture))
 
     def _orient(self, capture: Capture) -> Capture:
-        capture = join_near_lasers(capture)
         return flip_capture(capture, self.flip) if self.flip else capture
 
     def _join_bins(self, capture: Capture) -> Capture:
@@ -218,7 +222,8 @@ class Settings:
     def plan_quickest(
         self, capture: Capture, grid: Grid, names: tuple[str, ...] = METHODS_BY_SPEED
     ) -> tuple[str, Plan]:
-        """Return the first method whose plan is not refused, and that plan.
+        """Return the first method that takes the capture and does not take longer than the last
+        one, and its plan.
 
         Parameters
         ----------
@@ -240,9 +245,12 @@ class Settings:
         """
         for name in names[:-1]:
             try:
-                return name, self.make_method(name).plan(capture, grid)
+                plan = self.make_method(name).plan(capture, grid)
             except InputError:
                 continue
+            images = getattr(plan, "images", 1)
+            if images == 1 or images * MIN_PAIRS_PER_IMAGE <= len(capture.points):
+                return name, plan
         return names[-1], self.make_method(names[-1]).plan(capture, grid)
 
     def with_method(self, name: str) -> Settings:
@@ -296,10 +304,10 @@ def settings_for(capture: Capture, **given: Any) -> Settings:
 
 def complete_settings(capture: Capture, **given: Any) -> Settings:
     """Find settings that suit a capture, but for the method; see `settings_for`."""
+    capture = choose_roles(join_near_lasers(capture))
     require_plausible(capture)
-    capture = join_near_lasers(capture)
     found = _complete_gate(capture, Settings(**given))
-    gated = replace(found, bins_together=1).prepare(capture)
+    gated = choose_roles(replace(found, bins_together=1).prepare(capture))
     if found.fade is None and find_lit_end(gated):
         fade = FADE_FRACTION * float(np.ptp(capture.axis.paths))
         found = _add(found, "fade", fade, "light still comes when the record ends")

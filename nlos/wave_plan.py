@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from nlos.backends import Backend
+from nlos.backends import Backend, Diffraction
 from nlos.band import Band
 from nlos.capture import Capture
 from nlos.geometry import Grid
@@ -20,6 +20,7 @@ from nlos.plane import Plane
 from nlos.propagation.propagate import WallToPlane
 from nlos.rsd.diffraction import BYTES_PER_WAVE, DiffractionPlan
 from nlos.volume import Volume
+from tofclip.arrays import Array
 
 SUM_BYTES, MAGNITUDE_BYTES = 8, 4
 """Per voxel: a complex64 sum, and its float32 magnitude."""
@@ -90,15 +91,17 @@ class WavePlan(PhasorPlan):
             + MAGNITUDE_BYTES * capture.axis.bins * capture.valid.size
             + SPECTRUM_COPIES * groups[0].memory_bytes
         )
-        self._diffractions = [
-            backend.plane_to_depths(one.plane_to_depths, build_source(one.group, band))
-            for one in groups
-        ]
+        self._diffractions = _build_diffractions(groups, band, backend)
         self._warned = False
 
     @property
     def cost(self) -> int:
         return len(self.groups) * self.grid.size
+
+    @property
+    def images(self) -> int:
+        """Images that are made and added up."""
+        return len(self.groups)
 
     @property
     def memory_bytes(self) -> int:
@@ -113,14 +116,69 @@ class WavePlan(PhasorPlan):
         if not self._warned:
             warn_of_aliasing(capture, self.band)
             self._warned = True
-        total = self._backend.zeros(self.grid.shape)
-        for group, diffraction in zip(self.groups, self._diffractions, strict=True):
-            plane, waves = group.plane_to_depths.plane, group.plane_to_depths.waves
-            wall_work = int(group.wall_fraction * self.grid.size)
-            wall_progress = SubProgress(
-                progress, plane.x.size * plane.y.size * waves.count, wall_work
+        total = self.zeros()
+        for number in range(len(self.groups)):
+            self.add_to_depths(
+                number, self.propagate_to_plane(number, capture, progress), total, progress
             )
-            depth_progress = SubProgress(progress, self.grid.size, self.grid.size - wall_work)
-            on_plane = group.wall_to_plane(capture, wall_progress)
-            diffraction.add(on_plane, total, depth_progress)
         return Volume(total, self.grid, {**capture.provenance, "imaging": self.settings})
+
+    def zeros(self) -> Array:
+        """Make a dark field (z, y, x) on the plan's device, complex64."""
+        return self._backend.zeros(self.grid.shape)
+
+    def propagate_to_plane(self, number: int, capture: Capture, progress: Progress) -> Array:
+        """Return the field (y, x, frequencies) of one illumination group on its plane.
+
+        Parameters
+        ----------
+        number : int
+            Of the group.
+        capture : Capture
+        progress : callable
+            Called with a part of the number of voxels.
+
+        Returns
+        -------
+        (y, x, frequencies) complex64 array
+        """
+        group = self.groups[number]
+        plane, waves = group.plane_to_depths.plane, group.plane_to_depths.waves
+        points = plane.x.size * plane.y.size * waves.count
+        return group.wall_to_plane(capture, SubProgress(progress, points, self._wall_work(number)))
+
+    def add_to_depths(self, number: int, on_plane: Array, total: Array, progress: Progress) -> None:
+        """Add what the field of one illumination group shows to a volume.
+
+        Parameters
+        ----------
+        number : int
+            Of the group.
+        on_plane : (y, x, frequencies) complex64 array
+        total : (z, y, x) complex64 array
+            Added to, in place.
+        progress : callable
+            Called with the rest of the number of voxels.
+        """
+        work = self.grid.size - self._wall_work(number)
+        self._diffractions[number].add(on_plane, total, SubProgress(progress, self.grid.size, work))
+
+    def _wall_work(self, number: int) -> int:
+        """How many voxels the way from the wall to the plane counts for."""
+        return int(self.groups[number].wall_fraction * self.grid.size)
+
+
+def _build_diffractions(
+    groups: Sequence[GroupPlan], band: Band, backend: Backend
+) -> list[Diffraction]:
+    """Return what carries every group's field to the voxels; groups of one plane share it."""
+    by_plane: dict[int, Diffraction] = {}
+    found = []
+    for one in groups:
+        plan = one.plane_to_depths
+        if id(plan) not in by_plane:
+            by_plane[id(plan)] = backend.plane_to_depths(plan, build_source(one.group, band))
+            found.append(by_plane[id(plan)])
+        else:
+            found.append(by_plane[id(plan)].for_laser(one.group.laser))
+    return found

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Generic
 from apps.progress import show_progress
 from nlos import Refinement
 from nlos.illumination_groups import AliasingWarning
+from nlos.moveout import MidpointImaging
 from nlos.refinement.photons import PhotonRefinement
 from nlos.refinement.refine import build_total_variation
 from nlos.settings import METHOD_CLASSES, Settings, complete_settings, find_bright_box, find_scout
@@ -380,7 +381,7 @@ def build_refinement(settings: Refining, imaging: Settings, grid: Grid) -> tuple
         )
         linear = cast("PhasorMethod", imaging.make_method())
         return found, PhotonRefinement(
-            linear,
+            MidpointImaging(linear),
             found.iterations or PHOTON_ITERATIONS,
             found.prior_weight or 0.0,
             blank=imaging.gate or 0.0,

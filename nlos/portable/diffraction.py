@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -19,6 +20,8 @@ from nlos.rsd.image_planes import Illumination, LaserSource
 from nlos.rsd.kernels import TAPS
 from tofclip.arrays import Array
 from tofclip.threads import run_blocks, split_blocks
+
+FloatArray = NDArray[np.float64]
 
 MAX_CACHE_BYTES = 1 << 30
 """Transfer functions and illuminations of all depths are kept for the next field if they take no
@@ -77,6 +80,15 @@ class PortableDiffraction:
         self.plan, self.source, self.library = plan, source, library
         self._depths = DepthPropagator(plan)
         self._cached_blocks: list[_DepthBlock] = []
+        self._keeps_blocks = True
+
+    def for_laser(self, laser: FloatArray | None) -> PortableDiffraction:
+        """Return the same for the light of another spot, which plans its depths for every field."""
+        other = copy.copy(self)
+        other.source = replace(self.source, laser=laser)
+        other._cached_blocks, other._keeps_blocks = [], False
+        other.__dict__.pop("_lateral_distance_squared", None)
+        return other
 
     def add(self, values: Array, total: Array, progress: Progress = ignore_progress) -> None:
         """Add ``sum_k S_k(r) * exp(1j * k * |r_L - r|)`` to every voxel r; see
@@ -169,7 +181,8 @@ class PortableDiffraction:
         waves, frequencies = self._wave_weights.shape
         size = max(1, self.library.chunk_bytes // (8 * waves * frequencies))
         nodes = self.plan.transfer.nodes.size
-        is_cached = 8 * self.plan.grid.z.size * nodes * frequencies <= MAX_CACHE_BYTES
+        size_bytes = 8 * self.plan.grid.z.size * nodes * frequencies
+        is_cached = self._keeps_blocks and size_bytes <= MAX_CACHE_BYTES
         made = []
         for some in split_blocks(self.plan.grid.z.size, size):
             planes = self._plan_block(some)

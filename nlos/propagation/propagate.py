@@ -22,6 +22,9 @@ Propagation = Literal["spectral", "time"]
 WallToPlane = Callable[[Capture, Progress], Array]
 """Carries what a capture's wall points recorded to a plane: the field (y, x, frequencies) there."""
 
+GroupToPlane = Callable[[Capture, Progress, IlluminationGroup], Array]
+"""The same for one of several groups of the same wall points."""
+
 
 def propagate(
     capture: Capture,
@@ -71,7 +74,7 @@ def propagate(
         capture, group, plane, band, choose_backend(capture, band), propagation, tolerance
     )
     wavenumbers = group.legs * band.wavenumbers
-    return PlaneField(wall_to_plane(capture, ignore_progress), plane, wavenumbers)
+    return PlaneField(wall_to_plane(capture, ignore_progress, group), plane, wavenumbers)
 
 
 def plan_wall_to_plane(
@@ -82,8 +85,9 @@ def plan_wall_to_plane(
     backend: Backend,
     propagation: Propagation = "spectral",
     tolerance: float = 1e-2,
-) -> WallToPlane:
-    """Return what carries one illumination group of such captures onto a plane; see `propagate`.
+) -> GroupToPlane:
+    """Return what carries an illumination group of such captures, or another one of the same wall
+    points, onto a plane; see `propagate`.
 
     Parameters
     ----------
@@ -99,8 +103,8 @@ def plan_wall_to_plane(
     Returns
     -------
     callable
-        From a capture and a progress, which counts points of the plane times frequencies, to the
-        field (y, x, frequencies).
+        From a capture, a progress, which counts points of the plane times frequencies, and a group
+        to the field (y, x, frequencies).
 
     Raises
     ------
@@ -116,7 +120,7 @@ def plan_wall_to_plane(
     if propagation == "time":
         require_numpy_signal("propagation in time", capture)
 
-        def shift_and_sum(one: Capture, progress: Progress) -> Array:
+        def shift_and_sum(one: Capture, progress: Progress, group: IlluminationGroup) -> Array:
             traces = np.ascontiguousarray(one.traces()[group.indices])
             return propagate_in_time(points, traces, plane, band, group.legs, progress)
 
@@ -124,7 +128,7 @@ def plan_wall_to_plane(
     waves = build_waves(group, band, continued=False)
     propagated = backend.propagate_phasors(points, plane, waves, tolerance)
 
-    def propagate_spectrum(one: Capture, progress: Progress) -> Array:
+    def propagate_spectrum(one: Capture, progress: Progress, group: IlluminationGroup) -> Array:
         return propagated.field(backend.compute_phasors(one, group), progress)
 
     return propagate_spectrum

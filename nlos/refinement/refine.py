@@ -12,6 +12,7 @@ from nlos.hybrid import Hybrid
 from nlos.illumination_groups import warn_of_aliasing
 from nlos.method import MEMORY_LIMIT_BYTES, Method, Plan, Progress, require_numpy_signal
 from nlos.plane import axis_step
+from nlos.reciprocity import choose_roles
 from nlos.refinement.model import WallModel
 from nlos.volume import Volume
 from nlos.wave_plan import WavePlan
@@ -97,7 +98,7 @@ class Refinement(Method):
             or memory does not suffice.
         """
         require_numpy_signal("iterative refinement", capture)
-        hybrid = self.hybrid.plan(capture, grid)
+        hybrid = self.hybrid.plan_waves(choose_roles(capture), grid)
         _require_fine_depths(grid, self.hybrid.wavelength)
         _require_memory(grid)
         return RefinementPlan(capture, grid, self, hybrid)
@@ -130,7 +131,7 @@ class RefinementPlan(Plan):
 
     def _image(self, capture: Capture, progress: Progress) -> Volume:
         warn_of_aliasing(capture, self.hybrid.band)
-        model = WallModel(self.hybrid, capture)
+        model = WallModel(self.hybrid, choose_roles(capture))
         prior, size = self.method.prior, self.grid.size
         result = prior.recover(
             model.operator(), model.measurements(), progress=lambda done: progress(done * size)

@@ -6,7 +6,8 @@ inverse transforms per depth replace one per frequency.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import copy
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 
 import numpy as np
@@ -157,11 +158,14 @@ class LaserSource:
         rad/m.
     strength : (frequencies,) array
         Share of each frequency in the pulse; decides what may be neglected.
+    splits : dict
+        Illuminations split so far, which spots at other places share.
     """
 
     laser: FloatArray | None
     wavenumbers: FloatArray
     strength: FloatArray
+    splits: dict[tuple[float, float], Illumination] = field(default_factory=dict, repr=False)
 
     @property
     def centre_wavenumber(self) -> float:
@@ -202,15 +206,11 @@ class LaserSource:
 
     def _split_range(self, half: float, tolerance: float) -> Illumination:
         key = half, tolerance
-        if key not in self._split_cache:
-            self._split_cache[key] = split_illumination(
+        if key not in self.splits:
+            self.splits[key] = split_illumination(
                 self.wavenumbers - self.centre_wavenumber, self.strength, half, tolerance
             )
-        return self._split_cache[key]
-
-    @cached_property
-    def _split_cache(self) -> dict[tuple[float, float], Illumination]:
-        return {}
+        return self.splits[key]
 
 
 class CompiledDiffraction:
@@ -234,6 +234,14 @@ class CompiledDiffraction:
         self.groups = WaveGroups(plan.plane_waves)
         self.table_bytes = 0
         self._spare: list[_Workspace] = []
+
+    def for_laser(self, laser: FloatArray | None) -> CompiledDiffraction:
+        """Return the same for the light of another spot; both share tables and threads' memory."""
+        _ = self._interpolation
+        other = copy.copy(self)
+        other.source = replace(self.source, laser=laser)
+        other.__dict__.pop("_lights", None)
+        return other
 
     def add(
         self,
@@ -263,10 +271,8 @@ class CompiledDiffraction:
             lights, interpolation = self._lights, self._interpolation
 
             def process_block(planes: slice) -> None:
-                workspace = (
-                    self._spare.pop() if self._spare else self._make_workspace(interpolation)
-                )
-                workspace.image(spectrum, lights[planes], planes, total)
+                workspace = self._take_workspace(interpolation)
+                workspace.image(spectrum, self.source, lights[planes], planes, total)
                 self._spare.append(workspace)
                 progress(total[planes].size)
 
@@ -289,9 +295,14 @@ class CompiledDiffraction:
     def _interpolation(self) -> Interpolation:
         return self.groups.interpolation(self.plan.transfer)
 
-    def _make_workspace(self, interpolation: Interpolation) -> _Workspace:
+    def _take_workspace(self, interpolation: Interpolation) -> _Workspace:
+        """Return a workspace that is not in use and holds all terms, or a new one."""
         max_terms = max(light.coefficients.shape[1] for light in self._lights)
-        return _Workspace(self.plan, self.source, self.groups, interpolation, max_terms)
+        if self._spare:
+            found = self._spare.pop()
+            if found.max_terms >= max_terms:
+                return found
+        return _Workspace(self.plan, self.groups, interpolation, max_terms)
 
 
 class _Workspace:
@@ -300,17 +311,12 @@ class _Workspace:
     def __init__(
         self,
         plan: DiffractionPlan,
-        source: LaserSource,
         groups: WaveGroups,
         interpolation: Interpolation,
         terms: int,
     ) -> None:
-        self.plan, self.source, self.groups, self.interpolation = (
-            plan,
-            source,
-            groups,
-            interpolation,
-        )
+        self.plan, self.groups, self.interpolation = plan, groups, interpolation
+        self.max_terms = terms
         self.inverse = choose_inverse(groups.indices, plan.lattice, plan.grid.shape[1:], terms)
         # repeated waves are sent to a spare cell that nothing reads
         self.cell_indices = np.where(
@@ -323,7 +329,12 @@ class _Workspace:
         )
 
     def image(
-        self, spectrum: FloatParts, lights: list[Illumination], planes: slice, total: Field
+        self,
+        spectrum: FloatParts,
+        source: LaserSource,
+        lights: list[Illumination],
+        planes: slice,
+        total: Field,
     ) -> None:
         """Add a few depth planes.
 
@@ -331,6 +342,7 @@ class _Workspace:
         ----------
         spectrum : float32 array
             Plane waves of the wall's field at all frequencies.
+        source : LaserSource
         lights : list of Illumination
             One for each plane.
         planes : slice
@@ -339,16 +351,20 @@ class _Workspace:
             Added to, in place.
         """
         depths = self.plan.grid.z[planes]
-        carried = self._propagate_terms(spectrum, lights, depths)
-        for terms, light, depth, field in zip(carried, lights, depths, total[planes], strict=True):
+        carried = self._propagate_terms(spectrum, source, lights, depths)
+        for terms, light, depth, image in zip(carried, lights, depths, total[planes], strict=True):
             count = light.coefficients.shape[1]
             for some in split_blocks(count, len(self.inverse.spectra)):
                 scatter_terms(terms[some], self.cell_indices, self.folded, self.inverse.spectra)
                 self.inverse.transform(some)
-            self._illuminate(self.inverse.images[:count], light, depth, field)
+            self._illuminate(self.inverse.images[:count], source, light, depth, image)
 
     def _propagate_terms(
-        self, spectrum: FloatParts, lights: list[Illumination], depths: FloatArray
+        self,
+        spectrum: FloatParts,
+        source: LaserSource,
+        lights: list[Illumination],
+        depths: FloatArray,
     ) -> FloatParts:
         """Return the plane waves of all terms, (depths, m, groups, 2, MIRRORED, LANES)."""
         leading_zeros, between = self.groups.leading_zeros, self.interpolation
@@ -360,7 +376,7 @@ class _Workspace:
         nodes = []
         for own, light, depth in zip(coefficients, lights, depths, strict=True):
             own[: light.coefficients.shape[1], leading_zeros:] = light.coefficients.T
-            delay = np.array([light.span.mean(), self.source.centre_wavenumber])
+            delay = np.array([light.span.mean(), source.centre_wavenumber])
             nodes.append(
                 self.plan.transfer.evaluate(depth - self.plan.plane.z, delay, leading_zeros)
             )
@@ -372,10 +388,12 @@ class _Workspace:
         )
         return terms
 
-    def _illuminate(self, images: Field, light: Illumination, depth: float, field: Field) -> None:
+    def _illuminate(
+        self, images: Field, source: LaserSource, light: Illumination, depth: float, field: Field
+    ) -> None:
         """Let the laser's wave meet the images of one depth plane."""
         x, y = self.plan.grid.x, self.plan.grid.y
-        laser = np.zeros(3) if self.source.laser is None else self.source.laser
+        laser = np.zeros(3) if source.laser is None else source.laser
         table, carrier = np.ascontiguousarray(light.table.T), self.inverse.carrier
         add_illuminated_terms(
             images,
@@ -384,7 +402,7 @@ class _Workspace:
             y,
             depth,
             laser,
-            self.source.centre_wavenumber,
+            source.centre_wavenumber,
             table,
             light.span,
             carrier,

@@ -4,7 +4,9 @@ domain.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 from nlos.backends import Backend, choose_backend
 from nlos.band import Band, VirtualPulse
@@ -14,12 +16,14 @@ from nlos.illumination_groups import (
     IlluminationGroup,
     build_waves,
     choose_unaliased_band,
+    gather_by_points,
     group_by_illumination,
     require_few_spots,
 )
-from nlos.method import PhasorMethod, Progress, require_imageable
+from nlos.method import PhasorMethod, PhasorPlan, Progress, require_imageable
 from nlos.plane import PlanarWall, is_evenly_spaced
 from nlos.propagation.propagate import require_tolerance
+from nlos.reciprocity import ReciprocalPlan, choose_roles
 from nlos.rsd.diffraction import DiffractionPlan
 from nlos.wave_plan import GroupPlan, WavePlan
 from tofclip.arrays import Array
@@ -79,25 +83,31 @@ class PlanarRSD(PhasorMethod):
         object.__setattr__(self, "pulse", VirtualPulse(self.wavelength, self.cycles))
         require_tolerance(self.tolerance)
 
-    def plan(self, capture: Capture, grid: Grid) -> WavePlan:
+    def plan(self, capture: Capture, grid: Grid) -> PhasorPlan:
         """Make the method ready for captures like `capture` on `grid`.
 
         Parameters
         ----------
         capture : Capture
-            Of a planar, evenly sampled wall at z = const and few laser spots.
+            Of a planar, evenly sampled wall at z = const and few laser spots; or the other way round.
         grid : Grid
             In front of the wall, evenly spaced along x and y.
 
         Returns
         -------
-        WavePlan
+        WavePlan or ReciprocalPlan
 
         Raises
         ------
         InputError
             The method cannot image such a capture on the grid, or not within memory.
         """
+        quicker = choose_roles(capture)
+        if quicker is not capture:
+            return ReciprocalPlan(capture, grid, self._plan_waves(quicker, grid))
+        return self._plan_waves(capture, grid)
+
+    def _plan_waves(self, capture: Capture, grid: Grid) -> WavePlan:
         require_imageable(capture, grid)
         require_even_grid(grid)
         band = choose_unaliased_band(capture, grid, self.pulse)
@@ -129,7 +139,10 @@ class PlanarRSD(PhasorMethod):
         """
         groups = group_by_illumination(capture)
         require_few_spots(capture, groups)
-        return [self._plan_group(capture, group, grid, band, backend) for group in groups]
+        plans: list[GroupPlan] = []
+        for same in gather_by_points(capture, groups):
+            plans += self._plan_groups_at(capture, same, grid, band, backend)
+        return plans
 
     @property
     def settings(self) -> dict[str, str | float]:
@@ -141,27 +154,31 @@ class PlanarRSD(PhasorMethod):
             "tolerance": self.tolerance,
         }
 
-    def _plan_group(
+    def _plan_groups_at(
         self,
         capture: Capture,
-        group: IlluminationGroup,
+        groups: Sequence[IlluminationGroup],
         grid: Grid,
         band: Band,
         backend: Backend,
-    ) -> GroupPlan:
-        wall = PlanarWall.of(capture.points[group.indices])
+    ) -> list[GroupPlan]:
+        """Plan groups of the same wall points, whose ways differ in the laser spot only."""
+        wall = PlanarWall.of(capture.points[groups[0].indices])
         if grid.z[0] <= wall.plane.z:
             raise InputError(
                 f"the grid must begin in front of the wall, which is at z = {wall.plane.z:.4g} m"
             )
-        waves = build_waves(group, band, continued=False)
+        waves = build_waves(groups[0], band, continued=False)
         plane_to_depths = DiffractionPlan(wall.plane, grid, waves, self.tolerance)
         plane_to_depths.require_memory()
 
-        def place_phasors(one: Capture, progress: Progress) -> Array:
+        def place_phasors(one: Capture, progress: Progress, group: IlluminationGroup) -> Array:
             return backend.place_on_lattice(backend.compute_phasors(one, group), wall.lattice)
 
-        return GroupPlan(group, place_phasors, plane_to_depths)
+        return [
+            GroupPlan(group, partial(place_phasors, group=group), plane_to_depths)
+            for group in groups
+        ]
 
 
 def require_even_grid(grid: Grid) -> None:

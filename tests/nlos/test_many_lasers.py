@@ -1,0 +1,132 @@
+"""Scans of many laser spots: several fields added up, roles swapped, and pairs at their midpoints."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD, Refinement, settings_for
+from nlos.capture import TimeAxis
+from nlos.moveout import MidpointImaging, join_near_lasers
+from nlos.reciprocity import choose_roles
+from nlos.refinement.photons import PhotonRefinement
+from nlos.simulate import PointScene
+from tofclip.solvers import Sparse
+
+pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
+AXIS, JITTER, WAVELENGTH = TimeAxis(320, 32e-12), 40e-12, 0.2
+HIDDEN = [[0.1, -0.2, 0.7], [-0.2, 0.1, 0.9]]
+SCENE = PointScene(HIDDEN, [400.0, 500.0])
+GRID = Grid.box((-0.4, 0.4), (-0.4, 0.4), (0.55, 1.0), 0.04)
+LASERS = np.array([[0.1, 0.05, 0.0], [-0.15, 0.2, 0.0]])
+
+
+def lattice(points: int, curved: bool = False) -> np.ndarray:
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, points), np.linspace(-0.5, 0.5, points))
+    return np.stack([x, y, 0.1 * x**2 if curved else 0 * x], axis=-1)
+
+
+@cache
+def exhaustive(kind: str, points: int = 16) -> Capture:
+    """Two spots, each seen by all points of a wall; or all points lit in turns, seen by two."""
+    wall = lattice(points, "curved" in kind)
+    signals = [SCENE.simulate_capture(wall, spot, AXIS, JITTER).signal for spot in LASERS]
+    if "scanned" not in kind:
+        return Capture.exhaustive(np.stack(signals, axis=1), wall, LASERS, AXIS.bin_width)
+    signal = np.stack(signals, axis=-1)
+    # As seen from the detectors: the fall of light is symmetric.
+    return Capture.exhaustive(signal, LASERS, wall, AXIS.bin_width)
+
+
+def pairs(apart: float, points: int = 24) -> Capture:
+    wall = lattice(points)
+    lasers = wall + np.array([apart, 0, 0])
+    return SCENE.simulate_capture(wall, lasers, AXIS, JITTER)
+
+
+def difference(found: np.ndarray, exact: np.ndarray) -> float:
+    """Relative difference of two images, whose scale does not matter."""
+    scale = np.vdot(exact, found) / np.vdot(exact, exact)
+    return float(np.linalg.norm(found / scale - exact) / np.linalg.norm(exact))
+
+
+@pytest.mark.parametrize("kind", ["planar", "curved", "planar, scanned", "curved, scanned"])
+def test_many_spots_show_what_backprojection_shows(kind: str) -> None:
+    capture = exhaustive(kind)
+    method = Hybrid(WAVELENGTH) if "curved" in kind else PlanarRSD(WAVELENGTH)
+    exact = Backprojection(WAVELENGTH).reconstruct(capture, GRID)
+    found = method.reconstruct(capture, GRID)
+    # The tolerance of each way, and of waves that meet no distance any more.
+    assert difference(found.values, exact.values) < 0.02
+    assert found.provenance["imaging"]["method"] in ("rsd", "hybrid")
+
+
+def test_spots_that_light_the_same_wall_share_one_plan() -> None:
+    plan = PlanarRSD(WAVELENGTH).plan(exhaustive("planar"), GRID)
+    assert plan.images == 2
+    assert plan.groups[0].plane_to_depths is plan.groups[1].plane_to_depths
+    scanned = PlanarRSD(WAVELENGTH).plan(exhaustive("planar, scanned"), GRID)
+    # Two for each of two detectors, not one for each of 256 spots.
+    assert scanned.images == 4
+    assert choose_roles(exhaustive("planar")) is exhaustive("planar")
+
+
+def test_a_scan_by_the_laser_is_imaged_by_default() -> None:
+    capture = exhaustive("planar, scanned")
+    settings = settings_for(capture, wavelength=WAVELENGTH)
+    # 512 pairs for four images: back-projection is as quick.
+    assert settings.method == "backprojection"
+    wall, spot = capture.wall[:, :, :1], capture.laser[:, :, :1]
+    one = Capture(capture.signal[..., :1], wall, spot, AXIS.bin_width)
+    found = settings_for(one, wavelength=WAVELENGTH)
+    # The box is as wide as the laser's scan, for the wall is a single point.
+    assert found.x == pytest.approx((-0.5, 0.5), abs=0.05)
+
+
+def test_scans_by_the_laser_are_refined() -> None:
+    capture, grid = exhaustive("planar, scanned", 8), Grid(GRID.x[::2], GRID.y[::2], GRID.z[::2])
+    longer = Hybrid(2 * WAVELENGTH)
+    shot = longer.reconstruct(capture, grid)
+    refined = Refinement(longer, Sparse(2e-2, 5)).reconstruct(capture, grid)
+    # The sparse image gathers its light in fewer voxels than the shot does.
+    spread = [float(one.values.sum() ** 2 / np.sum(one.values**2)) for one in (shot, refined)]
+    assert spread[1] < 0.5 * spread[0]
+    nearest = np.linalg.norm(np.array(HIDDEN) - refined.find_brightest(), axis=1).min()
+    assert nearest < 0.12
+
+
+@pytest.mark.parametrize(("apart", "error"), [(0.05, 0.02), (0.12, 0.05)])
+def test_pairs_a_decimetre_apart_are_imaged_at_their_midpoint(apart: float, error: float) -> None:
+    capture = pairs(apart)
+    joined = join_near_lasers(capture)
+    assert np.array_equal(joined.laser, joined.wall)
+    exact = Backprojection(WAVELENGTH).reconstruct(capture, GRID).values
+    found = MidpointImaging(PlanarRSD(WAVELENGTH)).reconstruct(capture, GRID).values
+    assert difference(found, exact) < error
+    # Without moveout the path is too long by a part of the offset's square.
+    bare = PlanarRSD(WAVELENGTH).reconstruct(replace(joined, signal=capture.signal), GRID).values
+    assert difference(bare, exact) > 1.4 * difference(found, exact)
+    assert settings_for(capture, wavelength=WAVELENGTH).method == "rsd"
+
+
+def test_pairs_far_apart_stay_as_they_are() -> None:
+    mirrored = SCENE.simulate_capture(lattice(16), lattice(16)[::-1], AXIS, JITTER)
+    assert join_near_lasers(mirrored) is mirrored
+    assert settings_for(mirrored, wavelength=WAVELENGTH).method == "backprojection"
+    fine = pairs(0.25, 40)
+    assert join_near_lasers(fine) is fine
+
+
+def test_counts_of_near_pairs_are_refined_as_they_are() -> None:
+    counts = np.random.default_rng(0).poisson(pairs(0.1, 12).signal * 0.2 + 0.01)
+    capture = replace(pairs(0.1, 12), signal=counts.astype(np.float32))
+    settings = settings_for(capture, wavelength=WAVELENGTH)
+    assert np.array_equal(settings.prepare_counts(capture).laser, capture.laser)
+    method = PhotonRefinement(MidpointImaging(PlanarRSD(WAVELENGTH)), iterations=3)
+    refined = method.reconstruct(capture, GRID)
+    assert "refined" not in refined.provenance["imaging"]["stopped_because"]
+    nearest = np.linalg.norm(np.array(HIDDEN) - refined.find_brightest(), axis=1).min()
+    assert nearest < 0.06
