@@ -23,6 +23,7 @@ from tofclip.recovery.surface_patches import SmoothBasis, find_patches
 from tofclip.recovery.surface_solver import refine_state
 from tofclip.recovery.surfaces import (
     SurfaceRecovery,
+    estimate_displacement,
     extrapolate_steps,
     find_usual_brightness,
 )
@@ -192,6 +193,25 @@ def test_a_refused_or_taken_step_never_raises_the_misfit(shot):
     assert model.misfit(refined.amplitude) <= before
     assert model.state.gains.mean() == pytest.approx(CAMERA.gains.mean())
     assert model.state.delays[3] == model.state.stretches[3] == 0
+
+
+def test_without_noise_a_plate_is_where_it_is():
+    """What the prior does to amplitudes must not pass for views that are late, and so for another
+    range: 0.02 to 0.06 mm when it did.
+    """
+    scene = Scene((place("board", (0, 0), 30, 1.4),))
+    clean = simulate_shot(scene, INSTRUMENT, seed=0)
+    streak = replace(clean.streak, counts=clean.signal)
+    returns = recover(streak, clean.camera, SurfaceRecovery(iterations=1)).returns
+    error = (returns.image("range") - clean.truth.range)[clean.truth.target]
+    assert abs(np.nanmean(error)) < 5e-6
+
+
+def test_errors_that_alternate_displace_the_picture_by_their_mean():
+    """And hardly up or down, as lines of either slant take part alike."""
+    right, down = estimate_displacement(CAMERA, 0.49)
+    assert right == pytest.approx(0.49 / 7, rel=0.05)
+    assert down < 0.2 * right
 
 
 def test_light_is_placed_on_an_uneven_time_axis(shot):

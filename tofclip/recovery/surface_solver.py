@@ -174,8 +174,8 @@ class Refinement:
 def refine_state(
     model: SurfaceModel, amplitude: Image, earlier: Refinement | None = None
 ) -> Refinement:
-    """Take a Gauss-Newton step on ranges, gains, delays, stretches and pulse widths, if it lowers
-    the misfit.
+    """Take a Gauss-Newton step on ranges, gains, pulse widths and, from the second step on, delays
+    and stretches, if it lowers the misfit that amplitudes cannot explain.
 
     The covariance is ``H^-1 S H^-1`` with the information H of the data and the sum S of squares of
     the score over clusters of measurements (H. White, Econometrica 50, 1, 1982): it holds the noise that
@@ -196,24 +196,33 @@ def refine_state(
     state = model.state
     error = model.image - model.render(amplitude)
     pull = model.weights * error
-    groups = list(model.iterate_derivatives(amplitude))
+    # As long as ranges are off by much, views that are late would take a part of it: ranges go first.
+    groups = [
+        group
+        for group in model.iterate_derivatives(amplitude)
+        if earlier is not None or group.names[0][0] not in SWEEP_SIGMAS
+    ]
     changes = _eliminate_amplitude(
         model, amplitude, groups, None if earlier is None else earlier.explained
     )
     names = [name for group in groups for name in group.names]
     normal = _multiply_groups(groups, model.weights)
     scores = _sum_scores(groups, pull)
+    # The prior leaves amplitudes a little too even. That looks like views that are late, but not once
+    # amplitudes have explained what they can.
+    scale = _scale_amplitude(model, amplitude > 0)
+    rest = error - model.render(_explain_by_amplitude(model, error, scale, ELIMINATION_ITERATIONS))
     bending, moment = _bend(model, names)
     for index, (name, _, view) in enumerate(names):
         if name in SWEEP_SIGMAS:
             bending[index, index] = 1 / SWEEP_SIGMAS[name] ** 2
             moment[index] = getattr(state, name)[view] / SWEEP_SIGMAS[name] ** 2
-    slope = scores.sum(axis=1) - moment
-    scale = np.sqrt(np.diag(normal)) + np.finfo(np.float32).tiny
-    whole = (normal + bending) / np.outer(scale, scale) + RIDGE * np.eye(scale.size)
-    inverse = np.linalg.inv(whole) / np.outer(scale, scale)
+    slope = _sum_scores(groups, model.weights * rest).sum(axis=1) - moment
+    unit = np.sqrt(np.diag(normal)) + np.finfo(np.float32).tiny
+    whole = (normal + bending) / np.outer(unit, unit) + RIDGE * np.eye(unit.size)
+    inverse = np.linalg.inv(whole) / np.outer(unit, unit)
     change = inverse @ slope
-    before, step = _objective(model, amplitude), 1.0
+    before, step = _objective(model, rest), 1.0
     moved = amplitude
     while step >= SMALLEST_STEP:
         ahead = _move(state, names, step * change)
@@ -227,7 +236,11 @@ def refine_state(
                 moved[part] -= (step * change[own]).astype(np.float32) @ changes[:, part]
         moved = np.float32(excess) * np.maximum(moved, 0)
         model.place(ahead)
-        if _objective(model, moved) < before:
+        error = model.image - model.render(moved)
+        rest = error - model.render(
+            _explain_by_amplitude(model, error, scale, ELIMINATION_ITERATIONS)
+        )
+        if _objective(model, rest) < before:
             break
         step /= 2
     else:
@@ -260,14 +273,11 @@ def _eliminate_amplitude(
         if group.names[0][0] == "coefficients" and len(group.names) == COEFFICIENTS
     ]
     quadratic = np.isin(model.surface, [group.names[0][1] for group in plain])
-    diagonal = model.gather(model.weights, squared=True)
-    lit = (amplitude > 0) & quadratic & (diagonal > 0)
-    scale = np.where(lit, 1 / np.sqrt(np.maximum(diagonal, np.finfo(np.float32).tiny)), 0)
-    scale = scale.astype(np.float32)
+    scale = _scale_amplitude(model, (amplitude > 0) & quadratic)
     changes = np.zeros((COEFFICIENTS, model.surface.size), np.float32)
     iterations = ELIMINATION_ITERATIONS
     if start is not None:
-        changes[:, lit] = start[:, lit]
+        changes[:, scale > 0] = start[:, scale > 0]
         iterations = FURTHER_ELIMINATION_ITERATIONS
     for number, change in enumerate(changes):
         image = np.zeros_like(model.image)
@@ -275,17 +285,7 @@ def _eliminate_amplitude(
             image[group.row : group.row + group.images.shape[1]] += group.images[number]
         if start is not None:
             image -= model.render(change)
-        residual = scale * model.gather(model.weights * image)
-        direction, energy = residual.copy(), float(np.sum(residual**2, dtype=np.float64))
-        for _ in range(iterations):
-            if energy == 0:
-                break
-            product = scale * model.gather(model.weights * model.render(scale * direction))
-            length = energy / float(np.sum(direction * product, dtype=np.float64))
-            change += np.float32(length) * scale * direction
-            residual -= np.float32(length) * product
-            before, energy = energy, float(np.sum(residual**2, dtype=np.float64))
-            direction = residual + np.float32(energy / before) * direction
+        change += _explain_by_amplitude(model, image, scale, iterations)
         for group in plain:
             part = model.parts[group.names[0][1]]
             rows = group.row, group.row + group.images.shape[1]
@@ -293,8 +293,34 @@ def _eliminate_amplitude(
     return changes
 
 
-def _objective(model: SurfaceModel, amplitude: Image) -> float:
-    """Misfit and bending."""
+def _scale_amplitude(model: SurfaceModel, lit: NDArray[np.bool_]) -> Image:
+    """Scales in which lit amplitudes count alike for the data; 0 for all others, which stay."""
+    diagonal = model.gather(model.weights, squared=True)
+    scale = 1 / np.sqrt(np.maximum(diagonal, np.finfo(np.float32).tiny))
+    return np.where(lit & (diagonal > 0), scale, 0).astype(np.float32)
+
+
+def _explain_by_amplitude(
+    model: SurfaceModel, image: Image, scale: Image, iterations: int
+) -> Image:
+    """The change of amplitude x that lowers ``|image - A x|_w`` most, by conjugate gradients."""
+    change = np.zeros_like(scale)
+    residual = scale * model.gather(model.weights * image)
+    direction, energy = residual.copy(), float(np.sum(residual**2, dtype=np.float64))
+    for _ in range(iterations):
+        if energy == 0:
+            break
+        product = scale * model.gather(model.weights * model.render(scale * direction))
+        length = energy / float(np.sum(direction * product, dtype=np.float64))
+        change += np.float32(length) * scale * direction
+        residual -= np.float32(length) * product
+        before, energy = energy, float(np.sum(residual**2, dtype=np.float64))
+        direction = residual + np.float32(energy / before) * direction
+    return change
+
+
+def _objective(model: SurfaceModel, rest: Image) -> float:
+    """Half the squared misfit that is left, and what is known of surfaces and sweep beforehand."""
     bent = sum(
         float(c @ basis.bending @ c) / 2
         for basis, c in zip(model.bases, model.state.coefficients, strict=True)
@@ -303,7 +329,8 @@ def _objective(model: SurfaceModel, amplitude: Image) -> float:
         float(np.sum(getattr(model.state, name) ** 2)) / (2 * sigma**2)
         for name, sigma in SWEEP_SIGMAS.items()
     )
-    return model.misfit(amplitude) + bent + swept
+    misfit = float(np.sum(model.weights * rest**2, dtype=np.float64)) / 2
+    return misfit + bent + swept
 
 
 def _bend(model: SurfaceModel, names: list[tuple[str, int, int]]) -> tuple[FloatArray, FloatArray]:

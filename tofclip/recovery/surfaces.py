@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from tofclip.camera import measure
+from tofclip.camera import Camera, measure
 from tofclip.errors import InputError
 from tofclip.lidar import Detection, Returns, compute_ray_directions, depth
 from tofclip.recovery.surface_model import (
@@ -231,11 +231,8 @@ class SurfaceRecovery:
             # range = length / inverse depth
             by_inverse = distance[part] ** 2 / model.ray_length[part]
             deviation[part] = np.sqrt(by_inverse**2 * variance + rest**2)
-        # What all centres have in common only displaces the picture, and no shot shows it: the mean of
-        # errors that alternate, as of neighbouring lenslets measured in turns. Independent ones would
-        # leave sqrt(views) as much.
-        displacement_px = centre_error_px / camera.views
-        deviation = np.hypot(deviation, displacement_px * np.hypot(*model.compute_slopes()))
+        displacement = estimate_displacement(camera, centre_error_px)
+        deviation = np.hypot(deviation, np.hypot(*(displacement * model.compute_slopes().T).T))
         intensity = amplitude * distance**2
         limit = self.detection.signal_to_noise
         usual = np.zeros(len(model.masks))
@@ -267,6 +264,29 @@ class SurfaceRecovery:
             camera=camera,
             shear=np.asarray(camera.shear_at(distance[chosen])),
         )
+
+
+def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
+    """Return how far errors of the slit centres displace the picture to the right and down, px.
+
+    Of errors e_v a shot shows all but what looks like a displaced picture, ``e_v = dx - dy
+    tan(angle_v)``. That part is taken to be that of errors which alternate, as of neighbouring
+    lenslets measured in turns; independent ones would leave sqrt(views) as much.
+
+    Parameters
+    ----------
+    camera : Camera
+    centre_error_px : float
+        How far off the calibration had each slit centre, as for `tofclip.recovery.Shot`.
+
+    Returns
+    -------
+    (2,) float array
+    """
+    in_turns = (-1.0) ** np.arange(camera.views)
+    looks = np.stack([np.ones(camera.views), -np.tan(camera.angles)], axis=1)
+    found: FloatArray = np.abs(np.linalg.pinv(looks) @ in_turns) * centre_error_px
+    return found
 
 
 def extrapolate_steps(lengths: FloatArray) -> FloatArray:
