@@ -41,6 +41,8 @@ OPTIONS_OF_ARGUMENTS = {
     "method": "--method",
     "overwrite": "--overwrite",
     "pulse": "--pulse-ps",
+    "region": "--region",
+    "target": "--target-m",
     "time_zero": "--time-zero-ns",
 }
 """The command line's option for an argument that the libraries' messages name."""
@@ -62,6 +64,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
 
   demo               all of it on a simulated scene, no files needed: start here
   calibrate          find a camera's views in four pictures of a point source
+  calibrate range    time zero, range walk, offsets and reflectance from shots of a target at known distances
   recover            streak image to one picture per instant
   cloud              recovered frames to a point cloud
   view               look at any of these, or an instrument: a page, a window, a picture, a film
@@ -91,6 +94,7 @@ tofclip {__version__}: 3D from streak images, through occluders and around corne
 VERBS: VerbTable = {
     "demo": "Simulate a scene of letters and plates, recover it from one streak image, and compare with the truth.",
     "calibrate": "Find every view's slit centre and line angle, and draw the fits over the data.",
+    "calibrate range": "Find time zero, range walk, offsets, response and reflectance from shots of a target.",
     "recover": "Recover every transient frame of a raw streak image, or of each one of a sequence.",
     "cloud": "Find each pixel's returns and place them in space: x right, y down, z forward, in metres.",
     "view": "Look at a source: on a page of the browser, in a window, as a picture or as a film.",

@@ -56,7 +56,8 @@ def make_lazy_group(
         Where the modules are. A module holds a function named like the verb, or a group of verbs
         called ``app``.
     verbs : VerbTable
-        In the order of the help.
+        In the order of the help. A verb of two words, such as ``"calibrate range"``, stands beside
+        one that is called by the first word alone.
     readers : collection of str, optional
         Verbs whose first argument is a file, a folder, a pattern or an address. A file that is not
         there is refused before the verb and what it works with are imported, which takes longer
@@ -83,6 +84,9 @@ def make_lazy_group(
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
             """Find the verb that is called; only this one is imported."""
+            pair = " ".join(args[:2])
+            if pair in verbs:  # before the verb that is called by the first word alone
+                args = [pair, *args[2:]]
             name, listed, further = super().resolve_command(ctx, args)
             if name in readers and not ctx.resilient_parsing:
                 _require_source(further)
@@ -90,7 +94,12 @@ def make_lazy_group(
 
         def load_verb(self, name: str) -> Command:
             """Import a verb and return its command."""
-            return load_command(f"{package}.{name.replace('-', '_')}", name)
+            return load_command(f"{package}.{re.sub('[- ]', '_', name)}", name)
+
+        def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+            """Complete single words, as shells take them."""
+            found = super().shell_complete(ctx, incomplete)
+            return [item for item in found if " " not in item.value]
 
     return LazyGroup
 

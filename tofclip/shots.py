@@ -422,6 +422,16 @@ class Returns(Storable):
         known = self.camera.lenslet_pitch > 0
         return self.y - known * rows * missing, self.x - known * columns * missing
 
+    @property
+    def reflectance(self) -> NDArray[np.float32]:
+        """Reflectance of the surfaces as if they faced the camera, percent; NaN where the camera has
+        not seen a target of known reflectance.
+        """
+        known = self.camera.range_calibration
+        if known is None:
+            return np.full(self.y.shape, np.nan, np.float32)
+        return known.compute_reflectance(self.intensity, self.y, self.x).astype(np.float32)
+
     def __getitem__(self, chosen: NDArray[Any]) -> Returns:
         """Return some of the returns, by a mask or by numbers."""
         columns = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,12 +20,19 @@ from apps.figures.photons import make_range_figure
 from apps.figures.style import save_figure
 from apps.verbs.cloud import CLOUD_SUFFIXES, DEPTH_SUFFIX
 from devices.photons import read_photons as read_counted_photons
+from tofclip.camera import Camera
 from tofclip.errors import InputError
 from tofclip.lidar import Pulse, point_cloud, save_depth
-from tofclip.lidar.photons import PhotonImage, SurfaceImage, estimate_pixels, estimate_surface
+from tofclip.lidar.photons import (
+    PhotonImage,
+    SurfaceImage,
+    estimate_pixels,
+    estimate_surface,
+    make_pinhole,
+)
 from tofclip.lidar.photons.files import read_photons
 from tofclip.storage import atomic_path
-from tofclip.units import NANOSECOND, PICOSECOND, SPEED_OF_LIGHT
+from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -84,10 +90,21 @@ def photons(
             metavar="ORDER", help="Order of a cube's axes, e.g. tyx.", show_default="recognised"
         ),
     ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="H5",
+            help="Made by calibrate range of the same pixels: its time zero, range walk, offsets, reflectance and "
+            "focal length are used.",
+            show_default="a pinhole",
+        ),
+    ] = None,
     focal_length_px: Annotated[
         float | None,
         typer.Option(
-            metavar="PX", help="Of the pinhole camera.", show_default="from the field of view"
+            metavar="PX",
+            help="Of the pinhole camera.",
+            show_default="the camera's, or from the field of view",
         ),
     ] = None,
     field_of_view_deg: Annotated[
@@ -95,12 +112,13 @@ def photons(
         typer.Option(metavar="DEG", help="Width of the picture, in place of a focal length."),
     ] = DEFAULT_FIELD_OF_VIEW_DEG,
     time_zero_ns: Annotated[
-        float,
+        float | None,
         typer.Option(
             metavar="NS",
             help="When light of range 0 arrives, after the first bin; of an instrument's own time.",
+            show_default="the camera's, or 0",
         ),
-    ] = 0.0,
+    ] = None,
     single_pixel: Annotated[
         bool, typer.Option("--single-pixel", help="Judge every pixel by its own photons alone.")
     ] = False,
@@ -134,7 +152,7 @@ def photons(
     """
     started = time.perf_counter()
     suffix = out.suffix.lower()
-    inputs = _list_inputs(file, pulse, background)
+    inputs = _list_inputs(file, pulse, background, camera)
     if not single_pixel and (background is not None or cycles is not None):
         raise InputError("--background and --cycles go with --single-pixel")
     require_writable(out, *CLOUD_SUFFIXES, DEPTH_SUFFIX, *PICTURE_SUFFIXES, inputs=inputs)
@@ -142,10 +160,10 @@ def photons(
         raise InputError("give the pulse's width (--pulse-ps) or its shape (--pulse), not both")
     if returns < 1:
         raise InputError(f"at least one return is looked for in a pixel, got --returns {returns}")
-    if not 0 < field_of_view_deg < 180 or (focal_length_px is not None and not focal_length_px > 0):
-        raise InputError("the focal length must be positive, the field of view within 0..180")
+    require_view(focal_length_px, field_of_view_deg)
+    known = None if camera is None else Camera.load(camera)
     width = None if bin_width_ps is None else bin_width_ps * PICOSECOND
-    image, shape, first_time = _read_photons(file, width, axes)
+    image, shape, first_time = read_any_photons(file, width, axes)
     shape = _load_pulse(pulse, image.bin_width) or shape
     if pulse_ps is not None:
         shape = Pulse.gaussian(pulse_ps * PICOSECOND)
@@ -154,19 +172,19 @@ def photons(
         if single_pixel
         else estimate_surface(image, shape, learn=pulse is None, max_returns=returns)
     )
-    # Light travels the range twice, hence half the speed.
-    shift = SPEED_OF_LIGHT / 2 * (time_zero_ns * NANOSECOND - first_time)
-    further = tuple(replace(layer, range=layer.range - shift) for layer in found.further)
-    found = replace(found, range=found.range - shift, further=further)
-    columns = image.image_shape[1]
-    # Half the width over the tangent of half the field of view: a pinhole camera.
-    focal = focal_length_px or columns / 2 / np.tan(np.deg2rad(field_of_view_deg) / 2)
+    seen_by = choose_camera(
+        known, image.image_shape, focal_length_px, field_of_view_deg, found.pulse.fwhm
+    )
+    if time_zero_ns is not None:
+        seen_by = seen_by.replace(time_zero=time_zero_ns * NANOSECOND)
+    found = found.calibrate(seen_by, first_time)
     settings = {
         "bin_width_ps": image.bin_width / PICOSECOND,
         "bins": image.bins,
         "image_shape": list(image.image_shape),
-        "focal_length_px": float(focal),
-        "time_zero_ns": time_zero_ns,
+        "focal_length_px": seen_by.focal_length_px,
+        "time_zero_ns": seen_by.time_zero / NANOSECOND,
+        **({} if camera is None else {"camera": str(camera)}),
         "single_pixel": single_pixel,
         "returns": returns,
         **({} if cycles is None else {"cycles": cycles}),
@@ -175,13 +193,13 @@ def photons(
     past = build_provenance({"verb": "lidar photons", "source": file, **settings}, *inputs)
     # The ending of the name chooses what is written.
     if suffix == RANGE_IMAGE_SUFFIX:
-        save_range_image(found, out)
+        save_range_image(found, seen_by, out)
     elif suffix in PICTURE_SUFFIXES:
         save_figure(make_range_figure(found), out)
     elif suffix == DEPTH_SUFFIX:
-        save_depth(found.to_returns(float(focal), past), out)
+        save_depth(found.to_returns(seen_by, past), out)
     else:
-        point_cloud(found.to_returns(float(focal), past)).save(out)
+        point_cloud(found.to_returns(seen_by, past)).save(out)
     seen = np.isfinite(found.range)
     report(_make_figures(found, seen, time.perf_counter() - started, settings), as_json, [out])
 
@@ -191,7 +209,7 @@ def _list_inputs(file: str, *further: Path | None) -> tuple[Path, ...]:
     return (*named, *(path for path in further if path is not None))
 
 
-def _read_photons(
+def read_any_photons(
     file: str, bin_width: float | None, axes: str | None
 ) -> tuple[PhotonImage, Pulse | None, float]:
     """Read a file or an instrument; return its photons, its response where it knows that, and the
@@ -243,10 +261,54 @@ def _load_bins(path: Path, what: str) -> np.ndarray[Any, Any]:
     return np.asarray(samples, dtype=np.float64)
 
 
-def save_range_image(found: SurfaceImage, path: Path) -> None:
-    """Write ranges, deviations, photons and outlier probabilities to an NPZ file, whole or not at
-    all.
+def require_view(focal_length_px: float | None, field_of_view_deg: float) -> None:
+    """Refuse a focal length or a field of view that no camera has."""
+    if not 0 < field_of_view_deg < 180 or (focal_length_px is not None and not focal_length_px > 0):
+        raise InputError("the focal length must be positive, the field of view within 0..180")
+
+
+def choose_camera(
+    known: Camera | None,
+    image_shape: tuple[int, int],
+    focal_length_px: float | None,
+    field_of_view_deg: float,
+    pulse_fwhm: float,
+) -> Camera:
+    """Return a known camera, or a pinhole.
+
+    Parameters
+    ----------
+    known : Camera or None
+    image_shape : (int, int)
+        Rows and columns of the pinhole.
+    focal_length_px : float or None
+        In place of the camera's, or of that of the field of view.
+    field_of_view_deg : float
+        Width of a pinhole's picture.
+    pulse_fwhm : float
+        Of a return, s.
+
+    Returns
+    -------
+    Camera
     """
+    if known is not None:
+        return known if focal_length_px is None else known.replace(focal_length_px=focal_length_px)
+    # Half the width over the tangent of half the field of view.
+    usual = image_shape[1] / 2 / np.tan(np.deg2rad(field_of_view_deg) / 2)
+    return make_pinhole(image_shape, float(focal_length_px or usual), pulse_fwhm)
+
+
+def save_range_image(found: SurfaceImage, camera: Camera, path: Path) -> None:
+    """Write ranges, deviations, photons and outlier probabilities to an NPZ file, whole or not at
+    all; reflectances too, where the camera knows them.
+    """
+    known = camera.range_calibration
+    further: dict[str, Any] = {}
+    if known is not None and np.isfinite(known.reflectance_scale):
+        further["reflectance_percent"] = known.compute_reflectance(
+            found.intensity * found.range**2, *np.indices(found.range.shape)
+        )
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(
             file,
@@ -254,4 +316,5 @@ def save_range_image(found: SurfaceImage, path: Path) -> None:
             range_sigma_m=found.range_sigma,
             intensity=found.intensity,
             outlier_probability=found.outlier_probability,
+            **further,
         )

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -43,7 +44,7 @@ def test_the_list_of_commands_says_what_the_verbs_say(package: str) -> None:
     name = "apps.cli" if package == "apps" else package
     prefix = "apps.verbs" if package == "apps" else package
     for verb, line in importlib.import_module(name).VERBS.items():
-        text = load_command(f"{prefix}.{verb.replace('-', '_')}", verb).help or ""
+        text = load_command(f"{prefix}.{re.sub('[- ]', '_', verb)}", verb).help or ""
         assert line == " ".join(text.split("\n\n")[0].split()), f"{name}.VERBS: {verb}"
 
 

@@ -8,7 +8,7 @@ from scipy.io import loadmat
 
 from tofclip.errors import InputError, ShapeError
 from tofclip.lidar import Pulse
-from tofclip.lidar.photons import PhotonImage, estimate_surface
+from tofclip.lidar.photons import PhotonImage, estimate_surface, make_pinhole
 from tofclip.lidar.photons.response import measure_pulse_width
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -158,7 +158,7 @@ def test_two_layers_are_both_found_and_none_twice() -> None:
     assert np.mean((hits[0] > 0) & (hits[1] > 0)) >= 0.85
     assert np.mean((hits[0] > 1) | (hits[1] > 1)) <= 0.02
     assert np.mean(np.isfinite(ranges).sum(axis=0) > 2) <= 0.02
-    returns = found.to_returns(60.0)
+    returns = found.to_returns(make_pinhole(found.range.shape, 60.0, FWHM))
     assert len(returns) == np.isfinite(ranges).sum()
     assert returns.return_number.max() >= 2
     one_pixel = (returns.y == 24) & (returns.x == 30)

@@ -8,6 +8,7 @@ from tofclip.camera.measurement import (
     require_width,
 )
 from tofclip.camera.model import Camera
+from tofclip.camera.range_calibration import RangeCalibration
 from tofclip.camera.sweep import PolynomialSweep, ProjectiveSweep, SkewSweep, Sweep
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "Measurement",
     "PolynomialSweep",
     "ProjectiveSweep",
+    "RangeCalibration",
     "Rectifier",
     "SkewSweep",
     "Sweep",

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from tofclip.camera.range_calibration import RangeCalibration
 from tofclip.camera.sweep import FloatArray, Sweep, sweep_from_record
 from tofclip.errors import CalibrationError
 from tofclip.operators import LineProjection
@@ -66,6 +67,8 @@ class Camera(Storable):
         and y/z; none by default.
     centre_uncertainty_px, angle_uncertainty : (views,) array, optional
         One standard deviation of the calibration.
+    range_calibration : RangeCalibration, optional
+        Range walk, offsets and response of the pixels, and reflectance; none by default.
 
     Raises
     ------
@@ -113,6 +116,10 @@ class Camera(Storable):
     )
     angle_uncertainty: FloatArray = field(
         default_factory=lambda: np.empty(0), metadata=stored_array("rad", "view")
+    )
+    range_calibration: RangeCalibration | None = field(
+        default=None,
+        metadata=stored_child(RangeCalibration.from_record, "range_calibration", optional=True),
     )
 
     def __post_init__(self) -> None:
@@ -188,6 +195,8 @@ class Camera(Storable):
             raise CalibrationError(
                 f"lens distortion must be 5 finite numbers, got {self.distortion}"
             )
+        if self.range_calibration is not None:
+            self.range_calibration.require_shape(self.image_shape)
 
     @property
     def views(self) -> int:

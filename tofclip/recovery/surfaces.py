@@ -29,6 +29,7 @@ import scipy
 from tofclip.camera import Camera, measure
 from tofclip.errors import InputError
 from tofclip.lidar import Detection, Returns, compute_ray_directions, depth
+from tofclip.lidar.range_correction import correct_returns
 from tofclip.recovery.surface_model import (
     EXTENT_SIGMAS,
     FWHM_PER_SIGMA,
@@ -127,7 +128,8 @@ class SurfaceRecovery:
             Most of the light does not come from surfaces.
         """
         camera, count = frames.camera, frames.times.size
-        found = depth(frames)
+        # The model explains what was measured: corrections come when its returns are listed.
+        found = depth(frames, camera.replace(range_calibration=None))
         bin_m = SPEED_OF_LIGHT * frames.bin_width / 2
         directions = compute_ray_directions(camera, *np.indices(camera.image_shape).reshape(2, -1))
         ray_length = (1 / directions[:, 2]).reshape(camera.image_shape)
@@ -253,7 +255,7 @@ class SurfaceRecovery:
         y, x = np.divmod(model.pixel[chosen], camera.image_shape[1])
         starts = np.flatnonzero(np.diff(model.pixel[chosen], prepend=-1))
         rank = np.arange(chosen.size) - np.repeat(starts, np.diff(starts, append=chosen.size)) + 1
-        return Returns(
+        measured = Returns(
             y=y.astype(np.int32),
             x=x.astype(np.int32),
             range=distance[chosen],
@@ -264,6 +266,7 @@ class SurfaceRecovery:
             camera=camera,
             shear=np.asarray(camera.shear_at(distance[chosen])),
         )
+        return correct_returns(measured)
 
 
 def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:

@@ -17,7 +17,7 @@ from tofclip.lidar.photons.pile_up import correct_pile_up
 from tofclip.lidar.photons.pixels import estimate_pixels
 from tofclip.lidar.photons.smoothing import Smoothness, locate_with_smoothness
 from tofclip.lidar.photons.surface import estimate_surface
-from tofclip.lidar.photons.surface_image import SurfaceImage
+from tofclip.lidar.photons.surface_image import SurfaceImage, make_pinhole
 
 __all__ = [
     "Accuracy",
@@ -32,5 +32,6 @@ __all__ = [
     "estimate_surface",
     "learn_background",
     "locate_with_smoothness",
+    "make_pinhole",
     "measure_accuracy",
 ]

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from tofclip.camera import Camera
+from tofclip.errors import CalibrationError
 from tofclip.lidar.photons.photon_image import FloatArray
 from tofclip.lidar.pulse import Pulse
+from tofclip.lidar.range_correction import correct_ranges
 from tofclip.shots import Returns
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -46,16 +48,46 @@ class SurfaceImage:
     settings: dict[str, float | str]
     further: tuple[SurfaceImage, ...] = ()
 
-    def to_returns(
-        self, focal_length_px: float, provenance: Mapping[str, Any] | None = None
-    ) -> Returns:
-        """List the pixels with a range, as seen by a pinhole camera.
+    def calibrate(self, camera: Camera, first_time: float = 0.0) -> SurfaceImage:
+        """Return the ranges from the camera's time zero, with its range calibration applied.
 
         Parameters
         ----------
-        focal_length_px : float
-            Distance of the pinhole from the picture, in pixels; the optical axis meets pixel
-            ``(rows // 2, columns // 2)``.
+        camera : Camera
+        first_time : float
+            Reading of the time axis at the middle of the first bin, s.
+
+        Returns
+        -------
+        SurfaceImage
+
+        Raises
+        ------
+        CalibrationError
+            The camera has another number of pixels.
+        """
+        if camera.image_shape != self.range.shape:
+            raise CalibrationError(
+                f"the camera has {camera.image_shape} pixels, the photons {self.range.shape}"
+            )
+        further = tuple(one.calibrate(camera, first_time) for one in self.further)
+        # Light travels the range twice, hence half the speed.
+        distance = self.range - SPEED_OF_LIGHT / 2 * (camera.time_zero - first_time)
+        sigma = self.range_sigma
+        if camera.range_calibration is not None:
+            y, x = np.indices(self.range.shape)
+            distance, _, sigma = correct_ranges(
+                camera.range_calibration, distance, self.intensity, sigma, (y, x)
+            )
+        return replace(self, range=distance, range_sigma=sigma, further=further)
+
+    def to_returns(self, camera: Camera, provenance: Mapping[str, Any] | None = None) -> Returns:
+        """List the pixels with a range.
+
+        Parameters
+        ----------
+        camera : Camera
+            Says where the pixels look, see `make_pinhole`.
         provenance : mapping, optional
             How they came about.
 
@@ -63,23 +95,15 @@ class SurfaceImage:
         -------
         tofclip.lidar.Returns
         """
-        rows, columns = self.range.shape
-        pinhole = Camera(
-            np.array([columns / 2]),
-            np.zeros(1),
-            (rows, columns),
-            columns,
-            pulse_fwhm=self.pulse.fwhm,
-            focal_length_px=focal_length_px,
-        )
+        columns = self.range.shape[1]
         layers = [self, *self.further]
         distance = np.stack([layer.range for layer in layers], axis=2).reshape(-1, len(layers))
         order = np.argsort(distance, axis=1)
         pixel, nearness = np.nonzero(np.isfinite(np.take_along_axis(distance, order, axis=1)))
         layer = order[pixel, nearness]
-        sigma, signal = (
+        sigma, signal, doubt = (
             np.stack([getattr(one, name) for one in layers], axis=2).reshape(distance.shape)
-            for name in ("range_sigma", "intensity")
+            for name in ("range_sigma", "intensity", "outlier_probability")
         )
         found = distance[pixel, layer]
         y, x = np.divmod(pixel, columns)
@@ -91,6 +115,36 @@ class SurfaceImage:
             confidence=sigma[pixel, layer].astype(np.float32),
             return_number=(nearness + 1).astype(np.uint8),
             time=2 * found / SPEED_OF_LIGHT,
-            camera=pinhole,
+            camera=camera,
             provenance={} if provenance is None else provenance,
+            false_alarm=doubt[pixel, layer],
         )
+
+
+def make_pinhole(image_shape: tuple[int, int], focal_length_px: float, pulse_fwhm: float) -> Camera:
+    """Return a camera that only says where its pixels look.
+
+    Parameters
+    ----------
+    image_shape : (int, int)
+        Rows and columns.
+    focal_length_px : float
+        Distance of the pinhole from the picture, in pixels; the optical axis meets pixel
+        ``(rows // 2, columns // 2)``.
+    pulse_fwhm : float
+        Full width at half maximum of a return, s.
+
+    Returns
+    -------
+    Camera
+        Of one view.
+    """
+    columns = image_shape[1]
+    return Camera(
+        np.array([columns / 2]),
+        np.zeros(1),
+        image_shape,
+        columns,
+        pulse_fwhm=pulse_fwhm,
+        focal_length_px=focal_length_px,
+    )

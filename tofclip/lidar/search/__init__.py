@@ -43,6 +43,7 @@ from tofclip.errors import InputError, ShapeError, require_type
 from tofclip.lidar.detection import Detection
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.pulse import Pulse
+from tofclip.lidar.range_correction import correct_returns
 from tofclip.lidar.search.array_api import ArraySearch, ArrayTraces
 from tofclip.lidar.significance import (
     CANDIDATES,
@@ -156,7 +157,7 @@ class ReturnSearch:
             self.camera.image_shape,
             SPEED_OF_LIGHT / 2 * self.pulse.fwhm,
         )
-        return Returns(
+        measured = Returns(
             y=y.astype(np.int32),
             x=x.astype(np.int32),
             range=distance[kept],
@@ -169,6 +170,7 @@ class ReturnSearch:
             provenance={} if provenance is None else provenance,
             false_alarm=doubt[kept] if judge is not None else doubt,
         )
+        return correct_returns(measured)
 
     def _shear_at(self, time: FloatArray) -> FloatArray:
         if (

@@ -1,0 +1,192 @@
+"""What a target at a known distance tells of an instrument's ranges and intensities.
+
+A detector reports a strong return earlier than a weak one (range walk), every pixel has a delay and
+a gain of its own, and counts become a reflectance only beside a target whose reflectance is known.
+The corrections are made where returns are listed, see `tofclip.lidar.range_correction`; time zero is
+the camera's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tofclip.errors import CalibrationError
+from tofclip.records import Storable, stored_array, stored_value
+from tofclip.units import SPEED_OF_LIGHT
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RangeCalibration(Storable):
+    """Corrections of ranges and intensities, each with its standard deviation.
+
+    Parameters
+    ----------
+    time_zero_sigma : float
+        One standard deviation of the camera's time zero, s.
+    walk : (order,) array
+        Range walk: what is measured too long, as the coefficients a_1, a_2... of
+        ``sum a_n log10(signal / reference_signal)^n``, m. Empty where it is not known.
+    walk_covariance : (order, order) array
+        Of these coefficients, m^2.
+    reference_signal : float
+        Counts of a return for which time zero holds as it is.
+    signal_range : (2,) array
+        Weakest and strongest return of the calibration, counts; beyond, the walk is that of the
+        nearer one.
+    offsets, offset_sigma : (rows, columns) array
+        What each pixel measures too long, and its standard deviation, m. Empty where not known.
+    response : (rows, columns) array
+        Relative brightness of each pixel, 1 on average. Empty where not known.
+    reflectance_scale : float
+        Reflectance, percent, of a surface that faces the camera and returns one count from 1 m; NaN
+        where not known.
+    reflectance_scale_sigma : float
+        Its relative standard deviation.
+
+    Raises
+    ------
+    CalibrationError
+        Arrays disagree in shape, or a number is not finite or not positive where it has to be.
+    """
+
+    RECORD_KIND = "range_calibration"
+
+    time_zero_sigma: float = field(metadata=stored_value("time_zero_sigma_s"))
+    walk: FloatArray = field(
+        default_factory=lambda: np.empty(0), metadata=stored_array("m", "power")
+    )
+    walk_covariance: FloatArray = field(
+        default_factory=lambda: np.empty((0, 0)), metadata=stored_array("m^2", "power", "power")
+    )
+    reference_signal: float = field(default=1.0, metadata=stored_value("reference_signal_counts"))
+    signal_range: FloatArray = field(
+        default_factory=lambda: np.array([1.0, 1.0]), metadata=stored_array("count", "end")
+    )
+    offsets: FloatArray = field(
+        default_factory=lambda: np.empty((0, 0)), metadata=stored_array("m", "y", "x")
+    )
+    offset_sigma: FloatArray = field(
+        default_factory=lambda: np.empty((0, 0)), metadata=stored_array("m", "y", "x")
+    )
+    response: FloatArray = field(
+        default_factory=lambda: np.empty((0, 0)), metadata=stored_array("", "y", "x")
+    )
+    reflectance_scale: float = field(
+        default=np.nan, metadata=stored_value("reflectance_percent_of_one_count_at_1_m")
+    )
+    reflectance_scale_sigma: float = field(
+        default=np.nan, metadata=stored_value("reflectance_relative_sigma")
+    )
+
+    def __post_init__(self) -> None:
+        for name in (
+            "walk",
+            "walk_covariance",
+            "signal_range",
+            "offsets",
+            "offset_sigma",
+            "response",
+        ):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+            if not np.all(np.isfinite(array)):
+                raise CalibrationError(f"{name} of a range calibration must be finite")
+        order = self.walk.size
+        if self.walk.ndim != 1 or self.walk_covariance.shape != (order, order):
+            raise CalibrationError("the range walk and its covariance must be of one order")
+        if self.offsets.ndim != 2 or self.offsets.shape != self.offset_sigma.shape:
+            raise CalibrationError("the pixels' offsets and their deviations must be of one shape")
+        if self.response.ndim != 2 or np.any(self.response <= 0):
+            raise CalibrationError("the pixels' response must be positive numbers (rows, columns)")
+        if not (
+            self.signal_range.shape == (2,)
+            and 0 < self.signal_range[0] <= self.signal_range[1]
+            and self.reference_signal > 0
+        ):
+            raise CalibrationError(
+                "the signals of a range calibration must be positive, weak first"
+            )
+        if not (np.isfinite(self.time_zero_sigma) and self.time_zero_sigma >= 0):
+            raise CalibrationError("the deviation of time zero must be a number of seconds")
+
+    def require_shape(self, image_shape: tuple[int, int]) -> None:
+        """Raise `CalibrationError` where the pixels are those of another picture."""
+        for name in ("offsets", "response"):
+            known = getattr(self, name)
+            if known.size and known.shape != image_shape:
+                raise CalibrationError(
+                    f"{name} of the range calibration are of {known.shape} pixels, the picture has "
+                    f"{image_shape}"
+                )
+
+    def compute_walk(self, signal: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return what returns of some strength are measured too long, and its deviation.
+
+        Parameters
+        ----------
+        signal : (n,) array
+            Counts of the returns.
+
+        Returns
+        -------
+        walk, sigma : (n,) float64 array
+            Metres.
+        """
+        strength = np.clip(np.asarray(signal, dtype=np.float64), *self.signal_range)
+        decades = np.log10(strength / self.reference_signal)
+        powers = decades[..., np.newaxis] ** np.arange(1, self.walk.size + 1)
+        variance = np.einsum("...i,ij,...j->...", powers, self.walk_covariance, powers)
+        return powers @ self.walk, np.sqrt(np.maximum(variance, 0))
+
+    def compute_excess(
+        self, signal: ArrayLike, y: NDArray[np.integer], x: NDArray[np.integer]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what returns are measured too long, by walk and pixel, and its deviation.
+
+        Parameters
+        ----------
+        signal : (n,) array
+            Counts of the returns.
+        y, x : (n,) int array
+            Row and column of their pixels.
+
+        Returns
+        -------
+        excess, sigma : (n,) float64 array
+            Metres. The deviation holds that of time zero too, which all returns share.
+        """
+        excess, sigma = self.compute_walk(signal)
+        sigma = np.hypot(sigma, SPEED_OF_LIGHT / 2 * self.time_zero_sigma)
+        if self.offsets.size:
+            excess = excess + self.offsets[y, x]
+            sigma = np.hypot(sigma, self.offset_sigma[y, x])
+        return excess, sigma
+
+    def compute_reflectance(
+        self, intensity: ArrayLike, y: NDArray[np.integer], x: NDArray[np.integer]
+    ) -> FloatArray:
+        """Return the reflectance of surfaces as if they faced the camera, percent.
+
+        Parameters
+        ----------
+        intensity : (n,) array
+            Counts, referred to a range of 1 m.
+        y, x : (n,) int array
+            Row and column of their pixels.
+
+        Returns
+        -------
+        (n,) float64 array
+            NaN where no target of known reflectance was seen.
+        """
+        gain = self.response[y, x] if self.response.size else 1.0
+        reflectance: FloatArray = (
+            self.reflectance_scale * np.asarray(intensity, dtype=np.float64) / gain
+        )
+        return reflectance

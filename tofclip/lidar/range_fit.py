@@ -1,0 +1,416 @@
+"""Time zero, range walk, the pixels' offsets and response, and reflectance, from shots of a target at
+known distances.
+
+The target is flat, faces the camera and shows in most pixels. A measured range is
+
+    ``R / cos(angle) + time zero + walk(signal) + jitter of the shot + offset of the pixel + noise``
+
+with the distance R along the optical axis. Shots and pixels are effects of their own
+(`tofclip.lidar.mixed_model`), so that standard deviations hold where shots jitter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.camera import Camera, RangeCalibration
+from tofclip.errors import CalibrationError, InputError
+from tofclip.lidar.geometry import compute_ray_directions
+from tofclip.lidar.mixed_model import Effects, Measurements, fit_effects
+from tofclip.lidar.range_correction import measured_square
+from tofclip.shots import Returns
+from tofclip.units import SPEED_OF_LIGHT
+
+FloatArray = NDArray[np.float64]
+
+MIN_WALK_SHOTS = 3
+MIN_WALK_SPAN_DECADES = 0.3
+"""Of the returns' intensities, a factor of two; a walk from less would be noise drawn out."""
+
+MIN_CURVED_WALK_SHOTS, CURVED_WALK_SPAN_DECADES = 6, 1.0
+"""From here on the walk is a parabola of the decades, below a straight line."""
+
+SPAN_PERCENTILES = (2.0, 98.0)
+
+WINDOW_PULSES = 0.5
+"""Returns of one surface lie within this many pulse widths."""
+
+MAX_RIVAL_FRACTION = 0.7
+"""Of the target's returns, that another surface may have."""
+
+MAX_SHOT_SPREAD_PULSES = 1.0
+"""By which the shots' time zeros may differ."""
+
+MAX_BRIGHTNESS_RATIO = 1.5
+"""Of shots that are said to show one reflectance."""
+
+
+@dataclass(frozen=True)
+class TargetShot:
+    """What was seen of a target at a known distance.
+
+    Parameters
+    ----------
+    returns : Returns
+        As they were measured, without a range calibration; ranges from the camera's time zero.
+    distance : float
+        Of the target along the optical axis, m.
+    record : (float, float)
+        First and last time of flight of the record, s, from the same time zero.
+    name : str
+        For messages.
+    reflectance_percent : float
+        Of the target; NaN where it is not known.
+    """
+
+    returns: Returns
+    distance: float
+    record: tuple[float, float]
+    name: str = "the shot"
+    reflectance_percent: float = np.nan
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.distance) and self.distance > 0):
+            raise InputError(f"a target's distance must be a positive length, got {self.distance}")
+        if not (np.isnan(self.reflectance_percent) or 0 < self.reflectance_percent <= 1000):
+            raise InputError(
+                f"a reflectance must be a positive percentage, got {self.reflectance_percent}"
+            )
+
+
+@dataclass(frozen=True)
+class RangeFit:
+    """A camera whose ranges are calibrated, and what the fit looked like.
+
+    Parameters
+    ----------
+    camera : Camera
+        With its time zero and range calibration.
+    jitter : float
+        One standard deviation of the shots' own time zeros, s; NaN of a single shot.
+    offset_spread : float
+        One standard deviation of the pixels' offsets, m; NaN of a single shot.
+    signal : (n,) array
+        Counts of the returns that were fitted.
+    excess : (n,) array
+        What they measured too long, offsets of pixels and shots taken off, m.
+    target_fraction : float
+        Of the pixels with a return, those whose return is the target's.
+    walk_note, offsets_note, response_note : str
+        Why a part was not fitted; empty where it was.
+    """
+
+    camera: Camera
+    jitter: float
+    offset_spread: float
+    signal: FloatArray
+    excess: FloatArray
+    target_fraction: float
+    walk_note: str
+    offsets_note: str
+    response_note: str
+
+    @property
+    def calibration(self) -> RangeCalibration:
+        """The camera's range calibration."""
+        known = self.camera.range_calibration
+        assert known is not None
+        return known
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """The target's returns of all shots, side by side."""
+
+    y: NDArray[np.int64]
+    x: NDArray[np.int64]
+    shot: NDArray[np.int64]
+    pixel: NDArray[np.int64]
+    excess: FloatArray
+    sigma: FloatArray
+    signal: FloatArray
+    cosine: FloatArray
+    fraction: float
+
+
+def fit_range_calibration(
+    shots: Sequence[TargetShot], camera: Camera | None = None, walk: bool | None = None
+) -> RangeFit:
+    """Calibrate ranges by shots of a target at known distances.
+
+    Parameters
+    ----------
+    shots : sequence of TargetShot
+        From three on, of different brightness, they give the range walk; from two on the pixels'
+        offsets and response.
+    camera : Camera, optional
+        That is to have the result; by default the first shot's.
+    walk : bool, optional
+        Whether a range walk must be fitted, or must not; by default where the shots can tell it.
+
+    Returns
+    -------
+    RangeFit
+
+    Raises
+    ------
+    CalibrationError
+        A shot has no return, shows two surfaces, or disagrees with the others; the targets lie
+        further apart than the record is long; or a walk is asked for that the shots cannot tell.
+    """
+    if not shots:
+        raise InputError("a range calibration needs a shot of a target")
+    base = shots[0].returns.camera if camera is None else camera
+    pulse = SPEED_OF_LIGHT / 2 * base.pulse_fwhm
+    _require_reach(shots)
+    sample = _gather([_select_target(shot, base, pulse) for shot in shots])
+    _require_agreement(shots, sample, pulse)
+    span = np.percentile(np.log10(sample.signal), SPAN_PERCENTILES)
+    walk_note = _explain_missing_walk(len(shots), span, walk)
+    curved = len(shots) >= MIN_CURVED_WALK_SHOTS and np.ptp(span) >= CURVED_WALK_SPAN_DECADES
+    order = 0 if walk_note else 1 + int(curved)
+    reference = float(10 ** np.median(np.log10(sample.signal)))
+    decades = np.log10(sample.signal / reference)
+    data = Measurements(
+        sample.excess,
+        sample.sigma,
+        decades[:, np.newaxis] ** np.arange(order + 1),
+        sample.shot,
+        sample.pixel,
+        (sample.y, sample.x),
+    )
+    repeated = len(shots) > 1
+    effects = fit_effects(data, repeated, repeated)
+    once = "one shot does not tell the pixels' own from noise: give two or more"
+    calibration = RangeCalibration(
+        time_zero_sigma=float(np.sqrt(effects.covariance[0, 0]) * 2 / SPEED_OF_LIGHT),
+        walk=effects.fixed[1:],
+        walk_covariance=effects.covariance[1:, 1:],
+        reference_signal=reference,
+        signal_range=10**span,
+    )
+    shape = base.image_shape
+    if repeated:
+        calibration = replace(
+            calibration,
+            offsets=_to_picture(effects.pixels, shape),
+            offset_sigma=_to_picture(
+                effects.pixel_sigma, shape, float(np.sqrt(effects.variances.pixels))
+            ),
+        )
+    calibration = _add_brightness(calibration, shots, sample, effects, base)
+    late = float(effects.fixed[0]) * 2 / SPEED_OF_LIGHT
+    left = (sample.excess - effects.shots[sample.shot] - effects.pixels[sample.pixel])[
+        effects.inliers
+    ]
+    return RangeFit(
+        base.replace(time_zero=late, range_calibration=calibration),
+        float(np.sqrt(effects.variances.shots)) * 2 / SPEED_OF_LIGHT if repeated else np.nan,
+        float(np.sqrt(effects.variances.pixels)) if repeated else np.nan,
+        sample.signal[effects.inliers],
+        left - effects.fixed[0],
+        sample.fraction,
+        walk_note,
+        "" if repeated else once,
+        "" if repeated else once,
+    )
+
+
+def _require_reach(shots: Sequence[TargetShot]) -> None:
+    """Refuse targets that lie further apart than the record is long: one of them is not in it."""
+    distances = np.array([shot.distance for shot in shots])
+    length = min(shot.record[1] - shot.record[0] for shot in shots) * SPEED_OF_LIGHT / 2
+    if np.ptp(distances) > length:
+        raise CalibrationError(
+            f"the targets lie {np.ptp(distances):.3g} m apart, and the record shows {length:.3g} m: "
+            "one of them is out of the record"
+        )
+
+
+def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
+    """Keep the strongest return of each pixel where it is the target's.
+
+    Parameters
+    ----------
+    shot : TargetShot
+    camera : Camera
+        Says where the pixels look.
+    pulse : float
+        Width of a pulse, m.
+
+    Returns
+    -------
+    _Sample
+        Excess over the target's range, from the start of the time axis rather than any time zero.
+    """
+    if shot.returns.camera.image_shape != camera.image_shape:
+        raise CalibrationError(
+            f"{shot.name}: its picture has {shot.returns.camera.image_shape} pixels, the camera's "
+            f"{camera.image_shape}"
+        )
+    found = shot.returns.select("strongest")
+    if len(found) == 0:
+        raise CalibrationError(
+            f"{shot.name}: no return stands out: is the target in the record and in the picture?"
+        )
+    cosine = compute_ray_directions(camera, found.y, found.x)[:, 2]
+    excess = found.range - shot.distance / cosine
+    sigma = np.maximum(found.confidence.astype(np.float64), np.finfo(np.float32).tiny)
+    width = max(WINDOW_PULSES * pulse, 6 * float(np.median(sigma)))
+    target = _find_cluster(excess, width, shot.name)
+    arrival = 2 / SPEED_OF_LIGHT * float(np.median(found.range[target]))
+    margin = camera.pulse_fwhm / 2
+    if not shot.record[0] + margin <= arrival <= shot.record[1] - margin:
+        raise CalibrationError(
+            f"{shot.name}: the target's return is cut off by the end of the record; move the "
+            "target or the record"
+        )
+    zero = SPEED_OF_LIGHT / 2 * shot.returns.camera.time_zero
+    square = measured_square(found.range)
+    y, x = found.y[target].astype(np.int64), found.x[target].astype(np.int64)
+    return _Sample(
+        y,
+        x,
+        np.zeros(y.size, np.int64),
+        y * camera.image_shape[1] + x,
+        excess[target] + zero,
+        sigma[target],
+        np.maximum(found.intensity / square, np.finfo(np.float32).tiny)[target],
+        cosine[target],
+        float(target.mean()),
+    )
+
+
+def _find_cluster(excess: FloatArray, width: float, name: str) -> NDArray[np.bool_]:
+    """Say which returns lie in the window that holds most of them, and refuse a rival to it."""
+    order = np.sort(excess)
+    inside = np.searchsorted(order, order + width, side="right") - np.arange(order.size)
+    first = int(np.argmax(inside))
+    middle = float(np.median(order[first : first + inside[first]]))
+    target: NDArray[np.bool_] = np.abs(excess - middle) <= width
+    others = np.sort(excess[~target])
+    if others.size:
+        rivals = np.searchsorted(others, others + width, side="right") - np.arange(others.size)
+        if rivals.max() > MAX_RIVAL_FRACTION * target.sum():
+            further = float(others[int(np.argmax(rivals))]) - middle
+            raise CalibrationError(
+                f"{name}: two surfaces as large as each other, {abs(further):.3g} m apart: which "
+                "is the target? Cut the picture to it (`region`)"
+            )
+    return target
+
+
+def _gather(samples: Sequence[_Sample]) -> _Sample:
+    """Put the shots' returns side by side, with the shots' numbers."""
+    names = ("y", "x", "pixel", "excess", "sigma", "signal", "cosine")
+    joined = {name: np.concatenate([getattr(one, name) for one in samples]) for name in names}
+    shot = np.repeat(np.arange(len(samples)), [one.y.size for one in samples])
+    fraction = min(one.fraction for one in samples)
+    return _Sample(shot=shot, fraction=fraction, **joined)
+
+
+def _require_agreement(shots: Sequence[TargetShot], sample: _Sample, pulse: float) -> None:
+    """Refuse a shot whose target is not where its distance and the other shots put it."""
+    places = np.array([np.median(sample.excess[sample.shot == n]) for n in range(len(shots))])
+    off = places - np.median(places)
+    worst = int(np.argmax(np.abs(off)))
+    limit = max(MAX_SHOT_SPREAD_PULSES * pulse, 6 * float(np.median(sample.sigma)))
+    if abs(off[worst]) > limit:
+        raise CalibrationError(
+            f"{shots[worst].name}: its target comes {off[worst]:+.3g} m from where the other shots "
+            "put it: check its distance (`target`)"
+        )
+
+
+def _explain_missing_walk(shots: int, span: FloatArray, asked: bool | None) -> str:
+    """Say why no walk can be fitted, if so; refuse where one is asked for."""
+    note = ""
+    if asked is False:
+        return "not asked for"
+    if shots < MIN_WALK_SHOTS:
+        note = f"a range walk needs {MIN_WALK_SHOTS} shots of different brightness, got {shots}"
+    elif np.ptp(span) < MIN_WALK_SPAN_DECADES:
+        note = (
+            f"the returns' intensities span a factor of {10 ** np.ptp(span):.2g}, a range walk needs "
+            f"{10**MIN_WALK_SPAN_DECADES:.2g}: take shots through a grey filter or at other distances"
+        )
+    if note and asked:
+        raise CalibrationError(note)
+    return note
+
+
+def _add_brightness(
+    calibration: RangeCalibration,
+    shots: Sequence[TargetShot],
+    sample: _Sample,
+    effects: Effects,
+    camera: Camera,
+) -> RangeCalibration:
+    """Add the pixels' response and the scale of reflectance, from logarithms of intensities.
+
+    Parameters
+    ----------
+    calibration : RangeCalibration
+        Of the ranges.
+    shots : sequence of TargetShot
+    sample : _Sample
+    effects : Effects
+        Of the ranges, which say what belongs to the target.
+    camera : Camera
+
+    Returns
+    -------
+    RangeCalibration
+    """
+    used = effects.inliers
+    shot, pixel = sample.shot[used], sample.pixel[used]
+    # The range that the calibration gives: that of the target, up to noise.
+    distance = np.array([one.distance for one in shots])[shot] / sample.cosine[used]
+    intensity = sample.signal[used] * distance**2
+    brightness = fit_effects(
+        Measurements(
+            # A surface that faces the camera looks darker at an angle, by Lambert's law.
+            np.log(intensity / sample.cosine[used]),
+            1 / np.sqrt(np.maximum(sample.signal[used], 1.0)),
+            (shot[:, np.newaxis] == np.arange(len(shots))).astype(np.float64),
+            shot,
+            pixel,
+            (sample.y[used], sample.x[used]),
+        ),
+        with_shots=False,
+        with_pixels=len(shots) > 1,
+    )
+    if len(shots) > 1:
+        response = _to_picture(np.exp(brightness.pixels), camera.image_shape, 1.0)
+        calibration = replace(calibration, response=response)
+    percent = np.array([one.reflectance_percent for one in shots])
+    known = np.isfinite(percent)
+    if not known.any():
+        return calibration
+    scales = (np.log(percent) - brightness.fixed)[known]
+    ratio = float(np.exp(np.ptp(scales)))
+    if ratio > MAX_BRIGHTNESS_RATIO:
+        raise CalibrationError(
+            f"the shots' brightness differs by a factor of {ratio:.3g} at the reflectance given: "
+            "give each shot's own, with the transmission of its filter"
+        )
+    own = brightness.covariance[np.ix_(known, known)]
+    sigma = float(np.sqrt(own.mean()))
+    if scales.size > 1:
+        sigma = max(sigma, float(np.std(scales, ddof=1) / np.sqrt(scales.size)))
+    return replace(
+        calibration,
+        reflectance_scale=float(np.exp(scales.mean())),
+        reflectance_scale_sigma=sigma,
+    )
+
+
+def _to_picture(values: FloatArray, shape: tuple[int, int], missing: float = 0.0) -> FloatArray:
+    """Lay the values of pixels out as a picture; those behind the last one were never seen."""
+    picture = np.full(shape[0] * shape[1], missing)
+    picture[: values.size] = values
+    return picture.reshape(shape)
