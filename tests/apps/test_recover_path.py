@@ -30,13 +30,15 @@ def count_calls(action: Callable[[], object]) -> Counter[tuple[str, str]]:
         if event == "call" and is_function and code.co_filename.startswith(OURS):
             calls[code.co_filename.removeprefix(f"{ROOT}/"), code.co_qualname] += 1
 
-    threading.setprofile(note)
-    sys.setprofile(note)
+    # Of traces and profiles the former are told of our calls only, not of those of compiled code.
+    before = sys.gettrace()
+    threading.settrace(note)
+    sys.settrace(note)
     try:
         action()
     finally:
-        sys.setprofile(None)
-        threading.setprofile(None)
+        sys.settrace(before)
+        threading.settrace(None)  # type: ignore[arg-type]
     return calls
 
 

@@ -22,6 +22,7 @@ from tofclip.lidar.photons import (
     locate_with_smoothness,
     measure_accuracy,
 )
+from tofclip.lidar.photons.kernels import find_best_scores
 from tofclip.units import SPEED_OF_LIGHT
 
 BIN = 20e-12
@@ -141,6 +142,21 @@ def test_false_alarms_come_at_the_stated_rate_at_any_background(background, rate
         0.999, TRIALS, rate
     )  # eight cases: one in a hundred runs would fail one of them
     assert low - rate * silent * TRIALS <= alarms <= high
+
+
+def test_the_best_score_is_the_largest_sum_of_weights_and_counts():
+    noise = np.random.default_rng(4)
+    weights, shade = noise.random((2, 7)), noise.integers(0, 2, 32)
+    counts = noise.poisson(2.0, (5, 32)).astype(float)
+    for first in (-3, -9, 2):  # the filter reaches to both sides, backwards, and ahead
+        best = np.empty(5)
+        find_best_scores(counts, weights, shade, first, best)
+        for row in range(5):
+            at = np.arange(32)[:, np.newaxis] + first + np.arange(7)
+            there = (at >= 0) & (at < 32)
+            at = np.where(there, at, 0)
+            scores = np.sum(weights[shade[at], np.arange(7)] * counts[row, at] * there, axis=1)
+            assert best[row] == pytest.approx(scores.max(), rel=1e-12)
 
 
 def make_profile(name: str, bins: int) -> np.ndarray:

@@ -71,8 +71,66 @@ def find_best_scores(histograms, weights, shade, first, best):
     best : (n,) float64 array
         Overwritten.
     """
+    table = spread_filter(weights, shade)
+    score = np.zeros(shade.size)
     for row in range(histograms.shape[0]):
-        best[row] = find_best_score(histograms[row], weights, shade, first)[0]
+        best[row] = compute_best_score(histograms[row], table, first, score)
+
+
+@njit(nogil=True, cache=True)
+def spread_filter(weights, shade):
+    """Weights that each bin has in the filter, (width, bins): as `compute_best_score` takes them.
+
+    Parameters
+    ----------
+    weights, shade
+        As for `find_best_score`.
+    """
+    table = np.empty((weights.shape[1], shade.size))
+    for w in range(weights.shape[1]):
+        for i in range(shade.size):
+            table[w, i] = weights[shade[i], w]
+    return table
+
+
+@njit(nogil=True, cache=True)
+def compute_best_score(counts, table, first, score):
+    """What `find_best_score` says of histograms in which most bins hold photons, to the bit.
+
+    Taking all bins at a time, one weight after the other, needs neither a question about each bin
+    nor a search for what it reaches.
+
+    Parameters
+    ----------
+    counts : (bins,) array
+        Photons.
+    table : (width, bins) float array
+        From `spread_filter`.
+    first : int
+        Bin of the first weight, counted from the return's.
+    score : (bins,) float array
+        Overwritten.
+
+    Returns
+    -------
+    float
+    """
+    score[:] = 0
+    for w in range(table.shape[0]):
+        ahead = first + w
+        begin, end = max(0, ahead), min(counts.size, counts.size + ahead)
+        own, light, sums = (
+            table[w, begin:end],
+            counts[begin:end],
+            score[begin - ahead : end - ahead],
+        )
+        for i in range(sums.size):
+            sums[i] += own[i] * light[i]
+    best = score[0]
+    for value in score:
+        if value > best:
+            best = value
+    return best
 
 
 @njit(nogil=True, cache=True)
@@ -93,7 +151,7 @@ def simulate_best_scores(photons, arrived, noise, weights, shade, first, best):
         Overwritten.
     """
     bins = arrived.size
-    counts = np.zeros(bins)
+    counts, score, table = np.zeros(bins), np.zeros(bins), spread_filter(weights, shade)
     # where to begin the search for a photon's bin: hardly a step from where it ends
     begin = np.searchsorted(arrived, np.arange(bins) / bins, side="right")
     for trial in range(best.size):
@@ -104,7 +162,7 @@ def simulate_best_scores(photons, arrived, noise, weights, shade, first, best):
             while arrived[i] <= place:
                 i += 1
             counts[i] += 1
-        best[trial] = find_best_score(counts, weights, shade, first)[0]
+        best[trial] = compute_best_score(counts, table, first, score)
 
 
 @njit(nogil=True, cache=True)
