@@ -376,3 +376,24 @@ def test_the_objective_at_the_beginning_is_that_of_the_pictures_given(method):
     assert after.objective[0] == pytest.approx(before.objective[-1], rel=1e-9)
     with pytest.raises(ShapeError, match="pictures to begin at"):
         method.recover(operator, measurements, start=before.frames[:1])
+
+
+def test_a_lone_picture_costs_its_iterations_products_and_one_more(monkeypatch):
+    """The operator's norm is known from the first recovery."""
+    operator = projection()
+    measurements = operator(np.ones((12, 11)))[:, np.newaxis]
+    products = []
+    for name in ("_forward", "_adjoint"):
+        product = getattr(LineProjection, name)
+        monkeypatch.setattr(
+            LineProjection,
+            name,
+            lambda self, block, name=name, product=product: (
+                products.append(name) or product(self, block)
+            ),
+        )
+    method = Sparse(1e-2, iterations=7, gap=0.0)
+    method.recover(operator, measurements)
+    products.clear()
+    method.recover(operator, measurements)
+    assert (products.count("_forward"), products.count("_adjoint")) == (7, 8)

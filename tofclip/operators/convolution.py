@@ -74,22 +74,28 @@ class PointSpreadConvolution(LinearOperator):
         shift = [-(begin + middle) for begin, middle in zip(first, centre, strict=True)]
         self._spectrum = scipy.fft.rfft2(np.roll(placed, shift, (0, 1)))[..., np.newaxis]
 
+        # correlation: the conjugate spectrum turns the convolution around
+        self._conjugate = self._spectrum.conj()
+
     def _forward(self, block: Array) -> Array:
         return self._apply_spectrum(block, self._spectrum, self.shape_out)
 
     def _adjoint(self, block: Array) -> Array:
-        # correlation: the conjugate spectrum turns the convolution around
-        return self._apply_spectrum(block, self._spectrum.conj(), self.shape_in)
+        return self._apply_spectrum(block, self._conjugate, self.shape_in)
 
     def _apply_spectrum(
         self, block: Array, spectrum: NDArray[Any], shape: tuple[int, ...]
     ) -> Array:
         import scipy.fft
 
-        transformed = scipy.fft.rfft2(block, s=self._padded, axes=(0, 1))
+        # One axis after the other: rows of padding need no transform along themselves.
+        rows, columns = self._padded
+        transformed = scipy.fft.rfft(block, columns, axis=1)
+        transformed = scipy.fft.fft(transformed, rows, axis=0, overwrite_x=True)
         transformed *= spectrum
-        filtered = scipy.fft.irfft2(transformed, s=self._padded, axes=(0, 1), overwrite_x=True)
-        return np.ascontiguousarray(filtered[: shape[0], : shape[1]])
+        kept = scipy.fft.ifft(transformed, axis=0, overwrite_x=True)[: shape[0]]
+        filtered = scipy.fft.irfft(kept, columns, axis=1, overwrite_x=True)
+        return np.ascontiguousarray(filtered[:, : shape[1]])
 
 
 def validate_point_spread(

@@ -444,7 +444,8 @@ class ProximalMethod(ABC):
         started = time.perf_counter()
         step = 1 / (NORM_MARGIN * operator.squared_norm)
         batches = make_batches(operator, measurements)
-        self._warm_up_loops(operator, step, batches.zero_measurements())
+        if measurements.shape[1] > 1:  # a lone picture has the calling thread to itself
+            self._warm_up_loops(operator, step, batches.zero_measurements())
         setup_seconds = time.perf_counter() - started
         zero = self._look_at_zero(operator, batches, measurements, valid)
         # with max(A'f) as weight the l1 solution is zero: relative weights suit shots of any
