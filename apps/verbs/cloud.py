@@ -89,6 +89,10 @@ def cloud(
 ) -> None:
     """Find each pixel's returns and place them in space: x right, y down, z forward, in metres.
 
+    Columns of a point: intensity, range with its standard deviation (range_sigma), number within the
+    pixel, time of flight; where known the probability that it is noise (false_alarm) and the
+    surface's reflectance in percent (see calibrate range).
+
     Of a sequence, clouds that are in the folder already are kept; frames of which none can be made
     are listed at the end, and the exit status is 1.
 

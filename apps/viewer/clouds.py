@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from apps.viewer.source import Source, View
 from tofclip.errors import FileFormatError, InputError
 from tofclip.lidar import PointCloud
+from tofclip.lidar.cloud import OPTIONAL_COLUMNS
 from tofclip.lidar.export import read_table
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -110,5 +111,6 @@ def make_cloud(xyz: NDArray[Any], known: dict[str, NDArray[Any]] | None = None) 
         "return_number": known.get("return_number", np.ones(len(xyz), np.uint8)),
         # Light travels the range twice.
         "time": known.get("time", 2 * distance / SPEED_OF_LIGHT),
+        **{name: known[name] for name in OPTIONAL_COLUMNS if name in known},
     }
     return PointCloud(xyz=xyz, **columns)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -49,6 +50,39 @@ def test_pye57_reads_e57(cloud, tmp_path) -> None:
         path.write_bytes(damaged)
         with pytest.raises(FileFormatError, match=r"scene\.e57"):
             PointCloud.load(path)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".csv", ".npz", ".h5", ".las", ".laz", ".e57"])
+def test_doubt_and_reflectance_travel_in_every_format(cloud, tmp_path, suffix) -> None:
+    """Where they are known; files of clouds that do not know them have no such columns."""
+    pytest.importorskip({".las": "laspy", ".laz": "lazrs", ".e57": "pye57"}.get(suffix, "h5py"))
+    random = np.random.default_rng(2)
+    doubt = random.uniform(0, 0.5, len(cloud)).astype(np.float32)
+    percent = random.uniform(1, 90, len(cloud)).astype(np.float32)
+    path = tmp_path / f"cloud{suffix}"
+    replace(cloud, false_alarm=doubt, reflectance=percent).save(path)
+    back = PointCloud.load(path)
+    np.testing.assert_array_equal(back.false_alarm, doubt)
+    np.testing.assert_array_equal(back.reflectance, percent)
+    assert {"false_alarm", "reflectance"} <= set(PointCloud.read_outline(path).fields)
+    cloud.save(path)
+    assert not {"false_alarm", "reflectance"} & set(PointCloud.read_outline(path).fields)
+    assert np.isnan(PointCloud.load(path).false_alarm).all()
+
+
+def test_programs_of_others_see_doubt_and_reflectance(cloud, tmp_path) -> None:
+    doubt = np.linspace(0, 0.5, len(cloud)).astype(np.float32)
+    known = replace(cloud, false_alarm=doubt, reflectance=100 * doubt)
+    open3d = pytest.importorskip("open3d")
+    known.save(tmp_path / "cloud.ply")
+    seen = open3d.t.io.read_point_cloud(str(tmp_path / "cloud.ply")).point
+    np.testing.assert_array_equal(seen["false_alarm"].numpy().ravel(), doubt)
+    np.testing.assert_array_equal(seen["reflectance"].numpy().ravel(), 100 * doubt)
+    pytest.importorskip("rosbags")
+    reading = pytest.importorskip("mcap_ros2.reader")
+    write_bag([StampedCloud(known, 5)], tmp_path / "one.mcap")
+    (one,) = reading.read_ros2_messages(tmp_path / "one.mcap")
+    assert {"false_alarm", "reflectance"} <= {field.name for field in one.ros_msg.fields}
 
 
 def test_mcap_reads_the_stamps_and_the_points(cloud, tmp_path) -> None:

@@ -29,8 +29,16 @@ COLUMN_UNITS = {
     "range": "m",
     "return_number": "",
     "time": "s",
+    "false_alarm": "",
+    "reflectance": "percent",
 }
 """The columns of a point cloud, in the order in which files hold them."""
+
+PROPERTY_COLUMNS = tuple(name for name in COLUMN_UNITS if name not in "xyz")
+"""Those beside the positions."""
+
+OPTIONAL_COLUMNS = ("false_alarm", "reflectance")
+"""In files only where they are known of a point."""
 
 OLD_NAMES = {"confidence": "range_sigma"}
 """Columns of older files, read for one more version, and what they are called now."""
@@ -38,7 +46,8 @@ OLD_NAMES = {"confidence": "range_sigma"}
 
 def _column(name: str, dtype: type = np.float32) -> dict[str, Any]:
     """Declare a column with one value for each point."""
-    return stored_array(COLUMN_UNITS[name], "point", dtype=dtype)
+    optional = name in OPTIONAL_COLUMNS
+    return stored_array(COLUMN_UNITS[name], "point", dtype=dtype, optional=optional)
 
 
 @dataclass(frozen=True)
@@ -62,6 +71,11 @@ class PointCloud(Storable):
         Time of flight there and back, s.
     provenance : mapping
         How it came about; kept in HDF5 files only.
+    false_alarm : (n,) float32 array, optional
+        Probability that the point is noise; NaN, the default, where it is not known.
+    reflectance : (n,) float32 array, optional
+        Of the surface as if it faced the camera, percent; NaN, the default, where the camera has
+        not seen a target of known reflectance.
 
     Raises
     ------
@@ -78,6 +92,12 @@ class PointCloud(Storable):
     return_number: NDArray[np.uint8] = field(metadata=_column("return_number", np.uint8))
     time: NDArray[np.float32] = field(metadata=_column("time"))
     provenance: Mapping[str, Any] = field(default_factory=dict, metadata=stored_provenance())
+    false_alarm: NDArray[np.float32] = field(
+        default_factory=lambda: np.empty(0, np.float32), metadata=_column("false_alarm")
+    )
+    reflectance: NDArray[np.float32] = field(
+        default_factory=lambda: np.empty(0, np.float32), metadata=_column("reflectance")
+    )
 
     def __post_init__(self) -> None:
         xyz = np.ascontiguousarray(self.xyz, dtype=np.float32)
@@ -86,9 +106,11 @@ class PointCloud(Storable):
         if not np.all(np.isfinite(xyz)):
             raise InputError("the positions of a point cloud must be finite")
         object.__setattr__(self, "xyz", xyz)
-        for name in ("intensity", "range_sigma", "range", "return_number", "time"):
+        for name in PROPERTY_COLUMNS:
             dtype = np.uint8 if name == "return_number" else np.float32
             column = np.ascontiguousarray(getattr(self, name), dtype=dtype)
+            if name in OPTIONAL_COLUMNS and column.size == 0:
+                column = np.full(xyz.shape[0], np.nan, np.float32)
             if column.shape != (xyz.shape[0],):
                 raise ShapeError(f"{name} of a point cloud", (xyz.shape[0],), column.shape)
             object.__setattr__(self, name, column)
@@ -98,7 +120,7 @@ class PointCloud(Storable):
 
     def __getitem__(self, points: Any) -> PointCloud:
         """Return some of the points: a slice, a mask or numbers, as ``cloud[cloud.range < 2]``."""
-        names = ("xyz", "intensity", "range_sigma", "range", "return_number", "time")
+        names = ("xyz", *PROPERTY_COLUMNS)
         try:
             chosen = {name: getattr(self, name)[points] for name in names}
         except (IndexError, TypeError) as fault:
@@ -223,14 +245,23 @@ class PointCloud(Storable):
         """
         if Path(path).suffix.lower() == ".h5":
             return read_outline(path)
-        shape = _list_columns(path)["x"].shape
+        columns = _list_columns(path)
+        shape = columns["x"].shape
         axes = ("point",) if len(shape) == 1 else ("y", "x")
         fields = {"xyz": Field(make_stand_in((*shape, 3), np.float32), "m", (*axes, "xyz"))}
         for name, units in COLUMN_UNITS.items():
-            if name not in "xyz":
+            if name in columns and name not in "xyz":
                 dtype = np.uint8 if name == "return_number" else np.float32
                 fields[name] = Field(make_stand_in(shape, dtype), units, axes)
         return Record("cloud", fields)
+
+    def to_record(self) -> Record:
+        """Return what is known of the points for storage."""
+        record = super().to_record()
+        known = {column.name for column in self.columns} | {"xyz"}
+        return replace(
+            record, fields={name: one for name, one in record.fields.items() if name in known}
+        )
 
     @classmethod
     def from_record(cls, record: Record) -> PointCloud:
@@ -245,6 +276,7 @@ class PointCloud(Storable):
         return [
             Column(name, unit, values[name] if name in values else getattr(self, name))
             for name, unit in COLUMN_UNITS.items()
+            if name not in OPTIONAL_COLUMNS or np.isfinite(getattr(self, name)).any()
         ]
 
 
@@ -269,6 +301,8 @@ def point_cloud(returns: Returns) -> PointCloud:
         return_number=returns.return_number,
         time=returns.time.astype(np.float32),
         provenance=returns.provenance,
+        false_alarm=returns.false_alarm.astype(np.float32),
+        reflectance=returns.reflectance,
     )
 
 
@@ -277,6 +311,6 @@ def _list_columns(path: str | Path) -> dict[str, ArchiveEntry]:
     listed = export.list_columns(path)
     columns = {OLD_NAMES.get(name, name): entry for name, entry in listed.items()}
     for name in COLUMN_UNITS:
-        if name not in columns:
+        if name not in columns and name not in OPTIONAL_COLUMNS:
             raise FileFormatError(path, f"has no column '{name}': it was not written by tofclip")
-    return {name: columns[name] for name in COLUMN_UNITS}
+    return {name: columns[name] for name in COLUMN_UNITS if name in columns}

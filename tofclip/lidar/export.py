@@ -196,7 +196,7 @@ def _list_npz(path: Path) -> Entries:
 
 def _strip_unit(label: str) -> str:
     name, _, unit = label.rpartition("_")
-    return name if unit in ("m", "s", "count") else label
+    return name if unit in ("m", "s", "count", "percent") else label
 
 
 def _read_header(file: BinaryIO, path: Path, first: str, last: str) -> list[list[str]]:

@@ -14,14 +14,12 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tofclip.errors import InputError, MissingDependencyError, ShapeError
-from tofclip.lidar.cloud import PointCloud
+from tofclip.lidar.cloud import PROPERTY_COLUMNS, PointCloud
 
 FloatArray = NDArray[np.float64]
 
 MAD_TO_SIGMA = 1.4826
 MIN_SPACING_RATIO = 3.0
-
-PROPERTY_COLUMNS = ("intensity", "range_sigma", "range", "return_number", "time")
 
 
 @dataclass(frozen=True)
@@ -146,7 +144,9 @@ def downsample_cloud(cloud: PointCloud, voxel: float) -> PointCloud:
     first = np.full(number.size, 255, np.uint8)
     np.minimum.at(first, group, cloud.return_number)
     columns: dict[str, Any] = {
-        name: mean(getattr(cloud, name)) for name in ("intensity", "range", "time")
+        name: mean(getattr(cloud, name))
+        for name in PROPERTY_COLUMNS
+        if name not in ("range_sigma", "return_number")
     }
     # the error of a mean of n independent points is the root of their mean variance over n
     columns["range_sigma"] = np.sqrt(mean(cloud.range_sigma.astype(np.float64) ** 2) / number)

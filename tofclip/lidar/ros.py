@@ -120,9 +120,9 @@ def make_point_cloud_message(stamped: StampedCloud, typestore: Any) -> Any:
     """
     types, cloud = typestore.types, stamped.cloud
     columns = {axis: cloud.xyz[:, number] for number, axis in enumerate("xyz")}
-    for name in ("intensity", "range_sigma", "range", "return_number"):
-        columns[name] = getattr(cloud, name)
-    columns["time_of_flight"] = cloud.time
+    for column in cloud.columns:
+        if column.name not in "xyz":
+            columns["time_of_flight" if column.name == "time" else column.name] = column.values
     layout = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
     rows = np.empty(len(cloud), layout)
     for name, values in columns.items():
