@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.capture import TimeAxis
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_type
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 
 ENVELOPE_SIGMAS = 3.0
@@ -64,6 +64,7 @@ class VirtualPulse:
     def __post_init__(self) -> None:
         for name in ("wavelength", "cycles"):
             value = getattr(self, name)
+            require_type(value, (int, float, np.number), f"{name} of the virtual pulse is a number")
             if not (np.isfinite(value) and value > 0):
                 raise InputError(
                     f"{name} of the virtual pulse must be a positive number, got {value}"

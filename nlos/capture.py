@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from tofclip.arrays import Array, ComputeDevice, is_numpy, namespace, require_numpy, to_numpy
 from tofclip.errors import InputError, ShapeError
+from tofclip.notebook import render_html
 from tofclip.storage import Field, Record
-from tofclip.units import SPEED_OF_LIGHT
+from tofclip.units import PICOSECOND, SPEED_OF_LIGHT
 
 if TYPE_CHECKING:
     from tofclip.shots import Frames
@@ -130,6 +131,27 @@ class Capture:
         object.__setattr__(self, "bin_width", float(self.bin_width))
         object.__setattr__(self, "start", float(self.start))
         self._validate()
+
+    def __repr__(self) -> str:
+        points = " x ".join(map(str, self.wall.shape[:-1])) or "1"
+        spots = "one laser spot" if self.laser.shape == (3,) else "a laser spot for each"
+        return (
+            f"Capture({points} wall points, {spots}, {self.signal.shape[0]} bins of "
+            f"{self.bin_width / PICOSECOND:.3g} ps)"
+        )
+
+    def _repr_html_(self) -> str:
+        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        last = self.start + self.signal.shape[0] * self.axis.spacing
+        described = {
+            "signal (time, wall)": " x ".join(map(str, self.signal.shape)),
+            "wall": " x ".join(f"{side:.3f}" for side in high - low) + " m (x, y, z)",
+            "laser": "one spot" if self.laser.shape == (3,) else "a spot for each wall point",
+            "time bin": f"{self.bin_width / PICOSECOND:.4g} ps",
+            "length of path": f"{self.start:.3f} to {last:.3f} m",
+        }
+        picture = to_numpy(self.signal).sum(axis=0) if self.wall.ndim == 3 else None
+        return render_html("Capture", described, picture)
 
     def _validate(self) -> None:
         if self.wall.ndim == 0 or self.wall.shape[-1] != 3:

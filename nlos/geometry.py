@@ -111,6 +111,8 @@ class Grid:
         InputError
             The record ends before anything hidden could be seen.
         """
+        if not hasattr(capture, "points"):
+            raise InputError(f"a grid lies before a Capture's wall, not a {type(capture).__name__}")
         low, high = capture.points.min(axis=0), capture.points.max(axis=0)
         width = float(max(high[0] - low[0], high[1] - low[1]))
         middle = float(low[2] + high[2]) / 2

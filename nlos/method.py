@@ -17,7 +17,7 @@ from nlos.capture import Capture
 from nlos.geometry import Grid
 from nlos.volume import Volume
 from tofclip.arrays import is_numpy
-from tofclip.errors import InputError
+from tofclip.errors import InputError, require_type
 
 Progress = Callable[[int], None]
 """Called with the number of look-ups or voxels just done, from several threads; may raise to
@@ -209,6 +209,8 @@ class Method(ABC):
         InputError
             The method cannot image such a capture on the grid.
         """
+        require_type(capture, Capture, "a hidden scene is imaged from a Capture")
+        require_type(grid, Grid, "voxels are those of a Grid, see nlos.Grid.in_front_of")
         return self.plan(capture, grid).image(capture, progress)
 
 

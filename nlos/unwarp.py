@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from nlos.capture import Capture
 from nlos.kernels import shift_signals
 from tofclip.arrays import require_numpy, to_numpy
-from tofclip.errors import InputError, ShapeError
+from tofclip.errors import InputError, ShapeError, require_type
 from tofclip.shots import Frames
 from tofclip.storage import Record
 from tofclip.units import SPEED_OF_LIGHT
@@ -26,6 +26,7 @@ one bin.
 
 def extract_wall_capture(frames: Frames) -> Capture:
     """Do what `Capture.from_frames` describes."""
+    require_type(frames, Frames, "a capture is made of Frames, see tofclip.recover")
     record = frames.attachments.get(ATTACHMENT_NAME)
     if record is None or record.kind != ATTACHMENT_NAME:
         raise InputError(

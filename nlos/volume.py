@@ -81,6 +81,9 @@ class Volume:
             raise InputError("a volume must not hold NaN or infinity")
         object.__setattr__(self, "values", values)
 
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(to_numpy(self.values), dtype=dtype)
+
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.grid.shape))
         return f"Volume({shape} voxels (z, y, x), {self.values.dtype})"

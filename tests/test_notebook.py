@@ -70,8 +70,17 @@ def test_a_line_and_a_page_say_what_is_held(
     assert "no time zero given" in no_zero._repr_html_()
     assert repr(cloud).startswith("PointCloud(40 points, range ")
     assert repr(volume) == "Volume(4 x 5 x 6 voxels (z, y, x), float32)"
-    for one in (frames, volume):
+    streak = tofclip.Streak(np.ones((9, 7)), np.arange(9) * 1e-9, camera=frames.camera)
+    assert repr(streak) == "Streak(9 x 7 counts (time, column), 0.000 to 8.000 ns, with its camera)"
+    assert repr(frames.camera).startswith("Camera(2 views, pictures of 6 x 5 pixels, time zero")
+    wall = np.stack([*np.meshgrid([0.0, 0.1, 0.2], [0.0, 0.1]), np.zeros((2, 3))], axis=-1)
+    capture = nlos.Capture(np.ones((50, 2, 3)), wall, np.zeros(3), 8e-12)
+    assert repr(capture) == "Capture(2 x 3 wall points, one laser spot, 50 bins of 8 ps)"
+    assert "0.200 x 0.100 x 0.000 m" in capture._repr_html_()
+    assert "line angles" in frames.camera._repr_html_()
+    for one in (frames, volume, cloud, streak, capture):
         assert "<img" in one._repr_html_()
+    assert "<img" not in cloud[:0]._repr_html_()
     assert "&lt;tv&gt;" in frames._repr_html_()
     assert "range" in cloud._repr_html_()
 
@@ -96,8 +105,12 @@ def test_one_function_opens_every_file(
 def test_objects_become_those_of_other_libraries(
     frames: tofclip.Frames, cloud: tofclip.PointCloud
 ) -> None:
-    assert np.array_equal(np.asarray(frames), frames.values)
     volume = nlos.Volume(np.ones((4, 5, 6), np.float32), nlos.Grid.box((0, 5), (0, 4), (1, 4), 1.0))
+    streak = tofclip.Streak(np.ones((9, 7)))
+    assert np.array_equal(np.asarray(frames), frames.values)
+    assert np.array_equal(np.asarray(cloud), cloud.xyz)
+    assert np.array_equal(np.asarray(volume), volume.values)
+    assert np.array_equal(np.asarray(streak), streak.counts)
     pytest.importorskip("torch", reason="pip install torch")
     for tensor, array in (
         (frames.to_torch(), frames.values),
@@ -188,3 +201,35 @@ def test_wrong_types_and_names_are_refused_by_our_own_errors(
             frames.sel(range=limits)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="slice, a mask or numbers"):
         cloud["near"]
+    with pytest.raises(InputError, match=r"one point is cloud\[3:4\]"):
+        cloud[3]
+    with pytest.raises(InputError, match="no frame is selected of 50"):
+        frames[60:70]
+    with pytest.raises(InputError, match="step cannot be negative"):
+        frames[::-1]
+    with pytest.raises(InputError, match="belong to a Camera"):
+        tofclip.Frames("a", "b", "c")  # type: ignore[arg-type]
+
+
+def test_a_number_is_not_taken_for_a_file_that_is_open(tmp_path: Path) -> None:
+    """Python's `open` takes a number for one of the process's files, and closes it afterwards."""
+    with open(tmp_path / "mine.txt", "w") as mine:
+        for read in (tofclip.load, tofclip.read_streak, tofclip.Camera.load):
+            with pytest.raises(InputError, match="a file is given by its name, not a int"):
+                read(mine.fileno())  # type: ignore[arg-type]
+        mine.write("still open")
+    assert (tmp_path / "mine.txt").read_text() == "still open"
+
+
+def test_wrong_types_are_refused_around_the_corner(frames: tofclip.Frames) -> None:
+    hybrid = nlos.Hybrid(wavelength=0.05)
+    grid = nlos.Grid.box((0, 5), (0, 4), (1, 4), 1.0)
+    calls: tuple[Callable[[], Any], ...] = (
+        lambda: nlos.Capture.from_frames(3),  # type: ignore[arg-type]
+        lambda: nlos.Grid.in_front_of(frames, voxel=0.01),  # type: ignore[arg-type]
+        lambda: nlos.Hybrid(wavelength="long"),  # type: ignore[arg-type]
+        lambda: hybrid.reconstruct(frames, grid),  # type: ignore[arg-type]
+    )
+    for call in calls:
+        with pytest.raises(InputError, match="not a"):
+            call()

@@ -34,6 +34,7 @@ named as in Python, in backquotes (`bin_width`); the command line puts its optio
 
 from __future__ import annotations
 
+from os import PathLike
 from pathlib import Path
 
 __all__ = [
@@ -152,13 +153,13 @@ class ProtocolError(DeviceError):
     """The instrument said something that its protocol does not allow."""
 
 
-def require_type(value: object, wanted: type, use: str) -> None:
+def require_type(value: object, wanted: type | tuple[type, ...], use: str) -> None:
     """Refuse an argument of another type than the one that is needed.
 
     Parameters
     ----------
     value : object
-    wanted : type
+    wanted : type or tuple of types
     use : str
         What needs it and how one comes by it, such as ``"recover takes a Streak, see read_streak"``.
 
@@ -175,3 +176,18 @@ def require_type(value: object, wanted: type, use: str) -> None:
     """
     if not isinstance(value, wanted):
         raise InputError(f"{use}, not a {type(value).__name__}")
+
+
+def require_path(path: object) -> None:
+    """Refuse what is not the name of a file: Python would take a number for a file that is open.
+
+    Parameters
+    ----------
+    path : object
+
+    Raises
+    ------
+    InputError
+        It is neither text nor a path.
+    """
+    require_type(path, (str, PathLike), "a file is given by its name")

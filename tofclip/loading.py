@@ -6,7 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from tofclip.errors import FileFormatError
+from tofclip.errors import FileFormatError, require_path
 from tofclip.io import read_streak
 from tofclip.lidar import PointCloud
 from tofclip.storage import Record, translate_read_errors
@@ -52,6 +52,7 @@ def load(path: str | Path) -> Any:
     --------
     >>> frames = tofclip.load("frames.h5")  # doctest: +SKIP
     """
+    require_path(path)
     file = Path(path)
     with translate_read_errors(file), open(file, "rb") as opened:
         start = opened.read(len(HDF5_SIGNATURE))

@@ -124,6 +124,47 @@ class Streak(Storable):
         if self.row_times is not None:
             object.__setattr__(self, "row_times", self._check_times(self.row_times))
 
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(self.counts, dtype=dtype)
+
+    def __repr__(self) -> str:
+        rows, columns = self.counts.shape
+        return (
+            f"Streak({rows} x {columns} counts (time, column), {self._time_text}, "
+            f"{'no camera' if self.camera is None else 'with its camera'})"
+        )
+
+    def _repr_html_(self) -> str:
+        described = {
+            "counts (time, column)": " x ".join(map(str, self.counts.shape)),
+            "time axis": self._time_text,
+            "camera": "none" if self.camera is None else repr(self.camera),
+            "source": self.source,
+        }
+        return render_html("Streak image", described, np.sqrt(np.maximum(self.counts, 0)))
+
+    @property
+    def _time_text(self) -> str:
+        if self.row_times is None:
+            return "no time axis"
+        return f"{1e9 * self.row_times[0]:.3f} to {1e9 * self.row_times[-1]:.3f} ns"
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the counts.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, optional
+            Where to draw; by default the current figure's.
+
+        Returns
+        -------
+        matplotlib Axes
+        """
+        ax = plot_picture(self.counts, f"streak image, {self._time_text}", ax)
+        ax.set(xlabel="slit column (px)", ylabel="time (rows)")
+        return ax
+
     def _check_times(self, times: Any) -> NDArray[np.float64]:
         checked = np.asarray(times, dtype=np.float64)
         if checked.shape != (self.counts.shape[0],):
@@ -530,9 +571,9 @@ class Frames(Storable):
     )
 
     def __post_init__(self) -> None:
+        require_type(self.camera, Camera, "frames belong to a Camera")
         times = np.asarray(self.times, dtype=np.float64)
         object.__setattr__(self, "times", times)
-        require_type(self.camera, Camera, "frames belong to a Camera")
         if not hasattr(self.values, "shape"):
             require_type(self.values, np.ndarray, "the values of frames are an array (time, y, x)")
         expected = (times.size, *self.camera.image_shape)
@@ -560,6 +601,10 @@ class Frames(Storable):
             raise InputError(
                 "frames are selected by a slice, such as frames[100:101] for one of them"
             )
+        if self.times[frames].size == 0:
+            raise InputError(f"no frame is selected of {len(self)}")
+        if (frames.step or 1) < 0:
+            raise InputError("frames stay in the order of time; a step cannot be negative")
         return replace(
             self,
             values=self.values[frames],

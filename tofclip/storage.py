@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from tofclip.errors import FileFormatError, InputError, StorageError
+from tofclip.errors import FileFormatError, InputError, StorageError, require_path
 from tofclip.file_limits import require_bounded_dataset, require_own_member
 from tofclip.version import __version__
 
@@ -271,7 +271,7 @@ def write_record(record: Record, path: str | Path) -> None:
 
     suffix = Path(path).suffix.lower()
     if suffix in FOREIGN_SUFFIXES:
-        raise InputError(f"{path}: {record.kind} is saved as HDF5 (.h5), not as '{suffix}'")
+        raise InputError(f"{path}: '{record.kind}' is saved as HDF5 (.h5), not as '{suffix}'")
     with atomic_path(path) as temporary:
         # HDF5 crashes the process when the disk fills up under it: it writes to memory, and Python
         # to the disk.
@@ -286,6 +286,7 @@ def write_record(record: Record, path: str | Path) -> None:
 
 def read_record(path: str | Path) -> Record:
     """Read the record in `path`, of whatever kind; see `Record.load`."""
+    require_path(path)
     return _read_file(path, _read_values)
 
 

@@ -128,6 +128,7 @@ class PyvistaRenderer:
         import pyvista
 
         if self._plotter is None:
+            _silence_missing_screen()
             self._plotter = pyvista.Plotter(off_screen=True)
             self._plotter.set_background([value / 255 for value in BACKGROUND])
         plotter, camera = self._plotter, self._plotter.camera
@@ -137,6 +138,13 @@ class PyvistaRenderer:
         camera.up, camera.view_angle = (-DOWN).tolist(), float(np.rad2deg(viewpoint.field_of_view))
         plotter.renderer.reset_camera_clipping_range()
         return np.ascontiguousarray(plotter.screenshot(return_img=True)[..., :3])
+
+
+def _silence_missing_screen() -> None:
+    """Keep VTK from warning that there is no X server: it goes on without one, which is wanted."""
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
 
 
 class RasterRenderer:

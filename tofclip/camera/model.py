@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from tofclip.camera.range_calibration import RangeCalibration
 from tofclip.camera.sweep import FloatArray, Sweep, sweep_from_record
 from tofclip.errors import CalibrationError
+from tofclip.notebook import render_html
 from tofclip.operators import LineProjection
 from tofclip.records import Storable, stored_array, stored_child, stored_value
 from tofclip.storage import Record
@@ -146,6 +147,24 @@ class Camera(Storable):
             self, "image_shape", (int(self.image_shape[0]), int(self.image_shape[1]))
         )
         self._validate()
+
+    def __repr__(self) -> str:
+        rows, columns = self.image_shape
+        zero = f"time zero {1e9 * self.time_zero:.3f} ns" if self.time_zero else "no time zero"
+        return f"Camera({self.views} views, pictures of {rows} x {columns} pixels, {zero})"
+
+    def _repr_html_(self) -> str:
+        rows, columns = self.image_shape
+        described = {
+            "views": str(self.views),
+            "pictures (y, x)": f"{rows} x {columns} px",
+            "slit": f"{self.slit_width_px} px",
+            "centres": ", ".join(f"{centre:.1f}" for centre in self.centres_px) + " px",
+            "line angles": ", ".join(f"{angle:.1f}" for angle in np.rad2deg(self.angles)) + "°",
+            "sweep": "unknown: found from each shot" if self.sweep is None else "known",
+            "time zero": f"{1e9 * self.time_zero:.3f} ns" if self.time_zero else "not given",
+        }
+        return render_html("Camera", described, None)
 
     def _set_field(self, name: str, value: Any) -> None:
         # A copy that cannot be written to: operators made from it would go on with the old numbers.

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from tofclip.errors import FileFormatError
+from tofclip.errors import FileFormatError, require_path
 from tofclip.io.itex import SIGNATURE as ITEX_SIGNATURE
 from tofclip.io.itex import outline_itex, read_itex
 from tofclip.io.lift import outline_lift, read_lift
@@ -60,6 +60,7 @@ def read_streak(path: str | Path, bin_width: float | None = None) -> Streak:
     InputError
         Its pixels hold NaN, are all zero, all saturated, or negative where counts cannot be.
     """
+    require_path(path)
     streak = _select_reader(path)[0](path)
     if bin_width is not None:
         streak = streak.with_bin_width(bin_width)

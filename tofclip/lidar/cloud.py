@@ -40,6 +40,9 @@ PROPERTY_COLUMNS = tuple(name for name in COLUMN_UNITS if name not in "xyz")
 OPTIONAL_COLUMNS = ("false_alarm", "reflectance")
 """In files only where they are known of a point."""
 
+FRONT_PIXELS = 64
+"""Rows and columns of a cloud's picture in a notebook."""
+
 OLD_NAMES = {"confidence": "range_sigma"}
 """Columns of older files, read for one more version, and what they are called now."""
 
@@ -120,6 +123,10 @@ class PointCloud(Storable):
 
     def __getitem__(self, points: Any) -> PointCloud:
         """Return some of the points: a slice, a mask or numbers, as ``cloud[cloud.range < 2]``."""
+        if isinstance(points, (int, np.integer)):
+            raise InputError(
+                f"one point is cloud[{points}:{points + 1}]; cloud.xyz has its position"
+            )
         names = ("xyz", *PROPERTY_COLUMNS)
         try:
             chosen = {name: getattr(self, name)[points] for name in names}
@@ -128,6 +135,9 @@ class PointCloud(Storable):
                 f"points are selected by a slice, a mask or numbers: {fault}"
             ) from fault
         return replace(self, **chosen)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(self.xyz, dtype=dtype)
 
     @property
     def confidence(self) -> NDArray[np.float32]:
@@ -145,7 +155,17 @@ class PointCloud(Storable):
             for axis, column in zip("xyz", self.xyz.T, strict=True):
                 rows[axis] = f"{column.min():.3f} to {column.max():.3f} m"
             rows["range"] = f"{self.range.min():.3f} to {self.range.max():.3f} m"
-        return render_html("PointCloud", rows, None)
+        return render_html("PointCloud", rows, self._render_front())
+
+    def _render_front(self) -> NDArray[np.float64] | None:
+        """Light of the points as the camera sees them, (rows, columns); None without points."""
+        if len(self) == 0:
+            return None
+        x, y, _ = self.xyz.T
+        light: NDArray[np.float64]
+        light, *_ = np.histogram2d(y, x, bins=FRONT_PIXELS, weights=self.intensity)
+        picture: NDArray[np.float64] = np.sqrt(np.maximum(light, 0))
+        return picture
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the points as the camera sees them, coloured by range.
@@ -159,7 +179,9 @@ class PointCloud(Storable):
         -------
         matplotlib Axes
         """
-        return plot_points(self.xyz, self.range, ax)
+        ax = plot_points(self.xyz, self.range, ax)
+        ax.set_title(f"{len(self)} points")
+        return ax
 
     def to_pandas(self) -> Any:
         """Return a `pandas.DataFrame` with a row for each point, columns as in `COLUMN_UNITS`.
