@@ -35,7 +35,6 @@ from tofclip.arrays import to_numpy
 from tofclip.camera.measurement import MeasurementNoise
 from tofclip.errors import InputError
 from tofclip.lidar.detection import Detection
-from tofclip.lidar.neighbours import pool_significance
 from tofclip.lidar.pulse import Pulse
 from tofclip.shots import Frames
 from tofclip.units import SPEED_OF_LIGHT
@@ -249,6 +248,8 @@ class CandidatePool:
         -------
         (n,) float64 array
         """
+        from tofclip.lidar.neighbours import pool_significance
+
         starts = np.searchsorted(
             self.pixel, np.arange(self.image_shape[0] * self.image_shape[1] + 1)
         )

@@ -139,17 +139,26 @@ def smooth_rows(image, kernel, rows, margin, result):
     result : (rows, columns) float32 array, overwritten in those rows
     """
     half = kernel.size // 2
-    columns = image.shape[1]
     for number in range(rows.size):
         target = rows[number]
-        for column in range(columns):
-            result[target, column] = 0
-        for tap in range(kernel.size):
-            source = target + margin + half - tap
-            weight = kernel[tap]
-            if weight != 0 and 0 <= source < image.shape[0]:
-                for column in range(columns):
-                    result[target, column] += weight * image[source, column]
+        top = target + margin + half  # the source row of the first tap
+        line = result[target]
+        line[:] = 0
+        tap, end = max(0, top - image.shape[0] + 1), min(kernel.size, top + 1)
+        # Four rows at a time, as whole lines: the sums stay in registers, and an index into two
+        # dimensions would be checked for every pixel.
+        while tap + 4 <= end:
+            a, b, c, d = kernel[tap], kernel[tap + 1], kernel[tap + 2], kernel[tap + 3]
+            line_a, line_b = image[top - tap], image[top - tap - 1]
+            line_c, line_d = image[top - tap - 2], image[top - tap - 3]
+            for i in range(line.size):
+                line[i] += a * line_a[i] + b * line_b[i] + c * line_c[i] + d * line_d[i]
+            tap += 4
+        while tap < end:
+            weight, source = kernel[tap], image[top - tap]
+            for i in range(line.size):
+                line[i] += weight * source[i]
+            tap += 1
 
 
 @nogil_njit
