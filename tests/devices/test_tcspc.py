@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import struct
 import sys
+import tracemalloc
+import zipfile
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -314,3 +318,42 @@ def test_the_shape_of_an_sdt_image(tmp_path: Path) -> None:
         assert source.calibration.attributes["rows"] == 4  # type: ignore[union-attr]
         assert source.info.details["columns"] == 6
     np.testing.assert_array_equal(records["histogram"].reshape(cube[0].shape), cube[0])
+
+
+PACKED = 0x1000
+
+
+def pack_sdt(path: Path, data: bytes, compression: int = zipfile.ZIP_DEFLATED) -> None:
+    """Write a file of one block that is a ZIP archive of `data`, as newer programs do."""
+    tcspc_files.write_sdt(path, np.ones((1, 50), np.uint16))
+    layout = np.dtype(sdtfile.sdtfile.BLOCK_HEADER).newbyteorder("<")
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", compression) as opened:
+        opened.writestr("data_block", data)
+    whole = path.read_bytes()
+    block = np.frombuffer(whole[-100 - layout.itemsize : -100], layout).copy()
+    block["block_type"] |= PACKED
+    block["next_block_offs"] = block["data_offs"] + len(archive.getvalue())
+    path.write_bytes(whole[: -100 - layout.itemsize] + block.tobytes() + archive.getvalue())
+
+
+def test_packed_blocks_are_read_and_take_no_more_than_they_hold(tmp_path: Path) -> None:
+    path, counts = tmp_path / "run.sdt", np.arange(50, dtype="<u2")
+    pack_sdt(path, counts.tobytes())
+    np.testing.assert_array_equal(read_transient(f"file://{path}").counts[:, 0], counts)
+    whole = path.read_bytes()
+    size = struct.pack("<I", len(whole))  # where the block ends: three gigabytes later
+    far = whole.replace(size, struct.pack("<I", 3_400_000_000))
+    assert far != whole
+    for bomb in (far, None):
+        if bomb is None:
+            pack_sdt(path, bytes(1 << 24), zipfile.ZIP_LZMA)  # 16 MiB out of 3 kB
+        else:
+            path.write_bytes(bomb)
+        tracemalloc.start()
+        try:
+            with pytest.raises(FileFormatError, match="block 0"):
+                read_transient(f"file://{path}")
+            assert tracemalloc.get_traced_memory()[1] < 1 << 22
+        finally:
+            tracemalloc.stop()

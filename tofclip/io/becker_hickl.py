@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,8 @@ from numpy.typing import NDArray
 
 from tofclip.dependencies import import_file_reader
 from tofclip.errors import FileFormatError
-from tofclip.file_limits import require_bounded_size
+from tofclip.file_limits import BoundedFile, require_bounded_size
+from tofclip.io.archive import MEMBER_COMPRESSIONS
 
 LAST_OLD_REVISION = 14
 # `no_of_data_blocks` has 16 bits; where they do not suffice it says this, and the number is in
@@ -40,7 +43,7 @@ def read_sdt_blocks(path: Path) -> tuple[list[NDArray[Any]], float]:
     """
     sdtfile = import_file_reader("sdtfile", "tofclip[tcspc]")
     require_bounded_sdt(path)
-    with sdtfile.SdtFile(path) as file:
+    with BoundedFile(path) as opened, sdtfile.SdtFile(opened) as file:
         blocks = [np.asarray(block) for block in file.data]
         steps = {float(times[1] - times[0]) for times in file.times if len(times) > 1}
     if len(steps) != 1:
@@ -81,4 +84,20 @@ def require_bounded_sdt(path: Path) -> None:
         found = np.fromfile(path, layout, 1, offset=place)[0]
         packed = bool(sdtfile.BlockType(int(found["block_type"])).compress)
         require_bounded_size(path, f"block {block}", int(found["block_length"]), size, packed)
-        place = int(found["next_block_offs"])
+        begin, place = int(found["data_offs"]), int(found["next_block_offs"])
+        if packed:
+            _require_bounded_archive(path, f"block {block}", begin, place)
+
+
+def _require_bounded_archive(path: Path, name: str, begin: int, end: int) -> None:
+    """Refuse a packed block, a ZIP archive of one member, that would unpack to any size."""
+    if not 0 <= begin < end <= path.stat().st_size:
+        raise FileFormatError(path, f"is truncated or damaged: {name} lies beyond its end")
+    with BoundedFile(path) as opened:
+        opened.seek(begin)
+        content = opened.read(end - begin)
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        for member in archive.filelist[:1]:
+            if member.compress_type not in MEMBER_COMPRESSIONS:
+                raise FileFormatError(path, f"{name} is packed in a way that is not read")
+            require_bounded_size(path, name, member.file_size, member.compress_size, True)
