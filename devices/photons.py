@@ -5,20 +5,32 @@ Besides what a source itself takes, its address may say how to gather (`GATHERIN
 
 * ``scans``: whole scans of a gate, or whole histograms, to add up; 1 by default;
 * ``binning``: pixels along each side of a square that count as one; 1 by default.
+
+Photons with a time stamp each, as of a LinoSPAD2's recording, are counted in bins, for which
+`devices.transients.ACCUMULATION_OPTIONS` are taken; the line of pixels is a picture of one row.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from devices.linospad2.calibration import BoardCalibration
+from devices.recording.reader import read_head_if_recording
 from devices.registry import open as open_source
 from devices.source import Source
-from devices.transients import read_batches, strip_options
+from devices.transients import (
+    ACCUMULATION_OPTIONS,
+    AccumulationSettings,
+    accumulate_streak,
+    read_batches,
+    strip_options,
+)
 from devices.uri import Uri
 from tofclip.errors import InputError
 from tofclip.lidar import Pulse
@@ -27,6 +39,7 @@ from tofclip.storage import Record
 
 GATHERING_OPTIONS = ("scans", "binning")
 MAX_CUBE_BYTES = 1 << 32
+STAMPS_SUFFIX = ".dat"
 EDGE_S = 1e-10
 """Standard deviation of a gate's edges and the laser's pulse, where nothing better is known, s."""
 
@@ -58,8 +71,21 @@ class CountedPhotons:
         return PhotonImage.from_cube(np.moveaxis(self.counts, 0, -1), self.bin_width)
 
 
-def read_photons(address: str) -> CountedPhotons:
-    """Read as many whole scans as an address asks for.
+def find_address(file: str) -> str | None:
+    """Return the address of a file that holds an instrument's records, None of any other file.
+
+    Parameters
+    ----------
+    file : str
+        A recording of this program, or a LinoSPAD2's (``.dat``).
+    """
+    path = Path(file)
+    is_stamps = path.suffix.lower() == STAMPS_SUFFIX
+    return f"file://{file}" if is_stamps or read_head_if_recording(path) is not None else None
+
+
+def read_photons(address: str, bin_width: float | None = None) -> CountedPhotons:
+    """Read as many whole scans as an address asks for, or count the photons of a recording.
 
     Memory: the counts, and one batch of the source.
 
@@ -67,6 +93,9 @@ def read_photons(address: str) -> CountedPhotons:
     ----------
     address : str
         As `devices.open` takes it, with `GATHERING_OPTIONS` where wanted.
+    bin_width : float, optional
+        Duration of a bin, s, in which photons with a time stamp each are counted, 20 ps by default;
+        other instruments know their own.
 
     Returns
     -------
@@ -75,7 +104,7 @@ def read_photons(address: str) -> CountedPhotons:
     Raises
     ------
     InputError
-        The source counts no photons in time, or ended before a whole scan.
+        The source counts no photons in time, knows its own bins, or ended before a whole scan.
     DeviceError
         The instrument failed before that.
     """
@@ -83,9 +112,14 @@ def read_photons(address: str) -> CountedPhotons:
     scans, binning = uri.value("scans", int, 1), uri.value("binning", int, 1)
     if scans < 1 or binning < 1:
         raise InputError(f"'{address}': scans and binning must be positive")
-    with open_source(strip_options(uri, GATHERING_OPTIONS)) as source:
+    gathering = AccumulationSettings.from_uri(uri, bin_width)
+    with open_source(strip_options(uri, GATHERING_OPTIONS + ACCUMULATION_OPTIONS)) as source:
         known = source.calibration
         axis = _find_time_axis(known)
+        if known is not None and known.kind == BoardCalibration.RECORD_KIND:
+            return _count_stamps(source, known, gathering)
+        if bin_width is not None:
+            raise InputError(f"'{address}': an instrument knows its own bins")
         if known is None or axis is None:
             raise InputError(
                 f"'{address}': {source.info.instrument} counts no photons in time for each pixel; "
@@ -102,6 +136,15 @@ def read_photons(address: str) -> CountedPhotons:
         while source.read() is not None:
             pass
     return CountedPhotons(counts, times, pulse)
+
+
+def _count_stamps(source: Source, known: Record, gathering: AccumulationSettings) -> CountedPhotons:
+    """Count a line's photons, each of which has a time stamp, in bins; hot pixels are left dark."""
+    streak = accumulate_streak(read_batches(source, gathering.seconds), known, gathering)
+    counts = streak.counts
+    if streak.saturated is not None:
+        counts = np.where(streak.saturated, np.float32(0), counts)
+    return CountedPhotons(counts[:, np.newaxis, :], streak.times)
 
 
 def _find_time_axis(known: Record | None) -> str | None:

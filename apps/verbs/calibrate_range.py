@@ -27,6 +27,7 @@ from apps.verbs.photons import (
     read_any_photons,
     require_view,
 )
+from devices.photons import find_address
 from tofclip.camera import Camera
 from tofclip.errors import FileFormatError, InputError
 from tofclip.io import read_streak
@@ -249,7 +250,7 @@ class _ShotReader:
 
     def _load_frames(self, shot: str, distance: float) -> Frames | None:
         """Load frames or recover them; None of counted photons."""
-        if "://" in shot or Path(shot).suffix.lower() in PHOTON_SUFFIXES:
+        if "://" in shot or Path(shot).suffix.lower() in PHOTON_SUFFIXES or find_address(shot):
             return None
         with translate_read_errors(shot), open(shot, "rb") as file:
             ours = file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE

@@ -15,6 +15,8 @@ from apps.conventions import (
     summarise_list,
     to_json_value,
 )
+from devices.linospad2.source import LinoSpad2File
+from devices.photons import STAMPS_SUFFIX
 from devices.recording.reader import read_head_if_recording
 from tofclip.errors import FileFormatError
 from tofclip.io.streaks import outline_streak_file
@@ -72,6 +74,10 @@ def _read_outline(file: Path) -> Record:
     recording = read_head_if_recording(file)
     if recording is not None:
         return recording
+    if file.suffix.lower() == STAMPS_SUFFIX:
+        with LinoSpad2File(file) as source:
+            known = {"instrument": source.info.instrument, **source.info.details}
+            return Record("photon stamps", attributes=known | {"stamps": source.stats.acquired})
     with translate_read_errors(file), open(file, "rb") as opened:
         start = opened.read(len(HDF5_SIGNATURE))
     # Decided by content, because suffixes get lost.

@@ -19,6 +19,7 @@ from apps.conventions import (
 from apps.figures.photons import make_range_figure
 from apps.figures.style import save_figure
 from apps.verbs.cloud import CLOUD_SUFFIXES, DEPTH_SUFFIX
+from devices.photons import find_address
 from devices.photons import read_photons as read_counted_photons
 from tofclip.camera import Camera
 from tofclip.errors import InputError
@@ -48,8 +49,8 @@ def photons(
         typer.Argument(
             metavar="FILE",
             help="Counted photons: .npy, .npz, .mat, HDF5, multi-page TIFF, .ptu or .sdt; a cube of counts, a list of "
-            "photon times for each pixel, or events x, y, time. Or an instrument that counts them, such as "
-            "'spad512://HOST?mode=gated'.",
+            "photon times for each pixel, or events x, y, time. Or a LinoSPAD2's recording (.dat), one by record, or "
+            "an instrument that counts them, such as 'spad512://HOST?mode=gated'.",
         ),
     ],
     out: Annotated[
@@ -215,11 +216,12 @@ def read_any_photons(
     """Read a file or an instrument; return its photons, its response where it knows that, and the
     time of its first bin, s.
     """
-    if "://" not in file:
+    address = file if "://" in file else find_address(file)
+    if address is None:
         return read_photons(Path(file), bin_width, axes), None, 0.0
-    if bin_width is not None or axes is not None:
-        raise InputError(f"{file}: an instrument knows its own bins and axes")
-    counted = read_counted_photons(file)
+    if axes is not None:
+        raise InputError(f"{file}: an instrument knows its own axes")
+    counted = read_counted_photons(address, bin_width)
     return counted.to_image(), counted.pulse, float(counted.times[0])
 
 

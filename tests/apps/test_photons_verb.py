@@ -10,7 +10,11 @@ import pytest
 from small_instrument import Run
 
 from apps.cli import main
-from devices.scenes import render_array_delays
+from devices.linospad2.calibration import BoardCalibration
+from devices.linospad2.codec import LinoSpad2Codec
+from devices.linospad2.simulation import LASER_PERIOD_S, SimulatedBoard
+from devices.photons import find_address, read_photons
+from devices.scenes import render_array_delays, simulate_line_light
 from tofclip.lidar import PointCloud
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -114,3 +118,70 @@ def test_a_gated_arrays_address_becomes_ranges(tmp_path: Path) -> None:
     # Steps are 96 mm; where none of them falls on an edge, the edge may be anywhere between two.
     assert np.median(np.abs(error)) < 0.048
     assert main([*words, "--bin-width-ps", "9"]) == 2
+
+
+def test_a_recording_of_time_stamps_becomes_ranges(run: Run, tmp_path: Path) -> None:
+    """LinoSPAD2's own file and a recording of ours, by their plain names."""
+    light = simulate_line_light()
+    board = SimulatedBoard(
+        light, BoardCalibration.ideal(), LinoSpad2Codec("2212s", 24, True), 300, 3
+    )
+    stamps = tmp_path / "run.dat"
+    stamps.write_bytes(b"".join(board.encode_cycle(number) for number in range(12)))
+    stamps.with_suffix(".toml").write_text(
+        'firmware = "2212s"\ntimestamps_per_cycle = 24\nabsolute_counter = true\n'
+        f"laser_period_ps = {LASER_PERIOD_S * 1e12}\n"
+    )
+    found = json.loads(run("info", stamps, "--json").out)
+    assert (found["kind"], found["attributes"]["firmware"]) == ("photon stamps", "2212s")
+    assert found["attributes"]["stamps"] > 1000
+    ours = tmp_path / "run.h5"
+    words = ["--out", ours, "--seconds", "5", "--overwrite"]
+    assert run("record", f"file://{stamps}", *words).status == 0
+    assert json.loads(run("info", ours, "--json").out)["kind"] == "recording"
+    counts = [read_photons(find_address(str(file)), 250e-12).counts for file in (stamps, ours)]
+    assert counts[0].shape == (100, 1, 256)
+    np.testing.assert_array_equal(*counts)
+    out = tmp_path / "range.npz"
+    words = ["--bin-width-ps", "250", "--pulse-ps", "600", "--single-pixel", "--json"]
+    outcome = run("lidar", "photons", stamps, "--out", out, *words)
+    assert (outcome.status, outcome.err) == (0, "")
+    assert json.loads(outcome.out)["settings"]["image_shape"] == [1, 256]
+    with np.load(out) as written:
+        found = written["range_m"][0]
+    # Where one surface sends most of a pixel's light, its delay is the brightest instant's.
+    brightest = light.row_times[light.photons.argmax(axis=0)]
+    error = found - SPEED_OF_LIGHT / 2 * brightest
+    assert np.nanmedian(np.abs(error)) < SPEED_OF_LIGHT / 2 * 250e-12
+
+
+def test_a_given_background_and_cycles_are_used(run: Run, tmp_path: Path) -> None:
+    """A ramp whose shape is given is no return; with pile-up corrected, photons are more than
+    counted.
+    """
+    noise = np.random.default_rng(3)
+    shape = np.exp(-np.arange(64) / 10)
+    cube = noise.poisson(3 * shape, (4, 5, 64))
+    cube[0, 0, 40:43] += (10, 25, 10)
+    np.save(tmp_path / "cube.npy", cube.astype(np.uint8))
+    np.save(tmp_path / "dark.npy", shape)
+    words = ["lidar", "photons", tmp_path / "cube.npy", "--bin-width-ps", "80", "--pulse-ps", "160"]
+    signal = {}
+    for cycles in (None, 120):
+        out = tmp_path / "range.npz"
+        further = [] if cycles is None else ["--cycles", cycles]
+        outcome = run(
+            *words, "--single-pixel", "--background", tmp_path / "dark.npy", *further, "--out", out
+        )
+        assert (outcome.status, outcome.err) == (0, "")
+        with np.load(out) as written:
+            seen = np.isfinite(written["range_m"])
+            signal[cycles] = written["intensity"][0, 0]
+            assert written["range_m"][0, 0] == pytest.approx(41 * BIN_M, abs=0.2 * BIN_M)
+        # One in a hundred of the 19 others at most; two of them would be one in fifty cases.
+        assert seen.sum() <= 2
+    assert signal[120] > 1.2 * signal[None]
+    for option in (["--background", tmp_path / "dark.npy"], ["--cycles", "9"]):
+        outcome = run(*words, *option, "--out", tmp_path / "range.npz")
+        assert outcome.status == 2
+        assert "--single-pixel" in outcome.err
