@@ -169,6 +169,20 @@ def make_npy_header(shape: tuple[int, ...]) -> bytes:
     return buffer.getvalue()
 
 
+def test_pages_in_a_circle_are_refused(tmp_path: Path) -> None:
+    """A damaged link from the last page back to the first kept the reader busy for ever."""
+    path = tmp_path / "circle.tif"
+    tifffile.imwrite(path, np.ones((3, 4, 5), np.uint8), photometric="minisblack", metadata=None)
+    with tifffile.TiffFile(path) as tiff:
+        first, last = tiff.pages[0].offset, tiff.pages[-1]
+        link = last.offset + 2 + 12 * len(last.aspage().tags)
+    content = bytearray(path.read_bytes())
+    content[link : link + 4] = first.to_bytes(4, "little")
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match="in a circle"):
+        describe_photons(path)
+
+
 def test_small_files_that_claim_terabytes_are_refused(tmp_path) -> None:
     header = make_npy_header((1 << 14, 1 << 14, 1 << 12))
     (tmp_path / "a.npy").write_bytes(header)

@@ -104,6 +104,26 @@ def _check_only_page(tiff: tifffile.TiffFile, path: str | Path) -> tifffile.Tiff
     return page
 
 
+def require_finite_chain(tiff: tifffile.TiffFile, path: str | Path) -> None:
+    """Refuse a file whose pictures follow each other in a circle: going through them has no end.
+
+    Parameters
+    ----------
+    tiff : TiffFile
+    path : path-like
+        The file, for the message.
+
+    Raises
+    ------
+    FileFormatError
+    """
+    seen: set[int] = set()
+    for page in tiff.pages:
+        if page.offset in seen:
+            raise FileFormatError(path, "is damaged: its pictures follow each other in a circle")
+        seen.add(page.offset)
+
+
 def require_bounded_page(page: tifffile.TiffPage, path: str | Path) -> None:
     """Refuse a picture that claims more than its file can hold.
 
