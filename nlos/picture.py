@@ -76,6 +76,11 @@ def _draw_figure(volume: Volume) -> Figure:
     figure.colorbar(
         drawn, ax=depth_map, label="z (m)", location="bottom", shrink=0.8, ticks=MaxNLocator(4)
     )
+    # Places are found here and stay: saving would draw all twice, once only to find them.
+    layout = figure.get_layout_engine()
+    if layout is not None:
+        layout.execute(figure)
+    figure.set_layout_engine(None)
     return figure
 
 
