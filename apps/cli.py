@@ -27,6 +27,7 @@ from apps.help import (
     make_lazy_group,
 )
 from tofclip import __version__
+from tofclip.compiling import observe_compiling
 from tofclip.dependencies import describe_missing_package
 from tofclip.errors import TofclipError
 
@@ -148,6 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = DEBUG_FLAG in words
     _heed_end_signals()
+    stop_observing = observe_compiling(_CompileNotice().announce)
     try:
         status = app(
             [word for word in words if word != DEBUG_FLAG],
@@ -164,9 +166,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SystemExit as end:  # typer's answer to a broken pipe, and the end of shell completion
         completes = end.code == 0 or COMPLETION_VARIABLE in os.environ
         status = end.code if completes else EXIT_BROKEN_PIPE
+    finally:
+        stop_observing()
     if status == EXIT_INTERRUPTED:
         print("tofclip: interrupted; no unfinished file was left behind", file=sys.stderr)
     return int(status or 0)
+
+
+class _CompileNotice:
+    """Says once, on a terminal, why a first run takes longer."""
+
+    def __init__(self) -> None:
+        self.given = False
+
+    def announce(self, loop: str) -> None:
+        """Print the line, if it has not been printed; `loop` is what is compiled first."""
+        if self.given or not sys.stderr.isatty():
+            return
+        self.given = True
+        print(
+            f"compiling loops for this processor, once ({loop} and others; "
+            "tofclip warm-up does all beforehand)",
+            file=sys.stderr,
+        )
 
 
 def _heed_end_signals() -> None:

@@ -21,7 +21,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tofclip.lidar.pulse_fit import compiled
+from tofclip.compiling import compile_as_part
+from tofclip.lidar.pulse_fit import loop_part
 from tofclip.threads import run_blocks
 
 FloatArray = NDArray[np.float64]
@@ -49,7 +50,7 @@ RETURNS_PER_BLOCK = 512
 NEIGHBOURS = 96
 """Room for the (2 * 8 / 2 + 1)^2 = 81 neighbours, in whole vectors."""
 
-vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy", _nrt=False)
+vectorised_part = compile_as_part(fastmath=True, _nrt=False)
 
 
 def add_recovery_error(
@@ -148,7 +149,7 @@ def scatter_about_planes(
         scatter[own] = scatter_about_plane(around, number, gate, used, residual)
 
 
-@compiled
+@loop_part
 def scatter_about_plane(around, number, gate, used, residual):
     """Robust deviation of neighbours from a plane through them, -1 if they are few.
 
@@ -184,7 +185,7 @@ def scatter_about_plane(around, number, gate, used, residual):
     return scatter
 
 
-@vectorised
+@vectorised_part
 def measure_offsets(around, a, b, c, residual):
     """Distance of each neighbour from the plane ``a * right + b * down + c``.
 
@@ -201,7 +202,7 @@ def measure_offsets(around, a, b, c, residual):
         residual[t] = abs(off[t] - a * right[t] - b * down[t] - c)
 
 
-@vectorised
+@vectorised_part
 def mark_near(residual, number, most, used):
     """Use the neighbours that are off by at most so much; return whether others were used before.
 
@@ -227,7 +228,7 @@ def mark_near(residual, number, most, used):
     return changed > 0
 
 
-@vectorised
+@vectorised_part
 def find_median(residual, used, count):
     """Return the median of what is used, by halving an interval: each step is one look at all.
 
@@ -259,7 +260,7 @@ def find_median(residual, used, count):
     return float(high)
 
 
-@compiled
+@loop_part
 def find_donor(nearness, metres, pixel, starts, image_shape, own):
     """Find the return nearest in range among those within a plane's reach whose row and column
     `PLANE_STEP_PX` divides.
@@ -292,7 +293,7 @@ def find_donor(nearness, metres, pixel, starts, image_shape, own):
     return found, least
 
 
-@compiled
+@loop_part
 def collect_neighbours(nearness, metres, pixel, starts, image_shape, own, around):
     """List the returns around one: columns and rows away, and how much further off, in m.
 
@@ -330,7 +331,7 @@ def collect_neighbours(nearness, metres, pixel, starts, image_shape, own, around
     return number
 
 
-@vectorised
+@vectorised_part
 def fit_plane_around(around, used):
     """Least-squares plane ``a * right + b * down + c`` through the neighbours that are used.
 

@@ -12,6 +12,7 @@ from numba import njit
 from numba.core.types import Array
 from numba.extending import overload
 
+from tofclip.compiling import compile_as_part
 from tofclip.lidar.detection import CONVERGENCE_STEP_BINS
 
 EVEN_VARIANCE = (
@@ -21,13 +22,13 @@ EVEN_VARIANCE = (
 
 # Without counts of the arrays' owners, which cost a lock for every array that is handed on; nothing
 # here allocates.
-compiled = njit(nogil=True, cache=True, error_model="numpy", _nrt=False)
+loop_part = compile_as_part(_nrt=False)
 inlined = njit(
     inline="always"
 )  # called for every bin: handing over the arrays would cost more than the work
 
 
-@compiled
+@loop_part
 def find_pulse_window(times, near, arrival, scale):
     """First bin and the bin after the last one that a return at `arrival` reaches; `near` guesses
     them.
@@ -52,7 +53,7 @@ def find_pulse_window(times, near, arrival, scale):
     )
 
 
-@compiled
+@loop_part
 def find_first_bin(times, near, instant):
     """First bin at `instant` or later, step by step from a bin near it.
 
@@ -191,7 +192,7 @@ def compute_residual(trace, times, background, curve, scale, estimate, i, withou
     return rest
 
 
-@compiled
+@loop_part
 def refine_returns(trace, times, background, curve, scale, estimate, variance, rounds):
     """Least-squares arrival and height of every return, by Gauss-Newton steps on one return at a
     time.
@@ -236,7 +237,7 @@ def refine_returns(trace, times, background, curve, scale, estimate, variance, r
             break
 
 
-@compiled
+@loop_part
 def check_overlap(estimate, k, curve, scale):
     """Whether another return reaches return k, and the most that one of them moved.
 
@@ -271,7 +272,7 @@ def check_overlap(estimate, k, curve, scale):
     return crowded, moving
 
 
-@compiled
+@loop_part
 def sum_normal_equations(trace, times, background, curve, scale, estimate, k, crowded, variance):
     """Sums over the bins of return k, of their pulse p, its slope d and the rest r: pp, pd, dd, pr,
     dr; see `refine_returns`.
@@ -326,7 +327,7 @@ def sum_normal_equations(trace, times, background, curve, scale, estimate, k, cr
     return pp, pd, dd, pr, dr
 
 
-@compiled
+@loop_part
 def take_gauss_newton_step(times, sums, own):
     """Improve one return's arrival and height in place, and enter by how many bins it moved (at
     most one).
@@ -359,7 +360,7 @@ def take_gauss_newton_step(times, sums, own):
     own[0], own[1], own[4] = own[0] + step, height, abs(step) / bin_width
 
 
-@compiled
+@loop_part
 def measure_returns(trace, times, background, noise, curve, scale, estimate, least, profile, found):
     """Write instant, sum and standard deviation of every return that proves itself; return their
     number.
@@ -421,7 +422,7 @@ def measure_returns(trace, times, background, noise, curve, scale, estimate, lea
     return number
 
 
-@compiled
+@loop_part
 def estimate_sum_and_deviation(profile, height, noise, pp, pd, dd):
     """Sum of a return over its bins, and the standard deviation of its arrival.
 
@@ -456,7 +457,7 @@ def estimate_sum_and_deviation(profile, height, noise, pp, pd, dd):
     return total, np.sqrt(variance) / (across_energy * height)
 
 
-@compiled
+@loop_part
 def sort_rows(table):
     """Sort a few rows by their first column, in place."""
     for last in range(1, table.shape[0]):

@@ -14,7 +14,10 @@ import math
 
 from numba import njit
 
+from tofclip.compiling import compile_as_part
+
 nogil_njit = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+loop_part = compile_as_part(fastmath=True)
 
 SPLINE_SAMPLES = 3
 SPLINE_VARIANCE = 0.25  # rows^2, of the samples' spread
@@ -189,7 +192,7 @@ def prox_masked_tv(picture, mask, weight, iterations, dual, result):
         apply_dual(picture, mask, weight, ahead, result)
 
 
-@nogil_njit
+@loop_part
 def apply_dual(picture, mask, weight, ahead, result):
     """The picture that belongs to a dual variable: ``max(picture + weight * div ahead, 0)``."""
     for y in range(picture.shape[0]):
@@ -204,7 +207,7 @@ def apply_dual(picture, mask, weight, ahead, result):
                 result[y, x] = max(picture[y, x] + weight * divergence, 0.0)
 
 
-@nogil_njit
+@loop_part
 def ascend_dual(result, mask, weight, momentum, ahead, dual):
     """A projected gradient step on the dual variable, with momentum."""
     rows, columns = result.shape

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from tofclip.compiling import compile_as_part
 from tofclip.operators.kernels import multiply_sparse_block, multiply_sparse_rows
 from tofclip.threads import LANES
 
@@ -25,7 +26,7 @@ inline_njit = njit(
 )  # so that a full block's number of lanes is a constant to the compiler
 
 
-helper_njit = njit(fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy")
+row_part = compile_as_part(fastmath={"contract", "nsz", "arcp", "afn"})
 """For a row of a picture with all its lanes, one after the other: a loop over few arrays is a vector
 loop, because the compiler checks only a few for overlap. Numbers that each lane has are repeated for
 every pixel of a row.
@@ -60,21 +61,21 @@ def shrink_nonnegative(current, previous, momentum, gradient, step, threshold, t
         _add_row(made, total)
 
 
-@helper_njit
+@row_part
 def _shrink_row(current, previous, momentum, gradient, step, threshold, result):
     for i in range(current.size):
         point = current[i] + momentum[i] * (current[i] - previous[i])
         result[i] = max(point - step[i] * gradient[i] - threshold[i], np.float32(0))
 
 
-@helper_njit
+@row_part
 def _descend_row(current, previous, momentum, gradient, step):
     for i in range(current.size):
         point = current[i] + momentum[i] * (current[i] - previous[i])
         gradient[i] = point - step[i] * gradient[i]
 
 
-@helper_njit
+@row_part
 def _add_distance(current, previous, momentum, result, distance):
     """Add the squares of ``result - z``."""
     for i in range(current.size):
@@ -82,13 +83,13 @@ def _add_distance(current, previous, momentum, result, distance):
         distance[i] += moved * moved
 
 
-@helper_njit
+@row_part
 def _add_row(row, total):
     for i in range(row.size):
         total[i] += row[i]
 
 
-@helper_njit
+@row_part
 def _put_row(row, target):
     for i in range(row.size):
         target[i] = row[i]
@@ -289,7 +290,7 @@ def descend_total_variation(
     _add_variation(lanes, previous[rows - 1], previous[rows - 1], total)
 
 
-@helper_njit
+@row_part
 def _make_primal_row(lanes, noisy, weight, down, above, across, result):
     """``result = max(noisy + weight * div(dual), 0)``; `above` is `down` one row higher."""
     nothing, inner = np.float32(0), noisy.size - lanes
@@ -303,7 +304,7 @@ def _make_primal_row(lanes, noisy, weight, down, above, across, result):
         result[i] = max(noisy[i] + weight[i] * divergence, nothing)
 
 
-@helper_njit
+@row_part
 def _update_dual_row(lanes, here, below, sweep, down, across, shrink):
     """``dual = project(dual + sweep * grad(picture))`` onto vectors of length at most 1; `shrink` is
     room for a row.
@@ -321,7 +322,7 @@ def _update_dual_row(lanes, here, below, sweep, down, across, shrink):
         down[i] = (down[i] + sweep[i] * (below[i] - here[i])) * shrink[i]
 
 
-@helper_njit
+@row_part
 def _add_variation(lanes, here, below, total):
     inner, right = here.size - lanes, here[lanes:]
     for i in range(inner):

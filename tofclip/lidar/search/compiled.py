@@ -10,11 +10,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from tofclip.compiling import compile_as_part
 from tofclip.lidar.detection import MAX_FIT_ROUNDS, PREFIT_THRESHOLD_FACTOR
 from tofclip.lidar.pulse_fit import (
     EVEN_VARIANCE,
-    compiled,
     find_pulse_window,
+    loop_part,
     measure_returns,
     refine_returns,
     sort_rows,
@@ -25,7 +26,7 @@ BINS_PER_GROUP = 32  # bins of which the highest peak is kept
 NEIGHBOUR_FRACTION = 0.5  # of what is of interest: weaker peaks do not move a return beside them
 WEIGHTS_PER_PASS = 4  # weights of a filter that are applied in one pass
 
-vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy", _nrt=False)
+vectorised_part = compile_as_part(fastmath=True, _nrt=False)
 
 
 @njit(nogil=True, cache=True)
@@ -96,7 +97,7 @@ def find_returns(
         )
 
 
-@compiled
+@loop_part
 def find_trace_returns(
     trace, times, bin_weights, filters, pulse, phases, limits, least, memory, found
 ):
@@ -198,7 +199,7 @@ def find_trace_returns(
     return number
 
 
-@compiled
+@loop_part
 def is_wanted(peaks, k, times, least, reach):
     """Whether a peak, or one within `reach` of it, exceeds what is of interest there.
 
@@ -223,7 +224,7 @@ def is_wanted(peaks, k, times, least, reach):
     return False
 
 
-@vectorised
+@vectorised_part
 def correlate_trace(trace, filters, score):
     """Filter a trace: ``score[j] = sum_w filters[w, j] * trace[j + w - width // 2]``.
 
@@ -266,7 +267,7 @@ def correlate_trace(trace, filters, score):
                 score[j] += filters[w, j] * trace[j + w - half]
 
 
-@vectorised
+@vectorised_part
 def compute_response(trace, matched, j):
     """Response of the matched filter at bin j.
 
@@ -290,7 +291,7 @@ def compute_response(trace, matched, j):
     return float(total)
 
 
-@compiled
+@loop_part
 def interpolate_peak_time(trace, times, matched, background, j, here):
     """Instant near bin j at which the response, `here` at the bin, is highest: by a parabola in its
     logarithm.
@@ -321,7 +322,7 @@ def interpolate_peak_time(trace, times, matched, background, j, here):
     return times[j] + share * (times[j + 1] - times[j - 1]) / 2
 
 
-@compiled
+@loop_part
 def find_strongest_peaks(
     moments, trace, times, bin_weights, matched, gains, scale, limits, maxima, bounds, free, peaks
 ):
@@ -409,7 +410,7 @@ def find_strongest_peaks(
     return number, background, noise
 
 
-@vectorised
+@vectorised_part
 def copy_local_maxima(score, least, factor, level, maxima):
     """Copy the inner local maxima above zero that may be of interest, and zero for all other
     scores; of a level top the last bin.
@@ -434,7 +435,7 @@ def copy_local_maxima(score, least, factor, level, maxima):
         )
 
 
-@vectorised
+@vectorised_part
 def update_group_maxima(maxima, first, last, bounds):
     """Largest maximum of each group of bins from `first` to before `last`, or 0.
 
@@ -458,7 +459,7 @@ def update_group_maxima(maxima, first, last, bounds):
         highest_bits[group] = highest
 
 
-@vectorised
+@vectorised_part
 def find_bin_in_group(maxima, group, value):
     """Bin of the last maximum of a group that is as high as `value`, which has to be there.
 
@@ -478,7 +479,7 @@ def find_bin_in_group(maxima, group, value):
     return group * BINS_PER_GROUP + place
 
 
-@compiled
+@loop_part
 def clear_maxima_around(best, times, distance, maxima, bounds):
     """Take away the maxima nearer than `distance` to a bin, and that at the bin itself.
 
@@ -504,7 +505,7 @@ def clear_maxima_around(best, times, distance, maxima, bounds):
     update_group_maxima(maxima, first // BINS_PER_GROUP, last // BINS_PER_GROUP + 1, bounds)
 
 
-@vectorised
+@vectorised_part
 def sum_moments(trace, bin_weights):
     """Sum, sum of squares and number of bins; float32 squares would drown a small noise on a high
     background.
@@ -527,7 +528,7 @@ def sum_moments(trace, bin_weights):
     return total, square, bins
 
 
-@compiled
+@loop_part
 def compute_mean_and_deviation(total, square, bins):
     """Mean and standard deviation from sum, sum of squares and number.
 
@@ -547,7 +548,7 @@ def compute_mean_and_deviation(total, square, bins):
     return mean, np.sqrt(max(square / bins - mean * mean, 0.0))
 
 
-@compiled
+@loop_part
 def find_highest(values):
     """Return where the first of the highest values stands."""
     place, highest = 0, values[0]

@@ -16,12 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from tofclip.compiling import compile_as_part
 from tofclip.lidar.detection import CONVERGENCE_STEP_BINS, MAX_FIT_ROUNDS
 from tofclip.lidar.pulse import Pulse
-from tofclip.lidar.pulse_fit import compiled
+from tofclip.lidar.pulse_fit import loop_part
 from tofclip.lidar.traces import TraceBins
 
 PHASES_PER_BIN = 64
@@ -32,7 +32,7 @@ VECTOR_BINS = 16
 MAX_UNEVENNESS = 1e-3
 """Of a bin, over the length of a pulse: moves no return by more."""
 
-vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy", _nrt=False)
+vectorised_part = compile_as_part(fastmath=True, _nrt=False)
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class PhaseTable:
         return even
 
 
-@compiled
+@loop_part
 def fit_lone_returns(
     trace,
     times,
@@ -214,7 +214,7 @@ def fit_lone_returns(
     return number
 
 
-@compiled
+@loop_part
 def find_phase(offset):
     """Number and place of the tabulated phase nearest to an offset.
 
@@ -231,7 +231,7 @@ def find_phase(offset):
     return phase, phase / PHASES_PER_BIN - MAX_OFFSET_BINS
 
 
-@vectorised
+@vectorised_part
 def copy_rest(trace, first, number, background, rest):
     """Copy some bins of a trace less the background.
 
@@ -248,7 +248,7 @@ def copy_rest(trace, first, number, background, rest):
         rest[w] = there[w] - level
 
 
-@vectorised
+@vectorised_part
 def project_on_pulse(rest, shape, slope):
     """Products of what is left of a trace with pulse and slope.
 
@@ -270,7 +270,7 @@ def project_on_pulse(rest, shape, slope):
     return float(pr), float(dr)
 
 
-@vectorised
+@vectorised_part
 def sum_misfit(rest, shape, slope, height, later):
     """Sum of squares of what a return does not explain in the bins that it reaches.
 
