@@ -36,6 +36,8 @@ class FrontSurface:
         Brightness, 0 where nothing is seen.
     normals : (y, x, 3) float32 array
         Unit vectors that point to the wall's side (z < 0); NaN where nothing is seen.
+    source : str
+        What depth and normals were found from.
     """
 
     x: FloatArray
@@ -43,6 +45,7 @@ class FrontSurface:
     depth: NDArray[np.float32]
     albedo: NDArray[np.float32]
     normals: NDArray[np.float32]
+    source: str = "gradient of the volume"
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -92,6 +95,7 @@ class FrontSurface:
             "ply",
             "format binary_little_endian 1.0",
             "comment units: m",
+            f"comment normals: {self.source}",
             f"element vertex {len(points)}",
             *(f"property float {name}" for name in names),
             f"element face {len(faces)}",

@@ -237,9 +237,9 @@ class Volume:
         x, y, z = (record.array(name, np.float64, 1, "m") for name in "xyz")
         return cls(values, Grid(x, y, z), record.provenance)
 
-    def save(self, path: str | Path) -> None:
-        """Write the volume to an HDF5 file, whole or not at all."""
-        self.to_record().save(path)
+    def save(self, path: str | Path, compressed: bool = True) -> None:
+        """Write the volume to an HDF5 file, whole or not at all; `compressed` as of `Record.save`."""
+        self.to_record().save(path, compressed)
 
     @classmethod
     def load(cls, path: str | Path) -> Volume:

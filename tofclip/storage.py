@@ -231,8 +231,14 @@ class Record:
             raise FileFormatError(self.origin, f"{self.kind} record carries no {kind} '{name}'")
         return found
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, compressed: bool = True) -> None:
         """Write the record to `path`, whole or not at all.
+
+        Parameters
+        ----------
+        path : str or Path
+        compressed : bool
+            Whether large arrays are made smaller, which takes ten times as long as writing them.
 
         Raises
         ------
@@ -240,7 +246,7 @@ class Record:
             The disk is full, the folder is missing or writing is not allowed; `path` is left as it
             was.
         """
-        write_record(self, path)
+        write_record(self, path, compressed)
 
     @classmethod
     def load(cls, path: str | Path, *kinds: str) -> Record:
@@ -252,13 +258,14 @@ class Record:
         return found
 
 
-def write_record(record: Record, path: str | Path) -> None:
+def write_record(record: Record, path: str | Path, compressed: bool = True) -> None:
     """Write a record to `path`, whole or not at all; see `Record.save`.
 
     Parameters
     ----------
     record : Record
     path : str or Path
+    compressed : bool
 
     Raises
     ------
@@ -280,7 +287,7 @@ def write_record(record: Record, path: str | Path) -> None:
             _write_attribute(file, "format", FORMAT_NAME)
             _write_attribute(file, "format_version", FORMAT_VERSION)
             _write_attribute(file, "provenance", json.dumps(dict(record.provenance), default=str))
-            _write_group(file, record)
+            _write_group(file, record, compressed)
         temporary.write_bytes(image.getbuffer())
 
 
@@ -376,16 +383,17 @@ def _open_file(path: str | Path) -> Iterator[h5py.File]:
         raise StorageError(f"{path}: does not fit into this computer's memory") from fault
 
 
-def _write_group(group: h5py.Group, record: Record) -> None:
+def _write_group(group: h5py.Group, record: Record, compressed: bool) -> None:
     _write_attribute(group, "kind", record.kind)
     for name, value in record.attributes.items():
         _write_attribute(group, f"value.{name}", value)
     for name, entry in record.fields.items():
-        dataset = group.create_dataset(name, data=entry.values, **_storage_options(entry.values))
+        options = _storage_options(entry.values, compressed)
+        dataset = group.create_dataset(name, data=entry.values, **options)
         _write_attribute(dataset, "units", entry.units)
         _write_attribute(dataset, "axes", ",".join(entry.axes))
     for name, child in record.children.items():
-        _write_group(group.create_group(name), child)
+        _write_group(group.create_group(name), child, compressed)
 
 
 def _write_attribute(item: h5py.Group | h5py.Dataset, name: str, value: Scalar) -> None:
@@ -399,8 +407,8 @@ def _write_attribute(item: h5py.Group | h5py.Dataset, name: str, value: Scalar) 
         item.attrs[name] = value
 
 
-def _storage_options(values: NDArray[Any]) -> dict[str, Any]:
-    """Checksums for every array, compression for the large ones."""
+def _storage_options(values: NDArray[Any], compressed: bool) -> dict[str, Any]:
+    """Checksums for every array, compression for the large ones if it is asked for."""
     if values.size == 0 or values.ndim == 0:
         return {}
     if values.nbytes < MIN_COMPRESSED_BYTES:
@@ -408,6 +416,8 @@ def _storage_options(values: NDArray[Any]) -> dict[str, Any]:
     chunks: tuple[int, ...] | bool = True
     if values.ndim == len(CUBE_CHUNK_SHAPE):
         chunks = tuple(min(c, n) for c, n in zip(CUBE_CHUNK_SHAPE, values.shape, strict=True))
+    if not compressed:
+        return {"chunks": chunks, "fletcher32": True}
     return {
         "chunks": chunks,
         "compression": "gzip",

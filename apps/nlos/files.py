@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 CAPTURE_SUFFIXES = (".h5", ".hdf5", ".npz", ".mat")
 VOLUME_SUFFIXES = (*RECORD_SUFFIXES, *WRITERS, *POINT_SUFFIXES)
+SURFACE_SUFFIXES = (".ply",)
 GEOMETRY_FILE = "geometry.toml"
 """Makes a folder of renderings one capture; see `nlos.io`."""
 
@@ -53,16 +54,20 @@ class ResultFiles:
     picture : Path or None
     settings : Path
         Written last: where it stands, the others are whole.
+    surface : Path or None
+        The front surface with normals.
     """
 
     volumes: Sequence[Path]
     picture: Path | None
     settings: Path
+    surface: Path | None = None
 
     @property
     def paths(self) -> list[Path]:
         """Every file, in the order of writing."""
-        return [*self.volumes, *([] if self.picture is None else [self.picture]), self.settings]
+        others = [one for one in (self.picture, self.surface) if one is not None]
+        return [*self.volumes, *others, self.settings]
 
     def require_writable(self, *inputs: Path) -> None:
         """Refuse names that cannot be written, or that would overwrite an input."""
@@ -70,6 +75,10 @@ class ResultFiles:
             require_writable(volume, *VOLUME_SUFFIXES, inputs=inputs)
         if self.picture is not None:
             require_writable(self.picture, *PICTURE_SUFFIXES, inputs=inputs)
+        if self.surface is not None:
+            require_writable(self.surface, *SURFACE_SUFFIXES, inputs=inputs)
+            if self.surface.resolve() in [volume.resolve() for volume in self.volumes]:
+                raise InputError(f"{self.surface}: volume and surface need names of their own")
         require_writable(self.settings, inputs=inputs)
 
     def is_up_to_date(self, source: Path) -> bool:

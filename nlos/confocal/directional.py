@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +10,16 @@ from numpy.typing import NDArray
 from nlos.capture import Capture
 from nlos.confocal.light_cone import LightCone, build_rebinning_matrix, tabulate_powers
 from nlos.confocal.scan import ConfocalScan, find_padded_length, resample_to_grid
-from nlos.front_surface import FrontSurface, build_front_surface, require_surface
+from nlos.front_surface import (
+    FrontSurface,
+    build_front_surface,
+    find_front_surface,
+    require_surface,
+)
 from nlos.geometry import Grid
 from nlos.volume import Volume
+from tofclip.arrays import ComputeDevice
+from tofclip.errors import InputError
 from tofclip.threads import run_blocks, thread_count
 
 FREQUENCIES_PER_BLOCK = 8
@@ -72,7 +79,8 @@ class DirectionalLightCone:
         peak = volume.magnitude.argmax(axis=0)
         rows, columns = np.indices(peak.shape)
         normals = np.moveaxis(vectors[:, peak, rows, columns], 0, -1)
-        return build_front_surface(volume, normals, fraction)
+        found = build_front_surface(volume, normals, fraction)
+        return replace(found, source="directional light-cone transform")
 
     def _deconvolve(self, scan: ConfocalScan, grid: Grid) -> NDArray[np.float32]:
         """Return albedo times normal, (3, z, y, x)."""
@@ -134,3 +142,34 @@ def _separate(
 
     run_blocks(process_block, spectrum.shape[2], FREQUENCIES_PER_BLOCK)
     return parts
+
+
+def find_imaged_surface(capture: Capture, volume: Volume, fraction: float = 0.3) -> FrontSurface:
+    """Find the front surface of a capture that has been imaged: by the directional light-cone
+    transform where it takes the capture, else from the volume's gradients.
+
+    Parameters
+    ----------
+    capture : Capture
+        That the volume was made of.
+    volume : Volume
+        Whose voxels are taken.
+    fraction : float
+        A line of sight shows a surface where its brightest voxel has this fraction of the
+        brightest of all.
+
+    Returns
+    -------
+    FrontSurface
+
+    Raises
+    ------
+    InputError
+        The volume is too small or dark, or the fraction is not between 0 and 1.
+    """
+    here = capture.on(ComputeDevice())
+    try:
+        LightCone().plan(here, volume.grid)
+    except InputError:
+        return find_front_surface(volume.on(ComputeDevice()), fraction)
+    return DirectionalLightCone().find_front_surface(here, volume.grid, fraction)

@@ -105,3 +105,23 @@ def test_what_makes_no_sense_is_refused(
     refused = run("nlos", "stream", tmp_path, "--out", tmp_path / "out", *words)
     assert refused.status == 2
     assert reason in refused.err.splitlines()[-1]
+
+
+def test_far_depths_are_averaged_over_captures(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    for number in range(3):
+        moving(number).save(tmp_path / "in" / f"{number}.h5")
+    volumes = {}
+    for average in (1, 3):
+        out = tmp_path / str(average)
+        words = ["--out", out, *WORDS, "--average", average]
+        assert object_of(run, "stream", tmp_path / "in", *words)["delivered"] == 3
+        volumes[average] = Volume.load(out / "2.h5")
+    alone, averaged = (volumes[average].values for average in (1, 3))
+    # Two captures at 0.5 m, three at 0.9 m: none is as it was, and a trail of the point is there.
+    assert averaged[0].max() < alone[0].max()
+    row = volumes[1].grid.find_nearest((-0.2, 0.05, 0.9))
+    assert averaged[row] > 1.2 * alone[row]
+    outcome = run("nlos", "stream", tmp_path, "--out", out, "--average", 2, "--method", "fk")
+    assert outcome.status == 2
+    assert "--average adds up waves" in outcome.err

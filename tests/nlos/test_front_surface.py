@@ -84,3 +84,21 @@ def test_what_shows_no_surface_is_refused() -> None:
     ):
         with pytest.raises(InputError, match=reason):
             find_front_surface(volume, fraction)
+
+
+def test_a_sphere_has_its_normals() -> None:
+    """A bright shell about a centre: brightness changes most towards it."""
+    z, y, x = np.meshgrid(GRID.z, GRID.y, GRID.x, indexing="ij")
+    centre, radius = CENTRE + np.array([0, 0, 0.15]), 0.3
+    away = np.stack([x, y, z], axis=-1) - centre
+    shell = np.exp(-(((np.linalg.norm(away, axis=-1) - radius) / 0.03) ** 2))
+    # Only its front half is seen.
+    found = find_front_surface(Volume(shell * (away[..., 2] < 0), GRID), 0.5)
+    outward = found.points - centre
+    inner = np.linalg.norm(outward[:, :2], axis=1) < 0.2
+    assert inner.sum() > 200
+    distance = np.linalg.norm(outward, axis=1)
+    # A tenth of a voxel, where the shell is steep it is brightest a little behind.
+    assert np.median(np.abs(distance[inner] - radius)) < 0.005
+    cosines = np.sum(found.normals[found.seen] * outward / distance[:, None], axis=1)[inner]
+    assert np.percentile(np.degrees(np.arccos(np.clip(cosines, -1, 1))), 90) < 8

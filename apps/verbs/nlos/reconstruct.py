@@ -48,6 +48,7 @@ from apps.settings import (
     setting_field,
     settings_to_dict,
 )
+from nlos.confocal.directional import find_imaged_surface
 from nlos.io import read_capture
 from nlos.settings import is_brightest_on_wall
 from tofclip.arrays import ComputeDevice
@@ -79,7 +80,9 @@ class ReconstructSettings(RefinementSettings):
         choices=METHODS,
     )
     point_fraction: float = setting_field(
-        "SHARE", "Voxels with this share of the brightest become points of .ply, .pcd, .csv.", 0.3
+        "SHARE",
+        "Voxels with this share of the brightest become points of .ply, .pcd, .csv, and the surface.",
+        0.3,
     )
 
 
@@ -113,6 +116,13 @@ def reconstruct(
             show_default="only in a folder",
         ),
     ] = None,
+    surface: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PLY",
+            help="What is seen from the wall as a mesh: depth, normals, brightness.",
+        ),
+    ] = None,
     settings: SettingsOption = None,
     suffix: Annotated[
         list[str] | None,
@@ -143,24 +153,30 @@ def reconstruct(
     for captures of few photons, by time of flight, background included. --refine l1 or tv look for
     the albedo that explains the wall's waves best, at the cost of some four images per iteration.
 
+    --surface takes what is foremost and bright on every line of sight from the wall (above
+    --point-fraction of the brightest) and its direction: from a confocal scan of a planar wall by
+    the directional light-cone transform, else from the gradients of the volume.
+
     With --device rsd, hybrid and backprojection compute on a GPU; the
     others cannot.
 
     Of a folder every capture is imaged into the folder --out. Captures whose results are there
     already are skipped. If some fail, the others are done all the same, and the exit status is 1.
 
-    Example: tofclip nlos reconstruct capture.h5 --out volume.h5 --png volume.png
+    Example: tofclip nlos reconstruct capture.h5 --out volume.h5 --surface mesh.ply
     """
     order = _ImagingRequest(load_settings(ReconstructSettings, settings, flags), device)
     _check_settings(order.settings)
     # A device that does not exist is refused before any capture is read.
     resolve_device(device, cluster)
     if is_capture_folder(source):
+        if surface is not None:
+            raise InputError(f"{source}: --surface is for a single capture, and this is a folder")
         _reconstruct_folder(source, out, order, suffix or [".h5"], (cluster, as_json))
         return
     if cluster is not None:
         raise InputError(f"{source}: --cluster is for a folder of captures")
-    results = ResultFiles([out], png, out.with_suffix(SETTINGS_SUFFIX))
+    results = ResultFiles([out], png, out.with_suffix(SETTINGS_SUFFIX), surface)
     results.require_writable(source, *([] if settings is None else [settings]))
     report(_reconstruct_single(source, results, order), as_json, results.paths)
 
@@ -214,6 +230,11 @@ def _reconstruct_single(
         write_volume(volume, path, found.point_fraction)
     if results.picture is not None:
         volume.save_picture(results.picture)
+    figures = {}
+    if results.surface is not None:
+        seen = find_imaged_surface(prepared.capture, volume, found.point_fraction)
+        seen.save(results.surface)
+        figures = {"surface_points": len(seen.points), "surface_source": seen.source}
     save_settings(found, results.settings, f"{SETTINGS_HEADING}\n{content}")
     return {
         "method": found.method,
@@ -235,6 +256,7 @@ def _reconstruct_single(
         "seconds": seconds,
         "voxels_per_second": volume.grid.size / seconds,
         "peak_m": dict(zip("xyz", volume.find_brightest(), strict=True)),
+        **figures,
     }
 
 

@@ -7,7 +7,7 @@ import threading
 import time
 import webbrowser
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -22,6 +22,7 @@ from apps.conventions import JsonOption, make_folder, report
 from apps.nlos.files import CAPTURE_SUFFIXES, is_capture_folder, list_captures
 from apps.nlos.imaging import (
     METHODS,
+    PORTABLE_METHODS,
     ImagingSettings,
     parse_method_names,
     prepare_imaging,
@@ -35,7 +36,9 @@ from apps.settings import (
     save_settings,
     setting_field,
 )
+from nlos.averaging import DepthAverage
 from nlos.io import read_capture
+from nlos.method import PhasorPlan
 from tofclip.errors import InputError, TofclipError
 from tofclip.sequences.streaming import run_in_order
 
@@ -61,6 +64,11 @@ class StreamSettings(ImagingSettings):
         f"One of {', '.join(METHODS)}.",
         shown="the quickest that suits the first capture",
         choices=METHODS,
+    )
+    average: int = setting_field(
+        "N",
+        "Captures averaged at the last depth, fewer nearer by: rsd, hybrid, backprojection.",
+        1,
     )
 
 
@@ -106,6 +114,9 @@ def stream(
     time axis; what it has not is counted as failed. All of the box is imaged, since things move.
     Every capture is accounted for: acquired = delivered + dropped + failed.
 
+    --average takes the noise off what is far without smearing what moves near by: the number of
+    captures grows in proportion to the distance from the wall, as does what is resolved.
+
     Example: tofclip nlos stream captures/ --out volumes/
     """
     wanted = replace(load_settings(StreamSettings, settings, flags), everywhere=True)
@@ -125,7 +136,8 @@ def stream(
             out / SETTINGS_NAME,
             SETTINGS_HEADING,
         )
-        made = _VolumeStream(chain([first], coming), prepared, plan, out, follow_s > 0)
+        imaging = _choose_imaging(plan, prepared, wanted.average)
+        made = _VolumeStream(chain([first], coming), prepared, imaging, out, follow_s > 0)
         figures = _run_with_page(made, source) if view else made.run()
     figures = {
         "method": prepared.settings.method,
@@ -143,10 +155,27 @@ def _check_settings(wanted: StreamSettings, follow_s: float, captures: int | Non
     if wanted.method is not None and len(names) > 1:
         raise InputError(f"one method images a stream, got '{wanted.method}'")
     require_valid_settings(wanted, names)
+    if wanted.average < 1:
+        raise InputError(f"--average must be 1 or more, got {wanted.average}")
+    if wanted.average > 1 and wanted.method not in (None, *PORTABLE_METHODS):
+        raise InputError(
+            f"--average adds up waves, which {wanted.method} has none of: use one of "
+            f"{', '.join(PORTABLE_METHODS)}"
+        )
     if not (np.isfinite(follow_s) and follow_s >= 0):
         raise InputError(f"--follow-s must be 0 s or more, got {follow_s}")
     if captures is not None and captures < 1:
         raise InputError(f"--captures must be positive, got {captures}")
+
+
+def _choose_imaging(
+    plan: Plan, prepared: PreparedImaging[StreamSettings], captures: int
+) -> Callable[[Capture], Volume]:
+    """Return what images a capture: the plan, or the plan and an average over depth."""
+    if captures == 1 or not isinstance(plan, PhasorPlan):
+        return plan.image
+    average = DepthAverage(plan.grid, float(prepared.capture.points[:, 2].max()), captures)
+    return lambda capture: average.add(plan.field(capture))
 
 
 def _read_captures(source: Path, follow_s: float) -> Iterator[_NamedCapture]:
@@ -190,7 +219,8 @@ class _VolumeStream:
     coming : iterable of _NamedCapture
     prepared : PreparedImaging
         Of the first of them.
-    plan : Plan
+    imaging : callable
+        From a capture to its volume.
     out : Path
     live : bool
         Whether captures do not wait: then the oldest that waits is dropped.
@@ -200,11 +230,11 @@ class _VolumeStream:
         self,
         coming: Iterable[_NamedCapture],
         prepared: PreparedImaging[StreamSettings],
-        plan: Plan,
+        imaging: Callable[[Capture], Volume],
         out: Path,
         live: bool,
     ) -> None:
-        self._coming, self._prepared, self._plan, self._out = coming, prepared, plan, out
+        self._coming, self._prepared, self._image, self._out = coming, prepared, imaging, out
         self._live, self._acquired = live, 0
         self.latest: deque[Volume] = deque(maxlen=1)
         self._imaging: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
@@ -258,9 +288,9 @@ class _VolumeStream:
                 raise InputError(one.problem)
             capture = self._prepared.settings.prepare(one.capture)
             started = time.perf_counter()
-            volume = self._plan.image(capture)
+            volume = self._image(capture)
             self._imaging.append(time.perf_counter() - started)
-            volume.save(self._out / f"{one.name}.h5")
+            volume.save(self._out / f"{one.name}.h5", compressed=False)
         except TofclipError as fault:
             self.failed += 1
             print(f"tofclip: failed: {one.name}: {fault}", file=sys.stderr)
