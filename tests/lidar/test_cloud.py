@@ -127,6 +127,22 @@ def test_every_format_brings_every_bit_back(tmp_path_factory, suffix, points, se
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_two_columns_of_one_name_are_refused(tmp_path, suffix):
+    path = tmp_path / f"scene{suffix}"
+    ones = np.ones(3, np.float32)
+    PointCloud(np.ones((3, 3), np.float32), ones, ones, ones, np.ones(3, np.uint8), ones).save(path)
+    before, after = {
+        ".ply": (b"property float y\n", b"property float x\n"),
+        ".pcd": (b"FIELDS x y z", b"FIELDS x x z"),
+    }[suffix]
+    content = path.read_bytes()
+    assert before in content
+    path.write_bytes(content.replace(before, after))
+    with pytest.raises(FileFormatError, match="two columns of one name"):
+        PointCloud.load(path)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
 def test_open3d_reads_the_same_points(open3d, tmp_path, suffix):
     cloud = random_cloud(200, 1)
     cloud.save(tmp_path / f"scene{suffix}")

@@ -219,6 +219,8 @@ def _list_binary(
     """List the columns of the binary rows from byte `start` on."""
     if any(code is None for _, code in properties) or not points.isdecimal():
         raise FileFormatError(path, "has columns of a type that tofclip does not write")
+    if len({name for name, _ in properties}) < len(properties):
+        raise FileFormatError(path, "has two columns of one name")
     layout = np.dtype([(name, str(code)) for name, code in properties])
     held = path.stat().st_size - start
     if held != int(points) * layout.itemsize:
