@@ -18,6 +18,7 @@ from tofclip.simulate import (
     render_true_frames,
     simulate_shot,
 )
+from tofclip.solvers import LinearInverse, ProximalMethod, Sparse
 from tofclip.threads import run_blocks
 
 ROWS = (254, 1016)
@@ -41,15 +42,28 @@ def prepare_ranges(rows: int) -> PreparedCase:
     return PreparedCase(lambda: depth(frames), copy, frames.values[0].size)
 
 
-def prepare_streaming(rows: int) -> PreparedCase:
-    """Shots that were read already, one after the other: sweep, linear inverse, returns, clouds."""
+def prepare_streaming(rows: int, method: LinearInverse | ProximalMethod) -> PreparedCase:
+    """Shots that were read already, one after the other: sweep, recovery, returns, clouds.
+
+    Parameters
+    ----------
+    rows : int
+    method : LinearInverse or ProximalMethod
+        One with a prior begins each shot at the last one's pictures; its first shot is not counted.
+
+    Returns
+    -------
+    PreparedCase
+    """
     made = make_instrument(rows)
     streaks = [simulate_shot(make_default_scene(), made, seed).streak for seed in range(3)]
-    pipeline = RangingPipeline(made.camera, streaks[0].times)
+    pipeline = RangingPipeline(made.camera, streaks[0].times, method)
     shots = [streaks[number % len(streaks)] for number in range(STREAM_SHOTS)]
     projection, data = made.camera.operator(), measurements(rows)[: made.camera.slit_width_px]
     if data.shape[0] != make_operator().shape_out[0]:
         raise RuntimeError("the demo's instrument has another slit than the benchmark's")
+    if pipeline.in_order:
+        list(stream_clouds(shots[:1], pipeline))
     return PreparedCase(
         lambda: list(stream_clouds(shots, pipeline)),
         lambda: run_dense_products(projection, data),
@@ -75,6 +89,15 @@ CASES = (
         ROWS,
         "shots",
         "a dense and a sparse product of all rows alone",
-        prepare_streaming,
+        lambda rows: prepare_streaming(rows, LinearInverse()),
+    ),
+    Case(
+        "streaming-l1",
+        f"a stream of {STREAM_SHOTS} shots to clouds by l1, each begun at the last one's pictures",
+        "time bins",
+        ROWS,
+        "shots",
+        "a dense and a sparse product of all rows alone",
+        lambda rows: prepare_streaming(rows, Sparse()),
     ),
 )

@@ -42,9 +42,8 @@ def compute_ray_directions(
     down = (np.asarray(rows, dtype=np.float64) - axis_row) / camera.focal_length_px
     if camera.distortion.any():
         right, down = undistort_directions(right, down, camera.distortion)
-    directions = np.stack([right, down, np.ones_like(right)], axis=-1)
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    return directions
+    forward = 1 / np.sqrt(right * right + down * down + 1)
+    return np.stack([right * forward, down * forward, forward], axis=-1)
 
 
 def distort_directions(
