@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from apps.benchmarks.recovery import make_operator, measurements, run_dense_prod
 from tofclip.lidar import depth
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
+from tofclip.shots import Streak
 from tofclip.simulate import (
     Instrument,
     make_default_instrument,
@@ -42,6 +44,13 @@ def prepare_ranges(rows: int) -> PreparedCase:
     return PreparedCase(lambda: depth(frames), copy, frames.values[0].size)
 
 
+@lru_cache(maxsize=1)
+def simulate_shots(rows: int) -> list[Streak]:
+    """Three shots of the demo's scene that differ in their noise."""
+    scene, made = make_default_scene(), make_instrument(rows)
+    return [simulate_shot(scene, made, seed).streak for seed in range(3)]
+
+
 def prepare_streaming(rows: int, method: LinearInverse | ProximalMethod) -> PreparedCase:
     """Shots that were read already, one after the other: sweep, recovery, returns, clouds.
 
@@ -56,7 +65,7 @@ def prepare_streaming(rows: int, method: LinearInverse | ProximalMethod) -> Prep
     PreparedCase
     """
     made = make_instrument(rows)
-    streaks = [simulate_shot(make_default_scene(), made, seed).streak for seed in range(3)]
+    streaks = simulate_shots(rows)
     pipeline = RangingPipeline(made.camera, streaks[0].times, method)
     shots = [streaks[number % len(streaks)] for number in range(STREAM_SHOTS)]
     projection, data = made.camera.operator(), measurements(rows)[: made.camera.slit_width_px]

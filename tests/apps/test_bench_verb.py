@@ -33,7 +33,9 @@ def weight_searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Sizes of the measurements for which a weight was looked for; the search itself takes long."""
     searches: list[int] = []
 
-    def choose_quickly(_: object, __: object, measurements: np.ndarray, ___: int) -> WeightChoice:
+    def choose_quickly(
+        _: object, __: object, measurements: np.ndarray, ___: int, **____: object
+    ) -> WeightChoice:
         searches.append(measurements.size)
         return WeightChoice(2e-3, np.array([2e-3]), np.array([1.0]))
 
