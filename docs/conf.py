@@ -34,6 +34,8 @@ smartquotes = False  # they would turn -- of an option into a dash
 default_role = "py:obj"
 autodoc_default_options = {"members": True}
 autodoc_typehints = "signature"  # the docstrings add shapes and units
+# NumPy's own unions fill five lines of a signature
+autodoc_type_aliases = {"DTypeLike": "DTypeLike", "ArrayLike": "ArrayLike"}
 napoleon_google_docstring = False
 napoleon_use_param = False
 napoleon_use_rtype = False
