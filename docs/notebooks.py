@@ -40,8 +40,20 @@ def run_notebook(notebook: Path, folder: Path) -> Path:
     return folder / f"{notebook.stem}.md"
 
 
+def format_page(page: Path) -> None:
+    """Format the code of a page in its place, by the rules of the folder that it lies in.
+
+    nbconvert copies cells as they stand, with the semicolons that keep a notebook from printing.
+    """
+    subprocess.run(
+        [sys.executable, "-m", "ruff", "format", "--quiet", page.name], check=True, cwd=page.parent
+    )
+
+
 def make_page(notebook: Path, files: Path) -> None:
     """Run a notebook with copies of files at hand and put its page and pictures beside it.
+
+    The page is formatted as all code of the project is (``pip install 'tofclip[lint]'``).
 
     Parameters
     ----------
@@ -54,7 +66,7 @@ def make_page(notebook: Path, files: Path) -> None:
             if file.is_file():
                 shutil.copy(file, folder)
         page = run_notebook(notebook, Path(folder))
-        shutil.copy(page, notebook.parent)
+        format_page(Path(shutil.copy(page, notebook.parent)))
         pictures = notebook.parent / f"{notebook.stem}_files"
         shutil.rmtree(pictures, ignore_errors=True)
         shutil.copytree(page.with_name(pictures.name), pictures)

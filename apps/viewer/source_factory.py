@@ -46,7 +46,10 @@ FIRST_LOOK_ROUNDS = 2
 which is most of its time. Two leave 0.2 rows and 0.6 px of them on a recorded shot: no letter moves.
 """
 
-FIRST_LOOK_NOTE = f"first look ({FIRST_LOOK_METHOD}, {FIRST_LOOK_ITERATIONS} iterations): tofclip recover measures"
+FIRST_LOOK_NOTE = (
+    f"quick look ({FIRST_LOOK_METHOD}, {FIRST_LOOK_ITERATIONS} iterations); "
+    "for measurements run tofclip recover"
+)
 
 
 @dataclass(frozen=True)

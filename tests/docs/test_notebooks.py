@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from matplotlib.image import imread
-from notebooks import run_notebook
+from notebooks import format_page, run_notebook
 
 import tofclip
 
@@ -66,3 +66,12 @@ def test_a_page_shows_its_notebook(name: str) -> None:
     pictures = list((NOTEBOOKS / f"{name}_files").glob("*.png"))
     assert pictures
     assert all(f"{one.parent.name}/{one.name}" in page for one in pictures)
+
+
+def test_pages_are_formatted_as_all_code_is(tmp_path: Path) -> None:
+    pytest.importorskip("ruff", reason="pip install 'tofclip[lint]'")
+    page = tmp_path / "page.md"
+    page.write_text("A plot:\n\n```python\nplt.plot(x,y)\nplt.ylabel('counts');\n```\n\n    1  2\n")
+    format_page(page)
+    expected = 'A plot:\n\n```python\nplt.plot(x, y)\nplt.ylabel("counts")\n```\n\n    1  2\n'
+    assert page.read_text() == expected  # what a cell printed stays as it was

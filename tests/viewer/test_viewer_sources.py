@@ -219,6 +219,8 @@ def test_a_quick_look_is_called_one_and_another_method_can_be_asked_for(folder: 
     shot, stack = str(folder / "shot.h5"), str(folder / "stack.h5")
     with_camera = ShotOptions(camera=folder / "camera.h5")
     assert open_source(shot).notes == (FIRST_LOOK_NOTE,)
+    expected = "quick look (l1, 25 iterations); for measurements run tofclip recover"
+    assert expected == FIRST_LOOK_NOTE
     assert open_source(shot, ShotOptions(method="linear")).notes == (LINEAR_NOTE,)
     assert open_source(stack, with_camera).notes == (LINEAR_NOTE,)
     sharp = open_source(stack, replace(with_camera, method="l1"))
