@@ -4,7 +4,7 @@ Refocusing explains the measurements by one picture at one depth, and everything
 each pixel lies at a shear of its own (`tofclip.light_field.warp`), so that one picture h explains all
 measurements:
 
-    minimise over h >= 0:  1/2 |A W h - f|^2 + weight TV(h),
+    minimise over h >= 0:  ``1/2 |A W h - f|^2 + weight TV(h)``,
 
 with W from the reference view's picture to all views, what hides what included, and the views'
 encoders A. Where the depths are not known they come from the sharpest of pictures refocused at
