@@ -87,7 +87,7 @@ def simulate(
     """Measure the true views of a light field with a camera of few measurements.
 
     Example: tofclip clip simulate light_field.npz --encoder line --sampling-ratio 0.5 --out
-    readings.h5
+    measurements.h5
     """
     require_writable(out, *RECORD_SUFFIXES, inputs=(light_field,))
     known = read_light_field(light_field)
@@ -152,7 +152,7 @@ def recover(
 ) -> None:
     """Recover the picture refocused at one depth.
 
-    Example: tofclip clip recover readings.h5 --shear -0.3 --preset quality --out picture.png
+    Example: tofclip clip recover measurements.h5 --shear -0.3 --preset quality --out picture.png
     """
     # No output may replace a file that is read.
     inputs = (measurement,) if truth is None else (measurement, truth)

@@ -121,7 +121,7 @@ def test_the_walk_through(
     expected += " scene.png clouds occlusion-output nlos-demo-output"
     assert {
         *expected.split(),
-        "readings.h5",
+        "measurements.h5",
         "picture.png",
         "run.h5",
         "photons.h5",
