@@ -23,6 +23,7 @@ from apps.help import (
     EXIT_DEFECT,
     EXIT_INPUT_ERROR,
     EXIT_INTERRUPTED,
+    MAX_HELP_WIDTH,
     VerbTable,
     make_lazy_group,
 )
@@ -114,13 +115,17 @@ VERBS: VerbTable = {
 }
 """Each verb's module in `apps.verbs` and its line in the list of commands."""
 
-FILE_READERS = ("recover", "cloud", "info")
+FILE_READERS = (
+    *("recover", "cloud", "info"),
+    *("nlos reconstruct", "nlos film", "nlos compare", "nlos info"),
+)
 """Verbs whose first argument has to be there."""
 
 app = typer.Typer(
     name="tofclip",
     cls=make_lazy_group("apps.verbs", VERBS, FILE_READERS),
     pretty_exceptions_enable=False,
+    context_settings={"max_content_width": MAX_HELP_WIDTH},
     epilog=EPILOG,
 )
 

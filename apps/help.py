@@ -35,9 +35,12 @@ EPILOG = (
 )
 
 EXAMPLE_MARK = "Example:"
+AS_WRITTEN = "\b\n"  # before a paragraph whose lines typer must not join
 MAX_EXAMPLE_WIDTH = (
     72  # of an example, so that it fits the narrowest usual terminal with its indentation
 )
+
+MAX_HELP_WIDTH = 100  # columns, on a terminal that has them
 
 VerbTable = Mapping[str, str]
 """The one-line help of each verb, by its name; its module has _ for -."""
@@ -59,9 +62,9 @@ def make_lazy_group(
         In the order of the help. A verb of two words, such as ``"calibrate range"``, stands beside
         one that is called by the first word alone.
     readers : collection of str, optional
-        Verbs whose first argument is a file, a folder, a pattern or an address. A file that is not
-        there is refused before the verb and what it works with are imported, which takes longer
-        than all else.
+        Verbs, of one word or two, whose first argument is a file, a folder, a pattern or an address.
+        A file that is not there is refused before anything else is looked at or imported, which
+        takes longer than all else.
 
     Returns
     -------
@@ -74,7 +77,8 @@ def make_lazy_group(
             super().__init__(**attributes)
             # what the list of commands shows until a verb is called
             for name, line in verbs.items():
-                self.add_command(TyperCommand(name, help=line, rich_markup_mode=None))
+                self.add_command(TyperCommand(name, help=line, short_help=line))
+            self.rich_markup_mode = None
 
         def get_params(self, ctx: Any) -> list[Any]:
             """Return the options, those of completion too, which typer adds later."""
@@ -82,14 +86,18 @@ def make_lazy_group(
             _hide_types_of_flags(params)
             return params
 
+        def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+            """Refuse a source that is not there, before typer loads what it reads options with."""
+            if not ctx.resilient_parsing:
+                _require_source(args, readers)
+            return super().parse_args(ctx, args)
+
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
             """Find the verb that is called; only this one is imported."""
             pair = " ".join(args[:2])
             if pair in verbs:  # before the verb that is called by the first word alone
                 args = [pair, *args[2:]]
             name, listed, further = super().resolve_command(ctx, args)
-            if name in readers and not ctx.resilient_parsing:
-                _require_source(further)
             return name, (name and self.load_verb(name)) or listed, further
 
         def load_verb(self, name: str) -> Command:
@@ -104,8 +112,12 @@ def make_lazy_group(
     return LazyGroup
 
 
-def _require_source(words: Sequence[str]) -> None:
-    """Refuse a source that is plainly a file's name and not there."""
+def _require_source(words: Sequence[str], readers: Collection[str]) -> None:
+    """Refuse the source of a verb among `readers` that is plainly a file's name and not there."""
+    length = next((n for n in (2, 1) if " ".join(words[:n]) in readers), None)
+    if length is None:
+        return
+    words = words[length:]
     source = words[0] if words and not {"--help", "-h"} & set(words) else "-"
     if len(words) > 1 and not words[1].startswith("-"):
         return  # one name too many, about which the verb itself complains
@@ -139,17 +151,20 @@ def load_command(module: str, name: str) -> Command:
     group.name = name
     # A verb on its own is taken out of the group that it was registered in.
     command: Command = group if is_group else cast("TyperCommand", group.commands[name])
-    show_flags_without_type(command)
+    simplify_help(command)
     return command
 
 
-def show_flags_without_type(command: Command) -> None:
-    """Let the help of a command, and of those of a group, show an option that takes no value as one,
-    such as ``--json``, where typer writes ``--json <bool>``.
+def simplify_help(command: Command) -> None:
+    """Let a command, and those of a group, show their help as plain text, and an option that takes no
+    value as one, such as ``--json``, where typer writes ``--json <bool>``.
+
+    Importing what draws frames around the help takes longer than all the rest of showing it.
     """
+    command.rich_markup_mode = None
     _hide_types_of_flags(command.get_params(typer.Context(command)))
     for further in getattr(command, "commands", {}).values():
-        show_flags_without_type(further)
+        simplify_help(further)
 
 
 def _hide_types_of_flags(params: Sequence[Any]) -> None:
@@ -188,9 +203,10 @@ def set_help_texts(app: typer.Typer) -> None:
     """Give every verb its help, made from its docstring; the exit statuses are its last paragraph."""
     for verb in app.registered_commands:
         prose, examples = split_docstring(verb.callback.__doc__ if verb.callback else None)
-        shown = [f"{EXAMPLE_MARK}\n    {wrap_command(example)}" for example in examples]
-        verb.help = _escape_markup("\n\n".join(prose))
-        verb.epilog = _escape_markup("\n\n".join([*shown, EPILOG]))
+        shown = [f"{AS_WRITTEN}{EXAMPLE_MARK}\n    {wrap_command(example)}" for example in examples]
+        verb.help = "\n\n".join(_keep_table(one) for one in prose)
+        verb.short_help = prose[0] if prose else None  # shown whole, not its first words
+        verb.epilog = "\n\n".join([*shown, EPILOG])
     for group in app.registered_groups:
         if group.typer_instance is not None:
             set_help_texts(group.typer_instance)
@@ -216,11 +232,12 @@ def wrap_command(command: str) -> str:
 
 
 def _join_lines(paragraph: str) -> str:
-    return (
-        paragraph if re.search(r"^[ *-]", paragraph, re.MULTILINE) else " ".join(paragraph.split())
-    )
+    return paragraph if _is_table(paragraph) else " ".join(paragraph.split())
 
 
-def _escape_markup(text: str) -> str:
-    """Keep rich from taking brackets, as of extras, for its markup."""
-    return re.sub(r"(?=\[[a-z#/@])", r"\\", text)
+def _keep_table(paragraph: str) -> str:
+    return f"{AS_WRITTEN}{paragraph}" if _is_table(paragraph) else paragraph
+
+
+def _is_table(paragraph: str) -> bool:
+    return re.search(r"^[ *-]", paragraph, re.MULTILINE) is not None

@@ -35,7 +35,14 @@ def test_help_of_a_verb(run: Run, monkeypatch: pytest.MonkeyPatch, name: str) ->
     assert "--json" in outcome.out
     assert "Exit status: 0 done; 2 unusable input" in outcome.out
     for example in split_docstring(VERBS[name].callback.__doc__)[1]:
+        assert f"Example:\n      {wrap_command(example).splitlines()[0]}\n" in outcome.out
         assert all(line.strip() in outcome.out for line in wrap_command(example).splitlines())
+
+
+@pytest.mark.parametrize("words", [[], ["lidar"]])
+def test_the_list_of_commands_is_shown_whole(run: Run, words: list[str]) -> None:
+    shown = " ".join(run(*words, "--help").out.split())
+    assert "..." not in shown.partition("Commands:")[2]
 
 
 @pytest.mark.parametrize("package", ["apps", "apps.verbs.nlos"])

@@ -17,10 +17,7 @@ VERBS: VerbTable = {
 }
 """Each verb's module and its line in the list of commands."""
 
-FILE_READERS = ("reconstruct", "film", "compare", "info")
-"""Verbs whose first argument has to be there."""
-
-app = typer.Typer(cls=make_lazy_group("apps.verbs.nlos", VERBS, FILE_READERS))
+app = typer.Typer(cls=make_lazy_group("apps.verbs.nlos", VERBS))
 
 
 @app.callback(invoke_without_command=True)
