@@ -144,6 +144,21 @@ def test_one_shot_gives_time_zero_and_reflectance() -> None:
     assert known.reflectance_scale == pytest.approx(40 / 2000, rel=0.02)
 
 
+def test_one_return_of_a_single_pixel_is_as_sure_as_it_says() -> None:
+    shot = World(0).see(1.0, 2000)
+    chosen = np.zeros(len(shot.returns), bool)
+    chosen[0] = True
+    alone = replace(
+        shot.returns[chosen],
+        y=np.zeros(1, np.int32),
+        x=np.zeros(1, np.int32),
+        camera=Camera(np.zeros(1), np.zeros(1), (1, 1), 1, pulse_fwhm=400e-12),
+    )
+    fit = fit_range_calibration([replace(shot, returns=alone)])
+    sigma = float(alone.confidence[0]) * 2 / SPEED_OF_LIGHT
+    assert fit.calibration.time_zero_sigma == pytest.approx(sigma, rel=1e-6)
+
+
 def test_response_and_reflectance_of_several_shots() -> None:
     world = World(1)
     shots = [world.see(d, n, p) for d, n, p in ((1, 2000, 40), (1.5, 1000, 45), (2, 500, 40))]
@@ -177,8 +192,11 @@ def test_what_cannot_be_told_is_refused() -> None:
     one = world.see(1.0, 1000)
     nothing = np.zeros(one.returns.y.size, bool)
     two = one.returns.range + np.where(one.returns.x < 9, 0.0, 0.5)
+    few = nothing.copy()
+    few[:2] = True
     refused = {
         "no return stands out": [replace(one, returns=one.returns[nothing])],
+        "in 3 or more pixels": [replace(one, returns=one.returns[few])],
         "needs 3 shots": [one, world.see(1.5, 100)],
         "grey filter": [one, world.see(1.5, 1000), world.see(2.0, 1100)],
         "out of the record": [one, replace(world.see(1.0, 1000), distance=20.0)],

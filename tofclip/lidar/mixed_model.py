@@ -222,6 +222,9 @@ def _estimate_variances(
     Variances
     """
     start = _solve(data, Variances(1.0, 0.0, 0.0), sizes)
+    if data.value.size <= data.design.shape[1]:
+        # Nothing is left over that would tell the noise: the measurements' own deviations hold.
+        return Variances(1.0, 0.0, 0.0)
     scatter = float(np.mean(start.residual**2 / data.sigma**2))
     typical = scatter * float(np.median(data.sigma**2))
     seen = [np.unique(data.shot), np.unique(data.pixel)]

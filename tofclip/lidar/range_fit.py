@@ -39,6 +39,10 @@ SPAN_PERCENTILES = (2.0, 98.0)
 WINDOW_PULSES = 0.5
 """Returns of one surface lie within this many pulse widths."""
 
+MIN_TARGET_PIXELS = 3
+"""With the target's return. In the dark a detector announces one in a pixel of a hundred, at any
+range: the camera of such a shot would be wrong by the length of the record."""
+
 MAX_RIVAL_FRACTION = 0.7
 """Of the target's returns, that another surface may have."""
 
@@ -253,15 +257,20 @@ def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
             f"{camera.image_shape}"
         )
     found = shot.returns.select("strongest")
+    needed = min(MIN_TARGET_PIXELS, camera.image_shape[0] * camera.image_shape[1])
+    missing = CalibrationError(
+        f"{shot.name}: no return stands out in {needed} or more pixels: is the target in the record "
+        "and in the picture?"
+    )
     if len(found) == 0:
-        raise CalibrationError(
-            f"{shot.name}: no return stands out: is the target in the record and in the picture?"
-        )
+        raise missing
     cosine = compute_ray_directions(camera, found.y, found.x)[:, 2]
     excess = found.range - shot.distance / cosine
     sigma = np.maximum(found.confidence.astype(np.float64), np.finfo(np.float32).tiny)
     width = max(WINDOW_PULSES * pulse, 6 * float(np.median(sigma)))
     target = _find_cluster(excess, width, shot.name)
+    if target.sum() < needed:
+        raise missing
     arrival = 2 / SPEED_OF_LIGHT * float(np.median(found.range[target]))
     margin = camera.pulse_fwhm / 2
     if not shot.record[0] + margin <= arrival <= shot.record[1] - margin:
