@@ -18,7 +18,11 @@ from apps.occlusion.scenes import (
 )
 from tofclip.errors import InputError, ShapeError
 from tofclip.metrics import correlation_coefficient, nmse
-from tofclip.occlusion.measurements import TimedMeasurements, measure_views
+from tofclip.occlusion.measurements import (
+    TimedMeasurements,
+    add_poisson_noise,
+    measure_views,
+)
 from tofclip.occlusion.recovery import build_occluded_model, find_occlusion_mask, separate_occluder
 from tofclip.occlusion.region import InactiveRegion
 from tofclip.units import SPEED_OF_LIGHT
@@ -56,6 +60,24 @@ def test_a_single_return_is_not_split(plate):
     assert dark.find_returns() == ()
     with pytest.raises(InputError, match="no light"):
         separate_occluder(dark)
+
+
+@pytest.mark.parametrize("photons", [300, 1e6])
+def test_a_dim_target_behind_a_retroreflector_is_found_and_noise_is_not(plate, photons):
+    """The occluder 300 times as bright: the target has 0.012 % of its peak, and its photons."""
+    clean, early = plate.measurements, plate.time_axis.times < 0.55e-9
+    per_unit = photons / (clean.values * ~early).sum()
+    random = np.random.default_rng(0)
+    dazzled = add_poisson_noise(clean.values * (1 + 299 * early), per_unit, random)
+    measured = replace(clean, values=dazzled)
+    _, target = measured.find_returns()
+    assert target.distance == pytest.approx(OCCLUDER_DISTANCE_M + TARGET_DEPTH_M, rel=0.02)
+    assert len(measured.split_returns(OCCLUDER_DISTANCE_M + TARGET_DEPTH_M / 2)) == 2
+    # A background of a photon in a hundred measurements, whose noise is 1 % of the peak where it is dim.
+    light = clean.values * early + 0.01 * clean.values.mean()
+    for _ in range(5):
+        counts = add_poisson_noise(light, 0.1 * per_unit, random)
+        assert len(replace(clean, values=counts).find_returns()) == 1
 
 
 def test_the_model_of_hidden_pixels_and_shadows_agrees_with_cast_rays(plate):
