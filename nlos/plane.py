@@ -120,13 +120,59 @@ class PlaneField:
     wavenumbers: FloatArray
 
 
+FADE_FRACTION = 0.75
+"""Of the room beside the straight ways, over how much the field fades towards the rim."""
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualPlane(Plane):
+    """A plane on which a field is known, to be continued from there; towards its rim the field
+    fades.
+
+    A field cut off at the rim would send waves of its own from there, which weaken with the square
+    root of the rim's distance only. Faded out as a raised cosine, whose second derivative jumps,
+    they weaken with the third power of the fade's width.
+
+    Parameters
+    ----------
+    x, y : (n,) array
+        Evenly spaced and increasing, m; at least 2 of each.
+    z : float
+        m.
+    fade : (float, float)
+        Width of the fade along y and x, m.
+    """
+
+    fade: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def weights(self) -> NDArray[np.float32]:
+        """What each point stands for in an integral over the plane: area times fade, m^2, shape
+        (y, x).
+        """
+        along_y, along_x = (
+            step * _fade_out(axis, width)
+            for axis, step, width in zip((self.y, self.x), self.steps, self.fade, strict=True)
+        )
+        return np.outer(along_y, along_x).astype(np.float32)
+
+
+def _fade_out(axis: FloatArray, width: float) -> FloatArray:
+    """Return a raised cosine at both ends of an axis, 0 half a step outside of them."""
+    half = axis_step(axis) / 2
+    inward = np.minimum(axis - axis[0], axis[-1] - axis) + half
+    faded: FloatArray = (1 - np.cos(np.pi * np.minimum(inward / (width + half), 1))) / 2
+    return faded
+
+
 def choose_virtual_plane(
     points: FloatArray, grid: Grid, waves: SphericalWaves, zones: float, z: float | None = None
-) -> Plane:
+) -> VirtualPlane:
     """Choose a plane between a wall and the hidden scene that misses little of what passes.
 
     It holds the straight way from every wall point to every voxel behind it, and around these some
-    Fresnel zones of the middle wave; its points are half the shortest wavelength apart.
+    Fresnel zones of the middle wave, in which the field fades; its points are half the shortest
+    wavelength apart.
 
     Parameters
     ----------
@@ -142,7 +188,7 @@ def choose_virtual_plane(
 
     Returns
     -------
-    Plane
+    VirtualPlane
     """
     low, high = points.min(axis=0), points.max(axis=0)
     shortest, middle = (
@@ -153,15 +199,19 @@ def choose_virtual_plane(
         z = float(high[2] + np.clip(shortest, MIN_GAP_M, MAX_GAP_M))
     gap = z - float(low[2])
     behind = grid.z[grid.z > z]
-    weight = gap / (gap + float(behind[0]) - z) if behind.size else 1.0
-    room = zones * np.sqrt(middle * gap)
-    axes = []
+    depth = gap + float(behind[0]) - z if behind.size else gap
+    axes, fades = [], []
     for first, last, voxels in zip(low[:2], high[:2], (grid.x, grid.y), strict=True):
-        start = first + weight * min(0.0, voxels[0] - first) - room
-        stop = last + weight * max(0.0, voxels[-1] - last) + room
+        before, beyond = max(0.0, first - voxels[0]), max(0.0, voxels[-1] - last)
+        # Along a slanted way to voxels beside the wall, a zone's cut is longer: it grows with the
+        # root of the way and is seen aslant.
+        slant = 1 + (max(before, beyond) / depth) ** 2
+        room = zones * np.sqrt(middle * gap) * slant**0.75
+        start, stop = first - before * gap / depth - room, last + beyond * gap / depth + room
         count = max(1, int(np.ceil((stop - start) / (shortest / 2))))
         axes.append(np.linspace(start, stop, count + 1))
-    return Plane(axes[0], axes[1], z)
+        fades.append(float(FADE_FRACTION * room))
+    return VirtualPlane(axes[0], axes[1], z, (fades[1], fades[0]))
 
 
 SAME_COORDINATE_FRACTION = 0.02

@@ -124,6 +124,22 @@ def test_the_virtual_plane_keeps_its_distance_and_samples_the_shortest_wave() ->
     assert wide.x[-1] == pytest.approx(2)  # half way to a voxel at 3 m
 
 
+def test_the_field_fades_towards_the_rim_beside_the_straight_ways_only() -> None:
+    points = shaped_wall("planar", 9).reshape(-1, 3)
+    waves = SphericalWaves(2 * np.pi / 0.07, 0.0, 1, True)
+    plane = choose_virtual_plane(points, Grid([-0.5, 1.5], [-0.5, 0.5], [0.5]), waves, 2.0)
+    weights = plane.weights / np.prod(plane.steps)
+    assert weights.shape == plane.shape
+    assert weights.max() == pytest.approx(1)
+    inside = weights[:, (plane.x > -1) & (plane.x < 1.07)][np.abs(plane.y) < 1]
+    np.testing.assert_allclose(inside, 1, rtol=1e-6)
+    assert weights[0].max() < 0.05  # half a step from where nothing is left
+    # Voxels beside the wall along x ask for more room there than along y.
+    assert plane.fade[1] > plane.fade[0] == pytest.approx(0.75 * 2 * 0.07)
+    sharp = choose_virtual_plane(points, Grid([-0.5, 0.5], [-0.5, 0.5], [0.5]), waves, 0.0)
+    np.testing.assert_allclose(sharp.weights, np.prod(sharp.steps), rtol=1e-6)
+
+
 def test_what_cannot_be_propagated_is_refused() -> None:
     capture = shaped_capture("relief", 7)
     with pytest.raises(InputError, match="in front of the wall"):
