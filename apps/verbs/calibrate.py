@@ -13,7 +13,6 @@ from apps.conventions import (
     RECORD_SUFFIXES,
     JsonOption,
     PreviewOption,
-    TimeZeroOption,
     report,
     require_writable,
 )
@@ -42,14 +41,22 @@ def calibrate(
         Path, typer.Option(metavar="TIF", help="The same without the source.")
     ],
     out: Annotated[Path, typer.Option(metavar="H5", help="The camera file to write.")],
-    time_zero_ns: TimeZeroOption = None,
+    time_zero_ns: Annotated[
+        float | None,
+        typer.Option(
+            metavar="NS",
+            help="Reading of the time axis at which light of range 0 would arrive, in ns; e.g. -10.784. These pictures "
+            "do not show it; calibrate range finds it.",
+            show_default="not known: ranges are right up to one constant",
+        ),
+    ] = None,
     focal_length_px: Annotated[
         float | None,
         typer.Option(
             metavar="PX",
             help="Distance from lenslet to picture in pixels, which these pictures do not show. It gives the cloud its "
             "width and height.",
-            show_default="that of similar instruments",
+            show_default="265, that of similar instruments",
         ),
     ] = None,
     pulse_ps: Annotated[

@@ -165,7 +165,7 @@ def scene(
     ] = 40,
     as_json: JsonOption = False,
 ) -> None:
-    """List the objects of a scene with range, size and standard deviation, and draw it from three sides.
+    """List a scene's objects with range, size and standard deviation; draw them from three sides.
 
     Points fainter than a twentieth of the brightest are left out: most are rays that few views leave
     around bright things. `cloud` has them all.
