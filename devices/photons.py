@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from devices.linospad2.calibration import BoardCalibration
 from devices.recording.reader import read_head_if_recording
@@ -204,6 +203,8 @@ def _make_gate_response(known: Record, times: NDArray[np.float64]) -> Pulse:
     """Return how one instant shows while a gate moves over it: it is seen from when the gate still
     closes behind it until it opens after it, which is the instant itself.
     """
+    from scipy.special import ndtr
+
     width = known.number("gate_width_s")
     step = float(times[1] - times[0])
     spacing = min(step, EDGE_S) / 4

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from devices.codec import Records
 from devices.histogram.accumulator import MIN_WIDTH_BINS, Accumulator, BinAxis
-from devices.histogram.kernels import add_stamps, add_tags, add_times, find_last_sync
 from devices.linospad2.calibration import CLOCK_PERIOD_S, BoardCalibration
 from devices.linospad2.codec import PIXELS
 from devices.timetag.codec import DELTA
@@ -49,6 +48,8 @@ class StampHistogram(Accumulator):
         """
         if records.dtype.names is None or records.dtype.names[-2:] != ("code", "pixel"):
             raise InputError(f"LinoSPAD2's time stamps end in code and pixel, got {records.dtype}")
+        from devices.histogram.kernels import add_stamps
+
         rows = np.ascontiguousarray(records).view(_WORD_DTYPE).reshape(len(records), -1)
         clock, period = CLOCK_PERIOD_S / self.axis.bin_width, self.axis.period_bins
 
@@ -107,6 +108,8 @@ class TagHistogram(Accumulator):
         records : (n,) array of `devices.timetag.codec.RECORD_DTYPE`
         after_gap : bool
         """
+        from devices.histogram.kernels import add_tags, find_last_sync
+
         # Sync pulses may be among the missing records, so that the last known one may be of an
         # earlier period.
         if after_gap:
@@ -168,6 +171,8 @@ class TimeHistogram(Accumulator):
             raise InputError(f"there are {self.pixels} pixels, got {pixels.min()}..{pixels.max()}")
         if not np.all(np.isfinite(times)):
             raise InputError("a photon's time must be finite")
+        from devices.histogram.kernels import add_times
+
         scale, shift, period = 1 / self.axis.bin_width, self.axis.shift_bins, self.axis.period_bins
 
         def add(piece: slice, steps: NDArray[Any]) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from devices.codec import ByteView, DecodeResult, Records, as_bytes
-from devices.linospad2.kernels import (
+from devices.linospad2.words import (
     ADDRESSES,
     CODE_MASK,
     CONVERTERS,
@@ -31,9 +31,6 @@ from devices.linospad2.kernels import (
     OUT_OF_ORDER,
     OVERFULL,
     PIXEL_CONVERTERS,
-    count_stamps,
-    decode_stamps,
-    encode_stamps,
 )
 from tofclip.errors import InputError
 from tofclip.storage import Scalar
@@ -173,6 +170,8 @@ class LinoSpad2Codec:
         -------
         DecodeResult
         """
+        from devices.linospad2.kernels import decode_stamps
+
         cycles = self._view_cycles(data)
         kept, malformed = self._count_per_cycle(cycles)
         # Counted first: each block then knows which rows of the result are its own, and threads
@@ -203,6 +202,8 @@ class LinoSpad2Codec:
         InputError
             The stream cannot hold these time stamps, or they are not in its order.
         """
+        from devices.linospad2.kernels import encode_stamps
+
         self._require_valid(records)
         if len(records) == 0:
             return b""
@@ -230,6 +231,8 @@ class LinoSpad2Codec:
 
     def _count_per_cycle(self, cycles: NDArray[np.uint32]) -> tuple[NDArray[np.int64], int]:
         """Count the time stamps of each cycle, and all malformed words."""
+        from devices.linospad2.kernels import count_stamps
+
         kept = np.empty(len(cycles), np.int64)
         strays: list[int] = []  # appending is safe on several threads
 

@@ -7,15 +7,19 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from devices.linospad2.words import (
+    ADDRESSES,
+    CODE_MASK,
+    CONVERTERS,
+    COUNTERS_DIFFER,
+    ENCODED_OK,
+    OUT_OF_ORDER,
+    OVERFULL,
+    PIXEL_CONVERTERS,
+    VALID_BIT,
+)
+
 compiled = njit(nogil=True, cache=True, error_model="numpy")
-
-CONVERTERS = 65
-PIXEL_CONVERTERS = 64
-ADDRESSES = 4
-CODE_MASK = np.uint32(0x0FFFFFFF)
-VALID_BIT = np.uint32(0x80000000)
-
-ENCODED_OK, OUT_OF_ORDER, OVERFULL, COUNTERS_DIFFER = 0, 1, 2, 3
 
 
 @compiled

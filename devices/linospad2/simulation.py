@@ -18,7 +18,7 @@ from devices.codec import Records
 from devices.ledger import Ledger
 from devices.linospad2.calibration import CLOCK_PERIOD_S, CODES_PER_PERIOD, BoardCalibration
 from devices.linospad2.codec import FIRMWARES, PIXELS, LinoSpad2Codec
-from devices.linospad2.kernels import ADDRESSES
+from devices.linospad2.words import ADDRESSES
 from devices.scenes import LineLight, simulate_line_light
 from devices.source import Info
 from devices.stream import STREAM_OPTIONS, StreamSource, Transfer, parse_buffer_settings

@@ -20,16 +20,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from devices.codec import ByteView, DecodeResult, Records, as_bytes
-from devices.timetag.kernels import (
-    DELTA,
-    LOST,
-    RECORD_BYTES,
-    TIME_BITS,
-    TIME_MASK,
-    WRAP,
-    decode_timetags,
-    encode_timetags,
-)
+from devices.timetag.words import DELTA, LOST, RECORD_BYTES, TIME_BITS, TIME_MASK, WRAP
 from tofclip.errors import InputError
 from tofclip.storage import Scalar
 
@@ -110,6 +101,8 @@ class TimeTagCodec:
         InputError
             The bytes are not whole records.
         """
+        from devices.timetag.kernels import decode_timetags
+
         words = as_bytes(data)
         if words.size % RECORD_BYTES:
             raise InputError(
@@ -128,6 +121,8 @@ class TimeTagCodec:
         InputError
             No instrument would send these records: see `mark_wraps` for the ones that it adds.
         """
+        from devices.timetag.kernels import encode_timetags
+
         _require_valid(records)
         data = np.empty(len(records) * RECORD_BYTES, np.uint8)
         encode_timetags(records["time_ticks"], records["channels"], records["flags"], data)

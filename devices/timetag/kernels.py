@@ -9,13 +9,17 @@ import math
 import numpy as np
 from numba import njit
 
-compiled = njit(nogil=True, cache=True, error_model="numpy")
+from devices.timetag.words import (
+    DELTA,
+    HALF_RANGE,
+    LOST,
+    RECORD_BYTES,
+    TIME_BITS,
+    TIME_MASK,
+    WRAP,
+)
 
-RECORD_BYTES = 6
-TIME_BITS = 36
-TIME_MASK = (1 << TIME_BITS) - 1
-HALF_RANGE = 1 << (TIME_BITS - 1)
-DELTA, WRAP, LOST = 1, 2, 4
+compiled = njit(nogil=True, cache=True, error_model="numpy")
 
 # The 53 upper bits of a word fill the mantissa of a double.
 _DOUBLE_STEP = 2.0**-53

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from devices.codec import ByteView, Records
 from devices.scenes import LineLight
 from devices.timetag.codec import COUNTER_RANGE, RECORD_BYTES, RECORD_DTYPE, WRAP
-from devices.timetag.kernels import encode_timetags, fill_poisson_words
 from tofclip.errors import InputError
 
 MAX_TICK = (1 << 62) - 1
@@ -77,6 +76,8 @@ class PoissonStream:
 
         Arguments and result are those of `TagStream.next_words`.
         """
+        from devices.timetag.kernels import fill_poisson_words
+
         words = np.empty(limit * RECORD_BYTES, np.uint8)
         written = fill_poisson_words(
             self._state, self._now, self._scale, self._weights, last, words
@@ -155,6 +156,8 @@ class PulsedSceneStream:
 
     def _fill_block(self) -> None:
         """Make the records of the next pulses; the same number of a block gives the same records."""
+        from devices.timetag.kernels import encode_timetags
+
         records = self._draw_records(np.random.default_rng([self._seed, self._block]))
         first = self._block * BLOCK_TICKS
         self._block += 1
