@@ -27,10 +27,10 @@ from apps.help import (
     VerbTable,
     make_lazy_group,
 )
-from tofclip import __version__
 from tofclip.compiling import observe_compiling
 from tofclip.dependencies import describe_missing_package
 from tofclip.errors import TofclipError
+from tofclip.version import __version__
 
 ARGUMENT_IN_MESSAGE = re.compile(r"`(?P<name>[a-z_]+)(?:=\"?(?P<value>[^`\"]*)\"?)?`")
 OPTIONS_OF_ARGUMENTS = {

@@ -9,17 +9,6 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    ProgressColumn,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-
 Advance = Callable[[int], None]
 
 _screen_lock = threading.Lock()
@@ -87,17 +76,20 @@ def _open_bar(title: str, total: int | None) -> Iterator[Advance]:
 
 @contextlib.contextmanager
 def _draw_bar(title: str, total: int | None) -> Iterator[Advance]:
-    columns: tuple[ProgressColumn, ...] = (
-        TextColumn("{task.description}"),
-        BarColumn(None),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
+    from rich import progress
+    from rich.console import Console
+
+    columns: tuple[progress.ProgressColumn, ...] = (
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(None),
+        progress.TaskProgressColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("left"),
+        progress.TimeRemainingColumn(),
     )
     if total is None:
         columns = columns[:2] + columns[3:4]  # nothing is known of what is left
-    with Progress(*columns, console=Console(stderr=True), transient=True) as drawn:
+    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as drawn:
         task = drawn.add_task(title, total=total)
         yield lambda amount: drawn.advance(task, amount)
 

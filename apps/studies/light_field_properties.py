@@ -4,7 +4,9 @@ focus, and a viewpoint between the views.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,7 +30,7 @@ from tofclip.simulate.light_fields import (
     render_shear_map,
     render_view,
 )
-from tofclip.simulate.patterns import make_plain_pattern, make_text_pattern
+from tofclip.simulate.patterns import Pattern, make_plain_pattern, make_text_pattern
 from tofclip.threads import map_parallel
 
 FOCUS_SCENES = ("letters", "blocks", "still-life", "slanted-text")
@@ -147,10 +149,9 @@ PLATE_LIGHT_DIRECTION = (
     0.05,
     -1.0,
 )  # mirrored towards the cameras by a plate that faces them
-TEXT_PATTERN = make_text_pattern("TOF\nCLIP", 0.05, 0.35)
-MATERIALS = {
-    "matt": Lambertian(TEXT_PATTERN),
-    "glossy": Specular(TEXT_PATTERN, gloss=0.6, exponent=150.0),
+MATERIALS: Mapping[str, Callable[[Pattern], Lambertian]] = {
+    "matt": Lambertian,
+    "glossy": partial(Specular, gloss=0.6, exponent=150.0),
 }
 
 
@@ -173,8 +174,9 @@ def run_glossy_plate(library: Library, seeds: int, advance: Advance) -> Outcome:
         A row of figures for each case, and the pictures to show.
     """
     rows, panels = [], []
-    for name, material in MATERIALS.items():
-        rendered = render_light_field(_make_scene(library, material), library.array)
+    pattern = make_text_pattern("TOF\nCLIP", 0.05, 0.35)
+    for name, make_material in MATERIALS.items():
+        rendered = render_light_field(_make_scene(library, make_material(pattern)), library.array)
         field, plate = rendered.light_field, _erode_mask(rendered.shears < 0)
         reference = field.pictures[int(np.argmin((field.views**2).sum(axis=1)))]
         pictures = [_recover_stack(field, seed, advance) for seed in range(seeds)]

@@ -7,9 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.benchmarks.page import render_page as made_page
-from apps.benchmarks.registry import find_cases
-from apps.benchmarks.run import count_processes, run_cases
 from apps.conventions import JsonOption, report, require_writable
 from apps.progress import show_progress
 from tofclip.storage import atomic_path
@@ -51,6 +48,10 @@ def bench(
 
     Example: tofclip bench --page benchmarks.md --json
     """
+    from apps.benchmarks.page import render_page
+    from apps.benchmarks.registry import find_cases
+    from apps.benchmarks.run import count_processes, run_cases
+
     cases = find_cases(name)
     if page is not None:
         # Before the measurements, which take minutes.
@@ -60,7 +61,7 @@ def bench(
     if page is not None:
         command = "tofclip bench" if name == "all" else f"tofclip bench {name}"
         with atomic_path(page) as temporary:
-            temporary.write_text(made_page(figures, command), encoding="utf-8")
+            temporary.write_text(render_page(figures, command), encoding="utf-8")
     if as_json:
         report(figures, as_json=True)
     else:

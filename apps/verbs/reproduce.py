@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from apps.conventions import ClusterOption, JsonOption, make_completer, make_folder, report
-from apps.figures.reproduction import make_reproduction_figure
-from apps.figures.style import save_figure, store_picture
 from apps.progress import show_progress
 from apps.reproduction import STUDY_FOLDER, load_result, make_result, write_page, write_result
 from apps.sequences import report_summary, run_with_progress
@@ -171,6 +169,9 @@ def _run_study(
     """Run a study, and write its figure, its tables and, last, the file that marks it as
     finished.
     """
+    from apps.figures.reproduction import make_reproduction_figure
+    from apps.figures.style import save_figure, store_picture
+
     started = time.perf_counter()
     outcome = study.work(library, seeds if study.seeded else 1, advance)
     seconds = time.perf_counter() - started

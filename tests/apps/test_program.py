@@ -83,6 +83,19 @@ def test_help_and_refusals_need_nothing_heavy(words: list[str], said: str) -> No
     assert HEAVY.isdisjoint(loaded.split())
 
 
+def test_verbs_load_the_compiler_and_the_plots_when_they_need_them() -> None:
+    verbs = [name for name in cli.VERBS if name != "nlos"]
+    code = (
+        "import sys; from apps.cli import app; import typer; group = typer.main.get_group(app);"
+        f"[group.load_verb(name) for name in {verbs!r}]; print(*sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    late = {"numba", "matplotlib", "rich", "scipy.optimize", "pydantic", "viser", "pyvista"}
+    assert late.isdisjoint(done.stdout.split())
+
+
 def test_statuses_of_the_process(files: Path) -> None:
     good, bad = ran("info", files / "camera.h5", "--json"), ran("info", files / "absent.h5")
     assert (good.returncode, good.stderr, json.loads(good.stdout)["kind"]) == (0, "", "camera")
@@ -190,6 +203,12 @@ def test_ctrl_c_while_the_program_starts_shows_no_traceback(tmp_path: Path, modu
     done = started_elsewhere(tmp_path, "--version")
     assert (done.returncode, done.stdout) == (130, "")
     assert done.stderr == "tofclip: interrupted\n"
+
+
+def test_little_is_loaded_before_a_ctrl_c_can_be_caught(tmp_path: Path) -> None:
+    (tmp_path / "lazy_loader.py").write_text("raise KeyboardInterrupt\n")
+    done = started_elsewhere(tmp_path, "--version")
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"{tofclip.__version__}\n", "")
 
 
 def test_ctrl_c_while_a_verb_is_imported_shows_no_traceback(tmp_path: Path) -> None:
