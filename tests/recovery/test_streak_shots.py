@@ -12,6 +12,7 @@ from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
 from tofclip.lidar import Returns, depth
 from tofclip.recovery import open_shot, plan_recovery
+from tofclip.recovery.plan import make_method
 from tofclip.shots import Streak
 
 
@@ -29,9 +30,9 @@ def make_camera() -> Camera:
     )
 
 
-def locate(counts: np.ndarray, method: str) -> Returns:
+def locate(counts: np.ndarray, method: str, iterations: int | None = None) -> Returns:
     streak = Streak(counts, np.arange(oracle.ROWS) * oracle.ROW_S, camera=make_camera())
-    return depth(plan_recovery(open_shot(streak), method).run())
+    return depth(plan_recovery(open_shot(streak), make_method(method, iterations=iterations)).run())
 
 
 def compute_range_z(returns: Returns, scene: oracle.Scene) -> float:
@@ -146,6 +147,23 @@ def test_glints_of_any_brightness_elsewhere(method, brightness, corner) -> None:
     bright = oracle.compute_light(scene)
     counts = oracle.count_photons(bright, 1400 * bright.max() / plain.max(), seed=3)
     check_returns("retroreflector", method, scene, counts)
+
+
+def test_more_iterations_take_the_rim_off_thin_bars() -> None:
+    """Its false returns lie above and below the bars, which the views see nearly along the columns.
+
+    Over four seeds 80 iterations leave 0.44 to 0.56 of them, and at most 1.2 % of all.
+    """
+    steps = oracle.make_steps()
+    counts = oracle.count_photons(oracle.compute_light(steps), seed=6)
+    scores = []
+    for iterations in (40, 80):
+        returns = locate(counts, "l1", iterations)
+        scores.append(oracle.score(returns.y, returns.x, returns.range, steps))
+    (_, usual), (missed, false) = scores
+    assert false < 0.7 * usual
+    assert false <= 0.02
+    assert missed <= 0.02
 
 
 def test_the_probability_of_a_false_alarm_is_kept(room, light) -> None:
