@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tofclip.errors import InputError, StorageError
-from tofclip.storage import collect_provenance
 
 if TYPE_CHECKING:
     from tofclip.shots import Frames
@@ -130,6 +129,8 @@ def build_provenance(
     dict
         Plain values only, for JSON.
     """
+    from tofclip.storage import collect_provenance
+
     described = collect_provenance(
         {name: _to_plain_value(value) for name, value in settings.items()}, *inputs
     )

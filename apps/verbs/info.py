@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -15,24 +15,6 @@ from apps.conventions import (
     summarise_list,
     to_json_value,
 )
-from devices.linospad2.source import LinoSpad2File
-from devices.photons import STAMPS_SUFFIX
-from devices.recording.reader import read_head_if_recording
-from tofclip.errors import FileFormatError
-from tofclip.io.streaks import outline_streak_file
-from tofclip.lidar import PointCloud
-from tofclip.lidar.photons.files import describe_photons
-from tofclip.loading import CLOUD_SUFFIXES, HDF5_SIGNATURE
-from tofclip.storage import (
-    Record,
-    is_own_file,
-    is_stand_in,
-    read_outline,
-    translate_read_errors,
-)
-
-if TYPE_CHECKING:
-    from tofclip.storage import Field
 
 
 def info(
@@ -48,77 +30,13 @@ def info(
 
     Example: tofclip info frames.h5
     """
-    found = to_json_value({"file": file, **_describe_file(file)})
+    from apps.outline import describe_file
+
+    found = to_json_value({"file": file, **describe_file(file)})
     if as_json:
         report(found, as_json)
     else:
         print("\n".join(_format_tree(found)))
-
-
-def _describe_file(file: Path) -> dict[str, Any]:
-    """Describe our own records, streak images, point clouds and counted photons by their headers."""
-    try:
-        return _describe_record(_read_outline(file))
-    except FileFormatError as refusal:
-        if is_own_file(file):
-            raise  # a damaged record, not counted photons
-        try:
-            return describe_photons(file)
-        except FileFormatError:
-            # The first refusal names the formats that were expected.
-            raise refusal from None
-
-
-def _read_outline(file: Path) -> Record:
-    """Read what a file says about its arrays, not their values, which may not fit into memory."""
-    recording = read_head_if_recording(file)
-    if recording is not None:
-        return recording
-    if file.suffix.lower() == STAMPS_SUFFIX:
-        with LinoSpad2File(file) as source:
-            known = {"instrument": source.info.instrument, **source.info.details}
-            return Record("photon stamps", attributes=known | {"stamps": source.stats.acquired})
-    with translate_read_errors(file), open(file, "rb") as opened:
-        start = opened.read(len(HDF5_SIGNATURE))
-    # Decided by content, because suffixes get lost.
-    if start == HDF5_SIGNATURE:
-        return read_outline(file)
-    if file.suffix.lower() not in CLOUD_SUFFIXES:
-        return outline_streak_file(file)
-    try:
-        return PointCloud.read_outline(file)
-    except FileFormatError:
-        if file.suffix.lower() != ".npz":
-            raise
-    return outline_streak_file(file)  # an archive that is not a point cloud may be a LIFT shot
-
-
-def _describe_record(record: Record) -> dict[str, Any]:
-    found: dict[str, Any] = {"kind": record.kind}
-    if record.attributes:
-        found["attributes"] = record.attributes
-    if record.fields:
-        found["fields"] = {name: _describe_field(entry) for name, entry in record.fields.items()}
-    if record.children:
-        found["children"] = {
-            name: _describe_record(child) for name, child in record.children.items()
-        }
-    if record.provenance:
-        found["provenance"] = record.provenance
-    return found
-
-
-def _describe_field(entry: Field) -> dict[str, Any]:
-    values = entry.values
-    known = {
-        "shape": values.shape,
-        "type": str(values.dtype),
-        "units": entry.units,
-        "axes": entry.axes,
-    }
-    if values.dtype.kind not in "uif" or is_stand_in(values):
-        return known
-    return {**known, "values": values}
 
 
 def _format_tree(found: Mapping[str, Any], depth: int = 0) -> Iterator[str]:

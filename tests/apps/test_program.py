@@ -69,6 +69,7 @@ HEAVY = {
     ("words", "said"),
     [
         (["--help"], "Usage: tofclip"),
+        (["info", "--help"], "Usage: tofclip info"),
         (["info", "absent.h5"], "absent.h5: no such file"),
         (["nlos", "info", "absent.h5"], "absent.h5: no such file"),
     ],
@@ -80,7 +81,9 @@ def test_help_and_refusals_need_nothing_heavy(words: list[str], said: str) -> No
     )
     *shown, loaded = done.stdout.splitlines()
     assert said in "\n".join([*shown, done.stderr])
-    assert HEAVY.isdisjoint(loaded.split())
+    # pydantic reads the options before those of a verb
+    allowed = {"pydantic"} if words == ["info", "--help"] else set()
+    assert allowed.issuperset(HEAVY.intersection(loaded.split()))
 
 
 def test_verbs_load_the_compiler_and_the_plots_when_they_need_them() -> None:
@@ -116,7 +119,7 @@ def test_a_defect_is_one_line_as_well(
     def fail(*_: object) -> None:
         raise ZeroDivisionError("a defect\nin two lines")
 
-    monkeypatch.setattr("apps.verbs.info._read_outline", fail)
+    monkeypatch.setattr("apps.outline._read_outline", fail)
     outcome = run("info", files / "camera.h5")
     assert outcome.status == cli.EXIT_DEFECT
     assert outcome.err.startswith(
