@@ -61,6 +61,32 @@ class SubProgress:
         self._progress(increment)
 
 
+class PlannedGeometry:
+    """Wall, laser, time axis and device that something is made ready for.
+
+    Parameters
+    ----------
+    capture : Capture
+    """
+
+    def __init__(self, capture: Capture) -> None:
+        self.wall, self.laser = capture.wall, capture.laser
+        self.axis, self.device = capture.axis, capture.device
+
+    def require_same(self, capture: Capture) -> None:
+        """Refuse a capture that was not planned for."""
+        for name, planned in (("wall", self.wall), ("laser", self.laser)):
+            found = getattr(capture, name)
+            if found is not planned and not np.array_equal(found, planned, equal_nan=True):
+                raise InputError(
+                    f"the {name} is not that of the capture that this imaging was planned for"
+                )
+        if capture.axis != self.axis:
+            raise InputError(f"planned for {self.axis}, got a capture of {capture.axis}")
+        if capture.device != self.device:
+            raise InputError(f"planned for signals on {self.device}, got one on {capture.device}")
+
+
 class Plan(ABC):
     """A method made ready for captures of one geometry on one grid.
 
@@ -77,8 +103,7 @@ class Plan(ABC):
 
     def __init__(self, capture: Capture, grid: Grid) -> None:
         self.grid = grid
-        self._wall, self._laser = capture.wall, capture.laser
-        self._axis, self._device = capture.axis, capture.device
+        self.geometry = PlannedGeometry(capture)
 
     @property
     def cost(self) -> int:
@@ -121,16 +146,7 @@ class Plan(ABC):
 
     def require_same_geometry(self, capture: Capture) -> None:
         """Refuse a capture that was not planned for."""
-        for name, planned in (("wall", self._wall), ("laser", self._laser)):
-            found = getattr(capture, name)
-            if found is not planned and not np.array_equal(found, planned, equal_nan=True):
-                raise InputError(
-                    f"the {name} is not that of the capture that this imaging was planned for"
-                )
-        if capture.axis != self._axis:
-            raise InputError(f"planned for {self._axis}, got a capture of {capture.axis}")
-        if capture.device != self._device:
-            raise InputError(f"planned for signals on {self._device}, got one on {capture.device}")
+        self.geometry.require_same(capture)
 
 
 class PhasorPlan(Plan):

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from nlos.capture import Capture
 from nlos.geometry import FloatArray, Grid
 from nlos.illumination_groups import is_confocal
-from nlos.method import PhasorMethod, PhasorPlan, Progress
+from nlos.method import PhasorMethod, PhasorPlan, PlannedGeometry, Progress
 from nlos.volume import Volume
 from tofclip.arrays import is_numpy
 from tofclip.threads import split_blocks
@@ -50,6 +50,9 @@ MAX_SAMPLED_PAIRS = 500
 PAIRS_PER_BLOCK = 256
 """Pairs whose signals are read together."""
 
+BYTES_PER_READING, MAX_KEPT_BYTES = 12, 1 << 28
+"""A bin and a weight; where they take more than this together, they are found again every time."""
+
 
 def join_near_lasers(capture: Capture) -> Capture:
     """Take pairs of a laser spot and a wall point close by for confocal ones at their midpoint.
@@ -68,20 +71,56 @@ def join_near_lasers(capture: Capture) -> Capture:
         The same one where pairs are so far apart that the path would err too much, or all are
         confocal already.
     """
-    if capture.laser.ndim == 1 or is_confocal(capture) or len(capture.points) == 1:
-        return capture
-    extent = float(np.ptp(capture.points, axis=0).max())
-    apart = float(np.linalg.norm(capture.lasers - capture.points, axis=1).max())
-    near = min(NEAR_LASER_M, MAX_NEAR_LASER_FRACTION * extent)
-    middle = (capture.wall + capture.laser) / 2
-    if apart <= max(NEAR_LASER_FRACTION * extent, near):
-        return replace(capture, wall=middle, laser=middle)
-    if apart > MAX_OFFSET_FRACTION * extent or not is_numpy(capture.signal):
-        return capture
-    joined = replace(capture, wall=middle, laser=middle)
-    if _find_path_error(capture) > MAX_PATH_ERROR_FRACTION * joined.spacing:
-        return capture
-    return replace(joined, signal=_apply_moveout(capture))
+    return MidpointJoin(capture).join(capture)
+
+
+class MidpointJoin:
+    """What `join_near_lasers` does, made ready for captures of one geometry.
+
+    Parameters
+    ----------
+    capture : Capture
+        One of them.
+    """
+
+    def __init__(self, capture: Capture) -> None:
+        self._geometry = PlannedGeometry(capture)
+        self._middle: FloatArray | None = None
+        self._moveout: _Moveout | None = None
+        if capture.laser.ndim == 1 or is_confocal(capture) or len(capture.points) == 1:
+            return
+        extent = float(np.ptp(capture.points, axis=0).max())
+        apart = float(np.linalg.norm(capture.lasers - capture.points, axis=1).max())
+        near = min(NEAR_LASER_M, MAX_NEAR_LASER_FRACTION * extent)
+        middle = (capture.wall + capture.laser) / 2
+        if apart <= max(NEAR_LASER_FRACTION * extent, near):
+            self._middle = middle
+        elif apart <= MAX_OFFSET_FRACTION * extent and is_numpy(capture.signal):
+            spacing = replace(capture, wall=middle, laser=middle).spacing
+            if _find_path_error(capture) <= MAX_PATH_ERROR_FRACTION * spacing:
+                self._middle, self._moveout = middle, _Moveout(capture)
+
+    def join(self, capture: Capture) -> Capture:
+        """Return a capture with its pairs at their midpoints, or itself; see `join_near_lasers`.
+
+        Parameters
+        ----------
+        capture : Capture
+
+        Returns
+        -------
+        Capture
+
+        Raises
+        ------
+        InputError
+            Wall, laser, time axis or device differ from those that were planned for.
+        """
+        self._geometry.require_same(capture)
+        if self._middle is None:
+            return capture
+        signal = capture.signal if self._moveout is None else self._moveout.read(capture.signal)
+        return replace(capture, wall=self._middle, laser=self._middle, signal=signal)
 
 
 class MidpointImaging(PhasorMethod):
@@ -113,17 +152,20 @@ class MidpointImaging(PhasorMethod):
         InputError
             The method cannot image such a capture on the grid.
         """
-        joined = join_near_lasers(capture)
+        join = MidpointJoin(capture)
+        joined = join.join(capture)
         plan = self.method.plan(joined, grid)
-        return plan if joined is capture else _MidpointPlan(capture, grid, plan)
+        return plan if joined is capture else _MidpointPlan(capture, grid, join, plan)
 
 
 class _MidpointPlan(PhasorPlan):
     """A plan for joined pairs, for captures as they come."""
 
-    def __init__(self, capture: Capture, grid: Grid, joined: PhasorPlan) -> None:
+    def __init__(
+        self, capture: Capture, grid: Grid, join: MidpointJoin, joined: PhasorPlan
+    ) -> None:
         super().__init__(capture, grid)
-        self.joined = joined
+        self.join, self.joined = join, joined
 
     @property
     def cost(self) -> int:
@@ -134,7 +176,7 @@ class _MidpointPlan(PhasorPlan):
         return self.joined.memory_bytes
 
     def _field(self, capture: Capture, progress: Progress) -> Volume:
-        return self.joined.field(join_near_lasers(capture), progress)
+        return self.joined.field(self.join.join(capture), progress)
 
 
 def _sample_space(points: FloatArray) -> FloatArray:
@@ -187,19 +229,57 @@ def _path_of(confocal: FloatArray, squared: Any, along: Any) -> FloatArray:
     return np.asarray(np.sqrt((total + root) / 2))
 
 
-def _apply_moveout(capture: Capture) -> NDArray[np.float32]:
-    """Read every valid signal at the path of its pair; linear between bins, (t, ...)."""
-    _, squared, along = _find_offsets(capture, slice(None))
-    axis, places = capture.axis, np.flatnonzero(capture.valid)
-    signal = np.zeros(capture.signal.shape, np.float32)
-    flat, recorded = (one.reshape(axis.bins, -1) for one in (signal, capture.signal))
-    confocal = np.maximum(axis.paths, 0)[:, np.newaxis]
-    for some in split_blocks(len(places), PAIRS_PER_BLOCK):
-        own = places[some]
-        bins = (_path_of(confocal, squared[some], along[some]) - axis.start) / axis.spacing
-        before = np.clip(bins.astype(np.int64), 0, axis.bins - 2)
+class _Moveout:
+    """Where between the bins every valid signal is read: at the path of its pair.
+
+    Parameters
+    ----------
+    capture : Capture
+        For its geometry; NumPy's arrays.
+    """
+
+    def __init__(self, capture: Capture) -> None:
+        self._axis, self._places = capture.axis, np.flatnonzero(capture.valid)
+        _, self._squared, self._along = _find_offsets(capture, slice(None))
+        self._blocks = list(split_blocks(len(self._places), PAIRS_PER_BLOCK))
+        values = len(self._places) * capture.axis.bins
+        self._kept = (
+            [self._find_bins(some) for some in self._blocks]
+            if values * BYTES_PER_READING <= MAX_KEPT_BYTES
+            else None
+        )
+
+    def read(self, signal: NDArray[Any]) -> NDArray[np.float32]:
+        """Return signals (t, ...) read at their pairs' paths, linear between bins; 0 outside.
+
+        Parameters
+        ----------
+        signal : (t, ...) array
+
+        Returns
+        -------
+        (t, ...) float32 array
+        """
+        read = np.zeros(signal.shape, np.float32)
+        flat, recorded = (one.reshape(self._axis.bins, -1) for one in (read, signal))
+        for number, some in enumerate(self._blocks):
+            before, weight = self._kept[number] if self._kept else self._find_bins(some)
+            own = self._places[some]
+            # Two bins of silence for what lies outside.
+            block = np.concatenate([recorded[:, own], np.zeros((2, own.size), recorded.dtype)])
+            first, second = block.take(before), block.take(before + own.size)
+            flat[:, own] = first + weight * (second - first)
+        return read
+
+    def _find_bins(self, some: slice) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+        """Find the bin before each reading of some pairs, as a place in their (t, n) signals, and
+        the weight of the bin after it, both (t, n).
+        """
+        axis = self._axis
+        confocal = np.maximum(axis.paths, 0)[:, np.newaxis]
+        paths = _path_of(confocal, self._squared[some], self._along[some])
+        bins = (paths - axis.start) / axis.spacing
+        before = np.clip(bins.astype(np.intp), 0, axis.bins - 2)
         weight = (bins - before).astype(np.float32)
-        first, second = recorded[before, own], recorded[before + 1, own]
-        inside = (bins >= 0) & (bins <= axis.bins - 1)
-        flat[:, own] = np.where(inside, first + weight * (second - first), 0)
-    return signal
+        before[(bins < 0) | (bins > axis.bins - 1)] = axis.bins
+        return before * before.shape[1] + np.arange(before.shape[1]), weight

@@ -8,7 +8,7 @@ voxels, the box, and the quickest method. The command line and Python use the sa
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -186,9 +186,23 @@ class Settings:
             raise InputError("these settings have no box yet; complete them by settings_for")
         return x, y, (near, far)
 
-    def prepare(self, capture: Capture) -> Capture:
-        """Mirror coordinates, blank the wall's own light and put time bins together, as settings say."""
-        capture = self._orient(join_near_lasers(capture))
+    def prepare(
+        self, capture: Capture, join: Callable[[Capture], Capture] = join_near_lasers
+    ) -> Capture:
+        """Mirror coordinates, blank the wall's own light and put time bins together, as settings say.
+
+        Parameters
+        ----------
+        capture : Capture
+        join : callable
+            Brings pairs to their midpoints; `nlos.moveout.MidpointJoin.join` for many captures of
+            one geometry.
+
+        Returns
+        -------
+        Capture
+        """
+        capture = self._orient(join(capture))
         if self.gate is not None:
             capture = remove_first_bounce(capture, self.gate, self.gate_ramp or 0.0)
         if self.fade:

@@ -169,7 +169,7 @@ class PhotonPlan(Plan):
 
     @property
     def memory_bytes(self) -> int:
-        signals = self._axis.bins * self._wall.size // 3
+        signals = self.geometry.axis.bins * self.geometry.wall.size // 3
         return self.linear.memory_bytes + 4 * VOLUME_COPIES * self.grid.size + 24 * signals
 
     def _image(self, capture: Capture, progress: Progress) -> Volume:

@@ -12,7 +12,8 @@ from hidden_point import object_of
 from small_instrument import Run
 
 import nlos.rsd.planar
-from nlos import Capture, Volume
+from apps.verbs.nlos.stream import _VolumeStream
+from nlos import Capture, Volume, moveout
 from nlos.capture import TimeAxis
 from nlos.simulate import PointScene, build_relay_wall
 
@@ -54,6 +55,25 @@ def test_every_capture_becomes_a_volume_by_one_plan(
         run, "stream", tmp_path / "in", "--out", tmp_path / "b", "--settings", out / "stream.toml"
     )
     assert again["voxels"] == found["voxels"]
+
+
+def test_pairs_are_joined_by_one_plan(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wall = build_relay_wall("planar", 16, 1.2)
+    capture = PointScene([[0.0, 0.05, 0.7]]).simulate_capture(
+        wall, wall + np.array([0.1, 0.0, 0.0]), TimeAxis(160, 50e-12), 5e-11
+    )
+    (tmp_path / "in").mkdir()
+    for number in range(3):
+        capture.save(tmp_path / "in" / f"{number}.h5")
+    found, before = [], []
+    path_of, run_stream = moveout._path_of, _VolumeStream.run
+    monkeypatch.setattr(moveout, "_path_of", lambda *a: found.append(1) or path_of(*a))
+    monkeypatch.setattr(_VolumeStream, "run", lambda s: before.append(len(found)) or run_stream(s))
+    words = ["--out", tmp_path / "out", *WORDS[:-1], 700]  # paths are as if confocal
+    assert object_of(run, "stream", tmp_path / "in", *words)["delivered"] == 3
+    assert before == [len(found)] != [0]
 
 
 def test_captures_that_cannot_be_imaged_are_counted(run: Run, tmp_path: Path) -> None:

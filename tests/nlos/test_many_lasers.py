@@ -8,12 +8,22 @@ from functools import cache
 import numpy as np
 import pytest
 
-from nlos import Backprojection, Capture, Grid, Hybrid, PlanarRSD, Refinement, settings_for
+from nlos import (
+    Backprojection,
+    Capture,
+    Grid,
+    Hybrid,
+    PlanarRSD,
+    Refinement,
+    moveout,
+    settings_for,
+)
 from nlos.capture import TimeAxis
-from nlos.moveout import MidpointImaging, join_near_lasers
+from nlos.moveout import MidpointImaging, MidpointJoin, join_near_lasers
 from nlos.reciprocity import choose_roles
 from nlos.refinement.photons import PhotonRefinement
 from nlos.simulate import PointScene
+from tofclip.errors import InputError
 from tofclip.solvers import Sparse
 
 pytestmark = pytest.mark.filterwarnings("ignore::nlos.illumination_groups.AliasingWarning")
@@ -110,6 +120,25 @@ def test_pairs_a_decimetre_apart_are_imaged_at_their_midpoint(apart: float, erro
     bare = PlanarRSD(WAVELENGTH).reconstruct(replace(joined, signal=capture.signal), GRID).values
     assert difference(bare, exact) > 1.4 * difference(found, exact)
     assert settings_for(capture, wavelength=WAVELENGTH).method == "rsd"
+
+
+def test_paths_of_pairs_are_found_once_for_many_captures(monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = pairs(0.1, 12)
+    kept = MidpointJoin(capture)
+    monkeypatch.setattr(moveout, "MAX_KEPT_BYTES", 0)  # found again every time
+    anew = MidpointJoin(capture)
+    found, path_of = [], moveout._path_of
+    monkeypatch.setattr(moveout, "_path_of", lambda *a: found.append(1) or path_of(*a))
+    for factor in (1, 3):
+        brighter = replace(capture, signal=capture.signal * np.float32(factor))
+        joined = kept.join(brighter)
+        assert not found
+        assert joined.signal.any()
+        assert np.array_equal(joined.signal, anew.join(brighter).signal)
+        assert found
+        found.clear()
+    with pytest.raises(InputError, match="planned for"):
+        kept.join(replace(capture, start=0.1))
 
 
 def test_pairs_far_apart_stay_as_they_are() -> None:

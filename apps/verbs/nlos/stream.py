@@ -39,6 +39,7 @@ from apps.settings import (
 from nlos.averaging import DepthAverage
 from nlos.io import read_capture
 from nlos.method import PhasorPlan
+from nlos.moveout import MidpointJoin
 from tofclip.errors import InputError, TofclipError
 from tofclip.sequences.streaming import run_in_order
 
@@ -236,6 +237,7 @@ class _VolumeStream:
     ) -> None:
         self._coming, self._prepared, self._image, self._out = coming, prepared, imaging, out
         self._live, self._acquired = live, 0
+        self._midpoints = MidpointJoin(prepared.recorded)
         self.latest: deque[Volume] = deque(maxlen=1)
         self._imaging: deque[float] = deque(maxlen=MAX_LATENCY_SAMPLES)
         self.latency, self.failed, self.delivered = float("nan"), 0, 0
@@ -286,7 +288,7 @@ class _VolumeStream:
         try:
             if one.capture is None:
                 raise InputError(one.problem)
-            capture = self._prepared.settings.prepare(one.capture)
+            capture = self._prepared.settings.prepare(one.capture, self._midpoints.join)
             started = time.perf_counter()
             volume = self._image(capture)
             self._imaging.append(time.perf_counter() - started)
