@@ -2,6 +2,6 @@
 
 import sys
 
-from apps.cli import main
+from tofclip.__main__ import main
 
 sys.exit(main())

@@ -27,7 +27,7 @@ from apps.help import (
     VerbTable,
     make_lazy_group,
 )
-from tofclip.compiling import observe_compiling
+from tofclip.compile_observers import observers
 from tofclip.dependencies import describe_missing_package
 from tofclip.errors import TofclipError
 from tofclip.version import __version__
@@ -154,7 +154,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = DEBUG_FLAG in words
     _heed_end_signals()
-    stop_observing = observe_compiling(_CompileNotice().announce)
+    announce = _CompileNotice().announce
+    observers.append(announce)
     try:
         status = app(
             [word for word in words if word != DEBUG_FLAG],
@@ -172,7 +173,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         completes = end.code == 0 or COMPLETION_VARIABLE in os.environ
         status = end.code if completes else EXIT_BROKEN_PIPE
     finally:
-        stop_observing()
+        observers.remove(announce)
     if status == EXIT_INTERRUPTED:
         print("tofclip: interrupted; no unfinished file was left behind", file=sys.stderr)
     return int(status or 0)

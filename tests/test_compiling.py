@@ -9,7 +9,8 @@ import numba
 import pytest
 
 from apps import cli
-from tofclip.compiling import compile_as_part, observe_compiling
+from tofclip.compile_observers import observers
+from tofclip.compiling import compile_as_part
 
 
 def test_a_part_runs_from_python_and_from_a_compiled_loop() -> None:
@@ -22,7 +23,8 @@ def test_a_part_runs_from_python_and_from_a_compiled_loop() -> None:
         return halve(halve(number))
 
     names: list[str] = []
-    stop = observe_compiling(names.append)
+    observers.append(names.append)
+    told = observers[-1]
     try:
         assert (halve(3.0), names) == (1.5, [])
         assert quarter(3.0) == 0.75
@@ -30,7 +32,7 @@ def test_a_part_runs_from_python_and_from_a_compiled_loop() -> None:
         assert quarter(5.0) == 1.25
         assert names == ["quarter", "halve"]
     finally:
-        stop()
+        observers.remove(told)
     assert quarter(1) == 0.25
     assert len(names) == 2
 

@@ -62,7 +62,10 @@ def test_frames_and_cloud_are_those_of_the_compiled_loops(
     assert there.figures["relative_residual"] == pytest.approx(
         here.figures["relative_residual"], rel=1e-4
     )
-    np.testing.assert_allclose(points["torch:cpu"].range, points["cpu"].range, atol=1e-4)  # m
+    off = np.abs(points["torch:cpu"].range - points["cpu"].range)
+    # Compiled loops fit lone returns by a table of phases, which errs by less than a tenth of their
+    # own deviation; a tenth of a millimetre is for sums in another order.
+    assert np.all(off < 1e-4 + 0.1 * points["cpu"].range_sigma)
 
 
 @pytest.mark.usefixtures("torch")

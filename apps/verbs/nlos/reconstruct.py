@@ -163,7 +163,7 @@ def reconstruct(
     Of a folder every capture is imaged into the folder --out. Captures whose results are there
     already are skipped. If some fail, the others are done all the same, and the exit status is 1.
 
-    Example: tofclip nlos reconstruct capture.h5 --out volume.h5 --surface mesh.ply
+    Example: tofclip nlos reconstruct capture.h5 --out volume.h5 --png volume.png --surface mesh.ply
     """
     order = _ImagingRequest(load_settings(ReconstructSettings, settings, flags), device)
     _check_settings(order.settings)

@@ -158,7 +158,7 @@ def test_tables_have_a_row_for_each_case_and_count_their_steps(library, name, mo
     # rows and steps are at stake here; the search for weights has tests of its own and takes most
     # of the time
     found = WeightChoice(2e-2, np.array([2e-2]), np.array([1.0]))
-    monkeypatch.setattr("tofclip.recovery.light_field.choose_weight", lambda *_: found)
+    monkeypatch.setattr("tofclip.recovery.light_field.choose_weight", lambda *_, **__: found)
     (study,) = find_studies(name)
     steps: list[int] = []
     outcome = study.work(library, 1, steps.append)
