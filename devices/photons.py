@@ -39,6 +39,9 @@ from tofclip.storage import Record
 GATHERING_OPTIONS = ("scans", "binning")
 MAX_CUBE_BYTES = 1 << 32
 STAMPS_SUFFIX = ".dat"
+STAMP_SCHEMES = ("file", "linospad2", "sim+linospad2")
+"""Of addresses whose photons may have a time stamp each; other instruments have bins of their own."""
+
 EDGE_S = 1e-10
 """Standard deviation of a gate's edges and the laser's pulse, where nothing better is known, s."""
 
@@ -112,7 +115,8 @@ def read_photons(address: str, bin_width: float | None = None) -> CountedPhotons
     if scans < 1 or binning < 1:
         raise InputError(f"'{address}': scans and binning must be positive")
     gathering = AccumulationSettings.from_uri(uri, bin_width)
-    with open_source(strip_options(uri, GATHERING_OPTIONS + ACCUMULATION_OPTIONS)) as source:
+    counting = ACCUMULATION_OPTIONS if uri.scheme in STAMP_SCHEMES else ()
+    with open_source(strip_options(uri, GATHERING_OPTIONS + counting)) as source:
         known = source.calibration
         axis = _find_time_axis(known)
         if known is not None and known.kind == BoardCalibration.RECORD_KIND:

@@ -190,7 +190,7 @@ def test_pages_that_are_the_same_stay_untouched(tmp_path: Path) -> None:
 
 def test_what_a_page_says() -> None:
     text = render_page("lidar scene", VERBS["lidar scene"])
-    assert text.startswith("# tofclip lidar scene\n\nList the objects")
+    assert text.startswith("# tofclip lidar scene\n\nList a scene's objects")
     assert "```sh\ntofclip lidar scene frames.h5 --out scene.png\n```" in text
     assert "`--reach-mm MM`\n: Points this close belong together. \\[default: 40.0\\]" in text
     assert "## Arguments\n\n`FRAMES" in text
