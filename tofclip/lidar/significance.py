@@ -17,8 +17,9 @@ brightest return tells it from a dim wall beside a retroreflector. Three things 
   J. Am. Stat. Assoc. 96, 1151 (2001); the decoys are those of proteomics).
 
 What is spread around true returns goes on in neighbouring pixels as well, so decoys do not know it.
-It is less significant than the surface of its own pixel (`MIN_PIXEL_SHARE`) and than most of what
-is at its range (`MIN_INSTANT_SHARE`), and far weaker (`MIN_INSTANT_BRIGHTNESS`). The shares were
+It is less significant, and weaker, than the surface of its own pixel (`MIN_PIXEL_SHARE`), and it is
+less significant than most of what is at its range (`MIN_INSTANT_SHARE`), and far weaker
+(`MIN_INSTANT_BRIGHTNESS`). The shares were
 found on two scenes by different forward models, in bright, dark and dazzled shots.
 """
 
@@ -56,7 +57,8 @@ CANDIDATES = Detection(
 POOL_RADIUS_PX = 2.9
 CORE_RADIUS_PX = 1.5
 MIN_PIXEL_SHARE = 0.3
-"""Of the pixel's most significant candidate, pooled over either radius."""
+"""Of the pixel's most significant candidate, pooled over either radius. What is brighter than that
+one is not what it spreads, however little is known of it at an instant full of light."""
 
 GATE_PULSES_PER_PX = 0.45
 """A pool of 2.9 pixels then reaches 1.3 pulse lengths in range."""
@@ -142,10 +144,33 @@ class SignificanceJudge:
             bright = find_usual_at_range(distance, np.where(kept, signal, 0), length)
             kept &= signal >= MIN_INSTANT_BRIGHTNESS * bright
         for pooled in (core, whole):
-            best = np.zeros(int(np.prod(pool.image_shape)))
-            np.maximum.at(best, pixel, pooled)
-            kept &= pooled >= MIN_PIXEL_SHARE * best[pixel]
+            best, brightness = find_most_significant(pixel, pooled, signal)
+            kept &= (pooled >= MIN_PIXEL_SHARE * best) | (signal >= brightness)
         return kept, probability
+
+
+def find_most_significant(
+    pixel: NDArray[np.int64], pooled: FloatArray, signal: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return significance and signal of the most significant candidate in each one's pixel.
+
+    Parameters
+    ----------
+    pixel : (n,) int array
+        Not decreasing.
+    pooled : (n,) array
+        Significance.
+    signal : (n,) array
+        Counts.
+
+    Returns
+    -------
+    significance, signal : (n,) array
+    """
+    order = np.lexsort((pooled, pixel))
+    _, inverse, counts = np.unique(pixel, return_inverse=True, return_counts=True)
+    last = order[np.cumsum(counts) - 1][inverse]
+    return pooled[last], signal[last]
 
 
 def weigh_candidates(

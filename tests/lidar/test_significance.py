@@ -1,0 +1,48 @@
+"""Which candidates of recovered frames are returns."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import tofclip
+from tofclip.lidar.significance import find_most_significant
+
+SIZE = 32
+SURFACE, RAY = (slice(6, 26), 30, 2000.0), (slice(14, 18), 70, 100.0)
+"""Rows and columns, frame, counts."""
+
+
+def test_what_is_bright_is_not_dropped_for_what_is_dim_and_sure() -> None:
+    """Where an instant is full of light, what the model does not explain of it makes every pixel
+    uncertain; a dim ray in the dark is surer than a bright surface, and no reason to drop it.
+    """
+    camera = tofclip.Camera(
+        [20.0, 60.0, 100.0], [-0.7, 0.0, 0.7], (SIZE, SIZE), 121, pulse_fwhm=60e-12
+    )
+    times = np.arange(100) * 10e-12
+    cube = np.zeros((times.size, SIZE, SIZE), np.float32)
+    for place, frame, brightness in (SURFACE, RAY):
+        pulse = np.exp(-0.5 * ((times - times[frame]) / 25.5e-12) ** 2)
+        cube[:, place, place] += brightness * pulse[:, np.newaxis, np.newaxis].astype(np.float32)
+    figures = {
+        "noise_floor_count": 4.0,
+        "noise_gain_count": 1.0,
+        "noise_dazzle_count": 1e6,
+        "noise_misfit_fraction": 0.3,
+    }
+    returns = tofclip.depth(tofclip.Frames(cube, times, camera, figures=figures))
+    place, frame, _ = SURFACE
+    found = np.zeros((SIZE, SIZE), bool)
+    near = np.abs(returns.time - times[frame]) < camera.pulse_fwhm / 4
+    found[returns.y[near].astype(int), returns.x[near].astype(int)] = True
+    assert found[RAY[0], RAY[0]].all()
+    assert found[place, place].mean() > 0.95  # corners have few neighbours
+
+
+def test_the_most_significant_of_each_pixel() -> None:
+    pixel = np.array([2, 2, 5, 7, 7, 7])
+    pooled = np.array([1.0, 3.0, 2.0, 9.0, 8.0, 7.0])
+    signal = np.array([10.0, 11.0, 12.0, 13.0, 14.0, 15.0])
+    best, brightness = find_most_significant(pixel, pooled, signal)
+    np.testing.assert_array_equal(best, [3, 3, 2, 9, 9, 9])
+    np.testing.assert_array_equal(brightness, [11, 11, 12, 13, 13, 13])
