@@ -254,7 +254,8 @@ def test_captures_on_a_cluster_are_imaged_as_here(run, scheduler, tmp_path):
     )
 
 
-def test_ctrl_c_ends_the_workers_and_leaves_whole_results(recorded, tmp_path):
+@pytest.mark.parametrize("after_s", [0.0, 1.0])  # while workers start, and while they work
+def test_ctrl_c_ends_the_workers_and_leaves_whole_results(recorded, tmp_path, after_s):
     shots, out = tmp_path / "shots", tmp_path / "out"
     shots.mkdir()
     for number in range(40):
@@ -280,7 +281,7 @@ def test_ctrl_c_ends_the_workers_and_leaves_whole_results(recorded, tmp_path):
             process.poll() is None and len(psutil.Process(process.pid).children()) < 2
         ):  # a worker and a tracker
             time.sleep(0.05)
-        time.sleep(1)
+        time.sleep(after_s)
         workers = psutil.Process(process.pid).children(recursive=True)
         os.killpg(process.pid, signal.SIGINT)
         _, err = process.communicate(timeout=300)  # a busy machine takes its time

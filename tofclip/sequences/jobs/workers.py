@@ -7,8 +7,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import signal
-import threading
 from collections.abc import Iterator
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
 from tofclip.errors import InputError, MissingDependencyError
@@ -76,20 +76,20 @@ def _start_local_cluster(distributed: Any, number: int) -> Iterator[Client]:
     replaces it if it dies.
     """
     threads = str(max(1, thread_count() // number))
-    with _silence_log():
-        # The shield is needed only while processes start: they inherit the handler, this one gets
-        # it back.
+    with _silence_log(), contextlib.ExitStack() as running:
+        # Only while processes start; a Ctrl-C of that time comes at the end of the shield.
         with _shield_children_from_interrupt():
-            cluster = distributed.LocalCluster(
-                n_workers=number,
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address="127.0.0.1:0",  # no one else may look
-                silence_logs=logging.CRITICAL,
-                env={THREADS_VARIABLE: threads},
+            cluster = running.enter_context(
+                distributed.LocalCluster(
+                    n_workers=number,
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address="127.0.0.1:0",  # no one else may look
+                    silence_logs=logging.CRITICAL,
+                    env={THREADS_VARIABLE: threads},
+                )
             )
-        with cluster, distributed.Client(cluster) as client:
-            yield client
+        yield running.enter_context(distributed.Client(cluster))
 
 
 @contextlib.contextmanager
@@ -132,15 +132,17 @@ def _shield_children_from_interrupt() -> Iterator[None]:
     """Keep processes started now from hearing Ctrl-C: a terminal sends it to all, and we end them
     ourselves.
     """
-    # Python sets signal handlers from the main thread only.
-    if threading.current_thread() is not threading.main_thread():
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # It unblocks the signal once it has started, so it has to be there before.
+    resource_tracker.ensure_running()
+    # Blocked, not ignored: threads and processes started now inherit it, and nothing is lost.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager
