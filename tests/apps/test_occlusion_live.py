@@ -53,7 +53,10 @@ def test_the_gate_and_the_occluders_width_decide_what_is_seen() -> None:
     assert wide.occluder[0].shape.half_extent[0] == pytest.approx(7.5e-3)
     hidden = look_behind(Experiment(wide, SETTINGS), 0.085)
     assert "nothing is promised" in hidden.description
-    assert not hidden.pictures[CLIP_GATED].any()
+    # What passes beside the occluder is light, far above its noise; it shows no person.
+    seen, gated = between.pictures[CLIP_GATED], hidden.pictures[CLIP_GATED]
+    assert gated.sum() < 0.25 * seen.sum()
+    assert correlation_coefficient(gated, truth) < 0.5
 
 
 def test_every_occluder_has_a_person_behind_it() -> None:
