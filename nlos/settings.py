@@ -112,7 +112,7 @@ METHODS_BY_SPEED = ("rsd", "hybrid", "backprojection")
 """They give the same picture; the later one takes more walls and lasers, and more time."""
 
 MIN_PAIRS_PER_IMAGE = 250
-"""An image by waves takes as long as to back-project so many pairs of spots; measured. One is made
+"""An image by waves takes as long as to back-project this many pairs of spots; measured. One is made
 for every laser spot, or two for every wall point that sees many."""
 
 TRANSFORM_METHODS = ("lct", "fk")

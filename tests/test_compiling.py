@@ -24,7 +24,7 @@ def test_a_part_runs_from_python_and_from_a_compiled_loop() -> None:
 
     names: list[str] = []
     observers.append(names.append)
-    told = observers[-1]
+    observer = observers[-1]
     try:
         assert (halve(3.0), names) == (1.5, [])
         assert quarter(3.0) == 0.75
@@ -32,7 +32,7 @@ def test_a_part_runs_from_python_and_from_a_compiled_loop() -> None:
         assert quarter(5.0) == 1.25
         assert names == ["quarter", "halve"]
     finally:
-        observers.remove(told)
+        observers.remove(observer)
     assert quarter(1) == 0.25
     assert len(names) == 2
 

@@ -26,7 +26,7 @@ def note(frame, event, _):
 import apps.verbs.nlos.reconstruct  # what is called while modules are imported is not its path
 from apps.cli import main
 sys.argv = {words!r}
-sys.settrace(note)  # is told of calls of Python only: cheaper than a profile
+sys.settrace(note)  # sees calls of Python only: cheaper than a profile
 try:
     main()
 except SystemExit:

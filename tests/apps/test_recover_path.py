@@ -30,7 +30,7 @@ def count_calls(action: Callable[[], object]) -> Counter[tuple[str, str]]:
         if event == "call" and is_function and code.co_filename.startswith(OURS):
             calls[code.co_filename.removeprefix(f"{ROOT}/"), code.co_qualname] += 1
 
-    # Of traces and profiles the former are told of our calls only, not of those of compiled code.
+    # A trace sees our calls only, a profile those of compiled code as well.
     before = sys.gettrace()
     threading.settrace(note)
     sys.settrace(note)

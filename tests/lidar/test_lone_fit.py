@@ -16,7 +16,7 @@ TIMES = 10e-9 + BIN * np.arange(BINS)
 
 
 def look(arrivals_bins: np.ndarray, times: np.ndarray, noise: float = 0.0) -> Frames:
-    """One return in each pixel, so many bins after the first."""
+    """One return in each pixel, this many bins after the first."""
     after = times[:, np.newaxis] - (times[0] + BIN * arrivals_bins)
     values = 100 * Pulse.gaussian(FWHM)(after) + 3.0
     values += np.random.default_rng(0).normal(0, 1, values.shape) * noise

@@ -43,7 +43,7 @@ class World:
         self.jitter_m = jitter_m
 
     def see(self, distance: float, photons: float, percent: float = np.nan) -> TargetShot:
-        """A shot of a plate that sends back so many photons from the axis."""
+        """A shot of a plate that sends back this many photons from the axis."""
         y, x = (place.ravel() for place in np.indices(SHAPE))
         cosine = compute_ray_directions(CAMERA, y, x)[:, 2]
         true = distance / cosine

@@ -19,8 +19,8 @@ brightest return tells it from a dim wall beside a retroreflector. Three things 
 What is spread around true returns goes on in neighbouring pixels as well, so decoys do not know it.
 It is less significant, and weaker, than the surface of its own pixel (`MIN_PIXEL_SHARE`), and it is
 less significant than most of what is at its range (`MIN_INSTANT_SHARE`), and far weaker
-(`MIN_INSTANT_BRIGHTNESS`). The shares were
-found on two scenes by different forward models, in bright, dark and dazzled shots.
+(`MIN_INSTANT_BRIGHTNESS`). The shares were found on two scenes by different forward models, in
+bright, dark and dazzled shots.
 """
 
 from __future__ import annotations
@@ -168,8 +168,7 @@ def find_most_significant(
     significance, signal : (n,) array
     """
     order = np.lexsort((pooled, pixel))
-    _, inverse, counts = np.unique(pixel, return_inverse=True, return_counts=True)
-    last = order[np.cumsum(counts) - 1][inverse]
+    last = order[np.searchsorted(pixel, pixel, side="right") - 1]
     return pooled[last], signal[last]
 
 
