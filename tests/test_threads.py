@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from tofclip import threads as threads_module
 from tofclip.errors import InputError
 from tofclip.threads import (
     LANES,
@@ -126,6 +127,20 @@ def test_items_are_taken_as_they_are_needed():
     assert len(taken) == thread_count() + 1
     coming.close()
     assert len(taken) == thread_count() + 1
+
+
+def test_a_forgotten_map_may_be_closed_while_this_thread_holds_the_lock():
+    coming = map_parallel(abs, range(1000))
+    assert next(coming) == 0
+
+    def close_as_the_collector_might() -> None:
+        with threads_module._blas_limit.lock:
+            coming.close()
+
+    closing = threading.Thread(target=close_as_the_collector_might, daemon=True)
+    closing.start()
+    closing.join(30)
+    assert not closing.is_alive()
 
 
 def test_work_on_this_thread_stays_there_when_a_part_of_it_asks_for_the_same(monkeypatch):

@@ -180,7 +180,9 @@ class _BlasLimit:
     """What `limit_blas_threads` has changed in this process, for all its threads."""
 
     def __init__(self) -> None:
-        self.lock = threading.Lock()
+        # The collector may close a forgotten `map_parallel` at any time, also on the thread that
+        # holds the lock.
+        self.lock = threading.RLock()
         self.open_blocks = 0
         self.limited: dict[str, tuple[LibController, int]] = {}
         """By file: a library that has one number of threads for the process, and what it had."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,18 +26,17 @@ def scheduler() -> Iterator[str]:
     """Address of a scheduler with two workers; a job may outlive one of them and no more."""
     dask = pytest.importorskip("dask", reason="dask.distributed is an extra")
     distributed = pytest.importorskip("distributed", reason="dask.distributed is an extra")
-    settings = {"distributed.scheduler.allowed-failures": 1}
-    with (
-        dask.config.set(settings),
-        distributed.LocalCluster(
+    with dask.config.set({"distributed.scheduler.allowed-failures": 1}):
+        cluster = distributed.LocalCluster(
             n_workers=2,
             threads_per_worker=1,
             dashboard_address="127.0.0.1:0",
             silence_logs=logging.CRITICAL,
             env={"TOFCLIP_THREADS": "1"},
-        ) as cluster,
-    ):
+        )
         yield cluster.scheduler_address
+        with contextlib.suppress(TimeoutError):  # what is left of it ends with this process
+            cluster.close(timeout=60)
 
 
 @pytest.fixture(scope="package")
