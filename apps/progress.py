@@ -89,7 +89,13 @@ def _draw_bar(title: str, total: int | None) -> Iterator[Advance]:
     )
     if total is None:
         columns = columns[:2] + columns[3:4]  # nothing is known of what is left
-    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as drawn:
+    # Printed while the bar is there, a line goes above it; a pipe gets it as it is.
+    with progress.Progress(
+        *columns,
+        console=Console(stderr=True),
+        transient=True,
+        redirect_stdout=sys.stdout.isatty(),
+    ) as drawn:
         task = drawn.add_task(title, total=total)
         yield lambda amount: drawn.advance(task, amount)
 

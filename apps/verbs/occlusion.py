@@ -241,7 +241,7 @@ def _show_live(
 ) -> None:
     """Serve a page with the walk, or with a recording behind a gate, until Ctrl-C."""
     from apps.occlusion.live import GatedSource, WalkSource
-    from apps.verbs.view import serve_page
+    from apps.verbs.view import PageDoor
     from apps.viewer.server import LOOPBACK
     from apps.viewer.session import Session
     from apps.viewer.source_factory import ShotOptions, open_source
@@ -255,7 +255,7 @@ def _show_live(
             else GatedSource(open_source(recording, ShotOptions(camera, time_zero=time_zero)))
         )
     with contextlib.closing(source) as opened:
-        serve_page(Session(opened), LOOPBACK, port, no_browser, as_json)
+        PageDoor(LOOPBACK, port, no_browser, as_json).serve(Session(opened))
 
 
 def _run_experiment(experiment: Experiment) -> tuple[SeparatedImages, list[ProbeResult]]:

@@ -6,6 +6,8 @@ import contextlib
 import sys
 import time
 import webbrowser
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,12 +16,18 @@ import typer
 from apps.conventions import JsonOption, TimeZeroOption, make_completer, report, require_writable
 from apps.progress import show_activity, show_progress
 from apps.viewer.desktop import open_window
-from apps.viewer.page import Page
+from apps.viewer.page import Page, WaitingPage
 from apps.viewer.render import choose_renderer
 from apps.viewer.scene_figure import choose_frames, save_film, save_picture
 from apps.viewer.server import parse_loopback
 from apps.viewer.session import Session
-from apps.viewer.source_factory import LOOK_METHODS, SURFACES, ShotOptions, open_source
+from apps.viewer.source_factory import (
+    LOOK_METHODS,
+    SURFACES,
+    ShotOptions,
+    announce_nothing,
+    open_source,
+)
 from tofclip.errors import InputError
 from tofclip.units import NANOSECOND, PICOSECOND
 
@@ -96,11 +104,14 @@ def view(
         None if time_zero_ns is None else time_zero_ns * NANOSECOND,
         method,
     )
+    is_page = not (desktop or png or mp4)
+    door = PageDoor(host, port, no_browser, as_json)
     # Closing stops a live source and its threads, however the view ends.
-    with show_activity(f"opening {source}"):
-        found = open_source(source, known)
-    with contextlib.closing(found) as opened:
-        session = Session(opened)
+    with contextlib.closing(door), contextlib.ExitStack() as opened:
+        with show_activity(f"opening {source}"):
+            announce = partial(door.open_waiting, source) if is_page else announce_nothing
+            found = opened.enter_context(contextlib.closing(open_source(source, known, announce)))
+            session = Session(found)
         if png is not None:
             _draw_picture(session, png, started, as_json)
         elif mp4 is not None:
@@ -108,7 +119,7 @@ def view(
         elif desktop:
             _open_window(session)
         else:
-            serve_page(session, host, port, no_browser, as_json)
+            door.serve(session)
 
 
 def _check_outputs(
@@ -146,14 +157,13 @@ def _open_window(session: Session) -> None:
     open_window(session)
 
 
-def serve_page(
-    session: Session, host: str, port: int | None, no_browser: bool, as_json: bool
-) -> None:
-    """Serve a page until Ctrl-C.
+@dataclass
+class PageDoor:
+    """Where the page is served, and how a browser comes there: at once where a source takes seconds,
+    so that the page is loaded by then.
 
     Parameters
     ----------
-    session : Session
     host : str
         A loopback address, or ``"localhost"``.
     port : int, optional
@@ -162,15 +172,54 @@ def serve_page(
         Whether the page is not opened here.
     as_json : bool
         Whether its address is reported as JSON.
-
-    Raises
-    ------
-    InputError, MissingDependencyError
-        It cannot be served.
     """
-    with contextlib.closing(Page(session, port, parse_loopback(host))) as page:
-        report({"address": page.address}, as_json)
+
+    host: str
+    port: int | None = None
+    no_browser: bool = False
+    as_json: bool = False
+    _waiting: WaitingPage | None = None
+
+    def open_waiting(self, source: str, words: str) -> None:
+        """Serve a page that says what is being done.
+
+        Parameters
+        ----------
+        source : str
+            As the user named it.
+        words : str
+            What is being done.
+        """
+        title = source if "://" in source else Path(source).name
+        self._waiting = WaitingPage(title, words, self.port, parse_loopback(self.host))
+        self._show_address(self._waiting.address)
+
+    def serve(self, session: Session) -> None:
+        """Serve a session until Ctrl-C.
+
+        Parameters
+        ----------
+        session : Session
+
+        Raises
+        ------
+        InputError, MissingDependencyError
+            It cannot be served.
+        """
+        page = Page(session, self.port, parse_loopback(self.host), self._waiting)
+        was_waiting, self._waiting = self._waiting is not None, None
+        with contextlib.closing(page):
+            if not was_waiting:
+                self._show_address(page.address)
+            page.run()
+
+    def close(self) -> None:
+        """Stop serving a page that still waits: there will be nothing to look at."""
+        if self._waiting is not None:
+            self._waiting.close()
+
+    def _show_address(self, address: str) -> None:
+        report({"address": address}, self.as_json)
         sys.stdout.flush()  # a program that reads the address waits for it
-        if not no_browser:
-            webbrowser.open(page.address)
-        page.run()
+        if not self.no_browser:
+            webbrowser.open(address)

@@ -6,7 +6,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,13 +14,16 @@ from apps.viewer.controls import Controls
 from apps.viewer.drawing import POINT_STYLE, FramePacer, Points, RateCounter
 from apps.viewer.export_panel import ExportPanel
 from apps.viewer.furniture import draw_furniture
-from apps.viewer.page_text import Status, format_page_title, render_page_html
+from apps.viewer.page_text import Status, format_page_title, render_page_html, render_waiting_html
 from apps.viewer.selection_panel import NO_SHADOWS, SelectionPanel
 from apps.viewer.server import LOOPBACK, get_address, start_server, stop_server
 from apps.viewer.session import DisplayedFrame, Session
 from apps.viewer.side_pictures import render_pictures
 from apps.viewer.viewpoint import Box, Viewpoint, make_presets, move_camera, place_viewpoint
 from tofclip.errors import TofclipError
+
+if TYPE_CHECKING:
+    import viser
 
 TICK_S = 1 / 60
 """s between two looks at the clock."""
@@ -44,13 +47,15 @@ AMBIENT_INTENSITY = 2.0
 SURFACE_COLOUR = (216, 210, 196)
 
 
-class Page:
-    """Serves a session. One thread, in `run`, owns the session; whatever the browsers ask for waits
-    in a queue.
+class WaitingPage:
+    """A page that says what is being done, until `Page` takes its place: browsers load it meanwhile.
 
     Parameters
     ----------
-    session : Session
+    title : str
+        Of the source.
+    words : str
+        What is being done.
     port : int, optional
     host : str
         A loopback address.
@@ -61,15 +66,58 @@ class Page:
         As `start_server`.
     """
 
-    def __init__(self, session: Session, port: int | None = None, host: str = LOOPBACK) -> None:
+    def __init__(
+        self, title: str, words: str, port: int | None = None, host: str = LOOPBACK
+    ) -> None:
+        self.server = start_server(port, host)
+        self.address = get_address(self.server, host)
+        _set_up_panel(self.server, title)
+        self._words = self.server.gui.add_html(render_waiting_html(words))
+
+    def hand_over(self) -> viser.ViserServer:
+        """Return the server, its page empty again."""
+        self._words.remove()
+        return self.server
+
+    def close(self) -> None:
+        """Stop serving."""
+        stop_server(self.server)
+
+
+class Page:
+    """Serves a session. One thread, in `run`, owns the session; whatever the browsers ask for waits
+    in a queue.
+
+    Parameters
+    ----------
+    session : Session
+    port : int, optional
+    host : str
+        A loopback address.
+    waiting : WaitingPage, optional
+        Served already, where this page is to be; instead of port and host.
+
+    Raises
+    ------
+    InputError, MissingDependencyError
+        As `start_server`.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        port: int | None = None,
+        host: str = LOOPBACK,
+        waiting: WaitingPage | None = None,
+    ) -> None:
         self.session = session
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stopping, self._woken = threading.Event(), threading.Event()
         first = session.frame_at(time.monotonic())
         self._framed_cloud = first.cloud.xyz
         self.viewpoint = place_viewpoint(first.cloud.xyz, SCENE_ASPECT)
-        self.server = start_server(port, host)
-        self.address = get_address(self.server, host)
+        self.server = start_server(port, host) if waiting is None else waiting.hand_over()
+        self.address = get_address(self.server, host) if waiting is None else waiting.address
         self._pace, self._frames = FramePacer(), RateCounter()
         self.points = Points(self.server, self.post)
         self._set_up_scene()
@@ -124,10 +172,7 @@ class Page:
 
     def _set_up_scene(self) -> None:
         server = self.server
-        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        server.gui.set_panel_label(format_page_title(self.session.source.title))
-        server.gui.main_panel.dock_right()
-        server.gui.main_panel.set_width(PANEL_PX)
+        _set_up_panel(server, self.session.source.title)
         server.scene.set_up_direction("-y")
         # Shadows and reflections say nothing here, and take a software renderer ten seconds to
         # prepare for.
@@ -274,3 +319,11 @@ class Page:
             client.add_notification(
                 "that cannot be", str(fault), auto_close_seconds=6.0, color="red"
             )
+
+
+def _set_up_panel(server: viser.ViserServer, title: str) -> None:
+    """Dock the panel of controls at the right, under the name of the source."""
+    server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+    server.gui.set_panel_label(format_page_title(title))
+    server.gui.main_panel.dock_right()
+    server.gui.main_panel.set_width(PANEL_PX)

@@ -160,6 +160,17 @@ def render_page_html(title: str) -> str:
     )
 
 
+def render_waiting_html(words: str) -> str:
+    """Return what is said while there is nothing to look at yet.
+
+    Parameters
+    ----------
+    words : str
+        What is being done.
+    """
+    return f"<div id='waiting' style='{HTML_STYLE}'>{html.escape(words)} ...</div>"
+
+
 def format_page_title(title: str) -> str:
     """Return what stands above the controls."""
     return f"tofclip · {title}"[:60]

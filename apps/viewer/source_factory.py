@@ -76,7 +76,17 @@ class ShotOptions:
     method: str | None = None
 
 
-def open_source(name: str, options: ShotOptions | None = None) -> Source:
+Announce = Callable[[str], None]
+"""Called with what is about to be done, before it takes seconds."""
+
+
+def announce_nothing(_: str) -> None:
+    """Take no notice."""
+
+
+def open_source(
+    name: str, options: ShotOptions | None = None, announce: Announce = announce_nothing
+) -> Source:
     """Open a file, a folder of files, or the address of an instrument.
 
     Parameters
@@ -86,6 +96,8 @@ def open_source(name: str, options: ShotOptions | None = None) -> Source:
         streak image; a folder of clouds or of streak images; or an address such as
         ``sim+linospad2://?seed=1``.
     options : ShotOptions, optional
+    announce : callable
+        Called with what is done where it takes seconds, as soon as the inputs are known to be good.
 
     Returns
     -------
@@ -98,22 +110,22 @@ def open_source(name: str, options: ShotOptions | None = None) -> Source:
     """
     options = options or ShotOptions()
     if "://" in name:
-        return _open_instrument(name, options)
+        return _open_instrument(name, options, announce)
     path = Path(name)
     if path.is_dir():
-        return _open_folder(path, options)
+        return _open_folder(path, options, announce)
     with translate_read_errors(path), open(path, "rb") as file:
         start = file.read(len(HDF5_SIGNATURE))
     if start == HDF5_SIGNATURE:
-        return _open_hdf5(path, options)
+        return _open_hdf5(path, options, announce)
     if path.suffix.lower() in CLOUD_SUFFIXES and not (
         path.suffix.lower() == ".npz" and _is_lift_archive(path)
     ):
         return CloudSource(path.name, [path])
-    return _open_shots(path.name, [partial(_read_shot, path, options)], options)
+    return _open_shots(path.name, [partial(_read_shot, path, options)], options, announce)
 
 
-def _open_hdf5(path: Path, options: ShotOptions) -> Source:
+def _open_hdf5(path: Path, options: ShotOptions, announce: Announce) -> Source:
     if _is_stack(path):
         from tofclip.shots import StreakStack
 
@@ -122,6 +134,7 @@ def _open_hdf5(path: Path, options: ShotOptions) -> Source:
             path.name,
             [partial(_read_stacked_shot, stack, number, options) for number in range(len(stack))],
             options,
+            announce,
         )
     record = Record.load(path)
     if record.kind == "frames":
@@ -136,27 +149,33 @@ def _open_hdf5(path: Path, options: ShotOptions) -> Source:
     if record.kind == "cloud":
         return CloudSource(path.name, [path])
     if record.kind == "streak":
-        return _open_shots(path.name, [partial(_read_shot, path, options)], options)
+        return _open_shots(path.name, [partial(_read_shot, path, options)], options, announce)
     raise FileFormatError(
         path, f"holds a {record.kind} record; frames, clouds, volumes and shots can be looked at"
     )
 
 
-def _open_folder(path: Path, options: ShotOptions) -> Source:
+def _open_folder(path: Path, options: ShotOptions, announce: Announce) -> Source:
     if clouds := find_clouds(path):
         return CloudSource(path.name, clouds)
     shots = sorted(entry for entry in path.iterdir() if entry.is_file() and entry.name[0] != ".")
     if not shots:
         raise InputError(f"{path}: the folder holds nothing to look at")
-    return _open_shots(path.name, [partial(_read_shot, shot, options) for shot in shots], options)
+    readers = [partial(_read_shot, shot, options) for shot in shots]
+    return _open_shots(path.name, readers, options, announce)
 
 
-def _open_shots(title: str, shots: Sequence[Callable[[], Streak]], options: ShotOptions) -> Source:
+def _open_shots(
+    title: str,
+    shots: Sequence[Callable[[], Streak]],
+    options: ShotOptions,
+    announce: Announce,
+) -> Source:
     """Shots in files. A single one becomes a transient, so that time can be walked through."""
     first = shots[0]()
     if options.method == SURFACES and len(shots) == 1:
-        return _open_surfaces(title, first, options)
-    camera = _find_camera(first, options)
+        return _open_surfaces(title, first, options, announce)
+    camera = _find_camera(title, first, options, announce)
     if len(shots) > 1:
         return StoredShotSource(title, shots, camera, _make_method(options.method))
     measured = measure(first.counts, first.saturated, camera)
@@ -169,9 +188,10 @@ def _open_shots(title: str, shots: Sequence[Callable[[], Streak]], options: Shot
     return source
 
 
-def _open_surfaces(title: str, shot: Streak, options: ShotOptions) -> Source:
+def _open_surfaces(title: str, shot: Streak, options: ShotOptions, announce: Announce) -> Source:
     """A single shot by its surfaces; a refocus, which shows frames, is quick."""
     opened = open_shot(shot, options.camera, options.time_zero)
+    announce(f"recovering the surfaces of {title}")
     frames = plan_recovery(opened, SURFACES).run()
     measured = measure(shot.counts, shot.saturated, frames.camera)
     return TransientSource(title, frames, measured.values, _make_method(FIRST_LOOK_METHOD))
@@ -194,21 +214,23 @@ def _make_method(name: str | None) -> Method | None:
     return cast(Method, make_method(name, iterations=iterations))
 
 
-def _open_instrument(address: str, options: ShotOptions) -> Source:
+def _open_instrument(address: str, options: ShotOptions, announce: Announce) -> Source:
     """An instrument that goes on, or a recording, which is gathered once."""
     if address.lower().startswith("file://"):
-        return _open_shots(address, [lambda: read_transient(address, options.bin_width)], options)
+        reader = partial(read_transient, address, options.bin_width)
+        return _open_shots(address, [reader], options, announce)
     shots = TrackedShots(read_transients(address, options.bin_width))
     first = shots.peek()
     if first is None:
         raise InputError(f"{address}: the source ended before it gave anything")
-    camera = _find_camera(first, options)
+    camera = _find_camera(address, first, options, announce)
     return LiveShotSource(address, shots, camera, _make_method(options.method))
 
 
-def _find_camera(shot: Streak, options: ShotOptions) -> Camera:
+def _find_camera(title: str, shot: Streak, options: ShotOptions, announce: Announce) -> Camera:
     """The camera of a row of shots; a sweep that is not known is found from the first one."""
     opened = open_shot(shot, options.camera, options.time_zero)
+    announce(f"recovering {title}")
     return opened.fit_camera(max_rounds=FIRST_LOOK_ROUNDS).camera
 
 

@@ -21,6 +21,7 @@ from apps.occlusion.live import (
     look_behind,
 )
 from apps.occlusion.scenes import make_occlusion_scene, make_walking_scene
+from apps.verbs.view import PageDoor
 from apps.viewer.session import Session
 from apps.viewer.source_factory import open_source
 from tofclip.errors import InputError
@@ -118,7 +119,7 @@ def test_the_verb_serves_either(
     run: Run, files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     served: list[Any] = []
-    monkeypatch.setattr("apps.verbs.view.serve_page", lambda session, *_: served.append(session))
+    monkeypatch.setattr(PageDoor, "serve", lambda _, session: served.append(session))
     words = ("occlusion", "demo", "--live", "--no-browser")
     assert run(*words, "--scene", "bush", "--side-px", 24).status == 0
     assert run(*words, "--recording", files / "streak.h5").status == 0

@@ -7,18 +7,21 @@ import os
 import subprocess
 import sys
 import time
+import urllib.request
 from pathlib import Path
 
 import pytest
-from viewer_scenes import frames, plane
+from viewer_scenes import frames, plane, streak
 
 import tofclip
 from apps.cli import main
 from apps.viewer import render
 from apps.viewer.desktop import DesktopWindow, open_window
+from apps.viewer.page import Page
 from apps.viewer.session import Session
 from apps.viewer.transient import TransientSource
-from tofclip.errors import MissingDependencyError
+from tofclip.errors import InputError, MissingDependencyError
+from tofclip.recovery import Shot
 
 ROOT = Path(tofclip.__file__).parents[1]
 PROGRAM = [sys.executable, "-m", "apps", "view"]
@@ -76,6 +79,35 @@ def test_a_window_without_a_display_says_what_is_missing(
     monkeypatch.setattr("apps.viewer.desktop.has_working_graphics", lambda: False)
     with pytest.raises(MissingDependencyError, match="OpenGL"):
         open_window(Session(TransientSource("frames", frames())))
+
+
+def test_the_page_of_a_raw_shot_opens_before_it_is_recovered(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is wrong with the inputs is said without a page; after that, the address comes first."""
+    shot = tmp_path / "shot.h5"
+    streak().save(shot)
+    order: list[str] = []
+    fit = Shot.fit_camera
+    monkeypatch.setattr(
+        Shot, "fit_camera", lambda *words, **more: order.append("recovered") or fit(*words, **more)
+    )
+    monkeypatch.setattr("webbrowser.open", lambda _: order.append("page"))
+    monkeypatch.setattr(Page, "run", lambda page: order.append(page.address))
+    assert main(["view", str(shot), "--camera", str(tmp_path / "none.h5")]) == 2
+    assert order == []
+    capsys.readouterr()
+    assert main(["view", str(shot), "--json"]) == 0
+    address = json.loads(capsys.readouterr().out)["address"]
+    assert order == ["page", "recovered", address]
+    monkeypatch.setattr(Shot, "fit_camera", lambda *_, **__: raise_input_error())
+    assert main(["view", str(shot), "--json"]) == 2
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(json.loads(capsys.readouterr().out)["address"])
+
+
+def raise_input_error() -> None:
+    raise InputError("no light")
 
 
 def test_the_window_follows_its_keys() -> None:

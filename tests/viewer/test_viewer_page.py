@@ -15,9 +15,10 @@ import pytest
 from matplotlib.image import imread
 from viewer_scenes import PlaneSource, frames, volume
 
-from apps.viewer.page import Page
+from apps.viewer.page import Page, WaitingPage
 from apps.viewer.session import GATE_AROUND_FRAME, Session
 from apps.viewer.transient import TransientSource
+from apps.viewer.viewpoint import Viewpoint
 from apps.viewer.volume import SLICE_MODE, SURFACE_MODE, VolumeSource
 from tofclip.lidar import PointCloud
 
@@ -227,6 +228,30 @@ def test_no_control_moves_while_frames_pass(seen: Seen, seconds: float) -> None:
     seen.press("pause")
     seen.choose("speed", "1")
     seen.press(">|")
+
+
+def test_a_page_that_waits_becomes_the_page_in_the_same_tab(browser: Any) -> None:
+    """A raw shot takes seconds: the browser has loaded by then, and says what it waits for."""
+    waiting = WaitingPage("shot.tif", "recovering <b>shot.tif")
+    tab = browser.new_page(viewport={"width": 1024, "height": 700})
+    tab.goto(waiting.address)
+    tab.locator("#waiting").wait_for(timeout=LOADING_MS)
+    assert tab.locator("#waiting").inner_text() == "recovering <b>shot.tif ..."
+    page = Page(Session(PlaneSource()), waiting=waiting)
+    thread = threading.Thread(target=page.run, daemon=True)
+    thread.start()
+    tab.locator("#frame-number").wait_for(timeout=LOADING_MS)
+    assert tab.locator("#waiting").count() == 0
+    (client,) = page.server.get_clients().values()
+    until(lambda: page.viewpoint.is_close_to(look(client)), "the cloud is framed", LOADING_MS)
+    tab.close()
+    page.close()
+    thread.join(10)
+
+
+def look(client: Any) -> Viewpoint:
+    """Where a browser looks from."""
+    return Viewpoint(client.camera.position, client.camera.look_at, client.camera.fov)
 
 
 def test_play_pause_and_step(seen: Seen) -> None:
