@@ -179,12 +179,43 @@ def report(
         print(json.dumps(plain, allow_nan=False))
         return
     width = max(map(len, plain), default=0)
+    compared = _find_compared(plain)
     for name, value in plain.items():
-        print(f"{name.replace('_', ' '):<{width}}  {_format_value(value)}")
+        if name not in compared:
+            print(f"{_format_name(name):<{width}}  {_format_value(value)}")
+        elif name == compared[0]:
+            print("\n".join(_format_table({column: plain[column] for column in compared})))
     if note:
         print(f"note: {note}")
     for path in written:
         print(f"wrote {path}")
+
+
+def _find_compared(figures: Mapping[str, Any]) -> list[str]:
+    """Return the names of mappings that say the same of several things, such as methods."""
+    rows = {name: tuple(value) for name, value in figures.items() if isinstance(value, dict)}
+    kinds = list(rows.values())
+    shared = next((keys for keys in kinds if len(keys) > 1 and kinds.count(keys) > 1), ())
+    return [name for name, keys in rows.items() if shared and keys == shared]
+
+
+def _format_table(columns: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Put several things side by side: a column for each, a line for each figure."""
+    figures = list(next(iter(columns.values())))
+    cells = [["", *map(_format_name, columns)]]
+    cells += [
+        [_format_name(name), *(_format_value(column[name]) for column in columns.values())]
+        for name in figures
+    ]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return [
+        "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in cells
+    ]
+
+
+def _format_name(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def describe_ranges(frames: Frames) -> str:
@@ -228,7 +259,9 @@ def _format_value(value: Any) -> str:
             return summarise_list(value)
         return ", ".join(map(_format_value, value))
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_format_value(entry)}" for name, entry in value.items())
+        return ", ".join(
+            f"{_format_name(name)} {_format_value(entry)}" for name, entry in value.items()
+        )
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) < 1000 else f"{value:.0f}"
     return "unknown" if value is None else str(value)

@@ -11,6 +11,7 @@ import inspect
 import re
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, cast
@@ -162,9 +163,39 @@ def simplify_help(command: Command) -> None:
     Importing what draws frames around the help takes longer than all the rest of showing it.
     """
     command.rich_markup_mode = None
+    # the settings of a verb stand under a heading of their own
+    command.format_options = partial(_write_options, command)  # type: ignore[method-assign]
+    usage = command.collect_usage_pieces
+    command.collect_usage_pieces = lambda ctx: _simplify_usage(usage(ctx))  # type: ignore[method-assign]
     _hide_types_of_flags(command.get_params(typer.Context(command)))
     for further in getattr(command, "commands", {}).values():
         simplify_help(further)
+
+
+def _write_options(command: Command, ctx: Any, formatter: Any) -> None:
+    """Write arguments and options under their headings, and a group's verbs."""
+    panels: dict[str, list[tuple[str, str]]] = {}
+    for param in command.get_params(ctx):
+        entry = param.get_help_record(ctx)
+        if entry is not None:
+            usual = "Arguments" if param.param_type_name == "argument" else "Options"
+            heading = getattr(param, "rich_help_panel", None) or usual
+            panels.setdefault(heading, []).append((entry[0], _simplify_default(entry[1])))
+    for heading, entries in panels.items():
+        with formatter.section(heading):
+            formatter.write_dl(entries)
+    if isinstance(command, TyperGroup):
+        command.format_commands(ctx, formatter)
+
+
+def _simplify_usage(pieces: Sequence[str]) -> list[str]:
+    """Take the braces off the names of arguments, of which typer writes ``{SHOT...}...``."""
+    return [re.sub(r"^\{(.*?)(\.\.\.)?\}", r"\1", piece) for piece in pieces]
+
+
+def _simplify_default(text: str) -> str:
+    """Take the brackets off a default in words, which typer puts around it within its own."""
+    return re.sub(r"\[default: \((.*)\)\]$", r"[default: \1]", text)
 
 
 def _hide_types_of_flags(params: Sequence[Any]) -> None:
@@ -240,4 +271,4 @@ def _keep_table(paragraph: str) -> str:
 
 
 def _is_table(paragraph: str) -> bool:
-    return re.search(r"^[ *-]", paragraph, re.MULTILINE) is not None
+    return re.search(r"^( |[*-] )", paragraph, re.MULTILINE) is not None

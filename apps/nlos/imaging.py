@@ -75,6 +75,7 @@ class ImagingSettings:
         None,
         "Fill all of that box with voxels, not only the part that coarse ones find bright.",
         False,
+        shown="no",
     )
     flip: str | None = setting_field(
         "AXIS", "Mirror the picture along x or y.", shown="no", choices=("x", "y")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apps.viewer.shot_recovery import find_min_intensity
 from apps.viewer.source import Source, View
 from tofclip.errors import FileFormatError, InputError
 from tofclip.lidar import PointCloud
@@ -42,6 +43,11 @@ class CloudSource(Source):
         self._cache: OrderedDict[int, View] = OrderedDict()
         if not self._paths:
             raise InputError(f"{title}: there is no cloud to show")
+        cloud = self.view(0).cloud
+        # Of a cloud of this program: the dim rays that few views leave around bright things would
+        # hide the others. What intensities of other programs mean is not known.
+        if np.any(cloud.range_sigma > 0):
+            self.min_intensity = find_min_intensity(cloud)
 
     def __len__(self) -> int:
         return len(self._paths)

@@ -308,13 +308,17 @@ class AppearancePanel:
         self._bind(self._size, lambda _: resize())
 
     def _add_filters(self, first: DisplayedFrame) -> None:
-        columns = {"range": first.cloud.range, "intensity": first.cloud.intensity}
-        columns |= dict(zip("xyz", first.cloud.xyz.T, strict=True))
+        cloud = self._session.source.view(first.frame).cloud  # whole, as without filters
+        columns = {"range": cloud.range, "intensity": cloud.intensity}
+        columns |= dict(zip("xyz", cloud.xyz.T, strict=True))
         self._filter_handles: dict[str, tuple[Any, Limits]] = {}
         for name in FILTER_NAMES:
             whole = _round_outwards(columns[name])
+            low, high = getattr(self._session.filters, name)
             handle = self._gui.add_vector2(
-                name, whole, hint="least and most; in m, intensities in counts"
+                name,
+                (max(low, whole[0]), min(high, whole[1])),
+                hint="least and most; in m, intensities in counts",
             )
             self._filter_handles[name] = handle, whole
             self._bind(handle, lambda _: self._set_filters())

@@ -12,7 +12,7 @@ import numpy as np
 from apps.viewer.colouring import PALETTE_SIZE, Scale, choose_ticks, load_palette
 from tofclip.units import NANOSECOND, SPEED_OF_LIGHT
 
-GRADIENT_STOPS = 24
+GRADIENT_STOPS, LABEL_MARGIN = 24, 0.04
 HTML_STYLE = "padding:0.2em 0.8em 0.6em;font-size:0.85em;line-height:1.5"
 LINE_STYLE = (
     "white-space:nowrap;overflow:hidden;text-overflow:ellipsis;font-variant-numeric:tabular-nums"
@@ -104,7 +104,10 @@ class Status:
         lines.append(f"<span id='points'>{self.points}</span> points{part}")
         if self.frames > 1 or self.label == "LIVE":
             coming = f"data {self.data_rate:.1f}/s, " if self.data_rate > 0 else ""
-            lines.append(f"<span id='rates'>{coming}shown {self.frame_rate:.1f}/s</span>")
+            shown_words = (
+                f"shown {self.frame_rate:.1f}/s" if self.frame_rate > 0 else "standing still"
+            )
+            lines.append(f"<span id='rates'>{coming}{shown_words}</span>")
         if self.label == "LIVE" or np.isfinite(self.cloud_latency):
             delay = (
                 f"{1e3 * self.cloud_latency:.0f} ms"
@@ -133,7 +136,8 @@ def render_scale_html(scale: Scale) -> str:
     stops = ",".join(f"rgb({red},{green},{blue})" for red, green, blue in colours.tolist())
     places, title = choose_ticks(scale)
     ticks = "".join(
-        f"<span style='position:absolute;left:{100 * place:.1f}%;transform:translateX(-50%)'>{label}</span>"
+        f"<span style='position:absolute;left:{100 * place:.1f}%;transform:translateX(-{_find_label_shift(place)}%)'>"
+        f"{label}</span>"
         for place, label in places
     )
     return (
@@ -141,6 +145,11 @@ def render_scale_html(scale: Scale) -> str:
         f"<div style='height:0.9em;background:linear-gradient(to right,{stops})'></div>"
         f"<div style='position:relative;height:1.5em'>{ticks}</div></div>"
     )
+
+
+def _find_label_shift(place: float) -> int:
+    """Share of a label's width by which it stands left of its place, %: at the ends it stays inside."""
+    return 0 if place < LABEL_MARGIN else 100 if place > 1 - LABEL_MARGIN else 50
 
 
 def render_page_html(title: str) -> str:

@@ -82,6 +82,8 @@ GATE_MODES = (GATE_UP_TO_FRAME, GATE_AROUND_FRAME, GATE_ALL_TIMES)
 or ever does.
 """
 
+DIM_NOTE = "dim points are left out (filters, intensity)"
+
 HALF_GATE_FRAMES = 12
 """Frames on either side of the current one, in the gate `GATE_AROUND_FRAME`, unless set."""
 
@@ -132,7 +134,9 @@ class Session:
     def __init__(self, source: Source) -> None:
         self.source = source
         self.clock = PlaybackClock(source.rate)
-        self.colouring, self.filters = Colouring(), Filters()
+        self.colouring = Colouring()
+        least = source.min_intensity
+        self.filters = Filters(intensity=(least, np.inf)) if least > 0 else Filters()
         self.gate, self.half_gate = GATE_UP_TO_FRAME, HALF_GATE_FRAMES
         self.shear: float | None = None
         self.following = source.is_live
@@ -164,7 +168,9 @@ class Session:
     def notes(self) -> tuple[str, ...]:
         """What has to be known about what is shown, each once."""
         refocused = (self.source.refocus_note,) if self.shear is not None else ()
-        return tuple(dict.fromkeys(note for note in (*refocused, *self.source.notes) if note))
+        least = self.source.min_intensity
+        dim = (DIM_NOTE,) if least > 0 and self.filters.intensity[0] == least else ()
+        return tuple(dict.fromkeys(note for note in (*refocused, *dim, *self.source.notes) if note))
 
     def play(self) -> None:
         """Run through the frames; a live source from the oldest one that is still there."""
@@ -286,9 +292,12 @@ class Session:
         view = _thin_view(whole, self._find_point_limit())
         kept = self._gate_filters(frame).select(view.cloud)
         cloud = view.cloud if kept.all() else select_points(view.cloud, kept)
-        # The scale is that of all points, so that colours keep their meaning while time passes.
-        scale = make_scale(view.cloud, self.colouring)
-        brightest = find_full_light(view.cloud) if self.colouring.shaded else 0.0
+        # The scale is that of all points, so that colours keep their meaning while time passes; of
+        # all but the dim ones, which would have the others shine alike.
+        lit = view.cloud.intensity >= self.source.min_intensity
+        usual = view.cloud if lit.all() or not lit.any() else select_points(view.cloud, lit)
+        scale = make_scale(usual, self.colouring)
+        brightest = find_full_light(usual) if self.colouring.shaded else 0.0
         pixels = view.pixels if view.pixels is None or kept.all() else view.pixels[kept]
         return DisplayedFrame(
             frame,

@@ -132,16 +132,16 @@ def make_view(returns: Returns, cloud: PointCloud | None = None) -> View:
     return View(points, np.stack([returns.y, returns.x], axis=-1))
 
 
-def find_min_intensity(whole: View) -> float:
+def find_min_intensity(whole: PointCloud) -> float:
     """Return the intensity below which a return of a shot does not count, as `Detection` has it for
     all of its frames.
 
     Parameters
     ----------
-    whole : View
+    whole : PointCloud
         Of all frames.
     """
-    light = whole.cloud.intensity
+    light = whole.intensity
     return (
         float(np.quantile(light, SCENE_BRIGHTNESS_QUANTILE)) * Detection().min_scene_fraction
         if light.size

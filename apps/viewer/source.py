@@ -142,6 +142,8 @@ class Source(abc.ABC):
         What has to be known about everything that is shown, such as that ranges have no time zero.
     settings : tuple of Setting
         What is set by sliders, beyond what all sources have.
+    min_intensity : float
+        Counts; dimmer points are left out until the filters are reset. 0 for none.
     """
 
     title: str
@@ -151,6 +153,7 @@ class Source(abc.ABC):
     frame_name: str = "frame"
     notes: tuple[str, ...] = ()
     settings: tuple[Setting, ...] = ()
+    min_intensity: float = 0.0
 
     @abc.abstractmethod
     def __len__(self) -> int:

@@ -148,7 +148,7 @@ class TransientSource(Source):
         View
         """
         return self._recovery.view(
-            self._measurements, shear, gate, find_min_intensity(self._full_view)
+            self._measurements, shear, gate, find_min_intensity(self._full_view.cloud)
         )
 
     @functools.cached_property
@@ -158,7 +158,7 @@ class TransientSource(Source):
             return make_view(self.frames.returns)
         # Of these the dim ones, rays that few views leave around bright things, would hide the others.
         found = make_view(depth(self.frames))
-        return select_brighter(found, find_min_intensity(found))
+        return select_brighter(found, find_min_intensity(found.cloud))
 
     @functools.cached_property
     def _measurements(self) -> Readings:

@@ -90,8 +90,9 @@ class Viewpoint:
 SCALE_BAR_FRACTION = 0.4
 """The scale bar is at most as long as this fraction of the box's width."""
 
-SCALE_BAR_DEPTH, Z_MARK_DEPTH = 0.7, 0.85
-"""Fractions of the box's depth, from its front: there neither hides the other's words from any side."""
+SCALE_BAR_DEPTH, Z_MARK_DEPTH = 0.0, 0.85
+"""Fractions of the box's depth, from its front: nothing stands before the scale bar, and neither hides
+the other's words from any side."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ class Box:
 
     @property
     def scale_bar(self) -> FloatArray:
-        """Ends of a bar of a round length across the floor, near the back, (2, 3) in m."""
+        """Ends of a bar of a round length at the front of the floor, (2, 3) in m."""
         width = float(self.high[0] - self.low[0])
         length = round_length_down(SCALE_BAR_FRACTION * width) if width > 0 else 0.0
         middle = (self.low + self.high) / 2

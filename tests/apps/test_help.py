@@ -210,6 +210,24 @@ def test_a_page_keeps_the_headings_of_the_help() -> None:
     )
 
 
+def test_the_help_has_the_headings_of_the_page(run: Run) -> None:
+    """Settings apart from options, defaults in words without brackets of their own, prose as wide as
+    the terminal even where a line begins with an option, and arguments by their names.
+    """
+    shown = run("nlos", "reconstruct", "--help").out
+    places = [
+        shown.index(word) for word in ("\nOptions:", "  --json ", "\nSettings (", "--cycles N")
+    ]
+    assert places == sorted(places)
+    assert "(None)" not in shown
+    assert "[default: (" not in shown
+    assert "Usage: tofclip nlos reconstruct [OPTIONS] CAPTURE\n" in shown
+    assert "refine photons looks for the albedo" in " ".join(shown.split())
+    assert max(map(len, shown.splitlines())) <= 80
+    assert "SHOT..." in run("calibrate", "range", "--help").out.splitlines()[0]
+    assert "{" not in run("calibrate", "range", "--help").out.splitlines()[0]
+
+
 def test_a_flag_is_shown_without_a_type(run: Run) -> None:
     for words in ((), ("recover",), ("lidar",), ("lidar", "sequence")):
         shown = run(*words, "--help").out

@@ -42,6 +42,26 @@ class TestReport:
         lines = ["range m  1.235, unknown", "points   3", "at       x 0.5, z 12346", "wrote out.h5"]
         assert capsys.readouterr().out.splitlines() == lines
 
+    def test_what_is_said_of_several_things_stands_side_by_side(
+        self, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        figures = {
+            "seed": 0,
+            "hybrid": {"seconds": 2.2384, "peak_mib": 65.0},
+            "flat": {"seconds": 1.3, "peak_mib": 40.0},
+            "lost": {"device_count": 1, "host_count": 2},
+            "found": {"device_count": 1, "host_count": 2},
+        }
+        report(figures, as_json=False)
+        assert capsys.readouterr().out.splitlines() == [
+            "seed    0",
+            "          hybrid  flat",
+            "seconds   2.238   1.3",
+            "peak mib  65      40",
+            "lost    device count 1, host count 2",
+            "found   device count 1, host count 2",
+        ]
+
     def test_infinity_is_unknown(self) -> None:
         assert to_json_value([np.inf, -np.inf, True, None, "text"]) == [
             None,

@@ -33,7 +33,14 @@ from apps.viewer.clouds import make_cloud
 from apps.viewer.live import LiveShotSource
 from apps.viewer.render import RasterRenderer
 from apps.viewer.scene_figure import SceneFigure
-from apps.viewer.session import GATE_ALL_TIMES, GATE_AROUND_FRAME, GATE_UP_TO_FRAME, Session
+from apps.viewer.session import (
+    DIM_NOTE,
+    GATE_ALL_TIMES,
+    GATE_AROUND_FRAME,
+    GATE_UP_TO_FRAME,
+    Filters,
+    Session,
+)
 from apps.viewer.side_pictures import project_front, render_pictures
 from apps.viewer.source import LINEAR_NOTE, NO_TIME_ZERO_NOTE, Gate, Source, View
 from apps.viewer.source_factory import FIRST_LOOK_NOTE, ShotOptions, open_source
@@ -170,6 +177,28 @@ def test_clouds_follow_one_another(folder: Path) -> None:
     assert session.frame_at(0.0).frame == 1
     with pytest.raises(InputError, match="focused"):
         source.refocus(0, 1.0, Gate(0, 1))
+
+
+def test_dim_rays_of_a_cloud_of_ours_are_left_out_at_first(tmp_path: Path) -> None:
+    """A hundred points that are a hundredth as bright as the others stand before them."""
+    bright, dim = plane(100, 2.0), plane(100, 1.0, seed=1)
+    light = np.concatenate([bright.intensity, 0.01 * dim.intensity])
+    xyz = np.concatenate([bright.xyz, dim.xyz])
+    ours = {"intensity": light, "range_sigma": np.full(200, 2e-3, np.float32)}
+    make_cloud(xyz, ours).save(tmp_path / "ours.ply")
+    make_cloud(xyz, {"intensity": light}).save(tmp_path / "others.ply")
+    session = Session(open_source(str(tmp_path / "ours.ply")))
+    shown = session.frame_at(0.0)
+    assert len(shown.cloud) == 100
+    assert shown.cloud.range.min() > 1.9
+    assert session.notes == (DIM_NOTE,)
+    # lit as if the dim ones were not there: 15 % of the others in full light, as of any cloud
+    assert np.ptp(shown.colours.sum(axis=1, dtype=int)) > 100
+    session.filters = Filters()
+    assert len(session.frame_at(0.0).cloud) == 200
+    assert session.notes == ()
+    # what brightness means to another program is not known
+    assert len(Session(open_source(str(tmp_path / "others.ply"))).frame_at(0.0).cloud) == 200
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".csv", ".npz", ".h5"])
