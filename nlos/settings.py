@@ -191,6 +191,9 @@ class Settings:
     ) -> Capture:
         """Mirror coordinates, blank the wall's own light and put time bins together, as settings say.
 
+        Of laser spots and wall points the fewer come as laser spots: a wave is imaged for each,
+        and seen from a lone detector all of its surroundings would be bright.
+
         Parameters
         ----------
         capture : Capture
@@ -202,7 +205,7 @@ class Settings:
         -------
         Capture
         """
-        capture = self._orient(join(capture))
+        capture = self._orient(choose_roles(join(capture)))
         if self.gate is not None:
             capture = remove_first_bounce(capture, self.gate, self.gate_ramp or 0.0)
         if self.fade:
@@ -321,7 +324,7 @@ def complete_settings(capture: Capture, **given: Any) -> Settings:
     capture = choose_roles(join_near_lasers(capture))
     require_plausible(capture)
     found = _complete_gate(capture, Settings(**given))
-    gated = choose_roles(replace(found, bins_together=1).prepare(capture))
+    gated = replace(found, bins_together=1).prepare(capture)
     if found.fade is None and find_lit_end(gated):
         fade = FADE_FRACTION * float(np.ptp(capture.axis.paths))
         found = _add(found, "fade", fade, "light still comes when the record ends")

@@ -96,6 +96,8 @@ def find_first_bounce(capture: Capture) -> FirstBounce | None:
     if follows <= 0:
         follows = float(level[peak]) * FADED_FRACTION
     faded = np.flatnonzero(level[peak : valley + 1] - lowest <= FADED_FRACTION * follows)
+    if faded.size and faded[0] == 0:
+        return None  # a few counts of the background before anything else
     end = float(late[peak + int(faded[0])]) if faded.size else float(late[valley])
     return FirstBounce(max(end, 0.0), (float(level[peak]) - lowest) / follows)
 

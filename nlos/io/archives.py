@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +19,24 @@ SURFACE_OPTIMISATION_BIN_M = 1.2e-3
 
 PAIR_BIN_WIDTH_S = 32e-12
 
+HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+"""About z: from x to the left and y up to x to the right and y down."""
+
+EVEN_BINS_TOLERANCE = 1e-3
+"""Of a bin's width, what even bins may differ by: times are often rounded."""
+
+MAX_EVEN_BINS_RATIO = 8
+"""Uneven bins become at most this number of times as many even ones."""
+
 
 def read_numpy_archive(fields: NamedArrays) -> Capture:
-    """Read ``H`` (t, ...), ``wall_xyz`` (..., 3), ``laser_xyz`` ((3,) or (..., 3)), ``delta_t_s``
-    or ``delta_t_m``, and ``t_start_m``, 0 where it is absent.
+    """Read ``H`` (t, ...), ``wall_xyz`` (..., 3), ``laser_xyz`` ((3,) or (..., 3)), and of the
+    time axis either ``delta_t_s`` or ``delta_t_m`` and ``t_start_m``, 0 where it is absent, or the
+    middle of every bin in ``t_s`` or ``t_m``.
 
     Lengths in m, durations in s; bin 0 holds the path ``t_start_m`` from the laser spot to the wall
-    point. Lasers (lasers..., 3) of which each was combined with all wall points come with ``H`` (t,
-    lasers..., points...).
+    point. Bins of different widths are put into even ones. Lasers (lasers..., 3) of which each was
+    combined with all wall points come with ``H`` (t, lasers..., points...).
 
     Raises
     ------
@@ -34,19 +45,75 @@ def read_numpy_archive(fields: NamedArrays) -> Capture:
     """
     signal = fields.read_numbers("H")
     wall, laser = (fields.read_coordinates(f"{name}_xyz") for name in ("wall", "laser"))
-    start = fields.number("t_start_m") if "t_start_m" in fields else 0.0
-    bin_width = (
-        fields.number("delta_t_s")
-        if "delta_t_s" in fields
-        else fields.number("delta_t_m") / SPEED_OF_LIGHT
-    )
     points = wall.shape[:-1]
     if signal.shape[:-1] == points and signal.shape[1:] != points:
         raise FileFormatError(
             fields.path,
             f"H of shape {signal.shape} ends with time; put time first: np.moveaxis(H, -1, 0)",
         )
+    times = next((name for name in ("t_m", "t_s") if name in fields), None)
+    if times is not None:
+        paths = fields.finite_array(times, len(signal)) * (1 if times == "t_m" else SPEED_OF_LIGHT)
+        signal, start, spacing = resample_evenly(fields, signal, paths)
+        return match_lasers_to_sensors(fields, signal, wall, laser, spacing / SPEED_OF_LIGHT, start)
+    start = fields.number("t_start_m") if "t_start_m" in fields else 0.0
+    bin_width = (
+        fields.number("delta_t_s")
+        if "delta_t_s" in fields
+        else fields.number("delta_t_m") / SPEED_OF_LIGHT
+    )
     return match_lasers_to_sensors(fields, signal, wall, laser, bin_width, start)
+
+
+def resample_evenly(
+    fields: NamedArrays, signal: NDArray[Any], paths: NDArray[np.float64]
+) -> tuple[NDArray[Any], float, float]:
+    """Put counts of time bins that need not be even into even ones; no photon is lost or doubled.
+
+    The light of a bin is taken to be spread evenly over it; an even bin is as wide as the median.
+
+    Parameters
+    ----------
+    fields : NamedArrays
+        For the error message.
+    signal : (t, ...) array
+    paths : (t,) array
+        Path at the middle of every bin, m.
+
+    Returns
+    -------
+    signal : (t, ...) array
+        The same one where bins are even.
+    start, spacing : float
+        Path of the first bin and from one to the next, m.
+
+    Raises
+    ------
+    FileFormatError
+        Paths do not grow, or differ so much in width that even bins would be too many.
+    """
+    widths = np.diff(paths)
+    if len(paths) < 2 or not widths.min() > 0:
+        raise FileFormatError(fields.path, "has times that do not grow from bin to bin")
+    spacing = float(widths.mean())
+    if np.abs(widths - spacing).max() <= EVEN_BINS_TOLERANCE * spacing:
+        return signal, float(paths[0]), spacing
+    spacing = float(np.median(widths))
+    middles = (paths[1:] + paths[:-1]) / 2
+    edges = np.concatenate([[paths[0] - widths[0] / 2], middles, [paths[-1] + widths[-1] / 2]])
+    bins = max(2, int(np.ceil((edges[-1] - edges[0]) / spacing)))
+    if bins > MAX_EVEN_BINS_RATIO * len(paths):
+        raise FileFormatError(
+            fields.path, f"has time bins so uneven that {bins} even ones would be needed"
+        )
+    even = edges[0] + spacing * np.arange(bins + 1)
+    flat = signal.reshape(len(signal), -1)
+    arrived = np.concatenate([np.zeros((1, flat.shape[1])), np.cumsum(flat, axis=0, dtype=float)])
+    before = np.clip(np.searchsorted(edges, even, side="right") - 1, 0, len(signal) - 1)
+    part = np.clip((even - edges[before]) / (edges[before + 1] - edges[before]), 0, 1)
+    light = arrived[before] + part[:, np.newaxis] * (arrived[before + 1] - arrived[before])
+    resampled = np.diff(light, axis=0).astype(np.float32).reshape(bins, *signal.shape[1:])
+    return resampled, float(even[0]) + spacing / 2, spacing
 
 
 def read_surface_optimisation_data(fields: NamedArrays) -> Capture:
@@ -63,26 +130,19 @@ def read_surface_optimisation_data(fields: NamedArrays) -> Capture:
     return Capture(counts.T, wall, wall, SURFACE_OPTIMISATION_BIN_M / SPEED_OF_LIGHT)
 
 
-def read_curvelet_data(fields: NamedArrays) -> Capture:
-    """Read ``sub_Sig`` (pairs, t) in bins of 32 ps, with the laser spots and wall points of the
-    pairs in ``C_i.mat`` and ``C_d.mat`` beside the file: (pairs, 3), m.
-
-    Liu et al., "Non-line-of-sight imaging with arbitrary illumination and detection pattern", Nat.
-    Commun. 14, 3230 (2023).
-    """
-    counts = fields.array("sub_Sig", None, None)
-    laser, wall = (_read_pair_points(fields, name, len(counts)) for name in ("C_i.mat", "C_d.mat"))
-    return Capture(counts.T, wall, laser, PAIR_BIN_WIDTH_S)
-
-
 def read_general_data(fields: NamedArrays) -> Capture:
-    """Read ``data`` (rows, columns, t) of irregular pairs in bins of 32 ps, with ``laserpoints``
-    and ``detectpoints`` (rows, columns, 3), m, in ``setup.mat`` beside the file.
+    """Read ``data`` (rows, columns, t) of irregular pairs, with ``laserpoints`` and
+    ``detectpoints`` (rows, columns, 3), m, in ``setup.mat`` beside the file.
+
+    Bins are 32 ps, or ``timeRes`` s where that number stands in either file: the authors keep it in
+    a file of settings instead, and it is another one for the data sets of others. Seen from the
+    wall x runs to the left and y up: their script reverses both before it shows a volume, and only
+    so the letter and the number of "tuan" read as in the photograph of them.
 
     Field names, units and bins are those of https://github.com/hy520484/general-NLOS; of
     ``data_NAME.mat``, ``setup_NAME.mat`` is taken where there is one.
     """
-    counts = fields.array("data", None, None, None)
+    counts = fields.read_time_last("data")
     own = fields.path.with_name(fields.path.name.replace("data", "setup", 1))
     setup = own if own != fields.path and own.is_file() else fields.path.with_name("setup.mat")
     if not setup.is_file():
@@ -94,25 +154,9 @@ def read_general_data(fields: NamedArrays) -> Capture:
     laser, wall = (
         beside.finite_array(name, *counts.shape[:2], 3) for name in ("laserpoints", "detectpoints")
     )
-    return Capture(np.moveaxis(counts, 2, 0), wall, laser, PAIR_BIN_WIDTH_S)
-
-
-def _read_pair_points(fields: NamedArrays, name: str, pairs: int) -> NDArray[np.float64]:
-    """Points (pairs, 3), m, of the file of that name beside the signals."""
-    path = fields.path.with_name(name)
-    if not path.is_file():
-        raise FileFormatError(
-            fields.path,
-            f"holds sub_Sig of {pairs} pairs; it needs C_i.mat (laser spots) and C_d.mat (wall points) beside it, "
-            "see docs/own_wall.md",
-        )
-    beside = read_matlab(path)
-    for one in sorted(beside.names):
-        points = beside.read_numbers(one).astype(np.float64)
-        if points.shape == (pairs, 3):
-            # The authors' order is (depth, x, y) where the first column does not vary.
-            return np.roll(points, -1, axis=1) if np.ptp(points[:, 0]) == 0 else points
-    raise FileFormatError(path, f"holds no points of shape ({pairs}, 3)")
+    stated = next((one for one in (fields, beside) if "timeRes" in one), None)
+    bin_width = PAIR_BIN_WIDTH_S if stated is None else stated.number("timeRes")
+    return Capture(np.moveaxis(counts, 2, 0), wall @ HALF_TURN, laser @ HALF_TURN, bin_width)
 
 
 def read_lift_archive(path: str | Path) -> Capture:

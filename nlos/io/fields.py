@@ -64,6 +64,20 @@ class NamedArrays(Archive):
         """Return entry `name`, numbers of any shape but an empty one."""
         return self.array(name, *[None] * self._count_axes(name))
 
+    def read_time_last(self, name: str) -> NDArray[Any]:
+        """Return entry `name`, signals of three axes with time last.
+
+        Two equal axes after a longer one are rows and columns after time, which is refused.
+        """
+        signal = self.array(name, None, None, None)
+        if signal.shape[1] == signal.shape[2] < signal.shape[0]:
+            raise FileFormatError(
+                self.path,
+                f"{name} of shape {signal.shape} begins with time; put time last: "
+                f"permute({name}, [2 3 1])",
+            )
+        return signal
+
     def read_coordinates(self, name: str) -> NDArray[np.float64]:
         """Return entry `name`, an array (..., 3) of coordinates; NaN is allowed."""
         dimensions = max(1, self._count_axes(name))

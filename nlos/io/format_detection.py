@@ -8,12 +8,12 @@ from pathlib import Path
 
 from nlos.capture import Capture
 from nlos.io.archives import (
-    read_curvelet_data,
     read_general_data,
     read_lift_archive,
     read_numpy_archive,
     read_surface_optimisation_data,
 )
+from nlos.io.curvelet import read_curvelet_data
 from nlos.io.fields import NamedArrays, is_matlab, read_hdf5, read_matlab
 from nlos.io.renderings import read_streak_folder
 from nlos.io.stanford import read_light_cone_data, read_migration_data
@@ -52,6 +52,8 @@ Reader = Callable[[NamedArrays], Capture]
 # A file is known by the names of its fields; the first format whose fields are all there is taken.
 ARCHIVE_FORMATS: Mapping[tuple[str, ...], Reader] = {
     ("H", "wall_xyz", "laser_xyz", "delta_t_s"): read_numpy_archive,
+    ("H", "wall_xyz", "laser_xyz", "t_s"): read_numpy_archive,
+    ("H", "wall_xyz", "laser_xyz", "t_m"): read_numpy_archive,
     ("H", "wall_xyz", "laser_xyz", "delta_t_m"): read_numpy_archive,
 }
 HDF5_FORMATS: Mapping[tuple[str, ...], Reader] = {
@@ -75,7 +77,8 @@ def read_capture(path: str | Path) -> Capture:
     The format is recognised by content:
 
     * our own HDF5: captures, and recovered frames that carry a relay wall;
-    * NumPy archives with ``H``, ``wall_xyz``, ``laser_xyz``, and ``delta_t_s`` or ``delta_t_m``;
+    * NumPy archives with ``H``, ``wall_xyz``, ``laser_xyz``, and ``delta_t_s``, ``delta_t_m``,
+      ``t_s`` or ``t_m``;
     * LIFT archives (Feng and Gao 2021), whose frames are recovered by the linear inverse;
     * HDF5 of y-tal, and of the Zaragoza NLOS data set;
     * .mat files, of any version, of O'Toole 2018, Lindell 2019, Tsai 2019, Liu 2019, Liu 2020 and

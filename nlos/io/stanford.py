@@ -33,7 +33,7 @@ MIGRATION_WALL_WIDTH_M = 2.0
 
 def read_light_cone_data(fields: NamedArrays) -> Capture:
     """Read a scene of the light-cone transform's data set."""
-    counts = fields.array("rect_data", None, None, None)
+    counts = fields.read_time_last("rect_data")
     wall = np.swapaxes(_build_wall(counts.shape[1], counts.shape[0], fields.number("width")), 0, 1)
     wall = wall[::-1]
     return Capture(np.moveaxis(counts, 2, 0), wall, wall, LIGHT_CONE_BIN_WIDTH_S)
@@ -43,7 +43,7 @@ def read_migration_data(fields: NamedArrays) -> Capture:
     """Read a scene of f-k migration's data set; ``tofgrid`` from the same file or from a
     ``tof*.mat`` beside it.
     """
-    counts = fields.array("meas", None, None, None)
+    counts = fields.read_time_last("meas")
     arrival = _read_arrival_bins(fields, counts.shape[:2])
     delay_bins = arrival * PICOSECOND / MIGRATION_BIN_WIDTH_S
     by_bin = np.ascontiguousarray(

@@ -46,7 +46,7 @@ def read_phasor_field_data(fields: NamedArrays) -> Capture:
 
 def read_rectified_data(fields: NamedArrays) -> Capture:
     """Read a scene of the data set of 2020."""
-    counts = fields.array("rect_data", None, None, None)
+    counts = fields.read_time_last("rect_data")
     rows, columns, _ = counts.shape
     spacing = fields.number("sampling_spacing")
     x, y = ((np.arange(n) - n / 2) * spacing for n in (columns, rows))

@@ -22,7 +22,7 @@ from nlos.capture import TimeAxis
 from nlos.moveout import MidpointImaging, MidpointJoin, join_near_lasers
 from nlos.reciprocity import choose_roles
 from nlos.refinement.photons import PhotonRefinement
-from nlos.simulate import PointScene
+from nlos.simulate import PointScene, add_poisson_noise
 from tofclip.errors import InputError
 from tofclip.solvers import Sparse
 
@@ -87,13 +87,27 @@ def test_spots_that_light_the_same_wall_share_one_plan() -> None:
 def test_a_scan_by_the_laser_is_imaged_by_default() -> None:
     capture = exhaustive("planar, scanned")
     settings = settings_for(capture, wavelength=WAVELENGTH)
-    # 512 pairs for four images: back-projection is as quick.
-    assert settings.method == "backprojection"
+    # 512 pairs for two images, as if the two detectors were the laser spots.
+    assert settings.method == "rsd"
+    assert len(np.unique(settings.prepare(capture).lasers, axis=0)) == 2
     wall, spot = capture.wall[:, :, :1], capture.laser[:, :, :1]
     one = Capture(capture.signal[..., :1], wall, spot, AXIS.bin_width)
     found = settings_for(one, wavelength=WAVELENGTH)
     # The box is as wide as the laser's scan, for the wall is a single point.
     assert found.x == pytest.approx((-0.5, 0.5), abs=0.05)
+
+
+def test_a_lone_detector_is_not_the_brightest() -> None:
+    """Its own surroundings are near every pair; as a laser spot it shows what is hidden."""
+    capture = exhaustive("planar, scanned")
+    one = Capture(capture.signal[..., :1], capture.wall[:, :, :1], capture.laser[:, :, :1], 32e-12)
+    counts = add_poisson_noise(one, 2, 0.02, seed=1)
+    x, y, _ = LASERS[0]
+    grid = Grid(x + GRID.x, y + GRID.y, np.arange(0.01, 1.0, 0.04))
+    method = PlanarRSD(WAVELENGTH / 2)
+    prepared = settings_for(counts, wavelength=WAVELENGTH / 2).prepare(counts)
+    assert method.reconstruct(prepared, grid).find_brightest()[2] == pytest.approx(0.69)
+    assert method.reconstruct(counts, grid).find_brightest()[2] == pytest.approx(0.01)
 
 
 def test_scans_by_the_laser_are_refined() -> None:

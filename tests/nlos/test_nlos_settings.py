@@ -20,7 +20,7 @@ from nlos.preparation import (
 )
 from nlos.settings import complete_settings, is_brightest_on_wall
 from nlos.signal_analysis import find_first_bounce
-from nlos.simulate import PointScene
+from nlos.simulate import PointScene, add_poisson_noise
 from tofclip.errors import InputError
 
 WALL = planar_wall(24, 24) * 0.6
@@ -63,6 +63,14 @@ def test_nothing_is_gated_where_the_wall_is_dark() -> None:
     assert settings.method == "rsd"
     assert settings_for(clean(), gate=0.2).gate == 0.2
     assert settings_for(clean(), wavelength=0.3).wavelength == 0.3
+
+
+def test_background_is_not_the_walls_own_light() -> None:
+    """Few counts before anything else, of which some are the first: nothing fades after them."""
+    capture = clean(confocal=False)
+    for seed in range(5):
+        counts = add_poisson_noise(capture, 60, 0.02, seed)
+        assert settings_for(counts).gate is None
 
 
 def test_noise_makes_the_wave_longer() -> None:

@@ -328,14 +328,91 @@ def test_pairs_with_their_points_beside(tmp_path: Path) -> None:
     same(read_capture(tmp_path / "sub_Sig.mat"), expected)
 
 
+SETUP_SCRIPT = """%% Part I
+c = 3E8; % speed
+delta_t = 32E-12;
+% bx = 7;
+bx = c * delta_t; by = 1.2/12; bz = 0.1;
+xb = 0.9; yb = 0;
+grid_hor_f = 63:-1:0;
+"""
+
+
+def test_pairs_numbered_on_a_lattice(tmp_path: Path) -> None:
+    """Their second number grows to the left and their third upwards, seen from the wall."""
+    left, up = (grid.ravel() for grid in np.meshgrid(np.arange(12), np.arange(9)))
+    numbers = np.stack([0 * left, left, up], axis=-1)
+    wall = 0.1 * np.stack([-left, -up, 0 * left], axis=-1)
+    expected = simulated(wall, wall, TimeAxis(300, 32e-12))
+    folder = tmp_path / "full"
+    folder.mkdir()
+    write_matlab(folder / "sub_Sig.mat", "5", sub_Sig=expected.signal.T)
+    for name in ("C_i", "C_d"):
+        write_matlab(folder / f"{name}.mat", "5", **{name: numbers.astype(float)})
+    with pytest.raises(
+        FileFormatError, match=r"steps of a lattice; it needs experimental_setup\.m"
+    ):
+        read_capture(folder / "sub_Sig.mat")
+    script = tmp_path / "experimental_setup.m"
+    script.write_text(SETUP_SCRIPT)
+    same(read_capture(folder / "sub_Sig.mat"), expected)
+    script.write_text(SETUP_SCRIPT.replace("3E8", "1").replace("32E-12", "0.0096"))
+    assert read_capture(folder / "sub_Sig.mat").axis.spacing == pytest.approx(0.0096)
+    for broken in ("by = zeros(3);", "by = 0;", ""):
+        script.write_text(SETUP_SCRIPT.replace("by = 1.2/12;", broken))
+        with pytest.raises(FileFormatError, match="does not set by to a positive number"):
+            read_capture(folder / "sub_Sig.mat")
+
+
 def test_general_pairs(tmp_path: Path) -> None:
     lasers = WALL[::-1]
     expected = simulated(lasers, WALL, TimeAxis(300, 32e-12))
     write_matlab(tmp_path / "data_one.mat", "5", data=np.moveaxis(expected.signal, 0, 2))
     with pytest.raises(FileFormatError, match=r"setup\.mat.*docs/own_wall\.md"):
         read_capture(tmp_path / "data_one.mat")
-    write_matlab(tmp_path / "setup.mat", "5", laserpoints=lasers, detectpoints=WALL)
+    # Theirs run to the left and up.
+    turned = {"laserpoints": lasers * [-1, -1, 1], "detectpoints": WALL * [-1, -1, 1]}
+    write_matlab(tmp_path / "setup.mat", "5", **turned)
     same(read_capture(tmp_path / "data_one.mat"), expected)
+    write_matlab(tmp_path / "setup.mat", "5", **turned, timeRes=8.33e-12)
+    assert read_capture(tmp_path / "data_one.mat").bin_width == pytest.approx(8.33e-12)
+
+
+@pytest.mark.parametrize(
+    "others", [{"width": 0.5}, {"ts": 4e-12, "sampling_spacing": 0.1, "SPAD_index": [1, 1]}]
+)
+def test_signals_that_begin_with_time_are_refused(others: dict[str, Any], tmp_path: Path) -> None:
+    write_matlab(tmp_path / "a.mat", "5", rect_data=np.ones((50, 8, 8)), **others)
+    with pytest.raises(FileFormatError, match=r"begins with time; put time last: permute"):
+        read_capture(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize("name", ["t_s", "t_m"])
+def test_time_bins_that_are_named_one_by_one(name: str, tmp_path: Path) -> None:
+    unit = SPEED_OF_LIGHT if name == "t_s" else 1.0
+    file, fields = tmp_path / "a.npz", {"wall_xyz": WALL, "laser_xyz": SPOT}
+    expected = simulated()
+    np.savez(file, H=expected.signal, **fields, **{name: AXIS.paths / unit})
+    same(read_capture(file), expected)
+    # The same light in bins that are by turns wider and narrower, by up to 45 %.
+    number = np.arange(400)
+    uneven = 0.5 + AXIS.spacing * (number + 3 * np.sin(0.15 * number))
+    direct = np.linalg.norm(SPOT - HIDDEN) + np.linalg.norm(WALL - HIDDEN, axis=-1)
+    light = np.exp(-0.5 * ((uneven.reshape(-1, 1, 1) - direct) / 0.02) ** 2)
+    light *= np.gradient(uneven).reshape(-1, 1, 1) / AXIS.spacing
+    np.savez(file, H=light, **fields, **{name: uneven / unit}, delta_t_s=1.0)
+    found = read_capture(file)
+    assert found.signal.sum(axis=0) == pytest.approx(light.sum(axis=0), rel=1e-5)
+    arrival = np.tensordot(found.axis.paths, found.signal, (0, 0)) / found.signal.sum(axis=0)
+    # A fiftieth of a bin; as they came the middles err by up to three bins.
+    assert np.abs(arrival - direct).max() < 0.02 * AXIS.spacing
+    shows_the_point(found)
+    np.savez(file, H=light, **fields, **{name: uneven[::-1] / unit})
+    with pytest.raises(FileFormatError, match="do not grow from bin to bin"):
+        read_capture(file)
+    np.savez(file, H=light, **fields, **{name: np.append(uneven[:-1], uneven[-1] + 1e3) / unit})
+    with pytest.raises(FileFormatError, match="so uneven"):
+        read_capture(file)
 
 
 def test_archives_with_paths_lasers_and_time_last(tmp_path: Path) -> None:
