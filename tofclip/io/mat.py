@@ -33,6 +33,9 @@ NUMERIC_CLASSES = {
     number: np.dtype(name)
     for number, name in enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), 6)
 }
+PLAIN_CELL = (MATRIX, 6, 8, 5, 8, 1, 0)
+"""Words of a matrix that are the same for every one of two dimensions without a name."""
+
 EMPTY_CLASS = 6
 COMPLEX_FLAG = 0x0800
 VALUE_TYPES = {
@@ -260,8 +263,44 @@ class _Matrix:
         return _Matrix(self._path, self._order, part)
 
     def _iterate_cells(self, number: int) -> Iterator[NDArray[Any]]:
+        usual = struct.Struct(f"{self._order}14I")
         for _ in range(number):
+            plain = self._read_plain_cell(usual)
+            if plain is not None:
+                yield plain
+                continue
             inner = self._read_matrix()
             if inner.kind == CELL_CLASS:
                 raise FileFormatError(self._path, "holds cells inside cells")
             yield inner.values()
+
+    def _read_plain_cell(self, usual: struct.Struct) -> NDArray[Any] | None:
+        """Return the numbers of the next cell if it is written as most are, else None.
+
+        Photon times of every pixel are a hundred thousand cells: to look at each as a whole takes a
+        fifth of the time that part by part takes.
+
+        Parameters
+        ----------
+        usual : Struct
+            Fourteen words: from a matrix's tag to that of its values, where it has two dimensions
+            and no name.
+        """
+        start = self._place
+        if start + usual.size > len(self._content):
+            return None
+        words = usual.unpack_from(self._content, start)
+        length, flags, rows, columns, kind, size = (words[n] for n in (1, 4, 8, 9, 12, 13))
+        first = start + usual.size
+        if kind >> 16:  # a short one, whose values are inside the tag
+            kind, size, first = kind & 0xFFFF, kind >> 16, first - 4
+        if words[:1] + words[2:4] + words[6:8] + words[10:12] != PLAIN_CELL:
+            return None
+        own, stored = NUMERIC_CLASSES.get(flags & (COMPLEX_FLAG | 0xFF)), VALUE_TYPES.get(kind)
+        if own is None or stored is None or length % 8 or first + size > start + 8 + length:
+            return None
+        if start + 8 + length > len(self._content) or size != rows * columns * int(stored[1]):
+            return None
+        self._place = start + 8 + length
+        values = np.frombuffer(self._content, self._order + stored, rows * columns, first)
+        return values.astype(own, copy=False).reshape((rows, columns), order="F")

@@ -81,7 +81,11 @@ def _find_chance(seen: NDArray[Any], expected: NDArray[Any] | float) -> FloatArr
 
 
 def combine_layers(
-    layers: list[FloatArray], scene: Scene, to_range: float, settings: dict[str, float | str]
+    layers: list[FloatArray],
+    max_returns: int,
+    scene: Scene,
+    to_range: float,
+    settings: dict[str, float | str],
 ) -> SurfaceImage:
     """Turn the returns found one after the other into images, each pixel's strongest first.
 
@@ -89,6 +93,8 @@ def combine_layers(
     ----------
     layers : list of (rows, columns, 4) arrays
         See `SurfacePlan.locate`.
+    max_returns : int
+        Of these the strongest in each pixel are returned.
     scene : Scene
     to_range : float
         Metres in a bin.
@@ -111,6 +117,6 @@ def combine_layers(
             pulse=scene.response.pulse,
             settings=settings,
         )
-        for k in range(len(layers))
+        for k in range(min(max_returns, len(layers)))
     ]
     return replace(images[0], further=tuple(images[1:]))

@@ -25,7 +25,6 @@ from tofclip.lidar.photons.held_out import (
     choose_reach,
     judge_surface,
     learn_scene,
-    weigh_evidence,
 )
 from tofclip.lidar.photons.layers import combine_layers, keep_significant, remove_return
 from tofclip.lidar.photons.matching import (
@@ -123,8 +122,7 @@ def estimate_surface(
     surface = axis.to_bins(labels)
     report(0.6)
     reach, surface = choose_reach(train, test, training, surface)
-    evidence = weigh_evidence(test, train, training, surface)
-    to_probability = calibrate_outliers(margin.ravel(), evidence)
+    to_probability = calibrate_outliers(test, train, training, surface, margin)
     report(0.8)
 
     systematic = LEARNT_RESPONSE_SIGMA_WIDTHS * scene.response.width if learnt is not None else 0.0
@@ -141,12 +139,14 @@ def estimate_surface(
     }
     layers = [plan.locate(photons, scene)]
     rest = photons
-    for _ in range(1, max_returns):
+    # A surface goes on where another one stops: behind an edge the second of a pixel may be found
+    # only when the third of the picture is looked for.
+    for _ in range(max_returns if max_returns > 1 else 0):
         rest = remove_return(rest, scene, layers[-1])
         if not rest.bin.size:
             break
         layers.append(keep_significant(rest, scene, plan.locate(rest, scene)))
-    return combine_layers(layers, scene, to_range, settings)
+    return combine_layers(layers, max_returns, scene, to_range, settings)
 
 
 @dataclass(frozen=True)
