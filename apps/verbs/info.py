@@ -55,7 +55,16 @@ def _format_tree(found: Mapping[str, Any], depth: int = 0) -> Iterator[str]:
         elif isinstance(value, list) and len(value) > MAX_LISTED_VALUES:
             yield f"{lead} {summarise_list(value)}"
         else:
-            yield f"{lead} {value}"
+            yield f"{lead} {_format_plain(value)}"
+
+
+def _format_plain(value: Any) -> str:
+    """Six digits tell a person enough; --json has all."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_format_plain, value))}]" if value else "none"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "not known" if value is None else str(value)
 
 
 def _format_field(known: Mapping[str, Any]) -> str:

@@ -105,6 +105,7 @@ class TestRecover:
             assert abs(int(np.argmax(energy[row - 10 : row + 10])) - 10) <= 1
         assert (tmp_path / "frames.png").read_bytes().startswith(PNG)
         assert frames.provenance["settings"]["verb"] == "recover"
+        assert "data_term=LeastSquares, " in frames.provenance["settings"]["method"]
         assert frames.provenance["inputs"][0]["name"] == "streak.h5"
 
     def test_skew_is_found_where_the_camera_has_no_sweep(
@@ -294,6 +295,9 @@ class TestInfo:
         assert any(line.startswith("  values: 96 x 32 x 32 (time, y, x) float32") for line in lines)
         assert "    kind: camera" in lines
         assert "  angle_uncertainty: unknown" not in lines
+        (residual,) = (line for line in lines if line.startswith("  relative_residual: "))
+        assert len(residual.split(": ")[1]) <= 11  # six digits, a sign and an exponent
+        assert not any(line.endswith((": None", ": []")) for line in lines)
 
 
 def test_recorded_shots_can_be_described(run: Run, shared_data: Path) -> None:
