@@ -181,10 +181,15 @@ def report(
     width = max(map(len, plain), default=0)
     compared = _find_compared(plain)
     for name, value in plain.items():
-        if name not in compared:
+        entries = _list_alike_entries(value)
+        if name in compared[1:]:
+            continue  # in the table of the first
+        if name in compared:
+            print("\n".join(_format_columns({column: plain[column] for column in compared})))
+        elif entries:
+            print("\n".join([_format_name(name), *_format_rows(entries)]))
+        else:
             print(f"{_format_name(name):<{width}}  {_format_value(value)}")
-        elif name == compared[0]:
-            print("\n".join(_format_table({column: plain[column] for column in compared})))
     if note:
         print(f"note: {note}")
     for path in written:
@@ -199,14 +204,40 @@ def _find_compared(figures: Mapping[str, Any]) -> list[str]:
     return [name for name, keys in rows.items() if shared and keys == shared]
 
 
-def _format_table(columns: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Put several things side by side: a column for each, a line for each figure."""
-    figures = list(next(iter(columns.values())))
-    cells = [["", *map(_format_name, columns)]]
+def _list_alike_entries(value: Any) -> dict[str, dict[str, Any]]:
+    """Return the entries of a list, by their numbers, or of a mapping that say the same of several
+    things, such as stages; none of anything else.
+    """
+    if isinstance(value, list):
+        value = {str(number): entry for number, entry in enumerate(value, start=1)}
+    if not isinstance(value, dict) or len(value) < 2:
+        return {}
+    kinds = {tuple(entry) if isinstance(entry, dict) else () for entry in value.values()}
+    return value if len(kinds) == 1 and kinds != {()} else {}
+
+
+def _format_columns(things: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Put few things with many figures side by side: a column for each."""
+    figures = next(iter(things.values()))
+    cells = [["", *map(_format_name, things)]]
     cells += [
-        [_format_name(name), *(_format_value(column[name]) for column in columns.values())]
-        for name in figures
+        [_format_name(figure), *(_format_value(thing[figure]) for thing in things.values())]
+        for figure in figures
     ]
+    return _align_columns(cells)
+
+
+def _format_rows(things: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Put many things with few figures below each other: a line for each, indented."""
+    cells = [["  ", *map(_format_name, next(iter(things.values())))]]
+    cells += [
+        [f"  {_format_name(name)}", *map(_format_value, thing.values())]
+        for name, thing in things.items()
+    ]
+    return _align_columns(cells)
+
+
+def _align_columns(cells: Sequence[Sequence[str]]) -> list[str]:
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return [
         "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
@@ -264,4 +295,6 @@ def _format_value(value: Any) -> str:
         )
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) < 1000 else f"{value:.0f}"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return "unknown" if value is None else str(value)

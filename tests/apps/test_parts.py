@@ -51,15 +51,25 @@ class TestReport:
             "flat": {"seconds": 1.3, "peak_mib": 40.0},
             "lost": {"device_count": 1, "host_count": 2},
             "found": {"device_count": 1, "host_count": 2},
+            "stages_s": {"read": {"median": 0.25, "p95": 0.5}, "wait": {"median": 1.0, "p95": 2.0}},
+            "targets": [{"distance_m": 0.1, "seen": False}, {"distance_m": 0.2, "seen": True}],
         }
         report(figures, as_json=False)
         assert capsys.readouterr().out.splitlines() == [
-            "seed    0",
+            "seed      0",
             "          hybrid  flat",
             "seconds   2.238   1.3",
             "peak mib  65      40",
-            "lost    device count 1, host count 2",
-            "found   device count 1, host count 2",
+            "lost      device count 1, host count 2",
+            "found     device count 1, host count 2",
+            "stages s",
+            "        median  p95",
+            "  read  0.25    0.5",
+            "  wait  1       2",
+            "targets",
+            "     distance m  seen",
+            "  1  0.1         no",
+            "  2  0.2         yes",
         ]
 
     def test_infinity_is_unknown(self) -> None:
