@@ -81,6 +81,9 @@ by this part of how far aside it is, where the wall is not known."""
 MAX_START_M = 1e3
 """A record that begins after a longer path, m, still holds the ways to the devices."""
 
+MAX_SATURATED_FRACTION = 0.5
+"""Of the samples, what may have the largest value: light comes during a part of the record."""
+
 MAX_SIGNAL = 1e30
 """Larger samples overflow once they are squared."""
 
@@ -321,8 +324,9 @@ def settings_for(capture: Capture, **given: Any) -> Settings:
 
 def complete_settings(capture: Capture, **given: Any) -> Settings:
     """Find settings that suit a capture, but for the method; see `settings_for`."""
+    # As recorded: midpoints would hide that lasers stand off the wall.
+    require_plausible(choose_roles(capture))
     capture = choose_roles(join_near_lasers(capture))
-    require_plausible(capture)
     found = _complete_gate(capture, Settings(**given))
     gated = replace(found, bins_together=1).prepare(capture)
     if found.fade is None and find_lit_end(gated):
@@ -351,7 +355,7 @@ def require_plausible(capture: Capture) -> None:
     ------
     InputError
         The wall has no extent, the laser spot is not near the wall, the record begins after all
-        light, or the signals are dark, constant or overflow.
+        light, or the signals are dark, constant, saturated or overflow.
     """
     low, high = capture.points.min(axis=0), capture.points.max(axis=0)
     extent = float((high - low).max())
@@ -382,6 +386,12 @@ def require_plausible(capture: Capture) -> None:
         raise InputError("every signal is 0: there is nothing to image")
     if float(capture.signal.max()) == float(capture.signal.min()):
         raise InputError(f"every signal is {largest:.4g}, constant or saturated: nothing to image")
+    brightest = float(capture.signal.max())
+    saturated = float((capture.signal == brightest).sum()) / math.prod(capture.signal.shape)
+    if brightest > 0 and saturated > MAX_SATURATED_FRACTION:
+        raise InputError(
+            f"{100 * saturated:.0f} % of the samples are {brightest:.4g}, saturated: record less light"
+        )
 
 
 def require_usable_wavelength(capture: Capture, settings: Settings) -> None:
@@ -645,10 +655,28 @@ def _complete_box(capture: Capture, settings: Settings) -> Settings:
         )
     front = Grid.in_front_of(capture, voxel, near, settings.far)
     x, y, z = ((float(axis[0]), float(axis[-1])) for axis in (front.x, front.y, front.z))
-    return replace(
+    completed = replace(
         settings,
         x=x if settings.x is None else settings.x,
         y=y if settings.y is None else settings.y,
         near=z[0] if settings.near is None else settings.near,
         far=z[1] if settings.far is None else settings.far,
     )
+    longest = _find_longest_path(capture, completed)
+    if capture.start > longest:
+        raise InputError(
+            f"the record begins at a path of {capture.start:.4g} m, but none by way of the box up to "
+            f"z = {completed.far:.4g} m is longer than {longest:.4g} m: take the ways to and from the "
+            "devices off, or choose a farther box"
+        )
+    return completed
+
+
+def _find_longest_path(capture: Capture, settings: Settings) -> float:
+    """Longest path from a laser spot by way of the box to a wall point at most, m."""
+    corners = np.array(np.meshgrid(*settings.box)).reshape(3, -1).T
+    legs = [
+        max(float(np.linalg.norm(spots - corner, axis=1).max()) for corner in corners)
+        for spots in (capture.lasers, capture.points)
+    ]
+    return sum(legs)
