@@ -22,7 +22,6 @@ from tofclip.lidar.pulse_fit import (
 )
 from tofclip.lidar.search.lone_fit import fit_lone_returns
 
-BINS_PER_GROUP = 32  # bins of which the highest peak is kept
 NEIGHBOUR_FRACTION = 0.5  # of what is of interest: weaker peaks do not move a return beside them
 WEIGHTS_PER_PASS = 4  # weights of a filter that are applied in one pass
 
@@ -70,17 +69,17 @@ def find_returns(
     counts : (all pixels,) int64 array, overwritten where `pixels` says
         Number of returns of each pixel.
     """
-    groups = -(-times.size // BINS_PER_GROUP)
     memory = (
         np.empty(times.size, np.float32),
-        np.zeros(groups * BINS_PER_GROUP, np.float32),
-        np.empty(groups, np.float32),
+        np.empty(times.size, np.float32),
         bin_weights.copy(),
         np.empty((found.shape[1], 4)),
         np.empty((found.shape[1], 5)),
         np.empty((times.size, 3)),
         np.zeros(phases[1].shape[1], np.float32),
+        np.empty((times.size, 4), np.int64),
     )
+    list_windows(times, pulse[1], limits[0], memory[7])
     for place in range(traces.shape[0]):
         pixel = pixels[place]
         counts[pixel] = find_trace_returns(
@@ -131,7 +130,7 @@ def find_trace_returns(
     """
     (sharp, matched, gains), (curve, scale) = filters, pulse
     even, shapes, slopes, sums, half = phases
-    score, maxima, bounds, free, peaks, estimate, profile, rest = memory
+    score, maxima, free, peaks, estimate, profile, rest, windows = memory
     correlate_trace(trace, sharp, score)
     total, square, bins = sum_moments(trace, bin_weights)
     # the sharp filter's response to the background, below which nothing of interest can lie
@@ -144,10 +143,9 @@ def find_trace_returns(
         bin_weights,
         matched,
         gains,
-        scale,
+        windows,
         limits,
         maxima,
-        bounds,
         free,
         peaks,
     )
@@ -324,7 +322,7 @@ def interpolate_peak_time(trace, times, matched, background, j, here):
 
 @loop_part
 def find_strongest_peaks(
-    moments, trace, times, bin_weights, matched, gains, scale, limits, maxima, bounds, free, peaks
+    moments, trace, times, bin_weights, matched, gains, windows, limits, maxima, free, peaks
 ):
     """Fill `peaks` with the highest maxima that might count, in the order of time: bin, response,
     and bins they claim.
@@ -350,12 +348,12 @@ def find_strongest_peaks(
         As for `compute_response`.
     gains : (2,) floats
         Gains of the sharp filter and of the matched one.
-    scale : (4,) array or tuple
-        Of the pulse.
+    windows : (bins, 4) int64 array
+        See `list_windows`.
     limits : (5,) floats
         See `find_returns`.
-    maxima, bounds : float32 array
-        Local maxima of the score, and the largest of each group; used up.
+    maxima : (bins,) float32 array
+        Local maxima of the score; used up.
     free : (bins,) array
     peaks : (returns, 4) array
         Overwritten.
@@ -368,18 +366,16 @@ def find_strongest_peaks(
     total, square, bins = moments
     left, number, needed, claiming = bins, 0, 0.0, True
     background, noise = compute_mean_and_deviation(total, square, left)
-    update_group_maxima(maxima, 0, bounds.size, bounds)
     while number < peaks.shape[0]:
-        group = find_highest(bounds)
-        brightest = gains[1] * (bounds[group] / gains[0] - background)
+        best = find_highest(maxima)
+        brightest = gains[1] * (maxima[best] / gains[0] - background)
         if (
-            bounds[group] <= 0
+            maxima[best] <= 0
             or brightest <= max(limits[1] * noise, limits[4])
             or brightest * limits[3] ** 2 < needed
         ):
             break
-        best = find_bin_in_group(maxima, group, bounds[group])
-        first, last = find_pulse_window(times, (best, best), times[best], scale)
+        first, last = windows[best, 0], windows[best, 1]
         strength = compute_response(trace, matched, best)
         peaks[number, 0], peaks[number, 1], peaks[number, 2], peaks[number, 3] = (
             best,
@@ -388,7 +384,8 @@ def find_strongest_peaks(
             last,
         )
         number += 1
-        clear_maxima_around(best, times, limits[0], maxima, bounds)
+        for j in range(np.uintp(windows[best, 2]), np.uintp(windows[best, 3])):
+            maxima[j] = 0
         claiming = claiming and 2 * (left - (last - first)) >= bins
         if claiming:
             for i in range(np.uintp(first), np.uintp(last)):
@@ -421,8 +418,8 @@ def copy_local_maxima(score, least, factor, level, maxima):
     least : (bins,) float32 array
         Scores of interest exceed ``factor * least + level``.
     factor, level : float
-    maxima : (groups * BINS_PER_GROUP,) float32 array
-        Overwritten up to the last bin.
+    maxima : (bins,) float32 array
+        Overwritten.
     """
     zero, factor, level = np.float32(0), np.float32(factor), np.float32(level)
     maxima[0] = maxima[score.size - 1] = zero
@@ -435,74 +432,30 @@ def copy_local_maxima(score, least, factor, level, maxima):
         )
 
 
-@vectorised_part
-def update_group_maxima(maxima, first, last, bounds):
-    """Largest maximum of each group of bins from `first` to before `last`, or 0.
-
-    Numbers from zero up keep their order when their bits are read as whole numbers, whose maximum
-    is found in vectors.
-
-    Parameters
-    ----------
-    maxima : (groups * BINS_PER_GROUP,) float32 array
-        Not negative.
-    first, last : int
-        Groups.
-    bounds : (groups,) float32 array
-        Overwritten in these groups.
-    """
-    bits, highest_bits = maxima.view(np.int32), bounds.view(np.int32)
-    for group in range(first, last):
-        highest = np.int32(0)
-        for j in range(group * BINS_PER_GROUP, (group + 1) * BINS_PER_GROUP):
-            highest = max(highest, bits[j])
-        highest_bits[group] = highest
-
-
-@vectorised_part
-def find_bin_in_group(maxima, group, value):
-    """Bin of the last maximum of a group that is as high as `value`, which has to be there.
-
-    Parameters
-    ----------
-    maxima : (groups * BINS_PER_GROUP,) float32 array
-    group : int
-    value : float32
-
-    Returns
-    -------
-    int
-    """
-    place, here = 0, maxima[group * BINS_PER_GROUP : (group + 1) * BINS_PER_GROUP]
-    for j in range(BINS_PER_GROUP):
-        place = max(place, j if here[j] == value else 0)
-    return group * BINS_PER_GROUP + place
-
-
 @loop_part
-def clear_maxima_around(best, times, distance, maxima, bounds):
-    """Take away the maxima nearer than `distance` to a bin, and that at the bin itself.
+def list_windows(times, scale, distance, windows):
+    """List the bins that a return at each bin reaches, and those too near for another return.
 
     Parameters
     ----------
-    best : int
-        Bin.
     times : (bins,) array
-        Seconds.
+        Seconds, increasing.
+    scale : (4,) array or tuple
+        Of the pulse.
     distance : float
         Seconds.
-    maxima : (groups * BINS_PER_GROUP,) float32 array
-        Set to zero around the bin.
-    bounds : (groups,) float32 array
-        Brought up to date.
+    windows : (bins, 4) int64 array
+        Overwritten: first bin reached and the one after the last; first bin nearer than `distance`
+        and the one after the last.
     """
-    first = last = best
-    while first > 0 and times[best] - times[first - 1] < distance:
-        first -= 1
-    while last < times.size - 1 and times[last + 1] - times[best] < distance:
-        last += 1
-    maxima[first : last + 1] = 0
-    update_group_maxima(maxima, first // BINS_PER_GROUP, last // BINS_PER_GROUP + 1, bounds)
+    for j in range(times.size):
+        windows[j, 0], windows[j, 1] = find_pulse_window(times, (j, j), times[j], scale)
+        first = last = j
+        while first > 0 and times[j] - times[first - 1] < distance:
+            first -= 1
+        while last < times.size - 1 and times[last + 1] - times[j] < distance:
+            last += 1
+        windows[j, 2], windows[j, 3] = first, last + 1
 
 
 @vectorised_part
@@ -548,11 +501,26 @@ def compute_mean_and_deviation(total, square, bins):
     return mean, np.sqrt(max(square / bins - mean * mean, 0.0))
 
 
-@loop_part
-def find_highest(values):
-    """Return where the first of the highest values stands."""
-    place, highest = 0, values[0]
-    for other in range(1, values.size):  # without a branch, which could not be predicted
-        higher = values[other] > highest
-        place, highest = other if higher else place, values[other] if higher else highest
+@vectorised_part
+def find_highest(maxima):
+    """Return the last bin of the highest maximum.
+
+    Numbers from zero up keep their order when their bits are read as whole numbers, whose maximum
+    is found in vectors.
+
+    Parameters
+    ----------
+    maxima : (bins,) float32 array
+        Not negative.
+
+    Returns
+    -------
+    int
+    """
+    bits = maxima.view(np.int32)
+    highest = place = np.int32(0)
+    for j in range(bits.size):
+        highest = max(highest, bits[j])
+    for j in range(bits.size):
+        place = max(place, np.int32(j) if bits[j] == highest else np.int32(0))
     return place
