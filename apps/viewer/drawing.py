@@ -31,7 +31,7 @@ MAX_POINTS_PER_S = 2e6
 """What a browser with a software renderer takes without falling behind."""
 
 MIN_DRAWN_POINTS = 16_000
-"""Every renderer takes this number 20 times a second; smaller clouds are always drawn whole."""
+"""Smaller clouds are always drawn whole: this number six times a second by software on two cores."""
 
 MOVING_FRAME_S, STILL_FRAME_S = 0.08, 0.5
 """s that a browser may take to draw a large cloud while it moves, and while it stands still: browsers
