@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from apps.compile_ahead import compile_loops_ahead
 from apps.conventions import JsonOption, build_provenance, make_folder, report
 from apps.figures.demo import make_demo_figure
 from apps.figures.style import save_figure
@@ -45,12 +46,13 @@ def demo(
 
     Skew, gains and slit centres are found from the shot itself. Surfaces are recovered from the whole shot at
     once; the picture shows them beside total variation of each frame. Writes streak.h5, frames.h5,
-    cloud.ply and preview.png.
+    cloud.ply and preview.png. The first run on a machine compiles the loops it needs, on all cores.
 
     Example: tofclip demo --out demo-output
     """
     started = time.perf_counter()
     make_folder(out)
+    compile_loops_ahead()
     run = _run_demo(seed)
     written = [out / name for name in ("streak.h5", "frames.h5", "cloud.ply", "preview.png")]
     run.streak.save(written[0])
