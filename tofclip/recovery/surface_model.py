@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from tofclip.camera import Camera, estimate_dark_level
 from tofclip.lidar import compute_ray_directions
 from tofclip.recovery.surface_patches import SmoothBasis
+from tofclip.recovery.surface_pulse import FWHM_PER_SIGMA, ShotPulse
 from tofclip.shots import Streak
 from tofclip.threads import map_parallel, split_blocks, thread_count
 from tofclip.units import SPEED_OF_LIGHT
@@ -40,7 +41,6 @@ SLIT_PIXELS, SUBROWS = 4, 3
 WIDTH_STEP = 0.02  # relative; for the derivative by a pulse's width
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
 MIN_VARIANCE = 0.02  # rows^2, of the smoothing that is left of a pulse shorter than a row
-FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
 
 
 @dataclass
@@ -142,6 +142,8 @@ class SurfaceModel:
     bases : sequence of SmoothBasis
         Of the surfaces' inverse depths.
     state : SurfaceState
+    pulse : ShotPulse, optional
+        A Gaussian of the camera's width by default.
 
     Notes
     -----
@@ -155,10 +157,12 @@ class SurfaceModel:
         masks: NDArray[np.bool_],
         bases: Sequence[SmoothBasis],
         state: SurfaceState,
+        pulse: ShotPulse | None = None,
     ) -> None:
         self.camera, self.masks, self.bases = camera, masks, list(bases)
         self.bin_width = float(np.mean(np.diff(streak.times)))
         self.times = streak.times
+        self.pulse = pulse or ShotPulse(camera.pulse_fwhm / FWHM_PER_SIGMA / self.bin_width)
         self.image, self.weights = weigh_measurements(streak, camera)
         self.surface, y, x = np.nonzero(masks)
         self.pixel = y * masks.shape[2] + x
@@ -181,13 +185,18 @@ class SurfaceModel:
             [m @ c for m, c in zip(self.monomials, state.coefficients, strict=True)]
         )
         self.distance: FloatArray = self.ray_length / np.maximum(inverse, MIN_INVERSE_DEPTH)
-        sigma = self.camera.pulse_fwhm / FWHM_PER_SIGMA / self.bin_width
-        self._half = int(np.ceil(EXTENT_SIGMAS * MAX_LENGTHENING * sigma)) + 1
+        sigma = self.pulse.sigma
+        self._core_half = int(np.ceil(EXTENT_SIGMAS * MAX_LENGTHENING * sigma)) + 1
+        self._half = self._core_half + self.pulse.reach
         self._margin = self._half + 3
         points = self._directions * self.distance[:, np.newaxis]
         self._views = self._map_views(lambda view: self._place_view(view, points))
         self._sigmas = sigma * np.array([one.rows_per_instant for one in self._views])
-        self.kernels = [make_pulse(width, self._half) for width in self._sigmas * state.widths]
+        self.kernels = [self._make_kernel(width) for width in self._sigmas * state.widths]
+
+    def _make_kernel(self, sigma: float, variance: float = 1 / 6) -> Image:
+        """The pulse of a core of `sigma` rows, of which `variance` is already there."""
+        return self.pulse.extend(make_pulse(sigma, self._core_half, variance))
 
     def compute_slopes(self) -> FloatArray:
         """Return how steeply the ranges change along columns and rows, (2, points), m per pixel."""
@@ -385,7 +394,7 @@ class SurfaceModel:
             place, kernel = self._views[view], self.kernels[view]
             gain, slit_shares = self.state.gains[view], place.slit_shares
             if squared:  # a pulse is smooth: the square of its samples between rows is theirs
-                whole = make_pulse(self._sigmas[view] * self.state.widths[view], self._half, 0.0)
+                whole = self._make_kernel(self._sigmas[view] * self.state.widths[view], 0.0)
                 kernel, gain, slit_shares = whole**2, gain**2, slit_shares**2
             own, slit = self._overlap(view)
             part = np.zeros((image.shape[0], place.columns), np.float32)
@@ -428,9 +437,7 @@ class SurfaceModel:
 
     def _differentiate_view(self, view: int, amplitude: Image) -> Derivatives:
         kernel, own = self.kernels[view], self._overlap(view)
-        wider = make_pulse(
-            self._sigmas[view] * self.state.widths[view] * (1 + WIDTH_STEP), self._half
-        )
+        wider = self._make_kernel(self._sigmas[view] * self.state.widths[view] * (1 + WIDTH_STEP))
         images = {
             "gains": self.project(view, amplitude, kernel),
             "widths": self.project(view, amplitude, (wider - kernel) / np.float32(WIDTH_STEP)),

@@ -10,23 +10,37 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
+
+from tofclip.shots import Returns
 
 FloatArray = NDArray[np.float64]
 Pixels = NDArray[np.intp]
 
 MARGIN_PX = 10  # how far a surface may reach beyond the returns that showed it
 NEIGHBOUR_BINS = 1.6  # neighbouring pixels whose ranges differ by less lie on one surface
+STEEP_STEPS = (
+    4.0  # of that: by how much they may differ where the surface is turned as far on either side
+)
+STEEP_EXCESS = 1.5  # of that: two such differences have more noise than one
 MIN_PATCH_PX = 25  # fewer returns are not a surface of their own
+MIN_BEHIND_FRACTION = 0.25  # of a surface's usual brightness, for it to be seen behind another
+NEIGHBOURS_PX, MIN_CROWD = 5, 0.4  # side of a square, and how much of it must see the surface
+MIN_DIMMER_PX, MIN_DIMMER_LIGHT = 100, 0.02  # of a surface that is nowhere the brightest
+DIMMER_BINS = 0.8  # misfit of its returns
+DIMMER_REACH_BINS = 4.0  # nearer to a surface, a return is a part of it
 MERGE_BINS = 0.5  # misfit of either of two patches to one surface for both
-MERGE_EXCESS = 1.1  # or of their misfit to a surface of their own
+MERGE_EXCESS = 1.3  # or of their misfit to a surface of their own
 MERGE_REACH_BINS = 7.0  # of the larger's fit at the smaller: further off it is not tried
 FIT_ITERATIONS = 10
+RIDGE = 1e-9  # per return
 CURVATURE_PENALTY = 1e-3  # keeps small patches from bending
 COEFFICIENTS = 6
 KNOT_SPACING_PX = 12
 MAX_PIECES = 8
 BEND_BINS = 0.3  # misfit of a quadratic from which on splines are tried
+BENT_FRACTION = 0.6  # of a quadratic's misfit: splines are worth their freedom below
 EVIDENCE_ROUNDS = 2
 SPLINE_START_PENALTY, SPLINE_FLOOR = 1e-5, 1e-9  # per return, before the bending is known
 CORRELATED_PX = 30  # returns of a frame recovery that share their errors, about
@@ -161,6 +175,97 @@ def _merge_some(patches: list[Patch], ray_length: FloatArray, bin_m: float) -> b
     return len(patches) < before
 
 
+def find_dimmer_patches(
+    patches: list[Patch], returns: Returns, ray_length: FloatArray, bin_m: float
+) -> list[Patch]:
+    """Find surfaces that are nowhere the brightest of their pixels, as gauze before a bright wall.
+
+    Recoveries make weak returns of their own, here and there; those of a surface lie side by side and
+    hold a part of the light.
+
+    Parameters
+    ----------
+    patches : list of Patch
+        Of the strongest returns.
+    returns : Returns
+        All of the shot.
+    ray_length : (rows, columns) float array
+    bin_m : float
+        Range of a bin, m.
+
+    Returns
+    -------
+    list of Patch
+    """
+    pixel = returns.y.astype(np.intp) * ray_length.shape[1] + returns.x
+    length = ray_length.ravel()[pixel]
+    free = np.ones(pixel.size, bool)
+    for patch in patches:
+        fitted = length / (patch.basis.evaluate(pixel) @ patch.coefficients)
+        free &= np.abs(returns.range - fitted) > DIMMER_REACH_BINS * bin_m
+    chosen = np.flatnonzero(free)
+    light = float(returns.intensity.sum())
+    found = []
+    for patch in find_patches(pixel[chosen], returns.range[chosen], ray_length, bin_m):
+        on_patch = np.isin(pixel[chosen], patch.pixels)
+        fitted = length[chosen] / (patch.basis.evaluate(pixel[chosen]) @ patch.coefficients)
+        on_patch &= np.abs(returns.range[chosen] - fitted) < NEIGHBOUR_BINS * bin_m
+        own = float(returns.intensity[chosen[on_patch]].sum())
+        dim = patch.pixels.size >= MIN_DIMMER_PX and own > MIN_DIMMER_LIGHT * light
+        error = _compute_median_error(patch, patch.coefficients, ray_length.ravel()[patch.pixels])
+        # noise far out of a surface's pulse makes no surface of its own
+        dim = dim and error < DIMMER_BINS * bin_m
+        if dim and all(_are_apart(patch, one, ray_length, bin_m) for one in patches):
+            found.append(patch)
+    return found
+
+
+def _are_apart(patch: Patch, other: Patch, ray_length: FloatArray, bin_m: float) -> bool:
+    """Whether two surfaces are apart where the first one is seen."""
+    length = ray_length.ravel()[patch.pixels]
+    here, there = (
+        length / (one.basis.evaluate(patch.pixels) @ one.coefficients) for one in (patch, other)
+    )
+    return float(np.median(np.abs(here - there))) > DIMMER_REACH_BINS * bin_m
+
+
+def reach_further(
+    patch: Patch, returns: Returns, ray_length: FloatArray, bin_m: float
+) -> NDArray[np.bool_]:
+    """Return where a patch's surface is seen, also behind another that is brighter there.
+
+    A weaker return of a pixel is often the recovery's own. It counts where it lies on a surface that
+    other pixels see alone, nearly as bright as there, and with neighbours that do so as well.
+
+    Parameters
+    ----------
+    patch : Patch
+    returns : Returns
+        All of the shot.
+    ray_length : (rows, columns) float array
+    bin_m : float
+        Range of a bin, m.
+
+    Returns
+    -------
+    (rows, columns) bool array
+    """
+    own = np.zeros(ray_length.shape, bool)
+    own.ravel()[patch.pixels] = True
+    pixel = returns.y.astype(np.intp) * ray_length.shape[1] + returns.x
+    fitted = ray_length.ravel()[pixel] / (patch.basis.evaluate(pixel) @ patch.coefficients)
+    near = np.abs(returns.range - fitted) < NEIGHBOUR_BINS * bin_m
+    if not (near & own.ravel()[pixel]).any():
+        return own
+    usual = float(np.median(returns.intensity[near & own.ravel()[pixel]]))
+    near &= returns.intensity > MIN_BEHIND_FRACTION * usual
+    seen = own.copy()
+    seen.ravel()[pixel[near]] = True
+    crowded = scipy.ndimage.uniform_filter(seen.astype(np.float32), NEIGHBOURS_PX, mode="nearest")
+    found: NDArray[np.bool_] = own | (seen & (crowded > MIN_CROWD))
+    return found
+
+
 def _connect_neighbours(
     pixels: Pixels, distance: FloatArray, shape: tuple[int, ...], tolerance: float
 ) -> list[Pixels]:
@@ -187,12 +292,38 @@ def _connect_neighbours(
                 near = (one >= 0) & (other >= 0)
                 near &= np.abs(distance[one] - distance[other]) < tolerance
                 links.append(np.stack([one[near], other[near]]))
+        links += _link_steep_pixels(layers[0], distance, (down, right), tolerance)
     ends = np.concatenate(links, axis=1)
     graph = coo_array((np.ones(ends.shape[1], np.int8), tuple(ends)), shape=(pixels.size,) * 2)
     _, label = connected_components(graph, directed=False)
     sizes = np.bincount(label)
     largest = np.argsort(-sizes, kind="stable")
     return [np.flatnonzero(label == one) for one in largest[sizes[largest] >= MIN_PATCH_PX]]
+
+
+def _link_steep_pixels(
+    layer: Pixels, distance: FloatArray, step: tuple[int, int], tolerance: float
+) -> list[Pixels]:
+    """Pairs of neighbours whose ranges differ by more, but as much as on the other side: three
+    pixels of a surface that is turned far.
+    """
+    down, right = step
+    rows, columns = layer.shape
+    tall, wide = rows - 2 * down, columns - 2 * abs(right)
+    first = max(0, -2 * right)
+    three = [
+        layer[k * down : k * down + tall, first + k * right : first + k * right + wide]
+        for k in range(3)
+    ]
+    before, middle, after = three
+    there = (before >= 0) & (middle >= 0) & (after >= 0)
+    one, other = distance[middle] - distance[before], distance[after] - distance[middle]
+    there &= np.abs(one) + np.abs(other) < 2 * STEEP_STEPS * tolerance
+    there &= np.abs(other - one) < STEEP_EXCESS * tolerance
+    return [
+        np.stack([before[there], middle[there]]),
+        np.stack([middle[there], after[there]]),
+    ]
 
 
 def _fit_quadratic(pixels: Pixels, distance: FloatArray, ray_length: FloatArray) -> Patch:
@@ -208,6 +339,8 @@ def _fit_robustly(
 ) -> tuple[FloatArray, float]:
     """Coefficients and scale of the errors; outliers are weighted down (Cauchy's weights)."""
     weights, coefficients, scale = np.ones(values.size), np.zeros(design.shape[1]), 0.0
+    # returns along a line say nothing about what is across it
+    penalty = penalty + RIDGE * values.size * np.eye(design.shape[1])
     for _ in range(FIT_ITERATIONS):
         normal = design.T @ (design * weights[:, np.newaxis]) + penalty * weights.mean()
         coefficients = np.linalg.solve(normal, design.T @ (weights * values))
@@ -245,7 +378,9 @@ def _bend_where_needed(patch: Patch, ray_length: FloatArray, bin_m: float) -> Pa
     bent = Patch(
         patch.pixels, patch.distance, SmoothBasis(shape, box, basis.pieces, bending), coefficients
     )
-    return bent if _compute_median_error(bent, coefficients, length) < plain / 2 else patch
+    return (
+        bent if _compute_median_error(bent, coefficients, length) < BENT_FRACTION * plain else patch
+    )
 
 
 def _compute_median_error(patch: Patch, coefficients: FloatArray, length: FloatArray) -> float:

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from tofclip.camera import Camera, measure
 from tofclip.errors import InputError
@@ -32,14 +33,20 @@ from tofclip.lidar import Detection, Returns, compute_ray_directions, depth
 from tofclip.lidar.range_correction import correct_returns
 from tofclip.recovery.surface_model import (
     EXTENT_SIGMAS,
-    FWHM_PER_SIGMA,
     FloatArray,
     Image,
     SurfaceModel,
     SurfaceState,
     find_rows,
 )
-from tofclip.recovery.surface_patches import MARGIN_PX, Patch, find_patches
+from tofclip.recovery.surface_patches import (
+    MARGIN_PX,
+    Patch,
+    find_dimmer_patches,
+    find_patches,
+    reach_further,
+)
+from tofclip.recovery.surface_pulse import ShotPulse, measure_pulse
 from tofclip.recovery.surface_solver import AmplitudeSolver, Refinement, refine_state
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import Method, Progress, Sparse, ignore_progress
@@ -47,13 +54,20 @@ from tofclip.units import SPEED_OF_LIGHT
 
 START_ITERATIONS = 25
 REFINEMENTS, REFINEMENT_ITERATIONS = 2, 20
-MIN_SURFACE_SHARE = 0.5  # of the returns' light: below, the shot is not one of surfaces
-# Of the measurements, both smoothed so that photons' noise does not count: above, most of the light is
-# not where the surfaces are. Smoke's first light looks like one surface, but only the first.
-MAX_UNEXPLAINED, SMOOTHING_PX = 0.5, 2.0
+# Of the returns' light: below, the shot is not one of surfaces. Simulated shots of surfaces have 0.93
+# or more, recorded ones 0.97; recorded relay walls have 0.50 to 0.79.
+MIN_SURFACE_SHARE = 0.7
+# Of the measurements, both smoothed so that photons' noise hardly counts: above, much of the light is
+# not where the surfaces are. Surfaces leave 0.02 to 0.22, recorded relay walls 0.2 to 0.5. Smoke's
+# first light looks like one surface, but only the first.
+MAX_UNEXPLAINED, SMOOTHING_PX = 0.3, 2.0
+# Of a pulse's light, that long after its peak: more is not an instrument's afterglow (0.18), but light
+# that comes from many depths to each pixel.
+MAX_TAIL_SHARE = 0.3
 SURE_SIGMAS = 20.0  # points of which a surface certainly consists
 UPPER_QUANTILE = 0.9
 MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
+EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
 NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
 
 
@@ -138,18 +152,23 @@ class SurfaceRecovery:
         pixels = np.flatnonzero(np.isfinite(strongest))
         patches = find_patches(pixels, strongest[pixels], ray_length, bin_m)
         _require_surfaces(found, patches)
+        patches += find_dimmer_patches(patches, found, ray_length, bin_m)
         masks = np.zeros((len(patches), *camera.image_shape), bool)
         pictures = np.zeros(masks.shape, np.float32)
         brightness = frames.values.sum(axis=0).ravel()
         for patch, mask, picture in zip(patches, masks, pictures, strict=True):
-            mask.ravel()[patch.pixels] = True
             picture.ravel()[patch.pixels] = brightness[patch.pixels]
-            mask[...] = scipy.ndimage.binary_dilation(mask, np.ones((3, 3)), MARGIN_PX)
+            seen = reach_further(patch, found, ray_length, bin_m)
+            mask[...] = scipy.ndimage.binary_dilation(seen, np.ones((3, 3)), MARGIN_PX)
         state = SurfaceState.start([patch.coefficients for patch in patches], camera)
-        model = SurfaceModel(streak, camera, masks, [patch.basis for patch in patches], state)
+        bases = [patch.basis for patch in patches]
+        on_surface = np.concatenate([patch.pixels for patch in patches])
+        pulse = measure_pulse(frames, on_surface, strongest[on_surface])
+        _require_short_pulse(pulse)
+        model = SurfaceModel(streak, camera, masks, bases, state, pulse)
         solver = AmplitudeSolver(model, pictures[masks], self.weight)
         solver.run(START_ITERATIONS, progress, count)
-        _require_explained(model, solver.amplitude)
+        _require_explained(model, solver.amplitude, frames, streak)
         refinement, remainder = self._refine(model, solver, progress, count)
         solver.run(self.iterations, progress, count)
         returns = self._list_returns(model, solver, refinement, remainder, centre_error_px)
@@ -219,10 +238,11 @@ class SurfaceRecovery:
         distance, amplitude = model.distance, solver.amplitude
         # A pixel alone is hardly above the photons' noise: its neighbours on the surface, which the
         # prior ties to it, count as well.
-        information = np.zeros(model.masks.shape, np.float32)
+        pictures, information = np.zeros((2, *model.masks.shape), np.float32)
         information[model.masks] = model.gather(model.weights, squared=True)
-        pooled = NEIGHBOURHOOD_PX**2 * scipy.ndimage.uniform_filter(
-            information, (0, NEIGHBOURHOOD_PX, NEIGHBOURHOOD_PX), mode="constant"
+        pictures[model.masks] = amplitude
+        pooled = np.stack(
+            [pool_information(*one) for one in zip(information, pictures, strict=True)]
         )
         significance = amplitude * np.sqrt(pooled[model.masks] / solver.variance)
         deviation = np.zeros(distance.size)
@@ -292,6 +312,41 @@ def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
     return found
 
 
+def pool_information(information: Image, picture: Image) -> Image:
+    """Return the information about each pixel's amplitude, with that of pixels tied to it.
+
+    These are the nearest ones, and those further off that the prior has made as bright: where little
+    is known of each pixel it leaves large even pieces, whose amplitude all their pixels determine.
+
+    Parameters
+    ----------
+    information : (rows, columns) float32 array
+        Of each pixel alone, one over the variance of its amplitude.
+    picture : (rows, columns) float32 array
+        Amplitudes.
+
+    Returns
+    -------
+    (rows, columns) float32 array
+    """
+
+    def add_up(values: Image, side: int) -> Image:
+        mean: Image = scipy.ndimage.uniform_filter(values, side, mode="constant")
+        return side**2 * mean
+
+    pooled = add_up(information, NEIGHBOURHOOD_PX)
+    level = np.zeros(picture.shape, np.intp)
+    lit = picture > 0
+    level[lit] = np.floor(np.log(picture[lit]) / np.log(EVEN_RATIO)).astype(np.intp)
+    for one in np.unique(level[lit]):
+        even = lit & (np.abs(level - one) <= 1)
+        own = lit & (level == one)
+        wide = add_up(np.where(even, information, 0), EVEN_PX)
+        pooled[own] = np.maximum(pooled[own], wide[own])
+    found: Image = pooled
+    return found
+
+
 def extrapolate_steps(lengths: FloatArray) -> FloatArray:
     """Return how far steps that shrink as the last two did would still go.
 
@@ -334,33 +389,64 @@ def find_usual_brightness(amplitude: Image, significance: Image, limit: float) -
     return float(np.median(sure)) if sure.size else float("inf")
 
 
+def _refuse(fault: str) -> InputError:
+    """The error of a shot that is not one of surfaces."""
+    return InputError(
+        f"{fault}: this shot's light is not on surfaces (smoke, light in flight, a relay wall); "
+        'choose `method="tv"`'
+    )
+
+
 def _require_surfaces(found: Returns, patches: list[Patch]) -> None:
-    """Refuse a shot whose light does not come from surfaces."""
+    """Refuse a shot whose returns do not lie side by side on surfaces."""
     on_surface = np.zeros(found.camera.image_shape, bool)
     for patch in patches:
         on_surface.ravel()[patch.pixels] = True
     light = float(found.intensity.sum())
     share = float(found.intensity[on_surface[found.y, found.x]].sum()) / light if light else 0.0
     if share < MIN_SURFACE_SHARE:
-        raise InputError(
-            f"only {100 * share:.0f} % of this shot's light comes from surfaces; choose "
-            '`method="tv"`'
+        raise _refuse(f"only {100 * share:.0f} % of the returns' light lies on smooth surfaces")
+
+
+def _require_short_pulse(pulse: ShotPulse) -> None:
+    """Refuse a shot whose pixels go on receiving light long after the return."""
+    if pulse.tail_share > MAX_TAIL_SHARE:
+        raise _refuse(
+            f"{100 * pulse.tail_share:.0f} % of each pixel's light comes long after its peak"
         )
 
 
-def _require_explained(model: SurfaceModel, amplitude: Image) -> None:
-    """Refuse a shot that surfaces do not explain."""
+def _require_explained(
+    model: SurfaceModel, amplitude: Image, frames: Frames, streak: Streak
+) -> None:
+    """Refuse a shot that surfaces explain neither well nor as well as its frames do."""
+    unexplained = _compare_smoothed(model.render(amplitude), model.image, model.weights > 0)
+    if unexplained <= MAX_UNEXPLAINED:
+        return
+    # In little light noise is left over however right the surfaces are, and by frames as well.
+    camera = frames.camera
+    seen = measure(streak.counts, streak.saturated, camera)
+    predicted = np.zeros_like(seen.values)
+    for shear in np.unique(frames.shears):
+        own = np.flatnonzero(frames.shears == shear)
+        pictures = np.ascontiguousarray(np.moveaxis(frames.values[own], 0, -1))
+        predicted[:, own] = camera.operator(float(shear))(pictures)
+    by_frames = _compare_smoothed(predicted, seen.values, seen.valid)
+    if unexplained > by_frames:
+        raise _refuse(
+            f"surfaces leave {100 * unexplained:.0f} % of the signal unexplained, and frames "
+            f"{100 * by_frames:.0f} %"
+        )
+
+
+def _compare_smoothed(predicted: Image, measured: Image, valid: NDArray[np.bool_]) -> float:
+    """Norm of what is left over that of the measurements, both smoothed."""
     error, image = (
-        scipy.ndimage.gaussian_filter((one * (model.weights > 0)), SMOOTHING_PX)
-        for one in (model.image - model.render(amplitude), model.image)
+        scipy.ndimage.gaussian_filter(one * valid, SMOOTHING_PX)
+        for one in (measured - predicted, measured)
     )
     signal = float(np.linalg.norm(image))
-    unexplained = float(np.linalg.norm(error)) / signal if signal else 1.0
-    if unexplained > MAX_UNEXPLAINED:
-        raise InputError(
-            f"surfaces leave {100 * unexplained:.0f} % of this shot's signal unexplained: its light "
-            'is not on surfaces (smoke, light in flight, a relay wall); choose `method="tv"`'
-        )
+    return float(np.linalg.norm(error)) / signal if signal else 1.0
 
 
 def _render_frames(start: Frames, model: SurfaceModel, amplitude: Image) -> Image:
@@ -369,7 +455,7 @@ def _render_frames(start: Frames, model: SurfaceModel, amplitude: Image) -> Imag
 
     lit = np.flatnonzero(amplitude)
     row = find_rows(start.times, 2 * model.distance[lit] / SPEED_OF_LIGHT)
-    sigma = model.camera.pulse_fwhm / FWHM_PER_SIGMA / start.bin_width
+    sigma = model.pulse.sigma
     half = int(np.ceil(EXTENT_SIGMAS * sigma + 0.5))
     rows = np.round(row).astype(np.intp)[:, np.newaxis] + np.arange(-half, half + 2)
     upto = ndtr((rows - 0.5 - row[:, np.newaxis]) / sigma)
@@ -379,4 +465,7 @@ def _render_frames(start: Frames, model: SurfaceModel, amplitude: Image) -> Imag
     inside = (rows >= 0) & (rows < len(values))
     pixel = np.broadcast_to(model.pixel[lit][:, np.newaxis], rows.shape)
     np.add.at(values.reshape(len(values), -1), (rows[inside], pixel[inside]), light[inside])
+    if model.pulse.reach:
+        tail = model.pulse.extend(np.ones(1, np.float32))
+        values = scipy.ndimage.convolve1d(values, tail, axis=0, mode="constant")
     return values
