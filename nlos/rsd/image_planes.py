@@ -167,7 +167,7 @@ class LaserSource:
     strength: FloatArray
     splits: dict[tuple[float, float], Illumination] = field(default_factory=dict, repr=False)
 
-    @property
+    @cached_property
     def centre_wavenumber(self) -> float:
         """Wavenumber about which the illumination is expanded; 0 without one."""
         if self.laser is None:
