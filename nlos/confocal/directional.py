@@ -167,9 +167,11 @@ def find_imaged_surface(capture: Capture, volume: Volume, fraction: float = 0.3)
     InputError
         The volume is too small or dark, or the fraction is not between 0 and 1.
     """
-    here = capture.on(ComputeDevice())
+    here = volume.on(ComputeDevice())
+    require_surface(here.magnitude, fraction)
     try:
-        LightCone().plan(here, volume.grid)
+        return DirectionalLightCone().find_front_surface(
+            capture.on(ComputeDevice()), volume.grid, fraction
+        )
     except InputError:
-        return find_front_surface(volume.on(ComputeDevice()), fraction)
-    return DirectionalLightCone().find_front_surface(here, volume.grid, fraction)
+        return find_front_surface(here, fraction)
