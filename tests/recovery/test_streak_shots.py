@@ -149,20 +149,21 @@ def test_glints_of_any_brightness_elsewhere(method, brightness, corner) -> None:
     check_returns("retroreflector", method, scene, counts)
 
 
-def test_more_iterations_take_the_rim_off_thin_bars() -> None:
+def test_a_bright_shot_is_iterated_until_the_rim_of_thin_bars_is_gone() -> None:
     """Its false returns lie above and below the bars, which the views see nearly along the columns.
 
-    Over four seeds 80 iterations leave 0.44 to 0.56 of them, and at most 1.2 % of all.
+    Over four seeds 2.0 to 2.1 % of all are false after 40 iterations, and 1.4 to 1.6 % when bright
+    frames go on until their objective has settled.
     """
     steps = oracle.make_steps()
     counts = oracle.count_photons(oracle.compute_light(steps), seed=6)
     scores = []
-    for iterations in (40, 80):
+    for iterations in (40, None):
         returns = locate(counts, "l1", iterations)
         scores.append(oracle.score(returns.y, returns.x, returns.range, steps))
     (_, usual), (missed, false) = scores
-    assert false < 0.7 * usual
-    assert false <= 0.02
+    assert false < 0.9 * usual
+    assert false <= 0.018
     assert missed <= 0.02
 
 

@@ -10,7 +10,7 @@ import pytest
 import scipy.optimize
 import scipy.sparse
 
-from tofclip.errors import ShapeError
+from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LineProjection, SparseMatrix, estimate_squared_norm
 from tofclip.solvers import (
     Fista,
@@ -25,7 +25,7 @@ from tofclip.solvers import (
     iterate,
 )
 from tofclip.solvers.fista import ProximalStep
-from tofclip.solvers.method import GAP_INTERVAL, IterationHistory, Result
+from tofclip.solvers.method import GAP_INTERVAL, MIN_FURTHER_FALL, IterationHistory, Result
 from tofclip.threads import LANES
 
 
@@ -310,6 +310,29 @@ def test_the_gap_ends_a_run_and_is_told():
     least = Sparse(0.1, 3000, gap=1e-8).recover(operator, measurements).objective[-1]
     assert least <= done.objective[-1] <= least * (1 + 1e-3)
     assert np.isnan(TotalVariation(0.1, 10).recover(operator, measurements).duality_gap)
+
+
+def test_further_iterations_follow_only_while_the_objective_falls():
+    operator, reported = projection(), []
+    measurements = np.abs(np.random.default_rng(7).standard_normal((40, 5)))
+    short = Sparse(1e-3, 10, gap=0.0)
+    limited = short.recover(operator, measurements)
+    method = replace(short, further=3000)
+    done = method.recover(operator, measurements, progress=reported.append)
+    assert sum(reported) == method.work(5)
+    assert 10 < done.iterations < 3010
+    assert done.iterations % GAP_INTERVAL == 0
+    np.testing.assert_array_equal(done.objective[:11], limited.objective)
+    before, last = done.objective[-11], done.objective[-1]
+    assert before - last <= MIN_FURTHER_FALL * last
+    assert (
+        replace(short, iterations=done.iterations, further=50)
+        .recover(operator, measurements)
+        .iterations
+        == done.iterations
+    )
+    with pytest.raises(InputError, match="further"):
+        StoppingRule(3, further=-1)
 
 
 @pytest.mark.parametrize("method", [Sparse(0.05, 12), TotalVariation(0.05, 12)], ids=["l1", "tv"])

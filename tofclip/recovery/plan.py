@@ -73,9 +73,19 @@ MIN_NOISE_COUNT = 0.3
 
 AnyMethod = Method | SurfaceRecovery
 
+FURTHER_SPARSE_ITERATIONS = 40
+"""Of `l1` where their number is not given: a bright shot needs more of them than a dark one."""
+
+
+def make_sparse(**settings: Any) -> Sparse:
+    """Make the method `l1`, which goes on while its objective falls unless iterations are given."""
+    further = 0 if "iterations" in settings else FURTHER_SPARSE_ITERATIONS
+    return Sparse(**{"further": further, **settings})
+
+
 METHODS: dict[str, Callable[..., AnyMethod]] = {
     "tv": TotalVariation,
-    "l1": Sparse,
+    "l1": make_sparse,
     "linear": LinearInverse,
     "adjoint": Backprojection,
     "surfaces": SurfaceRecovery,

@@ -361,6 +361,8 @@ class ProximalMethod(ABC):
     gap : float
         A block is done as soon as every frame's objective is above the least one by at most this
         fraction of it, as the duality gap says, for priors that have one; 0: never.
+    further : int
+        Iterations that may follow for blocks whose objective still falls, see `StoppingRule`.
 
     Attributes
     ----------
@@ -374,6 +376,7 @@ class ProximalMethod(ABC):
     tolerance: float = 0.0
     data_term: DataTermMaker = LeastSquares
     gap: float = 1e-3
+    further: int = 0
     name = ""
     portable = False
 
@@ -440,7 +443,7 @@ class ProximalMethod(ABC):
         progress: Progress,
         start: Array | None,
     ) -> Result:
-        stopping = StoppingRule(self.iterations, self.tolerance, self.gap)
+        stopping = StoppingRule(self.iterations, self.tolerance, self.gap, self.further)
         started = time.perf_counter()
         step = 1 / (NORM_MARGIN * operator.squared_norm)
         batches = make_batches(operator, measurements)
@@ -516,7 +519,7 @@ class ProximalMethod(ABC):
 
     def work(self, frames: int) -> int:
         """Return how many frame iterations `recover` reports at most."""
-        return frames * self.iterations
+        return frames * (self.iterations + self.further)
 
 
 @dataclass(frozen=True)

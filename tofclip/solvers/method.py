@@ -8,7 +8,7 @@ on the same device. Memory beyond the result is bounded: see `tofclip.solvers.lo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -35,6 +35,12 @@ GAP_INTERVAL = 10
 """Iterations between two looks at the duality gap, each of which costs half an iteration."""
 
 
+MIN_FURTHER_FALL = 6e-3
+"""Of the objective. Between iterations 30 and 40 it falls by 0.9 to 3.6 % in shots whose thin bars
+have a rim of false points by then, and by 0.1 to 0.2 % in dark ones, in which more iterations only
+follow the noise."""
+
+
 @dataclass(frozen=True)
 class StoppingRule:
     """When a block of frames is done.
@@ -49,11 +55,15 @@ class StoppingRule:
     gap : float
         Stop, too, as soon as every frame's duality gap is at most this fraction of its objective,
         for solvers that know one. It is looked at every `GAP_INTERVAL` iterations.
+    further : int
+        Iterations that may follow, in steps of `GAP_INTERVAL`, as long as the last step took more
+        than `MIN_FURTHER_FALL` off the block's objective.
     """
 
     iterations: int
     tolerance: float = 0.0
     gap: float = 0.0
+    further: int = 0
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
@@ -61,6 +71,22 @@ class StoppingRule:
         for name, value in (("tolerance", self.tolerance), ("gap", self.gap)):
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"{name} must be finite and not negative, got {value}")
+        if self.further < 0:
+            raise InputError(f"further iterations must not be negative, got {self.further}")
+
+    def continues(self, objective: Sequence[Array]) -> bool:
+        """Say whether a block goes on after its iterations.
+
+        Parameters
+        ----------
+        objective : sequence of scalars
+            Of the block before the first and after every iteration.
+        """
+        done = len(objective) - 1
+        if not (done >= GAP_INTERVAL and self.iterations <= done < self.iterations + self.further):
+            return False
+        fall = objective[-1 - GAP_INTERVAL] - objective[-1]
+        return bool(fall > MIN_FURTHER_FALL * objective[-1])
 
 
 class IterativeSolver(Protocol):
@@ -117,7 +143,7 @@ def iterate(
     solver : IterativeSolver
         Advanced in place.
     stopping : StoppingRule
-        Maximum number of iterations and the tolerance.
+        Maximum number of iterations, what may follow them, and the tolerance.
     progress : callable
         Called with the number of frame iterations just done; those that are saved are reported too.
     frames : int
@@ -132,24 +158,29 @@ def iterate(
     # Sums stay where the arrays are: reading one back from a GPU would make every iteration wait.
     objective = [xp.sum(solver.objective)]
     converged, gap = False, None
-    for done in range(1, stopping.iterations + 1):
+    done, limit, most = 0, stopping.iterations, stopping.iterations + stopping.further
+    while done < limit:
+        done += 1
         solver.step()
         objective.append(xp.sum(solver.objective))
         if stopping.tolerance > 0:
             # a refused step changes nothing, which does not mean that the block has converged
             little = objective[-2] - objective[-1] < stopping.tolerance * objective[-1]
             converged = bool(little & ~xp.any(solver.rejected))
-        if stopping.gap > 0 and (
-            converged or done == stopping.iterations or done % GAP_INTERVAL == 0
-        ):
+        if stopping.gap > 0 and (converged or done == limit or done % GAP_INTERVAL == 0):
             gap = solver.duality_gap()
             if gap is not None:
                 converged |= bool(xp.all(gap <= stopping.gap * solver.objective))
         if converged:
             # The iterations that were saved count as done, so that a progress bar ends at its end.
-            progress(frames * (stopping.iterations - done + 1))
+            progress(frames * (most - done + 1))
             break
         progress(frames)
+        if done == limit:
+            if stopping.continues(objective):
+                limit = min(done + GAP_INTERVAL, most)
+            elif done < most:
+                progress(frames * (most - done))
     excess = float("nan") if gap is None else float(xp.sum(gap))
     return IterationHistory(to_numpy(xp.stack(objective)), converged, excess)
 

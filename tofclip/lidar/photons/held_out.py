@@ -4,6 +4,7 @@ which response and which reach of planes explain them best, and how probable an 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -34,7 +35,13 @@ MARGIN_WEIGHT, MARGIN_WEIGHT_SPREAD = 1 / 7, 0.5
 paths count what they share several times. In 16 simulated scenes of 0.7 to 20 signal and 2 to 200
 background photons the weight was 0.076 to 0.28."""
 
-MARGIN_WEIGHTS = np.geomspace(0.02, 1.0, 41)
+RIVAL_SPREAD = 0.5
+"""Of the logarithm of the number of labels that rival the best one: about one on surfaces (0.6 to
+2.4 in the same scenes), many where no light comes back."""
+
+MARGIN_WEIGHTS, RIVALS = np.geomspace(0.03, 0.8, 24), np.geomspace(0.5, 256, 10)
+MAX_JUDGED_PIXELS = 20_000
+"""Pixels, evenly chosen, that the outlier probability is learnt from."""
 
 
 def weigh_evidence(
@@ -185,8 +192,9 @@ def calibrate_outliers(
     """Learn the probability of an outlier from what the photons held back say.
 
     The margin between two labels is what the paths make of the log odds: the probability is a
-    logistic function of it, one half where two labels are as good. Its slope is the most likely one
-    given the photons held back, in which right and wrong pixels are mixed.
+    logistic function of it, one half where two labels are as good and the others are not. Its slope
+    and the number of rivals are the most likely ones given the photons held back, in which right
+    and wrong pixels are mixed.
 
     Parameters
     ----------
@@ -207,22 +215,24 @@ def calibrate_outliers(
     # Nor does a response explain the photons that it was learnt from as it does others, or one that
     # is given what a surface that is slightly off shows: either half is judged by the other one's.
     one, other = test.split(0.5, 0)
-    evidence = sum(
-        _weigh_best_pooled(part, train, *_learn_anew(teacher, scene, surface))
-        for teacher, part in ((other, one), (one, other))
-    )
-    for_surface = np.exp(np.clip(evidence, -30, 30))
-    flat = np.maximum(margin.ravel(), 0).astype(np.float64)
+    evidence = np.zeros(surface.size)
+    for teacher, part in ((other, one), (one, other)):
+        evidence += _weigh_best_pooled(part, train, *_learn_anew(teacher, scene, surface))
+    some = slice(None, None, -(-margin.size // MAX_JUDGED_PIXELS))
+    for_surface = np.exp(np.clip(evidence[some], -30, 30))
+    known = np.maximum(margin.ravel()[some], 0).astype(np.float64)
 
-    def weigh(weight: np.float64) -> float:
-        wrong = _logistic(-weight * flat)
-        prior = (np.log(weight / MARGIN_WEIGHT) / MARGIN_WEIGHT_SPREAD) ** 2 / 2
-        return float(np.sum(np.log((1 - wrong) * for_surface + wrong)) - prior)
+    def weigh(choice: tuple[np.float64, np.float64]) -> float:
+        weight, rivals = choice
+        wrong = _logistic(np.log(rivals) - weight * known)
+        prior = (np.log(weight / MARGIN_WEIGHT) / MARGIN_WEIGHT_SPREAD) ** 2
+        prior += (np.log(rivals) / RIVAL_SPREAD) ** 2
+        return float(np.sum(np.log((1 - wrong) * for_surface + wrong)) - prior / 2)
 
-    best = max(MARGIN_WEIGHTS, key=weigh)
+    weight, rivals = max(itertools.product(MARGIN_WEIGHTS, RIVALS), key=weigh)
 
     def to_probability(value: NDArray[np.float32]) -> FloatArray:
-        return _logistic(-best * np.maximum(value, 0).astype(np.float64))
+        return _logistic(np.log(rivals) - weight * np.maximum(value, 0).astype(np.float64))
 
     return to_probability
 

@@ -107,7 +107,7 @@ def _fit_planes(
     run_blocks(work, surface.shape[0], ROWS_PER_BLOCK)
 
 
-def estimate_bias(fitted: FloatArray, nested: FloatArray, reach: int) -> FloatArray:
+def estimate_bias(fitted: FloatArray, nested: FloatArray, reach: int, width: float) -> FloatArray:
     """Mean square, in bins, of what planes miss where a surface bends, (rows, columns).
 
     Two estimates of which one uses a part of the other's photons differ by the difference of their
@@ -119,6 +119,8 @@ def estimate_bias(fitted: FloatArray, nested: FloatArray, reach: int) -> FloatAr
         Fits of `reach` and of half of it; see `fit_surface`.
     reach : int
         In pixels.
+    width : float
+        Full width of the response, bins. Where a fit is less sure than that, nothing is known.
 
     Returns
     -------
@@ -128,7 +130,7 @@ def estimate_bias(fitted: FloatArray, nested: FloatArray, reach: int) -> FloatAr
     apart = (fitted[..., 0] - nested[..., 0]) ** 2
     wide, narrow = fitted[..., 1] ** 2, nested[..., 1] ** 2
     # A border that moved is not a bend.
-    known = np.isfinite(wide) & np.isfinite(narrow) & (apart < 25 * narrow)
+    known = (np.maximum(wide, narrow) < width**2) & (apart < 25 * narrow)
     excess = np.zeros(apart.shape)
     excess[known] = (apart - narrow)[known] + wide[known]
     number = scipy.ndimage.uniform_filter(known.astype(float), 2 * reach + 1, mode="nearest")

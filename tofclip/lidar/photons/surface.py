@@ -193,6 +193,10 @@ class SurfacePlan:
         fitted = fit_surface(photons, scene, nested[..., 0], self.reach)
         # Where no photon is near, the label is all there is.
         counted = np.minimum(fitted[..., 1], scene.response.width)
-        variance = counted**2 + estimate_bias(fitted, nested, self.reach) + self.systematic**2
+        variance = (
+            counted**2
+            + estimate_bias(fitted, nested, self.reach, scene.response.width)
+            + self.systematic**2
+        )
         doubt = self.to_probability(margin)
         return np.stack([fitted[..., 0], np.sqrt(variance), fitted[..., 2], doubt], axis=-1)
