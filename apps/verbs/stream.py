@@ -18,10 +18,11 @@ from apps.conventions import JsonOption, TimeZeroOption, report
 from apps.verbs.cloud import require_format
 from devices.shot_stream import TrackedShots, read_transients
 from tofclip.errors import InputError
-from tofclip.recovery import SharpestFocus, parse_focus
+from tofclip.recovery import SharpestFocus, SurfaceRecovery, parse_focus
 from tofclip.sequences import list_shots
-from tofclip.sequences.ranger import RangingPipeline, build_cloud_path
+from tofclip.sequences.ranger import CloudPipeline, RangingPipeline, build_cloud_path
 from tofclip.sequences.streaming import stream_clouds
+from tofclip.sequences.surface_following import SurfacePipeline
 from tofclip.solvers import LinearInverse, ProximalMethod, Sparse, TotalVariation
 from tofclip.units import NANOSECOND, PICOSECOND
 
@@ -71,7 +72,8 @@ def stream(
         typer.Option(
             metavar="NAME",
             help="linear, which is the fastest and draws rays around bright objects, or l1 or tv, "
-            "which leave them out: few iterations that begin at the last shot's pictures.",
+            "which leave them out: few iterations that begin at the last shot's pictures; or surfaces, "
+            "the truest and slowest, which follow those of the last shot.",
         ),
     ] = "linear",
     shots: Annotated[
@@ -117,7 +119,7 @@ def stream(
     first = coming.peek()
     if first is None:
         raise InputError(f"{source}: the source ended before it gave a shot")
-    pipeline = _make_ranger(
+    pipeline = _make_pipeline(
         first, camera, None if time_zero_ns is None else time_zero_ns * NANOSECOND, focus, method
     )
     # Instruments do not wait: the newest shot counts. Files do, and lose nothing.
@@ -137,14 +139,17 @@ def _read_shots(source: str, bin_width: float | None) -> Iterator[Streak]:
     return (shot() for shot in list_shots(source, bin_width).values())
 
 
-def _make_ranger(
+def _make_pipeline(
     first: Streak, camera: Path | None, time_zero: float | None, focus: str, method: str
-) -> RangingPipeline:
+) -> CloudPipeline:
     chosen = parse_focus(focus)
     if isinstance(chosen, SharpestFocus):
         raise InputError("a stream has one focus for all shots: depth-locked or fixed:S")
+    if method == SurfaceRecovery.name:  # each surface is recovered at the shear of its range
+        return SurfacePipeline.for_shot(first, camera, time_zero)
     if method not in STREAM_METHODS:
-        raise InputError(f"a stream's method is one of {', '.join(STREAM_METHODS)}, not '{method}'")
+        names = ", ".join((*STREAM_METHODS, SurfaceRecovery.name))
+        raise InputError(f"a stream's method is one of {names}, not '{method}'")
     return RangingPipeline.for_shot(first, camera, chosen, time_zero, STREAM_METHODS[method]())
 
 

@@ -11,6 +11,7 @@ from tofclip.lidar import depth, point_cloud
 from tofclip.recovery import DepthLockedFocus, recover
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
+from tofclip.sequences.surface_following import SurfacePipeline
 from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.patterns import make_plain_pattern
@@ -85,6 +86,26 @@ def test_a_prior_begins_at_the_last_shot_and_leaves_rays_out():
     known = made[0].camera.replace(**optics)
     with pytest.raises(InputError, match="one shear for all shots"):
         RangingPipeline(known, made[0].times, Sparse(), DepthLockedFocus())
+
+
+def test_surfaces_follow_those_of_the_last_shot_until_the_scene_changes(
+    streaks: list[Streak], camera: Camera
+) -> None:
+    pixel = 1.3 / 100.0
+    plate = make_plate((0.0, 0.0, 1.3), (14 * pixel, 14 * pixel), make_plain_pattern(0.8))
+    detector = StreakDetector(128, 50e-12, peak_photons=5e4)
+    other = simulate_shot(Scene((plate,)), Instrument(camera, detector), 0).streak
+    pipeline = SurfacePipeline.for_shot(streaks[0])
+    clouds = [one.cloud for one in stream_clouds([*streaks[:3], other], pipeline)]
+    assert pipeline.searches == 2
+    alone = recover(streaks[2], method="surfaces").returns
+    # plates of 81 pixels: of their rims some pixels more or less
+    assert len(clouds[2]) == pytest.approx(len(alone), rel=0.1)
+    near = clouds[2].range < 1.3
+    expected = alone.range[alone.range < 1.3]
+    # a tenth of a bin of 50 ps; the noise of another shot moves a surface by less
+    assert np.median(clouds[2].range[near]) == pytest.approx(np.median(expected), abs=7e-4)
+    assert np.median(clouds[3].range) == pytest.approx(1.3, abs=5e-3)
 
 
 def test_no_shot_is_no_cloud_and_faults_come_through():

@@ -11,6 +11,7 @@ Nothing is rectified, so that the noise of the measurements stays independent.
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -38,6 +39,7 @@ MODEL_ERROR_FRACTION = (
 EXTENT_SIGMAS = 3.5  # 5e-4 of a pulse lie outside
 MAX_LENGTHENING = 1.5  # pulses that turn out longer than the camera's are cut off beyond
 SLIT_PIXELS, SUBROWS = 4, 3
+SMOOTHING_PX = 2.0
 WIDTH_STEP = 0.02  # relative; for the derivative by a pulse's width
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
 MIN_VARIANCE = 0.02  # rows^2, of the smoothing that is left of a pulse shorter than a row
@@ -197,6 +199,16 @@ class SurfaceModel:
     def _make_kernel(self, sigma: float, variance: float = 1 / 6) -> Image:
         """The pulse of a core of `sigma` rows, of which `variance` is already there."""
         return self.pulse.extend(make_pulse(sigma, self._core_half, variance))
+
+    def see(self, streak: Streak) -> SurfaceModel:
+        """Return the same surfaces before another shot of the camera."""
+        other = copy.copy(self)
+        other.image, other.weights = weigh_measurements(streak, self.camera)
+        return other
+
+    def unexplained(self, amplitude: Image) -> float:
+        """What is left of the signal, as a fraction, smoothed so that photons' noise hardly counts."""
+        return compare_smoothed(self.render(amplitude), self.image, self.weights > 0)
 
     def compute_slopes(self) -> FloatArray:
         """Return how steeply the ranges change along columns and rows, (2, points), m per pixel."""
@@ -506,6 +518,26 @@ def find_rows(times: FloatArray, time: FloatArray) -> FloatArray:
     before, after = np.minimum(time - times[0], 0) / first, np.maximum(time - times[-1], 0) / last
     rows: FloatArray = np.interp(time, times, np.arange(times.size)) + before + after
     return rows
+
+
+def compare_smoothed(predicted: Image, measured: Image, valid: NDArray[np.bool_]) -> float:
+    """Return the norm of what is left over that of the measurements, both smoothed.
+
+    Parameters
+    ----------
+    predicted, measured : (rows, columns) float32 array
+    valid : (rows, columns) bool array
+
+    Returns
+    -------
+    float
+    """
+    error, image = (
+        scipy.ndimage.gaussian_filter(one * valid, SMOOTHING_PX)
+        for one in (measured - predicted, measured)
+    )
+    signal = float(np.linalg.norm(image))
+    return float(np.linalg.norm(error)) / signal if signal else 1.0
 
 
 def weigh_measurements(streak: Streak, camera: Camera) -> tuple[Image, Image]:

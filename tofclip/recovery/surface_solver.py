@@ -49,9 +49,17 @@ class AmplitudeSolver:
         Start.
     weight : float
         Of total variation, in standard deviations of the noise in the misfit's gradient.
+    earlier : AmplitudeSolver, optional
+        Of the same surfaces, seen by another shot: what it found saves work.
     """
 
-    def __init__(self, model: SurfaceModel, amplitude: Image, weight: float) -> None:
+    def __init__(
+        self,
+        model: SurfaceModel,
+        amplitude: Image,
+        weight: float,
+        earlier: AmplitudeSolver | None = None,
+    ) -> None:
         self.model, self.amplitude, self.weight = model, amplitude, weight
         rows, columns = model.camera.image_shape
         self._dual = np.zeros((len(model.masks), 2, rows, columns), np.float32)
@@ -59,6 +67,9 @@ class AmplitudeSolver:
         self._direction = np.ones(model.surface.size, np.float32)
         self._fresh = True
         self.variance = 1.0
+        if earlier is not None:
+            self._dual, self._direction = earlier._dual.copy(), earlier._direction
+            self._fresh, self.variance = False, earlier.variance
 
     def run(self, iterations: int, progress: Progress, frames: int) -> None:
         """Take some steps; `progress` hears of `frames` after each."""

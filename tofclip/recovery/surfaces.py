@@ -25,7 +25,6 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from tofclip.camera import Camera, measure
 from tofclip.errors import InputError
@@ -37,6 +36,7 @@ from tofclip.recovery.surface_model import (
     Image,
     SurfaceModel,
     SurfaceState,
+    compare_smoothed,
     find_rows,
 )
 from tofclip.recovery.surface_patches import (
@@ -60,15 +60,41 @@ MIN_SURFACE_SHARE = 0.7
 # Of the measurements, both smoothed so that photons' noise hardly counts: above, much of the light is
 # not where the surfaces are. Surfaces leave 0.02 to 0.22, recorded relay walls 0.2 to 0.5. Smoke's
 # first light looks like one surface, but only the first.
-MAX_UNEXPLAINED, SMOOTHING_PX = 0.3, 2.0
+MAX_UNEXPLAINED = 0.3
 # Of a pulse's light, that long after its peak: more is not an instrument's afterglow (0.18), but light
 # that comes from many depths to each pixel.
 MAX_TAIL_SHARE = 0.3
+FOLLOWING_ITERATIONS = 10  # before and after the ranges' step, where the last shot's fit begins
+# Of what surfaces leave unexplained, and beyond: from there on they are not the next shot's.
+CHANGED_RATIO, CHANGED_EXCESS = 1.25, 0.02
 SURE_SIGMAS = 20.0  # points of which a surface certainly consists
 UPPER_QUANTILE = 0.9
 MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
 EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
 NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
+
+
+@dataclass(frozen=True)
+class SurfaceFit:
+    """Surfaces as they were fitted to a shot.
+
+    Parameters
+    ----------
+    model : SurfaceModel
+    solver : AmplitudeSolver
+    refinement : Refinement
+        The last one.
+    remainder : (surfaces,) float array
+        What further steps would still change of each surface's range, m.
+    reference : float
+        What the surfaces left unexplained when they were found, as a fraction of the signal.
+    """
+
+    model: SurfaceModel
+    solver: AmplitudeSolver
+    refinement: Refinement
+    remainder: FloatArray
+    reference: float
 
 
 @dataclass(frozen=True)
@@ -141,6 +167,31 @@ class SurfaceRecovery:
         InputError
             Most of the light does not come from surfaces.
         """
+        fit = self.fit(streak, frames, progress)
+        return self._make_frames(frames, fit, self.list_returns(fit, centre_error_px))
+
+    def fit(
+        self, streak: Streak, frames: Frames, progress: Progress = ignore_progress
+    ) -> SurfaceFit:
+        """Find and fit the surfaces of a shot.
+
+        Parameters
+        ----------
+        streak : Streak
+        frames : Frames
+            A fast recovery of the same shot, with the camera to use.
+        progress : callable
+            Called with the number of frame iterations just done.
+
+        Returns
+        -------
+        SurfaceFit
+
+        Raises
+        ------
+        InputError
+            Most of the light does not come from surfaces.
+        """
         camera, count = frames.camera, frames.times.size
         # The model explains what was measured: corrections come when its returns are listed.
         found = depth(frames, camera.replace(range_calibration=None))
@@ -171,8 +222,33 @@ class SurfaceRecovery:
         _require_explained(model, solver.amplitude, frames, streak)
         refinement, remainder = self._refine(model, solver, progress, count)
         solver.run(self.iterations, progress, count)
-        returns = self._list_returns(model, solver, refinement, remainder, centre_error_px)
-        return self._make_frames(frames, model, solver, returns)
+        return SurfaceFit(model, solver, refinement, remainder, model.unexplained(solver.amplitude))
+
+    def follow(self, fit: SurfaceFit, streak: Streak) -> SurfaceFit | None:
+        """Fit the surfaces of the shot before to the next one of the same camera.
+
+        Parameters
+        ----------
+        fit : SurfaceFit
+            Of the shot before.
+        streak : Streak
+
+        Returns
+        -------
+        SurfaceFit or None
+            None where these surfaces no longer explain what they did: the scene has changed, and
+            surfaces have to be found anew.
+        """
+        model = fit.model.see(streak)
+        solver = AmplitudeSolver(model, fit.solver.amplitude, self.weight, fit.solver)
+        solver.run(FOLLOWING_ITERATIONS, ignore_progress, 0)
+        refinement = refine_state(model, solver.amplitude, fit.refinement)
+        solver.amplitude = refinement.amplitude
+        solver.run(FOLLOWING_ITERATIONS, ignore_progress, 0)
+        unexplained = model.unexplained(solver.amplitude)
+        if unexplained > CHANGED_RATIO * fit.reference + CHANGED_EXCESS:
+            return None
+        return SurfaceFit(model, solver, refinement, fit.remainder, fit.reference)
 
     @staticmethod
     def _refine(
@@ -191,14 +267,8 @@ class SurfaceRecovery:
         assert found is not None
         return found, extrapolate_steps(np.array(changes))
 
-    def _make_frames(
-        self,
-        start: Frames,
-        model: SurfaceModel,
-        solver: AmplitudeSolver,
-        returns: Returns,
-    ) -> Frames:
-        amplitude, camera = solver.amplitude, returns.camera
+    def _make_frames(self, start: Frames, fit: SurfaceFit, returns: Returns) -> Frames:
+        model, amplitude, camera = fit.model, fit.solver.amplitude, returns.camera
         # Rectified like every other method's: its residual is of measurements, not of raw pixels.
         rendered = model.render(amplitude)
         predicted, measured = (
@@ -225,15 +295,20 @@ class SurfaceRecovery:
             returns=returns,
         )
 
-    def _list_returns(
-        self,
-        model: SurfaceModel,
-        solver: AmplitudeSolver,
-        refinement: Refinement,
-        remainder: FloatArray,
-        centre_error_px: float,
-    ) -> Returns:
-        """Points that stand out of the noise and of their neighbourhood, pixel by pixel."""
+    def list_returns(self, fit: SurfaceFit, centre_error_px: float = 0.0) -> Returns:
+        """List the points that stand out of the noise and of their neighbourhood, pixel by pixel.
+
+        Parameters
+        ----------
+        fit : SurfaceFit
+        centre_error_px : float
+            How far off the calibration had each slit centre, as for `tofclip.recovery.Shot`.
+
+        Returns
+        -------
+        tofclip.shots.Returns
+        """
+        model, solver = fit.model, fit.solver
         camera = model.camera.replace(gains=model.state.gains)
         distance, amplitude = model.distance, solver.amplitude
         # A pixel alone is hardly above the photons' noise: its neighbours on the surface, which the
@@ -247,7 +322,7 @@ class SurfaceRecovery:
         significance = amplitude * np.sqrt(pooled[model.masks] / solver.variance)
         deviation = np.zeros(distance.size)
         for part, monomials, own, rest in zip(
-            model.parts, model.monomials, refinement.covariances, remainder, strict=True
+            model.parts, model.monomials, fit.refinement.covariances, fit.remainder, strict=True
         ):
             variance = np.einsum("pi,ij,pj->p", monomials, own, monomials)
             # range = length / inverse depth
@@ -420,7 +495,7 @@ def _require_explained(
     model: SurfaceModel, amplitude: Image, frames: Frames, streak: Streak
 ) -> None:
     """Refuse a shot that surfaces explain neither well nor as well as its frames do."""
-    unexplained = _compare_smoothed(model.render(amplitude), model.image, model.weights > 0)
+    unexplained = model.unexplained(amplitude)
     if unexplained <= MAX_UNEXPLAINED:
         return
     # In little light noise is left over however right the surfaces are, and by frames as well.
@@ -431,22 +506,12 @@ def _require_explained(
         own = np.flatnonzero(frames.shears == shear)
         pictures = np.ascontiguousarray(np.moveaxis(frames.values[own], 0, -1))
         predicted[:, own] = camera.operator(float(shear))(pictures)
-    by_frames = _compare_smoothed(predicted, seen.values, seen.valid)
+    by_frames = compare_smoothed(predicted, seen.values, seen.valid)
     if unexplained > by_frames:
         raise _refuse(
             f"surfaces leave {100 * unexplained:.0f} % of the signal unexplained, and frames "
             f"{100 * by_frames:.0f} %"
         )
-
-
-def _compare_smoothed(predicted: Image, measured: Image, valid: NDArray[np.bool_]) -> float:
-    """Norm of what is left over that of the measurements, both smoothed."""
-    error, image = (
-        scipy.ndimage.gaussian_filter(one * valid, SMOOTHING_PX)
-        for one in (measured - predicted, measured)
-    )
-    signal = float(np.linalg.norm(image))
-    return float(np.linalg.norm(error)) / signal if signal else 1.0
 
 
 def _render_frames(start: Frames, model: SurfaceModel, amplitude: Image) -> Image:

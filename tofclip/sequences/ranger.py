@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,24 @@ FloatArray = NDArray[np.float64]
 Shot = Callable[[], Streak]
 
 MAX_JITTER_BINS = 32
+
+
+class CloudPipeline(Protocol):
+    """What makes clouds of shots of one camera: `RangingPipeline`, or
+    `tofclip.sequences.surface_following.SurfacePipeline`.
+    """
+
+    rectifier: Rectifier
+
+    @property
+    def in_order(self) -> bool:
+        """Whether what comes out of a shot depends on those before it."""
+
+    def recover_shot(self, shot: Streak, measurements: NDArray[np.float32]) -> Any:
+        """Do what a shot needs as a whole; what comes out is for `search`."""
+
+    def search(self, found: Any) -> Returns:
+        """Find the returns in what `recover_shot` returned."""
 
 
 class RangingPipeline:
@@ -175,9 +193,20 @@ class RangingPipeline:
             return self._warm_start.recover(measurements, bins)
         return _ShotTraces(self, measurements, bins)
 
-    def search(self, traces: Traces) -> Returns:
+    def recover_shot(self, shot: Streak, measurements: NDArray[np.float32]) -> Traces:
+        """As `recover`, which needs no more of a shot than its measurements.
+
+        Parameters
+        ----------
+        shot : Streak
+        measurements : (columns, rows) float32 array
+            Of the shot, rectified.
+        """
+        return self.recover(measurements)
+
+    def search(self, found: Traces) -> Returns:
         """Find the returns in what `recover` returned."""
-        return self._search.find_returns(traces)
+        return self._search.find_returns(found)
 
     def cloud(self, measurements: NDArray[np.float32]) -> PointCloud:
         """Make the cloud of one shot's rectified measurements, (columns, rows)."""

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud, point_cloud
-from tofclip.sequences.ranger import RangingPipeline
+from tofclip.sequences.ranger import CloudPipeline, RangingPipeline
 from tofclip.shots import Returns, Streak
 from tofclip.threads import open_worker_pool, thread_count
 
@@ -320,7 +320,7 @@ class StreamedCloud:
 
 def stream_clouds(
     shots: Iterable[Streak],
-    pipeline: RangingPipeline | None = None,
+    pipeline: CloudPipeline | None = None,
     queue_size: int = 1,
     policy: Policy = "block",
     executor: Executor | None = None,
@@ -335,8 +335,8 @@ def stream_clouds(
     ----------
     shots : iterable of Streak
         A file's, a folder's or an instrument's; it is read on a thread of its own.
-    pipeline : RangingPipeline, optional
-        By default one for the camera that the first shot carries.
+    pipeline : RangingPipeline or SurfacePipeline, optional
+        By default a `RangingPipeline` for the camera that the first shot carries.
     queue_size : int
         Shots that wait for their turn, at most.
     policy : "block" or "drop_oldest"
@@ -390,15 +390,15 @@ def stream_clouds(
 
 
 def _make_cloud(
-    pipeline: RangingPipeline, shot: Streak
+    pipeline: CloudPipeline, shot: Streak
 ) -> tuple[NDArray[np.float32], Returns, PointCloud, dict[str, float]]:
     """Return a shot's measurements, returns and cloud, and what each step took, s."""
     ends = [perf_counter()]
     measurements = pipeline.rectifier.rectify(shot.counts)
     ends.append(perf_counter())
-    traces = pipeline.recover(measurements)
+    found = pipeline.recover_shot(shot, measurements)
     ends.append(perf_counter())
-    returns = pipeline.search(traces)
+    returns = pipeline.search(found)
     ends.append(perf_counter())
     cloud = point_cloud(returns)
     ends.append(perf_counter())

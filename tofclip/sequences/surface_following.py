@@ -1,0 +1,110 @@
+"""Shot after shot by its surfaces, each beginning at those of the shot before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.camera import Camera, Rectifier
+from tofclip.recovery import DepthLockedFocus, Shot, SurfaceRecovery, open_shot, plan_recovery
+from tofclip.recovery.focus import DEFAULT_FOCUS
+from tofclip.recovery.surfaces import SurfaceFit
+from tofclip.shots import Returns, Streak
+
+
+class SurfacePipeline:
+    """Makes clouds of shots of one camera by method "surfaces".
+
+    The first shot has its surfaces found. Each further one begins at the surfaces, brightnesses and
+    state of the instrument of the shot before, and needs a step on them and twenty iterations. Where
+    they no longer explain the shot, as when something has come in, surfaces are found anew. Shots
+    are taken in order.
+
+    Parameters
+    ----------
+    shot : Shot
+        Opened, its sweep known.
+    method : SurfaceRecovery, optional
+
+    Notes
+    -----
+    Memory: as `SurfaceRecovery`; nothing is kept of the shots before but the last fit.
+    """
+
+    in_order = True
+
+    def __init__(self, shot: Shot, method: SurfaceRecovery | None = None) -> None:
+        self.method = SurfaceRecovery() if method is None else method
+        self.camera, self._centre_error_px = shot.camera, shot.centre_error_px
+        self.rectifier = Rectifier(shot.camera, shot.times.size)
+        self.searches = 0
+        self._fit: SurfaceFit | None = None
+        self._lock = Lock()
+
+    @classmethod
+    def for_shot(
+        cls,
+        shot: Streak,
+        camera: Path | Camera | None = None,
+        time_zero: float | None = None,
+        method: SurfaceRecovery | None = None,
+    ) -> SurfacePipeline:
+        """Prepare for shots like this one; a sweep that is not known is found from it.
+
+        Parameters
+        ----------
+        shot : Streak
+            With a time axis.
+        camera : Path or Camera, optional
+            Defaults to the one that the shot carries.
+        time_zero : float, optional
+            Reading of the time axis at which light of range 0 would arrive, s; the camera's by
+            default.
+        method : SurfaceRecovery, optional
+
+        Returns
+        -------
+        SurfacePipeline
+
+        Raises
+        ------
+        MissingTimeAxisError, InputError, CalibrationError
+            As for `tofclip.recover`.
+        """
+        return cls(open_shot(shot, camera, time_zero).fit_camera(), method)
+
+    def recover_shot(self, shot: Streak, measurements: NDArray[np.float32]) -> SurfaceFit:
+        """Fit the surfaces of a shot.
+
+        Parameters
+        ----------
+        shot : Streak
+        measurements : (columns, rows) float32 array
+            Not needed: surfaces explain the raw image.
+
+        Returns
+        -------
+        SurfaceFit
+
+        Raises
+        ------
+        InputError
+            The shot's light is not on surfaces.
+        """
+        with self._lock:
+            if self._fit is not None:
+                self._fit = self.method.follow(self._fit, shot)
+            if self._fit is None:
+                self.searches += 1
+                opened = Shot(shot, self.camera, self._centre_error_px)
+                focus = DepthLockedFocus() if self.camera.lenslet_pitch > 0 else DEFAULT_FOCUS
+                start = plan_recovery(opened, self.method.start, focus).run()
+                self._fit = self.method.fit(shot, start)
+            return self._fit
+
+    def search(self, found: SurfaceFit) -> Returns:
+        """List the returns of what `recover_shot` returned."""
+        return self.method.list_returns(found, self._centre_error_px)
