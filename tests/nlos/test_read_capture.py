@@ -326,6 +326,11 @@ def test_pairs_with_their_points_beside(tmp_path: Path) -> None:
     write_matlab(tmp_path / "C_i.mat", "5", C_i=lasers)
     write_matlab(tmp_path / "C_d.mat", "5", C_d=points)
     same(read_capture(tmp_path / "sub_Sig.mat"), expected)
+    # A first coordinate that stays is the depth; the others run to the left and up.
+    for name, spots in (("C_i", lasers), ("C_d", points)):
+        x, y, z = spots.T
+        write_matlab(tmp_path / f"{name}.mat", "5", **{name: np.stack([z, -x, -y], axis=-1)})
+    same(read_capture(tmp_path / "sub_Sig.mat"), expected)
 
 
 SETUP_SCRIPT = """%% Part I
