@@ -18,7 +18,11 @@ SIDEWAYS_TILT_RAD, UPWARD_TILT_RAD = np.deg2rad(-1.0), np.deg2rad(0.8)
 """How far the eye is moved off the camera's place, as seen from the scene's middle: objects do not hide each other
 more than they did, and depth can be seen."""
 
-VIEW_MARGIN = 1.1
+VIEW_MARGIN, TIP_MARGIN, MAX_TIP = 1.1, 1.02, 1.3
+"""Room around most points, and around the tips of what sticks out; farther out than by the last factor,
+points are strays, for which the others are not made small.
+"""
+
 DOWN = np.array([0.0, 1.0, 0.0])
 FloatArray = NDArray[np.float64]
 
@@ -90,9 +94,10 @@ class Viewpoint:
 SCALE_BAR_FRACTION = 0.4
 """The scale bar is at most as long as this fraction of the box's width."""
 
-SCALE_BAR_DEPTH, Z_MARK_DEPTH = 0.0, 0.85
-"""Fractions of the box's depth, from its front: nothing stands before the scale bar, and neither hides
-the other's words from any side."""
+SCALE_BAR_DEPTH, Z_MARK_DEPTH = 0.3, 0.85
+"""Fractions of the box's depth, from its front: little stands before the scale bar, which farther in
+front would need much of the window, and neither hides the other's words from any side.
+"""
 
 
 @dataclass(frozen=True)
@@ -127,7 +132,7 @@ class Box:
 
     @property
     def scale_bar(self) -> FloatArray:
-        """Ends of a bar of a round length at the front of the floor, (2, 3) in m."""
+        """Ends of a bar of a round length across the floor, near the front, (2, 3) in m."""
         width = float(self.high[0] - self.low[0])
         length = round_length_down(SCALE_BAR_FRACTION * width) if width > 0 else 0.0
         middle = (self.low + self.high) / 2
@@ -240,7 +245,10 @@ def place_viewpoint(xyz: NDArray[np.float32], aspect: float = 1.5) -> Viewpoint:
     )  # of the tilted box
     slope = np.tan(FIELD_OF_VIEW_RAD / 2)
     away = half_depth + VIEW_MARGIN * max(half_height / slope, half_width / (slope * aspect), 0.05)
-    return Viewpoint(middle + away * direction, middle)
+    far = Viewpoint(middle + away * direction, middle)
+    # seen aslant, or with points outside of the box, a cloud is wider than its box from the front
+    wide = max(_fit_field_of_view(far, one, aspect) for one in (xyz, Box(low, high).scale_bar))
+    return Viewpoint(far.eye, middle, max(far.field_of_view, wide))
 
 
 def move_camera(camera: Any, viewpoint: Viewpoint) -> None:
@@ -259,4 +267,6 @@ def _fit_field_of_view(viewpoint: Viewpoint, xyz: NDArray[Any], aspect: float) -
     """Return the field of view that holds nearly all points."""
     right, down, depth = np.abs(viewpoint.axes @ (xyz - viewpoint.eye).T)
     slopes = np.maximum(down, right / aspect) / np.maximum(depth, 1e-6)
-    return float(2 * np.arctan(VIEW_MARGIN * np.percentile(slopes, 99.5)))
+    most, farthest = np.percentile(slopes, (99.5, 100.0))
+    tips = TIP_MARGIN * min(farthest, MAX_TIP * most)
+    return float(2 * np.arctan(max(VIEW_MARGIN * most, tips)))

@@ -195,6 +195,19 @@ def test_a_time_line_has_round_instants_at_their_frames() -> None:
     assert mark_times(times[:1]) == ((0, "10.02 ns"),)
 
 
+@pytest.mark.parametrize("aspect", [0.6, 1.23])
+def test_an_arm_that_sticks_out_is_in_the_first_picture(aspect: float) -> None:
+    """Four points in a thousand lie beside a near square, outside of its box."""
+    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 60), np.linspace(-0.3, 0.3, 60))
+    arm = np.stack([np.linspace(-0.5, -0.4, 14), np.full(14, 0.3), np.full(14, 0.9)], axis=1)
+    square = np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.9)], axis=1)
+    xyz = np.concatenate([square, arm]).astype(np.float32)
+    shape = 600, round(600 * aspect)
+    row, column, _ = place_viewpoint(xyz, aspect).project(xyz, shape)
+    assert 0 < row.min() < row.max() < shape[0]
+    assert 0 < column.min() < column.max() < shape[1]
+
+
 @pytest.mark.parametrize("aspect", [0.6, 0.9, 1.6])
 def test_the_scale_bar_is_in_the_first_picture(aspect: float) -> None:
     """Also of a deep cloud whose wide part is far away, so that the bar's place is the lowest."""
