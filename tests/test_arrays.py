@@ -9,6 +9,7 @@ from tofclip.arrays import (
     ComputeDevice,
     PerDevice,
     as_type,
+    clip_values,
     is_numpy,
     namespace,
     parse_device,
@@ -60,6 +61,20 @@ def test_what_is_there_already_is_not_copied(device):
 def test_the_functions_of_the_standard(device):
     there = device.put(VALUES)
     np.testing.assert_allclose(to_numpy(namespace(there).sum(there, axis=0)), VALUES.sum(axis=0))
+
+
+def test_values_beyond_a_limit_are_replaced_by_it(device):
+    values = np.array([-2.0, 0.5, 3.0], np.float32)
+    there = device.put(values)
+    for limits, expected in (
+        ((0.0, 1.0), [0.0, 0.5, 1.0]),
+        ((0.0, None), [0.0, 0.5, 3.0]),
+        ((None, 1.0), [-2.0, 0.5, 1.0]),
+    ):
+        found = to_numpy(clip_values(there, *limits))
+        np.testing.assert_array_equal(found, expected)
+        assert found.dtype == np.float32
+    assert type(clip_values(values, 0.0)) is np.ndarray
 
 
 def test_numpy_is_the_place_of_numpys_arrays(device):

@@ -68,6 +68,28 @@ def _resolve_namespace(arrays: tuple[Array, ...]) -> Any:
         ) from problem
 
 
+def clip_values(values: Array, lowest: float | None = None, highest: float | None = None) -> Array:
+    """Return an array's values with those below or above a limit replaced by it.
+
+    Parameters
+    ----------
+    values : array
+    lowest, highest : float, optional
+        No limit by default.
+
+    Returns
+    -------
+    array
+        Of the same shape and dtype.
+    """
+    if not is_numpy(values):
+        return namespace(values).clip(values, min=lowest, max=highest)
+    # the standard's function looks at dtypes and shapes for longer than a few numbers take
+    if lowest is not None:
+        values = np.maximum(values, lowest)
+    return values if highest is None else np.minimum(values, highest)
+
+
 def to_numpy(array: Array) -> NDArray[Any]:
     """Return the values as a NumPy array, fetched from wherever they are; a NumPy array comes back
     as it is.

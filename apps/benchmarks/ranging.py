@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 
@@ -25,6 +27,8 @@ from tofclip.threads import run_blocks
 
 ROWS = (254, 1016)
 STREAM_SHOTS = 8
+PACE_SHOTS_PER_S, PACED_SHOTS = 60, 48
+"""Pace at which the latency of a live view is measured, and for how many shots."""
 
 
 def make_instrument(rows: int) -> Instrument:
@@ -51,6 +55,26 @@ def simulate_shots(rows: int) -> list[Streak]:
     return [simulate_shot(scene, made, seed).streak for seed in range(3)]
 
 
+def bring_shots(streaks: list[Streak], shots: int, period_s: float) -> Iterator[Streak]:
+    """Bring a shot every `period_s` seconds.
+
+    Parameters
+    ----------
+    streaks : list of Streak
+        Used in turn.
+    shots : int
+    period_s : float
+
+    Yields
+    ------
+    Streak
+    """
+    began = time.perf_counter()
+    for number in range(shots):
+        time.sleep(max(0.0, began + number * period_s - time.perf_counter()))
+        yield streaks[number % len(streaks)]
+
+
 def prepare_streaming(rows: int, method: LinearInverse | ProximalMethod) -> PreparedCase:
     """Shots that were read already, one after the other: sweep, recovery, returns, clouds.
 
@@ -73,11 +97,21 @@ def prepare_streaming(rows: int, method: LinearInverse | ProximalMethod) -> Prep
         raise RuntimeError("the demo's instrument has another slit than the benchmark's")
     if pipeline.in_order:
         list(stream_clouds(shots[:1], pipeline))
+
+    def measure_latency() -> dict[str, float]:
+        coming = bring_shots(streaks, PACED_SHOTS, 1 / PACE_SHOTS_PER_S)
+        late = [one.latency for one in stream_clouds(coming, pipeline, policy="drop_oldest")]
+        return {
+            f"latency_p95_ms at {PACE_SHOTS_PER_S} shots/s": 1e3 * float(np.percentile(late, 95)),
+            "clouds_per_shot there": len(late) / PACED_SHOTS,
+        }
+
     return PreparedCase(
         lambda: list(stream_clouds(shots, pipeline)),
         lambda: run_dense_products(projection, data),
         STREAM_SHOTS,
         floor_fraction=1 / STREAM_SHOTS,
+        figures=measure_latency,
     )
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from distributed import LocalCluster
 
 from apps.benchmarks.case import Case, PreparedCase
-from apps.benchmarks.ranging import make_instrument
+from apps.benchmarks.ranging import bring_shots, make_instrument
 from tofclip.sequences import RangingSettings, list_shots
 from tofclip.sequences.jobs import Summary, run_jobs
 from tofclip.sequences.ranger import RangingPipeline
@@ -41,26 +41,6 @@ def make_streaks(rows: int) -> list[Streak]:
     """Shots that differ in their noise."""
     instrument, scene = make_instrument(rows), make_default_scene()
     return [simulate_shot(scene, instrument, seed).streak for seed in range(DISTINCT_SHOTS)]
-
-
-def bring_shots(streaks: list[Streak], shots: int, period_s: float) -> Iterator[Streak]:
-    """Bring a shot every `period_s` seconds.
-
-    Parameters
-    ----------
-    streaks : list of Streak
-        Used in turn.
-    shots : int
-    period_s : float
-
-    Yields
-    ------
-    Streak
-    """
-    began = time.perf_counter()
-    for number in range(shots):
-        time.sleep(max(0.0, began + number * period_s - time.perf_counter()))
-        yield streaks[number % len(streaks)]
 
 
 def prepare_stream(rows: int, shots: int) -> PreparedCase:

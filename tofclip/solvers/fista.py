@@ -16,7 +16,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import Array, namespace, require_numpy, to_numpy, zeros
+from tofclip.arrays import Array, clip_values, namespace, require_numpy, to_numpy, zeros
 from tofclip.errors import InputError, ShapeError
 from tofclip.operators import LinearOperator
 from tofclip.solvers.data_terms import DataTerm, DataTermMaker, LeastSquares
@@ -130,8 +130,8 @@ class NonnegativeSparsity:
         """Return what makes ``A' dual`` nowhere greater than the weight."""
         xp = namespace(pull)
         steepest = xp.max(pull, axis=tuple(range(pull.ndim - 1)))
-        steepest = xp.clip(xp.astype(steepest, xp.float64), min=1e-300)
-        return xp.clip(self.weight / steepest, max=1.0)
+        steepest = clip_values(xp.astype(steepest, xp.float64), TINY)
+        return clip_values(self.weight / steepest, highest=1.0)
 
 
 class NonnegativeTotalVariation:
@@ -318,12 +318,12 @@ class Fista:
         one's ``t |A (h - z)|^2`` and ``|h - z|^2``.
         """
         xp = namespace(distance)
-        used = xp.clip(curvature, min=TINY) / xp.clip(distance, min=TINY)
-        room = xp.clip((log(STEP_MARGIN) - xp.log(used)) / log(STEP_GROWTH), max=1.0)
+        used = clip_values(curvature, TINY) / clip_values(distance, TINY)
+        room = clip_values((log(STEP_MARGIN) - xp.log(used)) / log(STEP_GROWTH), highest=1.0)
         # a frame that stands still says nothing about its step
         room = xp.where(distance > 0, room, xp.zeros_like(room))
         level = self._level + xp.where(self.rejected, -STEP_RETREAT * xp.ones_like(room), room)
-        return xp.clip(level, min=0.0, max=MAX_STEP_LEVEL)
+        return clip_values(level, 0.0, MAX_STEP_LEVEL)
 
     def duality_gap(self) -> Array | None:
         """Return how far each frame's objective is above the least one at most, (frames,) float64.
