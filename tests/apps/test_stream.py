@@ -64,7 +64,7 @@ def test_a_stream_by_a_prior_says_so_and_its_rate(capsys: pytest.CaptureFixture[
     assert figures["clouds_per_second"] > 0
     assert figures["points"] > 0
     assert main(["stream", address, "--shots", "1", "--method", "wavelet"]) == 2
-    assert "linear, l1, tv, not 'wavelet'" in " ".join(capsys.readouterr().err.split())
+    assert "linear, l1, tv, surfaces, not 'wavelet'" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_slow_consumer_gets_the_newest_shot_and_the_truth_about_the_others(
