@@ -154,11 +154,14 @@ def compile_modules(modules: Sequence[str], report: Callable[[str], None]) -> No
     report : callable
         Called with the name of each function whose compiling begins.
     """
+    from numba.core.sigutils import normalize_signature
+
     observers.append(report)
     try:
         for (module, name), arguments in LOOPS.items():
             if module in modules:
-                _find_loop(module, name).compile(arguments)
+                # the cache knows a loop by the types as a call gives them, not by their names
+                _find_loop(module, name).compile(normalize_signature(arguments)[0])
     finally:
         observers.remove(report)
 

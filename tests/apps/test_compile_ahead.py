@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
 from numba.core.sigutils import normalize_signature
 from small_instrument import Run
@@ -42,6 +43,9 @@ def test_what_is_missing_is_compiled_by_other_processes_once(
     assert compile_ahead._is_missing(compile_ahead.OPERATORS)
     compile_ahead.compile_loops_ahead()
     assert not compile_ahead._is_missing(compile_ahead.OPERATORS)
+    columns, slits = np.zeros(2, np.int32), np.zeros((1, 2), np.int64)
+    cache(columns, columns, 1, slits)
+    assert (len(cache.stats.cache_hits), len(cache.stats.cache_misses)) == (1, 0)
 
 
 def test_a_process_that_fails_leaves_the_loops_to_be_compiled_when_they_are_called(
