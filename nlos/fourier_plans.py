@@ -7,6 +7,8 @@ out.
 
 from __future__ import annotations
 
+import importlib
+import sys
 import threading
 from typing import Any, Protocol
 
@@ -14,10 +16,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-try:
-    import pyfftw
-except ImportError:
-    pyfftw = None
+
+def _import_fftw() -> Any:
+    """Import pyfftw without what its interface for dask would bring: dask and pandas, which take
+    longer than an image.
+    """
+    hidden = "dask" not in sys.modules
+    if hidden:
+        sys.modules["dask"] = None  # type: ignore[assignment]
+    try:
+        return importlib.import_module("pyfftw")
+    except ImportError:
+        return None
+    finally:
+        if hidden:
+            del sys.modules["dask"]
+
+
+pyfftw: Any = _import_fftw()
 
 ComplexArray = NDArray[np.complex64]
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -41,3 +44,11 @@ def test_an_image_without_fftw(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fourier_plans, "pyfftw", None)
     without = method.reconstruct(capture, grid).values
     np.testing.assert_allclose(without, with_fftw, atol=1e-4 * with_fftw.max())
+
+
+def test_transforms_load_neither_dask_nor_pandas() -> None:
+    code = (
+        "import sys, nlos.fourier_plans as plans;"
+        "assert plans.pyfftw is not None; assert not {'dask', 'pandas'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
