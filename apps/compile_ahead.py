@@ -79,7 +79,7 @@ FUNCTIONS_PER_GROUP = (44, 52)
 
 
 def compile_loops_ahead() -> None:
-    """Compile what recovering and ranging a shot call, on as many cores as may be used.
+    """Compile what recovering and ranging a shot call, on two cores if they may be used.
 
     What is in the cache is not compiled again, and if nothing is missing nothing is said. A process
     that fails leaves its loops to be compiled when they are called.
