@@ -21,6 +21,9 @@ Readings = NDArray[np.float32]
 SHEAR_LIMITS = (-3.0, 3.0)
 """Pixels per view step between which a picture can be refocused."""
 
+MIN_PIXEL_SHARE = 0.3
+"""Of the strongest return of its pixel; weaker ones before it are mostly rays, which would hide it."""
+
 MIN_FRAMES = 3
 """Without a neighbour on either side no return is located."""
 
@@ -162,5 +165,29 @@ def select_brighter(view: View, intensity: float) -> View:
     -------
     View
     """
-    kept = view.cloud.intensity >= intensity
+    return _select(view, view.cloud.intensity >= intensity)
+
+
+def leave_out_rays(view: View) -> View:
+    """Return a view without dim points: of the whole scene, and beside a brighter one of their pixel.
+
+    Parameters
+    ----------
+    view : View
+        Of all frames, with pixels.
+
+    Returns
+    -------
+    View
+    """
+    found = select_brighter(view, find_min_intensity(view.cloud))
+    if found.pixels is None or len(found.cloud) == 0:
+        return found
+    strongest = np.zeros(found.pixels.max(axis=0) + 1, np.float32)
+    row, column = found.pixels.T
+    np.maximum.at(strongest, (row, column), found.cloud.intensity)
+    return _select(found, found.cloud.intensity >= MIN_PIXEL_SHARE * strongest[row, column])
+
+
+def _select(view: View, kept: NDArray[np.bool_]) -> View:
     return View(select_points(view.cloud, kept), None if view.pixels is None else view.pixels[kept])

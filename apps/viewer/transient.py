@@ -14,9 +14,9 @@ from apps.viewer.shot_recovery import (
     Readings,
     ShotRecovery,
     find_min_intensity,
+    leave_out_rays,
     list_recovery_notes,
     make_view,
-    select_brighter,
 )
 from apps.viewer.source import (
     LINEAR_FRAMES_NOTE,
@@ -157,8 +157,7 @@ class TransientSource(Source):
         if self.frames.returns is not None:
             return make_view(self.frames.returns)
         # Of these the dim ones, rays that few views leave around bright things, would hide the others.
-        found = make_view(depth(self.frames))
-        return select_brighter(found, find_min_intensity(found.cloud))
+        return leave_out_rays(make_view(depth(self.frames)))
 
     @functools.cached_property
     def _measurements(self) -> Readings:

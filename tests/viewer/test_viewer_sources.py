@@ -41,6 +41,7 @@ from apps.viewer.session import (
     Filters,
     Session,
 )
+from apps.viewer.shot_recovery import leave_out_rays
 from apps.viewer.side_pictures import project_front, render_pictures
 from apps.viewer.source import LINEAR_NOTE, NO_TIME_ZERO_NOTE, Gate, Source, View
 from apps.viewer.source_factory import FIRST_LOOK_NOTE, ShotOptions, open_source
@@ -177,6 +178,17 @@ def test_clouds_follow_one_another(folder: Path) -> None:
     assert session.frame_at(0.0).frame == 1
     with pytest.raises(InputError, match="focused"):
         source.refocus(0, 1.0, Gate(0, 1))
+
+
+def test_a_ray_before_a_brighter_return_of_its_pixel_does_not_hide_it() -> None:
+    """Two pixels: a weak return before a strong one, and two that are nearly as bright."""
+    light = np.array([10.0, 100.0, 60.0, 80.0], np.float32)
+    xyz = np.array([[0, 0, 1], [0, 0, 2], [1, 0, 1], [1, 0, 2]], np.float32)
+    pixels = np.array([[3, 4], [3, 4], [3, 5], [3, 5]])
+    kept = leave_out_rays(View(make_cloud(xyz, {"intensity": light}), pixels))
+    assert kept.cloud.intensity.tolist() == [100.0, 60.0, 80.0]
+    assert kept.pixels is not None
+    assert kept.pixels.tolist() == pixels[1:].tolist()
 
 
 def test_dim_rays_of_a_cloud_of_ours_are_left_out_at_first(tmp_path: Path) -> None:
