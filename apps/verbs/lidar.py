@@ -183,13 +183,15 @@ def scene(
     if not objects:
         raise InputError(f"{frames}: no {fewest_points} points lie together within {reach_mm:g} mm")
     save_figure(make_scene_figure(recovered, cloud, objects), out)
-    named = ("range", "width", "height", "confidence", "scatter")
+    named = ("range", "width", "height", "range_sigma", "scatter")
     rows = [
         {f"{name}_m": getattr(one, name) for name in named} | {"points": one.points.size}
         for one in objects
     ]
     if as_json:
-        report({"points": len(cloud), "objects": rows}, as_json=True)
+        # `confidence_m` is the deviation's earlier name: for one more version
+        renamed = [row | {"confidence_m": row["range_sigma_m"]} for row in rows]
+        report({"points": len(cloud), "objects": renamed}, as_json=True)
         return
     table = {f"object {number}": row for number, row in enumerate(rows, 1)}
     report(table, as_json, [out], describe_ranges(recovered))

@@ -211,6 +211,7 @@ def test_a_scene_is_listed_and_drawn(run: Run, tmp_path: Path) -> None:
     assert abs(first["range_m"] - 1.12) < 0.02  # beside the axis the way is longer than the depth
     assert abs(second["range_m"] - 1.62) < 0.02
     assert abs(first["width_m"] - 0.09) < 0.03
+    assert 0 < first["range_sigma_m"] == first["confidence_m"] < 0.02
     assert (tmp_path / "scene.png").read_bytes()[:4] == b"\x89PNG"
     assert run(*words, "--fewest-points", "9999").status == 2
     listed = run(*words, "--reach-mm", "60").out

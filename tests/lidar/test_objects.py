@@ -38,7 +38,7 @@ def test_objects_are_listed_from_the_nearest_with_their_size():
         pytest.approx(0.18, abs=0.011),
     )
     assert first.range == pytest.approx(1.51, abs=0.01)
-    assert (first.confidence, first.intensity) == (pytest.approx(2e-3), 5.0)
+    assert (first.range_sigma, first.intensity) == (pytest.approx(2e-3), 5.0)
     assert first.scatter < 0.02
 
 

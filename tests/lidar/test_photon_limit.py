@@ -18,6 +18,7 @@ from tofclip.lidar.photons import (
     Smoothness,
     compute_range_bound,
     correct_pile_up,
+    kernels,
     learn_background,
     locate_with_smoothness,
     measure_accuracy,
@@ -157,6 +158,29 @@ def test_the_best_score_is_the_largest_sum_of_weights_and_counts():
             at = np.where(there, at, 0)
             scores = np.sum(weights[shade[at], np.arange(7)] * counts[row, at] * there, axis=1)
             assert best[row] == pytest.approx(scores.max(), rel=1e-12)
+
+
+def test_thresholds_are_simulated_once_for_detectors_with_the_same_settings(monkeypatch):
+    simulated = []
+    simulate = kernels.simulate_best_scores
+
+    def count(photons, *arguments):
+        simulated.append(photons)
+        simulate(photons, *arguments)
+
+    monkeypatch.setattr(kernels, "simulate_best_scores", count)
+    settings = {"bins": BINS, "false_alarm_rate": 0.0123}
+    found = [PhotonDetector(Pulse.gaussian(FWHM), BIN, **settings).threshold(7) for _ in range(3)]
+    assert (simulated, len(set(found))) == ([7], 1)
+    uneven = np.linspace(1, 2, BINS)
+    for other in (
+        PhotonDetector(Pulse.gaussian(2 * FWHM), BIN, **settings),
+        PhotonDetector(Pulse.gaussian(FWHM), BIN, **settings, background=uneven),
+        PhotonDetector(Pulse.gaussian(FWHM), BIN, **settings, min_photons=5.0),
+        PhotonDetector(Pulse.gaussian(FWHM), BIN, BINS, false_alarm_rate=0.0124),
+    ):
+        assert other.threshold(7) != found[0]
+    assert simulated == 5 * [7]
 
 
 def make_profile(name: str, bins: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The objects of a cloud: groups of points that hang together, with range, size and confidence."""
+"""The objects of a cloud: groups of points that hang together, with range, its deviation, and size."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class DetectedObject:
         Numbers of its points in the cloud.
     range : float
         Median distance from the camera, m.
-    confidence : float
+    range_sigma : float
         Median of its points' expected standard deviations of range, m.
     scatter : float
         Robust standard deviation of its points' ranges, m: noise and its own depth.
@@ -41,7 +41,7 @@ class DetectedObject:
 
     points: NDArray[np.intp]
     range: float
-    confidence: float
+    range_sigma: float
     scatter: float
     centre: tuple[float, float, float]
     width: float
@@ -93,7 +93,7 @@ def _measure_object(cloud: PointCloud, points: NDArray[np.intp]) -> DetectedObje
     return DetectedObject(
         points=points,
         range=middle,
-        confidence=float(np.median(cloud.range_sigma[points])),
+        range_sigma=float(np.median(cloud.range_sigma[points])),
         scatter=1.4826 * float(np.median(np.abs(distance - middle))),
         centre=(x, y, z),
         width=float(high[0] - low[0]),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,9 +34,20 @@ HISTOGRAMS_PER_BLOCK = 256
 SHADE_RATIO = 1.1  # backgrounds that differ by less share a filter; thresholds hold for any filter
 MIN_RELATIVE_BACKGROUND = 1e-3  # of a usual bin; no bin is so dark that one photon decides
 NO_PILE_UP = 1e15  # cycles: the rate of any bin is as good as zero
+MAX_SHARED_THRESHOLDS = 32
+"""Settings of detectors whose thresholds are remembered: some hundred numbers each."""
+
 MIN_LIVE_CYCLES = (
     0.5  # a bin that hardly any cycle reaches says nothing, but not with infinite surety
 )
+
+
+@lru_cache(maxsize=MAX_SHARED_THRESHOLDS)
+def _share_thresholds(
+    weights: bytes, first_offset: int, background: bytes, false_alarm_rate: float
+) -> dict[int, float]:
+    """Return the same dictionary whenever the settings are the same: shots of a sequence are."""
+    return {}
 
 
 @dataclass(frozen=True)
@@ -188,7 +199,10 @@ class PhotonDetector:
 
     @cached_property
     def _threshold_cache(self) -> dict[int, float]:
-        return {}
+        """Thresholds by number of photons, shared by all detectors that would simulate the same."""
+        background = self.relative_background
+        filtering = self.weights(1.0).tobytes(), self.first_offset
+        return _share_thresholds(*filtering, background.tobytes(), self.false_alarm_rate)
 
     def threshold(self, photons: int) -> float:
         """Least score of a return in a histogram of a given number of photons, by simulation;
