@@ -7,7 +7,6 @@ import sys
 
 import numba
 import pytest
-from numba.core.codegen import CPUCodeLibrary
 
 from apps import cli
 from tofclip.compile_observers import observers
@@ -36,34 +35,6 @@ def test_a_part_runs_from_python_and_from_a_compiled_loop() -> None:
         observers.remove(observer)
     assert quarter(1) == 0.25
     assert len(names) == 2
-
-
-def test_parts_are_optimised_with_their_loop_and_not_before(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    optimised: list[str] = []
-    optimise = CPUCodeLibrary._optimize_final_module
-
-    def note(library: CPUCodeLibrary) -> None:
-        optimised.append(library.name)
-        optimise(library)
-
-    monkeypatch.setattr(CPUCodeLibrary, "_optimize_final_module", note)
-
-    @compile_as_part(fastmath=True)
-    def third(number):  # type: ignore[no-untyped-def]
-        return number / 3
-
-    @compile_as_part()
-    def ninth(number):  # type: ignore[no-untyped-def]
-        return third(third(number))
-
-    @numba.njit(error_model="python")
-    def add_parts(number):  # type: ignore[no-untyped-def]
-        return third(number) + ninth(number)
-
-    assert add_parts(9.0) == 4.0
-    assert [name.rpartition(".")[2] for name in optimised] == ["add_parts"]
 
 
 class Terminal(io.StringIO):
