@@ -13,6 +13,7 @@ import pytest
 from tofclip import depth, nmse, point_cloud, recover
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
+from tofclip.recovery.surface_fit import extrapolate_steps
 from tofclip.recovery.surface_model import (
     SurfaceModel,
     SurfaceState,
@@ -20,13 +21,9 @@ from tofclip.recovery.surface_model import (
     weigh_measurements,
 )
 from tofclip.recovery.surface_patches import SmoothBasis, find_patches
+from tofclip.recovery.surface_returns import estimate_displacement, find_usual_brightness
 from tofclip.recovery.surface_solver import refine_state
-from tofclip.recovery.surfaces import (
-    SurfaceRecovery,
-    estimate_displacement,
-    extrapolate_steps,
-    find_usual_brightness,
-)
+from tofclip.recovery.surfaces import SurfaceRecovery
 from tofclip.sequences import CloudSettings
 from tofclip.shots import Frames, Streak
 from tofclip.simulate import (

@@ -15,7 +15,8 @@ Surfaces come from a fast recovery of frames (`tofclip.recovery.surface_patches`
 their returns, since the data of a range window decide where a surface ends. Amplitudes are solved
 for by FISTA with a step size for each surface; ranges, gains, delays, stretches and pulse widths of
 the views by Gauss-Newton steps, each taken only if it lowers the misfit
-(`tofclip.recovery.surface_solver`). docs/recovery_algorithm.md derives it.
+(`tofclip.recovery.surface_solver`; `tofclip.recovery.surface_fit` has the order).
+docs/recovery_algorithm.md derives it.
 """
 
 from __future__ import annotations
@@ -26,75 +27,21 @@ from typing import Any
 import numpy as np
 import scipy
 
-from tofclip.camera import Camera, measure
+from tofclip.camera import measure
 from tofclip.errors import InputError
-from tofclip.lidar import Detection, Returns, compute_ray_directions, depth
-from tofclip.lidar.range_correction import correct_returns
-from tofclip.recovery.surface_model import (
-    EXTENT_SIGMAS,
-    FloatArray,
-    Image,
-    SurfaceModel,
-    SurfaceState,
-    compare_smoothed,
-    find_rows,
+from tofclip.lidar import Detection
+from tofclip.recovery.surface_fit import (
+    REFINEMENT_ITERATIONS,
+    REFINEMENTS,
+    START_ITERATIONS,
+    SurfaceFit,
+    fit_surfaces,
 )
-from tofclip.recovery.surface_patches import (
-    MARGIN_PX,
-    Patch,
-    find_dimmer_patches,
-    find_patches,
-    reach_further,
-)
-from tofclip.recovery.surface_pulse import ShotPulse, measure_pulse
-from tofclip.recovery.surface_solver import AmplitudeSolver, Refinement, refine_state
-from tofclip.shots import Frames, Streak
+from tofclip.recovery.surface_model import EXTENT_SIGMAS, Image, SurfaceModel, find_rows
+from tofclip.recovery.surface_returns import list_returns
+from tofclip.shots import Frames, Returns, Streak
 from tofclip.solvers import Method, Progress, Sparse, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
-
-START_ITERATIONS = 25
-REFINEMENTS, REFINEMENT_ITERATIONS = 2, 20
-# Of the returns' light: below, the shot is not one of surfaces. Simulated shots of surfaces have 0.93
-# or more, recorded ones 0.97; recorded relay walls have 0.50 to 0.79.
-MIN_SURFACE_SHARE = 0.7
-# Of the measurements, both smoothed so that photons' noise hardly counts: above, much of the light is
-# not where the surfaces are. Surfaces leave 0.02 to 0.22, recorded relay walls 0.2 to 0.5. Smoke's
-# first light looks like one surface, but only the first.
-MAX_UNEXPLAINED = 0.3
-# Of a pulse's light, that long after its peak: more is not an instrument's afterglow (0.18), but light
-# that comes from many depths to each pixel.
-MAX_TAIL_SHARE = 0.3
-FOLLOWING_ITERATIONS = 10  # before and after the ranges' step, where the last shot's fit begins
-# Of what surfaces leave unexplained, and beyond: from there on they are not the next shot's.
-CHANGED_RATIO, CHANGED_EXCESS = 1.25, 0.02
-SURE_SIGMAS = 20.0  # points of which a surface certainly consists
-UPPER_QUANTILE = 0.9
-MIN_BRIGHTNESS_FRACTION = 0.25  # of the surface's usual brightness: light beside its border is less
-EVEN_RATIO, EVEN_PX = 1.1, 31  # amplitudes as bright, and the side of the square where they count
-NEIGHBOURHOOD_PX = 7  # side of the square whose measurements decide whether a point is there
-
-
-@dataclass(frozen=True)
-class SurfaceFit:
-    """Surfaces as they were fitted to a shot.
-
-    Parameters
-    ----------
-    model : SurfaceModel
-    solver : AmplitudeSolver
-    refinement : Refinement
-        The last one.
-    remainder : (surfaces,) float array
-        What further steps would still change of each surface's range, m.
-    reference : float
-        What the surfaces left unexplained when they were found, as a fraction of the signal.
-    """
-
-    model: SurfaceModel
-    solver: AmplitudeSolver
-    refinement: Refinement
-    remainder: FloatArray
-    reference: float
 
 
 @dataclass(frozen=True)
@@ -167,105 +114,9 @@ class SurfaceRecovery:
         InputError
             Most of the light does not come from surfaces.
         """
-        fit = self.fit(streak, frames, progress)
-        return self._make_frames(frames, fit, self.list_returns(fit, centre_error_px))
-
-    def fit(
-        self, streak: Streak, frames: Frames, progress: Progress = ignore_progress
-    ) -> SurfaceFit:
-        """Find and fit the surfaces of a shot.
-
-        Parameters
-        ----------
-        streak : Streak
-        frames : Frames
-            A fast recovery of the same shot, with the camera to use.
-        progress : callable
-            Called with the number of frame iterations just done.
-
-        Returns
-        -------
-        SurfaceFit
-
-        Raises
-        ------
-        InputError
-            Most of the light does not come from surfaces.
-        """
-        camera, count = frames.camera, frames.times.size
-        # The model explains what was measured: corrections come when its returns are listed.
-        found = depth(frames, camera.replace(range_calibration=None))
-        bin_m = SPEED_OF_LIGHT * frames.bin_width / 2
-        directions = compute_ray_directions(camera, *np.indices(camera.image_shape).reshape(2, -1))
-        ray_length = (1 / directions[:, 2]).reshape(camera.image_shape)
-        # Weaker returns of a pixel are often the frames' own: they would widen the surfaces.
-        strongest = found.image("range").astype(np.float64).ravel()
-        pixels = np.flatnonzero(np.isfinite(strongest))
-        patches = find_patches(pixels, strongest[pixels], ray_length, bin_m)
-        _require_surfaces(found, patches)
-        patches += find_dimmer_patches(patches, found, ray_length, bin_m)
-        masks = np.zeros((len(patches), *camera.image_shape), bool)
-        pictures = np.zeros(masks.shape, np.float32)
-        brightness = frames.values.sum(axis=0).ravel()
-        for patch, mask, picture in zip(patches, masks, pictures, strict=True):
-            picture.ravel()[patch.pixels] = brightness[patch.pixels]
-            seen = reach_further(patch, found, ray_length, bin_m)
-            mask[...] = scipy.ndimage.binary_dilation(seen, np.ones((3, 3)), MARGIN_PX)
-        state = SurfaceState.start([patch.coefficients for patch in patches], camera)
-        bases = [patch.basis for patch in patches]
-        on_surface = np.concatenate([patch.pixels for patch in patches])
-        pulse = measure_pulse(frames, on_surface, strongest[on_surface])
-        _require_short_pulse(pulse)
-        model = SurfaceModel(streak, camera, masks, bases, state, pulse)
-        solver = AmplitudeSolver(model, pictures[masks], self.weight)
-        solver.run(START_ITERATIONS, progress, count)
-        _require_explained(model, solver.amplitude, frames, streak)
-        refinement, remainder = self._refine(model, solver, progress, count)
-        solver.run(self.iterations, progress, count)
-        return SurfaceFit(model, solver, refinement, remainder, model.unexplained(solver.amplitude))
-
-    def follow(self, fit: SurfaceFit, streak: Streak) -> SurfaceFit | None:
-        """Fit the surfaces of the shot before to the next one of the same camera.
-
-        Parameters
-        ----------
-        fit : SurfaceFit
-            Of the shot before.
-        streak : Streak
-
-        Returns
-        -------
-        SurfaceFit or None
-            None where these surfaces no longer explain what they did: the scene has changed, and
-            surfaces have to be found anew.
-        """
-        model = fit.model.see(streak)
-        solver = AmplitudeSolver(model, fit.solver.amplitude, self.weight, fit.solver)
-        solver.run(FOLLOWING_ITERATIONS, ignore_progress, 0)
-        refinement = refine_state(model, solver.amplitude, fit.refinement)
-        solver.amplitude = refinement.amplitude
-        solver.run(FOLLOWING_ITERATIONS, ignore_progress, 0)
-        unexplained = model.unexplained(solver.amplitude)
-        if unexplained > CHANGED_RATIO * fit.reference + CHANGED_EXCESS:
-            return None
-        return SurfaceFit(model, solver, refinement, fit.remainder, fit.reference)
-
-    @staticmethod
-    def _refine(
-        model: SurfaceModel, solver: AmplitudeSolver, progress: Progress, count: int
-    ) -> tuple[Refinement, FloatArray]:
-        """Steps on ranges and instrument; the last one, and what more would change of each surface."""
-        before, changes = model.distance, []
-        found = None
-        for _ in range(REFINEMENTS):
-            found = refine_state(model, solver.amplitude, found)
-            solver.amplitude = found.amplitude
-            solver.run(REFINEMENT_ITERATIONS, progress, count)
-            moved = model.distance - before
-            changes.append([np.sqrt(np.mean(moved[part] ** 2)) for part in model.parts])
-            before = model.distance
-        assert found is not None
-        return found, extrapolate_steps(np.array(changes))
+        fit = fit_surfaces(streak, frames, self.weight, self.iterations, progress)
+        returns = list_returns(fit, self.detection, centre_error_px)
+        return self._make_frames(frames, fit, returns)
 
     def _make_frames(self, start: Frames, fit: SurfaceFit, returns: Returns) -> Frames:
         model, amplitude, camera = fit.model, fit.solver.amplitude, returns.camera
@@ -293,224 +144,6 @@ class SurfaceRecovery:
             figures={**start.figures, **figures},
             shears=np.asarray(camera.shear_at(distance)),
             returns=returns,
-        )
-
-    def list_returns(self, fit: SurfaceFit, centre_error_px: float = 0.0) -> Returns:
-        """List the points that stand out of the noise and of their neighbourhood, pixel by pixel.
-
-        Parameters
-        ----------
-        fit : SurfaceFit
-        centre_error_px : float
-            How far off the calibration had each slit centre, as for `tofclip.recovery.Shot`.
-
-        Returns
-        -------
-        tofclip.shots.Returns
-        """
-        model, solver = fit.model, fit.solver
-        camera = model.camera.replace(gains=model.state.gains)
-        distance, amplitude = model.distance, solver.amplitude
-        # A pixel alone is hardly above the photons' noise: its neighbours on the surface, which the
-        # prior ties to it, count as well.
-        pictures, information = np.zeros((2, *model.masks.shape), np.float32)
-        information[model.masks] = model.gather(model.weights, squared=True)
-        pictures[model.masks] = amplitude
-        pooled = np.stack(
-            [pool_information(*one) for one in zip(information, pictures, strict=True)]
-        )
-        significance = amplitude * np.sqrt(pooled[model.masks] / solver.variance)
-        deviation = np.zeros(distance.size)
-        for part, monomials, own, rest in zip(
-            model.parts, model.monomials, fit.refinement.covariances, fit.remainder, strict=True
-        ):
-            variance = np.einsum("pi,ij,pj->p", monomials, own, monomials)
-            # range = length / inverse depth
-            by_inverse = distance[part] ** 2 / model.ray_length[part]
-            deviation[part] = np.sqrt(by_inverse**2 * variance + rest**2)
-        displacement = estimate_displacement(camera, centre_error_px)
-        deviation = np.hypot(deviation, np.hypot(*(displacement * model.compute_slopes().T).T))
-        intensity = amplitude * distance**2
-        limit = self.detection.signal_to_noise
-        usual = np.zeros(len(model.masks))
-        for one in range(usual.size):
-            own = model.surface == one
-            usual[one] = find_usual_brightness(amplitude[own], significance[own], limit)
-        bright = np.flatnonzero(
-            (significance > limit) & (amplitude > MIN_BRIGHTNESS_FRACTION * usual[model.surface])
-        )
-        strong = self.detection.find_significant(
-            model.pixel[bright],
-            2 * distance[bright] / SPEED_OF_LIGHT,
-            intensity[bright],
-            camera.pulse_fwhm,
-        )
-        chosen = bright[strong]
-        chosen = chosen[np.lexsort((distance[chosen], model.pixel[chosen]))]
-        y, x = np.divmod(model.pixel[chosen], camera.image_shape[1])
-        starts = np.flatnonzero(np.diff(model.pixel[chosen], prepend=-1))
-        rank = np.arange(chosen.size) - np.repeat(starts, np.diff(starts, append=chosen.size)) + 1
-        measured = Returns(
-            y=y.astype(np.int32),
-            x=x.astype(np.int32),
-            range=distance[chosen],
-            intensity=intensity[chosen].astype(np.float32),
-            confidence=deviation[chosen].astype(np.float32),
-            return_number=rank.astype(np.uint8),
-            time=2 * distance[chosen] / SPEED_OF_LIGHT,
-            camera=camera,
-            shear=np.asarray(camera.shear_at(distance[chosen])),
-        )
-        return correct_returns(measured)
-
-
-def estimate_displacement(camera: Camera, centre_error_px: float) -> FloatArray:
-    """Return how far errors of the slit centres displace the picture to the right and down, px.
-
-    Of errors e_v a shot shows all but what looks like a displaced picture, ``e_v = dx - dy
-    tan(angle_v)``. That part is taken to be that of errors which alternate, as of neighbouring
-    lenslets measured in turns; independent ones would leave sqrt(views) as much.
-
-    Parameters
-    ----------
-    camera : Camera
-    centre_error_px : float
-        How far off the calibration had each slit centre, as for `tofclip.recovery.Shot`.
-
-    Returns
-    -------
-    (2,) float array
-    """
-    in_turns = (-1.0) ** np.arange(camera.views)
-    looks = np.stack([np.ones(camera.views), -np.tan(camera.angles)], axis=1)
-    found: FloatArray = np.abs(np.linalg.pinv(looks) @ in_turns) * centre_error_px
-    return found
-
-
-def pool_information(information: Image, picture: Image) -> Image:
-    """Return the information about each pixel's amplitude, with that of pixels tied to it.
-
-    These are the nearest ones, and those further off that the prior has made as bright: where little
-    is known of each pixel it leaves large even pieces, whose amplitude all their pixels determine.
-
-    Parameters
-    ----------
-    information : (rows, columns) float32 array
-        Of each pixel alone, one over the variance of its amplitude.
-    picture : (rows, columns) float32 array
-        Amplitudes.
-
-    Returns
-    -------
-    (rows, columns) float32 array
-    """
-
-    def add_up(values: Image, side: int) -> Image:
-        mean: Image = scipy.ndimage.uniform_filter(values, side, mode="constant")
-        return side**2 * mean
-
-    pooled = add_up(information, NEIGHBOURHOOD_PX)
-    level = np.zeros(picture.shape, np.intp)
-    lit = picture > 0
-    level[lit] = np.floor(np.log(picture[lit]) / np.log(EVEN_RATIO)).astype(np.intp)
-    for one in np.unique(level[lit]):
-        even = lit & (np.abs(level - one) <= 1)
-        own = lit & (level == one)
-        wide = add_up(np.where(even, information, 0), EVEN_PX)
-        pooled[own] = np.maximum(pooled[own], wide[own])
-    found: Image = pooled
-    return found
-
-
-def extrapolate_steps(lengths: FloatArray) -> FloatArray:
-    """Return how far steps that shrink as the last two did would still go.
-
-    Parameters
-    ----------
-    lengths : (steps, n) float array
-        Two steps or more.
-
-    Returns
-    -------
-    (n,) float array
-        The sum of a geometric series; steps that do not shrink count as if they halved.
-    """
-    tiny = np.finfo(np.float64).tiny
-    ratio = np.minimum(lengths[-1] / np.maximum(lengths[-2], tiny), 0.5)
-    left: FloatArray = lengths[-1] * ratio / (1 - ratio)
-    return left
-
-
-def find_usual_brightness(amplitude: Image, significance: Image, limit: float) -> float:
-    """Return the usual amplitude of the points of which a surface certainly consists.
-
-    Parameters
-    ----------
-    amplitude, significance : (points,) float32 arrays
-        Of the surface; significance in standard deviations.
-    limit : float
-        Standard deviations below which there is no point.
-
-    Returns
-    -------
-    float
-        Infinite if no point is sure.
-    """
-    if amplitude.size == 0:
-        return float("inf")
-    # In little light no point is that far out of the noise, but some are further than others.
-    upper = float(np.quantile(significance, UPPER_QUANTILE))
-    sure = amplitude[significance > min(SURE_SIGMAS, max(limit, upper / 2))]
-    return float(np.median(sure)) if sure.size else float("inf")
-
-
-def _refuse(fault: str) -> InputError:
-    """The error of a shot that is not one of surfaces."""
-    return InputError(
-        f"{fault}: this shot's light is not on surfaces (smoke, light in flight, a relay wall); "
-        'choose `method="tv"`'
-    )
-
-
-def _require_surfaces(found: Returns, patches: list[Patch]) -> None:
-    """Refuse a shot whose returns do not lie side by side on surfaces."""
-    on_surface = np.zeros(found.camera.image_shape, bool)
-    for patch in patches:
-        on_surface.ravel()[patch.pixels] = True
-    light = float(found.intensity.sum())
-    share = float(found.intensity[on_surface[found.y, found.x]].sum()) / light if light else 0.0
-    if share < MIN_SURFACE_SHARE:
-        raise _refuse(f"only {100 * share:.0f} % of the returns' light lies on smooth surfaces")
-
-
-def _require_short_pulse(pulse: ShotPulse) -> None:
-    """Refuse a shot whose pixels go on receiving light long after the return."""
-    if pulse.tail_share > MAX_TAIL_SHARE:
-        raise _refuse(
-            f"{100 * pulse.tail_share:.0f} % of each pixel's light comes long after its peak"
-        )
-
-
-def _require_explained(
-    model: SurfaceModel, amplitude: Image, frames: Frames, streak: Streak
-) -> None:
-    """Refuse a shot that surfaces explain neither well nor as well as its frames do."""
-    unexplained = model.unexplained(amplitude)
-    if unexplained <= MAX_UNEXPLAINED:
-        return
-    # In little light noise is left over however right the surfaces are, and by frames as well.
-    camera = frames.camera
-    seen = measure(streak.counts, streak.saturated, camera)
-    predicted = np.zeros_like(seen.values)
-    for shear in np.unique(frames.shears):
-        own = np.flatnonzero(frames.shears == shear)
-        pictures = np.ascontiguousarray(np.moveaxis(frames.values[own], 0, -1))
-        predicted[:, own] = camera.operator(float(shear))(pictures)
-    by_frames = compare_smoothed(predicted, seen.values, seen.valid)
-    if unexplained > by_frames:
-        raise _refuse(
-            f"surfaces leave {100 * unexplained:.0f} % of the signal unexplained, and frames "
-            f"{100 * by_frames:.0f} %"
         )
 
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from tofclip.camera import Camera, Rectifier
 from tofclip.recovery import DepthLockedFocus, Shot, SurfaceRecovery, open_shot, plan_recovery
 from tofclip.recovery.focus import DEFAULT_FOCUS
-from tofclip.recovery.surfaces import SurfaceFit
+from tofclip.recovery.surface_fit import SurfaceFit, fit_surfaces, follow_surfaces
+from tofclip.recovery.surface_returns import list_returns
 from tofclip.shots import Returns, Streak
 
 
@@ -96,15 +97,16 @@ class SurfacePipeline:
         """
         with self._lock:
             if self._fit is not None:
-                self._fit = self.method.follow(self._fit, shot)
+                self._fit = follow_surfaces(self._fit, shot, self.method.weight)
             if self._fit is None:
                 self.searches += 1
                 opened = Shot(shot, self.camera, self._centre_error_px)
                 focus = DepthLockedFocus() if self.camera.lenslet_pitch > 0 else DEFAULT_FOCUS
                 start = plan_recovery(opened, self.method.start, focus).run()
-                self._fit = self.method.fit(shot, start)
+                weight, iterations = self.method.weight, self.method.iterations
+                self._fit = fit_surfaces(shot, start, weight, iterations)
             return self._fit
 
     def search(self, found: SurfaceFit) -> Returns:
         """List the returns of what `recover_shot` returned."""
-        return self.method.list_returns(found, self._centre_error_px)
+        return list_returns(found, self.method.detection, self._centre_error_px)

@@ -1,0 +1,184 @@
+"""Finding the surfaces of a shot and fitting them, or those of the shot before, to what it shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from tofclip.lidar import compute_ray_directions, depth
+from tofclip.recovery.surface_model import FloatArray, SurfaceModel, SurfaceState
+from tofclip.recovery.surface_patches import (
+    MARGIN_PX,
+    find_dimmer_patches,
+    find_patches,
+    reach_further,
+)
+from tofclip.recovery.surface_pulse import measure_pulse
+from tofclip.recovery.surface_refusal import (
+    require_explained,
+    require_short_pulse,
+    require_surfaces,
+)
+from tofclip.recovery.surface_solver import AmplitudeSolver, Refinement, refine_state
+from tofclip.shots import Frames, Streak
+from tofclip.solvers import Progress, ignore_progress
+from tofclip.units import SPEED_OF_LIGHT
+
+START_ITERATIONS = 25
+REFINEMENTS, REFINEMENT_ITERATIONS = 2, 20
+FOLLOWING_ITERATIONS = 10  # before and after the ranges' step, where the last shot's fit begins
+# Of what surfaces leave unexplained, and beyond: from there on they are not the next shot's.
+CHANGED_RATIO, CHANGED_EXCESS = 1.25, 0.02
+
+
+@dataclass(frozen=True)
+class SurfaceFit:
+    """Surfaces as they were fitted to a shot.
+
+    Parameters
+    ----------
+    model : SurfaceModel
+    solver : AmplitudeSolver
+    refinement : Refinement
+        The last one.
+    remainder : (surfaces,) float array
+        What further steps would still change of each surface's range, m.
+    reference : float
+        What the surfaces left unexplained when they were found, as a fraction of the signal.
+    """
+
+    model: SurfaceModel
+    solver: AmplitudeSolver
+    refinement: Refinement
+    remainder: FloatArray
+    reference: float
+
+
+def fit_surfaces(
+    streak: Streak,
+    frames: Frames,
+    weight: float,
+    iterations: int,
+    progress: Progress = ignore_progress,
+) -> SurfaceFit:
+    """Find and fit the surfaces of a shot.
+
+    Parameters
+    ----------
+    streak : Streak
+    frames : Frames
+        A fast recovery of the same shot, with the camera to use.
+    weight : float
+        Of total variation; see `tofclip.recovery.SurfaceRecovery`.
+    iterations : int
+        After the ranges are known.
+    progress : callable
+        Called with the number of frame iterations just done.
+
+    Returns
+    -------
+    SurfaceFit
+
+    Raises
+    ------
+    InputError
+        Most of the light does not come from surfaces.
+    """
+    camera, count = frames.camera, frames.times.size
+    # The model explains what was measured: corrections come when its returns are listed.
+    found = depth(frames, camera.replace(range_calibration=None))
+    bin_m = SPEED_OF_LIGHT * frames.bin_width / 2
+    directions = compute_ray_directions(camera, *np.indices(camera.image_shape).reshape(2, -1))
+    ray_length = (1 / directions[:, 2]).reshape(camera.image_shape)
+    # Weaker returns of a pixel are often the frames' own: they would widen the surfaces.
+    strongest = found.image("range").astype(np.float64).ravel()
+    pixels = np.flatnonzero(np.isfinite(strongest))
+    patches = find_patches(pixels, strongest[pixels], ray_length, bin_m)
+    require_surfaces(found, patches)
+    patches += find_dimmer_patches(patches, found, ray_length, bin_m)
+    masks = np.zeros((len(patches), *camera.image_shape), bool)
+    pictures = np.zeros(masks.shape, np.float32)
+    brightness = frames.values.sum(axis=0).ravel()
+    for patch, mask, picture in zip(patches, masks, pictures, strict=True):
+        picture.ravel()[patch.pixels] = brightness[patch.pixels]
+        seen = reach_further(patch, found, ray_length, bin_m)
+        mask[...] = scipy.ndimage.binary_dilation(seen, np.ones((3, 3)), MARGIN_PX)
+    state = SurfaceState.start([patch.coefficients for patch in patches], camera)
+    bases = [patch.basis for patch in patches]
+    on_surface = np.concatenate([patch.pixels for patch in patches])
+    pulse = measure_pulse(frames, on_surface, strongest[on_surface])
+    require_short_pulse(pulse)
+    model = SurfaceModel(streak, camera, masks, bases, state, pulse)
+    solver = AmplitudeSolver(model, pictures[masks], weight)
+    solver.run(START_ITERATIONS, progress, count)
+    require_explained(model, solver.amplitude, frames, streak)
+    refinement, remainder = _refine(model, solver, progress, count)
+    solver.run(iterations, progress, count)
+    return SurfaceFit(model, solver, refinement, remainder, model.unexplained(solver.amplitude))
+
+
+def follow_surfaces(fit: SurfaceFit, streak: Streak, weight: float) -> SurfaceFit | None:
+    """Fit the surfaces of the shot before to the next one of the same camera.
+
+    Parameters
+    ----------
+    fit : SurfaceFit
+        Of the shot before.
+    streak : Streak
+    weight : float
+        Of total variation; see `tofclip.recovery.SurfaceRecovery`.
+
+    Returns
+    -------
+    SurfaceFit or None
+        None where these surfaces no longer explain what they did: the scene has changed, and
+        surfaces have to be found anew.
+    """
+    model = fit.model.see(streak)
+    solver = AmplitudeSolver(model, fit.solver.amplitude, weight, fit.solver)
+    solver.run(FOLLOWING_ITERATIONS, ignore_progress, 0)
+    refinement = refine_state(model, solver.amplitude, fit.refinement)
+    solver.amplitude = refinement.amplitude
+    solver.run(FOLLOWING_ITERATIONS, ignore_progress, 0)
+    unexplained = model.unexplained(solver.amplitude)
+    if unexplained > CHANGED_RATIO * fit.reference + CHANGED_EXCESS:
+        return None
+    return SurfaceFit(model, solver, refinement, fit.remainder, fit.reference)
+
+
+def _refine(
+    model: SurfaceModel, solver: AmplitudeSolver, progress: Progress, count: int
+) -> tuple[Refinement, FloatArray]:
+    """Steps on ranges and instrument; the last one, and what more would change of each surface."""
+    before, changes = model.distance, []
+    found = None
+    for _ in range(REFINEMENTS):
+        found = refine_state(model, solver.amplitude, found)
+        solver.amplitude = found.amplitude
+        solver.run(REFINEMENT_ITERATIONS, progress, count)
+        moved = model.distance - before
+        changes.append([np.sqrt(np.mean(moved[part] ** 2)) for part in model.parts])
+        before = model.distance
+    assert found is not None
+    return found, extrapolate_steps(np.array(changes))
+
+
+def extrapolate_steps(lengths: FloatArray) -> FloatArray:
+    """Return how far steps that shrink as the last two did would still go.
+
+    Parameters
+    ----------
+    lengths : (steps, n) float array
+        Two steps or more.
+
+    Returns
+    -------
+    (n,) float array
+        The sum of a geometric series; steps that do not shrink count as if they halved.
+    """
+    tiny = np.finfo(np.float64).tiny
+    ratio = np.minimum(lengths[-1] / np.maximum(lengths[-2], tiny), 0.5)
+    left: FloatArray = lengths[-1] * ratio / (1 - ratio)
+    return left
