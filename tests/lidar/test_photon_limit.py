@@ -229,6 +229,10 @@ def test_what_pixels_have_in_common_is_background_but_a_wall_is_not():
         # a decay in blocks, and a mixture told apart: the wall alone would be ten times too much
         assert np.median(wrong) < 0.1
         assert wrong.max() < 0.6
+    hot = noise.poisson(dark + own, (2000, 256)).astype(float)
+    hot[7, 100] = 1e6
+    learnt = learn_background(hot, 3.0)  # within a second, and as without that pixel
+    assert np.abs(learnt[:90] / (dark / dark.mean())[:90] - 1).max() < 0.6
     even = noise.poisson(0.2 + own).astype(float)
     assert learn_background(even[:100], 3.0) is None
     with pytest.raises(ShapeError, match="background"):

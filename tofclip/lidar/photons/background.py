@@ -33,6 +33,12 @@ CLUMP_SIGNIFICANCE = 5.0
 BLOCK_COST = 6.0
 """Log-likelihood that a further block has to bring."""
 
+MAX_USUAL_COUNT = 500
+"""Photons of a window above four times the median: beyond, their number does not matter."""
+
+MAX_COUNTED = 4000
+"""Photons up to which numbers of them are told apart one by one; of more, they are rounded."""
+
 BUMP_WIDTHS = (1.0, 1.6, 2.5)
 """Widths of a bump that a surface may make, in widths of the pulse."""
 
@@ -156,7 +162,10 @@ def find_lower_mean(counts: FloatArray) -> float:
     -------
     float
     """
-    seen = np.bincount(counts.astype(np.int64))
+    # What is far beyond the usual is no background, and a list as long as its photons takes hours.
+    limit = 4 * float(np.median(counts)) + MAX_USUAL_COUNT
+    unit = max(1.0, limit / MAX_COUNTED)
+    seen = np.bincount((np.minimum(counts, limit) / unit).astype(np.int64))
     several = np.arange(seen.size)
     logs = scipy.special.gammaln(several + 1)
 
@@ -164,7 +173,8 @@ def find_lower_mean(counts: FloatArray) -> float:
         share, lower, strength = unpack(parameters)
         dark = np.exp(several * np.log(lower) - lower - logs)
         odds = strength / (1 + strength)
-        bright = np.convolve(dark, odds ** (several + 0.0) / (1 + strength))[: seen.size]
+        # the convolution with a geometric law, as a recursion
+        bright = scipy.signal.lfilter([1 / (1 + strength)], [1.0, -odds], dark)
         return -float(seen @ np.log((1 - share) * dark + share * bright + 1e-300))
 
     def unpack(parameters: FloatArray) -> tuple[float, float, float]:
@@ -179,7 +189,7 @@ def find_lower_mean(counts: FloatArray) -> float:
     lower = float(scipy.special.gammainccinv(quarter + 1, min(reached, 0.999)))
     start = np.array([-1.0, np.log(max(lower, 1e-6)), np.log(max(mean - lower, 0.3) + 1.0)])
     found = scipy.optimize.minimize(misfit, start, method="Nelder-Mead").x
-    return min(unpack(found)[1], mean)
+    return unit * min(unpack(found)[1], mean)
 
 
 def remove_bumps(level: FloatArray, counts: FloatArray, width: float) -> FloatArray:
