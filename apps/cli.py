@@ -116,10 +116,10 @@ VERBS: VerbTable = {
 """Each verb's module in `apps.verbs` and its line in the list of commands."""
 
 FILE_READERS = (
-    *("recover", "cloud", "info"),
-    *("nlos reconstruct", "nlos film", "nlos compare", "nlos info"),
+    *("recover", "cloud", "info", "view", "stream", "lidar photons", "lidar sequence"),
+    *("nlos reconstruct", "nlos film", "nlos compare", "nlos info", "nlos stream"),
 )
-"""Verbs whose first argument has to be there."""
+"""Verbs whose first argument has to be there, unless it is an address or a pattern."""
 
 app = typer.Typer(
     name="tofclip",

@@ -170,7 +170,9 @@ class StreamSource(DecodedSource):
         self._closed = True
         self._stopping.set()
         self._ring.end()
-        self._thread.join(STOP_TIMEOUT_S)
+        # The collector may close a forgotten source on any thread, its own reader's among them.
+        if self._thread is not threading.current_thread():
+            self._thread.join(STOP_TIMEOUT_S)
         _open_sources.discard(self)
 
     def _run_reader(self) -> None:

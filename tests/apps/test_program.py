@@ -239,13 +239,11 @@ def wait_for(terminal: int, text: str) -> str:
     return seen
 
 
-@pytest.mark.parametrize(
-    "words", [("recover",), ("cloud",), ("info",), ("nlos", "reconstruct"), ("nlos", "info")]
-)
+@pytest.mark.parametrize("verb", cli.FILE_READERS)
 def test_a_missing_file_is_refused_before_its_verb_is_imported(
-    run: Run, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+    run: Run, monkeypatch: pytest.MonkeyPatch, verb: str
 ) -> None:
     monkeypatch.setattr("apps.help.load_command", lambda *_: pytest.fail("it was imported"))
-    outcome = run(*words, "absent.h5")
+    outcome = run(*verb.split(), "absent.h5")
     assert (outcome.status, outcome.out) == (2, "")
     assert outcome.err == "tofclip: error: absent.h5: no such file\n"

@@ -5,6 +5,7 @@ none may be silent, none may hang.
 from __future__ import annotations
 
 import ast
+from concurrent.futures import Future
 from functools import lru_cache
 from pathlib import Path
 from time import monotonic
@@ -169,3 +170,27 @@ def test_a_reader_64_mib_behind(policy: OverflowPolicy) -> None:
     else:
         assert stats.dropped_host > 0 or stats.delivered == pictures
     assert monotonic() - began < 20
+
+
+class ClosingFeed(BoundlessFeed):
+    """Closes its own source after some pictures, as the collector may on the reader's thread."""
+
+    def __init__(self, pictures: int) -> None:
+        super().__init__(pictures)
+        self.source: Future[StreamSource] = Future()
+
+    def pull(self, timeout: float) -> Transfer | None:
+        source = self.source.result()
+        if self._number == 3:
+            source.close()
+        return super().pull(timeout)
+
+
+def test_a_source_that_is_closed_on_its_own_thread_ends_as_any_other() -> None:
+    feed = ClosingFeed(80)
+    source = StreamSource(feed, feed.codec, Ledger())  # type: ignore[arg-type]
+    feed.source.set_result(source)
+    while source._ring.get(5.0) is not None:
+        pass
+    source._thread.join(5.0)
+    assert not source._thread.is_alive()
