@@ -147,7 +147,8 @@ def photons(
 ) -> None:
     """Find the surface that counted photons show, with the deviation of every range.
 
-    Pulse, background and how far neighbours help each other are found from the photons.
+    Pulse, background and how far neighbours help each other are found from the photons. Hot pixels
+    are left out, counted, and marked in a range image (hot_pixels).
 
     Example: tofclip lidar photons cube.npy --bin-width-ps 80 --pulse-ps 400 --out range.npz
     """
@@ -303,10 +304,12 @@ def choose_camera(
 
 def save_range_image(found: SurfaceImage, camera: Camera, path: Path) -> None:
     """Write ranges, deviations, photons and outlier probabilities to an NPZ file, whole or not at
-    all; reflectances too, where the camera knows them.
+    all; reflectances too, where the camera knows them, and the mask of hot pixels, if any.
     """
     known = camera.range_calibration
     further: dict[str, Any] = {}
+    if found.hot_pixels is not None and found.hot_pixels.any():
+        further["hot_pixels"] = found.hot_pixels
     if known is not None and np.isfinite(known.reflectance_scale):
         further["reflectance_percent"] = known.compute_reflectance(
             found.intensity * found.range**2, *np.indices(found.range.shape)

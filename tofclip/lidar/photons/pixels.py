@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofclip.lidar.photons.detector import PhotonDetector
+from tofclip.lidar.photons.hot_pixels import find_hot_pixels, leave_out_pixels
 from tofclip.lidar.photons.photon_image import PhotonImage
 from tofclip.lidar.photons.response import measure_pulse_width
 from tofclip.lidar.photons.surface_image import SurfaceImage
@@ -45,13 +46,15 @@ def estimate_pixels(
     Returns
     -------
     SurfaceImage
-        NaN where no return stands out. The probability of an outlier is that of a false alarm.
+        NaN where no return stands out, and in hot pixels. The probability of an outlier is that of a false alarm.
 
     Raises
     ------
     InputError
         No pulse is given and none can be recognised, or the time axis is shorter than two pulses.
     """
+    hot = find_hot_pixels(photons)
+    photons = leave_out_pixels(photons, hot)
     shape = Pulse.gaussian(measure_pulse_width(photons)) if pulse is None else pulse
     detector = PhotonDetector(
         shape, photons.bin_width, photons.bins, false_alarm_rate, background=background
@@ -88,5 +91,7 @@ def estimate_pixels(
             else "learnt"
             if np.ptp(detector.relative_background)
             else "even",
+            "hot_pixels": int(hot.sum()),
         },
+        hot_pixels=hot,
     )

@@ -15,7 +15,7 @@ outlier come from the data: a part of the photons is held back, and what explain
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from tofclip.lidar.photons.held_out import (
     judge_surface,
     learn_scene,
 )
+from tofclip.lidar.photons.hot_pixels import find_hot_pixels, leave_out_pixels
 from tofclip.lidar.photons.layers import combine_layers, keep_significant, remove_return
 from tofclip.lidar.photons.matching import (
     JUMP_COST_RATIO,
@@ -82,7 +83,8 @@ def estimate_surface(
     Returns
     -------
     SurfaceImage
-        Every pixel has a range; `SurfaceImage.outlier_probability` says what it is worth.
+        Every pixel has a range, a hot one that of its neighbours;
+        `SurfaceImage.outlier_probability` says what it is worth.
 
     Raises
     ------
@@ -94,6 +96,8 @@ def estimate_surface(
     Memory: at most 2 GiB beside the photons.
     """
     report = (lambda _: None) if progress is None else progress
+    hot = find_hot_pixels(photons)
+    photons = leave_out_pixels(photons, hot)
     width = measure_pulse_width(photons) if pulse is None else 0.0
     start = Pulse.gaussian(width) if pulse is None else pulse
     scene = Scene(BinnedResponse.from_pulse(start, photons.bin_width), estimate_background(photons))
@@ -136,6 +140,7 @@ def estimate_surface(
         "jump_cost": slope_cost * JUMP_COST_RATIO,
         "reach_px": reach,
         "response_sigma_m": systematic * to_range,
+        "hot_pixels": int(hot.sum()),
     }
     layers = [plan.locate(photons, scene)]
     rest = photons
@@ -146,7 +151,8 @@ def estimate_surface(
         if not rest.bin.size:
             break
         layers.append(keep_significant(rest, scene, plan.locate(rest, scene)))
-    return combine_layers(layers, max_returns, scene, to_range, settings)
+    found = combine_layers(layers, max_returns, scene, to_range, settings)
+    return replace(found, hot_pixels=hot)
 
 
 @dataclass(frozen=True)

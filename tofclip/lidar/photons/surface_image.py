@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofclip.camera import Camera
 from tofclip.errors import CalibrationError
@@ -38,6 +39,8 @@ class SurfaceImage:
         What was chosen from the data, by name.
     further : tuple of SurfaceImage
         Weaker returns of the same pixels, the strongest first; NaN where there is none.
+    hot_pixels : (rows, columns) bool array, optional
+        Pixels whose photons were left out; see `tofclip.lidar.photons.hot_pixels`.
     """
 
     range: FloatArray
@@ -47,6 +50,7 @@ class SurfaceImage:
     pulse: Pulse
     settings: dict[str, float | str]
     further: tuple[SurfaceImage, ...] = ()
+    hot_pixels: NDArray[np.bool_] | None = None
 
     def calibrate(self, camera: Camera, first_time: float = 0.0) -> SurfaceImage:
         """Return the ranges from the camera's time zero, with its range calibration applied.
