@@ -44,6 +44,7 @@ OPTIONS_OF_ARGUMENTS = {
     "overwrite": "--overwrite",
     "pulse": "--pulse-ps",
     "region": "--region",
+    "single_pixel": "--single-pixel",
     "target": "--target-m",
     "time_zero": "--time-zero-ns",
 }

@@ -13,6 +13,7 @@ import scipy.io
 import tifffile
 
 from tofclip.errors import FileFormatError, InputError, StorageError
+from tofclip.lidar.photons import make_pinhole
 from tofclip.lidar.photons.files import describe_photons, read_photons
 
 BIN = 80e-12
@@ -127,6 +128,22 @@ def test_axes_in_any_order(axes, counts, tmp_path) -> None:
     )
     if axes.index("y") < axes.index("x"):  # a mirrored picture cannot be recognised
         assert read_photons(path, BIN).image_shape == (ROWS, COLUMNS)
+
+
+@pytest.mark.parametrize("rows_columns", [(1, 8), (6, 1), (1, 1)])
+def test_one_row_or_one_pixel_where_axes_are_told(rows_columns, counts, tmp_path) -> None:
+    path, (rows, columns) = tmp_path / "a.npy", rows_columns
+    some = counts[:rows, :columns]
+    np.save(path, np.moveaxis(some, 2, 0))
+    photons = read_photons(path, BIN, "tyx")
+    assert photons.image_shape == rows_columns
+    assert photons.bins == BINS
+    np.testing.assert_array_equal(
+        photons.histograms(slice(0, rows * columns)), some.reshape(-1, BINS)
+    )
+    with pytest.raises(FileFormatError, match="give `axes`"):
+        read_photons(path, BIN)
+    assert make_pinhole(rows_columns, 10.0, BIN).image_shape == rows_columns
 
 
 def test_time_is_recognised_by_its_peak_where_it_is_not_the_longest(tmp_path) -> None:

@@ -49,6 +49,18 @@ def compute_robust_z(error: np.ndarray, sigma: np.ndarray) -> float:
     return float(1.4826 * np.median(np.abs(ratio - np.median(ratio))))
 
 
+def test_too_few_photons_are_refused_for_what_they_are() -> None:
+    cube = np.zeros((6, 8, 100))
+    cube[2, 3, 50] = cube[4, 3, 50] = 1
+    with pytest.raises(InputError, match=r"2 photons are too few.*`single_pixel`"):
+        estimate_surface(PhotonImage.from_cube(cube, BIN), Pulse.gaussian(FWHM))
+    # photons that were scaled: pairs of less than one are no pulse, and no warning
+    noise = np.random.default_rng(0)
+    scaled = 0.4 * noise.poisson(0.05, (6, 8, 100))
+    with pytest.raises(InputError, match="no pulse"):
+        measure_pulse_width(PhotonImage.from_cube(scaled, BIN))
+
+
 def test_two_signal_photons_among_fifty_show_the_surface(dim) -> None:
     photons, surface = dim
     found = estimate_surface(photons, Pulse.gaussian(FWHM))

@@ -200,9 +200,14 @@ def open_photons(path: Path) -> PhotonFile:
         ) from fault
 
 
-def _find_layout(opened: PhotonFile, path: Path) -> tuple[str, list[ArrayEntry]]:
+def _find_layout(
+    opened: PhotonFile, path: Path, axes: str | None = None
+) -> tuple[str, list[ArrayEntry]]:
     """Choose the arrays that hold the photons."""
     cubes = [entry for entry in opened.arrays if len(entry.length) == 3 and entry.type != "cell"]
+    small = [entry for entry in opened.arrays if len(entry.shape) == 3 and entry.type != "cell"]
+    if axes or opened.axes:  # known: there may be one row, or one pixel
+        cubes = cubes or small
     named = [entry for entry in cubes if entry.name.rpartition("/")[2].lower() in CUBE_NAMES]
     cells = [entry for entry in opened.arrays if entry.type == "cell" and len(entry.shape) == 2]
     if len(named) == 1 or len(cubes) == 1:
@@ -215,13 +220,16 @@ def _find_layout(opened: PhotonFile, path: Path) -> tuple[str, list[ArrayEntry]]
         return "events", [flat["y"], flat["x"], times[0]]
     held = ", ".join(f"{entry.name} {entry.shape}" for entry in opened.arrays[:6]) or "no arrays"
     problem = "several cubes of photons" if len(cubes) > 1 else "no photons"
-    raise FileFormatError(path, f"holds {problem} ({held}); {SUITABLE}")
+    remedy = "give `axes`, e.g. yxt, of a picture of one row" if small and not cubes else SUITABLE
+    raise FileFormatError(path, f"holds {problem} ({held}); {remedy}")
 
 
 def _read_layout(opened: PhotonFile, path: Path, bin_width: float, axes: str | None) -> PhotonImage:
-    layout, arrays = _find_layout(opened, path)
+    layout, arrays = _find_layout(opened, path, axes)
     if layout == "cube":
-        cube = np.squeeze(arrays[0].load())
+        cube = arrays[0].load()
+        if cube.ndim > 3:
+            cube = np.squeeze(cube)
         if cube.dtype.kind not in "uifb":
             raise FileFormatError(path, f"its cube holds {cube.dtype}, not counts; {SUITABLE}")
         order = axes or opened.axes or recognise_axes(cube, path)

@@ -192,10 +192,20 @@ class PhotonImage:
         -------
         (PhotonImage, PhotonImage)
             Independent of each other if the photons are Poisson distributed.
+
+        Raises
+        ------
+        InputError
+            So few photons that one part has none.
         """
         noise = np.random.default_rng(seed)
         # binomial thinning of Poisson counts gives two independent Poisson counts
         second = noise.binomial(np.rint(self.count).astype(np.int64), fraction).astype(np.float32)
+        if not (second.any() and np.any(self.count > second)):
+            raise InputError(
+                f"{self.photons:g} photons are too few to find a surface and to hold some back "
+                "that judge it; each pixel may be judged alone (`single_pixel`)"
+            )
         return self.select(self.count - second), self.select(second)
 
     def histograms(self, pixels: slice) -> FloatArray:

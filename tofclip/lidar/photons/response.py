@@ -153,7 +153,8 @@ def measure_pulse_width(photons: PhotonImage) -> float:
         pairs = lags[: pieces * group].reshape(pieces, group).sum(axis=1)
         expected = chance[: pieces * group].reshape(pieces, group).sum(axis=1)
         excess = pairs - expected
-        if excess[0] > MIN_LAG_SIGNIFICANCE * np.sqrt(expected[0] + pairs[0] + 1):
+        # counts below one make negative pairs: a photon is none with itself
+        if excess[0] > MIN_LAG_SIGNIFICANCE * np.sqrt(max(expected[0] + pairs[0], 0.0) + 1):
             below = np.flatnonzero(excess < excess[0] / 2)
             if below.size:
                 last = int(below[0])

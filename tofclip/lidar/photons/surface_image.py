@@ -145,7 +145,7 @@ def make_pinhole(image_shape: tuple[int, int], focal_length_px: float, pulse_fwh
     """
     columns = image_shape[1]
     return Camera(
-        np.array([columns / 2]),
+        np.array([min(columns / 2, columns - 1)]),
         np.zeros(1),
         image_shape,
         columns,
