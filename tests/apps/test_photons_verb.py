@@ -179,6 +179,30 @@ def test_a_recording_of_time_stamps_becomes_ranges(run: Run, tmp_path: Path) -> 
     assert np.nanmedian(np.abs(error)) < SPEED_OF_LIGHT / 2 * 250e-12
 
 
+def test_a_recording_of_a_gated_array_becomes_ranges(run: Run, tmp_path: Path) -> None:
+    """SPAD512: one whole scan of a recording, by its address."""
+    instrument = (
+        "sim+spad512://?seed=1&mode=gated&gate_steps=8&gate_step_ps=1920"
+        "&gate_offset_ps=7000&gate_width_ns=3"
+    )
+    ours, out = tmp_path / "run.h5", tmp_path / "range.npz"
+    assert run("record", instrument, "--out", ours, "--seconds", "0.5").status == 0
+    found = json.loads(run("info", ours, "--json").out)
+    assert found["kind"] == "recording"
+    assert found["children"]["calibration"]["kind"] == "gate_scan"
+    assert find_address(str(ours)) == f"file://{ours}"
+    outcome = run("lidar", "photons", f"file://{ours}?binning=16", "--out", out, "--json")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert json.loads(outcome.out)["settings"]["image_shape"] == [32, 32]
+    with np.load(out) as written:
+        found = written["range_m"]
+    delays = render_array_delays().reshape(32, 16, 32, 16)
+    even = delays.max(axis=(1, 3)) - delays.min(axis=(1, 3)) < 1e-11
+    error = found[even] - delays.mean(axis=(1, 3))[even] * SPEED_OF_LIGHT / 2
+    # steps are 288 mm, see above
+    assert np.median(np.abs(error)) < 0.144
+
+
 def test_a_given_background_and_cycles_are_used(run: Run, tmp_path: Path) -> None:
     """A ramp whose shape is given is no return; with pile-up corrected, photons are more than
     counted.
