@@ -201,6 +201,9 @@ def test_a_recording_of_a_gated_array_becomes_ranges(run: Run, tmp_path: Path) -
     error = found[even] - delays.mean(axis=(1, 3))[even] * SPEED_OF_LIGHT / 2
     # steps are 288 mm, see above
     assert np.median(np.abs(error)) < 0.144
+    # A pixel alone: a pulse that hardly more than a bin sees once divided by a rounded zero.
+    alone = ("lidar", "photons", f"file://{ours}?binning=16", "--out", out, "--single-pixel")
+    assert run(*alone).status == 0
 
 
 def test_a_given_background_and_cycles_are_used(run: Run, tmp_path: Path) -> None:

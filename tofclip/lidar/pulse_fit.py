@@ -344,14 +344,14 @@ def take_gauss_newton_step(times, sums, own):
     pp, pd, dd, pr, dr = sums
     determinant = pp * dd - pd * pd
     own[4] = 0.0
-    # fewer than two bins see the pulse: nothing to improve
-    if determinant <= 0:
+    first, last = int(own[2]), int(own[3])
+    # fewer than two bins see the pulse: nothing to improve, though rounding may say otherwise
+    if last - first < 2 or determinant <= 0:
         return
     height = (dd * pr - pd * dr) / determinant
     if height <= 0:
         own[1] = 0.0
         return
-    first, last = int(own[2]), int(own[3])
     bin_width = (times[last - 1] - times[first]) / (last - 1 - first)
     step = -(pp * dr - pd * pr) / (
         determinant * height

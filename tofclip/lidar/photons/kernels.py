@@ -379,8 +379,9 @@ def summarise_return(trace, times, background, curve, scale, estimate, k, varian
         dd += weight * d * d
         total += height * p
     found[0], found[1], found[2] = arrival, total, np.inf
-    if height > 0 and pp * dd > pd * pd:
-        found[2] = 1 / (height * np.sqrt(dd - pd * pd / pp))
+    determinant = pp * dd - pd * pd
+    if height > 0 and determinant > 0:
+        found[2] = np.sqrt(pp / determinant) / height
 
 
 @njit(nogil=True, cache=True)
