@@ -17,8 +17,13 @@ from devices.remoteex.emulator import EmulatedStreakCamera
 from devices.scenes import EmulatedLight, draw_exposure, simulate_line_light
 from devices.shot_stream import read_transients
 from devices.transients import read_transient
+from tofclip.camera import Camera, SkewSweep
 from tofclip.lidar import PointCloud
+from tofclip.sequences.streaming import stream_clouds
+from tofclip.sequences.surface_following import SurfacePipeline
 from tofclip.shots import Streak, save_stack
+from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
+from tofclip.simulate.patterns import make_plain_pattern
 
 
 def shots(number: int) -> list[Streak]:
@@ -65,6 +70,40 @@ def test_a_stream_by_a_prior_says_so_and_its_rate(capsys: pytest.CaptureFixture[
     assert figures["points"] > 0
     assert main(["stream", address, "--shots", "1", "--method", "wavelet"]) == 2
     assert "linear, l1, tv, surfaces, not 'wavelet'" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_stream_by_surfaces_is_that_of_its_pipeline(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    centres = 30.0 + 45 * np.arange(4)
+    camera = Camera(
+        centres,
+        np.arctan([0.6, -0.7, 0.3, -0.1]),
+        (24, 24),
+        200,
+        sweep=SkewSweep(centres, np.zeros(4), np.zeros(4)),
+        time_zero=-6e-9,
+        pulse_fwhm=150e-12,
+    )
+    plate = make_plate((0.0, 0.0, 1.3), (0.05, 0.05), make_plain_pattern(0.8))
+    instrument = Instrument(camera, StreakDetector(80, 50e-12, peak_photons=5e4))
+    made = [simulate_shot(Scene((plate,)), instrument, seed).streak for seed in range(3)]
+    source, clouds = tmp_path / "shots.h5", tmp_path / "clouds"
+    save_stack(made, source)
+    camera.save(tmp_path / "camera.h5")
+    words = ["stream", str(source), "--camera", str(tmp_path / "camera.h5"), "--out", str(clouds)]
+    words += ["--method", "surfaces"]
+    assert main([*words, "--json"]) == 0
+    figures = read_report(capsys)
+    assert (figures["method"], figures["clouds"], figures["dropped"]) == ("surfaces", 3, 0)
+    assert figures["clouds_per_second"] > 0
+    pipeline = SurfacePipeline.for_shot(made[0])
+    for number, one in enumerate(stream_clouds(made, pipeline)):
+        cloud = PointCloud.load(clouds / f"cloud_{number:06d}.ply")
+        # a PLY keeps coordinates in float32
+        np.testing.assert_allclose(cloud.range, one.cloud.range, rtol=1e-6)
+        assert np.median(cloud.range) == pytest.approx(1.3, abs=1e-3)
+    assert pipeline.searches == 1
 
 
 def test_a_slow_consumer_gets_the_newest_shot_and_the_truth_about_the_others(
