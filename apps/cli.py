@@ -55,44 +55,48 @@ COMPLETION_VARIABLE = "_TOFCLIP_COMPLETE"  # set by shells that ask how a comman
 VERB_OVERVIEW = f"""\
 tofclip {__version__}: 3D from streak images, through occluders and around corners
 
-                        four focus pictures
-                                |
-                            calibrate
-                                |
-                            camera.h5
-                                |
-  raw streak image ---------> recover --> frames.h5 --+--> cloud ------------> scene.ply
-  or an instrument                                    |
-                                                      +--> nlos reconstruct -> volume.h5
+                   four focus pictures
+                            |
+                        calibrate
+                            |
+                        camera.h5
+                            |
+  raw streak image -> recover --> frames.h5 --+--> cloud ------------> scene.ply
+  or an instrument                            |
+                                              +--> nlos reconstruct -> volume.h5
 
-  demo               all of it on a simulated scene, no files needed: start here
-  calibrate          find a camera's views in four pictures of a point source
-  calibrate range    time zero, range walk, offsets and reflectance from shots of a target at known distances
-  recover            streak image to one picture per instant
-  cloud              recovered frames to a point cloud
-  view               look at any of these, or an instrument: a page, a window, a picture, a film
-  stream             an instrument's shots, a folder's or a stack's to clouds while they come, with latencies
-  lidar accuracy     accuracy of ranges from counted photons, beside the Cramer-Rao bound
-  lidar parallax     a shot to how the views move with range, for recover --focus depth-locked
-  lidar scene        recovered frames to a list of objects and a picture
-  lidar sequence     a folder or stack of shots to a sequence of clouds
-  lidar bag          a sequence of clouds to a ROS 2 bag or an MCAP file
-  nlos reconstruct   recovered frames of a wall, or a folder of them, to what is hidden around the corner
-  nlos film          the flash passing through the hidden scene, as a film
-  nlos compare       several methods on one capture, side by side, with time and memory
-  nlos simulate      the capture of a known hidden scene; nlos info: what a capture can show
-  nlos demo          a hidden 3D before a curved wall, imaged quickly and slowly
-  occlusion          what stands behind an occluder: inactive region, demonstration
-  clip               light fields from few measurements: simulate a camera, recover an image
-  reproduce          the paper's tables and figures, made again: reproduce all --out DIR
-  bench              how fast and how large all this is on this machine
-  devices            instruments and their recordings: list, info, test, verify, repair
-  record             an instrument's bytes, to be replayed exactly
-  convert            any readable streak image to this program's own HDF5
-  warm-up            compile everything now, so that no later run waits for it
-  info               what a file holds
+  demo              all of it on a simulated scene, no files needed: start here
+  calibrate         a camera's views, from four pictures of a point source
+  calibrate range   time zero and range walk, from shots of a target
+  recover           streak image to one picture per instant
+  cloud             recovered frames to a point cloud
+  view              any of these on a page, in a window, as a picture or a film
+  stream            shots to clouds while they come, with latencies
+  lidar photons     counted photons to a range image and a point cloud
+  lidar accuracy    accuracy of ranges from photons, beside the Cramer-Rao bound
+  lidar parallax    how views move with range, for recover --focus depth-locked
+  lidar scene       recovered frames to a list of objects and a picture
+  lidar sequence    a folder or stack of shots to a sequence of clouds
+  lidar bag         a sequence of clouds to a ROS 2 bag or an MCAP file
+  nlos reconstruct  recovered frames of a wall to what is around the corner
+  nlos info         what a capture of a wall can show, and by which method
+  nlos stream       captures to volumes while they come, with latencies
+  nlos film         the flash passing through the hidden scene, as a film
+  nlos compare      several methods on one capture, with time and memory
+  nlos simulate     the capture of a known hidden scene
+  nlos demo         a hidden 3D before a curved wall, imaged quickly and slowly
+  occlusion         what stands behind an occluder: inactive region, demo
+  clip              light fields from few measurements: simulate, recover
+  reproduce         the paper's tables and figures, made again
+  bench             how fast and how large all this is on this machine
+  devices           instruments and recordings: list, info, test, verify, repair
+  record            an instrument's bytes, to be replayed exactly
+  convert           any readable streak image to this program's own HDF5
+  warm-up           compile everything now, so that no later run waits for it
+  info              what a file holds
 
-  tofclip VERB --help explains a verb. Exit status: 0 done, 1 some failed, 2 unusable input, 130 interrupted."""
+  tofclip VERB --help explains a verb. Exit status: 0 done, 1 some failed,
+  2 unusable input, 130 interrupted."""
 
 VERBS: VerbTable = {
     "demo": "Simulate a scene of letters and plates, recover it from one streak image, and compare with the truth.",

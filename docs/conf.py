@@ -4,8 +4,10 @@ network.
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
+from typing import Any
 
 from sphinx.application import Sphinx
 
@@ -52,6 +54,46 @@ def write_verb_pages(app: Sphinx) -> None:
     write_pages(Path(app.srcdir) / "verbs")
 
 
+NUMPY_ARRAY = re.compile(
+    r"~?numpy\.ndarray\[tuple\[~?typing\.Any, \.\.\.\], ~?numpy\.dtype\[((?:[^\[\]]|\[[^\[\]]*\])*)\]\]"
+)
+
+
+def shorten_signature(
+    app: Sphinx,
+    what: str,
+    name: str,
+    obj: object,
+    options: Any,
+    signature: str | None,
+    returned: str | None,
+) -> tuple[str | None, str | None]:
+    """Write arrays as the code does, and defaults so that Sphinx can read the signature.
+
+    What it cannot read, such as ``<factory>``, it prints as it is, with full paths and no links.
+    """
+
+    def shorten(text: str | None) -> str | None:
+        return text and NUMPY_ARRAY.sub(r"~numpy.typing.NDArray[\1]", text)
+
+    return shorten(signature and signature.replace("<factory>", "...")), shorten(returned)
+
+
+def protect_plain_text(
+    app: Sphinx, what: str, name: str, obj: object, options: Any, lines: list[str]
+) -> None:
+    """Keep napoleon and reST from reading sentences as markup.
+
+    "m." and an author's initial at the beginning of a line would begin a list, and what stands
+    before a colon in a property's first line would become its type.
+    """
+    if what in {"attribute", "data", "property"} and lines:
+        lines[0] = lines[0].replace(": ", " -- ")
+    lines[:] = [re.sub(r"^(\s*)([A-Za-z])\.(?=\s|$)", r"\1\\\2.", line) for line in lines]
+
+
 def setup(app: Sphinx) -> None:
     """Register what Sphinx has to do first."""
     app.connect("builder-inited", write_verb_pages)
+    app.connect("autodoc-process-signature", shorten_signature)
+    app.connect("autodoc-process-docstring", protect_plain_text, priority=400)  # before napoleon

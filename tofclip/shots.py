@@ -623,9 +623,9 @@ class Frames(Storable):
         Parameters
         ----------
         range : (float, float), optional
-            m.
+            Nearest and furthest range, m.
         time : (float, float), optional
-            s.
+            First and last time of flight, s.
 
         Returns
         -------

@@ -83,6 +83,10 @@ def test_the_map_shows_the_verb(name: str) -> None:
     assert f"\n  {name} " in VERB_OVERVIEW or f"\n  {group} " in VERB_OVERVIEW
 
 
+def test_the_overview_fits_a_terminal_of_eighty_columns() -> None:
+    assert max(map(len, VERB_OVERVIEW.splitlines())) <= 80
+
+
 def test_prose_is_joined_and_examples_are_taken_out() -> None:
     prose, examples = split_docstring(
         "Do a\nthing.\n\n  a  table\n\nExample: tofclip do\n    it --now\n\nMore."

@@ -45,3 +45,22 @@ def test_what_a_page_shows_exists(module: str) -> None:
 def test_names_of_the_package_itself_are_listed() -> None:
     listed = set(re.findall(r"`tofclip\.(\w+) <", PAGES))
     assert listed == set(tofclip.__all__) - {"__version__"}
+
+
+def test_signatures_are_short_and_sentences_stay_sentences() -> None:
+    conf = pytest.importorskip("conf", reason="pages: pip install 'tofclip[docs]'")
+    array = "~numpy.ndarray[tuple[~typing.Any, ...], ~numpy.dtype[~numpy.float64]]"
+    assert conf.shorten_signature(
+        None, "class", "", None, None, f"(x: {array} = <factory>)", array
+    ) == (
+        "(x: ~numpy.typing.NDArray[~numpy.float64] = ...)",
+        "~numpy.typing.NDArray[~numpy.float64]",
+    )
+    lines = ["Where it lives: library and device.", "", "    m.", "    R. Bach, 1750."]
+    conf.protect_plain_text(None, "property", "", None, None, lines)
+    assert lines == [
+        "Where it lives -- library and device.",
+        "",
+        r"    \m.",
+        r"    \R. Bach, 1750.",
+    ]
