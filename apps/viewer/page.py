@@ -292,6 +292,7 @@ class Page:
             source.frame_name,
             source.describe_frame(shown.frame),
             self.session.notes,
+            source.whole_name,
             None if shown.surface is not None else self.points.drawn,
         )
 

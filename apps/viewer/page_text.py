@@ -62,6 +62,8 @@ class Status:
         Where a slice lies; empty where frames are not slices.
     notes : tuple of str
         What has to be known about the picture, such as that its ranges have no time zero.
+    whole_name : str
+        What is shown where it is not one frame but all of them, instead of the frame's number.
     drawn_points : int, optional
         Of a large cloud, by a browser that would be slow with all of them.
     """
@@ -79,6 +81,7 @@ class Status:
     frame_name: str = "frame"
     depth_text: str = ""
     notes: tuple[str, ...] = ()
+    whole_name: str = ""
     drawn_points: int | None = None
 
     @property
@@ -87,10 +90,11 @@ class Status:
         moves while frames pass.
         """
         colour = "#e5484d" if self.label == "LIVE" else "#3e8ed0"
-        name = html.escape(self.frame_name)
+        what = html.escape(self.whole_name or self.frame_name)
+        if not self.whole_name and (self.frames > 1 or self.label == "LIVE"):
+            what += f" <b id='frame-number'>{self.frame}</b> of {self.frames}"
         lines = [
-            f"<b id='label' style='color:{colour}'>{self.label}</b> {name} "
-            f"<b id='frame-number'>{self.frame}</b> of {self.frames}"
+            f"<b id='label' style='color:{colour}'>{self.label}</b> <span id='what'>{what}</span>"
         ]
         if np.isfinite(self.time):
             distance = SPEED_OF_LIGHT * self.time / 2

@@ -69,7 +69,8 @@ class SceneFigure:
             if self._renderer.name == "pyvista"
             else "   drawn by matplotlib: no working graphics library here"
         )
-        self._text.set_text(f"{self._title}, frame {shown.frame}: {len(shown.cloud)} points{note}")
+        of_frames = f", {shown.caption}" if shown.caption else ""
+        self._text.set_text(f"{self._title}{of_frames}: {len(shown.cloud)} points{note}")
         return self._figure
 
     def pixels(self, shown: DisplayedFrame) -> Image:

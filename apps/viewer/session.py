@@ -102,6 +102,8 @@ class DisplayedFrame:
     pixels : (n, 2) int array, optional
     surface : TriangleMesh, optional
         Drawn instead of the points.
+    caption : str
+        Of which frames the points are; empty where there is one only.
     thinned_from : int
         Points of which these were drawn by lot while frames pass; 0 where all are here.
     """
@@ -112,6 +114,7 @@ class DisplayedFrame:
     scale: Scale
     pixels: NDArray[np.int32] | None = None
     surface: TriangleMesh | None = None
+    caption: str = ""
     thinned_from: int = 0
 
     @property
@@ -306,8 +309,20 @@ class Session:
             scale,
             pixels,
             self.source.surface(),
+            self._name_frames(frame),
             0 if view is whole else len(whole.cloud),
         )
+
+    def _name_frames(self, frame: int) -> str:
+        """Say of which frames the points are: of one, of a transient's gate, or of all."""
+        if self.source.whole_name:
+            return f"{self.source.whole_name} {self.source.describe_frame(frame)}"
+        if self.source.capabilities.times is None:
+            return f"{self.source.frame_name} {frame}" if len(self.source) > 1 else ""
+        gate = self.gate_at(frame)
+        if gate == Gate(0, len(self.source)):
+            return f"all {gate.stop} frames"
+        return f"frames {gate.first} to {gate.stop - 1}"
 
     def _find_point_limit(self) -> int | None:
         """Most points of a frame, None for all: while frames pass, the next one has to come soon."""

@@ -200,6 +200,13 @@ class Source(abc.ABC):
         """What has to be said while a refocus is shown; empty where there is nothing to say."""
         return ""
 
+    @property
+    def whole_name(self) -> str:
+        """What is shown where it is not one frame but all of them, such as a maximum projection;
+        empty where it is one.
+        """
+        return ""
+
     def describe_frame(self, number: int) -> str:
         """Say in a few words what frame `number` is, beyond its time; empty where there is nothing to
         say.

@@ -57,11 +57,15 @@ class VolumeSource(Source):
     def __len__(self) -> int:
         return int(self.volume.grid.z.size)
 
+    @property
+    def whole_name(self) -> str:
+        return "" if self.display_modes.current == SLICE_MODE else self.display_modes.current
+
     def describe_frame(self, number: int) -> str:
         """Say where a slice lies, or that slices do not matter in this mode."""
-        if self.display_modes.current == SLICE_MODE:
-            return f"z {self.volume.grid.z[number]:.3f} m"
-        return f"{self.display_modes.current} of all {len(self)} slices"
+        if self.whole_name:
+            return f"of all {len(self)} slices"
+        return f"z {self.volume.grid.z[number]:.3f} m"
 
     def view(self, number: int) -> View:
         chosen = self.display_modes.current

@@ -60,7 +60,7 @@ class Seen:
         self.tab.on("console", self._listen)
         self.tab.on("pageerror", lambda fault: self.complaints.append(str(fault)))
         self.tab.goto(self.page.address)
-        self.tab.locator("#frame-number").wait_for(timeout=LOADING_MS)
+        self.tab.locator("#label").wait_for(timeout=LOADING_MS)
         notice = self.tab.locator(
             "[class*=Notification-closeButton]"
         )  # that the renderer is a slow one
@@ -423,10 +423,14 @@ def test_a_volume_as_a_surface(browser: Any) -> None:
     seen = Seen(browser, Session(VolumeSource("ball", volume())))
     try:
         until(lambda: seen.number("#points") > 10, "the maximum projection is shown first")
-        words = "maximum projection of all 21 slices"
-        assert seen.tab.locator("#depth").inner_text() == words
+        assert seen.tab.locator("#what").inner_text() == "maximum projection"
+        assert seen.tab.locator("#depth").inner_text() == "of all 21 slices"
+        assert seen.tab.locator("#frame-number").count() == 0  # it is not of slice 0
         seen.choose("show as", SLICE_MODE)
         seen.type("slice", "10")
+        until(
+            lambda: seen.tab.locator("#what").inner_text() == "slice 10 of 21", "the slice is named"
+        )
         until(lambda: seen.tab.locator("#depth").inner_text() == "z 0.500 m", "its depth is said")
         seen.choose("show as", SURFACE_MODE)
         seen.type("threshold", "0.6")

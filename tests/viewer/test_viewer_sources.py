@@ -31,6 +31,7 @@ from viewer_scenes import (
 
 from apps.viewer.clouds import make_cloud
 from apps.viewer.live import LiveShotSource
+from apps.viewer.page_text import Status
 from apps.viewer.render import RasterRenderer
 from apps.viewer.scene_figure import SceneFigure
 from apps.viewer.session import (
@@ -46,7 +47,7 @@ from apps.viewer.side_pictures import project_front, render_pictures
 from apps.viewer.source import LINEAR_NOTE, NO_TIME_ZERO_NOTE, Gate, Source, View
 from apps.viewer.source_factory import FIRST_LOOK_NOTE, ShotOptions, open_source
 from apps.viewer.viewpoint import Box, measure_point_spacing, place_viewpoint
-from apps.viewer.volume import PROJECTION_MODE, SLICE_MODE, SURFACE_MODE
+from apps.viewer.volume import PROJECTION_MODE, SLICE_MODE, SURFACE_MODE, VolumeSource
 from tofclip.camera import Rectifier
 from tofclip.camera.calibration import registration
 from tofclip.errors import FileFormatError, InputError, StorageError
@@ -349,6 +350,26 @@ def test_a_volume_as_voxels_surface_projection_and_slices(folder: Path) -> None:
     source.display_modes.current = "hologram"
     with pytest.raises(InputError, match="hologram"):
         session.frame_at(0.0)
+
+
+def test_what_is_shown_is_called_what_it_is(transient: Source) -> None:
+    """Every slice's projection is not slice 0, and all frames are not the last one."""
+    of_volume = Session(VolumeSource("ball", volume()))
+    assert of_volume.frame_at(0.0).caption == "maximum projection of all 21 slices"
+    of_volume.source.display_modes.current = SLICE_MODE
+    of_volume.jump(4)
+    assert of_volume.frame_at(0.0).caption == "slice 4"
+    of_frames = Session(transient)
+    last = len(transient) - 1
+    assert of_frames.frame_at(0.0).caption == f"all {last + 1} frames"
+    of_frames.jump(5)
+    assert of_frames.frame_at(0.0).caption == "frames 0 to 5"
+    status = Status(
+        "REPLAY", 0, 21, 9, 0.0, 0.0, whole_name=VolumeSource("ball", volume()).whole_name
+    )
+    assert "maximum projection" in status.html
+    assert "of 21" not in status.html
+    assert "0 of 1" not in Status("REPLAY", 0, 1, 9, 0.0, 0.0, frame_name="cloud").html
 
 
 def test_live_shots_are_followed_and_can_be_looked_at_again() -> None:
