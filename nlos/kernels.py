@@ -276,6 +276,41 @@ def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, spa
 
 
 @compiled
+def add_with_carrier(values, x, y, z, laser, wavenumber, field):
+    """Add ``values * exp(1j * wavenumber * R)``, R the distance from the laser spot, to some planes.
+
+    Parameters
+    ----------
+    values : (z, y, x) complex64 array
+    x, y, z : (n,) float64 array
+    laser : (3,) float64 array
+    wavenumber : float
+        rad/m.
+    field : (z, y, x) complex64 array
+        Added to.
+    """
+    waves = np.empty((2, x.size), np.float32)
+    for iz in range(z.size):
+        for iy in range(y.size):
+            across = (y[iy] - laser[1]) ** 2 + (z[iz] - laser[2]) ** 2
+            _compute_carrier(x, laser[0], across, wavenumber / (2 * math.pi), waves)
+            for ix in range(x.size):
+                field[iz, iy, ix] += values[iz, iy, ix] * complex(waves[0, ix], waves[1, ix])
+
+
+@compiled
+def _compute_carrier(x, laser_x, across, turns_per_metre, waves):
+    """Carrier wave of a row of voxels, real and imaginary parts."""
+    for ix in range(x.size):
+        turns = math.sqrt((x[ix] - laser_x) ** 2 + across) * turns_per_metre
+        turns -= math.floor(turns + 0.5)
+        waves[0, ix], waves[1, ix] = (
+            cosine_of_turns(np.float32(turns)),
+            sine_of_turns(np.float32(turns)),
+        )
+
+
+@compiled
 def _add_term(term, samples, before, weight, odd, sums):
     """Add a row of one term times its function, and 1j if `odd`."""
     real, imaginary = sums[0], sums[1]

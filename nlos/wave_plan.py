@@ -25,6 +25,10 @@ from tofclip.arrays import Array
 SUM_BYTES, MAGNITUDE_BYTES = 8, 4
 """Per voxel: a complex64 sum, and its float32 magnitude."""
 
+COMPUTED_BYTES = 8
+"""Per voxel, at most: the complex64 images of those depths that are computed, from which the others
+follow."""
+
 SPECTRUM_COPIES = 2
 """Spectra are held before and after they are transformed."""
 
@@ -87,7 +91,7 @@ class WavePlan(PhasorPlan):
         self.band, self.groups, self.settings = band, groups, dict(settings)
         self._backend = backend
         self._memory_bytes = (
-            grid.size * (SUM_BYTES + MAGNITUDE_BYTES)
+            grid.size * (SUM_BYTES + COMPUTED_BYTES + MAGNITUDE_BYTES)
             + MAGNITUDE_BYTES * capture.axis.bins * capture.valid.size
             + SPECTRUM_COPIES * groups[0].memory_bytes
         )

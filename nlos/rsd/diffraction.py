@@ -1,5 +1,5 @@
-"""From a plane to the voxels of many depths: a periodic lattice, its plane waves, and the plan that
-holds both.
+"""From a plane to the voxels of many depths: a periodic lattice, its plane waves, the plan that
+holds both, and which depths have to be computed.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from nlos.rsd.transfer import (
     find_min_periods,
 )
 from tofclip.errors import InputError
+from tofclip.threads import split_blocks
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -175,3 +176,203 @@ class DiffractionPlan:
         return TransferFunction(
             self.waves, self._window, float(self.plane_waves.lateral_limits[-1]), finest
         )
+
+
+# Along z an image without the laser's carrier is a sum of waves exp(1j * f * z) with
+# f = k * cos(theta) + (k - k_0) * cos(alpha): theta the angle at which the field's plane waves
+# travel, alpha that of the laser's wave. A band has few f, so that depths finer than half their
+# period are redundant: they follow from their neighbours, with an error that theory gives.
+
+SPACING_RATIOS = (4.0, 3.5, 3.0, 2.75, 2.5, 2.25, 2.0, 1.75, 1.5)
+"""Spacings of computed depths that are tried, relative to that of the wanted ones."""
+
+NEIGHBOURS = 6
+"""Computed depths on either side that an interpolated one takes."""
+
+DEPTHS_PER_BLOCK = 16
+"""Wanted depths that are interpolated by one matrix product."""
+
+ANGLES, AXIAL_BINS = 24, 128
+"""Cosines of each angle, and bins of f, that stand for the spectrum along z."""
+
+NOISE_FRACTION = 0.03
+"""Independent errors that computed depths may have, relative to the error allowed: interpolation
+does not enlarge them."""
+
+
+@dataclass(frozen=True, eq=False)
+class AxialSpectrum:
+    """How an image without the laser's carrier varies along z.
+
+    Parameters
+    ----------
+    wavenumbers : (n,) array
+        f, rad/m.
+    energies : (n,) array
+        Of the waves at each f; they add up to 1.
+    """
+
+    wavenumbers: FloatArray
+    energies: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        wavenumbers: FloatArray,
+        strength: FloatArray,
+        centre: float,
+        cosines: tuple[float, float],
+    ) -> AxialSpectrum:
+        """Return the spectrum of a field of all directions forward.
+
+        Parameters
+        ----------
+        wavenumbers : (frequencies,) array
+            k, rad/m.
+        strength : (frequencies,) array
+            Of each frequency.
+        centre : float
+            k_0, the carrier's wavenumber, rad/m.
+        cosines : (float, float)
+            Range of the cosine of the angle between the laser's wave and z; both 0 without one.
+
+        Returns
+        -------
+        AxialSpectrum
+        """
+        steps = (np.arange(ANGLES) + 0.5) / ANGLES
+        low, high = cosines
+        # directions are equally likely per solid angle, that is, per cosine
+        k = wavenumbers[:, np.newaxis, np.newaxis]
+        axial = k * steps[:, np.newaxis] + (k - centre) * (low + (high - low) * steps)
+        weights = np.broadcast_to((strength**2)[:, np.newaxis, np.newaxis], axial.shape)
+        energies, edges = np.histogram(axial, AXIAL_BINS, weights=weights)
+        return cls((edges[1:] + edges[:-1]) / 2, energies / energies.sum())
+
+    def interpolate(
+        self, wanted: FloatArray, known: FloatArray, noise: float
+    ) -> tuple[NDArray[np.complex128], FloatArray]:
+        """Return the best linear interpolation between depths, and its error.
+
+        Parameters
+        ----------
+        wanted, known : (m,), (n,) array
+            Depths, m.
+        noise : float
+            Relative error of the known ones, independent of each other.
+
+        Returns
+        -------
+        weights : (m, n) complex128 array
+        errors : (m,) float64 array
+            Root mean square, relative.
+        """
+        middle = float(known.mean())
+        waves, at_known = (
+            np.exp(1j * np.outer(depths - middle, self.wavenumbers)) for depths in (wanted, known)
+        )
+        # normal equations: correlations of the known depths, and with the wanted ones
+        weighted = at_known.conj().T * self.energies[:, np.newaxis]
+        correlations = at_known @ weighted + noise**2 * np.eye(known.size)
+        weights = np.linalg.solve(correlations.T, (waves @ weighted).T).T
+        missing = np.abs(waves - weights @ at_known) ** 2 @ self.energies
+        return weights, np.sqrt(missing)
+
+
+@dataclass(frozen=True, eq=False)
+class InterpolatedBlock:
+    """Some neighbouring depths as sums of computed ones.
+
+    Parameters
+    ----------
+    depths : slice
+        Of the wanted depths.
+    nodes : slice
+        Of the computed ones.
+    weights : (depths, nodes) complex64 array
+    """
+
+    depths: slice
+    nodes: slice
+    weights: NDArray[np.complex64]
+
+
+@dataclass(frozen=True, eq=False)
+class DepthInterpolation:
+    """Which depths are computed, and how all follow.
+
+    Parameters
+    ----------
+    nodes : (n,) int64 array
+        Indices of the depths that are computed, ascending.
+    blocks : list of InterpolatedBlock
+        All wanted depths; empty where every one is computed.
+    """
+
+    nodes: IntArray
+    blocks: list[InterpolatedBlock]
+
+
+def choose_depths(z: FloatArray, spectrum: AxialSpectrum, error: float) -> DepthInterpolation:
+    """Choose the fewest depths from which all others follow.
+
+    Parameters
+    ----------
+    z : (n,) float64 array
+        Wanted depths, ascending, m.
+    spectrum : AxialSpectrum
+    error : float
+        Root mean square error allowed at every depth, relative.
+
+    Returns
+    -------
+    DepthInterpolation
+    """
+    everything = DepthInterpolation(np.arange(z.size), [])
+    ratio = _find_spacing_ratio(z, spectrum, error)
+    if ratio == 1:
+        return everything
+    count = int(np.ceil((z.size - 1) / ratio)) + 1
+    nodes = np.unique(np.rint(np.linspace(0, z.size - 1, count)).astype(np.int64))
+    # Towards the ends depths have neighbours on one side only, and uneven ones may be far apart:
+    # what cannot be interpolated is computed.
+    while nodes.size < z.size:
+        blocks, failed = _interpolate_all(z, nodes, spectrum, error)
+        if not failed.size:
+            return DepthInterpolation(nodes, blocks)
+        # of each run of failures its middle: the rest may follow from that
+        runs = np.split(failed, np.flatnonzero(np.diff(failed) > 1) + 1)
+        nodes = np.union1d(nodes, [run[run.size // 2] for run in runs])
+    return everything
+
+
+def _find_spacing_ratio(z: FloatArray, spectrum: AxialSpectrum, error: float) -> float:
+    """Largest spacing of computed depths, relative to the wanted ones', that allows the error
+    half-way between two of many; 1 if none does.
+    """
+    if z.size <= 2 * NEIGHBOURS:
+        return 1.0
+    step = float(z[-1] - z[0]) / (z.size - 1)
+    places = np.arange(2.0 * NEIGHBOURS) - NEIGHBOURS + 0.5
+    for ratio in SPACING_RATIOS:
+        _, errors = spectrum.interpolate(np.zeros(1), ratio * step * places, NOISE_FRACTION * error)
+        if errors[0] <= error:
+            return ratio
+    return 1.0
+
+
+def _interpolate_all(
+    z: FloatArray, nodes: IntArray, spectrum: AxialSpectrum, error: float
+) -> tuple[list[InterpolatedBlock], IntArray]:
+    """Interpolate all depths between the nodes; return with them the indices of those that err too
+    much.
+    """
+    blocks, failed = [], []
+    for some in split_blocks(z.size, DEPTHS_PER_BLOCK):
+        first = max(int(np.searchsorted(nodes, some.start)) - NEIGHBOURS, 0)
+        last = int(np.searchsorted(nodes, some.stop - 1)) + NEIGHBOURS
+        around = slice(first, min(last, nodes.size))
+        weights, errors = spectrum.interpolate(z[some], z[nodes[around]], NOISE_FRACTION * error)
+        blocks.append(InterpolatedBlock(some, around, weights.astype(np.complex64)))
+        failed.append(some.start + np.flatnonzero(errors > error))
+    return blocks, np.concatenate(failed)

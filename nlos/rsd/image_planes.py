@@ -13,9 +13,15 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.kernels import add_illuminated_terms
+from nlos.kernels import add_illuminated_terms, add_with_carrier
 from nlos.method import Progress, ignore_progress
-from nlos.rsd.diffraction import DiffractionPlan
+from nlos.rsd.diffraction import (
+    AxialSpectrum,
+    DepthInterpolation,
+    DiffractionPlan,
+    InterpolatedBlock,
+    choose_depths,
+)
 from nlos.rsd.groups import Interpolation, WaveGroups
 from nlos.rsd.inverse import choose_inverse
 from nlos.rsd.kernels import propagate_spectrum, scatter_terms
@@ -146,6 +152,10 @@ more.
 """
 
 
+DEPTH_ERROR_FRACTION = 0.2
+"""Of the error allowed, what interpolation between depths may take."""
+
+
 @dataclass(frozen=True, eq=False)
 class LaserSource:
     """What shines on the hidden scene while the wall is watched.
@@ -173,6 +183,16 @@ class LaserSource:
         if self.laser is None:
             return 0.0
         return float(np.average(self.wavenumbers, weights=self.strength**2))
+
+    def describe_depths(self, plan: DiffractionPlan) -> AxialSpectrum:
+        """Describe how images vary with depth, but for the laser's carrier."""
+        cosines = (0.0, 0.0)
+        if self.laser is not None:
+            # beyond the spot all light goes forward
+            cosines = (0.0 if plan.grid.z[0] >= self.laser[2] else -1.0, 1.0)
+        return AxialSpectrum.of(
+            plan.waves.wavenumbers, self.strength, self.centre_wavenumber, cosines
+        )
 
     def illuminate_plane(self, plan: DiffractionPlan, depth: float) -> Illumination:
         """Split the illumination of the plane at one depth.
@@ -240,7 +260,8 @@ class CompiledDiffraction:
         _ = self._interpolation
         other = copy.copy(self)
         other.source = replace(self.source, laser=laser)
-        other.__dict__.pop("_lights", None)
+        for computed in ("_depths", "_lights"):
+            other.__dict__.pop(computed, None)
         return other
 
     def add(
@@ -269,19 +290,52 @@ class CompiledDiffraction:
             # What threads share is made before they start.
             self.table_bytes = self.table_bytes or plan.transfer.tabulate()
             lights, interpolation = self._lights, self._interpolation
+            nodes, blocks = self._depths.nodes, self._depths.blocks
+            computed = np.zeros((nodes.size, *total.shape[1:]), np.complex64) if blocks else total
+            shares = len(total) * np.arange(len(lights) + 1) // len(lights)
 
             def process_block(planes: slice) -> None:
                 workspace = self._take_workspace(interpolation)
-                workspace.image(spectrum, self.source, lights[planes], planes, total)
+                depths = plan.grid.z[nodes[planes]]
+                workspace.image(
+                    spectrum, self.source, lights[planes], depths, computed[planes], bool(blocks)
+                )
                 self._spare.append(workspace)
-                progress(total[planes].size)
+                progress(int(shares[planes.stop] - shares[planes.start]) * total[0].size)
 
             run_blocks(process_block, len(lights), size=PLANES_PER_BLOCK)
+            run_blocks(
+                lambda some: self._interpolate(blocks[some.start], computed, total), len(blocks), 1
+            )
+
+    def _interpolate(self, block: InterpolatedBlock, computed: Field, total: Field) -> None:
+        """Add some depths that follow from computed ones without the laser's carrier."""
+        grid, shape = self.plan.grid, (-1, *total.shape[1:])
+        known = computed[block.nodes].reshape(block.nodes.stop - block.nodes.start, -1)
+        laser = np.zeros(3) if self.source.laser is None else self.source.laser
+        add_with_carrier(
+            (block.weights @ known).reshape(shape),
+            grid.x,
+            grid.y,
+            grid.z[block.depths],
+            laser,
+            self.source.centre_wavenumber,
+            total[block.depths],
+        )
+
+    @cached_property
+    def _depths(self) -> DepthInterpolation:
+        """Which depths are computed, and how the others follow."""
+        return choose_depths(
+            self.plan.grid.z,
+            self.source.describe_depths(self.plan),
+            DEPTH_ERROR_FRACTION * self.plan.tolerance,
+        )
 
     @cached_property
     def _lights(self) -> list[Illumination]:
-        """The illumination of every depth."""
-        depths = self.plan.grid.z
+        """The illumination of every computed depth."""
+        depths = self.plan.grid.z[self._depths.nodes]
         lights = [build_constant_illumination(1)] * depths.size
 
         def split(planes: slice) -> None:
@@ -333,8 +387,9 @@ class _Workspace:
         spectrum: FloatParts,
         source: LaserSource,
         lights: list[Illumination],
-        planes: slice,
+        depths: FloatArray,
         total: Field,
+        without_carrier: bool,
     ) -> None:
         """Add a few depth planes.
 
@@ -345,19 +400,21 @@ class _Workspace:
         source : LaserSource
         lights : list of Illumination
             One for each plane.
-        planes : slice
-            Depths of the grid.
+        depths : (z,) float64 array
+            m.
         total : (z, y, x) complex64 array
             Added to, in place.
+        without_carrier : bool
+            Leave out the laser's carrier wave.
         """
-        depths = self.plan.grid.z[planes]
+        wavenumber = 0.0 if without_carrier else source.centre_wavenumber
         carried = self._propagate_terms(spectrum, source, lights, depths)
-        for terms, light, depth, image in zip(carried, lights, depths, total[planes], strict=True):
+        for terms, light, depth, image in zip(carried, lights, depths, total, strict=True):
             count = light.coefficients.shape[1]
             for some in split_blocks(count, len(self.inverse.spectra)):
                 scatter_terms(terms[some], self.cell_indices, self.folded, self.inverse.spectra)
                 self.inverse.transform(some)
-            self._illuminate(self.inverse.images[:count], source, light, depth, image)
+            self._illuminate(self.inverse.images[:count], source, light, depth, wavenumber, image)
 
     def _propagate_terms(
         self,
@@ -389,7 +446,13 @@ class _Workspace:
         return terms
 
     def _illuminate(
-        self, images: Field, source: LaserSource, light: Illumination, depth: float, field: Field
+        self,
+        images: Field,
+        source: LaserSource,
+        light: Illumination,
+        depth: float,
+        wavenumber: float,
+        field: Field,
     ) -> None:
         """Let the laser's wave meet the images of one depth plane."""
         x, y = self.plan.grid.x, self.plan.grid.y
@@ -402,7 +465,7 @@ class _Workspace:
             y,
             depth,
             laser,
-            source.centre_wavenumber,
+            wavenumber,
             table,
             light.span,
             carrier,

@@ -115,3 +115,16 @@ def test_bins_too_coarse_for_the_wavelength_are_an_empty_band(wavelength: float)
 def test_a_pulse_needs_positive_numbers(wavelength: float, cycles: float) -> None:
     with pytest.raises(InputError, match="virtual pulse must be a positive"):
         VirtualPulse(wavelength, cycles)
+
+
+def test_tails_too_small_for_normal_numbers_change_nothing() -> None:
+    """Simulated pulses fade to 1e-38 and below, which a processor multiplies ten times as slowly."""
+    random, band = np.random.default_rng(0), Band(VirtualPulse(0.125, 3), AXIS)
+    signal = random.normal(size=(6, AXIS.bins)).astype(np.float32)
+    tails = np.where(random.random(signal.shape) < 0.5, np.float32(1e-38) * signal, signal)
+    clean = np.where(np.abs(tails) < 1e-30, np.float32(0), tails)
+    assert np.array_equal(band.compute_phasors(tails), band.compute_phasors(clean))
+    # faint signals are no tails
+    faint = band.compute_phasors(np.float32(1e-25) * signal)
+    expected = 1e-25 * band.compute_phasors(signal).astype(np.complex128)
+    assert np.linalg.norm(faint - expected) < 1e-5 * np.linalg.norm(expected)
