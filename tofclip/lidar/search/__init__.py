@@ -140,35 +140,36 @@ class ReturnSearch:
         from tofclip.lidar.neighbours import add_recovery_error
 
         pixel, time, signal, deviation = self._find_candidates(traces, judge is not None)
-        distance = SPEED_OF_LIGHT * time / 2
         intensity = signal * _square_distance(time)
         doubt = np.empty(0)
         if judge is None:
-            kept = self.detection.find_significant(pixel, time, intensity, self.pulse.fwhm)
+            significant = self.detection.find_significant(pixel, time, intensity, self.pulse.fwhm)
         else:
-            kept, doubt = judge.judge(pixel, time, signal)
-        kept &= time > 0
-        y, x = np.divmod(pixel[kept], self.camera.image_shape[1])
+            significant, doubt = judge.judge(pixel, time, signal)
+        kept = np.flatnonzero(significant & (time > 0))
+        pixel, time, intensity = pixel.take(kept), time.take(kept), intensity.take(kept)
+        distance = SPEED_OF_LIGHT * time / 2
+        y, x = np.divmod(pixel, self.camera.image_shape[1])
         sigma = add_recovery_error(
-            SPEED_OF_LIGHT / 2 * deviation[kept],
-            distance[kept],
+            SPEED_OF_LIGHT / 2 * deviation.take(kept),
+            distance,
             compute_ray_directions(self.camera, y, x)[:, 2],
-            pixel[kept],
+            pixel,
             self.camera.image_shape,
             SPEED_OF_LIGHT / 2 * self.pulse.fwhm,
         )
         measured = Returns(
             y=y.astype(np.int32),
             x=x.astype(np.int32),
-            range=distance[kept],
-            intensity=intensity[kept].astype(np.float32),
+            range=distance,
+            intensity=intensity.astype(np.float32),
             confidence=sigma.astype(np.float32),
-            return_number=_rank_within_pixel(pixel[kept]),
-            time=time[kept],
+            return_number=_rank_within_pixel(pixel),
+            time=time,
             camera=self.camera,
-            shear=self._shear_at(time[kept]),
+            shear=self._shear_at(time),
             provenance={} if provenance is None else provenance,
-            false_alarm=doubt[kept] if judge is not None else doubt,
+            false_alarm=doubt if judge is None else doubt.take(kept),
         )
         return correct_returns(measured)
 

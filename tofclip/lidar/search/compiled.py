@@ -20,12 +20,24 @@ from tofclip.lidar.pulse_fit import (
     refine_returns,
     sort_rows,
 )
-from tofclip.lidar.search.lone_fit import fit_lone_returns
+from tofclip.lidar.search.lone_fit import (
+    LEAST,
+    LONE_COLUMNS,
+    NOISE,
+    OFFSET,
+    PEAK_BIN,
+    TRACE,
+    copy_rest,
+    fit_lone_returns,
+    measure_lone_returns,
+    stand_alone,
+)
 
 NEIGHBOUR_FRACTION = 0.5  # of what is of interest: weaker peaks do not move a return beside them
+LONE_ROOM = 256  # returns that are fitted together; what is known of them stays in cache
 WEIGHTS_PER_PASS = 4  # weights of a filter that are applied in one pass
 
-vectorised_part = compile_as_part(fastmath=True, _nrt=False)
+vectorised_part = compile_as_part(fastmath=True, _nrt=False, forceinline=True)
 
 
 @njit(nogil=True, cache=True)
@@ -69,38 +81,117 @@ def find_returns(
     counts : (all pixels,) int64 array, overwritten where `pixels` says
         Number of returns of each pixel.
     """
+    bins, most, shapes = times.size, found.shape[1], phases[1]
     memory = (
-        np.empty(times.size, np.float32),
-        np.empty(times.size, np.float32),
+        np.empty(bins, np.float32),
+        np.empty(bins, np.float32),
         bin_weights.copy(),
-        np.empty((found.shape[1], 4)),
-        np.empty((found.shape[1], 5)),
-        np.empty((times.size, 3)),
-        np.zeros(phases[1].shape[1], np.float32),
-        np.empty((times.size, 4), np.int64),
+        np.empty((most, 4)),
+        np.empty((most, 5)),
+        np.empty((bins, 3)),
+        np.empty((bins, 4), np.int64),
+        bin_weights.astype(np.float64),
     )
-    list_windows(times, pulse[1], limits[0], memory[7])
-    for place in range(traces.shape[0]):
-        pixel = pixels[place]
-        counts[pixel] = find_trace_returns(
-            traces[place],
-            times,
-            bin_weights,
-            filters,
-            pulse,
-            phases,
-            limits,
-            least,
-            memory,
-            found[pixel],
-        )
+    list_windows(times, pulse[1], limits[0], memory[6])
+    room = LONE_ROOM + most
+    lone, rests = np.empty((room, LONE_COLUMNS)), np.empty((room, shapes.shape[1]), np.float32)
+    search_traces(
+        traces,
+        pixels,
+        times,
+        bin_weights,
+        filters,
+        pulse,
+        phases,
+        limits,
+        least,
+        memory,
+        (lone, rests, np.empty(room, np.int64)),
+        found,
+        counts,
+    )
 
 
 @loop_part
-def find_trace_returns(
-    trace, times, bin_weights, filters, pulse, phases, limits, least, memory, found
+def search_traces(
+    traces,
+    pixels,
+    times,
+    bin_weights,
+    filters,
+    pulse,
+    phases,
+    limits,
+    least,
+    memory,
+    lone_memory,
+    found,
+    counts,
 ):
-    """Find the returns of one trace and return their number; `memory` is overwritten.
+    """Find the returns of each trace, in memory that is there already.
+
+    Parameters
+    ----------
+    traces, pixels, times, bin_weights, filters, pulse, phases, limits, least, found, counts
+        See `find_returns`.
+    memory : tuple
+        See `select_peaks`.
+    lone_memory : (lone, rests, active)
+        See `fit_lone_returns`; room for `LONE_ROOM` returns and those of one more trace.
+    """
+    even, shapes, slopes, sums, half = phases
+    lone, rests, active = lone_memory
+    estimate = memory[4]
+    # light that ends before the other's begins, whatever both of them move
+    distance, listed, begun = 2 * half + 1, 0, 0
+    for place in range(traces.shape[0]):
+        trace, pixel = traces[place], pixels[place]
+        kept, background, noise = select_peaks(
+            trace, times, bin_weights, filters, pulse, limits, least, memory
+        )
+        counts[pixel] = 0
+        if stand_alone(estimate, kept, even, distance):
+            for k in range(kept):
+                j = int(estimate[k, 4])
+                copy_rest(trace, np.uintp(j - half), np.uintp(distance), background, rests[listed])
+                lone[listed, OFFSET] = (estimate[k, 0] - times[j]) / (times[j + 1] - times[j])
+                lone[listed, NOISE] = noise
+                lone[listed, LEAST] = limits[1] * noise
+                lone[listed, PEAK_BIN], lone[listed, TRACE] = j, place
+                listed += 1
+        else:
+            counts[pixel] = fit_crowded_returns(
+                trace, times, background, noise, pulse, limits, memory, kept, found[pixel]
+            )
+        if listed < LONE_ROOM and place < traces.shape[0] - 1:
+            continue
+        fit_lone_returns(lone[:listed], rests, active, shapes, slopes, sums)
+        measure_lone_returns(
+            lone[:listed], rests, pixels, times, shapes, slopes, sums, found, counts
+        )
+        for again in range(begun, place + 1):
+            if counts[pixels[again]] < 0:
+                trace, pixel = traces[again], pixels[again]
+                kept, background, noise = select_peaks(
+                    trace, times, bin_weights, filters, pulse, limits, least, memory
+                )
+                counts[pixel] = fit_crowded_returns(
+                    trace,
+                    times,
+                    background,
+                    noise,
+                    pulse,
+                    limits,
+                    memory,
+                    kept,
+                    found[pixel],
+                )
+        listed, begun = 0, place + 1
+
+
+@loop_part
+def select_peaks(trace, times, bin_weights, filters, pulse, limits, least, memory):
+    """List the peaks of one trace that may be returns, in the order of time.
 
     Parameters
     ----------
@@ -114,25 +205,22 @@ def find_trace_returns(
         See `tofclip.lidar.search`.
     pulse : (curve, scale)
         See `tofclip.lidar.pulse_fit`.
-    phases : tuple
     limits : (5,) floats
-        See `find_returns`.
     least : (bins,) array
         See `find_returns`.
     memory : eight arrays
-        Overwritten.
-    found : (returns, 3) array
-        Overwritten: seconds, sum over the bins, standard deviation in seconds.
+        Overwritten; the fifth holds a first guess of each return: arrival, s, height, bins that
+        it reaches, and the peak's bin.
 
     Returns
     -------
-    int
+    number : int
+    background, noise : float
     """
-    (sharp, matched, gains), (curve, scale) = filters, pulse
-    even, shapes, slopes, sums, half = phases
-    score, maxima, free, peaks, estimate, profile, rest, windows = memory
+    (sharp, matched, gains), scale = filters, pulse[1]
+    score, maxima, free, peaks, estimate, _, windows, weights = memory
     correlate_trace(trace, sharp, score)
-    total, square, bins = sum_moments(trace, bin_weights)
+    total, square, bins = sum_moments(trace, weights)
     # the sharp filter's response to the background, below which nothing of interest can lie
     level = gains[0] * total / bins if limits[4] > 0 else 0.0
     copy_local_maxima(score, least, gains[0] / gains[1] * NEIGHBOUR_FRACTION, level, maxima)
@@ -167,31 +255,35 @@ def find_trace_returns(
             estimate[kept, 1] = max(trace[j] - background, 0.0)
             estimate[kept, 2], estimate[kept, 3], estimate[kept, 4] = peaks[k, 2], peaks[k, 3], j
             kept += 1
-    # light that ends before the other's begins, whatever both of them move
-    distance = 2 * half + 1
-    number = fit_lone_returns(
-        trace,
-        times,
-        background,
-        noise,
-        above_noise,
-        estimate[:kept],
-        distance,
-        even,
-        shapes,
-        slopes,
-        sums,
-        half,
-        rest,
-        found,
-    )
-    if number >= 0:
-        return number
-    refine_returns(
-        trace, times, background, curve, scale, estimate[:kept], EVEN_VARIANCE, MAX_FIT_ROUNDS
-    )
+    return kept, background, noise
+
+
+@loop_part
+def fit_crowded_returns(trace, times, background, noise, pulse, limits, memory, kept, found):
+    """Fit the returns of one trace by the exact fit, in which they may overlap.
+
+    Parameters
+    ----------
+    trace : (bins,) float32 array
+    times : (bins,) array
+        Seconds.
+    background, noise : float
+    pulse, limits, memory
+        As for `select_peaks`.
+    kept : int
+        Peaks that `select_peaks` listed.
+    found : (returns, 3) array
+        Overwritten: seconds, sum over the bins, standard deviation in seconds.
+
+    Returns
+    -------
+    int
+        Number of returns.
+    """
+    (curve, scale), estimate, profile = pulse, memory[4][:kept], memory[5]
+    refine_returns(trace, times, background, curve, scale, estimate, EVEN_VARIANCE, MAX_FIT_ROUNDS)
     number = measure_returns(
-        trace, times, background, noise, curve, scale, estimate[:kept], above_noise, profile, found
+        trace, times, background, noise, curve, scale, estimate, limits[1] * noise, profile, found
     )
     sort_rows(found[:number])
     return number
@@ -466,7 +558,7 @@ def sum_moments(trace, bin_weights):
     Parameters
     ----------
     trace : (bins,) float32 array
-    bin_weights : (bins,) array
+    bin_weights : (bins,) float64 array
 
     Returns
     -------
@@ -474,7 +566,7 @@ def sum_moments(trace, bin_weights):
     """
     total = square = bins = 0.0
     for i in range(trace.size):
-        value, share = float(trace[i]), float(bin_weights[i])
+        value, share = float(trace[i]), bin_weights[i]
         total += share * value
         square += share * value * value
         bins += share

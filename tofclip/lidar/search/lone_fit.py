@@ -28,13 +28,19 @@ PHASES_PER_BIN = 64
 MAX_OFFSET_BINS = 1.5
 """By how much a return may move away from the bin of its peak; beyond, the exact fit takes over."""
 
-VECTOR_BINS = 32
-"""The table's width is a multiple of it: the compiler's loops over vectors take as many at a time."""
+VECTOR_BINS = 16
+"""The table's width is a multiple of it: loops over so many bins have no loop left in them."""
+
+OFFSET, HEIGHT, LEAST, NOISE, PEAK_BIN, TRACE, ALONG_PULSE, ALONG_SLOPE = range(8)
+LONE_COLUMNS = 8
+"""What is known of a return that stands alone: bins by which it arrives after the bin of its peak,
+height, response that it must exceed, noise, bin of the peak, its trace's place among those searched
+together, and the products of the trace with pulse and slope."""
 
 MAX_UNEVENNESS = 1e-3
 """Of a bin, over the length of a pulse: moves no return by more."""
 
-vectorised_part = compile_as_part(fastmath=True, _nrt=False)
+vectorised_part = compile_as_part(fastmath=True, _nrt=False, forceinline=True)
 
 
 @dataclass(frozen=True)
@@ -128,95 +134,133 @@ class PhaseTable:
 
 
 @loop_part
-def fit_lone_returns(
-    trace,
-    times,
-    background,
-    noise,
-    least,
-    estimate,
-    distance,
-    even,
-    shapes,
-    slopes,
-    sums,
-    half,
-    rest,
-    found,
-):
-    """Fit returns that stand alone and measure those that prove themselves.
+def stand_alone(estimate, number, even, distance):
+    """Whether no two returns of a trace are nearer than `distance`, each around an even bin.
 
     Parameters
     ----------
-    trace, times : (bins,) array
-        Brightness, and seconds.
-    background, noise : float
-        Mean and standard deviation of the bins without a return.
-    least : float
-        Response that a return must exceed.
-    estimate : (returns, 5) array
-        First guess of each arrival, seconds, and, in the last column, bin of the peak, increasing.
-    distance : float
-        Bins within which two returns do not stand alone.
+    estimate : (most returns, 5) array
+        In the last column the bins of the peaks, increasing.
+    number : int
+        Of returns.
     even : (bins,) bool array
         See `PhaseTable.find_even_bins`.
-    shapes, slopes, sums, half
-        See `PhaseTable`.
-    rest : (width,) float32 array
-        Zero, and zero again afterwards from bin ``2 * half + 1`` on.
-    found : (returns, 3) array
-        Overwritten: seconds, sum over the bins, standard deviation in seconds.
+    distance : int
+        Bins.
 
     Returns
     -------
-    int
-        Number of returns; -1 if one of them does not stand alone, and the exact fit is needed.
+    bool
     """
-    number = 0
-    for k in range(estimate.shape[0]):
-        j = int(estimate[k, 4])
-        if not even[j] or (k > 0 and j - estimate[k - 1, 4] < distance):
-            return -1
-    for k in range(estimate.shape[0]):
-        j = int(estimate[k, 4])
-        width = times[j + 1] - times[j]
-        copy_rest(trace, np.uintp(j - half), np.uintp(2 * half + 1), background, rest)
-        offset, height = (estimate[k, 0] - times[j]) / width, 0.0
-        for _ in range(MAX_FIT_ROUNDS):
+    alone = True
+    for k in range(number):
+        alone &= even[int(estimate[k, 4])]
+        alone &= k == 0 or estimate[k, 4] - estimate[k - 1, 4] >= distance
+    return alone
+
+
+@loop_part
+def fit_lone_returns(lone, rests, active, shapes, slopes, sums):
+    """Fit returns that stand alone, of many traces: each round takes one step of every return that
+    still moves.
+
+    A step waits for the one before it. Steps of different returns do not, so that the processor
+    works on several at a time.
+
+    Parameters
+    ----------
+    lone : (returns, LONE_COLUMNS) float64 array
+        Column `OFFSET`, by how many bins the return arrives after the bin of its peak, is improved;
+        `HEIGHT` is overwritten: not above zero where there is no pulse, NaN where the return moved
+        further than `MAX_OFFSET_BINS` and needs the exact fit.
+    rests : (returns, width) float32 array
+        Trace less background in the bins of the table around each peak; zero in those that fill up
+        its width.
+    active : (returns,) int64 array
+        Overwritten.
+    shapes, slopes, sums
+        See `PhaseTable`.
+    """
+    moving = lone.shape[0]
+    for k in range(moving):
+        active[k] = k
+    for _ in range(MAX_FIT_ROUNDS):
+        for a in range(moving):
+            k = active[a]
+            phase, _ = find_phase(lone[k, OFFSET])
+            lone[k, ALONG_PULSE], lone[k, ALONG_SLOPE] = project_on_pulse(
+                rests[k], shapes[phase], slopes[phase]
+            )
+        still = 0
+        for a in range(moving):
+            k = active[a]
+            offset, pr, dr = lone[k, OFFSET], lone[k, ALONG_PULSE], lone[k, ALONG_SLOPE]
             phase, start = find_phase(offset)
-            pr, dr = project_on_pulse(rest, shapes[phase], slopes[phase])
             pp, pd, dd = sums[phase, 0], sums[phase, 1], sums[phase, 2]
-            determinant = pp * dd - pd * pd
-            height = (dd * pr - pd * dr) / determinant
-            if height <= 0:
-                break
+            across = dd * pr - pd * dr
+            lone[k, HEIGHT] = across / (pp * dd - pd * pd)
+            if across <= 0:
+                continue
             # model: height * p(t - arrival), whose slope is -height * d
-            step = start - (pp * dr - pd * pr) / (determinant * height) - offset
+            step = start - (pp * dr - pd * pr) / across - offset
             step = min(max(step, -1.0), 1.0)
-            offset += step
-            if abs(offset) > MAX_OFFSET_BINS:
-                return -1
-            if abs(step) < CONVERGENCE_STEP_BINS:
-                break
+            lone[k, OFFSET] = offset + step
+            if abs(offset + step) > MAX_OFFSET_BINS:
+                lone[k, HEIGHT] = np.nan
+            elif abs(step) >= CONVERGENCE_STEP_BINS:
+                active[still] = k
+                still += 1
+        moving = still
+        if moving == 0:
+            break
+
+
+@loop_part
+def measure_lone_returns(lone, rests, pixels, times, shapes, slopes, sums, found, counts):
+    """Write instant, sum and standard deviation of the returns that prove themselves.
+
+    Parameters
+    ----------
+    lone : (returns, LONE_COLUMNS) float64 array
+        Of `fit_lone_returns`; those of one trace side by side, in the order of time.
+    rests : (returns, width) float32 array
+    pixels : (traces,) int64 array
+        Number of the pixel to which each trace belongs.
+    times : (bins,) array
+        Seconds.
+    shapes, slopes, sums
+        See `PhaseTable`.
+    found : (all pixels, most returns, 3) float64 array
+        Overwritten: seconds, sum over the bins, standard deviation in seconds.
+    counts : (all pixels,) int64 array
+        Goes up by one for each; -1 where a return of the pixel needs the exact fit.
+    """
+    for k in range(lone.shape[0]):
+        height, noise, offset = lone[k, HEIGHT], lone[k, NOISE], lone[k, OFFSET]
+        pixel, j = pixels[int(lone[k, TRACE])], int(lone[k, PEAK_BIN])
+        number = counts[pixel]
+        if np.isnan(height):
+            counts[pixel] = -1
+            continue
         phase, start = find_phase(offset)
         pp, pd, dd = sums[phase, 0], sums[phase, 1], sums[phase, 2]
-        if height <= 0 or height * np.sqrt(pp) <= least:
+        if number < 0 or height <= 0 or height * np.sqrt(pp) <= lone[k, LEAST]:
             continue
-        misfit = sum_misfit(rest, shapes[phase], slopes[phase], height, offset - start)
+        misfit = sum_misfit(rests[k], shapes[phase], slopes[phase], height, offset - start)
         misfit = max(misfit - noise * noise * (sums[phase, 6] - 2), 0.0)
         across_energy, total = dd - pd * pd / pp, height * sums[phase, 3]
         variance = (
             noise * noise * across_energy
             + misfit / max(height * sums[phase, 4], 1e-3 * total) * height * sums[phase, 5]
         )
-        found[number, 0] = times[j] + offset * width
-        found[number, 1] = total
-        found[number, 2] = np.sqrt(variance) / (across_energy * height) * width
-        number += 1
-    return number
+        width = times[j + 1] - times[j]
+        found[pixel, number, 0] = times[j] + offset * width
+        found[pixel, number, 1] = total
+        found[pixel, number, 2] = np.sqrt(variance) / (across_energy * height) * width
+        counts[pixel] = number + 1
 
 
-@loop_part
+@vectorised_part
 def find_phase(offset):
     """Number and place of the tabulated phase nearest to an offset.
 
@@ -235,7 +279,7 @@ def find_phase(offset):
 
 @vectorised_part
 def copy_rest(trace, first, number, background, rest):
-    """Copy some bins of a trace less the background.
+    """Copy some bins of a trace less the background, and fill up with zeros.
 
     Parameters
     ----------
@@ -243,9 +287,11 @@ def copy_rest(trace, first, number, background, rest):
     first, number : int
     background : float
     rest : (number or more,) float32 array
-        Overwritten in the first `number` bins.
+        Overwritten.
     """
     level, there = np.float32(background), trace[first : first + number]
+    for w in range(rest.size):
+        rest[w] = np.float32(0)
     for w in range(number):
         rest[w] = there[w] - level
 
@@ -257,15 +303,19 @@ def project_on_pulse(rest, shape, slope):
     Parameters
     ----------
     rest, shape, slope : (width,) float32 array
+        The width is a multiple of `VECTOR_BINS`.
 
     Returns
     -------
     (float, float)
     """
     pr = dr = np.float32(0)
-    for w in range(rest.size):
-        pr += rest[w] * shape[w]
-        dr += rest[w] * slope[w]
+    for first in range(np.uintp(0), np.uintp(rest.size), np.uintp(VECTOR_BINS)):
+        end = first + np.uintp(VECTOR_BINS)
+        r, p, d = rest[first:end], shape[first:end], slope[first:end]
+        for w in range(VECTOR_BINS):
+            pr += r[w] * p[w]
+            dr += r[w] * d[w]
     return float(pr), float(dr)
 
 
@@ -276,6 +326,7 @@ def sum_misfit(rest, shape, slope, height, later):
     Parameters
     ----------
     rest, shape, slope : (width,) float32 array
+        The width is a multiple of `VECTOR_BINS`.
     height, later : float
         Of the return, and bins by which it arrives after the tabulated phase.
 
@@ -284,7 +335,10 @@ def sum_misfit(rest, shape, slope, height, later):
     float
     """
     high, back, total = np.float32(height), np.float32(later), np.float32(0)
-    for w in range(rest.size):
-        off = rest[w] - high * (shape[w] - back * slope[w])
-        total += off * off if shape[w] > 0 else np.float32(0)
+    for first in range(np.uintp(0), np.uintp(rest.size), np.uintp(VECTOR_BINS)):
+        end = first + np.uintp(VECTOR_BINS)
+        r, p, d = rest[first:end], shape[first:end], slope[first:end]
+        for w in range(VECTOR_BINS):
+            off = r[w] - high * (p[w] - back * d[w])
+            total += off * off if p[w] > 0 else np.float32(0)
     return float(total)
