@@ -24,16 +24,37 @@ from tofclip.threads import map_parallel
 TITLE = "compiling loops for this processor, once"
 
 SEARCH, NEIGHBOURS = "tofclip.lidar.search.compiled", "tofclip.lidar.neighbours"
+LONE = "tofclip.lidar.search.lone_fit"
 CAMERA, OPERATORS = "tofclip.camera.kernels", "tofclip.operators.kernels"
 SOLVERS, SURFACES = "tofclip.solvers.kernels", "tofclip.recovery.surface_kernels"
 
 LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
     {
-        (SEARCH, "find_returns"): (
-            "(f4[:,::1], i8[::1], f8[::1], f4[::1], Tuple((f4[:,::1], f4[:,::1], UniTuple(f8, 2))),"
-            " Tuple((f8[:,::1], UniTuple(f8, 4))),"
-            " Tuple((b1[::1], f4[:,::1], f4[:,::1], f8[:,::1], i8)),"
-            " UniTuple(f8, 5), f4[::1], f8[:,:,::1], i8[::1])"
+        (SEARCH, "find_maxima"): (
+            "(f4[:,::1], f8[::1], f4[:,::1], f4[::1], f8, f4[::1], f8[:,::1], f4[:,::1])"
+        ),
+        (SEARCH, "find_strongest_peaks"): (
+            "(f4[:,::1], f8[::1], f4[::1], f4[:,::1], UniTuple(f8, 2), i8[:,::1], UniTuple(f8, 5),"
+            " f4[:,::1], i4[:,::1], f8[:,::1], f4[::1], f8[:,:,::1])"
+        ),
+        (SEARCH, "confirm_peaks"): (
+            "(f4[:,::1], f8[::1], f4[:,::1], UniTuple(f8, 5), f4[::1], f8[:,::1], f8[:,:,::1],"
+            " f8[:,:,::1])"
+        ),
+        (LONE, "list_lone_returns"): (
+            "(f4[:,::1], i8[::1], f8[::1], f8[:,::1], f8, f8[:,:,::1], b1[::1], i8, f8[:,::1],"
+            " f4[:,::1], i8[::1])"
+        ),
+        (LONE, "fit_lone_returns"): (
+            "(f8[:,::1], f4[:,::1], i8[::1], f4[:,::1], f4[:,::1], f8[:,::1])"
+        ),
+        (LONE, "measure_lone_returns"): (
+            "(f8[:,::1], f4[:,::1], i8[::1], f8[::1], f4[:,::1], f4[:,::1], f8[:,::1], f8[:,:,::1],"
+            " i8[::1])"
+        ),
+        (SEARCH, "fit_crowded_returns"): (
+            "(f4[:,::1], i8[::1], f8[::1], f8[:,::1], f8, f8[:,:,::1],"
+            " Tuple((f8[:,::1], UniTuple(f8, 4))), f8[:,::1], f8[:,:,::1], i8[::1])"
         ),
         (CAMERA, "sample_runs"): "(f4[:,::1], f4, f4[:,::1], u8[:,::1], f4[:,::1])",
         (OPERATORS, "count_tile_nonzeros"): "(i4[::1], i4[::1], i8, i8[:,::1])",
@@ -71,7 +92,10 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
 """Module and name of the loops that recovery and ranging of a shot call, and for which arguments: a
 letter and bytes for each kind of number, as Numba writes them."""
 
-GROUPS: Sequence[Sequence[str]] = ((SEARCH,), (SOLVERS, CAMERA, OPERATORS, NEIGHBOURS, SURFACES))
+GROUPS: Sequence[Sequence[str]] = (
+    (SEARCH, LONE),
+    (SOLVERS, CAMERA, OPERATORS, NEIGHBOURS, SURFACES),
+)
 """Modules whose loops take about as long to compile together, each for a process."""
 
 FUNCTIONS_PER_GROUP = (44, 52)

@@ -7,8 +7,9 @@ first and last instant that matter; see `tofclip.lidar.Pulse.kernel_table`.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from numba import njit
 from numba.core.types import Array
 from numba.extending import overload
 
@@ -23,9 +24,6 @@ EVEN_VARIANCE = (
 # Without counts of the arrays' owners, which cost a lock for every array that is handed on; nothing
 # here allocates.
 loop_part = compile_as_part(_nrt=False)
-inlined = njit(
-    inline="always"
-)  # called for every bin: handing over the arrays would cost more than the work
 
 
 @loop_part
@@ -132,7 +130,7 @@ def _compile_get_variance(variance, i, expected):
     return lambda variance, i, expected: variance[0] + variance[1] * expected
 
 
-@inlined
+@loop_part
 def interpolate_pulse(time, curve, scale):
     """Pulse and its slope at `time` after the arrival, by linear interpolation; zero outside the
     samples.
@@ -152,32 +150,29 @@ def interpolate_pulse(time, curve, scale):
         Pulse, and its slope per second.
     """
     position = time * scale[0] + scale[1]
-    p = d = 0.0
-    if 0 <= position < curve.shape[0] - 1:
-        left = np.uintp(position)  # no index that might count from the end
-        share, right = position - left, left + np.uintp(1)
-        p = curve[left, 0] + share * (curve[right, 0] - curve[left, 0])
-        d = curve[left, 1] + share * (curve[right, 1] - curve[left, 1])
-    return p, d
+    if not 0 <= position < curve.shape[0] - 1:
+        return 0.0, 0.0
+    number = np.uintp(position)  # no index that might count from the end
+    share, left, right = position - number, curve[number], curve[number + np.uintp(1)]
+    return left[0] + share * (right[0] - left[0]), left[1] + share * (right[1] - left[1])
 
 
-@inlined
-def compute_residual(trace, times, background, curve, scale, estimate, i, without):
-    """Bin i less the background and all returns except number `without` (-1: less all of them).
+@loop_part
+def subtract_returns(rest, time, curve, scale, estimate, without):
+    """What is left of a bin's brightness less all returns except number `without` (-1: less all).
 
     Parameters
     ----------
-    trace, times : (bins,) array
-        Brightness, and seconds.
-    background : float or (bins,) array
+    rest : float
+        Brightness less the background.
+    time : float
+        Instant of the bin, s.
     curve : (samples, 2) array
         Pulse and slope.
     scale : (4,) array or tuple
         Of the pulse.
     estimate : (returns, 5) array
         See `refine_returns`.
-    i : int
-        Bin.
     without : int
         Return that is not taken off.
 
@@ -185,10 +180,9 @@ def compute_residual(trace, times, background, curve, scale, estimate, i, withou
     -------
     float
     """
-    rest = trace[i] - get_level(background, i)
     for k in range(estimate.shape[0]):
         if k != without:
-            rest -= estimate[k, 1] * interpolate_pulse(times[i] - estimate[k, 0], curve, scale)[0]
+            rest -= estimate[k, 1] * interpolate_pulse(time - estimate[k, 0], curve, scale)[0]
     return rest
 
 
@@ -222,7 +216,8 @@ def refine_returns(trace, times, background, curve, scale, estimate, variance, r
     rounds : int
         Maximum number of steps for each return.
     """
-    estimate[:, 4] = np.inf
+    for k in range(estimate.shape[0]):
+        estimate[k, 4] = np.inf
     for _ in range(rounds):
         largest = 0.0
         for k in range(estimate.shape[0]):
@@ -232,7 +227,7 @@ def refine_returns(trace, times, background, curve, scale, estimate, variance, r
                     trace, times, background, curve, scale, estimate, k, crowded, variance
                 )
                 take_gauss_newton_step(times, sums, estimate[k])
-                largest = max(largest, estimate[k, 4])
+                largest = estimate[k, 4] if estimate[k, 4] > largest else largest
         if largest < CONVERGENCE_STEP_BINS:
             break
 
@@ -268,7 +263,7 @@ def check_overlap(estimate, k, curve, scale):
         later = estimate[other, 0] - estimate[k, 0]
         if other != k and -after < later < before:
             crowded = True
-            moving = max(moving, estimate[other, 4])
+            moving = estimate[other, 4] if estimate[other, 4] > moving else moving
     return crowded, moving
 
 
@@ -300,30 +295,26 @@ def sum_normal_equations(trace, times, background, curve, scale, estimate, k, cr
     -------
     five floats
     """
-    arrival, height = estimate[k, 0], estimate[k, 1]
-    first, last = find_pulse_window(
-        times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale
-    )
-    estimate[k, 2], estimate[k, 3] = first, last
+    own = estimate[k]
+    arrival, height = own[0], own[1]
+    first = find_first_bin(times, int(own[2]), arrival + scale[2])
+    last = find_first_bin(times, int(own[3]), arrival + scale[3])
+    own[2] = first
+    own[3] = last
     pp = pd = dd = pr = dr = 0.0
     for i in range(np.uintp(first), np.uintp(last)):
         p, d = interpolate_pulse(times[i] - arrival, curve, scale)
-        rest = trace[i] - get_level(background, i)
+        rest, weight = trace[i] - get_level(background, i), 1.0
         if crowded:
-            rest = compute_residual(trace, times, background, curve, scale, estimate, i, k)
+            rest = subtract_returns(rest, times[i], curve, scale, estimate, k)
         if variance[1] != 0:
-            weight = 1 / get_variance(variance, i, trace[i] - rest + height * p)
-            pp += weight * p * p
-            pd += weight * p * d
-            dd += weight * d * d
-            pr += weight * p * rest
-            dr += weight * d * rest
-        else:
-            pp += p * p
-            pd += p * d
-            dd += d * d
-            pr += p * rest
-            dr += d * rest
+            weight /= get_variance(variance, i, trace[i] - rest + height * p)
+        shape, slope = weight * p, weight * d
+        pp += shape * p
+        pd += shape * d
+        dd += slope * d
+        pr += shape * rest
+        dr += slope * rest
     return pp, pd, dd, pr, dr
 
 
@@ -356,8 +347,11 @@ def take_gauss_newton_step(times, sums, own):
     step = -(pp * dr - pd * pr) / (
         determinant * height
     )  # model: height * p(t - arrival), whose slope is -height * d
-    step = min(max(step, -bin_width), bin_width)
-    own[0], own[1], own[4] = own[0] + step, height, abs(step) / bin_width
+    if math.fabs(step) > bin_width:
+        step = math.copysign(bin_width, step)
+    own[0] += step
+    own[1] = height
+    own[4] = math.fabs(step) / bin_width
 
 
 @loop_part
@@ -393,31 +387,33 @@ def measure_returns(trace, times, background, noise, curve, scale, estimate, lea
     number = 0
     for k in range(estimate.shape[0]):
         arrival, height = estimate[k, 0], estimate[k, 1]
-        if height <= 0 or arrival < times[0] or arrival > times[-1]:
+        if height <= 0 or arrival < times[0] or arrival > times[times.size - 1]:
             continue
         crowded, _ = check_overlap(estimate, k, curve, scale)
-        first, last = find_pulse_window(
-            times, (int(estimate[k, 2]), int(estimate[k, 3])), arrival, scale
-        )
+        first = find_first_bin(times, int(estimate[k, 2]), arrival + scale[2])
+        last = find_first_bin(times, int(estimate[k, 3]), arrival + scale[3])
         pp = pd = dd = 0.0
         for i in range(np.uintp(first), np.uintp(last)):
             p, d = interpolate_pulse(times[i] - arrival, curve, scale)
-            rest = trace[i] - background - height * p
+            rest = trace[i] - background
             if crowded:
-                rest = (
-                    compute_residual(trace, times, background, curve, scale, estimate, i, k)
-                    - height * p
-                )
-            profile[i, 0], profile[i, 1], profile[i, 2] = p, d, rest
+                rest = subtract_returns(rest, times[i], curve, scale, estimate, k)
+            bin_profile = profile[i]
+            bin_profile[0] = p
+            bin_profile[1] = d
+            bin_profile[2] = rest - height * p
             pp += p * p
             pd += p * d
             dd += d * d
-        if height * np.sqrt(pp) <= least or pp * dd <= pd * pd:
+        if height * math.sqrt(pp) <= least or pp * dd <= pd * pd:
             continue
         total, deviation = estimate_sum_and_deviation(
             profile[first:last], height, noise, pp, pd, dd
         )
-        found[number, 0], found[number, 1], found[number, 2] = arrival, total, deviation
+        own = found[number]
+        own[0] = arrival
+        own[1] = total
+        own[2] = deviation
         number += 1
     return number
 
@@ -451,16 +447,24 @@ def estimate_sum_and_deviation(profile, height, noise, pp, pd, dd):
         unfitted += height * p * (1 - p * p * per_pp - across * across * per_across)
         weighted += across * across * height * p
     misfit += 2 * noise * noise  # two of the bins' worth of noise went into the fit
-    variance = (
-        noise * noise * across_energy + max(misfit, 0.0) / max(unfitted, 1e-3 * total) * weighted
-    )
-    return total, np.sqrt(variance) / (across_energy * height)
+    variance = noise * noise * across_energy
+    if misfit > 0:
+        least = 1e-3 * total
+        variance += misfit / (unfitted if unfitted > least else least) * weighted
+    return total, math.sqrt(variance) / (across_energy * height)
 
 
 @loop_part
-def sort_rows(table):
-    """Sort a few rows by their first column, in place."""
-    for last in range(1, table.shape[0]):
+def sort_rows(table, number):
+    """Sort the first few rows of a table by their first column, in place.
+
+    Parameters
+    ----------
+    table : (rows, columns) array
+    number : int
+        Of rows that are sorted.
+    """
+    for last in range(1, number):
         place = last
         while place > 0 and table[place - 1, 0] > table[place, 0]:
             for column in range(table.shape[1]):

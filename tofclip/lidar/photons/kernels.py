@@ -10,11 +10,11 @@ import numpy as np
 from numba import njit
 
 from tofclip.lidar.pulse_fit import (
-    compute_residual,
     find_pulse_window,
     get_variance,
     interpolate_pulse,
     refine_returns,
+    subtract_returns,
 )
 
 MAX_ITERATIONS = (
@@ -370,9 +370,8 @@ def summarise_return(trace, times, background, curve, scale, estimate, k, varian
     for i in range(first, last):
         p, d = interpolate_pulse(times[i] - arrival, curve, scale)
         # the variance follows the expected count, which trace less residual is
-        expected = trace[i] - compute_residual(
-            trace, times, background, curve, scale, estimate, i, -1
-        )
+        rest = subtract_returns(trace[i] - background[i], times[i], curve, scale, estimate, -1)
+        expected = trace[i] - rest
         weight = 1 / get_variance(variance, i, expected)
         pp += weight * p * p
         pd += weight * p * d

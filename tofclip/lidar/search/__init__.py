@@ -197,41 +197,25 @@ class ReturnSearch:
         """
         if isinstance(traces, ArrayTraces):
             return self._portable.find_candidates(traces.values)
-        from tofclip.lidar.search.compiled import find_returns
+        # the compiler takes as long to import as all else
+        from tofclip.lidar.search.trace_search import TraceSearch
 
         total, bins = traces.pixels.size, traces.bins
-        sharp, matched, gains = self._filters
-        # Beyond the bins that are searched the filters reach into what lies elsewhere on the axis.
-        filters = (
-            np.take(sharp, bins.numbers, axis=1) * bins.search_mask,
-            matched[bins.numbers],
-            gains,
-        )
         times = self.times[bins.numbers]
-        table = self._phase_table
-        phases = table.find_even_bins(bins), table.shapes, table.slopes, table.sums, table.half
-        fixed = times, bins.bin_weights, filters, self.pulse.kernel_table(), phases
         found = np.empty((total, self.detection.max_returns, 3))
         counts = np.zeros(total, np.int64)
-        limits = (
-            self.pulse.fwhm,
-            float(self.detection.signal_to_noise),
-            float(self.detection.min_pixel_fraction),
-            float(times[bins.search_mask].max(initial=0.0)),
-        )
         least = np.zeros(times.size, np.float32)
         size = min(max(BATCH_BYTES // (4 * times.size), 1), MAX_PIXELS_PER_BATCH)
         batches = list(split_blocks(total, size))
+        loops = TraceSearch(
+            times, bins, self._filters, self.pulse, self._phase_table, self.detection
+        )
 
         def work(chosen: list[slice]) -> None:
-            memory = np.empty((size, times.size), np.float32)
-            lowest = float(least.min())
+            memory = loops.allocate_memory(size)
             for some in chosen:
-                block = memory[: some.stop - some.start]
-                traces.fill(some, block)
-                find_returns(
-                    block, traces.pixels[some], *fixed, (*limits, lowest), least, found, counts
-                )
+                traces.fill(some, memory.traces[: some.stop - some.start])
+                loops.find_returns(traces.pixels[some], memory, least, found, counts)
 
         def search(chosen: list[slice]) -> None:
             run_blocks(lambda piece: work(chosen[piece]), len(chosen), BATCHES_PER_BLOCK)

@@ -32,6 +32,7 @@ from tofclip.lidar.detection import (
     Detection,
 )
 from tofclip.lidar.pulse import Pulse
+from tofclip.lidar.search.windows import list_windows
 from tofclip.operators.portable import Product, make_portable_product
 from tofclip.shots import Frames
 from tofclip.threads import split_blocks
@@ -221,8 +222,8 @@ class PeakSearch:
         self, times: FloatArray, filters: Filters, pulse: Pulse, detection: Detection
     ) -> None:
         (_, scale), self._detection = pulse.kernel_table(), detection
-        claimed = [np.searchsorted(times, times + reach) for reach in scale[2:]]
-        self._max_window_bins = max(1, int((claimed[1] - claimed[0]).max()))
+        windows = list_windows(times, scale, pulse.fwhm)
+        self._max_window_bins = max(1, int((windows[:, 1] - windows[:, 0]).max()))
         self._bins, self._last_time = times.size, float(times[-1])
         self._gains = [float(one.sum(axis=0).max()) for one in filters]
         self._sharp, self._matched = (
@@ -231,8 +232,7 @@ class PeakSearch:
         tables = [
             times,
             filters[1].sum(axis=0, dtype=np.float64),
-            *claimed,
-            *_find_neighbourhoods(times, pulse.fwhm),
+            *windows.T,
         ]
         self._tables = PerDevice(lambda device: [device.put(table) for table in tables])
 
@@ -368,23 +368,6 @@ def _sum_moments(centred: Array, offset: Array) -> BackgroundLevel:
     total = xp.sum(centred, axis=0, dtype=xp.float64)
     square = xp.sum(centred * centred, axis=0, dtype=xp.float64)
     return BackgroundLevel(offset, total, square, 0 * total + centred.shape[0])
-
-
-def _find_neighbourhoods(
-    times: FloatArray, distance: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First bin that is less than `distance` from each bin, and the one after the last.
-
-    Bins are often just so far apart; what then is less is for the rounding of their difference to
-    say, as in the compiled loops, and not for that of a sum with the distance.
-    """
-    first, last = (
-        np.searchsorted(times, times - distance),
-        np.searchsorted(times, times + distance, side="right"),
-    )
-    first += times - times[first] >= distance
-    last -= times[last - 1] - times >= distance
-    return first, last
 
 
 def _build_banded_product(filters: NDArray[np.float32], device: ComputeDevice) -> Product:

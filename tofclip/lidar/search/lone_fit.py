@@ -13,15 +13,15 @@ of their distance, at most (1 / 128)^2 of a bin: far below where the steps end
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from tofclip.compiling import compile_as_part
 from tofclip.lidar.detection import CONVERGENCE_STEP_BINS, MAX_FIT_ROUNDS
 from tofclip.lidar.pulse import Pulse
-from tofclip.lidar.pulse_fit import loop_part
 from tofclip.lidar.traces import TraceBins
 
 PHASES_PER_BIN = 64
@@ -40,7 +40,13 @@ together, and the products of the trace with pulse and slope."""
 MAX_UNEVENNESS = 1e-3
 """Of a bin, over the length of a pulse: moves no return by more."""
 
-vectorised_part = compile_as_part(fastmath=True, _nrt=False, forceinline=True)
+NOT_ALONE = -1
+"""In place of the number of returns of a trace: one of them does not stand alone."""
+
+SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
+"""What sums in vectors need; unlike all of ``fastmath`` it leaves infinities and NaN what they are."""
+
+search_step = njit(nogil=True, cache=True, fastmath=SUMS_IN_ANY_ORDER, error_model="numpy")
 
 
 @dataclass(frozen=True)
@@ -133,33 +139,67 @@ class PhaseTable:
         return even
 
 
-@loop_part
-def stand_alone(estimate, number, even, distance):
-    """Whether no two returns of a trace are nearer than `distance`, each around an even bin.
+@search_step
+def list_lone_returns(
+    traces, pixels, times, moments, least, estimates, even, half, lone, rests, counts
+):
+    """List the returns of the traces in which all of them stand alone, and return their number.
 
     Parameters
     ----------
-    estimate : (most returns, 5) array
-        In the last column the bins of the peaks, increasing.
-    number : int
-        Of returns.
+    traces : (n, bins) float32 array
+    pixels : (n,) int64 array
+        Number of the pixel to which each trace belongs.
+    times : (bins,) array
+        Seconds, increasing.
+    moments : (n, 3) array
+        Mean and standard deviation of the bins without a return, and number of estimates.
+    least : float
+        Standard deviations that a return's response must exceed.
+    estimates : (n, returns, 5) array
+        First guess of each arrival, seconds, and, in the last column, bin of the peak, increasing.
     even : (bins,) bool array
         See `PhaseTable.find_even_bins`.
-    distance : int
-        Bins.
+    half : int
+        See `PhaseTable`.
+    lone : (room, LONE_COLUMNS) float64 array
+        Overwritten; those of one trace side by side, in the order of time.
+    rests : (room, width) float32 array
+        Overwritten: trace less background in the bins of the table around each peak; zero in those
+        that fill up its width.
+    counts : (all pixels,) int64 array, overwritten where `pixels` says
+        0, or `NOT_ALONE`.
 
     Returns
     -------
-    bool
+    int
     """
-    alone = True
-    for k in range(number):
-        alone &= even[int(estimate[k, 4])]
-        alone &= k == 0 or estimate[k, 4] - estimate[k - 1, 4] >= distance
-    return alone
+    listed, held = 0, np.uintp(2 * half + 1)
+    for place in range(traces.shape[0]):
+        trace, guesses, number = traces[place], estimates[place], int(moments[place, 2])
+        level, alone = np.float32(moments[place, 0]), True
+        for k in range(number):
+            # light that ends before the other's begins, whatever both of them move
+            apart = k == 0 or guesses[k, 4] - guesses[k - 1, 4] >= 2 * half + 1
+            alone = alone and apart and even[int(guesses[k, 4])]
+        counts[pixels[place]] = 0 if alone else NOT_ALONE
+        for k in range(number if alone else 0):
+            own, rest, j = lone[listed], rests[listed], int(guesses[k, 4])
+            own[OFFSET] = (guesses[k, 0] - times[j]) / (times[j + 1] - times[j])
+            own[NOISE] = moments[place, 1]
+            own[LEAST] = least * moments[place, 1]
+            own[PEAK_BIN] = j
+            own[TRACE] = place
+            first = np.uintp(j - half)
+            for w in range(held):
+                rest[w] = trace[first + w] - level
+            for w in range(held, np.uintp(rest.size)):
+                rest[w] = np.float32(0)
+            listed += 1
+    return listed
 
 
-@loop_part
+@search_step
 def fit_lone_returns(lone, rests, active, shapes, slopes, sums):
     """Fit returns that stand alone, of many traces: each round takes one step of every return that
     still moves.
@@ -177,37 +217,43 @@ def fit_lone_returns(lone, rests, active, shapes, slopes, sums):
         Trace less background in the bins of the table around each peak; zero in those that fill up
         its width.
     active : (returns,) int64 array
-        Overwritten.
+        Numbers of the returns; overwritten.
     shapes, slopes, sums
         See `PhaseTable`.
     """
     moving = lone.shape[0]
-    for k in range(moving):
-        active[k] = k
     for _ in range(MAX_FIT_ROUNDS):
         for a in range(moving):
-            k = active[a]
-            phase, _ = find_phase(lone[k, OFFSET])
-            lone[k, ALONG_PULSE], lone[k, ALONG_SLOPE] = project_on_pulse(
-                rests[k], shapes[phase], slopes[phase]
-            )
+            own, rest = lone[active[a]], rests[active[a]]
+            phase = np.uintp((own[OFFSET] + MAX_OFFSET_BINS) * PHASES_PER_BIN + 0.5)
+            shape, slope = shapes[phase], slopes[phase]
+            pr = dr = np.float32(0)
+            for first in range(np.uintp(0), np.uintp(rest.size), np.uintp(VECTOR_BINS)):
+                for w in range(VECTOR_BINS):
+                    here = first + np.uintp(w)
+                    pr += rest[here] * shape[here]
+                    dr += rest[here] * slope[here]
+            own[ALONG_PULSE] = pr
+            own[ALONG_SLOPE] = dr
         still = 0
         for a in range(moving):
             k = active[a]
-            offset, pr, dr = lone[k, OFFSET], lone[k, ALONG_PULSE], lone[k, ALONG_SLOPE]
-            phase, start = find_phase(offset)
+            own = lone[k]
+            pr, dr = own[ALONG_PULSE], own[ALONG_SLOPE]
+            phase = np.uintp((own[OFFSET] + MAX_OFFSET_BINS) * PHASES_PER_BIN + 0.5)
             pp, pd, dd = sums[phase, 0], sums[phase, 1], sums[phase, 2]
             across = dd * pr - pd * dr
-            lone[k, HEIGHT] = across / (pp * dd - pd * pd)
+            own[HEIGHT] = across / (pp * dd - pd * pd)
             if across <= 0:
                 continue
             # model: height * p(t - arrival), whose slope is -height * d
-            step = start - (pp * dr - pd * pr) / across - offset
-            step = min(max(step, -1.0), 1.0)
-            lone[k, OFFSET] = offset + step
-            if abs(offset + step) > MAX_OFFSET_BINS:
-                lone[k, HEIGHT] = np.nan
-            elif abs(step) >= CONVERGENCE_STEP_BINS:
+            step = phase / PHASES_PER_BIN - MAX_OFFSET_BINS - own[OFFSET]
+            step -= (pp * dr - pd * pr) / across
+            step = 1.0 if step > 1.0 else (-1.0 if step < -1.0 else step)
+            own[OFFSET] += step
+            if math.fabs(own[OFFSET]) > MAX_OFFSET_BINS:
+                own[HEIGHT] = np.nan
+            elif math.fabs(step) >= CONVERGENCE_STEP_BINS:
                 active[still] = k
                 still += 1
         moving = still
@@ -215,7 +261,7 @@ def fit_lone_returns(lone, rests, active, shapes, slopes, sums):
             break
 
 
-@loop_part
+@search_step
 def measure_lone_returns(lone, rests, pixels, times, shapes, slopes, sums, found, counts):
     """Write instant, sum and standard deviation of the returns that prove themselves.
 
@@ -233,112 +279,34 @@ def measure_lone_returns(lone, rests, pixels, times, shapes, slopes, sums, found
     found : (all pixels, most returns, 3) float64 array
         Overwritten: seconds, sum over the bins, standard deviation in seconds.
     counts : (all pixels,) int64 array
-        Goes up by one for each; -1 where a return of the pixel needs the exact fit.
+        Goes up by one for each; `NOT_ALONE` where a return of the pixel needs the exact fit.
     """
     for k in range(lone.shape[0]):
-        height, noise, offset = lone[k, HEIGHT], lone[k, NOISE], lone[k, OFFSET]
-        pixel, j = pixels[int(lone[k, TRACE])], int(lone[k, PEAK_BIN])
+        own, rest = lone[k], rests[k]
+        height, noise, offset = own[HEIGHT], own[NOISE], own[OFFSET]
+        pixel, j = pixels[int(own[TRACE])], int(own[PEAK_BIN])
         number = counts[pixel]
-        if np.isnan(height):
-            counts[pixel] = -1
+        if math.isnan(height):
+            counts[pixel] = NOT_ALONE
             continue
-        phase, start = find_phase(offset)
-        pp, pd, dd = sums[phase, 0], sums[phase, 1], sums[phase, 2]
-        if number < 0 or height <= 0 or height * np.sqrt(pp) <= lone[k, LEAST]:
+        phase = np.uintp((offset + MAX_OFFSET_BINS) * PHASES_PER_BIN + 0.5)
+        shape, slope, known = shapes[phase], slopes[phase], sums[phase]
+        if number < 0 or height <= 0 or height * math.sqrt(known[0]) <= own[LEAST]:
             continue
-        misfit = sum_misfit(rests[k], shapes[phase], slopes[phase], height, offset - start)
-        misfit = max(misfit - noise * noise * (sums[phase, 6] - 2), 0.0)
-        across_energy, total = dd - pd * pd / pp, height * sums[phase, 3]
-        variance = (
-            noise * noise * across_energy
-            + misfit / max(height * sums[phase, 4], 1e-3 * total) * height * sums[phase, 5]
-        )
-        width = times[j + 1] - times[j]
-        found[pixel, number, 0] = times[j] + offset * width
-        found[pixel, number, 1] = total
-        found[pixel, number, 2] = np.sqrt(variance) / (across_energy * height) * width
+        high, misfit = np.float32(height), np.float32(0)
+        later = np.float32(offset - (phase / PHASES_PER_BIN - MAX_OFFSET_BINS))
+        for first in range(np.uintp(0), np.uintp(rest.size), np.uintp(VECTOR_BINS)):
+            for w in range(VECTOR_BINS):
+                here = first + np.uintp(w)
+                off = rest[here] - high * (shape[here] - later * slope[here])
+                misfit += off * off if shape[here] > 0 else np.float32(0)
+        excess = misfit - noise * noise * (known[6] - 2)
+        excess = excess if excess > 0 else 0.0
+        across_energy, total = known[2] - known[1] * known[1] / known[0], height * known[3]
+        unfitted = height * known[4] if height * known[4] > 1e-3 * total else 1e-3 * total
+        variance = noise * noise * across_energy + excess / unfitted * height * known[5]
+        width, result = times[j + 1] - times[j], found[pixel, number]
+        result[0] = times[j] + offset * width
+        result[1] = total
+        result[2] = math.sqrt(variance) / (across_energy * height) * width
         counts[pixel] = number + 1
-
-
-@vectorised_part
-def find_phase(offset):
-    """Number and place of the tabulated phase nearest to an offset.
-
-    Parameters
-    ----------
-    offset : float
-        Bins, at most `MAX_OFFSET_BINS` either way.
-
-    Returns
-    -------
-    (int, float)
-    """
-    phase = np.uintp((offset + MAX_OFFSET_BINS) * PHASES_PER_BIN + 0.5)
-    return phase, phase / PHASES_PER_BIN - MAX_OFFSET_BINS
-
-
-@vectorised_part
-def copy_rest(trace, first, number, background, rest):
-    """Copy some bins of a trace less the background, and fill up with zeros.
-
-    Parameters
-    ----------
-    trace : (bins,) float32 array
-    first, number : int
-    background : float
-    rest : (number or more,) float32 array
-        Overwritten.
-    """
-    level, there = np.float32(background), trace[first : first + number]
-    for w in range(rest.size):
-        rest[w] = np.float32(0)
-    for w in range(number):
-        rest[w] = there[w] - level
-
-
-@vectorised_part
-def project_on_pulse(rest, shape, slope):
-    """Products of what is left of a trace with pulse and slope.
-
-    Parameters
-    ----------
-    rest, shape, slope : (width,) float32 array
-        The width is a multiple of `VECTOR_BINS`.
-
-    Returns
-    -------
-    (float, float)
-    """
-    pr = dr = np.float32(0)
-    for first in range(np.uintp(0), np.uintp(rest.size), np.uintp(VECTOR_BINS)):
-        end = first + np.uintp(VECTOR_BINS)
-        r, p, d = rest[first:end], shape[first:end], slope[first:end]
-        for w in range(VECTOR_BINS):
-            pr += r[w] * p[w]
-            dr += r[w] * d[w]
-    return float(pr), float(dr)
-
-
-@vectorised_part
-def sum_misfit(rest, shape, slope, height, later):
-    """Sum of squares of what a return does not explain in the bins that it reaches.
-
-    Parameters
-    ----------
-    rest, shape, slope : (width,) float32 array
-        The width is a multiple of `VECTOR_BINS`.
-    height, later : float
-        Of the return, and bins by which it arrives after the tabulated phase.
-
-    Returns
-    -------
-    float
-    """
-    high, back, total = np.float32(height), np.float32(later), np.float32(0)
-    for first in range(np.uintp(0), np.uintp(rest.size), np.uintp(VECTOR_BINS)):
-        end = first + np.uintp(VECTOR_BINS)
-        r, p, d = rest[first:end], shape[first:end], slope[first:end]
-        for w in range(VECTOR_BINS):
-            off = r[w] - high * (p[w] - back * d[w])
-            total += off * off if p[w] > 0 else np.float32(0)
-    return float(total)
