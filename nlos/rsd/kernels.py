@@ -155,8 +155,11 @@ def propagate_spectrum(spectrum, first, nodes, begin, offset, node_weights, coef
                 _apply_transfer(waves, (group * frequencies + k) * GROUP_FLOATS, transfer, products)
                 _sum_frequencies(coefficients[depth], k, products, sums)
             for m in range(count):
-                to = ((depth * count + m) * groups + group) * GROUP_FLOATS
-                flat[to : to + GROUP_FLOATS] = sums[m * GROUP_FLOATS : (m + 1) * GROUP_FLOATS]
+                to = np.uint64(((depth * count + m) * groups + group) * GROUP_FLOATS)
+                of = np.uint64(m * GROUP_FLOATS)
+                # a loop, since assigning slices goes by way of a copy
+                for i in range(np.uint64(GROUP_FLOATS)):
+                    flat[to + i] = sums[of + i]
 
 
 # Unsigned indices into flat arrays: an index that might be negative would keep the loops from
