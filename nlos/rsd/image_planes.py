@@ -151,8 +151,7 @@ ILLUMINATION_ERROR_FRACTION = 0.25
 more.
 """
 
-
-DEPTH_ERROR_FRACTION = 0.2
+DEPTH_ERROR_FRACTION = 0.35
 """Of the error allowed, what interpolation between depths may take."""
 
 
