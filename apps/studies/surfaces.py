@@ -78,13 +78,15 @@ class Scored(NamedTuple):
     picture: NDArray[np.float32]
 
 
-def make_small_instrument(photons: float) -> Instrument:
+def make_small_instrument(photons: float, rays_per_pixel_side: int = 4) -> Instrument:
     """Return an instrument like the demonstration's with pictures of half its side.
 
     Parameters
     ----------
     photons : float
         Expected signal of the brightest streak pixel.
+    rays_per_pixel_side : int
+        Rays of the simulation; they have to be closer than the finest pattern.
     """
     centres = np.arange(60.0, 600.0, 86.0)
     camera = Camera(
@@ -99,7 +101,7 @@ def make_small_instrument(photons: float) -> Instrument:
         lenslet_pitch=LENSLET_PITCH_M,
         focus_distance=2.0,
     )
-    return Instrument(camera, StreakDetector(400, peak_photons=photons))
+    return Instrument(camera, StreakDetector(400, peak_photons=photons), rays_per_pixel_side)
 
 
 def _place(
@@ -168,11 +170,28 @@ def make_gauze_scene() -> Scene:
     )
 
 
+# A mesh of 0.2 pixels: of the usual rays, 0.25 pixels apart, each view would see another share of it.
+GAUZE_RAYS_PER_PIXEL_SIDE = 9
+
 SCENES: dict[str, Callable[[], Scene]] = {
     "slanted and curved": make_slanted_scene,
     "wires": make_wire_scene,
     "gauze": make_gauze_scene,
 }
+
+
+def make_scene_instrument(name: str, photons: float) -> Instrument:
+    """Return the instrument before which a scene of `SCENES` stands.
+
+    Parameters
+    ----------
+    name : str
+    photons : float
+        Expected signal of the brightest streak pixel.
+    """
+    if name == "gauze":
+        return make_small_instrument(photons, GAUZE_RAYS_PER_PIXEL_SIDE)
+    return make_small_instrument(photons)
 
 
 def score_methods(scene: Scene, instrument: Instrument, seed: int, fit: bool) -> dict[str, Scored]:
@@ -294,7 +313,7 @@ def run_scenes(
     for name, make_scene in SCENES.items():
         scene = make_scene()
         for count in photons:
-            instrument = make_small_instrument(count)
+            instrument = make_scene_instrument(name, count)
             scored = []
             for seed in range(seeds):
                 scored.append(score_methods(scene, instrument, seed, fit=False))

@@ -13,7 +13,7 @@ import pytest
 from tofclip import depth, nmse, point_cloud, recover
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
-from tofclip.recovery.surface_fit import extrapolate_steps
+from tofclip.recovery.surface_fit import extrapolate_steps, straighten_surfaces
 from tofclip.recovery.surface_model import (
     SurfaceModel,
     SurfaceState,
@@ -22,7 +22,7 @@ from tofclip.recovery.surface_model import (
 )
 from tofclip.recovery.surface_patches import SmoothBasis, find_patches
 from tofclip.recovery.surface_returns import estimate_displacement, find_usual_brightness
-from tofclip.recovery.surface_solver import refine_state
+from tofclip.recovery.surface_solver import AmplitudeSolver, refine_state
 from tofclip.recovery.surfaces import SurfaceRecovery
 from tofclip.sequences import CloudSettings
 from tofclip.shots import Frames, Streak
@@ -88,9 +88,12 @@ def found(shot) -> Frames:
     return recover(shot.streak, shot.camera, "surfaces")
 
 
-def make_model(streak: Streak) -> SurfaceModel:
+def make_model(streak: Streak, overlap: bool = False) -> SurfaceModel:
+    """Two plates; the further one reaches behind the whole of the nearer one, if asked for."""
     masks = np.zeros((2, *SHAPE), bool)
     masks[0, 8:30, 5:25] = masks[1, 20:40, 18:44] = True
+    if overlap:
+        masks[1, 4:40, 2:44] = True
     coefficients = np.zeros((2, 6))
     coefficients[:, 0] = 1 / 1.4, 1 / 1.7
     coefficients[:, 1] = 0.02, -0.03
@@ -163,6 +166,7 @@ def test_derivatives_are_those_of_the_image(shot):
     # time zero is the reference view's
     assert ("delays", 0, 3) not in found
     assert ("stretches", 0, 3) not in found
+    assert not any(name == "shading" for name, _, _ in found)
     for name, step in (
         (("coefficients", 0, 0), 2e-4), (("coefficients", 1, 2), 2e-4), (("gains", 0, 2), 1e-2),
         (("delays", 0, 4), 2e-2), (("stretches", 0, 1), 5e-2), (("widths", 0, 5), 2e-2),
@@ -180,6 +184,71 @@ def test_derivatives_are_those_of_the_image(shot):
         model.place(state)
         difference = (images[0] - images[1]) / (2 * step)
         assert np.linalg.norm(found[name] - difference) < 0.1 * np.linalg.norm(difference), name
+
+
+def test_each_view_sees_its_own_part_of_what_shines_through(shot):
+    """As through gauze: the view beside the lamp sees all that the lamp lights behind it."""
+    model = make_model(shot.streak, overlap=True)
+    amplitude = np.full(model.surface.size, 50, np.float32)
+    model.find_behind(amplitude)
+    hidden = model.masks[0].ravel()[model.pixel] & (model.surface == 1)
+    np.testing.assert_array_equal(model.behind, hidden)
+    even, shaded = model.state, model.state.copy()
+    shaded.shading[1] = [-0.25, -0.1, 0.1, 0.4, 0.15, -0.1, -0.2]
+    model.place(shaded)
+    y = np.random.default_rng(0).standard_normal(model.image.shape).astype(np.float32)
+    there, back = model.render(amplitude).astype(np.float64), model.gather(y).astype(np.float64)
+    assert np.vdot(there, y) == pytest.approx(float(np.vdot(amplitude, back)), rel=1e-4)
+    model.image = model.render(amplitude)
+    model.weights = 1 / (model.image + 5)
+    model.place(even)
+    for _ in range(2):
+        amplitude = refine_state(model, amplitude).amplitude
+    # what amplitudes take of it in two steps is a few hundredths of the largest
+    np.testing.assert_allclose(model.state.shading[1], shaded.shading[1], atol=0.03)
+    assert not model.state.shading[0].any()
+
+
+def test_what_all_views_see_alike_is_not_shaded(shot):
+    model = make_model(shot.streak, overlap=True)
+    amplitude = np.full(model.surface.size, 50, np.float32)
+    model.find_behind(amplitude)
+    clean = model.render(amplitude)
+    model.image = np.random.default_rng(0).poisson(clean + 1).astype(np.float32) - 1
+    model.weights = 1 / (clean + 1)
+    refine_state(model, amplitude)
+    assert not model.state.shading.any()
+    assert not model.behind.any()
+
+
+@pytest.mark.parametrize("bent", [False, True])
+def test_splines_are_left_where_a_quadratic_explains_the_shot(shot, bent: bool):
+    """Frames displace returns here and there, and splines follow them; the shot knows better."""
+    masks = np.zeros((1, *SHAPE), bool)
+    masks[0, 4:44, 4:44] = True
+    pixels = np.flatnonzero(masks)
+    y, x = np.divmod(pixels, SHAPE[1])
+    bump = 3e-3 * np.exp(-((x - 18) ** 2 + (y - 20) ** 2) / 50)
+    basis = SmoothBasis(SHAPE, (4, 4, 44, 44), (4, 4))
+    design = basis.evaluate(pixels)
+    flat = 1 / 1.5 + 1e-4 * x
+    found, true = (
+        np.linalg.lstsq(design, flat + part, rcond=None)[0] for part in (bump, bent * bump)
+    )
+    basis = replace(basis, bending=1e-3 * np.eye(design.shape[1]))
+    state = SurfaceState.start([true], CAMERA)
+    model = SurfaceModel(shot.streak, CAMERA, masks, [basis], state)
+    board = np.where((x // 6 + y // 6) % 2 == 0, 60, 30).astype(np.float32)
+    model.image = model.render(board)
+    model.weights = 1 / (model.image + 5)
+    model.place(SurfaceState.start([found], CAMERA))
+    amplitude = refine_state(model, board).amplitude
+    straight = straighten_surfaces(model, AmplitudeSolver(model, amplitude, 2.0))
+    assert (straight is None) == bent
+    if straight is not None:
+        assert straight.model.bases[0].pieces == (0, 0)
+        error = straight.model.distance - straight.model.ray_length / flat
+        assert np.median(np.abs(error)) < 0.1e-3  # 2.9 mm at the bump before
 
 
 def test_a_refused_or_taken_step_never_raises_the_misfit(shot):

@@ -21,7 +21,12 @@ from tofclip.recovery.surface_refusal import (
     require_short_pulse,
     require_surfaces,
 )
-from tofclip.recovery.surface_solver import AmplitudeSolver, Refinement, refine_state
+from tofclip.recovery.surface_solver import (
+    AmplitudeSolver,
+    Refinement,
+    compute_objective,
+    refine_state,
+)
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import Progress, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
@@ -115,8 +120,41 @@ def fit_surfaces(
     solver.run(START_ITERATIONS, progress, count)
     require_explained(model, solver.amplitude, frames, streak)
     refinement, remainder = _refine(model, solver, progress, count)
+    straight = straighten_surfaces(model, solver)
+    if straight is not None:
+        model, solver = straight.model, straight
+        refinement, remainder = _refine(model, solver, ignore_progress, count)
     solver.run(iterations, progress, count)
     return SurfaceFit(model, solver, refinement, remainder, model.unexplained(solver.amplitude))
+
+
+def straighten_surfaces(model: SurfaceModel, solver: AmplitudeSolver) -> AmplitudeSolver | None:
+    """Replace splines by quadratics that explain the shot at least as well.
+
+    Splines follow the returns of frames, also where these are displaced, as behind gauze; the shot
+    itself says whether the surface is bent.
+
+    Parameters
+    ----------
+    model : SurfaceModel
+    solver : AmplitudeSolver
+        Of this model.
+
+    Returns
+    -------
+    AmplitudeSolver or None
+        Of the model with those quadratics; None where all splines are needed.
+    """
+    found = None
+    for surface, basis in enumerate(model.bases):
+        if basis.pieces == (0, 0):
+            continue
+        trial = model.straighten(surface, solver.amplitude)
+        moved = refine_state(trial, solver.amplitude).amplitude
+        if compute_objective(trial, moved) <= compute_objective(model, solver.amplitude):
+            model, solver = trial, AmplitudeSolver(trial, moved, solver.weight, solver)
+            found = solver
+    return found
 
 
 def follow_surfaces(fit: SurfaceFit, streak: Streak, weight: float) -> SurfaceFit | None:
@@ -155,6 +193,7 @@ def _refine(
     before, changes = model.distance, []
     found = None
     for _ in range(REFINEMENTS):
+        model.find_behind(solver.amplitude)
         found = refine_state(model, solver.amplitude, found)
         solver.amplitude = found.amplitude
         solver.run(REFINEMENT_ITERATIONS, progress, count)

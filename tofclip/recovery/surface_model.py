@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from tofclip.camera import Camera, estimate_dark_level
 from tofclip.lidar import compute_ray_directions
-from tofclip.recovery.surface_patches import SmoothBasis
+from tofclip.recovery.surface_patches import MIN_BEHIND_FRACTION, SmoothBasis
 from tofclip.recovery.surface_pulse import FWHM_PER_SIGMA, ShotPulse
 from tofclip.shots import Streak
 from tofclip.threads import map_parallel, split_blocks, thread_count
@@ -42,6 +42,8 @@ SLIT_PIXELS, SUBROWS = 4, 3
 SMOOTHING_PX = 2.0
 WIDTH_STEP = 0.02  # relative; for the derivative by a pulse's width
 MIN_INVERSE_DEPTH = 1e-3  # 1/m; a surface that bends away ends a kilometre off
+MIN_BEHIND_PX = 100  # of a surface, seen through another
+FRONT_FRACTION = 0.5  # of a surface's usual brightness: it ends where its rim is darker
 MIN_VARIANCE = 0.02  # rows^2, of the smoothing that is left of a pulse shorter than a row
 
 
@@ -61,6 +63,10 @@ class SurfaceState:
         Rows by which those delays grow over the streak image.
     widths : (views,) float array
         Pulse widths, relative to the camera's.
+    shading : (surfaces, views) float array
+        Logarithms of how bright each view sees what lies behind another surface, relative to the
+        mean over the views. Through gauze the view beside the lamp sees just what the lamp lights,
+        and the others see a part of it.
     """
 
     coefficients: list[FloatArray]
@@ -68,6 +74,7 @@ class SurfaceState:
     delays: FloatArray
     stretches: FloatArray
     widths: FloatArray
+    shading: FloatArray
 
     @classmethod
     def start(cls, coefficients: Sequence[FloatArray], camera: Camera) -> SurfaceState:
@@ -79,7 +86,8 @@ class SurfaceState:
         camera : Camera
         """
         none = np.zeros(camera.views)
-        return cls(list(coefficients), camera.gains.copy(), none, none.copy(), none + 1)
+        even = np.zeros((len(coefficients), camera.views))
+        return cls(list(coefficients), camera.gains.copy(), none, none.copy(), none + 1, even)
 
     def copy(self) -> SurfaceState:
         """Return a state that can be changed without changing this one."""
@@ -89,6 +97,7 @@ class SurfaceState:
             self.delays.copy(),
             self.stretches.copy(),
             self.widths.copy(),
+            self.shading.copy(),
         )
 
 
@@ -164,6 +173,7 @@ class SurfaceModel:
         self.camera, self.masks, self.bases = camera, masks, list(bases)
         self.bin_width = float(np.mean(np.diff(streak.times)))
         self.times = streak.times
+        self.reference = int(np.argmin(np.abs(camera.view_positions)))
         self.pulse = pulse or ShotPulse(camera.pulse_fwhm / FWHM_PER_SIGMA / self.bin_width)
         self.image, self.weights = weigh_measurements(streak, camera)
         self.surface, y, x = np.nonzero(masks)
@@ -178,6 +188,7 @@ class SurfaceModel:
         self.ray_length = 1 / self._directions[:, 2]
         axis_row, axis_column = camera.optical_axis_px
         self._x, self._y = x - axis_column, y - axis_row
+        self.behind = np.zeros(self.surface.size, bool)
         self.place(state)
 
     def place(self, state: SurfaceState) -> None:
@@ -200,6 +211,25 @@ class SurfaceModel:
         """The pulse of a core of `sigma` rows, of which `variance` is already there."""
         return self.pulse.extend(make_pulse(sigma, self._core_half, variance))
 
+    def find_behind(self, amplitude: Image) -> None:
+        """Find the points that lie behind another surface and are seen through it.
+
+        Parameters
+        ----------
+        amplitude : (points,) float32 array
+        """
+        brightness = np.zeros(amplitude.size)
+        for part in self.parts:
+            light = amplitude[part]
+            brightness[part] = light / np.median(light[light > 0]) if light.any() else 0
+        nearest = np.full(self.masks[0].size, np.inf)
+        front = brightness > FRONT_FRACTION
+        np.minimum.at(nearest, self.pixel[front], self.distance[front])
+        behind = (self.distance > nearest[self.pixel]) & (brightness > MIN_BEHIND_FRACTION)
+        # a few pixels are a rim, where each surface has a part of the light
+        count = np.bincount(self.surface[behind], minlength=len(self.masks))
+        self.behind = behind & (count >= MIN_BEHIND_PX)[self.surface]
+
     def see(self, streak: Streak) -> SurfaceModel:
         """Return the same surfaces before another shot of the camera."""
         other = copy.copy(self)
@@ -209,6 +239,27 @@ class SurfaceModel:
     def unexplained(self, amplitude: Image) -> float:
         """What is left of the signal, as a fraction, smoothed so that photons' noise hardly counts."""
         return compare_smoothed(self.render(amplitude), self.image, self.weights > 0)
+
+    def straighten(self, surface: int, amplitude: Image) -> SurfaceModel:
+        """Return the same surfaces, one of splines replaced by the quadratic that is nearest to it.
+
+        Parameters
+        ----------
+        surface : int
+        amplitude : (points,) float32 array
+            The quadratic follows the points that are lit.
+        """
+        other, part = copy.copy(self), self.parts[surface]
+        basis = SmoothBasis(self.bases[surface].image_shape)
+        design, lit = basis.evaluate(self.pixel[part]), amplitude[part] > 0
+        inverse = self.ray_length[part] / self.distance[part]
+        state = self.state.copy()
+        nearest, *_ = np.linalg.lstsq(design[lit], inverse[lit])
+        state.coefficients[surface] = nearest.astype(np.float64)
+        other.bases, other.monomials = list(self.bases), list(self.monomials)
+        other.bases[surface], other.monomials[surface] = basis, design
+        other.place(state)
+        return other
 
     def compute_slopes(self) -> FloatArray:
         """Return how steeply the ranges change along columns and rows, (2, points), m per pixel."""
@@ -348,6 +399,7 @@ class SurfaceModel:
         from tofclip.recovery.surface_kernels import add_light, smooth_rows
 
         place, margin = self._views[view], self._margin
+        amplitude = self.shade(view, amplitude, part)
         first, last = (0, self.image.shape[0]) if rows is None else rows
         light = np.zeros((last - first + 2 * margin, place.columns), np.float32)
         add_light(
@@ -417,12 +469,30 @@ class SurfaceModel:
             found = np.zeros(self.surface.size, np.float32)
             row = place.row + np.int32(self._margin)
             gather_light(smooth, gain, row, place.row_shares, place.column, slit_shares, found)
-            return found
+            found = self.shade(view, found)
+            return self.shade(view, found) if squared else found
 
         total = np.zeros(self.surface.size, np.float32)
         for found in self._map_views(work):
             total += found
         return total
+
+    def shade(self, view: int, amplitude: Image, part: slice = slice(None)) -> Image:
+        """Return amplitudes as a view sees them.
+
+        Parameters
+        ----------
+        view : int
+        amplitude : (points,) float32 array
+            Of the points in `part`.
+        part : slice
+            Of the points; all by default.
+        """
+        behind = self.behind[part]
+        if not behind.any():
+            return amplitude
+        brightness = np.exp(self.state.shading[self.surface[part], view])
+        return np.where(behind, amplitude * brightness, amplitude).astype(np.float32)
 
     def misfit(self, amplitude: Image) -> float:
         """Half the weighted squared misfit."""
@@ -435,7 +505,7 @@ class SurfaceModel:
         The reference view keeps its delay and stretch: time zero is its own. Derivatives by gains
         and widths are by their logarithms.
         """
-        reference = int(np.argmin(np.abs(self.camera.view_positions)))
+        reference = self.reference
         views = range(self.camera.views)
         yield from map_parallel(lambda view: self._differentiate_view(view, amplitude), views)
         yield from map_parallel(
@@ -454,8 +524,14 @@ class SurfaceModel:
             "gains": self.project(view, amplitude, kernel),
             "widths": self.project(view, amplitude, (wider - kernel) / np.float32(WIDTH_STEP)),
         }
-        stacked = np.stack(list(images.values()))[:, :, own[0]] * np.float32(self.state.gains[view])
-        return Derivatives([(name, 0, view) for name in images], 0, own[1].start, stacked)
+        unknowns = [(name, 0, view) for name in images]
+        projected = list(images.values())
+        for surface in np.unique(self.surface[self.behind]):
+            chosen = self.behind & (self.surface == surface)
+            unknowns.append(("shading", int(surface), view))
+            projected.append(self.project(view, amplitude * chosen, kernel))
+        stacked = np.stack(projected)[:, :, own[0]] * np.float32(self.state.gains[view])
+        return Derivatives(unknowns, 0, own[1].start, stacked)
 
     def _differentiate_sweep(self, view: int, amplitude: Image) -> Derivatives:
         """By delay and stretch at a view's centre, which the views beside it feel as well."""

@@ -55,7 +55,8 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
         deviation[part] = np.sqrt(by_inverse**2 * variance + rest**2)
     displacement = estimate_displacement(camera, centre_error_px)
     deviation = np.hypot(deviation, np.hypot(*(displacement * model.compute_slopes().T).T))
-    intensity = amplitude * distance**2
+    # brightness is told as the reference view sees it
+    intensity = model.shade(model.reference, amplitude) * distance**2
     limit = detection.signal_to_noise
     usual = np.zeros(len(model.masks))
     for one in range(usual.size):

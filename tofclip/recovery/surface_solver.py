@@ -32,6 +32,9 @@ ELIMINATION_ITERATIONS, FURTHER_ELIMINATION_ITERATIONS = 6, 2
 # the demonstration. Later views and farther surfaces look alike, so that the mean over the views is
 # what all ranges have in common.
 SWEEP_SIGMAS = {"delays": 0.015, "stretches": 0.05}
+# Of the brightness behind another surface, between the views: less does not matter, or is noise.
+MIN_SHADING, SHADING_SIGMAS = 0.1, 3.0
+TINY = float(np.finfo(np.float32).tiny)
 RIDGE = 1e-6  # of each unknown's own information: for what the shot says nothing about
 CLUSTER_ROWS, CLUSTER_COLUMNS = 12, 48  # measurements whose misfits may depend on each other
 
@@ -195,7 +198,7 @@ def refine_state(
     Parameters
     ----------
     model : SurfaceModel
-        Moved in place. The mean gain stays.
+        Moved in place. The mean gain stays, and so does the mean brightness behind a surface.
     amplitude : (points,) float32 array
     earlier : Refinement, optional
         The step before this one, which saves work.
@@ -213,23 +216,24 @@ def refine_state(
         for group in model.iterate_derivatives(amplitude)
         if earlier is not None or group.names[0][0] not in SWEEP_SIGMAS
     ]
+    # The prior leaves amplitudes a little too even. That looks like views that are late, but not once
+    # amplitudes have explained what they can.
+    scale = _scale_amplitude(model, amplitude > 0)
+    rest = _leave_unexplained(model, error, scale)
+    groups = _leave_out_even_shading(model, groups, rest)
     changes = _eliminate_amplitude(
         model, amplitude, groups, None if earlier is None else earlier.explained
     )
     names = [name for group in groups for name in group.names]
     normal = _multiply_groups(groups, model.weights)
     scores = _sum_scores(groups, pull)
-    # The prior leaves amplitudes a little too even. That looks like views that are late, but not once
-    # amplitudes have explained what they can.
-    scale = _scale_amplitude(model, amplitude > 0)
-    rest = error - model.render(_explain_by_amplitude(model, error, scale, ELIMINATION_ITERATIONS))
     bending, moment = _bend(model, names)
     for index, (name, _, view) in enumerate(names):
         if name in SWEEP_SIGMAS:
             bending[index, index] = 1 / SWEEP_SIGMAS[name] ** 2
             moment[index] = getattr(state, name)[view] / SWEEP_SIGMAS[name] ** 2
     slope = _sum_scores(groups, model.weights * rest).sum(axis=1) - moment
-    unit = np.sqrt(np.diag(normal)) + np.finfo(np.float32).tiny
+    unit = np.sqrt(np.diag(normal)) + TINY
     whole = (normal + bending) / np.outer(unit, unit) + RIDGE * np.eye(unit.size)
     inverse = np.linalg.inv(whole) / np.outer(unit, unit)
     change = inverse @ slope
@@ -237,7 +241,7 @@ def refine_state(
     moved = amplitude
     while step >= SMALLEST_STEP:
         ahead = _move(state, names, step * change)
-        # the mean gain is the amplitudes' unit
+        # the mean gain is the amplitudes' unit, and so is the mean brightness behind a surface
         excess = ahead.gains.mean() / state.gains.mean()
         ahead.gains /= excess
         moved = amplitude.copy()
@@ -246,11 +250,11 @@ def refine_state(
             if len(own) == len(changes):
                 moved[part] -= (step * change[own]).astype(np.float32) @ changes[:, part]
         moved = np.float32(excess) * np.maximum(moved, 0)
+        brighter = ahead.shading.mean(axis=1)
+        ahead.shading -= brighter[:, np.newaxis]
+        moved *= np.where(model.behind, np.exp(brighter)[model.surface], 1).astype(np.float32)
         model.place(ahead)
-        error = model.image - model.render(moved)
-        rest = error - model.render(
-            _explain_by_amplitude(model, error, scale, ELIMINATION_ITERATIONS)
-        )
+        rest = _leave_unexplained(model, model.image - model.render(moved), scale)
         if _objective(model, rest) < before:
             break
         step /= 2
@@ -261,6 +265,41 @@ def refine_state(
     numbers = np.array([one if name == "coefficients" else -1 for name, one, _ in names])
     blocks = [np.flatnonzero(numbers == surface) for surface in range(len(model.masks))]
     return Refinement([robust[block][:, block] for block in blocks], moved, changes)
+
+
+def _leave_out_even_shading(
+    model: SurfaceModel, groups: list[Derivatives], rest: Image
+) -> list[Derivatives]:
+    """Leave out the shading of surfaces whose hidden points all views see alike, as behind a rim.
+
+    A surface that has been found to be shaded before stays so.
+    """
+    # what each view would make of them alone; views hardly share measurements
+    information = np.zeros(model.state.shading.shape)
+    shading = model.state.shading.copy()
+    known = shading.any(axis=1)
+    for group in groups:
+        height, width = group.images.shape[1:]
+        area = np.s_[group.row : group.row + height, group.column : group.column + width]
+        for (name, surface, view), image in zip(group.names, group.images, strict=True):
+            if name == "shading":
+                weighted = model.weights[area] * image
+                information[surface, view] = np.sum(weighted * image, dtype=np.float64)
+                pull = float(np.sum(weighted * rest[area], dtype=np.float64))
+                shading[surface, view] += pull / max(information[surface, view], TINY)
+    shading -= shading.mean(axis=1, keepdims=True)
+    variance = float(np.average(rest**2 * model.weights, weights=model.weights > 0))
+    gain = np.mean(information * shading**2, axis=1)
+    shaded = (np.std(shading, axis=1) > MIN_SHADING) & (gain > SHADING_SIGMAS**2 * variance)
+    shaded |= known
+    model.behind = model.behind & shaded[model.surface]
+    left = []
+    for group in groups:
+        own = [
+            i for i, (name, one, _) in enumerate(group.names) if name != "shading" or shaded[one]
+        ]
+        left.append(group._replace(names=[group.names[i] for i in own], images=group.images[own]))
+    return left
 
 
 def _eliminate_amplitude(
@@ -307,7 +346,7 @@ def _eliminate_amplitude(
 def _scale_amplitude(model: SurfaceModel, lit: NDArray[np.bool_]) -> Image:
     """Scales in which lit amplitudes count alike for the data; 0 for all others, which stay."""
     diagonal = model.gather(model.weights, squared=True)
-    scale = 1 / np.sqrt(np.maximum(diagonal, np.finfo(np.float32).tiny))
+    scale = 1 / np.sqrt(np.maximum(diagonal, TINY))
     return np.where(lit & (diagonal > 0), scale, 0).astype(np.float32)
 
 
@@ -328,6 +367,28 @@ def _explain_by_amplitude(
         before, energy = energy, float(np.sum(residual**2, dtype=np.float64))
         direction = residual + np.float32(energy / before) * direction
     return change
+
+
+def _leave_unexplained(model: SurfaceModel, error: Image, scale: Image) -> Image:
+    """What amplitudes cannot explain of a misfit."""
+    change = _explain_by_amplitude(model, error, scale, ELIMINATION_ITERATIONS)
+    rest: Image = error - model.render(change)
+    return rest
+
+
+def compute_objective(model: SurfaceModel, amplitude: Image) -> float:
+    """Return half the weighted squared misfit that amplitudes cannot explain, and what is known of
+    surfaces and sweep beforehand.
+
+    Parameters
+    ----------
+    model : SurfaceModel
+    amplitude : (points,) float32 array
+    """
+    error = model.image - model.render(amplitude)
+    return _objective(
+        model, _leave_unexplained(model, error, _scale_amplitude(model, amplitude > 0))
+    )
 
 
 def _objective(model: SurfaceModel, rest: Image) -> float:
@@ -412,6 +473,8 @@ def _move(
     """The state after a step; gains and widths change relatively."""
     moved = state.copy()
     for (name, surface, number), value in zip(names, change, strict=True):
-        values = moved.coefficients[surface] if name == "coefficients" else getattr(moved, name)
+        values = getattr(moved, name)
+        if name in ("coefficients", "shading"):
+            values = values[surface]
         values[number] += value * (values[number] if name in ("gains", "widths") else 1.0)
     return moved

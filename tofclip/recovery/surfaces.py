@@ -139,7 +139,7 @@ class SurfaceRecovery:
         }
         return replace(
             start,
-            values=_render_frames(start, model, amplitude),
+            values=_render_frames(start, model, model.shade(model.reference, amplitude)),
             camera=camera,
             figures={**start.figures, **figures},
             shears=np.asarray(camera.shear_at(distance)),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from apps.studies.surfaces import SCENES, make_small_instrument, score_methods
+from apps.studies.surfaces import SCENES, make_scene_instrument, score_methods
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", SCENES)
 def test_surfaces_are_never_worse_than_frames_in_good_light(name: str) -> None:
-    found = score_methods(SCENES[name](), make_small_instrument(2000), 0, fit=False)
+    found = score_methods(SCENES[name](), make_scene_instrument(name, 2000), 0, fit=False)
     ours = found["surfaces"].figures
     others = [found[method].figures for method in ("l1", "tv")]
     # on seed 0: 0.57 on slanted plates, 0.64 and 0.70 of l1 on wires and gauze
