@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from apps.studies.best import choose_settings
 from apps.studies.cases import (
     BORDER_PX,
     CAMERA_NAMES,
@@ -52,6 +53,21 @@ TABLE4_PERCENT = {  # refocused from the light field, direct; at each shear
     ("single-pixel", "blocks"): ((10.47, 10.67), (6.23, 7.35)),
     ("single-pixel", "letters"): ((13.02, 7.53), (4.41, 4.05)),
 }
+LIGHT_FIELD_CASES = [
+    Case((scene, f"{ratio:g}", LIGHT_FIELD_LABEL), scene, "single-pixel", ratio, 0.0, figures[0])
+    for (scene, ratio), figures in TABLE3_PERCENT.items()
+]
+PICTURE_CASES = [
+    Case((scene, f"{ratio:g}", f"s = {shear:g}"), scene, "single-pixel", ratio, shear, percent)
+    for (scene, ratio), figures in TABLE3_PERCENT.items()
+    for shear, percent in zip(SHEARS, figures[1:], strict=True)
+]
+REFOCUSING_CASES = [
+    Case((CAMERA_NAMES[encoder], scene, f"{shear:g}", label), scene, encoder, 1.0, shear, percent)
+    for (encoder, scene), figures in TABLE4_PERCENT.items()
+    for label, own in zip((REFOCUSED_LABEL, DIRECT_LABEL), figures, strict=True)
+    for shear, percent in zip(TABLE4_SHEARS, own, strict=True)
+]
 
 
 def recover_light_field(case: Case, library: Library, seed: int) -> LightField:
@@ -103,21 +119,10 @@ def run_table3(library: Library, seeds: int, advance: Advance) -> Outcome:
     Outcome
         A row of figures for each case, and the pictures to show.
     """
-    wholes = [
-        Case(
-            (scene, f"{ratio:g}", LIGHT_FIELD_LABEL), scene, "single-pixel", ratio, 0.0, figures[0]
-        )
-        for (scene, ratio), figures in TABLE3_PERCENT.items()
-    ]
-    direct = [
-        Case((scene, f"{ratio:g}", f"s = {shear:g}"), scene, "single-pixel", ratio, shear, percent)
-        for (scene, ratio), figures in TABLE3_PERCENT.items()
-        for shear, percent in zip(SHEARS, figures[1:], strict=True)
-    ]
-    solved = solve_cases(direct, library, seeds, advance)
-    found = _recover_light_fields(wholes, library, seeds, advance)
+    solved = solve_cases(PICTURE_CASES, library, seeds, advance)
+    found = _recover_light_fields(LIGHT_FIELD_CASES, library, seeds, advance)
     rows, panels = [], []
-    for number, (whole, fields) in enumerate(zip(wholes, found, strict=True)):
+    for number, (whole, fields) in enumerate(zip(LIGHT_FIELD_CASES, found, strict=True)):
         own = solved[4 * number : 4 * number + 4]
         truth = library.light_field(whole.scene).pictures
         percent = tuple(100 * nmse(field.pictures, truth, BORDER_PX) for field in fields)
@@ -149,18 +154,7 @@ def run_table4(library: Library, seeds: int, advance: Advance) -> Outcome:
     Outcome
         A row of figures for each case, and the pictures to show.
     """
-    direct = [
-        Case(
-            (CAMERA_NAMES[encoder], scene, f"{shear:g}", DIRECT_LABEL),
-            scene,
-            encoder,
-            1.0,
-            shear,
-            percent,
-        )
-        for (encoder, scene), (_, figures) in TABLE4_PERCENT.items()
-        for shear, percent in zip(TABLE4_SHEARS, figures, strict=True)
-    ]
+    direct = [case for case in REFOCUSING_CASES if case.labels[-1] == DIRECT_LABEL]
     wholes = [
         Case((CAMERA_NAMES[encoder], scene), scene, encoder, 1.0, 0.0)
         for encoder, scene in TABLE4_PERCENT
@@ -229,6 +223,10 @@ STUDIES = (
         40,
         5 * len(TABLE3_PERCENT),
         run_table3,
+        best=(
+            *(choose_settings(case, is_light_field=True) for case in LIGHT_FIELD_CASES),
+            *map(choose_settings, PICTURE_CASES),
+        ),
     ),
     Study(
         "table4",
@@ -240,5 +238,6 @@ STUDIES = (
         40,
         3 * len(TABLE4_PERCENT),
         run_table4,
+        best=tuple(map(choose_settings, REFOCUSING_CASES)),
     ),
 )

@@ -16,6 +16,7 @@ from apps.occlusion.probe import (
     probe_with_fixed_camera,
 )
 from apps.occlusion.scenes import BASELINE_M, make_occlusion_scene, make_upright_bar
+from apps.studies.best import choose_settings
 from apps.studies.cases import BORDER_PX, CAMERA_NAMES, Case, Library, solve_cases
 from apps.studies.outcome import CROSS_VALIDATED, Advance, Outcome, Panel, Row, Study
 from tofclip.metrics import nmse
@@ -89,6 +90,7 @@ BLACK_STUDY = Study(
     15,
     len(BLACK_CASES),
     run_black_occluders,
+    best=tuple(map(choose_settings, BLACK_CASES)),
 )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from apps.studies.best import BestCase
     from apps.studies.cases import Library
 
 Advance = Callable[[int], None]
@@ -105,6 +106,8 @@ class Study:
         Advances for each seed.
     recording : str or None
         What it needs of the folder of recorded data; without that it cannot be made.
+    best : tuple of BestCase
+        Rows of the paper that are also solved with the settings of choice.
     """
 
     name: str
@@ -117,3 +120,4 @@ class Study:
     work: Callable[[Library, int, Advance], Outcome]
     seeded: bool = True
     recording: str | None = None
+    best: tuple[BestCase, ...] = ()

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from itertools import groupby
 
+from apps.studies.best import choose_settings
 from apps.studies.cases import CAMERA_NAMES, Case, Library, SolvedCase, solve_cases
 from apps.studies.outcome import CROSS_VALIDATED, Advance, Outcome, Panel, Row, Study
 from tofclip.simulate.light_fields.scenes import EDITS
@@ -84,6 +85,7 @@ FLIP_STUDY = Study(
     40,
     len(FLIP_CASES),
     run_flip_test,
+    best=tuple(map(choose_settings, FLIP_CASES)),
 )
 
 
@@ -100,6 +102,36 @@ TABLE6_PERCENT = {  # photons of the largest measurement to NMSE, per cent
     ("single-pixel", "blocks"): {400: 57.88, 1000: 40.62, 4000: 20.58, 10000: 14.95},
     ("single-pixel", "letters"): {400: 43.45, 1000: 25.45, 4000: 16.16, 10000: 7.05},
 }
+
+
+INVALID_CASES = [
+    Case(
+        (CAMERA_NAMES[encoder], scene, f"{100 * share:g} %", term),
+        scene,
+        encoder,
+        1.0,
+        SHEARS[scene],
+        percent if term == "squares" else None,
+        bad_fraction=share,
+        data_term=term,
+    )
+    for (encoder, scene), figures in TABLE5_PERCENT.items()
+    for term in ("squares", "huber")
+    for share, percent in figures.items()
+]
+PHOTON_CASES = [
+    Case(
+        (CAMERA_NAMES[encoder], scene, str(photons)),
+        scene,
+        encoder,
+        1.0,
+        SHEARS[scene],
+        percent,
+        photons=photons,
+    )
+    for (encoder, scene), figures in TABLE6_PERCENT.items()
+    for photons, percent in figures.items()
+]
 
 
 def run_invalid_measurements(library: Library, seeds: int, advance: Advance) -> Outcome:
@@ -120,24 +152,9 @@ def run_invalid_measurements(library: Library, seeds: int, advance: Advance) -> 
     Outcome
         A row of figures for each case, and the pictures to show.
     """
-    cases = [
-        Case(
-            (CAMERA_NAMES[encoder], scene, f"{100 * share:g} %", term),
-            scene,
-            encoder,
-            1.0,
-            SHEARS[scene],
-            percent if term == "squares" else None,
-            bad_fraction=share,
-            data_term=term,
-        )
-        for (encoder, scene), figures in TABLE5_PERCENT.items()
-        for term in ("squares", "huber")
-        for share, percent in figures.items()
-    ]
     return _make_outcome(
         ("camera", "scene", "bad measurements", "data term"),
-        solve_cases(cases, library, seeds, advance),
+        solve_cases(INVALID_CASES, library, seeds, advance),
     )
 
 
@@ -158,21 +175,8 @@ def run_few_photons(library: Library, seeds: int, advance: Advance) -> Outcome:
     Outcome
         A row of figures for each case, and the pictures to show.
     """
-    cases = [
-        Case(
-            (CAMERA_NAMES[encoder], scene, str(photons)),
-            scene,
-            encoder,
-            1.0,
-            SHEARS[scene],
-            percent,
-            photons=photons,
-        )
-        for (encoder, scene), figures in TABLE6_PERCENT.items()
-        for photons, percent in figures.items()
-    ]
     return _make_outcome(
-        ("camera", "scene", "photons"), solve_cases(cases, library, seeds, advance)
+        ("camera", "scene", "photons"), solve_cases(PHOTON_CASES, library, seeds, advance)
     )
 
 
@@ -197,8 +201,9 @@ CORRUPTION_STUDIES = (
         "The paper does not say its data term; its figures stand beside squares, Huber's is ours. Scenes are our own.",
         CROSS_VALIDATED,
         50,
-        2 * sum(map(len, TABLE5_PERCENT.values())),
+        len(INVALID_CASES),
         run_invalid_measurements,
+        best=tuple(choose_settings(case) for case in INVALID_CASES if case.paper is not None),
     ),
     Study(
         "table6",
@@ -207,8 +212,9 @@ CORRUPTION_STUDIES = (
         "Scenes are our own.",
         CROSS_VALIDATED,
         15,
-        sum(map(len, TABLE6_PERCENT.values())),
+        len(PHOTON_CASES),
         run_few_photons,
+        best=tuple(map(choose_settings, PHOTON_CASES)),
     ),
 )
 

@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 
+from apps.studies.best import choose_settings
 from apps.studies.cases import (
     CAMERA_NAMES,
     Case,
@@ -129,6 +130,7 @@ def _make_study(name: str, figure: str, title: str, table: RepresentationTable, 
         35,
         len(table.cases),
         partial(RepresentationTable.evaluate, table),
+        best=tuple(choose_settings(case) for case in table.cases if case.paper is not None),
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from apps.conventions import (
@@ -18,7 +19,7 @@ from apps.conventions import (
 )
 from apps.progress import show_progress
 from tofclip.errors import InputError
-from tofclip.io.light_fields import read_light_field
+from tofclip.io.light_fields import read_depth_map, read_light_field
 from tofclip.light_field.measurement import (
     CameraSetup,
     ClipMeasurement,
@@ -26,15 +27,25 @@ from tofclip.light_field.measurement import (
     measure,
 )
 from tofclip.metrics import nmse, nmse_energy
-from tofclip.recovery.light_field import ClipRecovery
+from tofclip.recovery.all_in_focus import (
+    AllInFocus,
+    count_recoveries,
+    make_shear_range,
+    recover_all_in_focus,
+    recover_on_depth_map,
+)
+from tofclip.recovery.light_field import ClipRecovery, ClipResult
 from tofclip.storage import Field, Record, atomic_path
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from tofclip.light_field import LightField
+
 
 # Views leave the picture there, so that the rim is not scored.
 SCORED_BORDER_PX = 12
+SURFACES = "surfaces"
 
 app = typer.Typer(help="Light fields from few nonlocal measurements.", no_args_is_help=True)
 
@@ -129,8 +140,8 @@ def recover(
         str,
         typer.Option(
             metavar="NAME",
-            help="fast, or quality: a denoiser finishes.",
-            autocompletion=make_completer("fast", "quality"),
+            help="fast; quality: a denoiser finishes; surfaces: each pixel at its own depth.",
+            autocompletion=make_completer("fast", "quality", "surfaces"),
         ),
     ] = "fast",
     weight: Annotated[
@@ -148,32 +159,49 @@ def recover(
     truth: Annotated[
         Path | None, typer.Option(metavar="LIGHTFIELD", help="Light field to score against.")
     ] = None,
+    all_in_focus: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Picture sharp at all depths to write: .h5 (with its depths), .png or .exr.",
+        ),
+    ] = None,
+    depth_map: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Known shear of each pixel: .npy, or .h5 written by --all-in-focus.",
+            show_default="found from the measurements",
+        ),
+    ] = None,
+    shear_range: Annotated[
+        tuple[float, float],
+        typer.Option(metavar="S S", help="Nearest and farthest shear of surfaces to look for."),
+    ] = (-1.4, 1.4),
     as_json: JsonOption = False,
 ) -> None:
-    """Recover the picture refocused at one depth.
+    """Recover the picture refocused at one depth, and one that is sharp at all depths.
+
+    With surfaces one picture explains all measurements, each pixel at its own depth; the picture
+    refocused at S is rendered from it. The weight is then that of this picture.
 
     Example: tofclip clip recover measurements.h5 --shear -0.3 --preset quality --out picture.png
     """
     # No output may replace a file that is read.
-    inputs = (measurement,) if truth is None else (measurement, truth)
+    inputs = tuple(path for path in (measurement, truth, depth_map) if path is not None)
+    outputs = [path for path in (out, all_in_focus) if path is not None]
     # A wrong ending is refused before the recovery, not after it.
-    require_writable(out, ".h5", ".png", ".exr", inputs=inputs)
-    settings = ClipRecovery(prior, preset, _parse_weight(weight), data_term)
-    measurements = ClipMeasurement.load(measurement)
-    title = "recovering" if settings.weight is not None else "choosing the weight"
-    with show_progress(title, settings.work) as advance:
-        recovered = settings.recover(measurements, shear, advance)
-    figures: dict[str, Any] = (
-        {} if truth is None else _score_picture(recovered.picture, truth, shear)
+    for path in outputs:
+        require_writable(path, ".h5", ".png", ".exr", inputs=inputs)
+    if out == all_in_focus:
+        raise InputError("--out and --all-in-focus name the same file; take two")
+    if depth_map is not None and preset != SURFACES and all_in_focus is None:
+        raise InputError("--depth-map serves --preset surfaces and --all-in-focus only")
+    settings = ClipRecovery(
+        prior, "fast" if preset == SURFACES else preset, _parse_weight(weight), data_term
     )
-    figures |= {
-        "weight": recovered.weight,
-        "iterations": recovered.iterations,
-        "stopped_because": recovered.stop_reason,
-        "seconds": recovered.seconds,
-        "seconds_setup": recovered.seconds_setup,
-        "seconds_weight": recovered.seconds_weight,
-    }
+    measurements = ClipMeasurement.load(measurement)
+    known_field = None if truth is None else read_light_field(truth)
     past = {
         "verb": "clip recover",
         "shear": shear,
@@ -181,8 +209,79 @@ def recover(
         "preset": preset,
         "data_term": data_term,
     }
-    _write_picture(recovered.picture, out, measurement, past | {"weight": recovered.weight})
-    report(figures, as_json, [out])
+    surfaces = None
+    if preset == SURFACES or all_in_focus is not None:
+        surfaces = _recover_surfaces(
+            measurements,
+            replace(settings, preset="fast"),
+            settings.weight if preset == SURFACES else None,
+            depth_map,
+            shear_range,
+        )
+    if surfaces is not None and preset == SURFACES:
+        picture = surfaces.render_views(measurements.views).refocus(shear)
+        recovered: AllInFocus | ClipResult = surfaces
+        seconds = {"seconds": surfaces.seconds}
+    else:
+        title = "recovering" if settings.weight is not None else "choosing the weight"
+        with show_progress(title, settings.work) as advance:
+            recovered = plain = settings.recover(measurements, shear, advance)
+        picture = plain.picture
+        seconds = {
+            "seconds": plain.seconds,
+            "seconds_setup": plain.seconds_setup,
+            "seconds_weight": plain.seconds_weight,
+        }
+    figures: dict[str, Any] = (
+        {} if known_field is None else _score_picture(picture, known_field.refocus(shear))
+    )
+    if surfaces is not None and all_in_focus is not None:
+        figures |= _write_all_in_focus(surfaces, known_field, all_in_focus, measurement, past)
+    figures |= {
+        "weight": recovered.weight,
+        "iterations": recovered.iterations,
+        "stopped_because": recovered.stop_reason,
+        **seconds,
+    }
+    _write_picture({"picture": picture}, out, measurement, past | {"weight": recovered.weight})
+    report(figures, as_json, outputs)
+
+
+def _recover_surfaces(
+    measurements: ClipMeasurement,
+    settings: ClipRecovery,
+    weight: float | None,
+    depth_map: Path | None,
+    shear_range: tuple[float, float],
+) -> AllInFocus:
+    """Recover one picture with a depth for each pixel, known or found."""
+    if depth_map is not None:
+        shears = read_depth_map(depth_map)
+        with show_progress("recovering at known depths", 1) as advance:
+            found = recover_on_depth_map(measurements, shears, weight, settings)
+            advance(1)
+        return found
+    depths = make_shear_range(*shear_range, measurements.views)
+    with show_progress("looking for depths", count_recoveries(depths)) as advance:
+        return recover_all_in_focus(measurements, depths, weight, settings, advance)
+
+
+def _write_all_in_focus(
+    surfaces: AllInFocus,
+    truth: LightField | None,
+    out: Path,
+    measurement: Path,
+    past: dict[str, Any],
+) -> dict[str, float]:
+    """Write the picture that is sharp everywhere; return how far it is from the reference view."""
+    past = past | {"weight": surfaces.weight}
+    _write_picture({"picture": surfaces.picture, "shears": surfaces.shears}, out, measurement, past)
+    if truth is None:
+        return {}
+    references = truth.pictures[np.all(truth.views == 0, axis=1)]
+    if not len(references):
+        return {}
+    return {"nmse_all_in_focus": nmse(surfaces.picture, references[0], SCORED_BORDER_PX)}
 
 
 def _parse_weight(text: str) -> float | None:
@@ -196,9 +295,8 @@ def _parse_weight(text: str) -> float | None:
         raise InputError(f"--weight takes 'auto' or a number, not '{text}'") from None
 
 
-def _score_picture(picture: NDArray[Any], truth: Path, shear: float) -> dict[str, float]:
+def _score_picture(picture: NDArray[Any], refocused: NDArray[Any]) -> dict[str, float]:
     """Compare with the true views' shift-and-add."""
-    refocused = read_light_field(truth).refocus(shear)
     return {
         "nmse": nmse(picture, refocused, SCORED_BORDER_PX),
         "nmse_whole_frame": nmse(picture, refocused),
@@ -207,13 +305,17 @@ def _score_picture(picture: NDArray[Any], truth: Path, shear: float) -> dict[str
 
 
 def _write_picture(
-    picture: NDArray[Any], out: Path, measurement: Path, settings: dict[str, Any]
+    arrays: dict[str, NDArray[Any]], out: Path, measurement: Path, settings: dict[str, Any]
 ) -> None:
     """Write the picture; a PNG is scaled to the picture's own brightest pixel, the others keep the
-    values.
+    values, and HDF5 keeps its shears as well.
     """
+    picture = arrays["picture"]
     if out.suffix.lower() == ".h5":
-        fields_kept = {"picture": Field(picture, "", ("y", "x"))}
+        units = {"shears": "px"}
+        fields_kept = {
+            name: Field(values, units.get(name, ""), ("y", "x")) for name, values in arrays.items()
+        }
         past = build_provenance(settings, measurement)
         Record("picture", fields_kept, {"shear": settings["shear"]}, provenance=past).save(out)
         return

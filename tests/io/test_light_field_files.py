@@ -10,7 +10,7 @@ from matplotlib.image import imsave
 from tifffile import imwrite
 
 from tofclip.errors import FileFormatError, InputError, StorageError, TofclipError
-from tofclip.io.light_fields import read_light_field, write_light_field
+from tofclip.io.light_fields import read_depth_map, read_light_field, write_light_field
 from tofclip.light_field import LightField
 
 VIEWS = np.array([(v, u) for v in (-1.0, 0.0) for u in (-1.0, 0.0, 1.5)])
@@ -163,3 +163,16 @@ def test_nan_and_constant_pictures_are_refused(tmp_path, fault):
     OpenEXR.File([part]).write(str(tmp_path / "field.exr"))
     with pytest.raises(TofclipError):
         read_light_field(tmp_path / "field.exr")
+
+
+def test_a_map_of_depths_is_numbers_in_rows_and_columns(tmp_path):
+    path = tmp_path / "map.npy"
+    np.save(path, np.array([[0.5, np.inf], [-1.0, 0.0]], np.float32))
+    np.testing.assert_array_equal(read_depth_map(path), [[0.5, np.inf], [-1.0, 0.0]])
+    for wrong in (np.zeros(3), np.array([["a"]]), np.array([[None]])):
+        np.save(path, wrong, allow_pickle=True)
+        with pytest.raises(FileFormatError, match=r"map\.npy"):
+            read_depth_map(path)
+    path.write_bytes(path.read_bytes()[:20])
+    with pytest.raises(FileFormatError, match=r"map\.npy"):
+        read_depth_map(path)

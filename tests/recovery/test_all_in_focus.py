@@ -4,6 +4,8 @@ the farther one.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,12 @@ from tofclip.light_field import LightField
 from tofclip.light_field.measurement import CameraSetup, ClipMeasurement, measure
 from tofclip.light_field.warp import find_view_labels, make_view_warp
 from tofclip.metrics import nmse
-from tofclip.recovery.all_in_focus import recover_all_in_focus, recover_on_depth_map
+from tofclip.recovery.all_in_focus import (
+    count_recoveries,
+    make_shear_range,
+    recover_all_in_focus,
+    recover_on_depth_map,
+)
 from tofclip.recovery.light_field import ClipRecovery
 
 SIDE = 48
@@ -71,22 +78,46 @@ def test_a_matrix_of_views_matches_its_adjoint():
     assert np.vdot(warp(x), y) == pytest.approx(np.vdot(x, warp.H(y)), rel=1e-4)
 
 
-def test_one_picture_for_all_depths_is_better_than_any_refocused_one(measurement):
-    found = recover_on_depth_map(measurement, SHEARS[LABELS])
+def test_one_picture_for_all_depths_is_better_than_any_refocused_one(measurement, scene):
+    found = recover_on_depth_map(measurement, SHEARS[LABELS], weight=3e-4)
     plain = ClipRecovery(weight=1e-2)
-    refocused = min(
-        nmse(plain.recover(measurement, shear).picture, REFERENCE, 4) for shear in SHEARS
+    refocused = [plain.recover(measurement, shear).picture for shear in SHEARS]
+    assert nmse(found.picture, REFERENCE, 4) < 0.5 * min(
+        nmse(picture, REFERENCE, 4) for picture in refocused
     )
-    assert nmse(found.picture, REFERENCE, 4) < 0.5 * refocused
     assert found.refocused is None
+    # what is out of focus is rendered too, and does not have to be guessed
+    views = found.render_views(VIEWS)
+    for shear, picture in zip(SHEARS, refocused, strict=True):
+        true = scene.refocus(shear)
+        assert nmse(views.refocus(shear), true, 4) < 0.85 * nmse(picture, true, 4)  # 0.47, 0.72
+
+
+def test_a_weight_that_is_not_given_predicts_what_was_left_out(measurement):
+    """Cross-validation, as for one depth; noise asks for more of the prior."""
+    random = np.random.default_rng(0)
+    noise = 0.3 * measurement.values.std() * random.standard_normal(measurement.values.size)
+    noisy = replace(measurement, values=measurement.values + noise.astype(np.float32))
+    found = [recover_on_depth_map(one, SHEARS[LABELS]).weight for one in (measurement, noisy)]
+    assert found[1] > 2 * found[0]  # 5.4
 
 
 def test_depths_are_found_and_the_picture_beats_depth_from_focus(measurement):
-    found = recover_all_in_focus(measurement, np.arange(-1.5, 1.01, 0.5))
+    shears, steps = np.arange(-1.5, 1.01, 0.5), []
+    found = recover_all_in_focus(measurement, shears, progress=steps.append)
+    assert sum(steps) == count_recoveries(shears)
     assert found.refocused is not None
     error, other = (nmse(one, REFERENCE, 4) for one in (found.picture, found.refocused))
     assert error < other
     assert np.median(found.shears[FRAME]) == pytest.approx(NEAR, abs=0.25)
+
+
+def test_depths_are_tried_as_close_as_the_outermost_view_tells_them_apart():
+    shears = make_shear_range(-1.0, 0.5, VIEWS)
+    assert (shears[0], shears[-1]) == (-1.0, 0.5)
+    assert np.diff(shears).max() * 2 <= 0.6 + 1e-9
+    with pytest.raises(InputError, match="smaller"):
+        make_shear_range(0.5, -1.0, VIEWS)
 
 
 def test_maps_that_make_no_sense_are_refused(measurement):

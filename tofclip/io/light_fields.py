@@ -22,11 +22,17 @@ from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.file_limits import BoundedFile, require_bounded_size
-from tofclip.io.archive import Archive
+from tofclip.io.archive import NPY_SUFFIX, Archive
 from tofclip.io.exr import Channels, read_exr_parts
 from tofclip.io.tiff import MAX_PIXELS, NULL_LOG_HANDLER, require_bounded_page
 from tofclip.light_field import LightField
-from tofclip.storage import atomic_path, collect_provenance, format_error_line
+from tofclip.storage import (
+    Record,
+    atomic_path,
+    collect_provenance,
+    format_error_line,
+    translate_read_errors,
+)
 
 NUMBER_PATTERN = r"([-+]?\d+(?:\.\d+)?)"
 PART_NAME_PATTERN = re.compile(rf"v={NUMBER_PATTERN},u={NUMBER_PATTERN}")
@@ -273,6 +279,40 @@ def write_light_field(light_field: LightField, path: str | Path) -> None:
     if writer is None:
         raise InputError(f"{target}: the name of a light field must end in {' or '.join(_WRITERS)}")
     writer(light_field, target)
+
+
+def read_depth_map(path: str | Path) -> NDArray[np.float64]:
+    """Read the shear of each pixel of the reference view.
+
+    Parameters
+    ----------
+    path : path-like
+        ``.npy``: an array (rows, columns), pixels per view step, infinite where there is nothing.
+        ``.h5``: a picture with its shears, written by ``tofclip clip recover --all-in-focus``.
+
+    Returns
+    -------
+    (rows, columns) float64 array
+
+    Raises
+    ------
+    StorageError, FileFormatError
+        The file cannot be read, or holds something else.
+    """
+    source = Path(path)
+    if source.suffix.lower() != NPY_SUFFIX:
+        return Record.load(source, "picture").array("shears", np.float64, 2, "px")
+    with translate_read_errors(source):
+        try:
+            # mapped, so that a header that claims more than there is takes no memory
+            mapped = np.load(source, mmap_mode="r", allow_pickle=False)
+        except (ValueError, EOFError) as fault:
+            raise FileFormatError(source, format_error_line(fault)) from fault
+    if mapped.ndim != 2 or mapped.dtype.kind not in "fiu":
+        raise FileFormatError(
+            source, f"a map of depths is (rows, columns) numbers, found {mapped.shape}"
+        )
+    return np.array(mapped, np.float64)
 
 
 def _read_archive(path: Path) -> LightField:

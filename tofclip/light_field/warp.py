@@ -127,4 +127,6 @@ def _make_view(
         pixels[0, own] = at[0] * columns + at[1]
     target = np.broadcast_to(np.arange(labels.size), (4, labels.size)).ravel()
     entries = weights.reshape(-1).astype(np.float32), (target, pixels.reshape(-1).astype(np.int64))
-    return scipy.sparse.csr_array(entries, shape=(labels.size, labels.size))
+    matrix = scipy.sparse.csr_array(entries, shape=(labels.size, labels.size))
+    matrix.eliminate_zeros()  # points on pixels need one of four
+    return matrix

@@ -17,6 +17,7 @@ from tofclip.errors import InputError
 from tofclip.light_field import LightField
 from tofclip.light_field.measurement import ClipMeasurement
 from tofclip.operators import Diagonal, Identity, LinearOperator, ViewSelection
+from tofclip.operators.light_field_camera import LightFieldCamera
 from tofclip.solvers import (
     DataTermMaker,
     Huber,
@@ -30,7 +31,12 @@ from tofclip.solvers import (
     Wavelets,
     ignore_progress,
 )
-from tofclip.solvers.cross_validation import INITIAL_WEIGHT, MAX_WEIGHT_WORK, choose_weight
+from tofclip.solvers.cross_validation import (
+    FOLD_COUNT,
+    INITIAL_WEIGHT,
+    MAX_WEIGHT_WORK,
+    choose_weight,
+)
 from tofclip.solvers.data_terms import estimate_robust_deviation
 from tofclip.solvers.denoisers import BlockMatching, CollaborativeWiener, Denoiser, NonlocalMeans
 from tofclip.solvers.light_field_variation import LightFieldVariation
@@ -67,6 +73,28 @@ Its prediction error is a sum of many small errors on the dark ground, which any
 and of edges cut off; on letters with 0 to 10 % bad measurements the best weight is 1.5 to 2 times
 the one with the lowest error.
 """
+
+
+@dataclass(frozen=True)
+class WeightSearch:
+    """How a weight is looked for by cross-validation.
+
+    Parameters
+    ----------
+    first : float
+        Weight that is tried first.
+    max_folds : int
+        Folds that are tried.
+    tolerance : float
+        Of the objective in an iteration, at which a trial stops.
+    """
+
+    first: float = INITIAL_WEIGHT
+    max_folds: int = FOLD_COUNT
+    tolerance: float = OBJECTIVE_TOLERANCE
+
+
+THOROUGH_SEARCH = WeightSearch()
 
 
 @dataclass(frozen=True)
@@ -157,10 +185,40 @@ class ClipRecovery:
         ClipResult
             Picture (rows, columns), weight of the prior, and seconds of each step.
         """
+        camera = measurement.camera()
+        return self.recover_picture(measurement, camera, camera.model(shear), progress)
+
+    def recover_picture(
+        self,
+        measurement: ClipMeasurement,
+        camera: LightFieldCamera,
+        model: LinearOperator,
+        progress: Progress = ignore_progress,
+        search: WeightSearch = THOROUGH_SEARCH,
+    ) -> ClipResult:
+        """Recover the picture that a model of one's own explains the measurements by.
+
+        Parameters
+        ----------
+        measurement : ClipMeasurement
+        camera : LightFieldCamera
+            That made them.
+        model : LinearOperator
+            Picture (rows, columns) to measurements (measurements,), such as ``camera.model(shear)``.
+        progress : callable
+            As for `recover`.
+        search : WeightSearch
+            For a weight, if none is given.
+
+        Returns
+        -------
+        ClipResult
+            Picture (rows, columns), weight of the prior, and seconds of each step.
+        """
         begin = perf_counter()
-        problem = self._make_problem(measurement, shear)
+        problem = self._make_problem(measurement, camera, model)
         ready = perf_counter()
-        method = self._choose_method(problem, progress)
+        method = self._choose_method(problem, progress, search)
         chosen = perf_counter()
         result = self._add_denoiser(method).recover(problem.model, problem.measurements)
         progress(1)
@@ -174,9 +232,10 @@ class ClipRecovery:
             chosen - ready,
         )
 
-    def _make_problem(self, measurement: ClipMeasurement, shear: float) -> _InverseProblem:
-        camera = measurement.camera()
-        model, weighting = camera.model(shear), camera.weighting()
+    def _make_problem(
+        self, measurement: ClipMeasurement, camera: LightFieldCamera, model: LinearOperator
+    ) -> _InverseProblem:
+        weighting = camera.weighting()
         if self.data_term != "poisson":
             measurements = weighting(measurement.values)[:, np.newaxis]
             return _InverseProblem(
@@ -196,9 +255,11 @@ class ClipRecovery:
             model, measurements, camera.correlation_length, partial(Poisson, deviation=deviation)
         )
 
-    def _choose_method(self, problem: _InverseProblem, progress: Progress) -> ProximalMethod:
+    def _choose_method(
+        self, problem: _InverseProblem, progress: Progress, search: WeightSearch
+    ) -> ProximalMethod:
         """Return the prior's method with its data term and weight."""
-        first = INITIAL_WEIGHT if self.weight is None else self.weight
+        first = search.first if self.weight is None else self.weight
         method = VARIATIONAL_PRIORS.get(self.prior, TotalVariation)(
             first, MAX_ITERATIONS, OBJECTIVE_TOLERANCE, problem.data_term
         )
@@ -208,11 +269,13 @@ class ClipRecovery:
             return method
         # neighbours on a detector are left out together, or they would predict each other
         weight = choose_weight(
-            method,
+            replace(method, tolerance=search.tolerance),
             problem.model,
             problem.measurements[:, 0],
             problem.correlation_length,
             progress=progress,
+            first=search.first,
+            max_folds=search.max_folds,
         ).weight
         return replace(
             method, weight=weight * HUBER_WEIGHT_FACTOR if self.data_term == "huber" else weight

@@ -64,6 +64,8 @@ def choose_weight(
     run: int,
     seed: int = 0,
     progress: Progress = ignore_progress,
+    first: float = INITIAL_WEIGHT,
+    max_folds: int = FOLD_COUNT,
 ) -> WeightChoice:
     """Choose the weight at which measurements left out of the recovery are predicted best
     (eight-fold cross-validation).
@@ -90,6 +92,10 @@ def choose_weight(
     progress : callable
         Called with the number of recoveries just done, of `MAX_WEIGHT_WORK`; those that are not
         needed count as done at the end.
+    first : float
+        Weight that is tried first.
+    max_folds : int
+        Of the eight, that are tried; fewer take less time and know the error less well.
 
     Returns
     -------
@@ -101,7 +107,7 @@ def choose_weight(
         There is a single measurement, or the arrays are not NumPy's.
     """
     require_numpy("the choice of a prior's weight", measurements)
-    held = assign_folds(measurements.size, run, seed)
+    held = assign_folds(measurements.size, run, seed)[:, :max_folds]
     parts = np.split(held, held.shape[1], axis=1)
     column = measurements[:, np.newaxis]
 
@@ -115,7 +121,7 @@ def choose_weight(
         # the compiled loops of one picture keep one core busy and release the interpreter
         return sum(map_parallel(partial(unpredicted, replace(method, weight=weight)), parts))
 
-    choice = _search_downhill(error)
+    choice = _search_downhill(error, first)
     done = choice.errors.size * (FOLD_COUNT // len(parts)) * len(parts)
     progress(MAX_WEIGHT_WORK - done)
     return choice
@@ -160,21 +166,23 @@ def assign_folds(count: int, run: int, seed: int) -> NDArray[np.bool_]:
     return out
 
 
-def _search_downhill(error: Callable[[float], float]) -> WeightChoice:
-    """Try weights up or down from the first, whichever lowers the error, until it rises again."""
+def _search_downhill(
+    error: Callable[[float], float], first: float = INITIAL_WEIGHT
+) -> WeightChoice:
+    """Try weights up or down from `first`, whichever lowers the error, until it rises again."""
     # On a logarithmic axis the error has one valley: two trials say which way it goes down.
-    errors = {step: error(INITIAL_WEIGHT * WEIGHT_RATIO**step) for step in (0, 1)}
+    errors = {step: error(first * WEIGHT_RATIO**step) for step in (0, 1)}
     direction = 1 if errors[1] < errors[0] else -1
     while len(errors) < MAX_TRIALS:
         best = min(errors, key=errors.__getitem__)
         if best + direction in errors:
             break
-        errors[best + direction] = error(INITIAL_WEIGHT * WEIGHT_RATIO ** (best + direction))
+        errors[best + direction] = error(first * WEIGHT_RATIO ** (best + direction))
     steps = sorted(errors)
     values = np.array([errors[step] for step in steps])
     return WeightChoice(
-        float(INITIAL_WEIGHT * WEIGHT_RATIO ** _parabola_minimum(steps, values)),
-        INITIAL_WEIGHT * WEIGHT_RATIO ** np.array(steps, float),
+        float(first * WEIGHT_RATIO ** _parabola_minimum(steps, values)),
+        first * WEIGHT_RATIO ** np.array(steps, float),
         values,
     )
 
