@@ -16,7 +16,8 @@ from nlos.depths import DepthPropagator
 from nlos.method import Progress, ignore_progress
 from nlos.portable.library import ArrayLibrary, remove_whole_turns
 from nlos.rsd.diffraction import DiffractionPlan
-from nlos.rsd.image_planes import Illumination, LaserSource
+from nlos.rsd.illumination import Illumination
+from nlos.rsd.image_planes import LaserSource
 from nlos.rsd.kernels import TAPS
 from tofclip.arrays import Array
 from tofclip.threads import run_blocks, split_blocks

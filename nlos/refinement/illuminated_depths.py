@@ -12,7 +12,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from nlos.depths import DepthPropagator
 from nlos.rsd.diffraction import DiffractionPlan
-from nlos.rsd.image_planes import Illumination, LaserSource
+from nlos.rsd.illumination import Illumination
+from nlos.rsd.image_planes import LaserSource
 from tofclip.threads import run_blocks, thread_count
 
 Array = NDArray[Any]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,119 +23,16 @@ from nlos.rsd.diffraction import (
     choose_depths,
 )
 from nlos.rsd.groups import Interpolation, WaveGroups
+from nlos.rsd.illumination import (
+    Illumination,
+    build_constant_illumination,
+    split_illumination,
+)
 from nlos.rsd.inverse import choose_inverse
 from nlos.rsd.kernels import propagate_spectrum, scatter_terms
 from tofclip.threads import limit_blas_threads, run_blocks, split_blocks
 
-CHEBYSHEV_NODES = 64
-"""Chebyshev nodes over the distances on a plane; enough for a band that turns by 25 periods across
-them.
-"""
-
-TABLE_SAMPLES = 512
-"""Samples of a distance function; linear interpolation between them errs by 1e-4 at 6 periods."""
-
 FloatArray = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Illumination:
-    """``exp(1j * (k - k_0) * (R - middle)) ~ sum_m b_m(k) * f_m(R)``, the odd functions f times 1j.
-
-    The even and the odd part in R are each split by their own eigenvectors, which keeps everything
-    real and takes some two thirds of the terms of a Chebyshev expansion.
-
-    Parameters
-    ----------
-    coefficients : (frequencies, m) float32 array
-        b, even functions first.
-    even : int
-        How many functions are even.
-    table : (samples, m) float32 array
-        f over `span`.
-    span : (2,) float64 array
-        Smallest and largest R, m; `split_illumination` has it about 0.
-    """
-
-    coefficients: NDArray[np.float32]
-    even: int
-    table: NDArray[np.float32]
-    span: FloatArray
-
-
-def build_constant_illumination(frequencies: int) -> Illumination:
-    """No illumination wave: all frequencies simply add up."""
-    return Illumination(
-        np.ones((frequencies, 1), np.float32), 1, np.ones((2, 1), np.float32), np.zeros(2)
-    )
-
-
-def split_illumination(
-    detuning: FloatArray, strength: FloatArray, half: float, tolerance: float
-) -> Illumination:
-    """Split the illumination of distances from ``-half`` to ``half`` about a middle one.
-
-    Parameters
-    ----------
-    detuning : (frequencies,) array
-        ``k - k_0``, rad/m.
-    strength : (frequencies,) array
-        How much each frequency counts.
-    half : float
-        m.
-    tolerance : float
-        Root mean square error allowed, relative.
-
-    Returns
-    -------
-    Illumination
-    """
-    # Even and odd functions are known by their values at the positive half of the nodes.
-    angles = np.pi * (np.arange(CHEBYSHEV_NODES // 2) + 0.5) / CHEBYSHEV_NODES
-    phase = np.outer(np.cos(angles), half * detuning)
-    kept = [_find_leading_functions(wave(phase), strength, tolerance) for wave in (np.cos, np.sin)]
-    table = np.concatenate(
-        [_build_continuation_matrix(odd) @ values for odd, (values, _) in enumerate(kept)], axis=1
-    )
-    coefficients = np.concatenate([b for _, b in kept], axis=1)
-    span = np.array([-half, half])
-    return Illumination(
-        coefficients.astype(np.float32), kept[0][1].shape[1], table.astype(np.float32), span
-    )
-
-
-def _find_leading_functions(
-    wave: FloatArray, strength: FloatArray, tolerance: float
-) -> tuple[FloatArray, FloatArray]:
-    """Fewest orthonormal functions (nodes, m), and their coefficients (frequencies, m), that make
-    up `wave`.
-    """
-    weighted = wave * strength
-    values, vectors = np.linalg.eigh(weighted @ weighted.T)
-    # eigh sorts upwards; of both parts together, half the squared strength times the nodes is the
-    # whole.
-    allowed = tolerance**2 * np.sum(strength**2) * len(wave) / 2
-    dropped = int(np.count_nonzero(np.cumsum(np.maximum(values, 0)) < allowed))
-    functions = vectors[:, dropped:]
-    return functions, wave.T @ functions
-
-
-@cache
-def _build_continuation_matrix(odd: int) -> FloatArray:
-    """Matrix that continues a function from its Chebyshev nodes to all samples by its Chebyshev
-    series.
-    """
-    angles = np.pi * (np.arange(CHEBYSHEV_NODES // 2) + 0.5) / CHEBYSHEV_NODES
-    orders = 2 * np.arange(len(angles)) + odd
-    series = (2 / len(angles)) * np.cos(np.outer(orders, angles))
-    if not odd:
-        series[0] /= 2
-    continued: FloatArray = (
-        np.cos(np.outer(np.arccos(np.linspace(-1, 1, TABLE_SAMPLES)), orders)) @ series
-    )
-    return continued
-
-
 Field = NDArray[np.complex64]
 FloatParts = NDArray[np.float32]
 
@@ -335,14 +232,14 @@ class CompiledDiffraction:
     def _lights(self) -> list[Illumination]:
         """The illumination of every computed depth."""
         depths = self.plan.grid.z[self._depths.nodes]
-        lights = [build_constant_illumination(1)] * depths.size
+        lights: dict[int, Illumination] = {}
 
         def split(planes: slice) -> None:
             for i in range(planes.start, planes.stop):
                 lights[i] = self.source.illuminate_plane(self.plan, float(depths[i]))
 
-        run_blocks(split, len(lights), size=PLANES_PER_BLOCK)
-        return lights
+        run_blocks(split, depths.size, size=PLANES_PER_BLOCK)
+        return [lights[i] for i in range(depths.size)]
 
     @cached_property
     def _interpolation(self) -> Interpolation:
