@@ -109,7 +109,9 @@ def estimate_dark_level(counts: FloatImage) -> float:
     row_sums = counts.sum(axis=1)
     # Rows, not pixels: choosing the darkest pixels would choose those whose noise is low.
     quiet = np.argsort(row_sums)[: max(1, round(DARK_ROW_FRACTION * row_sums.size))]
-    return float(np.median(counts[quiet]))
+    # the median, which NumPy looks for ten times as long as it sorts
+    ordered = np.sort(counts[quiet], axis=None)
+    return float((ordered[(ordered.size - 1) // 2] + ordered[ordered.size // 2]) / 2)
 
 
 class Rectifier:
