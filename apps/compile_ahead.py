@@ -77,7 +77,10 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
             " f8[::1])"
         ),
         (NEIGHBOURS, "scatter_about_planes"): (
-            "(f8[::1], f8[::1], i8[::1], i8[::1], UniTuple(i8, 2), f8, i8[::1], b1, f8[::1])"
+            "(f8[::1], f8[::1], i8[::1], i8[::1], UniTuple(i8, 2), f8, i8[::1], f4[:,::1], f8[::1])"
+        ),
+        (NEIGHBOURS, "borrow_scatter"): (
+            "(f8[::1], f8[::1], i8[::1], i8[::1], UniTuple(i8, 2), f8, i8[::1], f8[::1])"
         ),
         (SURFACES, "split_over_slit"): "(f8[::1], f8, i8, i4[::1], f4[:,::1])",
         (SURFACES, "split_between_rows"): "(f8[::1], i4[::1], f4[:,::1])",

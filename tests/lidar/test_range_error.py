@@ -10,7 +10,7 @@ from tofclip.lidar.neighbours import (
     NEIGHBOURS,
     add_recovery_error,
     pool_significance,
-    scatter_about_plane,
+    scatter_about_planes,
 )
 
 SHAPE = (64, 64)
@@ -104,13 +104,22 @@ def test_neighbours_count_within_a_ball_whose_radius_in_range_is_in_gates() -> N
 def test_the_scatter_about_a_plane_counts_the_three_numbers_that_the_plane_took() -> None:
     """Of twelve neighbours a quarter of the variance goes into the plane: without it 13 % too little."""
     random = np.random.default_rng(0)
-    right, down = np.meshgrid(np.arange(4.0), np.arange(3.0))
-    found = []
-    for _ in range(2000):
-        off = 0.3 * right - 0.2 * down + random.normal(0, 1, right.shape)
-        around = np.zeros((3, NEIGHBOURS), np.float32)
-        around[:, :12] = right.ravel(), down.ravel(), off.ravel()
-        used, residual = np.empty(NEIGHBOURS, np.float32), np.empty(NEIGHBOURS, np.float32)
-        found.append(scatter_about_plane(around, 12, 1e3, used, residual))
+    rows, columns = 5, 7
+    pixel = np.array([y * columns + x for y in (0, 2, 4) for x in (0, 2, 4, 6)], np.int64)
+    starts = np.searchsorted(pixel, np.arange(rows * columns + 1))
+    plane = 0.3 * (pixel % columns) - 0.2 * (pixel // columns)
+    found = np.empty((2000, pixel.size))
+    for one in found:
+        scatter_about_planes(
+            plane + random.normal(0, 1, pixel.size),
+            np.ones(pixel.size),
+            pixel,
+            starts,
+            (rows, columns),
+            1e3,
+            np.array([5]),
+            np.zeros((5, NEIGHBOURS), np.float32),
+            one,
+        )
     # Medians of so few are 3 or 4 % off by themselves.
-    assert np.mean(found) == pytest.approx(1, abs=0.07)
+    assert found[:, 5].mean() == pytest.approx(1, abs=0.07)

@@ -17,12 +17,12 @@ recorded shot's geometry and one by another forward model, with total variation 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tofclip.compiling import compile_as_part
-from tofclip.lidar.pulse_fit import loop_part
 from tofclip.threads import run_blocks
 
 FloatArray = NDArray[np.float64]
@@ -50,7 +50,7 @@ RETURNS_PER_BLOCK = 512
 NEIGHBOURS = 96
 """Room for the (2 * 8 / 2 + 1)^2 = 81 neighbours, in whole vectors."""
 
-vectorised_part = compile_as_part(fastmath=True, _nrt=False)
+inlined = njit(inline="always")  # into the one loop that calls it
 
 
 def add_recovery_error(
@@ -91,14 +91,21 @@ def add_recovery_error(
     row, column = np.divmod(pixel, image_shape[1])
     first = (row % PLANE_STEP_PX == 0) & (column % PLANE_STEP_PX == 0)
     # neighbours have nearly the same returns around them: one plane in sixteen does
-    for chosen, borrow in ((np.flatnonzero(first), False), (np.flatnonzero(~first), True)):
+    chosen = np.flatnonzero(first)
+    surface = nearness, metres, pixel, starts, image_shape, gate
 
-        def work(piece: slice, some: NDArray[np.intp] = chosen, borrow: bool = borrow) -> None:
-            scatter_about_planes(
-                nearness, metres, pixel, starts, image_shape, gate, some[piece], borrow, scatter
-            )
+    def fit(piece: slice) -> None:
+        memory = np.zeros((5, NEIGHBOURS), np.float32)
+        scatter_about_planes(*surface, chosen[piece], memory, scatter)
 
-        run_blocks(work, chosen.size, RETURNS_PER_BLOCK)
+    def borrow(piece: slice) -> None:
+        borrow_scatter(*surface, others[piece], scatter)
+
+    run_blocks(fit, chosen.size, RETURNS_PER_BLOCK)
+    others = np.flatnonzero(~first)
+    run_blocks(borrow, others.size, RETURNS_PER_BLOCK)
+    chosen = others[np.isnan(scatter[others])]
+    run_blocks(fit, chosen.size, RETURNS_PER_BLOCK)
     known = scatter >= 0
     if np.count_nonzero(known) < MIN_KNOWN:
         return total
@@ -110,9 +117,9 @@ def add_recovery_error(
     return total
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
 def scatter_about_planes(
-    nearness, metres, pixel, starts, image_shape, gate, chosen, borrow, scatter
+    nearness, metres, pixel, starts, image_shape, gate, chosen, memory, scatter
 ):
     """Robust deviation of the returns around each from a plane through them, -1 if they are few.
 
@@ -131,110 +138,83 @@ def scatter_about_planes(
         m.
     chosen : (k,) int64 array
         Numbers of the returns.
-    borrow : bool
-        Whether they take what is known of a return near them, in a row and column that
-        `PLANE_STEP_PX` divides, on the same surface.
+    memory : (5, NEIGHBOURS) float32 array
+        Zeros; overwritten: columns and rows away, how much further off, whether it is used, and how
+        far from the plane, in m.
     scatter : (n,) array
         Overwritten at the chosen: m.
     """
-    around = np.zeros((3, NEIGHBOURS), np.float32)
-    used, residual = np.empty(NEIGHBOURS, np.float32), np.empty(NEIGHBOURS, np.float32)
     for own in chosen:
-        if borrow:
-            donor = find_donor(nearness, metres, pixel, starts, image_shape, own)
-            if donor[0] >= 0 and donor[1] < gate and scatter[donor[0]] >= 0:
-                scatter[own] = scatter[donor[0]]
-                continue
-        number = collect_neighbours(nearness, metres, pixel, starts, image_shape, own, around)
-        scatter[own] = scatter_about_plane(around, number, gate, used, residual)
+        number = collect_neighbours(nearness, metres, pixel, starts, image_shape, own, memory)
+        deviation, most, a, b, c, count = -1.0, gate, 0.0, 0.0, 0.0, 0
+        for rounds in range(FIT_ROUNDS + 1):
+            measure_offsets(memory, a, b, c)
+            if rounds > 0:
+                free = count / (count - 3.0)
+                deviation = MAD_TO_SIGMA * find_median(memory, count) * math.sqrt(free)
+                most = OUTLIER_DEVIATIONS * deviation
+            changed = mark_near(memory, number, most)
+            # where nothing changed further rounds would find the same
+            if rounds == FIT_ROUNDS or (rounds > 0 and not changed):
+                break
+            a, b, c, count = fit_plane_around(memory)
+            if count < MIN_NEIGHBOURS:
+                deviation = -1.0
+                break
+        scatter[own] = deviation
 
 
-@loop_part
-def scatter_about_plane(around, number, gate, used, residual):
-    """Robust deviation of neighbours from a plane through them, -1 if they are few.
-
-    Parameters
-    ----------
-    around : (3, NEIGHBOURS) float32 array
-        Columns and rows away, and how much further off, in m.
-    number : int
-        Of neighbours; what follows them does not count.
-    gate : float
-        m.
-    used, residual : (NEIGHBOURS,) float32 array
-        Room for what is worked out.
-
-    Returns
-    -------
-    float
-        m.
-    """
-    scatter = -1.0
-    measure_offsets(around, 0.0, 0.0, 0.0, residual)
-    mark_near(residual, number, gate, used)
-    for _ in range(FIT_ROUNDS):
-        a, b, c, count = fit_plane_around(around, used)
-        if count < MIN_NEIGHBOURS:
-            return -1.0
-        measure_offsets(around, a, b, c, residual)
-        free = count / (count - 3.0)
-        scatter = MAD_TO_SIGMA * find_median(residual, used, count) * np.sqrt(free)
-        # further rounds would find the same
-        if not mark_near(residual, number, OUTLIER_DEVIATIONS * scatter, used):
-            break
-    return scatter
-
-
-@vectorised_part
-def measure_offsets(around, a, b, c, residual):
+@inlined
+def measure_offsets(memory, a, b, c):
     """Distance of each neighbour from the plane ``a * right + b * down + c``.
 
     Parameters
     ----------
-    around : (3, NEIGHBOURS) float32 array
+    memory : (5, NEIGHBOURS) float32 array
+        See `scatter_about_planes`; the last row is overwritten, m.
     a, b, c : float
-    residual : (NEIGHBOURS,) float32 array
-        Overwritten, m.
     """
-    right, down, off = around[0], around[1], around[2]
-    a, b, c = np.float32(a), np.float32(b), np.float32(c)
+    right, down, off, residual = memory[0], memory[1], memory[2], memory[4]
+    slope, fall, level = np.float32(a), np.float32(b), np.float32(c)
     for t in range(NEIGHBOURS):
-        residual[t] = abs(off[t] - a * right[t] - b * down[t] - c)
+        residual[t] = math.fabs(off[t] - slope * right[t] - fall * down[t] - level)
 
 
-@vectorised_part
-def mark_near(residual, number, most, used):
+@inlined
+def mark_near(memory, number, most):
     """Use the neighbours that are off by at most so much; return whether others were used before.
 
     Parameters
     ----------
-    residual : (NEIGHBOURS,) float32 array
+    memory : (5, NEIGHBOURS) float32 array
+        See `scatter_about_planes`; 1 or 0 is written to the row that says which are used.
     number : int
         Of neighbours.
     most : float
         m.
-    used : (NEIGHBOURS,) float32 array
-        Overwritten: 1 or 0.
 
     Returns
     -------
     bool
     """
-    most, count, changed = np.float32(most), np.int32(number), np.float32(0)
+    used, residual = memory[3], memory[4]
+    farthest, listed, changed = np.float32(most), np.int32(number), np.float32(0)
     for t in range(NEIGHBOURS):
-        near = np.float32(1) if residual[t] <= most and np.int32(t) < count else np.float32(0)
-        changed += abs(near - used[t])
+        within = (residual[t] <= farthest) & (np.int32(t) < listed)
+        near = np.float32(1) if within else np.float32(0)
+        changed += math.fabs(near - used[t])
         used[t] = near
     return changed > 0
 
 
-@vectorised_part
-def find_median(residual, used, count):
+@inlined
+def find_median(memory, count):
     """Return the median of what is used, by halving an interval: each step is one look at all.
 
     Parameters
     ----------
-    residual, used : (NEIGHBOURS,) float32 array
+    memory : (5, NEIGHBOURS) float32 array
+        See `scatter_about_planes`.
     count : int
         Of those used, at least one.
 
@@ -243,58 +223,29 @@ def find_median(residual, used, count):
     float
         To `MEDIAN_PRECISION` of the largest.
     """
-    high = low = np.float32(0)
+    used, residual = memory[3], memory[4]
+    high = low = middle = np.float32(0)
     for t in range(NEIGHBOURS):
-        high = max(high, used[t] * residual[t])
+        here = used[t] * residual[t]
+        high = here if here > high else high
     precision = np.float32(MEDIAN_PRECISION) * high
+    middle = high
     while high - low > precision:
         middle, below = np.float32(0.5) * (low + high), np.float32(0)
         for t in range(NEIGHBOURS):
             below += used[t] if residual[t] <= middle else np.float32(0)
         if 2 * below == count:
-            return float(middle)
+            break
         if 2 * below > count:
             high = middle
         else:
             low = middle
-    return float(high)
+            middle = high
+    return middle
 
 
-@loop_part
-def find_donor(nearness, metres, pixel, starts, image_shape, own):
-    """Find the return nearest in range among those within a plane's reach whose row and column
-    `PLANE_STEP_PX` divides.
-
-    Parameters
-    ----------
-    nearness, metres, pixel, starts, image_shape
-        As for `scatter_about_planes`.
-    own : int
-        Number of the return.
-
-    Returns
-    -------
-    number : int
-        -1: none.
-    off : float
-        By how much it is nearer or further, m.
-    """
-    rows, columns = image_shape
-    y, x = pixel[own] // columns, pixel[own] % columns
-    found, least = -1, np.inf
-    top, left = y - y % PLANE_STEP_PX - PLANE_STEP_PX, x - x % PLANE_STEP_PX - PLANE_STEP_PX
-    for j in range(max(top, 0), min(top + 4 * PLANE_STEP_PX, rows), PLANE_STEP_PX):
-        for i in range(max(left, 0), min(left + 4 * PLANE_STEP_PX, columns), PLANE_STEP_PX):
-            there = j * columns + i
-            for k in range(starts[there], starts[there + 1]):
-                off = abs((nearness[own] - nearness[k]) * metres[own])
-                if off < least:
-                    found, least = k, off
-    return found, least
-
-
-@loop_part
-def collect_neighbours(nearness, metres, pixel, starts, image_shape, own, around):
+@inlined
+def collect_neighbours(nearness, metres, pixel, starts, image_shape, own, memory):
     """List the returns around one: columns and rows away, and how much further off, in m.
 
     Of several returns of a pixel the one that is nearest in range counts.
@@ -305,8 +256,8 @@ def collect_neighbours(nearness, metres, pixel, starts, image_shape, own, around
         As for `scatter_about_planes`.
     own : int
         Number of the return.
-    around : (3, NEIGHBOURS) float32 array
-        Overwritten.
+    memory : (5, NEIGHBOURS) float32 array
+        The first three rows are overwritten.
 
     Returns
     -------
@@ -315,30 +266,32 @@ def collect_neighbours(nearness, metres, pixel, starts, image_shape, own, around
     rows, columns = image_shape
     y, x = pixel[own] // columns, pixel[own] % columns
     number = 0
-    for j in range(max(-REACH_PX, -(y // STRIDE_PX) * STRIDE_PX), REACH_PX + 1, STRIDE_PX):
-        for i in range(max(-REACH_PX, -(x // STRIDE_PX) * STRIDE_PX), REACH_PX + 1, STRIDE_PX):
-            if y + j >= rows or x + i >= columns:
-                break
+    for j in range(-REACH_PX, REACH_PX + 1, STRIDE_PX):
+        for i in range(-REACH_PX, REACH_PX + 1, STRIDE_PX):
+            if y + j < 0 or x + i < 0 or y + j >= rows or x + i >= columns:
+                continue
             there = (y + j) * columns + x + i
-            best = np.inf
-            for k in range(starts[there], starts[there + 1]):
+            best, first = 0.0, starts[there]
+            for k in range(first, starts[there + 1]):
                 off = (nearness[own] - nearness[k]) * metres[own]
-                if abs(off) < abs(best):
+                if k == first or math.fabs(off) < math.fabs(best):
                     best = off
-            if best < np.inf:
-                around[0, number], around[1, number], around[2, number] = i, j, best
+            if first < starts[there + 1]:
+                memory[0, number] = i
+                memory[1, number] = j
+                memory[2, number] = best
                 number += 1
     return number
 
 
-@vectorised_part
-def fit_plane_around(around, used):
+@inlined
+def fit_plane_around(memory):
     """Least-squares plane ``a * right + b * down + c`` through the neighbours that are used.
 
     Parameters
     ----------
-    around : (3, NEIGHBOURS) float32 array
-    used : (NEIGHBOURS,) float32 array
+    memory : (5, NEIGHBOURS) float32 array
+        See `scatter_about_planes`.
 
     Returns
     -------
@@ -346,9 +299,8 @@ def fit_plane_around(around, used):
     count : int
         Neighbours used; 0 if they lie in one line, which says nothing of the slope across it.
     """
-    right, down, off = around[0], around[1], around[2]
-    zero = np.float32(0)
-    n = s = sx = sy = sxx = sxy = syy = sxv = syv = zero
+    right, down, off, used = memory[0], memory[1], memory[2], memory[3]
+    n = s = sx = sy = sxx = sxy = syy = sxv = syv = np.float32(0)
     for t in range(NEIGHBOURS):
         x, y, v = used[t] * right[t], used[t] * down[t], used[t] * off[t]
         n += used[t]
@@ -372,7 +324,40 @@ def fit_plane_around(around, used):
     return float(a), float(b), float((s - a * sx - b * sy) / n), int(n)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
+def borrow_scatter(nearness, metres, pixel, starts, image_shape, gate, chosen, scatter):
+    """Take over what is known of the return nearest in range, on the same surface, of those within
+    a plane's reach whose row and column `PLANE_STEP_PX` divides.
+
+    Parameters
+    ----------
+    nearness, metres, pixel, starts, image_shape, gate
+        As for `scatter_about_planes`.
+    chosen : (k,) int64 array
+        Numbers of the returns.
+    scatter : (n,) array
+        Overwritten at the chosen: m, NaN where there is no such return or it has few neighbours.
+    """
+    rows, columns = image_shape
+    for own in chosen:
+        y, x = pixel[own] // columns, pixel[own] % columns
+        found, least = -1, np.inf
+        top, left = y - y % PLANE_STEP_PX - PLANE_STEP_PX, x - x % PLANE_STEP_PX - PLANE_STEP_PX
+        for j in range(top, top + 4 * PLANE_STEP_PX, PLANE_STEP_PX):
+            for i in range(left, left + 4 * PLANE_STEP_PX, PLANE_STEP_PX):
+                if j < 0 or i < 0 or j >= rows or i >= columns:
+                    continue
+                there = j * columns + i
+                for k in range(starts[there], starts[there + 1]):
+                    off = math.fabs((nearness[own] - nearness[k]) * metres[own])
+                    if off < least:
+                        found, least = k, off
+        scatter[own] = scatter[found] if found >= 0 and least < gate else np.nan
+        if scatter[own] < 0:
+            scatter[own] = np.nan
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
 def pool_significance(pixel, at, distance, own, starts, image_shape, limits, pooled):
     """Add to each candidate's significance those of its neighbours at the same range.
 
@@ -399,14 +384,15 @@ def pool_significance(pixel, at, distance, own, starts, image_shape, limits, poo
     for number in range(pixel.size):
         y, x = pixel[number] // columns, pixel[number] % columns
         total = own[number]
-        for j in range(max(-reach, -y), min(reach, rows - 1 - y) + 1):
-            for i in range(max(-reach, -x), min(reach, columns - 1 - x) + 1):
+        for j in range(-reach, reach + 1):
+            for i in range(-reach, reach + 1):
                 left = radius * radius - j * j - i * i
-                if (j == 0 and i == 0) or left < 0:
+                inside = 0 <= y + j < rows and 0 <= x + i < columns
+                if not inside or left < 0 or (j == 0 and i == 0):
                     continue
-                most = gate * np.sqrt(left)
+                most = gate * math.sqrt(left)
                 there = (y + j) * columns + x + i
                 for k in range(starts[there], starts[there + 1]):
-                    if abs(distance[k] - at[number]) <= most:
+                    if math.fabs(distance[k] - at[number]) <= most:
                         total += own[k]
         pooled[number] = total
