@@ -57,6 +57,7 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
             " Tuple((f8[:,::1], UniTuple(f8, 4))), f8[:,::1], f8[:,:,::1], i8[::1])"
         ),
         (CAMERA, "sample_runs"): "(f4[:,::1], f4, f4[:,::1], u8[:,::1], f4[:,::1])",
+        (CAMERA, "mark_valid"): "(b1[:,::1], f4[:,::1], f4[:,::1], f4, b1[:,::1])",
         (OPERATORS, "count_tile_nonzeros"): "(i4[::1], i4[::1], i8, i8[:,::1])",
         (OPERATORS, "sort_into_tiles"): (
             "(i4[::1], i4[::1], f4[::1], i8, i8[:,::1], u4[::1], f4[::1])"
@@ -65,12 +66,13 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
             "(i8[:,::1], u4[::1], f4[::1], f4[:,::1], f4[:,::1])"
         ),
         (SOLVERS, "descend_total_variation"): (
-            "(i8, f4[:,::1], f4[:,::1], f4[::1], f4[:,::1], f4[::1], f4[::1], f4[:,:,::1], f4[::1])"
+            "(i8, f4[:,::1], f4[:,::1], f4[::1], f4[:,::1], f4[::1], f4[::1], f4[:,:,::1], f4[::1],"
+            " f4[:,::1], f4[::1])"
         ),
         (SOLVERS, "shrink_nonnegative"): (
-            "(f4[:,::1], f4[:,::1], f4[::1], f4[:,::1], f4[::1], f4[::1], f4[::1], f4[::1])"
+            "(f4[:,::1], f4[:,::1], f4[::1], f4[:,::1], f4[::1], f4[::1], f4[::1], f4[::1],"
+            " f4[::1])"
         ),
-        (SOLVERS, "restore_frames"): "(f4[:,:,::1], f4[:,:,::1], f4[::1])",
         (SOLVERS, "copy_lanes_to_frames"): "(f4[:,::1], f4[:,::1])",
         (NEIGHBOURS, "pool_significance"): (
             "(i8[::1], f8[::1], f8[::1], f8[::1], i8[::1], UniTuple(i8, 2), UniTuple(f8, 2),"
@@ -83,25 +85,25 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
             "(f8[::1], f8[::1], i8[::1], i8[::1], UniTuple(i8, 2), f8, i8[::1], f8[::1])"
         ),
         (SURFACES, "split_over_slit"): "(f8[::1], f8, i8, i4[::1], f4[:,::1])",
-        (SURFACES, "split_between_rows"): "(f8[::1], i4[::1], f4[:,::1])",
         (SURFACES, "add_light"): "(f4[::1], i4[::1], f4[:,::1], i4[::1], f4[:,::1], f4[:,::1])",
         (SURFACES, "gather_light"): (
             "(f4[:,::1], f8, i4[::1], f4[:,::1], i4[::1], f4[:,::1], f4[::1])"
         ),
         (SURFACES, "smooth_rows"): "(f4[:,::1], f4[::1], i8[::1], i8, f4[:,::1])",
-        (SURFACES, "prox_masked_tv"): "(f4[:,::1], b1[:,::1], f8, i8, f4[:,:,::1], f4[:,::1])",
+        (SURFACES, "apply_dual"): "(f4[:,::1], b1[:,::1], f8, f4[:,:,::1], f4[:,::1])",
+        (SURFACES, "ascend_dual"): ("(f4[:,::1], b1[:,::1], f8, f8, f4[:,:,::1], f4[:,:,::1])"),
     }
 )
 """Module and name of the loops that recovery and ranging of a shot call, and for which arguments: a
 letter and bytes for each kind of number, as Numba writes them."""
 
 GROUPS: Sequence[Sequence[str]] = (
-    (SEARCH, LONE),
-    (SOLVERS, CAMERA, OPERATORS, NEIGHBOURS, SURFACES),
+    (SEARCH, LONE, OPERATORS),
+    (SOLVERS, CAMERA, NEIGHBOURS, SURFACES),
 )
 """Modules whose loops take about as long to compile together, each for a process."""
 
-FUNCTIONS_PER_GROUP = (44, 52)
+FUNCTIONS_PER_GROUP = (29, 24)
 """Loops and their parts, which the compiler takes one by one."""
 
 

@@ -139,8 +139,7 @@ def test_a_pulse_between_rows_is_the_pulse_over_each_row():
     from tofclip.recovery.surface_kernels import split_between_rows
 
     sigma, places = 1.27, np.linspace(19.5, 20.5, 11)
-    first, shares = np.empty(places.size, np.int32), np.empty((places.size, 3), np.float32)
-    split_between_rows(places, first, shares)
+    first, shares = split_between_rows(places)
     edges = np.arange(42) - 0.5
     for place, start, share in zip(places, first, shares, strict=True):
         light = np.zeros(41)

@@ -83,7 +83,8 @@ class PictureTraces:
         """
         from tofclip.solvers.kernels import copy_lanes_to_frames
 
-        copy_lanes_to_frames(self._pictures[:, piece], traces)
+        # contiguous: the loop is compiled for solvers' blocks, and copying short runs costs little
+        copy_lanes_to_frames(np.ascontiguousarray(self._pictures[:, piece]), traces)
 
 
 class FrameTraces(PictureTraces):

@@ -12,36 +12,39 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from tofclip.compiling import compile_as_part
+Image = NDArray[np.float32]
 
 nogil_njit = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-loop_part = compile_as_part(fastmath=True)
 
 SPLINE_SAMPLES = 3
 SPLINE_VARIANCE = 0.25  # rows^2, of the samples' spread
 
 
-@nogil_njit
-def split_between_rows(row, first, shares):
+def split_between_rows(row: NDArray[np.float64]) -> tuple[NDArray[np.int32], Image]:
     """Put positions between rows: samples of the quadratic B-spline.
 
     Parameters
     ----------
-    row : (points,) float64 array
+    row : (points,) array
         Position of each point; row i reaches from i - 1/2 to i + 1/2.
-    first : (points,) int32 array, overwritten
+
+    Returns
+    -------
+    first : (points,) int32 array
         First of the three rows.
-    shares : (points, 3) float32 array, overwritten
+    shares : (points, 3) float32 array
     """
-    for point in range(row.size):
-        middle = math.floor(row[point] + 0.5)
-        off = row[point] - middle
-        first[point] = int(middle) - 1
-        shares[point, 0] = 0.5 * (0.5 - off) ** 2
-        shares[point, 1] = 0.75 - off * off
-        shares[point, 2] = 0.5 * (0.5 + off) ** 2
+    middle = np.floor(row + 0.5)
+    off = row - middle
+    shares = np.empty((row.size, SPLINE_SAMPLES), np.float32)
+    shares[:, 0] = 0.5 * (0.5 - off) ** 2
+    shares[:, 1] = 0.75 - off * off
+    shares[:, 2] = 0.5 * (0.5 + off) ** 2
+    return middle.astype(np.int32) - np.int32(1), shares
 
 
 @nogil_njit
@@ -63,11 +66,12 @@ def split_over_slit(position, tangent, subrows, first, shares):
     """
     reach = shares.shape[1]
     # a row of the picture is projected to tan(angle) slit pixels
-    spread = abs(tangent)
+    spread = math.fabs(tangent)
     for point in range(position.size):
         start = math.floor(position[point] - 0.5 * spread)
         first[point] = start
-        shares[point, :] = 0
+        for slit in range(reach):
+            shares[point, slit] = 0
         for line in range(subrows):
             place = position[point] + ((line + 0.5) / subrows - 0.5) * spread
             column = math.floor(place)
@@ -146,8 +150,10 @@ def smooth_rows(image, kernel, rows, margin, result):
         target = rows[number]
         top = target + margin + half  # the source row of the first tap
         line = result[target]
-        line[:] = 0
-        tap, end = max(0, top - image.shape[0] + 1), min(kernel.size, top + 1)
+        for i in range(line.size):
+            line[i] = 0
+        tap = top - image.shape[0] + 1 if top >= image.shape[0] else 0
+        end = kernel.size if kernel.size <= top else top + 1
         # Four rows at a time, as whole lines: the sums stay in registers, and an index into two
         # dimensions would be checked for every pixel.
         while tap + 4 <= end:
@@ -164,8 +170,14 @@ def smooth_rows(image, kernel, rows, margin, result):
             tap += 1
 
 
-@nogil_njit
-def prox_masked_tv(picture, mask, weight, iterations, dual, result):
+def prox_masked_tv(
+    picture: Image,
+    mask: NDArray[np.bool_],
+    weight: float,
+    iterations: int,
+    dual: Image,
+    result: Image,
+) -> None:
     """Nonnegative proximal step of total variation on a part of a picture.
 
     Fast gradient projection on the dual (A. Beck and M. Teboulle, IEEE Trans. Image Process. 18,
@@ -182,8 +194,7 @@ def prox_masked_tv(picture, mask, weight, iterations, dual, result):
     result : (rows, columns) float32 array, overwritten
         0 outside the mask.
     """
-    ahead = dual.copy()
-    age = 1.0
+    ahead, age, weight = dual.copy(), 1.0, float(weight)
     apply_dual(picture, mask, weight, ahead, result)
     for _ in range(iterations):
         older = (1 + math.sqrt(1 + 4 * age * age)) / 2
@@ -192,7 +203,7 @@ def prox_masked_tv(picture, mask, weight, iterations, dual, result):
         apply_dual(picture, mask, weight, ahead, result)
 
 
-@loop_part
+@nogil_njit
 def apply_dual(picture, mask, weight, ahead, result):
     """The picture that belongs to a dual variable: ``max(picture + weight * div ahead, 0)``."""
     for y in range(picture.shape[0]):
@@ -204,10 +215,11 @@ def apply_dual(picture, mask, weight, ahead, result):
                     divergence -= ahead[0, y - 1, x]
                 if x > 0:
                     divergence -= ahead[1, y, x - 1]
-                result[y, x] = max(picture[y, x] + weight * divergence, 0.0)
+                value = picture[y, x] + weight * divergence
+                result[y, x] = value if value > 0 else 0.0
 
 
-@loop_part
+@nogil_njit
 def ascend_dual(result, mask, weight, momentum, ahead, dual):
     """A projected gradient step on the dual variable, with momentum."""
     rows, columns = result.shape
@@ -223,9 +235,10 @@ def ascend_dual(result, mask, weight, momentum, ahead, dual):
             # 8 bounds the squared norm of the gradient of a picture
             p = ahead[0, y, x] + down / (8 * weight)
             q = ahead[1, y, x] + right / (8 * weight)
-            length = max(1.0, math.sqrt(p * p + q * q))
-            p /= length
-            q /= length
+            length = math.sqrt(p * p + q * q)
+            if length > 1:
+                p /= length
+                q /= length
             ahead[0, y, x] = p + momentum * (p - dual[0, y, x])
             ahead[1, y, x] = q + momentum * (q - dual[1, y, x])
             dual[0, y, x] = p

@@ -299,11 +299,7 @@ class SurfaceModel:
         )
 
         row, column, pace, before, fraction = self._locate(view, points)
-        first, shares = (
-            np.empty(row.size, np.int32),
-            np.empty((row.size, SPLINE_SAMPLES), np.float32),
-        )
-        split_between_rows(row, first, shares)
+        first, shares = split_between_rows(row)
         last = self.image.shape[0] + self._margin - SPLINE_SAMPLES
         shares[(first < -self._margin) | (first > last)] = 0
         np.clip(first, -self._margin, last, out=first)

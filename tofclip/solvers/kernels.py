@@ -9,6 +9,8 @@ differ in the sixth digit.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -34,7 +36,9 @@ every pixel of a row.
 
 
 @fast_njit
-def shrink_nonnegative(current, previous, momentum, gradient, step, threshold, total, distance):
+def shrink_nonnegative(
+    current, previous, momentum, gradient, step, threshold, scratch, total, distance
+):
     """``previous = max(z - step * gradient - threshold, 0)`` with ``z = current + momentum *
     (current - previous)``.
 
@@ -48,24 +52,23 @@ def shrink_nonnegative(current, previous, momentum, gradient, step, threshold, t
     gradient : (rows, row) array
     step, threshold : (row,) array
         Step size, and step size times weight.
+    scratch : (row,) array
+        Overwritten: a row that stays in cache.
     total, distance : (row,) array
-        Overwritten with sums over rows of the result, and of its squared difference from z.
+        To which sums over rows of the result, and of its squared difference from z, are added.
     """
-    total[:] = 0
-    distance[:] = 0
-    made = np.empty_like(step)  # a row that stays in cache
     for row in range(current.shape[0]):
-        _shrink_row(current[row], previous[row], momentum, gradient[row], step, threshold, made)
-        _add_distance(current[row], previous[row], momentum, made, distance)
-        _put_row(made, previous[row])
-        _add_row(made, total)
+        _shrink_row(current[row], previous[row], momentum, gradient[row], step, threshold, scratch)
+        _add_distance(current[row], previous[row], momentum, scratch, distance)
+        _put_row(scratch, previous[row], total)
 
 
 @row_part
 def _shrink_row(current, previous, momentum, gradient, step, threshold, result):
     for i in range(current.size):
         point = current[i] + momentum[i] * (current[i] - previous[i])
-        result[i] = max(point - step[i] * gradient[i] - threshold[i], np.float32(0))
+        value = point - step[i] * gradient[i] - threshold[i]
+        result[i] = value if value > 0 else np.float32(0)
 
 
 @row_part
@@ -84,15 +87,11 @@ def _add_distance(current, previous, momentum, result, distance):
 
 
 @row_part
-def _add_row(row, total):
-    for i in range(row.size):
-        total[i] += row[i]
-
-
-@row_part
-def _put_row(row, target):
+def _put_row(row, target, total):
+    """Copy a row, and add it to the sum of rows."""
     for i in range(row.size):
         target[i] = row[i]
+        total[i] += row[i]
 
 
 @fast_njit
@@ -133,7 +132,7 @@ def copy_lanes_to_frames(block, frames):
     pixels = block.shape[0]
     # Tile by tile, as a transposition reads along one axis and writes along the other.
     for first in range(0, pixels, TILE_PIXELS):
-        last = min(first + TILE_PIXELS, pixels)
+        last = first + TILE_PIXELS if first + TILE_PIXELS < pixels else pixels
         for lane in range(frames.shape[0]):
             for pixel in range(first, last):
                 frames[lane, pixel] = block[pixel, lane]
@@ -208,31 +207,8 @@ def update_peaks(tile_starts, columns, values, scales, block, highest):
 
 
 @fast_njit
-def restore_frames(candidate, current, rejected):
-    """``candidate = current`` in the lanes where `rejected` is 1; it is 0 elsewhere. Arrays are
-    (..., lanes).
-
-    Parameters
-    ----------
-    candidate : (rows, columns, lanes) array
-        Overwritten in rejected lanes.
-    current : (rows, columns, lanes) array
-    rejected : (lanes,) array of the pictures' dtype
-        1 or 0.
-    """
-    lanes = candidate.shape[2]
-    for row in range(current.shape[0]):
-        for column in range(current.shape[1]):
-            for lane in range(lanes):
-                here = candidate[row, column, lane]
-                candidate[row, column, lane] = here + rejected[lane] * (
-                    current[row, column, lane] - here
-                )
-
-
-@fast_njit
 def descend_total_variation(
-    lanes, current, previous, momentum, gradient, step, weight, dual, total
+    lanes, current, previous, momentum, gradient, step, weight, dual, sweep, scratch, total
 ):
     """A gradient step from ``z = current + momentum * (current - previous)``, and one sweep towards
     the picture nearest to it in total variation.
@@ -257,30 +233,33 @@ def descend_total_variation(
     dual : (2, rows, row) array
         Vertical and horizontal; updated in place. The last row of the one and the last column of
         the other stay zero: the difference across the border is.
+    sweep : (row,) array
+        Step size of the dual.
+    scratch : (4, row) array
+        The first row is zero; the others are overwritten.
     total : (row,) array
-        Overwritten with the sum over rows of the result's isotropic total variation.
+        To which the sum over rows of the result's isotropic total variation is added.
     """
-    rows, width = current.shape
-    dark, scratch, primal = np.zeros_like(step), np.empty_like(step), np.empty_like(current[:2])
-    # the squared norm of the gradient is at most 8 (Chambolle 2004)
-    sweep = np.zeros_like(step)
-    for i in range(width):
-        if weight[i] > 0:
-            sweep[i] = 1 / (8 * weight[i])
-    total[:] = 0
+    rows, dark, room = current.shape[0], scratch[0], scratch[1]
     for row in range(rows + 1):
         if row < rows:
             _descend_row(current[row], previous[row], momentum, gradient[row], step)
             above = dual[0, row - 1] if row > 0 else dark
             _make_primal_row(
-                lanes, gradient[row], weight, dual[0, row], above, dual[1, row], primal[row % 2]
+                lanes,
+                gradient[row],
+                weight,
+                dual[0, row],
+                above,
+                dual[1, row],
+                scratch[2 + row % 2],
             )
         if row > 0:
             # The dual of a row needs the primal of the row below it, so that it follows one row
             # behind.
             done = row - 1
-            made, below = primal[done % 2], primal[(row if row < rows else done) % 2]
-            _update_dual_row(lanes, made, below, sweep, dual[0, done], dual[1, done], scratch)
+            made, below = scratch[2 + done % 2], scratch[2 + (row if row < rows else done) % 2]
+            _update_dual_row(lanes, made, below, sweep, dual[0, done], dual[1, done], room)
             above = dual[0, done - 1] if done > 0 else dark
             _make_primal_row(
                 lanes, gradient[done], weight, dual[0, done], above, dual[1, done], previous[done]
@@ -293,15 +272,15 @@ def descend_total_variation(
 @row_part
 def _make_primal_row(lanes, noisy, weight, down, above, across, result):
     """``result = max(noisy + weight * div(dual), 0)``; `above` is `down` one row higher."""
-    nothing, inner = np.float32(0), noisy.size - lanes
-    for i in range(lanes):
-        result[i] = max(noisy[i] + weight[i] * (down[i] - above[i] + across[i]), nothing)
-    # slices, because an index with `lanes` taken off might be negative for all the compiler knows
-    noisy, weight, result = noisy[lanes:], weight[lanes:], result[lanes:]
-    down, above, here = down[lanes:], above[lanes:], across[lanes:]
-    for i in range(inner):
-        divergence = down[i] - above[i] + (here[i] - across[i])
-        result[i] = max(noisy[i] + weight[i] * divergence, nothing)
+    # unsigned: an index with `lanes` taken off might be negative for all the compiler knows
+    first, end = np.uintp(lanes), np.uintp(noisy.size)
+    for i in range(first):
+        value = noisy[i] + weight[i] * (down[i] - above[i] + across[i])
+        result[i] = value if value > 0 else np.float32(0)
+    for i in range(first, end):
+        divergence = down[i] - above[i] + (across[i] - across[i - first])
+        value = noisy[i] + weight[i] * divergence
+        result[i] = value if value > 0 else np.float32(0)
 
 
 @row_part
@@ -309,27 +288,31 @@ def _update_dual_row(lanes, here, below, sweep, down, across, shrink):
     """``dual = project(dual + sweep * grad(picture))`` onto vectors of length at most 1; `shrink` is
     room for a row.
     """
-    one, inner, right = np.float32(1), here.size - lanes, here[lanes:]
+    one, step = np.float32(1), np.uintp(lanes)
+    end = np.uintp(here.size)
+    inner = end - step
     for i in range(inner):
         vertical = down[i] + sweep[i] * (below[i] - here[i])
-        horizontal = across[i] + sweep[i] * (right[i] - here[i])
-        shrink[i] = one / np.sqrt(max(vertical * vertical + horizontal * horizontal, one))
-    for i in range(inner, here.size):
-        shrink[i] = one / max(abs(down[i] + sweep[i] * (below[i] - here[i])), one)
+        horizontal = across[i] + sweep[i] * (here[i + step] - here[i])
+        length = vertical * vertical + horizontal * horizontal
+        shrink[i] = one / math.sqrt(length if length > one else one)
+    for i in range(inner, end):
+        length = math.fabs(down[i] + sweep[i] * (below[i] - here[i]))
+        shrink[i] = one / (length if length > one else one)
     for i in range(inner):
-        across[i] = (across[i] + sweep[i] * (right[i] - here[i])) * shrink[i]
-    for i in range(here.size):
+        across[i] = (across[i] + sweep[i] * (here[i + step] - here[i])) * shrink[i]
+    for i in range(end):
         down[i] = (down[i] + sweep[i] * (below[i] - here[i])) * shrink[i]
 
 
 @row_part
 def _add_variation(lanes, here, below, total):
-    inner, right = here.size - lanes, here[lanes:]
-    for i in range(inner):
-        vertical, horizontal = below[i] - here[i], right[i] - here[i]
-        total[i] += np.sqrt(vertical * vertical + horizontal * horizontal)
-    for i in range(inner, here.size):
-        total[i] += abs(below[i] - here[i])
+    step, end = np.uintp(lanes), np.uintp(here.size)
+    for i in range(end - step):
+        vertical, horizontal = below[i] - here[i], here[i + step] - here[i]
+        total[i] += math.sqrt(vertical * vertical + horizontal * horizontal)
+    for i in range(end - step, end):
+        total[i] += math.fabs(below[i] - here[i])
 
 
 @fast_njit

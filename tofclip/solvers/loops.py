@@ -166,9 +166,9 @@ class CompiledLoops:
         Arguments and result are those of `Loops.prox_l1`.
         """
         now, before, slope = (_join_lanes(array) for array in (current, previous, gradient))
-        total, distance = np.empty((2, now.shape[1]), now.dtype)
+        scratch, total, distance = np.zeros((3, now.shape[1]), now.dtype)
         self._kernels.shrink_nonnegative(
-            now, before, *self._repeat(now, momentum, slope, step, weight), total, distance
+            now, before, *self._repeat(now, momentum, slope, step, weight), scratch, total, distance
         )
         return previous, _sum_columns(total, step), _sum_columns(distance, step)
 
@@ -189,13 +189,19 @@ class CompiledLoops:
         if dual is None:
             dual = np.zeros((2, *current.shape), current.dtype)
         now, before, slope = (_join_lanes(array) for array in (current, previous, gradient))
-        total = np.empty(now.shape[1], now.dtype)
+        total = np.zeros(now.shape[1], now.dtype)
+        repeated = self._repeat(now, momentum, slope, step, weight)
+        scaled = repeated[-1]
+        # the squared norm of the gradient is at most 8 (Chambolle 2004)
+        sweep = np.divide(1, 8 * scaled, out=np.zeros_like(scaled), where=scaled > 0)
         self._kernels.descend_total_variation(
             step.size,
             now,
             before,
-            *self._repeat(now, momentum, slope, step, weight),
+            *repeated,
             dual.reshape(2, *now.shape),
+            sweep,
+            np.zeros((4, now.shape[1]), now.dtype),
             total,
         )
         return previous, _sum_columns(total, step), dual
@@ -226,15 +232,8 @@ class CompiledLoops:
         Arguments and result are those of `Loops.restore_frames`.
         """
         if rejected.any():
-            self._kernels.restore_frames(
-                _flatten_rows(values), _flatten_rows(before), rejected.astype(values.dtype)
-            )
+            values[..., rejected] = before[..., rejected]
         return values
-
-
-def _flatten_rows(array: Array) -> Array:
-    """The same memory as (rows, columns, frames)."""
-    return array.reshape(-1, *array.shape[-2:])
 
 
 def _join_lanes(array: Array) -> Array:
