@@ -256,9 +256,9 @@ class Rectifier:
         valid, raw = np.empty(self._raw_row.shape, bool), np.ascontiguousarray(bad)
 
         def work(piece: slice) -> None:
-            mark_valid(
-                raw, self._raw_row[piece], self._raw_column[piece], np.float32(delay), valid[piece]
-            )
+            # one layout, whether each row has columns of its own or not: the loop is compiled once
+            column = np.ascontiguousarray(self._raw_column[piece])
+            mark_valid(raw, self._raw_row[piece], column, np.float32(delay), valid[piece])
 
         run_blocks(work, len(valid), ROWS_PER_BLOCK)
         # Dead columns are invalid at every instant, whatever the sensor shows there.
