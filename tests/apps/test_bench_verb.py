@@ -98,6 +98,21 @@ def test_the_time_of_other_programs_does_not_count(monkeypatch: pytest.MonkeyPat
     assert "left out" in found[1]["problem"]
 
 
+def test_runs_that_ask_no_other_program_say_nothing_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one thread of two nobody is asked: that is not a Python in which a program is missing."""
+
+    def measure(case: Case, extent: tuple[int, int], peers: str | None, clock: object) -> object:
+        return {"peers": {"other": {"seconds": 1.0} if peers else {"absent": "no Python"}}}
+
+    monkeypatch.setattr("apps.benchmarks.run._run_process", measure)
+    monkeypatch.setenv("TOFCLIP_THREADS", "2")
+    runs = run_cases([MADE_UP], "python", lambda _: None)["entries"][0]["runs"]
+    assert {run["threads"]: list(run["peers"]) for run in runs[-2:]} == {1: [], 2: ["other"]}
+    assert all("seconds" in found for run in runs for found in run["peers"].values())
+    unnamed = run_cases([MADE_UP], None, lambda _: None)["entries"][0]["runs"]
+    assert all("absent" in run["peers"]["other"] for run in unnamed)
+
+
 def made_up(size: int) -> PreparedCase:
     def absent() -> float:
         raise PeerUnavailableError("other: is not here")
