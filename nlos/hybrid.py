@@ -21,7 +21,7 @@ from nlos.illumination_groups import (
     require_few_spots,
 )
 from nlos.method import PhasorMethod, PhasorPlan, Progress, require_imageable
-from nlos.plane import choose_virtual_plane
+from nlos.plane import WallLattice, choose_virtual_plane
 from nlos.propagation.propagate import (
     Propagation,
     plan_wall_to_plane,
@@ -193,7 +193,9 @@ class Hybrid(PhasorMethod):
         waves = build_waves(groups[0], band, continued=True)
         zones = (RIM_ERROR / (RIM_ERROR_FRACTION * self.tolerance)) ** (1 / 3)
         points = capture.points[groups[0].indices]
-        plane = choose_virtual_plane(points, grid, waves, zones, self.plane_z)
+        plane = choose_virtual_plane(
+            points, grid, waves, zones, self.plane_z, WallLattice.find(points)
+        )
         plane_to_depths = DiffractionPlan(plane, grid, waves, self.tolerance)
         plane_to_depths.require_memory()
         tolerance = WALL_TO_PLANE_ERROR_FRACTION * self.tolerance

@@ -166,13 +166,19 @@ def _fade_out(axis: FloatArray, width: float) -> FloatArray:
 
 
 def choose_virtual_plane(
-    points: FloatArray, grid: Grid, waves: SphericalWaves, zones: float, z: float | None = None
+    points: FloatArray,
+    grid: Grid,
+    waves: SphericalWaves,
+    zones: float,
+    z: float | None = None,
+    wall: WallLattice | None = None,
 ) -> VirtualPlane:
     """Choose a plane between a wall and the hidden scene that misses little of what passes.
 
     It holds the straight way from every wall point to every voxel behind it, and around these some
-    Fresnel zones of the middle wave, in which the field fades; its points are half the shortest
-    wavelength apart.
+    Fresnel zones of the middle wave, in which the field fades; its points are at most half the
+    shortest wavelength apart. Where the wall's points stand above a lattice, their spacing is a
+    multiple or a fraction of its step, so that Fourier transforms lead from one to the other.
 
     Parameters
     ----------
@@ -185,6 +191,8 @@ def choose_virtual_plane(
     z : float, optional
         Where, m. Defaults to the shortest wavelength, but 5 to 10 cm, in front of the foremost wall
         point.
+    wall : WallLattice, optional
+        That the points stand above.
 
     Returns
     -------
@@ -201,17 +209,31 @@ def choose_virtual_plane(
     behind = grid.z[grid.z > z]
     depth = gap + float(behind[0]) - z if behind.size else gap
     axes, fades = [], []
-    for first, last, voxels in zip(low[:2], high[:2], (grid.x, grid.y), strict=True):
+    spacings = (shortest / 2, shortest / 2)
+    if wall is not None:
+        spacings = _fit_spacing(shortest / 2, wall.x), _fit_spacing(shortest / 2, wall.y)
+    for first, last, voxels, spacing in zip(
+        low[:2], high[:2], (grid.x, grid.y), spacings, strict=True
+    ):
         before, beyond = max(0.0, first - voxels[0]), max(0.0, voxels[-1] - last)
         # Along a slanted way to voxels beside the wall, a zone's cut is longer: it grows with the
         # root of the way and is seen aslant.
         slant = 1 + (max(before, beyond) / depth) ** 2
         room = zones * np.sqrt(middle * gap) * slant**0.75
         start, stop = first - before * gap / depth - room, last + beyond * gap / depth + room
-        count = max(1, int(np.ceil((stop - start) / (shortest / 2))))
+        count = max(1, int(np.ceil((stop - start) / spacing)))
+        if wall is not None:
+            middle_place, half = (start + stop) / 2, count * spacing / 2
+            start, stop = middle_place - half, middle_place + half
         axes.append(np.linspace(start, stop, count + 1))
         fades.append(float(FADE_FRACTION * room))
     return VirtualPlane(axes[0], axes[1], z, (fades[1], fades[0]))
+
+
+def _fit_spacing(widest: float, axis: FloatArray) -> float:
+    """Largest spacing up to a widest one that is a multiple or a fraction of an axis's step, m."""
+    step = axis_step(axis)
+    return step * int(widest / step) if step <= widest else step / int(np.ceil(step / widest))
 
 
 SAME_COORDINATE_FRACTION = 0.02
@@ -271,6 +293,14 @@ class WallLattice:
     def shape(self) -> tuple[int, int]:
         """Places along (y, x)."""
         return self.y.size, self.x.size
+
+    @classmethod
+    def find(cls, points: FloatArray) -> WallLattice | None:
+        """Find the lattice that wall points (n, 3) stand above, if there is one."""
+        try:
+            return cls.of(points)
+        except InputError:
+            return None
 
     @cached_property
     def is_complete(self) -> bool:

@@ -21,7 +21,6 @@ from nlos.rsd.transfer import (
     find_max_offsets,
     find_min_periods,
 )
-from tofclip.errors import InputError
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -102,11 +101,8 @@ class WallToPlanePlan:
         -------
         WallToPlanePlan or None
         """
-        try:
-            wall = WallLattice.of(points)
-        except InputError:
-            return None
-        return cls(points, wall, plane, waves, strength, tolerance)
+        wall = WallLattice.find(points)
+        return None if wall is None else cls(points, wall, plane, waves, strength, tolerance)
 
     @cached_property
     def is_faster_than_direct(self) -> bool:

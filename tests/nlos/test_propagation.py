@@ -9,7 +9,8 @@ from scene_shapes import SHAPES, SPOT, shaped_capture, shaped_wall
 from nlos import Capture, Grid, propagate
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
-from nlos.plane import Plane, choose_virtual_plane
+from nlos.plane import Plane, WallLattice, choose_virtual_plane
+from nlos.propagation.wall_to_plane_plan import WallToPlanePlan
 from nlos.rsd.transfer import SphericalWaves
 from nlos.simulate import PointScene
 from tofclip.errors import InputError
@@ -122,6 +123,29 @@ def test_the_virtual_plane_keeps_its_distance_and_samples_the_shortest_wave() ->
     plane_z = points[:, 2].max() + 0.07
     wide = choose_virtual_plane(points, Grid([-3, 3], [-0.5, 0.5], [plane_z + gap]), waves, 0.0)
     assert wide.x[-1] == pytest.approx(2)  # half way to a voxel at 3 m
+
+
+@pytest.mark.parametrize("shortest", [0.09, 0.52, 2.1])
+def test_the_virtual_plane_suits_the_walls_lattice(shortest: float) -> None:
+    """Finer and coarser than its points, 0.25 m apart: Fourier transforms lead there and back."""
+    points = shaped_wall("relief", 9).reshape(-1, 3)
+    waves = SphericalWaves(2 * np.pi / shortest, 0.0, 1, True)
+    box = Grid([-0.5, 0.5], [-0.5, 0.5], [1.0])
+    lattice = WallLattice.find(points)
+    assert lattice is not None
+    plane = choose_virtual_plane(points, box, waves, 1.0, wall=lattice)
+    free = choose_virtual_plane(points, box, waves, 1.0)
+    for axis, unfitted in ((plane.x, free.x), (plane.y, free.y)):
+        step = axis[1] - axis[0]
+        ratio = max(0.25 / step, step / 0.25)
+        assert ratio == pytest.approx(round(ratio), abs=1e-9)
+        assert shortest / 4 < step <= shortest / 2
+        assert axis[0] <= unfitted[0] + 1e-9
+        assert axis[-1] >= unfitted[-1] - 1e-9
+        assert axis[0] + axis[-1] == pytest.approx(unfitted[0] + unfitted[-1], abs=1e-9)
+    plan = WallToPlanePlan.of(points, plane, waves, np.ones(1), 1e-2)
+    assert plan is not None
+    assert plan.plane_lattice == tuple(map(round, plan.plane_lattice))
 
 
 def test_the_field_fades_towards_the_rim_beside_the_straight_ways_only() -> None:
