@@ -25,7 +25,13 @@ from tofclip.solvers import (
     iterate,
 )
 from tofclip.solvers.fista import ProximalStep
-from tofclip.solvers.method import GAP_INTERVAL, MIN_FURTHER_FALL, IterationHistory, Result
+from tofclip.solvers.method import (
+    GAP_INTERVAL,
+    MIN_FURTHER_FALL,
+    NOISE_FRACTION,
+    IterationHistory,
+    Result,
+)
 from tofclip.threads import LANES
 
 
@@ -333,6 +339,23 @@ def test_further_iterations_follow_only_while_the_objective_falls():
     )
     with pytest.raises(InputError, match="further"):
         StoppingRule(3, further=-1)
+
+
+def test_noise_is_not_followed_and_light_is() -> None:
+    operator, noise = projection(), np.random.default_rng(7)
+    method = Sparse(1e-3, 200, gap=0.0, noise_fall=2e-3)
+    dark = method.recover(operator, noise.standard_normal((40, 5)))
+    fall = -np.diff(dark.objective) / dark.objective[1:]
+    assert dark.stop_reason == "converged"
+    assert 1 < dark.iterations < 200
+    assert fall[-1] < 2e-3 <= fall[-2]
+    assert dark.objective[-1] > NOISE_FRACTION * dark.objective[0]
+    picture = np.zeros(operator.shape_in)
+    picture[2:4, 3:6] = 1
+    light = operator(picture)[:, np.newaxis]
+    assert method.recover(operator, light).iterations == 200
+    with pytest.raises(InputError, match="noise_fall"):
+        StoppingRule(3, noise_fall=-1e-3)
 
 
 @pytest.mark.parametrize("method", [Sparse(0.05, 12), TotalVariation(0.05, 12)], ids=["l1", "tv"])

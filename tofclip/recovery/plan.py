@@ -77,10 +77,22 @@ FURTHER_SPARSE_ITERATIONS = 40
 """Of `l1` where their number is not given: a bright shot needs more of them than a dark one."""
 
 
+SPARSE_NOISE_FALL = 2e-3
+"""Of `l1` where iterations are not given. In shots with 20 photons in the brightest pixel the solution
+without negative values turns the noise into single bright pixels, and empties those between: after
+25 iterations 25 and 34 % of two scenes' pixels are missed, after 40 33 and 41 %. Noise alone falls as
+slowly from the 19th iteration on."""
+
+
 def make_sparse(**settings: Any) -> Sparse:
-    """Make the method `l1`, which goes on while its objective falls unless iterations are given."""
-    further = 0 if "iterations" in settings else FURTHER_SPARSE_ITERATIONS
-    return Sparse(**{"further": further, **settings})
+    """Make the method `l1`, which goes on while its objective falls, and ends before it follows the
+    noise, unless iterations are given.
+    """
+    if "iterations" in settings:
+        return Sparse(**settings)
+    return Sparse(
+        **{"further": FURTHER_SPARSE_ITERATIONS, "noise_fall": SPARSE_NOISE_FALL, **settings}
+    )
 
 
 METHODS: dict[str, Callable[..., AnyMethod]] = {

@@ -363,6 +363,9 @@ class ProximalMethod(ABC):
         fraction of it, as the duality gap says, for priors that have one; 0: never.
     further : int
         Iterations that may follow for blocks whose objective still falls, see `StoppingRule`.
+    noise_fall : float
+        Fall of the objective in an iteration, relative, below which a block of little more than noise
+        is done, see `StoppingRule`.
 
     Attributes
     ----------
@@ -377,6 +380,7 @@ class ProximalMethod(ABC):
     data_term: DataTermMaker = LeastSquares
     gap: float = 1e-3
     further: int = 0
+    noise_fall: float = 0.0
     name = ""
     portable = False
 
@@ -443,7 +447,9 @@ class ProximalMethod(ABC):
         progress: Progress,
         start: Array | None,
     ) -> Result:
-        stopping = StoppingRule(self.iterations, self.tolerance, self.gap, self.further)
+        stopping = StoppingRule(
+            self.iterations, self.tolerance, self.gap, self.further, self.noise_fall
+        )
         started = time.perf_counter()
         step = 1 / (NORM_MARGIN * operator.squared_norm)
         batches = make_batches(operator, measurements)

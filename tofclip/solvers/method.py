@@ -35,6 +35,10 @@ GAP_INTERVAL = 10
 """Iterations between two looks at the duality gap, each of which costs half an iteration."""
 
 
+NOISE_FRACTION = 0.1
+"""Of a block's energy: what is left of it beyond is noise, since no model of a camera misses as much.
+"""
+
 MIN_FURTHER_FALL = 6e-3
 """Of the objective. Between iterations 30 and 40 it falls by 0.9 to 3.6 % in shots whose thin bars
 have a rim of false points by then, and by 0.1 to 0.2 % in dark ones, in which more iterations only
@@ -58,21 +62,42 @@ class StoppingRule:
     further : int
         Iterations that may follow, in steps of `GAP_INTERVAL`, as long as the last step took more
         than `MIN_FURTHER_FALL` off the block's objective.
+    noise_fall : float
+        Stop, too, where more than `NOISE_FRACTION` of the objective at zero is left and an iteration
+        takes less than this fraction off: what it fits is noise. 0: never.
     """
 
     iterations: int
     tolerance: float = 0.0
     gap: float = 0.0
     further: int = 0
+    noise_fall: float = 0.0
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
             raise InputError(f"at least one iteration is needed, got {self.iterations}")
-        for name, value in (("tolerance", self.tolerance), ("gap", self.gap)):
+        for name, value in (
+            ("tolerance", self.tolerance),
+            ("gap", self.gap),
+            ("noise_fall", self.noise_fall),
+        ):
             if not (np.isfinite(value) and value >= 0):
                 raise InputError(f"{name} must be finite and not negative, got {value}")
         if self.further < 0:
             raise InputError(f"further iterations must not be negative, got {self.further}")
+
+    def follows_noise(self, objective: Sequence[Array]) -> bool:
+        """Say whether a block of little more than noise has come as near to it as it should.
+
+        Parameters
+        ----------
+        objective : sequence of scalars
+            Of the block before the first and after every iteration.
+        """
+        before, last = objective[-2], objective[-1]
+        return bool(
+            (last > NOISE_FRACTION * objective[0]) & (before - last < self.noise_fall * last)
+        )
 
     def continues(self, objective: Sequence[Array]) -> bool:
         """Say whether a block goes on after its iterations.
@@ -115,7 +140,7 @@ class IterationHistory:
     objective : (iterations + 1,) array
         Sum over the frames before the first and after every iteration.
     converged : bool
-        Whether the tolerance or the gap ended it.
+        Whether the tolerance, the gap or the noise ended it.
     gap : float
         How far the last objective is above the least one at most; NaN where that is not known.
     """
@@ -135,8 +160,8 @@ def iterate(
 ) -> IterationHistory:
     """Run `solver` until `stopping` says that it is done.
 
-    A device is waited for once in an iteration if there is a tolerance, and not at all if there is
-    none.
+    A device is waited for once in an iteration if there is a tolerance or `noise_fall`, and not at all
+    if there is neither.
 
     Parameters
     ----------
@@ -167,6 +192,8 @@ def iterate(
             # a refused step changes nothing, which does not mean that the block has converged
             little = objective[-2] - objective[-1] < stopping.tolerance * objective[-1]
             converged = bool(little & ~xp.any(solver.rejected))
+        if stopping.noise_fall > 0:
+            converged |= stopping.follows_noise(objective)
         if stopping.gap > 0 and (converged or done == limit or done % GAP_INTERVAL == 0):
             gap = solver.duality_gap()
             if gap is not None:
