@@ -185,11 +185,14 @@ def report(
         if name in compared[1:]:
             continue  # in the table of the first
         if name in compared:
-            print("\n".join(_format_columns({column: plain[column] for column in compared})))
+            print("\n".join(_format_compared({column: plain[column] for column in compared})))
         elif entries:
             print("\n".join([_format_name(name), *_format_rows(entries)]))
         else:
-            print(f"{_format_name(name):<{width}}  {_format_value(value)}")
+            line = f"{_format_name(name):<{width}}  {_format_value(value)}"
+            if isinstance(value, dict) and len(line) > MAX_TABLE_WIDTH:
+                line = "\n".join([_format_name(name), *_format_entries(value)])
+            print(line)
     if note:
         print(f"note: {note}")
     for path in written:
@@ -216,6 +219,16 @@ def _list_alike_entries(value: Any) -> dict[str, dict[str, Any]]:
     return value if len(kinds) == 1 and kinds != {()} else {}
 
 
+MAX_TABLE_WIDTH = 100
+"""Columns of a terminal that a table of several things side by side may need."""
+
+
+def _format_compared(things: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Put things side by side where they fit, and below each other where there are too many."""
+    lines = _format_columns(things)
+    return lines if max(map(len, lines)) <= MAX_TABLE_WIDTH else _format_rows(things)
+
+
 def _format_columns(things: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Put few things with many figures side by side: a column for each."""
     figures = next(iter(things.values()))
@@ -237,6 +250,13 @@ def _format_rows(things: Mapping[str, Mapping[str, Any]]) -> list[str]:
     return _align_columns(cells)
 
 
+def _format_entries(entries: Mapping[str, Any]) -> list[str]:
+    """Put what is too long for one line below each other, indented."""
+    return _align_columns(
+        [[f"  {_format_name(name)}", _format_value(entry)] for name, entry in entries.items()]
+    )
+
+
 def _align_columns(cells: Sequence[Sequence[str]]) -> list[str]:
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return [
@@ -247,6 +267,18 @@ def _align_columns(cells: Sequence[Sequence[str]]) -> list[str]:
 
 def _format_name(name: str) -> str:
     return name.replace("_", " ")
+
+
+UNITS = {"m", "mm", "s", "ns", "ps", "px"}
+
+
+def _format_entry(name: str, value: Any) -> str:
+    """Put one of several figures of a line into words, its unit behind it."""
+    *words, last = name.split("_")
+    if last not in UNITS:
+        return f"{_format_name(name)} {_format_value(value)}"
+    unit = "" if value is None else f" {last}"
+    return " ".join([*words, f"{_format_value(value)}{unit}"])
 
 
 def describe_ranges(frames: Frames) -> str:
@@ -290,9 +322,7 @@ def _format_value(value: Any) -> str:
             return summarise_list(value)
         return ", ".join(map(_format_value, value))
     if isinstance(value, dict):
-        return ", ".join(
-            f"{_format_name(name)} {_format_value(entry)}" for name, entry in value.items()
-        )
+        return ", ".join(_format_entry(name, entry) for name, entry in value.items())
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) < 1000 else f"{value:.0f}"
     if isinstance(value, bool):

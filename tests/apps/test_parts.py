@@ -72,6 +72,19 @@ class TestReport:
             "  2  0.2         yes",
         ]
 
+    def test_many_things_stand_below_each_other_and_units_behind_their_figures(
+        self, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        found = {f"object_{number}": {"range_m": 1.5, "points": 7} for number in range(12)}
+        report(found, as_json=False)
+        lines = capsys.readouterr().out.splitlines()
+        assert lines[0].split() == ["range", "m", "points"]
+        assert lines[12].split() == ["object", "11", "1.5", "7"]
+        report({"wall": {"width_m": 2.0, "gap_mm": None}}, as_json=False)
+        assert capsys.readouterr().out == "wall  width 2 m, gap unknown\n"
+        report({"why": {"a": "x" * 60, "long_one": "y" * 60}}, as_json=False)
+        assert capsys.readouterr().out == f"why\n  a         {'x' * 60}\n  long one  {'y' * 60}\n"
+
     def test_infinity_is_unknown(self) -> None:
         assert to_json_value([np.inf, -np.inf, True, None, "text"]) == [
             None,
