@@ -23,6 +23,7 @@ STUDY_FOLDER = "reproduction"
 """Beside the page: what each study made."""
 
 OWN_SETTING = "the table's"
+UNTRIED_SETTING = "the table's (others not tried)"
 
 BEST_NOTE = (
     "Best of ours (tables 2 to 10) is what a user gets who takes the settings of choice: lines at even angles, "
@@ -93,33 +94,48 @@ def load_result(path: Path, settings: Mapping[str, Any]) -> Result | None:
         return None
 
 
-def add_best(result: Result, figures: Mapping[str, BestFigure], seconds: float) -> Result:
+def add_best(result: Result, figures: Mapping[str, BestFigure], seconds: float | None) -> Result:
     """Return a study's result with what the settings of choice reach in its rows.
 
     Parameters
     ----------
     result : dict
     figures : mapping of str to BestFigure
-        By the rows' labels, as `apps.studies.best.solve_best` returns them.
-    seconds : float
-        Of processor time, that they took.
+        By the rows' labels, as `apps.studies.best.solve_best` returns them; rows that are missing
+        are marked as not tried.
+    seconds : float or None
+        Of processor time, that they took; None: not known.
 
     Returns
     -------
     dict
     """
-    rows = [
-        row | {"best": None if found is None else _choose_better(row, found)}
-        for row in result["rows"]
-        for found in [figures.get(" | ".join(row["labels"]))]
-    ]
+    rows = []
+    for row in result["rows"]:
+        # the same case with another data term is one of the table's own settings
+        own = min(
+            one["mean"]
+            for one in result["rows"]
+            if _identify_case(result, one) == _identify_case(result, row)
+        )
+        found = figures.get(" | ".join(row["labels"]))
+        best = None if row["paper"] is None else _choose_better(own, found)
+        rows.append(row | {"best": best})
     return {**result, "rows": rows, "best_seconds": seconds}
 
 
-def _choose_better(row: Mapping[str, Any], found: BestFigure) -> dict[str, Any]:
-    """Return the figure and its setting; the table's own settings may be the best."""
-    if row["mean"] <= found.percent:
-        return {"percent": row["mean"], "setting": OWN_SETTING}
+def _identify_case(result: Result, row: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what rows share that differ in their data term only."""
+    named = zip(result["columns"], row["labels"], strict=True)
+    return tuple(label for column, label in named if column != "data term")
+
+
+def _choose_better(own: float, found: BestFigure | None) -> dict[str, Any]:
+    """Return the lower figure and its setting."""
+    if found is None:
+        return {"percent": own, "setting": UNTRIED_SETTING}
+    if own <= found.percent:
+        return {"percent": own, "setting": OWN_SETTING}
     return {"percent": found.percent, "setting": found.setting}
 
 
@@ -221,10 +237,10 @@ def render_section(result: Result, beside: str = "") -> str:
     text = f"{result['note']} The prior's weight: {result['weight']}. Made by {made}."
     if has_best:
         below, compared = count_below([result])
-        text += (
-            f" Best of ours: below the paper's figure in {below} of {compared} rows, "
-            f"{result['best_seconds']:.0f} s of processor time."
-        )
+        text += f" Best of ours: below the paper's figure in {below} of {compared} rows"
+        if result["best_seconds"] is not None:
+            text += f", {result['best_seconds']:.0f} s of processor time"
+        text += "."
     return f"## {result['title']} ({names})\n\n{text}\n\n{table}\n\n{picture}"
 
 

@@ -81,6 +81,9 @@ def test_the_page_marks_each_row_and_counts_them(tmp_path):
             ("d", 1.0, None),
         )
     ]
+    # the same case with another data term counts as the table's own
+    robust = {"labels": ["c", "huber"], "ours": [8.0], "mean": 8.0, "spread": 0.0, "paper": None}
+    rows = [row | {"labels": [*row["labels"], "squares"]} for row in rows] + [robust]
     result = {
         "name": "table2",
         "also": [],
@@ -88,19 +91,26 @@ def test_the_page_marks_each_row_and_counts_them(tmp_path):
         "note": "N.",
         "weight": "w",
         "command": "c",
-        "columns": ["row"],
+        "columns": ["row", "data term"],
         "figure": "%",
         "rows": rows,
         "seconds": 1.0,
     }
-    known = {"a": BestFigure(1.5, "surfaces"), "b": BestFigure(1.2, "quality")}
-    full = add_best(result, known | {"c": BestFigure(2.5, "quality")}, 12.0)
+    known = {
+        "a | squares": BestFigure(1.5, "surfaces"),
+        "b | squares": BestFigure(1.2, "quality"),
+    }
+    partial = add_best(result, known, 12.0)
+    assert "| c | squares | 9.00 |  | 2.00 | 8.00 | the table's (others not tried) | above |" in (
+        render_section(partial)
+    )
+    full = add_best(result, known | {"c | squares": BestFigure(2.5, "quality")}, 12.0)
     assert count_below([full]) == (2, 3)
     section = render_section(full)
-    assert "| a | 3.00 |  | 2.00 | 1.50 | surfaces | below |" in section
-    assert "| b | 1.00 |  | 2.00 | 1.00 | the table's | below |" in section
-    assert "| c | 9.00 |  | 2.00 | 2.50 | quality | above |" in section
-    assert "| d | 1.00 |  |  |  |  |  |" in section
+    assert "| a | squares | 3.00 |  | 2.00 | 1.50 | surfaces | below |" in section
+    assert "| b | squares | 1.00 |  | 2.00 | 1.00 | the table's | below |" in section
+    assert "| c | squares | 9.00 |  | 2.00 | 2.50 | quality | above |" in section
+    assert "| d | squares | 1.00 |  |  |  |  |  |" in section
     assert "in 2 of 3 rows, 12 s of processor time" in section
     page = write_page([full], tmp_path).read_text("utf-8")
     assert "below the paper's figure in 2 of 3 rows (67 %)" in page
