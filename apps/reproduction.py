@@ -205,6 +205,13 @@ def write_page(results: Sequence[Result], folder: Path) -> Path:
     if compared:
         share = f"{below} of {compared} rows ({100 * below / compared:.0f} %)"
         head += f"\n{BEST_NOTE} It is below the paper's figure in {share}.\n"
+        untried = sum(
+            _is_compared(row) and row["best"]["setting"] == UNTRIED_SETTING
+            for result in results
+            for row in result["rows"]
+        )
+        if untried:
+            head = f"{head.rstrip()} In {untried} rows only the table's own settings were tried.\n"
     sections = (render_section(result, f"{STUDY_FOLDER}/") for result in results)
     _write_text(folder / PAGE_NAME, "\n\n".join([head.rstrip(), *sections]) + "\n")
     return folder / PAGE_NAME
@@ -266,15 +273,16 @@ def _render_csv(result: Result) -> str:
             "mean",
             "spread",
             "paper",
-            "best",
-            "by",
+            *(("best", "by") if "best_seconds" in result else ()),
             *(f"seed {number}" for number in range(seeds)),
         ]
     )
     for row in result["rows"]:
         paper = "" if row["paper"] is None else row["paper"]
-        best = row.get("best") or {"percent": "", "setting": ""}
-        figures = [row["mean"], row["spread"], paper, best["percent"], best["setting"]]
+        figures = [row["mean"], row["spread"], paper]
+        if "best_seconds" in result:
+            best = row["best"] or {"percent": "", "setting": ""}
+            figures += [best["percent"], best["setting"]]
         writer.writerow([*row["labels"], *figures, *row["ours"]])
     return text.getvalue()
 
