@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from tofclip.storage import Field
 
 
+PHOTON_SUFFIXES = {".npy", ".mat", ".ptu", ".sdt"}
+"""Of files that hold counted photons or nothing of ours."""
+
+
 def describe_file(file: Path) -> dict[str, Any]:
     """Describe our own records, streak images, point clouds and counted photons by their headers."""
     try:
@@ -35,6 +39,8 @@ def describe_file(file: Path) -> dict[str, Any]:
         try:
             return describe_photons(file)
         except FileFormatError:
+            if file.suffix.lower() in PHOTON_SUFFIXES:
+                raise  # it names the arrays that were found
             # The first refusal names the formats that were expected.
             raise refusal from None
 

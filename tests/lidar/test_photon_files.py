@@ -243,3 +243,17 @@ def test_damaged_files_are_refused_in_one_line(name, counts, tmp_path) -> None:
             lines.append(str(fault))
     assert len(lines) > 10
     assert not any("\n" in line for line in lines)
+
+
+@pytest.mark.parametrize("shape", [(1, 40, 200), (1, 1, 200)])
+def test_a_row_or_a_pixel_is_described_and_its_axes_are_asked_for(
+    tmp_path: Path, shape: tuple[int, int, int]
+) -> None:
+    path = tmp_path / "row.npy"
+    np.save(path, np.ones(shape, np.uint16))
+    described = describe_photons(path)
+    assert described["arrays"] == {"array": f"{shape[0]} x {shape[1]} x 200 uint16"}
+    assert "give --axes" in described["axes"]
+    np.save(path, np.ones(7))
+    with pytest.raises(FileFormatError, match="holds no photons"):
+        describe_photons(path)

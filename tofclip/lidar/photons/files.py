@@ -162,12 +162,18 @@ def describe_photons(path: str | Path) -> dict[str, Any]:
         See `read_photons`.
     """
     opened = open_photons(Path(path))
-    layout = _find_layout(opened, Path(path))
+    axes = opened.axes
+    try:
+        layout = _find_layout(opened, Path(path))
+    except FileFormatError:
+        # a picture of one row or one pixel, whose axes no shape tells: any order shows its array
+        layout = _find_layout(opened, Path(path), "yxt")
+        axes = "not recognised: give --axes, e.g. yxt"
     found: dict[str, Any] = {"kind": "photons", "layout": layout[0]}
     if opened.bin_width is not None:
         found["bin_width_s"] = opened.bin_width
-    if opened.axes:
-        found["axes"] = opened.axes
+    if axes:
+        found["axes"] = axes
     found["arrays"] = {
         entry.name: f"{' x '.join(map(str, entry.shape))} {entry.type}" for entry in opened.arrays
     }
