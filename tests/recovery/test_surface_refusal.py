@@ -12,6 +12,7 @@ from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
 from tofclip.recovery import open_shot, plan_recovery
 from tofclip.recovery.surface_pulse import measure_pulse
+from tofclip.recovery.surface_refusal import measure_slopes
 from tofclip.recovery.surfaces import SurfaceRecovery
 from tofclip.shots import Streak
 from tofclip.solvers import Sparse
@@ -102,6 +103,18 @@ def gauze(seed: int) -> list:
         (2 * np.full(SHAPE, 1.25) / SPEED_OF_LIGHT, 0.5 * (np.abs(X) < 14) * (np.abs(Y) < 14)),
         (2 * np.full(SHAPE, 1.6) / SPEED_OF_LIGHT, bright),
     ]
+
+
+def test_slopes_are_those_of_planes_and_steps_are_none() -> None:
+    y, x = np.indices((30, 40))
+    distance = 1.5 + 0.02 * x - 0.01 * y
+    distance[:, 20:] += 0.5
+    distance[4:6, 4:9] = np.nan
+    slope, scatter = measure_slopes(distance.astype(np.float32))
+    np.testing.assert_allclose(slope[5:25, 5:15], np.hypot(0.02, 0.01), rtol=1e-4)
+    assert scatter[5:25, 5:15].max() < 1e-4
+    # half a metre within a window of 7 pixels: three windows beside the step look like a slope
+    assert np.mean((slope > 0.03)[15] & (scatter < slope)[15]) <= 4 / 40
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -18,6 +18,7 @@ from tofclip.recovery.surface_patches import (
 from tofclip.recovery.surface_pulse import measure_pulse
 from tofclip.recovery.surface_refusal import (
     require_explained,
+    require_gentle_slopes,
     require_short_pulse,
     require_surfaces,
 )
@@ -97,6 +98,7 @@ def fit_surfaces(
     bin_m = SPEED_OF_LIGHT * frames.bin_width / 2
     directions = compute_ray_directions(camera, *np.indices(camera.image_shape).reshape(2, -1))
     ray_length = (1 / directions[:, 2]).reshape(camera.image_shape)
+    require_gentle_slopes(found, bin_m)
     # Weaker returns of a pixel are often the frames' own: they would widen the surfaces.
     strongest = found.image("range").astype(np.float64).ravel()
     pixels = np.flatnonzero(np.isfinite(strongest))
