@@ -154,3 +154,10 @@ def test_a_hot_column_does_not_raise_the_dark_level():
     counts = np.full((ROWS, WIDTH), 100.0, np.float32)
     counts[:, 7] = 60_000
     assert estimate_dark_level(counts) == 100
+
+
+@pytest.mark.parametrize("columns", [7, 8])
+def test_the_dark_level_is_the_median_of_the_quietest_rows(columns):
+    counts = np.random.default_rng(columns).poisson(90, (60, columns)).astype(np.float32)
+    counts[5:] += 1000
+    assert estimate_dark_level(counts) == np.median(counts[np.argsort(counts.sum(axis=1))[:3]])

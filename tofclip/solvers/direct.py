@@ -147,18 +147,6 @@ class PreparedInverse:
     def _inverse(self) -> PerDevice[Array]:
         return PerDevice(partial(ComputeDevice.put, values=self.inverse_gram))
 
-    @cached_property
-    def _seen_inverse(self) -> tuple[NDArray[np.int64], NDArray[Any]]:
-        """The measurements that some pixel is seen by and that live, and their part of the inverse.
-
-        What others weigh is multiplied by nothing, and they do not weigh in elsewhere.
-        """
-        inverse, matrix = to_numpy(self.inverse_gram), self.operator
-        if not isinstance(matrix, SparseMatrix):
-            return np.arange(len(inverse)), inverse
-        seen = np.flatnonzero((np.diff(matrix.matrix.indptr) > 0) & inverse.any(axis=1))
-        return seen, np.ascontiguousarray(inverse[np.ix_(seen, seen)])
-
     def recover(self, measurements: Array, progress: Progress = ignore_progress) -> Result:
         """Recover one picture per column of `measurements`, where they are.
 
@@ -205,30 +193,26 @@ class PreparedInverse:
         """Return ``(A A' + mu I)^-1 f``, (blocks, measurements, LANES): the adjoint of each block
         is `LANES` pictures.
 
-        Frames beyond the last one are zero, and so is what no pixel is seen by.
+        Frames beyond the last one are zero.
 
         Parameters
         ----------
         measurements : (measurements, frames) array, finite
         """
-        frames, count = measurements.shape[1], self.inverse_gram.shape[0]
-        blocks, (seen, inverse) = -(-frames // LANES), self._seen_inverse
-        weights = np.empty((blocks, count, LANES), self.operator.dtype)
-        if seen.size < count:
-            weights[:, np.setdiff1d(np.arange(count), seen)] = 0
-            measurements = np.take(measurements.T, seen, axis=1).T
-        if blocks:
-            weights[-1, :, frames - (blocks - 1) * LANES :] = 0
+        frames = measurements.shape[1]
+        weights = np.zeros(
+            (-(-frames // LANES), self.inverse_gram.shape[0], LANES), self.operator.dtype
+        )
 
         def solve(piece: slice) -> None:
-            solved = inverse[piece] @ measurements
+            solved = self.inverse_gram[piece] @ measurements
             for number, part in enumerate(split_blocks(frames)):
-                weights[number, seen[piece], : part.stop - part.start] = solved[:, part]
+                weights[number, piece, : part.stop - part.start] = solved[:, part]
 
         # The blocks already keep every core busy: BLAS threads of its own would wait for, and spin
         # against, ours.
         with limit_blas_threads():
-            run_blocks(solve, seen.size, DENSE_BLOCK_ROWS)
+            run_blocks(solve, len(self.inverse_gram), DENSE_BLOCK_ROWS)
         return weights
 
 
