@@ -63,7 +63,7 @@ class ArrayTraces:
 
 
 class ArraySearch:
-    """What `tofclip.lidar.search.compiled.find_returns` does, for many pixels at once.
+    """What `tofclip.lidar.search.trace_search.TraceSearch` does, for many pixels at once.
 
     Peaks and fits are found step for step as there; only what was found, a few numbers for each
     return, is fetched. Memory on the device: 1 GiB beside the frames.
