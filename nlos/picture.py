@@ -25,6 +25,8 @@ brightest.
 
 COLOUR_MAP = "inferno"
 DEPTH_COLOUR_MAP = "viridis"
+MIN_DEPTH_SPAN_VOXELS = 8
+"""Of the colours' scale: a flat thing whose depths are one voxel apart would look like steps."""
 WIDTH_INCHES = 13.0
 DOTS_PER_INCH = 110
 MIN_PANEL_RATIO, MAX_PANEL_RATIO = 0.3, 2.0
@@ -103,6 +105,11 @@ def _draw_views(volume: Volume, front: Axes, side: Axes, top: Axes) -> AxesImage
     return _draw_picture(front, magnitude.max(axis=0), (x, y), ("x (m)", "y (m), down"))
 
 
+def _find_step(axis: NDArray[np.float64]) -> float:
+    """Distance of neighbouring voxels, m."""
+    return float(abs(axis[-1] - axis[0]) / max(axis.size - 1, 1))
+
+
 def _draw_depth(volume: Volume, axes: Axes) -> AxesImage:
     projection = volume.maximum_projection()
     weak = projection.brightness < DEPTH_THRESHOLD * projection.brightness.max()
@@ -112,6 +119,11 @@ def _draw_depth(volume: Volume, axes: Axes) -> AxesImage:
         axes, depth, (volume.grid.x, volume.grid.y), ("x (m)", "y (m), down"), None
     )
     drawn.set_cmap(DEPTH_COLOUR_MAP)
+    nearest, furthest = drawn.get_clim()
+    if nearest is not None and furthest is not None:
+        middle = (nearest + furthest) / 2
+        reach = max(furthest - nearest, MIN_DEPTH_SPAN_VOXELS * _find_step(volume.grid.z)) / 2
+        drawn.set_clim(middle - reach, middle + reach)
     return drawn
 
 

@@ -125,6 +125,14 @@ def test_flat_dark_and_single_voxel_volumes_can_be_drawn(tmp_path: Path) -> None
         Volume(np.zeros(grid.shape), grid).save_picture(tmp_path / "dark.png")
 
 
+def test_depths_one_voxel_apart_have_nearly_one_colour() -> None:
+    values = np.zeros((3, 3, 4))
+    values[1, :, :2] = values[2, :, 2:] = 1
+    figure = _draw_figure(Volume(values, Grid(GRID.x, GRID.y, [0.5, 0.6, 0.7])))
+    drawn = next(axes for axes in figure.axes if axes.get_title().startswith("depth")).images[0]
+    assert drawn.get_clim() == pytest.approx((0.25, 1.05))  # 8 voxels around 0.6 and 0.7 m
+
+
 def test_unknown_picture_formats_are_refused_before_drawing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"must end in \.png"):
         volume_with().save_picture(tmp_path / "mip.gif")
