@@ -80,16 +80,6 @@ class LaserSource:
             return 0.0
         return float(np.average(self.wavenumbers, weights=self.strength**2))
 
-    def describe_depths(self, plan: DiffractionPlan) -> AxialSpectrum:
-        """Describe how images vary with depth, but for the laser's carrier."""
-        cosines = (0.0, 0.0)
-        if self.laser is not None:
-            # beyond the spot all light goes forward
-            cosines = (0.0 if plan.grid.z[0] >= self.laser[2] else -1.0, 1.0)
-        return AxialSpectrum.of(
-            plan.waves.wavenumbers, self.strength, self.centre_wavenumber, cosines
-        )
-
     def illuminate_plane(self, plan: DiffractionPlan, depth: float) -> Illumination:
         """Split the illumination of the plane at one depth.
 
@@ -224,7 +214,7 @@ class CompiledDiffraction:
         """Which depths are computed, and how the others follow."""
         return choose_depths(
             self.plan.grid.z,
-            self.source.describe_depths(self.plan),
+            _describe_depths(self.source, self.plan),
             DEPTH_ERROR_FRACTION * self.plan.tolerance,
         )
 
@@ -367,3 +357,14 @@ class _Workspace:
             carrier,
             field,
         )
+
+
+def _describe_depths(source: LaserSource, plan: DiffractionPlan) -> AxialSpectrum:
+    """Describe how images vary with depth, but for the laser's carrier."""
+    cosines = (0.0, 0.0)
+    if source.laser is not None:
+        # beyond the spot all light goes forward
+        cosines = (0.0 if plan.grid.z[0] >= source.laser[2] else -1.0, 1.0)
+    return AxialSpectrum.of(
+        plan.waves.wavenumbers, source.strength, source.centre_wavenumber, cosines
+    )
