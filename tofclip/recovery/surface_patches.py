@@ -21,7 +21,7 @@ Pixels = NDArray[np.intp]
 MARGIN_PX = 10  # how far a surface may reach beyond the returns that showed it
 NEIGHBOUR_BINS = 1.6  # neighbouring pixels whose ranges differ by less lie on one surface
 # Of that: by how much they may differ where the surface is turned as far on either side.
-STEEP_STEPS = 8.0
+STEEP_STEPS = 4.0
 STEEP_EXCESS = 1.5  # of that: two such differences have more noise than one
 MIN_PATCH_PX = 25  # fewer returns are not a surface of their own
 MIN_BEHIND_FRACTION = 0.25  # of a surface's usual brightness, for it to be seen behind another
