@@ -186,6 +186,23 @@ def test_derivatives_are_those_of_the_image(shot):
         assert np.linalg.norm(found[name] - difference) < 0.1 * np.linalg.norm(difference), name
 
 
+@pytest.mark.parametrize("inverse", [1e3, 1e9, 1e-9])
+def test_surfaces_that_run_off_take_no_more_memory(shot, inverse: float):
+    """A millimetre before the camera the views spread a surface over a plane without end (2.5 TiB
+    once), and a kilometre off it lies beyond the last row.
+    """
+    model = make_model(shot.streak)
+    away = model.state.copy()
+    away.coefficients[0][:] = 0
+    away.coefficients[0][0] = inverse
+    model.place(away)
+    assert max(one.columns for one in model._views) < 1.1 * model.image.shape[1]
+    seen = model.gather(np.ones_like(model.image))
+    first, second = model.parts
+    assert not seen[first].any()
+    assert seen[second].all()
+
+
 def test_each_view_sees_its_own_part_of_what_shines_through(shot):
     """As through gauze: the view beside the lamp sees all that the lamp lights behind it."""
     model = make_model(shot.streak, overlap=True)

@@ -122,6 +122,10 @@ def fit_surfaces(
     solver.run(START_ITERATIONS, progress, count)
     require_explained(model, solver.amplitude, frames, streak)
     refinement, remainder = _refine(model, solver, progress, count)
+    straight = straighten_surfaces(model, solver)
+    if straight is not None:
+        model, solver = straight.model, straight
+        refinement, remainder = _refine(model, solver, ignore_progress, count)
     solver.run(iterations, progress, count)
     return SurfaceFit(model, solver, refinement, remainder, model.unexplained(solver.amplitude))
 

@@ -299,16 +299,21 @@ class SurfaceModel:
         )
 
         row, column, pace, before, fraction = self._locate(view, points)
-        first, shares = split_between_rows(row)
-        last = self.image.shape[0] + self._margin - SPLINE_SAMPLES
+        # Nothing of what misses the streak image is kept: a surface may run off without end, and one
+        # that comes close is spread over all of the slit's plane.
+        rows, columns = self.image.shape
+        away, last = self._margin + SPLINE_SAMPLES, rows + self._margin - SPLINE_SAMPLES
+        first, shares = split_between_rows(np.clip(row, -away, rows + away))
         shares[(first < -self._margin) | (first > last)] = 0
         np.clip(first, -self._margin, last, out=first)
         slit_first = np.empty(row.size, np.int32)
         slit = np.empty((row.size, SLIT_PIXELS), np.float32)
-        split_over_slit(column, np.tan(self.camera.angles[view]), SUBROWS, slit_first, slit)
+        along = np.clip(column, -SLIT_PIXELS, columns + SLIT_PIXELS)
+        split_over_slit(along, np.tan(self.camera.angles[view]), SUBROWS, slit_first, slit)
+        slit[along != column] = 0
         left = int(slit_first.min(initial=0))
         right = int(slit_first.max(initial=0)) + SLIT_PIXELS
-        hit = np.bincount(first + self._margin, minlength=self.image.shape[0] + 2 * self._margin)
+        hit = np.bincount(first + self._margin, minlength=rows + 2 * self._margin)
         reached = np.convolve(hit, np.ones(SPLINE_SAMPLES))[: hit.size] > 0
         lit = np.convolve(reached, np.ones(2 * self._half + 1), "same")
         return ViewPlaces(
