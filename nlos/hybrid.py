@@ -15,6 +15,7 @@ from nlos.geometry import Grid
 from nlos.illumination_groups import (
     IlluminationGroup,
     build_waves,
+    choose_roles,
     choose_unaliased_band,
     gather_by_points,
     group_by_illumination,
@@ -28,7 +29,7 @@ from nlos.propagation.propagate import (
     require_propagation,
     require_tolerance,
 )
-from nlos.reciprocity import ReciprocalPlan, choose_roles
+from nlos.reciprocity import ReciprocalPlan
 from nlos.rsd.diffraction import DiffractionPlan
 from nlos.rsd.planar import require_even_grid
 from nlos.wave_plan import GroupPlan, WavePlan

@@ -1,5 +1,6 @@
-"""The parts of a capture that one illumination made, a band in which no voxel sees an echo of the
-record, and whether the wall is sampled finely enough for it.
+"""The parts of a capture that one illumination made, which of laser spots and wall points to take for
+lasers, a band in which no voxel sees an echo of the record, and whether the wall is sampled finely
+enough for it.
 """
 
 from __future__ import annotations
@@ -7,7 +8,7 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +78,47 @@ def is_confocal(capture: Capture) -> bool:
     extent = float(np.ptp(capture.points, axis=0).max())
     apart = float(np.abs(capture.lasers - capture.points).max())
     return apart <= SAME_SPOT_FRACTION * extent
+
+
+def swap_roles(capture: Capture) -> Capture:
+    """Take laser spots for wall points and wall points for laser spots.
+
+    Parameters
+    ----------
+    capture : Capture
+
+    Returns
+    -------
+    Capture
+    """
+    lasers = np.broadcast_to(capture.laser, capture.wall.shape)
+    return replace(capture, wall=lasers, laser=capture.wall)
+
+
+def choose_roles(capture: Capture) -> Capture:
+    """Return the capture with fewer laser spots than wall points: itself, or its roles swapped.
+
+    A wave has to be imaged for every laser spot, whatever the number of wall points: a scan by a
+    laser in front of few detectors is quicker the other way round.
+
+    Parameters
+    ----------
+    capture : Capture
+
+    Returns
+    -------
+    Capture
+        The same one unless swapping helps.
+    """
+    if len(capture.lasers) == 1 or is_confocal(capture):
+        return capture
+    fewer = _count_places(capture.points) < _count_places(capture.lasers)
+    return swap_roles(capture) if fewer else capture
+
+
+def _count_places(spots: FloatArray) -> int:
+    """Count the different spots among those given (n, 3), but for chance: by one number each."""
+    return int(np.unique(spots @ np.array([1.0, np.sqrt(2), np.pi])).size)
 
 
 def group_by_illumination(capture: Capture) -> list[IlluminationGroup]:

@@ -9,52 +9,11 @@ from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from nlos.geometry import FloatArray, Grid
-from nlos.illumination_groups import is_confocal
+from nlos.illumination_groups import swap_roles
 from nlos.kernels import MIN_DISTANCE_M
 from nlos.method import PhasorPlan, Progress
 from nlos.volume import Volume
 from nlos.wave_plan import SUM_BYTES, WavePlan
-
-
-def swap_roles(capture: Capture) -> Capture:
-    """Take laser spots for wall points and wall points for laser spots.
-
-    Parameters
-    ----------
-    capture : Capture
-
-    Returns
-    -------
-    Capture
-    """
-    lasers = np.broadcast_to(capture.laser, capture.wall.shape)
-    return replace(capture, wall=lasers, laser=capture.wall)
-
-
-def choose_roles(capture: Capture) -> Capture:
-    """Return the capture with fewer laser spots than wall points: itself, or its roles swapped.
-
-    A wave has to be imaged for every laser spot, whatever the number of wall points: a scan by a
-    laser in front of few detectors is quicker the other way round.
-
-    Parameters
-    ----------
-    capture : Capture
-
-    Returns
-    -------
-    Capture
-        The same one unless swapping helps.
-    """
-    if len(capture.lasers) == 1 or is_confocal(capture):
-        return capture
-    fewer = _count_places(capture.points) < _count_places(capture.lasers)
-    return swap_roles(capture) if fewer else capture
-
-
-def _count_places(spots: FloatArray) -> int:
-    """Count the different spots among those given (n, 3), but for chance: by one number each."""
-    return int(np.unique(spots @ np.array([1.0, np.sqrt(2), np.pi])).size)
 
 
 class ReciprocalPlan(PhasorPlan):

@@ -17,7 +17,7 @@ import numpy as np
 from nlos.band import BAND_EDGE_LEVEL, VirtualPulse
 from nlos.capture import Capture
 from nlos.geometry import Grid
-from nlos.illumination_groups import is_confocal
+from nlos.illumination_groups import choose_roles, is_confocal
 from nlos.method import Method, Plan
 from nlos.moveout import join_near_lasers
 from nlos.preparation import (
@@ -26,7 +26,6 @@ from nlos.preparation import (
     rebin_capture,
     remove_first_bounce,
 )
-from nlos.reciprocity import choose_roles
 from nlos.signal_analysis import (
     SignalSpectrum,
     find_brightest_path,

@@ -124,9 +124,11 @@ def test_items_are_taken_as_they_are_needed():
 
     coming = map_parallel(lambda item: item, items())
     assert next(coming) == 0
-    assert len(taken) == thread_count() + 1
+    # one for each thread waits while the first result is used; without threads none does
+    needed = 1 if thread_count() == 1 else thread_count() + 1
+    assert len(taken) == needed
     coming.close()
-    assert len(taken) == thread_count() + 1
+    assert len(taken) == needed
 
 
 def test_a_forgotten_map_may_be_closed_while_this_thread_holds_the_lock():

@@ -72,6 +72,9 @@ MIN_COMPRESSED_BYTES = 1 << 16
 
 MAX_DEPTH = 16
 """Of records within records."""
+MAX_HASHED_BYTES = 1 << 24
+"""Of larger files, size, time of change and the first bytes, this number of them, stand for the content."""
+
 MAX_MESSAGE_LENGTH = 200
 """Of another library's message that is part of ours."""
 MAX_OUTLINE_VALUES = 9
@@ -517,6 +520,24 @@ def compute_sha256(path: str | Path) -> str:
     """Hexadecimal SHA-256 of a file."""
     with translate_read_errors(path), open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def identify_file(file: Path) -> str:
+    """Say by what a file's content is known again: its hash, or for a large one what
+    `MAX_HASHED_BYTES` says.
+
+    Raises
+    ------
+    StorageError
+        It cannot be read.
+    """
+    with translate_read_errors(file):
+        state = file.stat()
+        if state.st_size <= MAX_HASHED_BYTES:
+            return compute_sha256(file)
+        with open(file, "rb") as opened:
+            start = hashlib.sha256(opened.read(MAX_HASHED_BYTES)).hexdigest()
+    return f"{state.st_size} bytes, {state.st_mtime_ns} ns, {start}"
 
 
 @contextlib.contextmanager

@@ -122,11 +122,6 @@ def read_matlab(path: str | Path) -> NamedArrays:
     return NamedArrays(path, _list_mat_entries)
 
 
-def is_matlab(path: str | Path) -> bool:
-    """Whether a file begins like one of MATLAB's, version 5 to 7.3."""
-    return _read_start(path, 6) == b"MATLAB"
-
-
 def _list_hdf5_entries(path: Path, matlab: bool) -> Entries:
     import h5py
 

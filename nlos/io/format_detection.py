@@ -14,7 +14,7 @@ from nlos.io.archives import (
     read_surface_optimisation_data,
 )
 from nlos.io.curvelet import read_curvelet_data
-from nlos.io.fields import NamedArrays, is_matlab, read_hdf5, read_matlab
+from nlos.io.fields import NamedArrays, read_hdf5, read_matlab
 from nlos.io.renderings import read_streak_folder
 from nlos.io.stanford import read_light_cone_data, read_migration_data
 from nlos.io.tal import read_tal
@@ -46,6 +46,8 @@ def read_native(path: str | Path) -> Capture | None:
 
 
 ZIP_SIGNATURE = b"PK\x03\x04"
+MATLAB_SIGNATURE = b"MATLAB"
+"""Of .mat files from version 5 to 7.3."""
 
 Reader = Callable[[NamedArrays], Capture]
 
@@ -125,7 +127,7 @@ def _read_file(path: str | Path) -> Capture:
             if "streak_raw" in archive
             else _read_fields(archive, ARCHIVE_FORMATS)
         )
-    if is_matlab(path):
+    if start.startswith(MATLAB_SIGNATURE):
         return _read_fields(read_matlab(path), MATLAB_FORMATS)
     if start == HDF5_SIGNATURE:
         return read_native(path) or _read_fields(read_hdf5(path), HDF5_FORMATS)

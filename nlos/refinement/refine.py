@@ -9,10 +9,9 @@ import numpy as np
 from nlos.capture import Capture
 from nlos.geometry import Grid
 from nlos.hybrid import Hybrid
-from nlos.illumination_groups import warn_of_aliasing
+from nlos.illumination_groups import choose_roles, warn_of_aliasing
 from nlos.method import MEMORY_LIMIT_BYTES, Method, Plan, Progress, require_numpy_signal
 from nlos.plane import axis_step
-from nlos.reciprocity import choose_roles
 from nlos.refinement.model import WallModel
 from nlos.volume import Volume
 from nlos.wave_plan import WavePlan

@@ -15,6 +15,7 @@ from nlos.geometry import Grid
 from nlos.illumination_groups import (
     IlluminationGroup,
     build_waves,
+    choose_roles,
     choose_unaliased_band,
     gather_by_points,
     group_by_illumination,
@@ -23,7 +24,7 @@ from nlos.illumination_groups import (
 from nlos.method import PhasorMethod, PhasorPlan, Progress, require_imageable
 from nlos.plane import PlanarWall, is_evenly_spaced
 from nlos.propagation.propagate import require_tolerance
-from nlos.reciprocity import ReciprocalPlan, choose_roles
+from nlos.reciprocity import ReciprocalPlan
 from nlos.rsd.diffraction import DiffractionPlan
 from nlos.wave_plan import GroupPlan, WavePlan
 from tofclip.arrays import Array

@@ -15,7 +15,7 @@ from nlos.method import Plan
 MAX_FILES = 40
 
 COUNT_FILES = """
-import inspect, sys
+import inspect, sys, threading
 from pathlib import Path
 root = Path({root!r})
 seen = set()
@@ -26,6 +26,7 @@ def note(frame, event, _):
 import apps.verbs.nlos.reconstruct  # what is called while modules are imported is not its path
 from apps.cli import main
 sys.argv = {words!r}
+threading.settrace(note)  # what other threads pass through is on the path as well
 sys.settrace(note)  # sees calls of Python only: cheaper than a profile
 try:
     main()

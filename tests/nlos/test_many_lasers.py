@@ -19,8 +19,8 @@ from nlos import (
     settings_for,
 )
 from nlos.capture import TimeAxis
+from nlos.illumination_groups import choose_roles
 from nlos.moveout import MidpointImaging, MidpointJoin, join_near_lasers
-from nlos.reciprocity import choose_roles
 from nlos.refinement.photons import PhotonRefinement
 from nlos.simulate import PointScene, add_poisson_noise
 from tofclip.errors import InputError

@@ -20,8 +20,8 @@ from tofclip.sequences.jobs import (
     select_unfinished,
 )
 from tofclip.sequences.jobs import jobs as jobs_module
-from tofclip.sequences.jobs.output_folder import MAX_HASHED_BYTES
 from tofclip.sequences.jobs.workers import connect_workers, count_local_workers
+from tofclip.storage import MAX_HASHED_BYTES
 
 pytestmark = pytest.mark.xdist_group("cluster")  # one cluster for all of them
 

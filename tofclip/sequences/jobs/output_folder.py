@@ -5,19 +5,16 @@ another.
 from __future__ import annotations
 
 import glob
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from tofclip.errors import FileFormatError, InputError, StorageError
-from tofclip.storage import atomic_path, compute_sha256, translate_read_errors
+from tofclip.storage import atomic_path, identify_file, translate_read_errors
 
 SETTINGS_NAME = "settings.json"
 INPUTS_KEY = "inputs"
-MAX_HASHED_BYTES = 1 << 24
-"""Of larger files, size, time of change and the first bytes, this number of them, stand for the content."""
 
 
 def lock_output_folder(
@@ -86,24 +83,6 @@ def _identify_files(inputs: Mapping[str, Path]) -> dict[str, str]:
     # the shots of a stack share a file, which is read once
     marks = {file: identify_file(file) for file in set(inputs.values())}
     return {name: marks[file] for name, file in inputs.items()}
-
-
-def identify_file(file: Path) -> str:
-    """Say by what a file's content is known again: its hash, or for a large one what
-    `MAX_HASHED_BYTES` says.
-
-    Raises
-    ------
-    StorageError
-        It cannot be read.
-    """
-    with translate_read_errors(file):
-        state = file.stat()
-        if state.st_size <= MAX_HASHED_BYTES:
-            return compute_sha256(file)
-        with open(file, "rb") as opened:
-            start = hashlib.sha256(opened.read(MAX_HASHED_BYTES)).hexdigest()
-    return f"{state.st_size} bytes, {state.st_mtime_ns} ns, {start}"
 
 
 def _write_settings(path: Path, settings: Mapping[str, Any], marks: Mapping[str, str]) -> None:
