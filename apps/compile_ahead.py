@@ -69,6 +69,7 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
             "(i8, f4[:,::1], f4[:,::1], f4[::1], f4[:,::1], f4[::1], f4[::1], f4[:,:,::1], f4[::1],"
             " f4[:,::1], f4[::1])"
         ),
+        (SOLVERS, "restore_frames"): "(f4[:,:,::1], f4[:,:,::1], f4[::1])",
         (SOLVERS, "shrink_nonnegative"): (
             "(f4[:,::1], f4[:,::1], f4[::1], f4[:,::1], f4[::1], f4[::1], f4[::1], f4[::1],"
             " f4[::1])"
@@ -103,7 +104,7 @@ GROUPS: Sequence[Sequence[str]] = (
 )
 """Modules whose loops take about as long to compile together, each for a process."""
 
-FUNCTIONS_PER_GROUP = (29, 24)
+FUNCTIONS_PER_GROUP = (29, 25)
 """Loops and their parts, which the compiler takes one by one."""
 
 

@@ -207,6 +207,29 @@ def update_peaks(tile_starts, columns, values, scales, block, highest):
 
 
 @fast_njit
+def restore_frames(candidate, current, rejected):
+    """``candidate = current`` in the lanes where `rejected` is 1; it is 0 elsewhere. Arrays are
+    (..., lanes).
+
+    Parameters
+    ----------
+    candidate : (rows, columns, lanes) array
+        Overwritten in rejected lanes.
+    current : (rows, columns, lanes) array
+    rejected : (lanes,) array of the pictures' dtype
+        1 or 0.
+    """
+    lanes = candidate.shape[2]
+    for row in range(current.shape[0]):
+        for column in range(current.shape[1]):
+            for lane in range(lanes):
+                here = candidate[row, column, lane]
+                candidate[row, column, lane] = here + rejected[lane] * (
+                    current[row, column, lane] - here
+                )
+
+
+@fast_njit
 def descend_total_variation(
     lanes, current, previous, momentum, gradient, step, weight, dual, sweep, scratch, total
 ):

@@ -232,8 +232,15 @@ class CompiledLoops:
         Arguments and result are those of `Loops.restore_frames`.
         """
         if rejected.any():
-            values[..., rejected] = before[..., rejected]
+            self._kernels.restore_frames(
+                _flatten_rows(values), _flatten_rows(before), rejected.astype(values.dtype)
+            )
         return values
+
+
+def _flatten_rows(array: Array) -> Array:
+    """The same memory as (rows, columns, frames)."""
+    return array.reshape(-1, *array.shape[-2:])
 
 
 def _join_lanes(array: Array) -> Array:
