@@ -149,7 +149,8 @@ def straighten_surfaces(model: SurfaceModel, solver: AmplitudeSolver) -> Amplitu
     """
     found = None
     for surface, basis in enumerate(model.bases):
-        if basis.pieces == (0, 0):
+        lit = solver.amplitude[model.parts[surface]] > 0
+        if basis.pieces == (0, 0) or not lit.any():
             continue
         trial = model.straighten(surface, solver.amplitude)
         moved = refine_state(trial, solver.amplitude).amplitude

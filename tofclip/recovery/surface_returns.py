@@ -44,6 +44,8 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
     information[model.masks] = model.gather(model.weights, squared=True)
     pictures[model.masks] = amplitude
     pooled = np.stack([pool_information(*one) for one in zip(information, pictures, strict=True)])
+    # running sums may leave a rounding error below nothing
+    pooled = np.maximum(pooled, 0)
     significance = amplitude * np.sqrt(pooled[model.masks] / solver.variance)
     deviation = np.zeros(distance.size)
     for part, monomials, own, rest in zip(

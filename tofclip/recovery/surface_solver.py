@@ -239,28 +239,30 @@ def refine_state(
     change = inverse @ slope
     before, step = _objective(model, rest), 1.0
     moved = amplitude
-    while step >= SMALLEST_STEP:
-        ahead = _move(state, names, step * change)
-        # the mean gain is the amplitudes' unit, and so is the mean brightness behind a surface
-        excess = ahead.gains.mean() / state.gains.mean()
-        ahead.gains /= excess
-        moved = amplitude.copy()
-        for surface, part in enumerate(model.parts):
-            own = [i for i, name in enumerate(names) if name[:2] == ("coefficients", surface)]
-            if len(own) == len(changes):
-                moved[part] -= (step * change[own]).astype(np.float32) @ changes[:, part]
-        moved = np.float32(excess) * np.maximum(moved, 0)
-        brighter = ahead.shading.mean(axis=1)
-        ahead.shading -= brighter[:, np.newaxis]
-        moved *= np.where(model.behind, np.exp(brighter)[model.surface], 1).astype(np.float32)
-        model.place(ahead)
-        rest = _leave_unexplained(model, model.image - model.render(moved), scale)
-        if _objective(model, rest) < before:
-            break
-        step /= 2
-    else:
-        model.place(state)
-        moved = amplitude
+    # A step that is far too long may overflow: it is refused like others that lower nothing.
+    with np.errstate(over="ignore", invalid="ignore"):
+        while step >= SMALLEST_STEP:
+            ahead = _move(state, names, step * change)
+            # the mean gain is the amplitudes' unit, and so is the mean brightness behind a surface
+            excess = ahead.gains.mean() / state.gains.mean()
+            ahead.gains /= excess
+            moved = amplitude.copy()
+            for surface, part in enumerate(model.parts):
+                own = [i for i, name in enumerate(names) if name[:2] == ("coefficients", surface)]
+                if len(own) == len(changes):
+                    moved[part] -= (step * change[own]).astype(np.float32) @ changes[:, part]
+            moved = np.float32(excess) * np.maximum(moved, 0)
+            brighter = ahead.shading.mean(axis=1)
+            ahead.shading -= brighter[:, np.newaxis]
+            moved *= np.where(model.behind, np.exp(brighter)[model.surface], 1).astype(np.float32)
+            model.place(ahead)
+            rest = _leave_unexplained(model, model.image - model.render(moved), scale)
+            if _objective(model, rest) < before:
+                break
+            step /= 2
+        else:
+            model.place(state)
+            moved = amplitude
     robust = inverse @ (scores @ scores.T + bending) @ inverse
     numbers = np.array([one if name == "coefficients" else -1 for name, one, _ in names])
     blocks = [np.flatnonzero(numbers == surface) for surface in range(len(model.masks))]
