@@ -254,6 +254,7 @@ def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, spa
     )
     waves = np.empty((2, x.size), np.float32)
     per_metre = (table.shape[1] - 1) / max(span[1] - span[0], 1e-12)
+    turns_per_metre = wavenumber / (2 * math.pi)
     for iy in range(y.size):
         across = (y[iy] - laser[1]) ** 2 + (depth - laser[2]) ** 2
         for ix in range(x.size):
@@ -261,12 +262,7 @@ def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, spa
             place = max((distance - span[0]) * per_metre, 0.0)
             sample = min(int(place), table.shape[1] - 2)
             before[ix], weight[ix] = sample, place - sample
-            turns = distance * (wavenumber / (2 * math.pi))
-            turns -= math.floor(turns + 0.5)
-            waves[0, ix], waves[1, ix] = (
-                cosine_of_turns(np.float32(turns)),
-                sine_of_turns(np.float32(turns)),
-            )
+            waves[0, ix], waves[1, ix] = _compute_wave(distance * turns_per_metre)
         sums[:] = 0
         for m in range(terms.shape[0]):
             _add_term(terms[m, iy], table[m], before, weight, m >= odd, sums)
@@ -290,24 +286,23 @@ def add_with_carrier(values, x, y, z, laser, wavenumber, field):
         Added to.
     """
     waves = np.empty((2, x.size), np.float32)
+    turns_per_metre = wavenumber / (2 * math.pi)
     for iz in range(z.size):
         for iy in range(y.size):
             across = (y[iy] - laser[1]) ** 2 + (z[iz] - laser[2]) ** 2
-            _compute_carrier(x, laser[0], across, wavenumber / (2 * math.pi), waves)
+            # in a loop of its own, since what is complex keeps it from being done in vectors
+            for ix in range(x.size):
+                distance = math.sqrt((x[ix] - laser[0]) ** 2 + across)
+                waves[0, ix], waves[1, ix] = _compute_wave(distance * turns_per_metre)
             for ix in range(x.size):
                 field[iz, iy, ix] += values[iz, iy, ix] * complex(waves[0, ix], waves[1, ix])
 
 
 @compiled
-def _compute_carrier(x, laser_x, across, turns_per_metre, waves):
-    """Carrier wave of a row of voxels, real and imaginary parts."""
-    for ix in range(x.size):
-        turns = math.sqrt((x[ix] - laser_x) ** 2 + across) * turns_per_metre
-        turns -= math.floor(turns + 0.5)
-        waves[0, ix], waves[1, ix] = (
-            cosine_of_turns(np.float32(turns)),
-            sine_of_turns(np.float32(turns)),
-        )
+def _compute_wave(turns):
+    """Real and imaginary part of the carrier wave after some turns."""
+    turns -= math.floor(turns + 0.5)
+    return cosine_of_turns(np.float32(turns)), sine_of_turns(np.float32(turns))
 
 
 @compiled

@@ -187,22 +187,19 @@ def _add_best(result: Result, study: Study, library: Library, folder: Path) -> R
         "seed": SEED,
         "shears": list(SHEAR_RANGE),
     }
-    kept = load_result(path, settings) or {"figures": {}, "seconds": 0.0}
+    kept = dict(load_result(path, settings) or {"figures": {}, "seconds": 0.0})
     began = time.process_time() - kept["seconds"]
 
     def keep(figures: dict[str, BestFigure]) -> None:
-        text = {
-            "settings": settings,
-            "figures": to_plain(figures),
-            "seconds": time.process_time() - began,
-        }
+        kept.update(
+            settings=settings, figures=to_plain(figures), seconds=time.process_time() - began
+        )
         with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(text, indent=1), encoding="utf-8")
+            temporary.write_text(json.dumps(kept, indent=1), encoding="utf-8")
 
     with show_progress(f"{study.name}, best of ours", len(study.best)) as advance:
         figures = solve_best(study.best, library, from_plain(kept["figures"]), keep, advance)
-    seconds = (load_result(path, settings) or kept)["seconds"]
-    full = add_best(result, figures, seconds)
+    full = add_best(result, figures, kept["seconds"])
     write_result(full, folder)
     return full
 

@@ -147,16 +147,19 @@ def straighten_surfaces(model: SurfaceModel, solver: AmplitudeSolver) -> Amplitu
     AmplitudeSolver or None
         Of the model with those quadratics; None where all splines are needed.
     """
-    found = None
-    for surface, basis in enumerate(model.bases):
-        lit = solver.amplitude[model.parts[surface]] > 0
-        if basis.pieces == (0, 0) or not lit.any():
+    bent = [surface for surface, basis in enumerate(model.bases) if basis.pieces != (0, 0)]
+    if not bent:
+        return None
+    found, least = None, compute_objective(model, solver.amplitude)
+    for surface in bent:
+        if not (solver.amplitude[model.parts[surface]] > 0).any():
             continue
         trial = model.straighten(surface, solver.amplitude)
         moved = refine_state(trial, solver.amplitude).amplitude
-        if compute_objective(trial, moved) <= compute_objective(model, solver.amplitude):
+        objective = compute_objective(trial, moved)
+        if objective <= least:
             model, solver = trial, AmplitudeSolver(trial, moved, solver.weight, solver)
-            found = solver
+            found, least = solver, objective
     return found
 
 

@@ -65,10 +65,11 @@ class BinTable:
 
     def find_fullest(self, pixels: NDArray[np.int64]) -> tuple[NDArray[np.int64], FloatArray]:
         """Return the fullest bin of each of these pixels, and its photons."""
-        order = np.lexsort((self.count, self.place // self.bins))
-        last = np.searchsorted((self.place // self.bins), pixels, side="right") - 1
+        pixel = self.place // self.bins
+        order = np.lexsort((self.count, pixel))
+        last = np.searchsorted(pixel, pixels, side="right") - 1
         held = np.maximum(last, 0)
-        seen = (last >= 0) & (self.place[held] // self.bins == pixels)
+        seen = (last >= 0) & (pixel[held] == pixels)
         fullest = order[held]
         return np.where(seen, self.place[fullest] % self.bins, 0), np.where(
             seen, self.count[fullest], 0.0
