@@ -26,7 +26,7 @@ TITLE = "compiling loops for this processor, once"
 SEARCH, NEIGHBOURS = "tofclip.lidar.search.compiled", "tofclip.lidar.neighbours"
 LONE = "tofclip.lidar.search.lone_fit"
 CAMERA, OPERATORS = "tofclip.camera.kernels", "tofclip.operators.kernels"
-SOLVERS, SURFACES = "tofclip.solvers.kernels", "tofclip.recovery.surface_kernels"
+SOLVERS, SURFACES = "tofclip.solvers.kernels", "tofclip.recovery.surfaces.kernels"
 
 LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
     {

@@ -10,10 +10,9 @@ import pytest
 from tofclip import depth
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
-from tofclip.recovery import open_shot, plan_recovery
-from tofclip.recovery.surface_pulse import measure_pulse
-from tofclip.recovery.surface_refusal import measure_slopes
-from tofclip.recovery.surfaces import SurfaceRecovery
+from tofclip.recovery import SurfaceRecovery, open_shot, plan_recovery
+from tofclip.recovery.surfaces.pulse import measure_pulse
+from tofclip.recovery.surfaces.refusal import measure_slopes
 from tofclip.shots import Streak
 from tofclip.solvers import Sparse
 from tofclip.units import SPEED_OF_LIGHT

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from tofclip.camera import Camera, Rectifier
 from tofclip.recovery import DepthLockedFocus, Shot, SurfaceRecovery, open_shot, plan_recovery
 from tofclip.recovery.focus import DEFAULT_FOCUS
-from tofclip.recovery.surface_fit import SurfaceFit, fit_surfaces, follow_surfaces
-from tofclip.recovery.surface_returns import list_returns
+from tofclip.recovery.surfaces.fit import SurfaceFit, fit_surfaces, follow_surfaces
+from tofclip.recovery.surfaces.returns import list_returns
 from tofclip.shots import Returns, Streak
 
 

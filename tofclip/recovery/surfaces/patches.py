@@ -1,22 +1,23 @@
 """Smooth surfaces in the returns of frames: connected patches, and a robust smooth fit to each.
 
-A surface's inverse depth 1/z is a smooth function of the picture's coordinates: a quadratic, which
-a plane's is exactly, or a spline where a quadratic does not follow the returns. Range is
-``length / (1/z)``, with the length of the ray ``(X/f, Y/f, 1)``.
+A patch is the surface's first estimate: where it is seen, and its inverse depth over a `SmoothBasis`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tofclip.recovery.surfaces.basis import (
+    FloatArray,
+    Pixels,
+    SmoothBasis,
+    make_second_differences,
+)
 from tofclip.shots import Returns
-
-FloatArray = NDArray[np.float64]
-Pixels = NDArray[np.intp]
 
 MARGIN_PX = 10  # how far a surface may reach beyond the returns that showed it
 NEIGHBOUR_BINS = 1.6  # neighbouring pixels whose ranges differ by less lie on one surface
@@ -35,7 +36,6 @@ MERGE_REACH_BINS = 7.0  # of the larger's fit at the smaller: further off it is 
 FIT_ITERATIONS = 10
 RIDGE = 1e-9  # per return
 CURVATURE_PENALTY = 1e-3  # keeps small patches from bending
-COEFFICIENTS = 6
 KNOT_SPACING_PX = 12
 MAX_PIECES = 8
 BEND_BINS = 0.3  # misfit of a quadratic from which on splines are tried
@@ -43,56 +43,6 @@ BENT_FRACTION = 0.6  # of a quadratic's misfit: splines are worth their freedom 
 EVIDENCE_ROUNDS = 2
 SPLINE_START_PENALTY, SPLINE_FLOOR = 1e-5, 1e-9  # per return, before the bending is known
 CORRELATED_PX = 30  # returns of a frame recovery that share their errors, about
-SPLINE_DEGREE = 3
-
-
-@dataclass(frozen=True)
-class SmoothBasis:
-    """Smooth functions over the picture, of which a surface's inverse depth is a sum.
-
-    Parameters
-    ----------
-    image_shape : (int, int)
-    box : (int, int, int, int)
-        First row and column, and those after the last, over which splines run.
-    pieces : (int, int)
-        Of the splines along rows and columns; without any it is the six monomials of a quadratic.
-    bending : (n, n) float array
-        Half of ``c' bending c`` is added to the objective: what is known of coefficients c without
-        the shot. By default nothing is.
-    """
-
-    image_shape: tuple[int, int]
-    box: tuple[int, int, int, int] = (0, 0, 0, 0)
-    pieces: tuple[int, int] = (0, 0)
-    bending: FloatArray = field(default_factory=lambda: np.zeros((COEFFICIENTS, COEFFICIENTS)))
-
-    def evaluate(self, pixels: Pixels) -> FloatArray:
-        """Return the functions' values at raster numbers, (pixels, n)."""
-        if self.pieces == (0, 0):
-            return evaluate_monomials(pixels, self.image_shape)
-        y, x = np.divmod(pixels, self.image_shape[1])
-        top, left, bottom, right = self.box
-        down = _evaluate_splines((y - top + 0.5) / (bottom - top), self.pieces[0])
-        across = _evaluate_splines((x - left + 0.5) / (right - left), self.pieces[1])
-        return (down[:, :, np.newaxis] * across[:, np.newaxis]).reshape(pixels.size, -1)
-
-
-def _evaluate_splines(place: FloatArray, pieces: int) -> FloatArray:
-    """Uniform cubic B-splines over 0..1, (points, pieces + 3); beyond the ends as at the ends."""
-    from scipy.interpolate import BSpline
-
-    knots = np.arange(-SPLINE_DEGREE, pieces + SPLINE_DEGREE + 1) / pieces
-    inside = np.clip(place, 0.0, 1 - 1e-9)
-    found: FloatArray = BSpline.design_matrix(inside, knots, SPLINE_DEGREE).toarray()
-    return found
-
-
-def _make_second_differences(pieces: tuple[int, int]) -> FloatArray:
-    """Matrix of the second differences of neighbouring coefficients, along rows and columns."""
-    rows, columns = (number + SPLINE_DEGREE for number in pieces)
-    down, across = (np.diff(np.eye(number), 2, axis=0) for number in (rows, columns))
-    return np.concatenate([np.kron(down, np.eye(columns)), np.kron(np.eye(rows), across)])
 
 
 @dataclass(frozen=True)
@@ -114,21 +64,6 @@ class Patch:
     distance: FloatArray
     basis: SmoothBasis
     coefficients: FloatArray
-
-
-def evaluate_monomials(pixels: Pixels, image_shape: tuple[int, int]) -> FloatArray:
-    """Return 1, x, y, x^2, xy and y^2 of pixels, (n, 6), in halves of the picture from its middle.
-
-    Parameters
-    ----------
-    pixels : (n,) int array
-        Raster numbers.
-    image_shape : (int, int)
-    """
-    rows, columns = image_shape
-    y, x = np.divmod(pixels, columns)
-    down, right = 2 * y / rows - 1, 2 * x / columns - 1
-    return np.stack([np.ones_like(x), right, down, right**2, right * down, down**2], axis=-1)
 
 
 def find_patches(
@@ -365,7 +300,7 @@ def _bend_where_needed(patch: Patch, ray_length: FloatArray, bin_m: float) -> Pa
     )
     basis = SmoothBasis(shape, box, (down, across))
     design, inverse = basis.evaluate(patch.pixels), length / patch.distance
-    differences = _make_second_differences(basis.pieces)
+    differences = make_second_differences(basis.pieces)
     floor = SPLINE_FLOOR * patch.pixels.size * np.eye(design.shape[1])
     penalty = floor + SPLINE_START_PENALTY * patch.pixels.size * differences.T @ differences
     for _ in range(EVIDENCE_ROUNDS):

@@ -1,23 +1,4 @@
-"""Surfaces instead of frames: range and amplitude of every pixel from the whole shot at once.
-
-A frame is a thin slice through surfaces, often a ring or a sliver, which no prior on pictures fits.
-Here the prior is on the surfaces. Surface k has a range r_k(p), its inverse depth a smooth function
-over the picture, and an amplitude a_k(p) >= 0; the raw streak image is
-
-    y = sum_k sum_p a_k(p) g_v s_v(p, r_k(p)) h(t - 2 r_k(p) / c),
-
-with the gains g_v of the views, the place s_v of the pixel on the slit at the shear of its range,
-and the pulse h (`tofclip.recovery.surface_model`). With photon weights w the objective is
-
-    J(a, r) = 1/2 |A(r) a - y|^2_w + sum_k weight_k TV(a_k).
-
-Surfaces come from a fast recovery of frames (`tofclip.recovery.surface_patches`) and reach beyond
-their returns, since the data of a range window decide where a surface ends. Amplitudes are solved
-for by FISTA with a step size for each surface; ranges, gains, delays, stretches and pulse widths of
-the views by Gauss-Newton steps, each taken only if it lowers the misfit
-(`tofclip.recovery.surface_solver`; `tofclip.recovery.surface_fit` has the order).
-docs/recovery_algorithm.md derives it.
-"""
+"""The method "surfaces": surfaces of a whole shot, and frames as their rendering."""
 
 from __future__ import annotations
 
@@ -30,15 +11,17 @@ import scipy
 from tofclip.camera import measure
 from tofclip.errors import InputError
 from tofclip.lidar import Detection
-from tofclip.recovery.surface_fit import (
+from tofclip.recovery.surfaces.fit import (
     REFINEMENT_ITERATIONS,
     REFINEMENTS,
     START_ITERATIONS,
     SurfaceFit,
     fit_surfaces,
 )
-from tofclip.recovery.surface_model import EXTENT_SIGMAS, Image, SurfaceModel, find_rows
-from tofclip.recovery.surface_returns import list_returns
+from tofclip.recovery.surfaces.model import Image, SurfaceModel
+from tofclip.recovery.surfaces.places import find_rows
+from tofclip.recovery.surfaces.pulse import EXTENT_SIGMAS
+from tofclip.recovery.surfaces.returns import list_returns
 from tofclip.shots import Frames, Returns, Streak
 from tofclip.solvers import Method, Progress, Sparse, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT

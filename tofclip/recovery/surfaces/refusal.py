@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from tofclip.camera import measure
 from tofclip.errors import InputError
-from tofclip.recovery.surface_model import Image, SurfaceModel, compare_smoothed
-from tofclip.recovery.surface_patches import Patch
-from tofclip.recovery.surface_pulse import ShotPulse
+from tofclip.recovery.surfaces.model import Image, SurfaceModel
+from tofclip.recovery.surfaces.patches import Patch
+from tofclip.recovery.surfaces.pulse import ShotPulse
+from tofclip.recovery.surfaces.weights import compare_smoothed
 from tofclip.shots import Frames, Returns, Streak
 
 FloatArray = NDArray[np.float64]

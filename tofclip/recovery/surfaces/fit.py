@@ -8,26 +8,23 @@ import numpy as np
 import scipy
 
 from tofclip.lidar import compute_ray_directions, depth
-from tofclip.recovery.surface_model import FloatArray, SurfaceModel, SurfaceState
-from tofclip.recovery.surface_patches import (
+from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
+from tofclip.recovery.surfaces.model import FloatArray, SurfaceModel
+from tofclip.recovery.surfaces.patches import (
     MARGIN_PX,
     find_dimmer_patches,
     find_patches,
     reach_further,
 )
-from tofclip.recovery.surface_pulse import measure_pulse
-from tofclip.recovery.surface_refusal import (
+from tofclip.recovery.surfaces.pulse import measure_pulse
+from tofclip.recovery.surfaces.ranges import Refinement, compute_objective, refine_state
+from tofclip.recovery.surfaces.refusal import (
     require_explained,
     require_gentle_slopes,
     require_short_pulse,
     require_surfaces,
 )
-from tofclip.recovery.surface_solver import (
-    AmplitudeSolver,
-    Refinement,
-    compute_objective,
-    refine_state,
-)
+from tofclip.recovery.surfaces.state import SurfaceState
 from tofclip.shots import Frames, Streak
 from tofclip.solvers import Progress, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
@@ -147,7 +144,7 @@ def straighten_surfaces(model: SurfaceModel, solver: AmplitudeSolver) -> Amplitu
     AmplitudeSolver or None
         Of the model with those quadratics; None where all splines are needed.
     """
-    bent = [surface for surface, basis in enumerate(model.bases) if basis.pieces != (0, 0)]
+    bent = [surface for surface, basis in enumerate(model.bases) if not basis.is_quadratic]
     if not bent:
         return None
     found, least = None, compute_objective(model, solver.amplitude)

@@ -17,6 +17,7 @@ from tofclip.shots import Frames
 from tofclip.units import SPEED_OF_LIGHT
 
 FloatArray = NDArray[np.float64]
+Image = NDArray[np.float32]
 
 FWHM_PER_SIGMA = 2 * np.sqrt(2 * np.log(2))
 REACH_BEFORE, REACH_AFTER = 4.0, 14.0  # of the camera's pulse widths: what is looked at
@@ -29,6 +30,9 @@ CORE_EXCESS = 1.1  # of the least misfit: the widest core that is as good
 LAGS_BEFORE = 0.5  # camera's pulse widths: where the core may lie before the peak
 ROW_VARIANCE = 1 / 12  # rows^2, by which a row's own duration widens what frames show
 LEAST_SHARE = 1e-3  # of the pulse's light: below, a lag is none of the tail's
+EXTENT_SIGMAS = 3.5  # 5e-4 of a pulse lie outside
+SPLINE_LEFT_VARIANCE = 1 / 6  # rows^2: a B-spline's 1/4 without the 1/12 of the row itself
+MIN_VARIANCE = 0.02  # rows^2, of the smoothing that is left of a pulse shorter than a row
 
 
 @dataclass(frozen=True)
@@ -191,3 +195,30 @@ def split_core(
     whole = np.zeros(lags.size)
     whole[allowed] = shares
     return float(sigma), whole
+
+
+def make_pulse(sigma: float, half: int, variance: float = SPLINE_LEFT_VARIANCE) -> Image:
+    """Return the samples of a Gaussian pulse that are left to smooth with.
+
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation of the pulse, rows.
+    half : int
+        Samples to either side.
+    variance : float
+        Already there, rows^2.
+    """
+    rest = max(sigma**2 - variance, MIN_VARIANCE)
+    taps = np.arange(-half, half + 1)
+    pulse = np.exp(-(taps**2) / (2 * rest))
+    pulse[np.abs(taps) > EXTENT_SIGMAS * np.sqrt(rest) + 1] = 0  # which smoothing skips
+    found: Image = (pulse / pulse.sum()).astype(np.float32)
+    return found
+
+
+def differentiate_pulse(kernel: Image) -> Image:
+    """Derivative of a smoothed image by the light's row, as a kernel of the same length."""
+    steepness = -2j * np.pi * np.fft.rfftfreq(kernel.size)  # light that is later moves on
+    slope = np.fft.irfft(steepness * np.fft.rfft(kernel), kernel.size)
+    return slope.astype(np.float32)

@@ -8,8 +8,8 @@ import scipy
 from tofclip.camera import Camera
 from tofclip.lidar import Detection
 from tofclip.lidar.range_correction import correct_returns
-from tofclip.recovery.surface_fit import SurfaceFit
-from tofclip.recovery.surface_model import FloatArray, Image
+from tofclip.recovery.surfaces.fit import SurfaceFit
+from tofclip.recovery.surfaces.model import FloatArray, Image
 from tofclip.shots import Returns
 from tofclip.units import SPEED_OF_LIGHT
 

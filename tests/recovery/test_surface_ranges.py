@@ -1,0 +1,106 @@
+"""Steps on ranges and on what is uncertain of the instrument."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from surface_scene import CAMERA, INSTRUMENT, SCENE, SHAPE, make_model
+
+from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
+from tofclip.recovery.surfaces.basis import SmoothBasis
+from tofclip.recovery.surfaces.fit import extrapolate_steps, straighten_surfaces
+from tofclip.recovery.surfaces.model import SurfaceModel
+from tofclip.recovery.surfaces.ranges import refine_state
+from tofclip.recovery.surfaces.state import SurfaceState
+from tofclip.simulate import simulate_shot
+
+
+@pytest.fixture(scope="module")
+def shot():
+    return simulate_shot(SCENE, INSTRUMENT, seed=0)
+
+
+def compute_misfit(model: SurfaceModel, amplitude: np.ndarray) -> float:
+    return float(np.sum(model.weights * (model.render(amplitude) - model.image) ** 2))
+
+
+def test_a_refused_or_taken_step_never_raises_the_misfit(shot):
+    model = make_model(shot.streak)
+    amplitude = np.full(model.surface.size, 50, np.float32)
+    before = compute_misfit(model, amplitude)
+    refined = refine_state(model, amplitude)
+    assert compute_misfit(model, refined.amplitude) <= before
+    assert model.state.gains.mean() == pytest.approx(CAMERA.gains.mean())
+    assert model.state.delays[3] == model.state.stretches[3] == 0
+
+
+def test_each_view_sees_its_own_part_of_what_shines_through(shot):
+    """As through gauze: the view beside the lamp sees all that the lamp lights behind it."""
+    model = make_model(shot.streak, overlap=True)
+    amplitude = np.full(model.surface.size, 50, np.float32)
+    model.find_behind(amplitude)
+    hidden = model.masks[0].ravel()[model.pixel] & (model.surface == 1)
+    np.testing.assert_array_equal(model.behind, hidden)
+    even, shaded = model.state, model.state.copy()
+    shaded.shading[1] = [-0.25, -0.1, 0.1, 0.4, 0.15, -0.1, -0.2]
+    model.place(shaded)
+    y = np.random.default_rng(0).standard_normal(model.image.shape).astype(np.float32)
+    there, back = model.render(amplitude).astype(np.float64), model.gather(y).astype(np.float64)
+    assert np.vdot(there, y) == pytest.approx(float(np.vdot(amplitude, back)), rel=1e-4)
+    model.image = model.render(amplitude)
+    model.weights = 1 / (model.image + 5)
+    model.place(even)
+    for _ in range(2):
+        amplitude = refine_state(model, amplitude).amplitude
+    # what amplitudes take of it in two steps is a few hundredths of the largest
+    np.testing.assert_allclose(model.state.shading[1], shaded.shading[1], atol=0.03)
+    assert not model.state.shading[0].any()
+
+
+def test_what_all_views_see_alike_is_not_shaded(shot):
+    model = make_model(shot.streak, overlap=True)
+    amplitude = np.full(model.surface.size, 50, np.float32)
+    model.find_behind(amplitude)
+    clean = model.render(amplitude)
+    model.image = np.random.default_rng(0).poisson(clean + 1).astype(np.float32) - 1
+    model.weights = 1 / (clean + 1)
+    refine_state(model, amplitude)
+    assert not model.state.shading.any()
+    assert not model.behind.any()
+
+
+@pytest.mark.parametrize("bent", [False, True])
+def test_splines_are_left_where_a_quadratic_explains_the_shot(shot, bent: bool):
+    """Frames displace returns here and there, and splines follow them; the shot knows better."""
+    masks = np.zeros((1, *SHAPE), bool)
+    masks[0, 4:44, 4:44] = True
+    pixels = np.flatnonzero(masks)
+    y, x = np.divmod(pixels, SHAPE[1])
+    bump = 3e-3 * np.exp(-((x - 18) ** 2 + (y - 20) ** 2) / 50)
+    basis = SmoothBasis(SHAPE, (4, 4, 44, 44), (4, 4))
+    design = basis.evaluate(pixels)
+    flat = 1 / 1.5 + 1e-4 * x
+    found, true = (
+        np.linalg.lstsq(design, flat + part, rcond=None)[0] for part in (bump, bent * bump)
+    )
+    basis = replace(basis, bending=1e-3 * np.eye(design.shape[1]))
+    state = SurfaceState.start([true], CAMERA)
+    model = SurfaceModel(shot.streak, CAMERA, masks, [basis], state)
+    board = np.where((x // 6 + y // 6) % 2 == 0, 60, 30).astype(np.float32)
+    model.image = model.render(board)
+    model.weights = 1 / (model.image + 5)
+    model.place(SurfaceState.start([found], CAMERA))
+    amplitude = refine_state(model, board).amplitude
+    straight = straighten_surfaces(model, AmplitudeSolver(model, amplitude, 2.0))
+    assert (straight is None) == bent
+    if straight is not None:
+        assert straight.model.bases[0].is_quadratic
+        error = straight.model.distance - straight.model.ray_length / flat
+        assert np.median(np.abs(error)) < 0.1e-3  # 2.9 mm at the bump before
+
+
+def test_what_steps_leave_is_a_geometric_series():
+    lengths = np.array([[8.0, 4.0, 1.0], [2.0, 4.0, 0.0]])
+    np.testing.assert_allclose(extrapolate_steps(lengths), [2 / 3, 4.0, 0.0])

@@ -1,0 +1,198 @@
+"""Solving for amplitudes at fixed ranges: with the prior by FISTA, and without it what they explain."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.recovery.surfaces.model import FloatArray, Image, SurfaceModel
+from tofclip.solvers import Progress
+from tofclip.threads import run_blocks
+
+PROX_ITERATIONS = 6  # of the dual, which is kept from step to step
+NORM_ITERATIONS, FURTHER_NORM_ITERATIONS = 10, 2
+NORM_MARGIN = 1.1
+# Smooth changes of amplitude, which matter, converge first; those of the last step are nearly right.
+ELIMINATION_ITERATIONS, FURTHER_ELIMINATION_ITERATIONS = 6, 2
+TINY = float(np.finfo(np.float32).tiny)
+
+
+class AmplitudeSolver:
+    """FISTA for the amplitudes, a step size for each surface.
+
+    Different surfaces hardly share measurements, so that a step for each is as safe as one for all and
+    does not hold the bright ones back.
+
+    Parameters
+    ----------
+    model : SurfaceModel
+    amplitude : (points,) float32 array
+        Start.
+    weight : float
+        Of total variation, in standard deviations of the noise in the misfit's gradient.
+    earlier : AmplitudeSolver, optional
+        Of the same surfaces, seen by another shot: what it found saves work.
+    """
+
+    def __init__(
+        self,
+        model: SurfaceModel,
+        amplitude: Image,
+        weight: float,
+        earlier: AmplitudeSolver | None = None,
+    ) -> None:
+        self.model, self.amplitude, self.weight = model, amplitude, weight
+        rows, columns = model.camera.image_shape
+        self._dual = np.zeros((len(model.masks), 2, rows, columns), np.float32)
+        self._boxes = [find_box(mask) for mask in model.masks]
+        self._direction = np.ones(model.surface.size, np.float32)
+        self._fresh = True
+        self.variance = 1.0
+        if earlier is not None:
+            self._dual, self._direction = earlier._dual.copy(), earlier._direction
+            self._fresh, self.variance = False, earlier.variance
+
+    def run(self, iterations: int, progress: Progress, frames: int) -> None:
+        """Take some steps; `progress` hears of `frames` after each."""
+        model = self.model
+        steps = 1 / (NORM_MARGIN * self._estimate_norms())
+        weights = self.weight * self._estimate_gradient_noise()
+        step = steps[model.surface].astype(np.float32)
+        ahead, age = self.amplitude, 1.0
+        for _ in range(iterations):
+            error = model.render(ahead) - model.image
+            moved = self._shrink(
+                ahead - step * model.gather(model.weights * error), weights * steps
+            )
+            if np.sum((ahead - moved) * (moved - self.amplitude)) > 0:
+                age = 1.0  # the momentum points uphill (O'Donoghue and Candes, 2015)
+            older = (1 + np.sqrt(1 + 4 * age**2)) / 2
+            ahead = moved + np.float32((age - 1) / older) * (moved - self.amplitude)
+            self.amplitude, age = moved, older
+            progress(frames)
+        self.variance = estimate_excess_variance(model, self.amplitude)
+
+    def _estimate_norms(self) -> FloatArray:
+        """Largest eigenvalue of A'WA for each surface, by power iteration."""
+        model, count = self.model, len(self.model.masks)
+        vector, norms = self._direction, np.ones(count)
+        # the vector of the last time is nearly the one of moved surfaces
+        for _ in range(NORM_ITERATIONS if self._fresh else FURTHER_NORM_ITERATIONS):
+            vector = model.gather(model.weights * model.render(vector))
+            norms = np.sqrt(np.bincount(model.surface, vector.astype(np.float64) ** 2, count))
+            norms = np.maximum(norms, 1e-3 * norms.max())
+            vector /= norms[model.surface].astype(np.float32)
+        self._direction, self._fresh = vector, False
+        return norms
+
+    def _estimate_gradient_noise(self) -> FloatArray:
+        """Standard deviation of the misfit's gradient that photons make, for each surface.
+
+        The gradient A'W(A a - y) has the covariance A'WA times the variance of a weighted measurement.
+        """
+        model = self.model
+        information = self.variance * model.gather(model.weights, squared=True)
+        return np.array(
+            [
+                np.sqrt(np.median(information[part])) if part.stop > part.start else 1.0
+                for part in model.parts
+            ]
+        )
+
+    def _shrink(self, amplitude: Image, weights: FloatArray) -> Image:
+        """The proximal step of total variation on each surface."""
+        from tofclip.recovery.surfaces.kernels import prox_masked_tv
+
+        masks, found = self.model.masks, np.empty_like(amplitude)
+
+        def work(block: slice) -> None:
+            for one in range(block.start, block.stop):
+                rows, columns = self._boxes[one]
+                mask = np.ascontiguousarray(masks[one, rows, columns])
+                picture = np.zeros(mask.shape, np.float32)
+                picture[mask] = amplitude[self.model.parts[one]]
+                dual = np.ascontiguousarray(self._dual[one, :, rows, columns])
+                result = np.empty_like(picture)
+                prox_masked_tv(picture, mask, weights[one], PROX_ITERATIONS, dual, result)
+                self._dual[one, :, rows, columns] = dual
+                found[self.model.parts[one]] = result[mask]
+
+        run_blocks(work, len(masks), 1)
+        return found
+
+
+def find_box(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Return the rows and columns of the smallest box that holds a mask."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if rows.size == 0:
+        return slice(0, 1), slice(0, 1)
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+
+def estimate_excess_variance(model: SurfaceModel, amplitude: Image) -> float:
+    """Return the misfit's variance in units of what the weights expect, over lit measurements.
+
+    Parameters
+    ----------
+    model : SurfaceModel
+    amplitude : (points,) float32 array
+    """
+    predicted = model.render(amplitude)
+    lit = (predicted > 0) & (model.weights > 0)
+    if not lit.any():
+        return 1.0
+    return float(np.mean(model.weights[lit] * (predicted - model.image)[lit] ** 2))
+
+
+def scale_amplitude(model: SurfaceModel, lit: NDArray[np.bool_]) -> Image:
+    """Return scales in which lit amplitudes count alike for the data; 0 for all others, which stay.
+
+    Parameters
+    ----------
+    model : SurfaceModel
+    lit : (points,) bool array
+    """
+    diagonal = model.gather(model.weights, squared=True)
+    scale = 1 / np.sqrt(np.maximum(diagonal, TINY))
+    return np.where(lit & (diagonal > 0), scale, 0).astype(np.float32)
+
+
+def explain_by_amplitude(model: SurfaceModel, image: Image, scale: Image, iterations: int) -> Image:
+    """Return the change of amplitude x that lowers ``|image - A x|_w`` most, by conjugate gradients.
+
+    Parameters
+    ----------
+    model : SurfaceModel
+    image : (rows, columns) float32 array
+    scale : (points,) float32 array
+        Of `scale_amplitude`.
+    iterations : int
+    """
+    change = np.zeros_like(scale)
+    residual = scale * model.gather(model.weights * image)
+    direction, energy = residual.copy(), float(np.sum(residual**2, dtype=np.float64))
+    for _ in range(iterations):
+        if energy == 0:
+            break
+        product = scale * model.gather(model.weights * model.render(scale * direction))
+        length = energy / float(np.sum(direction * product, dtype=np.float64))
+        change += np.float32(length) * scale * direction
+        residual -= np.float32(length) * product
+        before, energy = energy, float(np.sum(residual**2, dtype=np.float64))
+        direction = residual + np.float32(energy / before) * direction
+    return change
+
+
+def leave_unexplained(model: SurfaceModel, error: Image, scale: Image) -> Image:
+    """Return what amplitudes cannot explain of a misfit.
+
+    Parameters
+    ----------
+    model : SurfaceModel
+    error : (rows, columns) float32 array
+    scale : (points,) float32 array
+        Of `scale_amplitude`.
+    """
+    change = explain_by_amplitude(model, error, scale, ELIMINATION_ITERATIONS)
+    rest: Image = error - model.render(change)
+    return rest

@@ -1,0 +1,265 @@
+"""Solving for ranges, and for what is uncertain of the instrument, by Gauss-Newton steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tofclip.recovery.surfaces.amplitudes import (
+    ELIMINATION_ITERATIONS,
+    FURTHER_ELIMINATION_ITERATIONS,
+    TINY,
+    explain_by_amplitude,
+    leave_unexplained,
+    scale_amplitude,
+)
+from tofclip.recovery.surfaces.basis import COEFFICIENTS
+from tofclip.recovery.surfaces.derivatives import (
+    Derivatives,
+    iterate_derivatives,
+    multiply_groups,
+    sum_scores,
+)
+from tofclip.recovery.surfaces.model import FloatArray, Image, SurfaceModel
+from tofclip.recovery.surfaces.state import SurfaceState
+
+SMALLEST_STEP = 1 / 16  # of a Gauss-Newton step, halved until it lowers the misfit
+# Rows by which each view's part of a sweep that was found from the shot is off: root mean squares of
+# the demonstration. Later views and farther surfaces look alike, so that the mean over the views is
+# what all ranges have in common.
+SWEEP_SIGMAS = {"delays": 0.015, "stretches": 0.05}
+# Of the brightness behind another surface, between the views: less does not matter, or is noise.
+MIN_SHADING, SHADING_SIGMAS = 0.1, 3.0
+RIDGE = 1e-6  # of each unknown's own information: for what the shot says nothing about
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """What a Gauss-Newton step knows.
+
+    Parameters
+    ----------
+    covariances : list of (n, n) float arrays
+        Of each surface's coefficients; everything else that was solved for is unknown.
+    amplitude : (points,) float32 array
+        After the step.
+    explained : (6, points) float32 array
+        Changes of amplitude that look like a change of each coefficient of a quadratic.
+    """
+
+    covariances: list[FloatArray]
+    amplitude: Image
+    explained: Image
+
+
+def refine_state(
+    model: SurfaceModel, amplitude: Image, earlier: Refinement | None = None
+) -> Refinement:
+    """Take a Gauss-Newton step on ranges, gains, pulse widths and, from the second step on, delays
+    and stretches, if it lowers the misfit that amplitudes cannot explain.
+
+    The covariance is ``H^-1 S H^-1`` with the information H of the data and the sum S of squares of
+    the score over clusters of measurements (H. White, Econometrica 50, 1, 1982): it holds the noise that
+    the misfit has, also where misfits of neighbouring measurements depend on each other.
+
+    Parameters
+    ----------
+    model : SurfaceModel
+        Moved in place. The mean gain stays, and so does the mean brightness behind a surface.
+    amplitude : (points,) float32 array
+    earlier : Refinement, optional
+        The step before this one, which saves work.
+
+    Returns
+    -------
+    Refinement
+    """
+    state = model.state
+    error = model.image - model.render(amplitude)
+    pull = model.weights * error
+    # As long as ranges are off by much, views that are late would take a part of it: ranges go first.
+    groups = [
+        group
+        for group in iterate_derivatives(model, amplitude)
+        if earlier is not None or group.names[0][0] not in SWEEP_SIGMAS
+    ]
+    # The prior leaves amplitudes a little too even. That looks like views that are late, but not once
+    # amplitudes have explained what they can.
+    scale = scale_amplitude(model, amplitude > 0)
+    rest = leave_unexplained(model, error, scale)
+    groups = _leave_out_even_shading(model, groups, rest)
+    changes = _eliminate_amplitude(
+        model, amplitude, groups, None if earlier is None else earlier.explained
+    )
+    names = [name for group in groups for name in group.names]
+    normal = multiply_groups(groups, model.weights)
+    scores = sum_scores(groups, pull)
+    bending, moment = _bend(model, names)
+    for index, (name, _, view) in enumerate(names):
+        if name in SWEEP_SIGMAS:
+            bending[index, index] = 1 / SWEEP_SIGMAS[name] ** 2
+            moment[index] = getattr(state, name)[view] / SWEEP_SIGMAS[name] ** 2
+    slope = sum_scores(groups, model.weights * rest).sum(axis=1) - moment
+    unit = np.sqrt(np.diag(normal)) + TINY
+    whole = (normal + bending) / np.outer(unit, unit) + RIDGE * np.eye(unit.size)
+    inverse = np.linalg.inv(whole) / np.outer(unit, unit)
+    change = inverse @ slope
+    before, step = _objective(model, rest), 1.0
+    moved = amplitude
+    # A step that is far too long may overflow: it is refused like others that lower nothing.
+    with np.errstate(over="ignore", invalid="ignore"):
+        while step >= SMALLEST_STEP:
+            ahead = _move(state, names, step * change)
+            # the mean gain is the amplitudes' unit, and so is the mean brightness behind a surface
+            excess = ahead.gains.mean() / state.gains.mean()
+            ahead.gains /= excess
+            moved = amplitude.copy()
+            for surface, part in enumerate(model.parts):
+                own = [i for i, name in enumerate(names) if name[:2] == ("coefficients", surface)]
+                if len(own) == len(changes):
+                    moved[part] -= (step * change[own]).astype(np.float32) @ changes[:, part]
+            moved = np.float32(excess) * np.maximum(moved, 0)
+            brighter = ahead.shading.mean(axis=1)
+            ahead.shading -= brighter[:, np.newaxis]
+            moved *= np.where(model.behind, np.exp(brighter)[model.surface], 1).astype(np.float32)
+            model.place(ahead)
+            rest = leave_unexplained(model, model.image - model.render(moved), scale)
+            if _objective(model, rest) < before:
+                break
+            step /= 2
+        else:
+            model.place(state)
+            moved = amplitude
+    robust = inverse @ (scores @ scores.T + bending) @ inverse
+    numbers = np.array([one if name == "coefficients" else -1 for name, one, _ in names])
+    blocks = [np.flatnonzero(numbers == surface) for surface in range(len(model.masks))]
+    return Refinement([robust[block][:, block] for block in blocks], moved, changes)
+
+
+def _leave_out_even_shading(
+    model: SurfaceModel, groups: list[Derivatives], rest: Image
+) -> list[Derivatives]:
+    """Leave out the shading of surfaces whose hidden points all views see alike, as behind a rim.
+
+    A surface that has been found to be shaded before stays so.
+    """
+    # what each view would make of them alone; views hardly share measurements
+    information = np.zeros(model.state.shading.shape)
+    shading = model.state.shading.copy()
+    known = shading.any(axis=1)
+    for group in groups:
+        height, width = group.images.shape[1:]
+        area = np.s_[group.row : group.row + height, group.column : group.column + width]
+        for (name, surface, view), image in zip(group.names, group.images, strict=True):
+            if name == "shading":
+                weighted = model.weights[area] * image
+                information[surface, view] = np.sum(weighted * image, dtype=np.float64)
+                pull = float(np.sum(weighted * rest[area], dtype=np.float64))
+                shading[surface, view] += pull / max(information[surface, view], TINY)
+    shading -= shading.mean(axis=1, keepdims=True)
+    variance = float(np.average(rest**2 * model.weights, weights=model.weights > 0))
+    gain = np.mean(information * shading**2, axis=1)
+    shaded = (np.std(shading, axis=1) > MIN_SHADING) & (gain > SHADING_SIGMAS**2 * variance)
+    shaded |= known
+    model.behind = model.behind & shaded[model.surface]
+    left = []
+    for group in groups:
+        own = [
+            i for i, (name, one, _) in enumerate(group.names) if name != "shading" or shaded[one]
+        ]
+        left.append(group._replace(names=[group.names[i] for i in own], images=group.images[own]))
+    return left
+
+
+def _eliminate_amplitude(
+    model: SurfaceModel, amplitude: Image, groups: list[Derivatives], start: Image | None
+) -> Image:
+    """Take from derivatives by coefficients, in place, what amplitudes can explain of them.
+
+    What is left of a derivative J is ``J - A x`` with the x that minimises its weighted norm, found
+    by conjugate gradients; a step on a coefficient takes x of the amplitude with it. Of different
+    surfaces, which hardly share measurements, the derivatives of one number are treated at once.
+    Surfaces of splines bend less than amplitudes could follow and are left as they are.
+
+    Returns
+    -------
+    (6, points) float32 array
+        x for each coefficient of the surfaces that are quadratics.
+    """
+    plain = [
+        group
+        for group in groups
+        if group.names[0][0] == "coefficients" and len(group.names) == COEFFICIENTS
+    ]
+    quadratic = np.isin(model.surface, [group.names[0][1] for group in plain])
+    scale = scale_amplitude(model, (amplitude > 0) & quadratic)
+    changes = np.zeros((COEFFICIENTS, model.surface.size), np.float32)
+    iterations = ELIMINATION_ITERATIONS
+    if start is not None:
+        changes[:, scale > 0] = start[:, scale > 0]
+        iterations = FURTHER_ELIMINATION_ITERATIONS
+    for number, change in enumerate(changes):
+        image = np.zeros_like(model.image)
+        for group in plain:
+            image[group.row : group.row + group.images.shape[1]] += group.images[number]
+        if start is not None:
+            image -= model.render(change)
+        change += explain_by_amplitude(model, image, scale, iterations)
+        for group in plain:
+            part = model.parts[group.names[0][1]]
+            rows = group.row, group.row + group.images.shape[1]
+            group.images[number] -= model.render_part(change[part], part, rows)
+    return changes
+
+
+def compute_objective(model: SurfaceModel, amplitude: Image) -> float:
+    """Return half the weighted squared misfit that amplitudes cannot explain, and what is known of
+    surfaces and sweep beforehand.
+
+    Parameters
+    ----------
+    model : SurfaceModel
+    amplitude : (points,) float32 array
+    """
+    error = model.image - model.render(amplitude)
+    return _objective(model, leave_unexplained(model, error, scale_amplitude(model, amplitude > 0)))
+
+
+def _objective(model: SurfaceModel, rest: Image) -> float:
+    """Half the squared misfit that is left, and what is known of surfaces and sweep beforehand."""
+    bent = sum(
+        float(c @ basis.bending @ c) / 2
+        for basis, c in zip(model.bases, model.state.coefficients, strict=True)
+    )
+    swept = sum(
+        float(np.sum(getattr(model.state, name) ** 2)) / (2 * sigma**2)
+        for name, sigma in SWEEP_SIGMAS.items()
+    )
+    misfit = float(np.sum(model.weights * rest**2, dtype=np.float64)) / 2
+    return misfit + bent + swept
+
+
+def _bend(model: SurfaceModel, names: list[tuple[str, int, int]]) -> tuple[FloatArray, FloatArray]:
+    """Second and first derivative of the surfaces' bending by all unknowns."""
+    second, first = np.zeros((len(names), len(names))), np.zeros(len(names))
+    for surface, (basis, c) in enumerate(zip(model.bases, model.state.coefficients, strict=True)):
+        own = [
+            i for i, (name, one, _) in enumerate(names) if (name, one) == ("coefficients", surface)
+        ]
+        second[np.ix_(own, own)] = basis.bending
+        first[own] = basis.bending @ c
+    return second, first
+
+
+def _move(
+    state: SurfaceState, names: list[tuple[str, int, int]], change: FloatArray
+) -> SurfaceState:
+    """The state after a step; gains and widths change relatively."""
+    moved = state.copy()
+    for (name, surface, number), value in zip(names, change, strict=True):
+        values = getattr(moved, name)
+        if name in ("coefficients", "shading"):
+            values = values[surface]
+        values[number] += value * (values[number] if name in ("gains", "widths") else 1.0)
+    return moved
