@@ -11,8 +11,7 @@ import streak_shots as oracle
 from tofclip.camera import Camera, SkewSweep
 from tofclip.errors import InputError
 from tofclip.lidar import Returns, depth
-from tofclip.recovery import open_shot, plan_recovery
-from tofclip.recovery.plan import make_method
+from tofclip.recovery import make_method, open_shot, plan_recovery
 from tofclip.shots import Streak
 
 

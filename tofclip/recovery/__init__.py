@@ -8,16 +8,14 @@ from tofclip.recovery.focus import (
     SharpestFocus,
     parse_focus,
 )
+from tofclip.recovery.methods import make_method
 from tofclip.recovery.parallax import ShotParallax, count_parallax_work, fit_parallax_to_shot
-from tofclip.recovery.plan import (
-    RecoveryPlan,
+from tofclip.recovery.plan import RecoveryPlan, plan_recovery, recover
+from tofclip.recovery.shot import (
     Shot,
     compute_view_delays_bins,
     fit_camera_to_shot,
-    make_method,
     open_shot,
-    plan_recovery,
-    recover,
     require_plausible_rows,
 )
 from tofclip.recovery.surfaces import SurfaceRecovery

@@ -17,9 +17,12 @@ import scipy
 from numpy.typing import NDArray
 
 from tofclip.shots import Streak
+from tofclip.storage import Scalar
 
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+
+DEFECTS_KEY, CLIPPED_KEY = "defective_readings", "clipped_readings"
 
 MIN_PULSE_ROWS = 2.0
 """Full width of the shortest pulse that is distinguished from a single row."""
@@ -289,5 +292,24 @@ def mask_defects(streak: Streak, pulse_fwhm: float) -> Streak:
         streak,
         counts=mended,
         saturated=known,
-        metadata={**streak.metadata, "defective_readings": str(defects.count)},
+        metadata={**streak.metadata, DEFECTS_KEY: str(defects.count)},
     )
+
+
+def count_defects(streak: Streak, clipping: float) -> dict[str, Scalar]:
+    """Count the readings that are defective and those that are cut off, where there are any.
+
+    Parameters
+    ----------
+    streak : Streak
+    clipping : float
+        Value at which it is cut off, see `find_clipping_level`.
+
+    Returns
+    -------
+    dict of str to int
+    """
+    clipped = int(np.count_nonzero(streak.counts >= clipping))
+    defective = int(streak.metadata.get(DEFECTS_KEY, 0))
+    found: dict[str, Scalar] = {DEFECTS_KEY: defective, CLIPPED_KEY: clipped}
+    return {name: number for name, number in found.items() if number}

@@ -20,7 +20,7 @@ from tofclip.camera.calibration import (
 from tofclip.camera.calibration.parallax import GATE_METHOD
 from tofclip.camera.calibration.registration import count_registration_iterations
 from tofclip.errors import CalibrationError, InputError
-from tofclip.recovery.plan import Shot
+from tofclip.recovery.shot import Shot
 from tofclip.solvers import Progress, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
 

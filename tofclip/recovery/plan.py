@@ -9,232 +9,30 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tofclip.arrays import Array, ComputeDevice, namespace, parse_device, to_numpy, zeros
-from tofclip.camera import Camera, Measurement, estimate_dark_level, measure
-from tofclip.camera.calibration import estimate_skew, register_views
-from tofclip.camera.calibration.registration import MAX_ROUND_COUNT, count_registration_iterations
-from tofclip.camera.measurement import (
-    MeasurementNoise,
-    find_dazzle_limit,
-    find_dazzled,
-    find_glints,
+from tofclip.arrays import ComputeDevice, parse_device, to_numpy
+from tofclip.camera import Camera, Measurement, measure
+from tofclip.camera.calibration.registration import count_registration_iterations
+from tofclip.camera.measurement import find_dazzled
+from tofclip.errors import require_type
+from tofclip.recovery.defects import count_defects, find_clipping_level
+from tofclip.recovery.focus import DEFAULT_FOCUS, DepthLockedFocus, Focus, parse_focus
+from tofclip.recovery.methods import AnyMethod, make_method
+from tofclip.recovery.noise import adapt_to_clipping, describe_noise, list_noise_figures
+from tofclip.recovery.segments import (
+    compute_segments_residual,
+    recover_glints,
+    recover_segments,
 )
-from tofclip.errors import InputError, require_type
-from tofclip.io import read_streak
-from tofclip.operators import LinearOperator
-from tofclip.recovery.defects import estimate_noise, find_clipping_level, mask_defects
-from tofclip.recovery.focus import (
-    DEFAULT_FOCUS,
-    DepthLockedFocus,
-    Focus,
-    FrameSegment,
-    parse_focus,
-)
+from tofclip.recovery.shot import Shot, open_shot
 from tofclip.recovery.surfaces import SurfaceRecovery
 from tofclip.shots import Frames, Streak
-from tofclip.solvers import (
-    Backprojection,
-    ClippedSquares,
-    LeastSquares,
-    LinearInverse,
-    Method,
-    Progress,
-    ProximalMethod,
-    Result,
-    Sparse,
-    TotalVariation,
-    ignore_progress,
-    relative_residual,
-)
-from tofclip.solvers.loops import frames_per_block
+from tofclip.solvers import Progress, ProximalMethod, ignore_progress
 from tofclip.storage import Scalar, collect_provenance
-from tofclip.threads import split_blocks
-from tofclip.units import PICOSECOND
-
-MAX_ROW_PER_PULSE = 100.0
-"""Longest row, in widths of the pulse: beyond, the unit of one of them is wrong."""
-
-CLIPPED_FRACTION = 0.9
-"""Of the limit above the dark: rectifying mixes what is cut off with its neighbours."""
-
-DEFECTS_KEY, CLIPPED_KEY = "defective_readings", "clipped_readings"
-
-MIN_NOISE_COUNT = 0.3
-"""A dark image whose readings are whole counts still hides this much."""
-
-AnyMethod = Method | SurfaceRecovery
-
-FURTHER_SPARSE_ITERATIONS = 40
-"""Of `l1` where their number is not given: a bright shot needs more of them than a dark one."""
-
-
-SPARSE_NOISE_FALL = 2e-3
-"""Of `l1` where iterations are not given. In shots with 20 photons in the brightest pixel the solution
-without negative values turns the noise into single bright pixels, and empties those between: after
-25 iterations 25 and 34 % of two scenes' pixels are missed, after 40 33 and 41 %. Noise alone falls as
-slowly from the 19th iteration on."""
-
-
-def make_sparse(**settings: Any) -> Sparse:
-    """Make the method `l1`, which goes on while its objective falls, and ends before it follows the
-    noise, unless iterations are given.
-    """
-    if "iterations" in settings:
-        return Sparse(**settings)
-    return Sparse(
-        **{"further": FURTHER_SPARSE_ITERATIONS, "noise_fall": SPARSE_NOISE_FALL, **settings}
-    )
-
-
-METHODS: dict[str, Callable[..., AnyMethod]] = {
-    "tv": TotalVariation,
-    "l1": make_sparse,
-    "linear": LinearInverse,
-    "adjoint": Backprojection,
-    "surfaces": SurfaceRecovery,
-}
-
-
-def make_method(name: str, **settings: Any) -> AnyMethod:
-    """Make a recovery method by its short name, with settings of its own where given.
-
-    Parameters
-    ----------
-    name : str
-        ``"tv"``, ``"l1"``, ``"linear"``, ``"adjoint"`` or ``"surfaces"``.
-    **settings
-        Passed on, such as ``iterations`` and ``weight`` of the iterative methods; None stands for
-        the method's own.
-
-    Raises
-    ------
-    InputError
-        There is no such method, or it has no such setting.
-
-    Examples
-    --------
-    >>> make_method("tv", iterations=100, weight=None).iterations
-    100
-    """
-    if name not in METHODS:
-        raise InputError(f"unknown method '{name}'; choose one of {', '.join(METHODS)}")
-    given = {setting: value for setting, value in settings.items() if value is not None}
-    try:
-        return METHODS[name](**given)
-    except TypeError as fault:
-        raise InputError(f"method '{name}' does not take {', '.join(given)}") from fault
-
-
-@dataclass(frozen=True)
-class Shot:
-    """A streak image together with what is known about the camera that took it.
-
-    Parameters
-    ----------
-    streak : Streak
-        With a time axis.
-    camera : Camera
-        With the time zero that holds for this shot. Its sweep may be unknown; see `fit_camera`.
-    centre_error_px : float
-        How far off the calibration had each slit centre, as far as the shot shows it; 0 where the
-        camera was not fitted to it.
-    """
-
-    streak: Streak
-    camera: Camera
-    centre_error_px: float = 0.0
-
-    @property
-    def times(self) -> NDArray[np.float64]:
-        """Time of flight of each row, (rows,), s: the camera's time zero is taken off."""
-        return self.streak.times - self.camera.time_zero
-
-    def fit_camera(
-        self, progress: Progress = ignore_progress, max_rounds: int = MAX_ROUND_COUNT
-    ) -> Shot:
-        """Return this shot with a camera whose sweep is known, found from the shot if need be.
-
-        Parameters
-        ----------
-        progress : callable
-        max_rounds : int
-            Refinements at most, see `tofclip.camera.calibration.register_views`.
-
-        Returns
-        -------
-        Shot
-        """
-        if self.camera.sweep is not None:
-            return self
-        found = fit_camera_to_shot(self.streak, self.camera, progress, max_rounds)
-        moved_px = found.centres_px - self.camera.centres_px
-        # two combinations of the centres only displace the picture, which no shot shows
-        freedom = max(found.views - 2, 1)
-        error_px = float(np.sqrt(np.sum(moved_px**2) / freedom))
-        return replace(self, camera=found, centre_error_px=error_px)
-
-
-def open_shot(
-    source: str | Path | Streak,
-    camera: str | Path | Camera | None = None,
-    time_zero: float | None = None,
-    bin_width: float | None = None,
-) -> Shot:
-    """Read a shot and settle which camera and which time zero belong to it.
-
-    Hot pixels, traces of particles and dead columns are masked (`tofclip.recovery.defects`).
-
-    Parameters
-    ----------
-    source : path-like or Streak
-        A file that `tofclip.read_streak` reads, or a streak image.
-    camera : path-like or Camera, optional
-        By default the one that the streak image carries.
-    time_zero : float, optional
-        Reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
-    bin_width : float, optional
-        Duration of a row, s; overrides the streak image's own time axis.
-
-    Returns
-    -------
-    Shot
-
-    Raises
-    ------
-    MissingTimeAxisError
-        Neither the streak image nor `bin_width` says how long a row lasts.
-    InputError
-        There is no camera.
-    StorageError, FileFormatError
-        A file cannot be read.
-
-    Examples
-    --------
-    >>> from tofclip.simulate.demo import simulate_demo  # doctest: +SKIP
-    >>> shot = open_shot("shot.h5", time_zero=-10.784e-9)  # doctest: +SKIP
-    """
-    if isinstance(source, Streak):
-        streak = source if bin_width is None else source.with_bin_width(bin_width)
-    else:
-        streak = read_streak(source, bin_width)
-    known = camera if camera is None or isinstance(camera, Camera) else Camera.load(camera)
-    known = known or streak.camera
-    if known is None:
-        raise InputError(
-            f"{streak.source} carries no camera: give one (`camera`, made by tofclip calibrate)"
-        )
-    require_plausible_rows(streak, known)
-    streak = mask_defects(streak, known.pulse_fwhm)
-    return Shot(streak, known if time_zero is None else known.replace(time_zero=time_zero))
 
 
 @dataclass(frozen=True)
@@ -308,7 +106,9 @@ class RecoveryPlan:
             result = recover_segments(method, camera, on_device, segments, progress)
             values = to_numpy(result.frames)
             if dazzled is not None and dazzled.any():
-                values = self._add_glints(values, camera, measurement, segments, dazzled)
+                values = recover_glints(
+                    values, self.method, camera, measurement, segments, dazzled, self.device
+                )
             solved = time.perf_counter()
             # measured with the frames where they were recovered: nothing is fetched twice
             residual = compute_segments_residual(camera, result.frames, on_device, segments)
@@ -323,7 +123,7 @@ class RecoveryPlan:
             "setup_seconds": result.setup_seconds,
             "device": str(self.device),
             **count_defects(streak, clipping),
-            **({} if noise is None else _list_noise_figures(noise, measurement, used, residual)),
+            **({} if noise is None else list_noise_figures(noise, measurement, used, residual)),
         }
         if np.isfinite(result.duality_gap):
             figures["duality_gap"] = result.duality_gap
@@ -343,32 +143,6 @@ class RecoveryPlan:
     def has_prior(self) -> bool:
         """Whether the method has a prior, and fits the measurements as well as noise allows."""
         return isinstance(self.method, ProximalMethod)
-
-    def _add_glints(
-        self,
-        values: NDArray[np.float32],
-        camera: Camera,
-        measurement: Measurement,
-        segments: Sequence[FrameSegment],
-        dazzled: NDArray[np.bool_],
-    ) -> NDArray[np.float32]:
-        """Return the frames with the pixels that dazzled measurements alone see."""
-        complete, method = values.copy(), self.method
-        assert not isinstance(method, SurfaceRecovery)
-        for segment in segments:
-            own = np.arange(dazzled.shape[1])[segment.frames]
-            some = own[dazzled[:, own].any(axis=0)]
-            if not some.size:
-                continue
-            operator = camera.operator(segment.shear)
-            whole = method.recover(
-                operator,
-                self.device.put(np.ascontiguousarray(measurement.values[:, some])),
-                self.device.put(np.ascontiguousarray(measurement.valid[:, some])),
-            )
-            glints = find_glints(operator, dazzled[:, some])
-            complete[some] = np.where(glints, to_numpy(whole.frames), complete[some])
-        return complete
 
     def _recover_surfaces(
         self, shot: Shot, method: SurfaceRecovery, progress: Progress, started: float
@@ -505,296 +279,3 @@ def recover(
     require_type(streak, Streak, "recover takes a Streak, see tofclip.read_streak")
     shot = open_shot(streak, camera)
     return plan_recovery(shot, method, focus or DEFAULT_FOCUS, device).run(progress)
-
-
-def require_plausible_rows(streak: Streak, camera: Camera) -> None:
-    """Refuse a time axis whose rows do not go with the camera's pulse, as of a wrong unit.
-
-    Parameters
-    ----------
-    streak : Streak
-    camera : Camera
-
-    Raises
-    ------
-    MissingTimeAxisError
-        There is no time axis.
-    InputError
-        A row is far longer than the pulse, or all rows together are shorter than it.
-    """
-    times, pulse = streak.times, camera.pulse_fwhm
-    rows = times.size
-    width = (times[-1] - times[0]) / max(rows - 1, 1)
-    if width > MAX_ROW_PER_PULSE * pulse:
-        fault = f"is {width / pulse:.3g} times as long as the pulse"
-    elif 0 < width * rows < pulse:
-        fault = f"is so short that all {rows} rows are shorter than the pulse"
-    else:
-        return
-    raise InputError(
-        f"{streak.source}: a row of {width / PICOSECOND:.4g} ps {fault} ({pulse / PICOSECOND:.3g} ps); "
-        "check the unit of `bin_width`, or give the pulse to calibrate (`pulse`)"
-    )
-
-
-def count_defects(streak: Streak, clipping: float) -> dict[str, Scalar]:
-    """Count the readings that are defective and those that are cut off, where there are any.
-
-    Parameters
-    ----------
-    streak : Streak
-    clipping : float
-        Value at which it is cut off, see `find_clipping_level`.
-
-    Returns
-    -------
-    dict of str to int
-    """
-    clipped = int(np.count_nonzero(streak.counts >= clipping))
-    defective = int(streak.metadata.get(DEFECTS_KEY, 0))
-    found: dict[str, Scalar] = {DEFECTS_KEY: defective, CLIPPED_KEY: clipped}
-    return {name: number for name, number in found.items() if number}
-
-
-def adapt_to_clipping(method: Method, streak: Streak, clipping: float) -> Method:
-    """Return a method with a prior that knows where a streak image is cut off.
-
-    Parameters
-    ----------
-    method : Method
-    streak : Streak
-    clipping : float
-        Value at which it is cut off, see `find_clipping_level`.
-
-    Returns
-    -------
-    Method
-        The same where nothing is cut off, or where it has a data term of its own.
-    """
-    if not isinstance(method, ProximalMethod) or method.data_term is not LeastSquares:
-        return method
-    if not np.isfinite(clipping):
-        return method
-    limit = CLIPPED_FRACTION * (clipping - estimate_dark_level(streak.counts))
-    return replace(method, data_term=partial(ClippedSquares, limit=limit))
-
-
-def describe_noise(streak: Streak, measurement: Measurement) -> MeasurementNoise:
-    """Say how the measurements fluctuate, by which returns are judged later.
-
-    For frames with a prior, which fit the measurements as well as these allow: what a linear
-    inverse spreads over the picture has another cause.
-
-    Parameters
-    ----------
-    streak : Streak
-    measurement : Measurement
-        Made of it.
-
-    Returns
-    -------
-    MeasurementNoise
-        Its misfit is known only after the recovery.
-    """
-    _, floor, gain = estimate_noise(streak.counts)
-    least = max(float(floor), MIN_NOISE_COUNT)
-    return MeasurementNoise(least, float(gain), dazzle=find_dazzle_limit(measurement, least))
-
-
-def _list_noise_figures(
-    noise: MeasurementNoise, measurement: Measurement, used: NDArray[np.bool_], residual: float
-) -> dict[str, Scalar]:
-    """List what the frames have to know of their measurements: noise, and what the model misses."""
-    light = np.where(used, measurement.values, 0)
-    energy = float(np.sum(light**2, dtype=np.float64))
-    explained = noise.floor**2 * np.count_nonzero(used) + noise.gain * float(
-        np.sum(np.maximum(light, 0), dtype=np.float64)
-    )
-    misfit = np.sqrt(max(residual**2 - explained / energy, 0.0)) if energy > 0 else 0.0
-    return replace(noise, misfit=float(misfit)).list_figures()
-
-
-def fit_camera_to_shot(
-    streak: Streak,
-    camera: Camera,
-    progress: Progress = ignore_progress,
-    max_rounds: int = MAX_ROUND_COUNT,
-) -> Camera:
-    """Return `camera` with sweep, gains and centres found from the shot itself.
-
-    Parameters
-    ----------
-    streak : Streak
-    camera : Camera
-        Where the search starts.
-    progress : callable
-        Called as the search for the views goes on.
-    max_rounds : int
-        Refinements at most, see `tofclip.camera.calibration.register_views`.
-
-    Returns
-    -------
-    Camera
-    """
-    skew = estimate_skew(streak.counts, camera)
-    # registration refines a skew that is right to a few rows, which the energy curves give
-    coarse = replace(camera, sweep=skew.sweep)
-    times = streak.times - camera.time_zero
-    return register_views(
-        streak.counts, streak.saturated, coarse, progress, times, max_rounds
-    ).camera
-
-
-def recover_segments(
-    method: Method,
-    camera: Camera,
-    measurement: Measurement,
-    segments: Sequence[FrameSegment],
-    progress: Progress = ignore_progress,
-) -> Result:
-    """Recover all frames, each segment with the operator of its own shear.
-
-    A prior's weight is relative to the brightest of the frames it is given. For segments to be
-    treated alike, it is made relative to what a surface like the shot's brightest would send back
-    from each segment's range.
-
-    Parameters
-    ----------
-    method : Method
-    camera : Camera
-    measurement : Measurement
-        Its arrays may be of any library that the method takes; the frames are where they are.
-    segments : sequence of FrameSegment
-        All frames, in order.
-    progress : callable
-        Called with the number of frame iterations just done.
-
-    Returns
-    -------
-    Result
-        Frames (frames, rows, columns).
-
-    Notes
-    -----
-    Memory: the frames, and one operator at a time.
-    """
-    if len(segments) == 1:
-        operator = camera.operator(segments[0].shear)
-        return method.recover(operator, measurement.values, measurement.valid, progress)
-    peaks = np.array(
-        [
-            _find_backprojection_peak(
-                camera.operator(segment.shear), _slice_measurement(measurement, segment)
-            )
-            for segment in segments
-        ]
-    )
-    expected = np.array([segment.brightness for segment in segments])
-    # the shot's brightest surface, as each segment's range would show it
-    scale = (np.maximum(peaks, 0) / expected).max() * expected
-    frames = zeros((measurement.values.shape[1], *camera.image_shape), measurement.values)
-    results = []
-    for segment, peak, bright in zip(segments, peaks, scale, strict=True):
-        if peak <= 0:
-            progress(method.work(segment.size))  # dark: nothing to recover
-            continue
-        part = _slice_measurement(measurement, segment)
-        weighted = (
-            # a prior's weight is relative to the brightest frame of what the solver is given
-            replace(method, weight=method.weight * bright / peak)
-            if isinstance(method, ProximalMethod)
-            else method
-        )
-        result = weighted.recover(camera.operator(segment.shear), part.values, part.valid, progress)
-        frames[segment.frames, ...] = result.frames
-        results.append(replace(result, frames=frames[segment.frames, ...]))
-    return _join_results(frames, results)
-
-
-def compute_segments_residual(
-    camera: Camera, frames: Array, measurement: Measurement, segments: Sequence[FrameSegment]
-) -> float:
-    """Return ``|F h - f| / |f|`` over all valid measurements, each frame with its own operator.
-
-    Parameters
-    ----------
-    camera : Camera
-    frames : (frames, rows, columns) array
-        Recovered.
-    measurement : Measurement
-    segments : sequence of FrameSegment
-        Without gaps; each has its shear.
-
-    Returns
-    -------
-    float
-        0 is a perfect fit.
-    """
-    misfit = energy = 0.0
-    for segment in segments:
-        part = _slice_measurement(measurement, segment)
-        xp = namespace(part.values)
-        own = float(xp.sum(_zero_invalid(part) ** 2, dtype=xp.float64))
-        if own > 0:
-            operator = camera.operator(segment.shear)
-            misfit += (
-                own
-                * relative_residual(operator, frames[segment.frames, ...], part.values, part.valid)
-                ** 2
-            )
-            energy += own
-    return float(np.sqrt(misfit / energy))
-
-
-def _slice_measurement(measurement: Measurement, segment: FrameSegment) -> Measurement:
-    columns = segment.frames
-    return Measurement(measurement.values[:, columns], measurement.valid[:, columns])
-
-
-def _zero_invalid(part: Measurement) -> Array:
-    """Return the measurements, zero where they are not valid."""
-    return namespace(part.values, part.valid).where(part.valid, part.values, 0.0)
-
-
-def _find_backprojection_peak(operator: LinearOperator, part: Measurement) -> float:
-    """Return the largest value of F'f over the valid measurements."""
-    xp, measurements = namespace(part.values), _zero_invalid(part)
-    blocks = split_blocks(measurements.shape[1], frames_per_block(operator, measurements))
-    return max(float(xp.max(operator.adjoint(measurements[:, block]))) for block in blocks)
-
-
-def _join_results(frames: Array, results: list[Result]) -> Result:
-    """Join what is known about the segments; those that stopped early count with their last
-    objective.
-    """
-    longest = max(result.objective.size for result in results)
-    objective = np.zeros(longest)
-    for result in results:
-        if result.objective.size:
-            # a segment that ended early keeps its last objective
-            objective += np.pad(result.objective, (0, longest - result.objective.size), "edge")
-    reasons = {result.stop_reason for result in results}
-    return Result(
-        frames,
-        max(result.iterations for result in results),
-        objective,
-        "iteration limit" if "iteration limit" in reasons else results[0].stop_reason,
-        sum(result.setup_seconds for result in results),
-        _join_gaps(results),
-    )
-
-
-def _join_gaps(results: list[Result]) -> float:
-    """The duality gap of all segments as a fraction of all their objectives; NaN where one has none."""
-    last = [result.objective[-1] if result.objective.size else np.nan for result in results]
-    excess = sum(result.duality_gap * value for result, value in zip(results, last, strict=True))
-    return float(excess / sum(last)) if sum(last) > 0 else float("nan")
-
-
-def compute_view_delays_bins(camera: Camera) -> list[float]:
-    """Rows by which each view is late at the first row, relative to the reference view."""
-    if camera.sweep is None:
-        return [0.0] * camera.views
-    rows, _ = camera.sweep.raw_position(np.zeros(camera.views), camera.centres_px)
-    reference = int(np.argmin(np.abs(camera.view_positions)))
-    return [float(row) for row in rows - rows[reference]]

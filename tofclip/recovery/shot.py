@@ -1,0 +1,195 @@
+"""A shot together with the camera that took it: opened once, its camera fitted if need be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.camera import Camera
+from tofclip.camera.calibration import estimate_skew, register_views
+from tofclip.camera.calibration.registration import MAX_ROUND_COUNT
+from tofclip.errors import InputError
+from tofclip.io import read_streak
+from tofclip.recovery.defects import mask_defects
+from tofclip.shots import Streak
+from tofclip.solvers import Progress, ignore_progress
+from tofclip.units import PICOSECOND
+
+MAX_ROW_PER_PULSE = 100.0
+"""Longest row, in widths of the pulse: beyond, the unit of one of them is wrong."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A streak image together with what is known about the camera that took it.
+
+    Parameters
+    ----------
+    streak : Streak
+        With a time axis.
+    camera : Camera
+        With the time zero that holds for this shot. Its sweep may be unknown; see `fit_camera`.
+    centre_error_px : float
+        How far off the calibration had each slit centre, as far as the shot shows it; 0 where the
+        camera was not fitted to it.
+    """
+
+    streak: Streak
+    camera: Camera
+    centre_error_px: float = 0.0
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Time of flight of each row, (rows,), s: the camera's time zero is taken off."""
+        return self.streak.times - self.camera.time_zero
+
+    def fit_camera(
+        self, progress: Progress = ignore_progress, max_rounds: int = MAX_ROUND_COUNT
+    ) -> Shot:
+        """Return this shot with a camera whose sweep is known, found from the shot if need be.
+
+        Parameters
+        ----------
+        progress : callable
+        max_rounds : int
+            Refinements at most, see `tofclip.camera.calibration.register_views`.
+
+        Returns
+        -------
+        Shot
+        """
+        if self.camera.sweep is not None:
+            return self
+        found = fit_camera_to_shot(self.streak, self.camera, progress, max_rounds)
+        moved_px = found.centres_px - self.camera.centres_px
+        # two combinations of the centres only displace the picture, which no shot shows
+        freedom = max(found.views - 2, 1)
+        error_px = float(np.sqrt(np.sum(moved_px**2) / freedom))
+        return replace(self, camera=found, centre_error_px=error_px)
+
+
+def open_shot(
+    source: str | Path | Streak,
+    camera: str | Path | Camera | None = None,
+    time_zero: float | None = None,
+    bin_width: float | None = None,
+) -> Shot:
+    """Read a shot and settle which camera and which time zero belong to it.
+
+    Hot pixels, traces of particles and dead columns are masked (`tofclip.recovery.defects`).
+
+    Parameters
+    ----------
+    source : path-like or Streak
+        A file that `tofclip.read_streak` reads, or a streak image.
+    camera : path-like or Camera, optional
+        By default the one that the streak image carries.
+    time_zero : float, optional
+        Reading of the time axis at which light of range 0 would arrive, s; the camera's by default.
+    bin_width : float, optional
+        Duration of a row, s; overrides the streak image's own time axis.
+
+    Returns
+    -------
+    Shot
+
+    Raises
+    ------
+    MissingTimeAxisError
+        Neither the streak image nor `bin_width` says how long a row lasts.
+    InputError
+        There is no camera.
+    StorageError, FileFormatError
+        A file cannot be read.
+
+    Examples
+    --------
+    >>> from tofclip.simulate.demo import simulate_demo  # doctest: +SKIP
+    >>> shot = open_shot("shot.h5", time_zero=-10.784e-9)  # doctest: +SKIP
+    """
+    if isinstance(source, Streak):
+        streak = source if bin_width is None else source.with_bin_width(bin_width)
+    else:
+        streak = read_streak(source, bin_width)
+    known = camera if camera is None or isinstance(camera, Camera) else Camera.load(camera)
+    known = known or streak.camera
+    if known is None:
+        raise InputError(
+            f"{streak.source} carries no camera: give one (`camera`, made by tofclip calibrate)"
+        )
+    require_plausible_rows(streak, known)
+    streak = mask_defects(streak, known.pulse_fwhm)
+    return Shot(streak, known if time_zero is None else known.replace(time_zero=time_zero))
+
+
+def require_plausible_rows(streak: Streak, camera: Camera) -> None:
+    """Refuse a time axis whose rows do not go with the camera's pulse, as of a wrong unit.
+
+    Parameters
+    ----------
+    streak : Streak
+    camera : Camera
+
+    Raises
+    ------
+    MissingTimeAxisError
+        There is no time axis.
+    InputError
+        A row is far longer than the pulse, or all rows together are shorter than it.
+    """
+    times, pulse = streak.times, camera.pulse_fwhm
+    rows = times.size
+    width = (times[-1] - times[0]) / max(rows - 1, 1)
+    if width > MAX_ROW_PER_PULSE * pulse:
+        fault = f"is {width / pulse:.3g} times as long as the pulse"
+    elif 0 < width * rows < pulse:
+        fault = f"is so short that all {rows} rows are shorter than the pulse"
+    else:
+        return
+    raise InputError(
+        f"{streak.source}: a row of {width / PICOSECOND:.4g} ps {fault} ({pulse / PICOSECOND:.3g} ps); "
+        "check the unit of `bin_width`, or give the pulse to calibrate (`pulse`)"
+    )
+
+
+def fit_camera_to_shot(
+    streak: Streak,
+    camera: Camera,
+    progress: Progress = ignore_progress,
+    max_rounds: int = MAX_ROUND_COUNT,
+) -> Camera:
+    """Return `camera` with sweep, gains and centres found from the shot itself.
+
+    Parameters
+    ----------
+    streak : Streak
+    camera : Camera
+        Where the search starts.
+    progress : callable
+        Called as the search for the views goes on.
+    max_rounds : int
+        Refinements at most, see `tofclip.camera.calibration.register_views`.
+
+    Returns
+    -------
+    Camera
+    """
+    skew = estimate_skew(streak.counts, camera)
+    # registration refines a skew that is right to a few rows, which the energy curves give
+    coarse = replace(camera, sweep=skew.sweep)
+    times = streak.times - camera.time_zero
+    return register_views(
+        streak.counts, streak.saturated, coarse, progress, times, max_rounds
+    ).camera
+
+
+def compute_view_delays_bins(camera: Camera) -> list[float]:
+    """Rows by which each view is late at the first row, relative to the reference view."""
+    if camera.sweep is None:
+        return [0.0] * camera.views
+    rows, _ = camera.sweep.raw_position(np.zeros(camera.views), camera.centres_px)
+    reference = int(np.argmin(np.abs(camera.view_positions)))
+    return [float(row) for row in rows - rows[reference]]
