@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
@@ -197,11 +198,19 @@ def recover(
         raise InputError("--out and --all-in-focus name the same file; take two")
     if depth_map is not None and preset != SURFACES and all_in_focus is None:
         raise InputError("--depth-map serves --preset surfaces and --all-in-focus only")
-    settings = ClipRecovery(
-        prior, "fast" if preset == SURFACES else preset, _parse_weight(weight), data_term
-    )
+    # Surfaces are found with the settings of the fast preset, whichever refocuses.
+    surface_settings = ClipRecovery(prior, "fast", _parse_weight(weight), data_term)
+    settings = replace(surface_settings, preset="fast" if preset == SURFACES else preset)
     measurements = ClipMeasurement.load(measurement)
     known_field = None if truth is None else read_light_field(truth)
+    find_surfaces = partial(
+        _find_surfaces, measurements, surface_settings, depth_map=depth_map, shears=shear_range
+    )
+    if preset == SURFACES:
+        found = _refocus_surfaces(measurements, shear, find_surfaces(weight=settings.weight))
+    else:
+        surfaces = None if all_in_focus is None else find_surfaces(weight=None)
+        found = _refocus_measurements(measurements, shear, settings, surfaces)
     past = {
         "verb": "clip recover",
         "shear": shear,
@@ -209,61 +218,77 @@ def recover(
         "preset": preset,
         "data_term": data_term,
     }
-    surfaces = None
-    if preset == SURFACES or all_in_focus is not None:
-        surfaces = _recover_surfaces(
-            measurements,
-            replace(settings, preset="fast"),
-            settings.weight if preset == SURFACES else None,
-            depth_map,
-            shear_range,
-        )
-    if surfaces is not None and preset == SURFACES:
-        picture = surfaces.render_views(measurements.views).refocus(shear)
-        recovered: AllInFocus | ClipResult = surfaces
-        seconds = {"seconds": surfaces.seconds}
-    else:
-        title = "recovering" if settings.weight is not None else "choosing the weight"
-        with show_progress(title, settings.work) as advance:
-            recovered = plain = settings.recover(measurements, shear, advance)
-        picture = plain.picture
-        seconds = {
-            "seconds": plain.seconds,
-            "seconds_setup": plain.seconds_setup,
-            "seconds_weight": plain.seconds_weight,
-        }
-    figures: dict[str, Any] = (
-        {} if known_field is None else _score_picture(picture, known_field.refocus(shear))
-    )
-    if surfaces is not None and all_in_focus is not None:
-        figures |= _write_all_in_focus(surfaces, known_field, all_in_focus, measurement, past)
-    figures |= {
-        "weight": recovered.weight,
-        "iterations": recovered.iterations,
-        "stopped_because": recovered.stop_reason,
-        **seconds,
-    }
-    _write_picture({"picture": picture}, out, measurement, past | {"weight": recovered.weight})
+    figures: dict[str, Any] = {}
+    if known_field is not None:
+        figures |= _score_picture(found.picture, known_field.refocus(shear))
+    if found.surfaces is not None and all_in_focus is not None:
+        figures |= _write_all_in_focus(found.surfaces, known_field, all_in_focus, measurement, past)
+    figures |= found.figures
+    past |= {"weight": found.figures["weight"]}
+    _write_picture({"picture": found.picture}, out, measurement, past)
     report(figures, as_json, outputs)
 
 
-def _recover_surfaces(
+class _Refocused(NamedTuple):
+    """A picture refocused at one depth, and the surfaces if they were looked for."""
+
+    picture: NDArray[Any]
+    figures: dict[str, Any]
+    surfaces: AllInFocus | None
+
+
+def _refocus_surfaces(
+    measurements: ClipMeasurement, shear: float, surfaces: AllInFocus
+) -> _Refocused:
+    """Render the picture at one depth from the one that explains all measurements."""
+    picture = surfaces.render_views(measurements.views).refocus(shear)
+    figures = _describe_recovery(surfaces) | {"seconds": surfaces.seconds}
+    return _Refocused(picture, figures, surfaces)
+
+
+def _refocus_measurements(
+    measurements: ClipMeasurement,
+    shear: float,
+    settings: ClipRecovery,
+    surfaces: AllInFocus | None,
+) -> _Refocused:
+    """Recover the picture at one depth from the measurements, taken to be sheared alike."""
+    title = "recovering" if settings.weight is not None else "choosing the weight"
+    with show_progress(title, settings.work) as advance:
+        found = settings.recover(measurements, shear, advance)
+    seconds = {
+        "seconds": found.seconds,
+        "seconds_setup": found.seconds_setup,
+        "seconds_weight": found.seconds_weight,
+    }
+    return _Refocused(found.picture, _describe_recovery(found) | seconds, surfaces)
+
+
+def _describe_recovery(found: AllInFocus | ClipResult) -> dict[str, Any]:
+    return {
+        "weight": found.weight,
+        "iterations": found.iterations,
+        "stopped_because": found.stop_reason,
+    }
+
+
+def _find_surfaces(
     measurements: ClipMeasurement,
     settings: ClipRecovery,
-    weight: float | None,
     depth_map: Path | None,
-    shear_range: tuple[float, float],
+    shears: tuple[float, float],
+    weight: float | None,
 ) -> AllInFocus:
     """Recover one picture with a depth for each pixel, known or found."""
     if depth_map is not None:
-        shears = read_depth_map(depth_map)
+        known = read_depth_map(depth_map)
         with show_progress("recovering at known depths", 1) as advance:
-            found = recover_on_depth_map(measurements, shears, weight, settings)
+            found = recover_on_depth_map(measurements, known, weight, settings)
             advance(1)
         return found
-    depths = make_shear_range(*shear_range, measurements.views)
-    with show_progress("looking for depths", count_recoveries(depths)) as advance:
-        return recover_all_in_focus(measurements, depths, weight, settings, advance)
+    tried = make_shear_range(*shears, measurements.views)
+    with show_progress("looking for depths", count_recoveries(tried)) as advance:
+        return recover_all_in_focus(measurements, tried, weight, settings, advance)
 
 
 def _write_all_in_focus(
