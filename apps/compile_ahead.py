@@ -79,11 +79,12 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
             "(i8[::1], f8[::1], f8[::1], f8[::1], i8[::1], UniTuple(i8, 2), UniTuple(f8, 2),"
             " f8[::1])"
         ),
+        (NEIGHBOURS, "raise_to_maximum"): "(i8[::1], f8[::1], f8[::1])",
         (NEIGHBOURS, "scatter_about_planes"): (
-            "(f8[::1], f8[::1], i8[::1], i8[::1], UniTuple(i8, 2), f8, i8[::1], f4[:,::1], f8[::1])"
+            "(f8[::1], f8[::1], i8[::1], i8, f8[:,:,:,::1], f8, i8[::1], f4[:,::1], f8[::1])"
         ),
         (NEIGHBOURS, "borrow_scatter"): (
-            "(f8[::1], f8[::1], i8[::1], i8[::1], UniTuple(i8, 2), f8, i8[::1], f8[::1])"
+            "(f8[::1], f8[::1], i8[::1], UniTuple(i8, 2), f8, f8[:,::1], f8[::1])"
         ),
         (SURFACES, "split_over_slit"): "(f8[::1], f8, i8, i4[::1], f4[:,::1])",
         (SURFACES, "add_light"): "(f4[::1], i4[::1], f4[:,::1], i4[::1], f4[:,::1], f4[:,::1])",
@@ -104,7 +105,7 @@ GROUPS: Sequence[Sequence[str]] = (
 )
 """Modules whose loops take about as long to compile together, each for a process."""
 
-FUNCTIONS_PER_GROUP = (29, 25)
+FUNCTIONS_PER_GROUP = (29, 27)
 """Loops and their parts, which the compiler takes one by one."""
 
 

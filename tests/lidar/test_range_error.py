@@ -7,8 +7,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from tofclip.lidar.neighbours import (
-    NEIGHBOURS,
     add_recovery_error,
+    allocate_window,
+    layer_returns,
     pool_significance,
     scatter_about_planes,
 )
@@ -109,16 +110,18 @@ def test_the_scatter_about_a_plane_counts_the_three_numbers_that_the_plane_took(
     starts = np.searchsorted(pixel, np.arange(rows * columns + 1))
     plane = 0.3 * (pixel % columns) - 0.2 * (pixel // columns)
     found = np.empty((2000, pixel.size))
+    window = allocate_window()
     for one in found:
+        nearness = plane + random.normal(0, 1, pixel.size)
         scatter_about_planes(
-            plane + random.normal(0, 1, pixel.size),
+            nearness,
             np.ones(pixel.size),
             pixel,
-            starts,
-            (rows, columns),
+            columns,
+            layer_returns(nearness, pixel, starts, (rows, columns)),
             1e3,
             np.array([5]),
-            np.zeros((5, NEIGHBOURS), np.float32),
+            window,
             one,
         )
     # Medians of so few are 3 or 4 % off by themselves.

@@ -14,7 +14,7 @@ from tofclip.errors import FileFormatError, InputError, ShapeError, require_type
 from tofclip.io.archive import ArchiveEntry
 from tofclip.lidar import export
 from tofclip.lidar.column import Column
-from tofclip.lidar.geometry import compute_ray_directions
+from tofclip.lidar.geometry import compute_slopes
 from tofclip.notebook import plot_points, render_html, require_package
 from tofclip.records import Storable, stored_array, stored_provenance
 from tofclip.shots import Returns
@@ -314,9 +314,12 @@ def point_cloud(returns: Returns) -> PointCloud:
         Radial distances with their camera.
     """
     require_type(returns, Returns, "a point cloud is made of Returns, see tofclip.depth")
-    directions = compute_ray_directions(returns.camera, *returns.line_of_sight_px)
+    right, down = compute_slopes(returns.camera, *returns.line_of_sight_px)
+    depth = returns.range / np.sqrt(right * right + down * down + 1)
+    xyz = np.empty((len(returns), 3), np.float32)
+    xyz[:, 0], xyz[:, 1], xyz[:, 2] = right * depth, down * depth, depth
     return PointCloud(
-        xyz=(directions * returns.range[:, np.newaxis]).astype(np.float32),
+        xyz=xyz,
         intensity=returns.intensity,
         range_sigma=returns.confidence,
         range=returns.range.astype(np.float32),

@@ -94,9 +94,12 @@ class Detection:
         """
         if pixel.size == 0:
             return np.zeros(0, dtype=bool)
-        needed = self.compute_least_intensity(pixel, time, intensity, pulse_width, time)
         strongest = _find_strongest(pixel, intensity)
-        np.maximum(needed, self.min_pixel_fraction * strongest[pixel], out=needed)
+        local = _find_local_maximum(time, intensity, pulse_width, time)
+        needed = np.maximum(
+            self._compute_least_of_scene(strongest), self.min_time_bin_fraction * local
+        )
+        np.maximum(needed, self.min_pixel_fraction * strongest.take(pixel), out=needed)
         strong: NDArray[np.bool_] = intensity >= needed
         return strong
 
@@ -122,16 +125,23 @@ class Detection:
         (m,) float64 array
             Brightness with the fall-off with range undone.
         """
-        strongest = _find_strongest(pixel, intensity)
-        scene = np.quantile(strongest[strongest > 0], SCENE_BRIGHTNESS_QUANTILE)
+        least = self._compute_least_of_scene(_find_strongest(pixel, intensity))
         local = _find_local_maximum(time, intensity, pulse_width, at)
-        return np.maximum(self.min_scene_fraction * scene, self.min_time_bin_fraction * local)
+        return np.maximum(least, self.min_time_bin_fraction * local)
+
+    def _compute_least_of_scene(self, strongest: FloatArray) -> float:
+        """Return what the scene asks of a return, from the strongest intensity of each pixel."""
+        scene = np.quantile(strongest[strongest > 0], SCENE_BRIGHTNESS_QUANTILE)
+        return self.min_scene_fraction * float(scene)
 
 
 def _find_strongest(pixel: NDArray[np.int64], intensity: FloatArray) -> FloatArray:
     """Largest intensity of each pixel, 0 where there is no candidate."""
+    # the compiler takes as long to import as all else
+    from tofclip.lidar.neighbours import raise_to_maximum
+
     strongest = np.zeros(int(pixel.max()) + 1)
-    np.maximum.at(strongest, pixel, intensity)
+    raise_to_maximum(pixel, intensity, strongest)
     return strongest
 
 
@@ -141,9 +151,13 @@ def _find_local_maximum(
     """Largest intensity among the candidates within `width` of each instant `at`, to a quarter of a
     width.
     """
+    from tofclip.lidar.neighbours import raise_to_maximum
+
     spacing, start = width / SLOTS_PER_WIDTH, min(time.min(), at.min())
-    slot, wanted = (np.round((one - start) / spacing).astype(np.intp) for one in (time, at))
+    slot = np.rint((time - start) / spacing).astype(np.int64)
+    wanted = slot if at is time else np.rint((at - start) / spacing).astype(np.int64)
     brightest = np.zeros(int(max(slot.max(), wanted.max())) + 1)
-    np.maximum.at(brightest, slot, intensity)
-    around: FloatArray = scipy.ndimage.maximum_filter1d(brightest, 2 * SLOTS_PER_WIDTH + 1)[wanted]
-    return around
+    raise_to_maximum(slot, intensity, brightest)
+    around: FloatArray = scipy.ndimage.maximum_filter1d(brightest, 2 * SLOTS_PER_WIDTH + 1)
+    chosen: FloatArray = around.take(wanted)
+    return chosen

@@ -37,13 +37,36 @@ def compute_ray_directions(
     CalibrationError
         A distortion so strong that no direction leads to a pixel.
     """
+    right, down = compute_slopes(camera, rows, columns)
+    forward = 1 / np.sqrt(right * right + down * down + 1)
+    return np.stack([right * forward, down * forward, forward], axis=-1)
+
+
+def compute_slopes(
+    camera: Camera, rows: ArrayLike, columns: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Slopes x / z and y / z of the directions of `compute_ray_directions`.
+
+    Parameters
+    ----------
+    camera, rows, columns
+        As for `compute_ray_directions`.
+
+    Returns
+    -------
+    right, down : (n,) float64 array
+
+    Raises
+    ------
+    CalibrationError
+        A distortion so strong that no direction leads to a pixel.
+    """
     axis_row, axis_column = camera.optical_axis_px
     right = (np.asarray(columns, dtype=np.float64) - axis_column) / camera.focal_length_px
     down = (np.asarray(rows, dtype=np.float64) - axis_row) / camera.focal_length_px
     if camera.distortion.any():
         right, down = undistort_directions(right, down, camera.distortion)
-    forward = 1 / np.sqrt(right * right + down * down + 1)
-    return np.stack([right * forward, down * forward, forward], axis=-1)
+    return right, down
 
 
 def distort_directions(

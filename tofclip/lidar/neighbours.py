@@ -18,6 +18,7 @@ recorded shot's geometry and one by another forward model, with total variation 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numba import njit
@@ -45,10 +46,24 @@ MIN_KNOWN = 20
 
 MAD_TO_SIGMA = 1.4826
 MEDIAN_PRECISION = 1e-4
-RETURNS_PER_BLOCK = 512
+RETURNS_PER_BLOCK = 2048
+"""About 3 ms of planes: less than that is done before other threads have begun."""
+
+MARGIN = REACH_PX // STRIDE_PX
+SIDE = 2 * MARGIN + 1
+"""Places for neighbours in a row of a window, and rows of a window."""
+
+WIDTH = 12
+"""Places of a row that are looked at, in whole vectors; those after `SIDE` are not used."""
 
 NEIGHBOURS = 96
-"""Room for the (2 * 8 / 2 + 1)^2 = 81 neighbours, in whole vectors."""
+"""Room for the SIDE^2 = 81 neighbours, in whole vectors."""
+
+CELL_LANES = 8
+"""Returns of a cell are compared with those around in whole vectors."""
+
+FAR = 1e20
+"""Nearness of a neighbour that is not there, 1/m."""
 
 inlined = njit(inline="always")  # into the one loop that calls it
 
@@ -83,29 +98,37 @@ def add_recovery_error(
         One standard deviation, m. Returns with few neighbours get what is usual for the others.
     """
     total = np.asarray(sigma, dtype=np.float64).copy()
+    if pixel.size == 0:
+        return total
     starts = np.zeros(image_shape[0] * image_shape[1] + 1, np.int64)
     np.cumsum(np.bincount(pixel, minlength=starts.size - 1), out=starts[1:])
     nearness = 1 / (distance * along_axis)
     metres = distance / nearness
-    scatter = np.empty(total.size)
-    row, column = np.divmod(pixel, image_shape[1])
-    first = (row % PLANE_STEP_PX == 0) & (column % PLANE_STEP_PX == 0)
+    layers = layer_returns(nearness, pixel, starts, image_shape)
+    scatter = np.full(total.size, np.nan)
+
+    def fit_planes(chosen: NDArray[np.int64]) -> None:
+        def fit(piece: slice) -> None:
+            scatter_about_planes(
+                nearness,
+                metres,
+                pixel,
+                image_shape[1],
+                layers,
+                gate,
+                chosen[piece],
+                allocate_window(),
+                scatter,
+            )
+
+        run_blocks(fit, chosen.size, RETURNS_PER_BLOCK)
+
     # neighbours have nearly the same returns around them: one plane in sixteen does
-    chosen = np.flatnonzero(first)
-    surface = nearness, metres, pixel, starts, image_shape, gate
-
-    def fit(piece: slice) -> None:
-        memory = np.zeros((5, NEIGHBOURS), np.float32)
-        scatter_about_planes(*surface, chosen[piece], memory, scatter)
-
-    def borrow(piece: slice) -> None:
-        borrow_scatter(*surface, others[piece], scatter)
-
-    run_blocks(fit, chosen.size, RETURNS_PER_BLOCK)
-    others = np.flatnonzero(~first)
-    run_blocks(borrow, others.size, RETURNS_PER_BLOCK)
-    chosen = others[np.isnan(scatter[others])]
-    run_blocks(fit, chosen.size, RETURNS_PER_BLOCK)
+    fit_planes(np.flatnonzero(_lay_out(image_shape)[1].take(pixel)))
+    # zeros, since numbers too small to be normal take a hundred times as long
+    cell = np.zeros((3, PLANE_STEP_PX**2 * layers.shape[0] + CELL_LANES))
+    borrow_scatter(nearness, metres, starts, image_shape, gate, cell, scatter)
+    fit_planes(np.flatnonzero(np.isnan(scatter)))
     known = scatter >= 0
     if np.count_nonzero(known) < MIN_KNOWN:
         return total
@@ -117,10 +140,72 @@ def add_recovery_error(
     return total
 
 
+@lru_cache(maxsize=4)
+def _lay_out(
+    image_shape: tuple[int, int],
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], tuple[int, int, int]]:
+    """Where each pixel lies in a layer of `layer_returns`, whether its returns have planes of their
+    own, and a layer's shape.
+    """
+    y, x = np.indices(image_shape).reshape(2, -1)
+    own_plane = (y % PLANE_STEP_PX == 0) & (x % PLANE_STEP_PX == 0)
+    rows, columns = (-(-size // STRIDE_PX) + MARGIN for size in image_shape)
+    shape = (STRIDE_PX**2, rows + MARGIN, columns + WIDTH)
+    place = np.ravel_multi_index(
+        (
+            y % STRIDE_PX * STRIDE_PX + x % STRIDE_PX,
+            y // STRIDE_PX + MARGIN,
+            x // STRIDE_PX + MARGIN,
+        ),
+        shape,
+    )
+    return place, own_plane, shape
+
+
+def layer_returns(
+    nearness: FloatArray,
+    pixel: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    image_shape: tuple[int, int],
+) -> FloatArray:
+    """Lay out the returns so that those at the neighbours' distance lie side by side.
+
+    Parameters
+    ----------
+    nearness : (n,) array
+        Inverse depth along the optical axis, 1/m.
+    pixel : (n,) int64 array
+        Not decreasing.
+    starts : (pixels + 1,) int64 array
+        First return of each pixel.
+    image_shape : (int, int)
+
+    Returns
+    -------
+    (most returns of a pixel, 4, rows, columns) float64 array
+        `nearness` of each pixel's first, second, ... returns, `FAR` where there is none; of pixels of
+        even rows and columns, even rows and odd columns, and so on, within a margin.
+    """
+    place, _, shape = _lay_out(image_shape)
+    number = np.arange(pixel.size) - starts.take(pixel)
+    layers = np.full((int(number.max()) + 1, *shape), FAR)
+    layers.reshape(-1)[place.take(pixel) + number * layers[0].size] = nearness
+    return layers
+
+
+def allocate_window() -> NDArray[np.float32]:
+    """Return the memory of `scatter_about_planes`: columns and rows away, how much further off, whether
+    it is used, and how far from the plane, in m, of each neighbour.
+    """
+    window = np.zeros((5, NEIGHBOURS), np.float32)
+    away = STRIDE_PX * np.arange(-MARGIN, MARGIN + 1)
+    window[0, : SIDE**2], window[1, : SIDE**2] = np.tile(away, SIDE), np.repeat(away, SIDE)
+    window[2] = FAR
+    return window
+
+
 @njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
-def scatter_about_planes(
-    nearness, metres, pixel, starts, image_shape, gate, chosen, memory, scatter
-):
+def scatter_about_planes(nearness, metres, pixel, columns, layers, gate, chosen, memory, scatter):
     """Robust deviation of the returns around each from a plane through them, -1 if they are few.
 
     Parameters
@@ -130,22 +215,26 @@ def scatter_about_planes(
     metres : (n,) array
         Change of a return's range for a change of its nearness, m^2.
     pixel : (n,) int64 array
-        Not decreasing.
-    starts : (pixels + 1,) int64 array
-        First return of each pixel.
-    image_shape : (int, int)
+    columns : int
+        Of the picture.
+    layers : (most returns of a pixel, 4, rows, columns) array
+        See `layer_returns`.
     gate : float
         m.
     chosen : (k,) int64 array
         Numbers of the returns.
     memory : (5, NEIGHBOURS) float32 array
-        Zeros; overwritten: columns and rows away, how much further off, whether it is used, and how
-        far from the plane, in m.
+        As `allocate_window` returns it; all but the first two rows are overwritten.
     scatter : (n,) array
         Overwritten at the chosen: m.
     """
+    nearest = np.empty(SIDE * WIDTH)
     for own in chosen:
-        number = collect_neighbours(nearness, metres, pixel, starts, image_shape, own, memory)
+        y, x = pixel[own] // columns, pixel[own] % columns
+        take_nearest(layers, (y, x), nearness[own], nearest)
+        for j in range(SIDE):
+            for i in range(SIDE):
+                memory[2, j * SIDE + i] = np.float32(nearest[j * WIDTH + i] * metres[own])
         deviation, most, a, b, c, count = -1.0, gate, 0.0, 0.0, 0.0, 0
         for rounds in range(FIT_ROUNDS + 1):
             measure_offsets(memory, a, b, c)
@@ -153,7 +242,7 @@ def scatter_about_planes(
                 free = count / (count - 3.0)
                 deviation = MAD_TO_SIGMA * find_median(memory, count) * math.sqrt(free)
                 most = OUTLIER_DEVIATIONS * deviation
-            changed = mark_near(memory, number, most)
+            changed = mark_near(memory, most)
             # where nothing changed further rounds would find the same
             if rounds == FIT_ROUNDS or (rounds > 0 and not changed):
                 break
@@ -162,6 +251,33 @@ def scatter_about_planes(
                 deviation = -1.0
                 break
         scatter[own] = deviation
+
+
+@inlined
+def take_nearest(layers, own, nearness, nearest):
+    """Of each pixel around, take the return that is nearest in range.
+
+    Parameters
+    ----------
+    layers : (most returns of a pixel, 4, rows, columns) array
+        See `layer_returns`.
+    own : (int, int)
+        Row and column of the pixel in the middle.
+    nearness : float
+        Of its return, 1/m.
+    nearest : (SIDE * WIDTH,) array
+        Overwritten: by how much its nearness is greater, 1/m; beyond any gate where there is none.
+    """
+    top, left = own[0] // STRIDE_PX, own[1] // STRIDE_PX
+    part = own[0] % STRIDE_PX * STRIDE_PX + own[1] % STRIDE_PX
+    for t in range(SIDE * WIDTH):
+        nearest[t] = FAR
+    for layer in range(layers.shape[0]):
+        window = layers[layer, part, top : top + SIDE, left : left + WIDTH]
+        for j in range(SIDE):
+            for i in range(WIDTH):
+                off, best = nearness - window[j, i], nearest[j * WIDTH + i]
+                nearest[j * WIDTH + i] = off if math.fabs(off) < math.fabs(best) else best
 
 
 @inlined
@@ -181,15 +297,13 @@ def measure_offsets(memory, a, b, c):
 
 
 @inlined
-def mark_near(memory, number, most):
+def mark_near(memory, most):
     """Use the neighbours that are off by at most so much; return whether others were used before.
 
     Parameters
     ----------
     memory : (5, NEIGHBOURS) float32 array
         See `scatter_about_planes`; 1 or 0 is written to the row that says which are used.
-    number : int
-        Of neighbours.
     most : float
         m.
 
@@ -198,10 +312,9 @@ def mark_near(memory, number, most):
     bool
     """
     used, residual = memory[3], memory[4]
-    farthest, listed, changed = np.float32(most), np.int32(number), np.float32(0)
+    farthest, changed = np.float32(most), np.float32(0)
     for t in range(NEIGHBOURS):
-        within = (residual[t] <= farthest) & (np.int32(t) < listed)
-        near = np.float32(1) if within else np.float32(0)
+        near = np.float32(1) if residual[t] <= farthest else np.float32(0)
         changed += math.fabs(near - used[t])
         used[t] = near
     return changed > 0
@@ -245,46 +358,6 @@ def find_median(memory, count):
 
 
 @inlined
-def collect_neighbours(nearness, metres, pixel, starts, image_shape, own, memory):
-    """List the returns around one: columns and rows away, and how much further off, in m.
-
-    Of several returns of a pixel the one that is nearest in range counts.
-
-    Parameters
-    ----------
-    nearness, metres, pixel, starts, image_shape
-        As for `scatter_about_planes`.
-    own : int
-        Number of the return.
-    memory : (5, NEIGHBOURS) float32 array
-        The first three rows are overwritten.
-
-    Returns
-    -------
-    int
-    """
-    rows, columns = image_shape
-    y, x = pixel[own] // columns, pixel[own] % columns
-    number = 0
-    for j in range(-REACH_PX, REACH_PX + 1, STRIDE_PX):
-        for i in range(-REACH_PX, REACH_PX + 1, STRIDE_PX):
-            if y + j < 0 or x + i < 0 or y + j >= rows or x + i >= columns:
-                continue
-            there = (y + j) * columns + x + i
-            best, first = 0.0, starts[there]
-            for k in range(first, starts[there + 1]):
-                off = (nearness[own] - nearness[k]) * metres[own]
-                if k == first or math.fabs(off) < math.fabs(best):
-                    best = off
-            if first < starts[there + 1]:
-                memory[0, number] = i
-                memory[1, number] = j
-                memory[2, number] = best
-                number += 1
-    return number
-
-
-@inlined
 def fit_plane_around(memory):
     """Least-squares plane ``a * right + b * down + c`` through the neighbours that are used.
 
@@ -325,36 +398,91 @@ def fit_plane_around(memory):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def borrow_scatter(nearness, metres, pixel, starts, image_shape, gate, chosen, scatter):
+def borrow_scatter(nearness, metres, starts, image_shape, gate, memory, scatter):
     """Take over what is known of the return nearest in range, on the same surface, of those within
     a plane's reach whose row and column `PLANE_STEP_PX` divides.
 
+    All returns of a cell of ``PLANE_STEP_PX**2`` pixels have the same ones around them.
+
     Parameters
     ----------
-    nearness, metres, pixel, starts, image_shape, gate
+    nearness, metres, gate
         As for `scatter_about_planes`.
-    chosen : (k,) int64 array
-        Numbers of the returns.
+    starts : (pixels + 1,) int64 array
+        First return of each pixel.
+    image_shape : (int, int)
+    memory : (3, PLANE_STEP_PX**2 * most returns of a pixel + CELL_LANES) array
+        Overwritten: nearness of a cell's returns, how far off the nearest is, and its scatter.
     scatter : (n,) array
-        Overwritten at the chosen: m, NaN where there is no such return or it has few neighbours.
+        Known of the pixels whose row and column `PLANE_STEP_PX` divides; overwritten elsewhere: m,
+        NaN where there is no such return or it has few neighbours.
     """
     rows, columns = image_shape
-    for own in chosen:
-        y, x = pixel[own] // columns, pixel[own] % columns
-        found, least = -1, np.inf
-        top, left = y - y % PLANE_STEP_PX - PLANE_STEP_PX, x - x % PLANE_STEP_PX - PLANE_STEP_PX
-        for j in range(top, top + 4 * PLANE_STEP_PX, PLANE_STEP_PX):
-            for i in range(left, left + 4 * PLANE_STEP_PX, PLANE_STEP_PX):
-                if j < 0 or i < 0 or j >= rows or i >= columns:
-                    continue
-                there = j * columns + i
-                for k in range(starts[there], starts[there + 1]):
-                    off = math.fabs((nearness[own] - nearness[k]) * metres[own])
-                    if off < least:
-                        found, least = k, off
-        scatter[own] = scatter[found] if found >= 0 and least < gate else np.nan
-        if scatter[own] < 0:
-            scatter[own] = np.nan
+    step = PLANE_STEP_PX
+    own, least, held = memory[0], memory[1], memory[2]
+    for top in range(0, rows, step):
+        for left in range(0, columns, step):
+            right, below = min(left + step, columns), min(top + step, rows)
+            number = open_cell(nearness, starts, columns, (top, below, left, right), memory)
+            if number == 0:
+                continue
+            lanes = (number + CELL_LANES - 1) // CELL_LANES * CELL_LANES
+            for y in range(max(top - step, 0), min(top + 3 * step, rows), step):
+                for x in range(max(left - step, 0), min(left + 3 * step, columns), step):
+                    for k in range(starts[y * columns + x], starts[y * columns + x + 1]):
+                        there, known = nearness[k], scatter[k]
+                        for lane in range(lanes):
+                            off = math.fabs(own[lane] - there)
+                            nearer = off < least[lane]
+                            # in this order: the other way round no vectors are made of it
+                            held[lane] = known if nearer else held[lane]
+                            least[lane] = off if nearer else least[lane]
+            number = starts[top * columns + left + 1] - starts[top * columns + left]
+            for y in range(top, below):
+                first = y * columns + left + (1 if y == top else 0)
+                for k in range(starts[first], starts[y * columns + right]):
+                    near = least[number] * metres[k] < gate and held[number] >= 0
+                    scatter[k] = held[number] if near else np.nan
+                    number += 1
+
+
+@inlined
+def open_cell(nearness, starts, columns, cell, memory):
+    """Return how many returns a cell has, and list their nearness.
+
+    Parameters
+    ----------
+    nearness, starts, memory
+        As for `borrow_scatter`.
+    columns : int
+        Of the picture.
+    cell : (int, int, int, int)
+        First row and the one after the last, first column and the one after the last.
+    """
+    own, least, held = memory[0], memory[1], memory[2]
+    top, below, left, right = cell
+    number = 0
+    for y in range(top, below):
+        for k in range(starts[y * columns + left], starts[y * columns + right]):
+            own[number], least[number], held[number] = nearness[k], np.inf, np.nan
+            number += 1
+    return number
+
+
+@njit(nogil=True, cache=True)
+def raise_to_maximum(index, values, maxima):
+    """Raise each of some maxima to the largest of its values.
+
+    Parameters
+    ----------
+    index : (n,) int64 array
+        To which of the maxima each value belongs.
+    values : (n,) array
+    maxima : (m,) array
+        Raised.
+    """
+    for number in range(index.size):
+        maxima[index[number]] = max(maxima[index[number]], values[number])
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

@@ -149,18 +149,18 @@ class ReturnSearch:
         kept = np.flatnonzero(significant & (time > 0))
         pixel, time, intensity = pixel.take(kept), time.take(kept), intensity.take(kept)
         distance = SPEED_OF_LIGHT * time / 2
-        y, x = np.divmod(pixel, self.camera.image_shape[1])
+        rows, columns, along_axis = self._lines_of_sight
         sigma = add_recovery_error(
             SPEED_OF_LIGHT / 2 * deviation.take(kept),
             distance,
-            compute_ray_directions(self.camera, y, x)[:, 2],
+            along_axis.take(pixel),
             pixel,
             self.camera.image_shape,
             SPEED_OF_LIGHT / 2 * self.pulse.fwhm,
         )
         measured = Returns(
-            y=y.astype(np.int32),
-            x=x.astype(np.int32),
+            y=rows.take(pixel),
+            x=columns.take(pixel),
             range=distance,
             intensity=intensity.astype(np.float32),
             confidence=sigma.astype(np.float32),
@@ -172,6 +172,13 @@ class ReturnSearch:
             false_alarm=doubt if judge is None else doubt.take(kept),
         )
         return correct_returns(measured)
+
+    @cached_property
+    def _lines_of_sight(self) -> tuple[NDArray[np.int32], NDArray[np.int32], FloatArray]:
+        """Row, column and the direction's z of every pixel."""
+        rows, columns = np.indices(self.camera.image_shape, np.int32).reshape(2, -1)
+        along_axis = compute_ray_directions(self.camera, rows, columns)[:, 2]
+        return rows, columns, np.ascontiguousarray(along_axis)
 
     def _shear_at(self, time: FloatArray) -> FloatArray:
         if (
@@ -393,7 +400,6 @@ def _square_distance(time: FloatArray) -> FloatArray:
 
 def _rank_within_pixel(pixel: NDArray[np.int64]) -> NDArray[np.uint8]:
     """Number the entries of each pixel from 1; equal pixels lie side by side."""
-    position = np.arange(pixel.size)
-    starts_here = np.r_[True, pixel[1:] != pixel[:-1]][: pixel.size]
-    start = np.maximum.accumulate(np.where(starts_here, position, 0))
-    return (position - start + 1).astype(np.uint8)
+    counts = np.bincount(pixel)
+    before = np.cumsum(counts) - counts
+    return (np.arange(1, pixel.size + 1) - before.take(pixel)).astype(np.uint8)
