@@ -22,7 +22,7 @@ from tofclip.camera.model import Camera
 from tofclip.errors import CalibrationError, InputError, ShapeError
 from tofclip.operators import LineProjection
 from tofclip.storage import Scalar
-from tofclip.threads import run_blocks
+from tofclip.threads import run_blocks, split_blocks
 
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -106,7 +106,8 @@ def estimate_dark_level(counts: FloatImage) -> float:
     Taken from whole rows, before or after the light came, so that it stays where the measurements
     scatter about it: the least value of a picture would turn noise into an offset.
     """
-    row_sums = counts.sum(axis=1)
+    # a product, which reads the picture at the rate of memory: NumPy's sum takes thrice as long
+    row_sums = counts @ np.ones(counts.shape[1], np.float32)
     # Rows, not pixels: choosing the darkest pixels would choose those whose noise is low.
     quiet = np.argsort(row_sums)[: max(1, round(DARK_ROW_FRACTION * row_sums.size))]
     # the median, which NumPy looks for ten times as long as it sorts
@@ -223,8 +224,8 @@ class Rectifier:
         def work(piece: slice) -> None:
             rows, target = self._raw_row[piece], measurements[piece]
             if self._stays_in_column and delay == 0:
-                first, last = np.searchsorted(self._runs[:, 0], [piece.start, piece.stop])
-                sample_runs(raw, level, self._raw_row, self._runs[first:last], measurements)
+                runs = self._runs[self._run_starts[piece.start] : self._run_starts[piece.stop]]
+                sample_runs(raw, level, self._raw_row, runs, measurements)
             elif self._stays_in_column:
                 sample_in_time(raw, level, rows, shift, target)
             else:
@@ -233,7 +234,9 @@ class Rectifier:
         run_blocks(work, len(measurements), ROWS_PER_BLOCK)
         # Zero, not their raw value: methods that take no mask must not see a stuck column as light.
         measurements[:, self.camera.dead_columns] = 0
-        if not measurements.max() > 0:
+        # Some rows at a time: noise about the dark level is above it in the first ones already.
+        pieces = split_blocks(len(measurements), ROWS_PER_BLOCK)
+        if not any(measurements[piece].max() > 0 for piece in pieces):
             raise InputError(NO_LIGHT_MESSAGE)
         return measurements.T
 
@@ -249,6 +252,11 @@ class Rectifier:
         # a run ends where the next one of its row begins
         last = np.where(np.append(row[1:], -1) == row, np.append(first[1:], 0), columns)
         return np.stack([row, first, last, top[row, first]], axis=1).astype(np.uint64)
+
+    @cached_property
+    def _run_starts(self) -> NDArray[np.int64]:
+        """Number of the first run of each rectified row, and of all runs behind the last one."""
+        return np.searchsorted(self._runs[:, 0], np.arange(len(self._raw_row) + 1, dtype=np.uint64))
 
     def _find_valid(self, bad: Mask, delay: float) -> Mask:
         from tofclip.camera.kernels import mark_valid
