@@ -10,6 +10,7 @@ from tofclip.arrays import (
     PerDevice,
     as_type,
     clip_values,
+    empty_aligned,
     is_numpy,
     namespace,
     parse_device,
@@ -192,3 +193,12 @@ def test_a_device_that_pytorch_does_not_have():
     for name in ("cuda:99", "nonsense"):
         with pytest.raises(MissingDependencyError, match='use `device="cpu"`'):
             parse_device(f"torch:{name}")
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (1000, 17), (0, 4)])
+def test_aligned_arrays_begin_a_cache_line(shape):
+    for dtype in (np.float32, np.float64):
+        made = [empty_aligned(shape, dtype) for _ in range(5)]
+        assert all(one.ctypes.data % 64 == 0 for one in made)
+        assert all(one.shape == shape and one.dtype == dtype for one in made)
+        assert all(one.flags.c_contiguous and one.flags.writeable for one in made)

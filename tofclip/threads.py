@@ -94,6 +94,11 @@ def open_worker_pool(threads: int | None = None) -> Iterator[Executor]:
             pool.shutdown(wait=True, cancel_futures=True)
 
 
+def count_block_threads() -> int:
+    """Return on how many threads `map_parallel` and `run_blocks` work when they are called here."""
+    return 1 if _is_limited() else thread_count()
+
+
 def map_parallel(
     work: Callable[[Job], Result], jobs: Iterable[Job], lookahead: int | None = None
 ) -> Generator[Result, None, None]:
@@ -124,7 +129,7 @@ def map_parallel(
     >>> list(map_parallel(abs, [-1, 2, -3]))
     [1, 2, 3]
     """
-    threads = 1 if _is_limited() else thread_count()
+    threads = count_block_threads()
     if threads == 1:
         yield from map(work, jobs)
         return

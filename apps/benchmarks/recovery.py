@@ -15,7 +15,6 @@ from apps.benchmarks.peers import time_astra
 from tofclip.camera import Camera
 from tofclip.operators import LineProjection
 from tofclip.solvers import Backprojection, LinearInverse, Method, Sparse, TotalVariation
-from tofclip.solvers.direct import DENSE_BLOCK_ROWS
 from tofclip.threads import LANES, limit_blas_threads, run_blocks
 
 ITERATIONS = 30
@@ -24,6 +23,7 @@ ANGLES_RAD: NDArray[np.float64] = np.radians(np.array([-44.0, -26.0, -12.5, 0.8,
 CENTRES_PX: NDArray[np.float64] = np.array([168.0 + 172.5 * view for view in range(7)])
 SLIT_WIDTH_PX = 1344
 PICTURE_SIDES_PX = (87, 174)
+DENSE_BLOCK_ROWS = 336  # of the dense matrix, which are read from memory once for all frames
 
 
 def make_operator(side: int = PICTURE_SIDES_PX[-1]) -> LineProjection:

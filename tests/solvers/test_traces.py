@@ -17,7 +17,7 @@ def camera() -> Camera:
     return Camera(np.array([30.0, 85.0, 140.0]), np.radians([-40.0, 5.0, 35.0]), (21, 37), 170)
 
 
-@pytest.mark.parametrize("frames", [1, 31, 64, 150])
+@pytest.mark.parametrize("frames", [1, 31, 64, 150, 300])
 def test_traces_are_the_pictures_seen_pixel_by_pixel(frames):
     measurements = np.random.default_rng(frames).random((170, frames)).astype(np.float32)
     prepared = LinearInverse().prepare(camera().operator())
@@ -31,6 +31,21 @@ def test_traces_are_the_pictures_seen_pixel_by_pixel(frames):
     # the same sums in the same order: only a lone frame goes another way
     np.testing.assert_allclose(found[:, 1:-1], expected, atol=1e-5 * np.abs(expected).max())
     assert np.all(found[:, [0, -1]] == -1)
+
+
+@pytest.mark.parametrize("frames", [1, LANES, 150])
+def test_weights_are_the_inverse_gram_matrix_times_the_measurements(frames):
+    prepared = LinearInverse().prepare(camera().operator())
+    measurements = np.random.default_rng(frames).random((170, frames)).astype(np.float32)
+    weights = prepared.weights(measurements)
+    expected = prepared.inverse_gram.astype(np.float64) @ measurements
+    # float32 sums of 170 products
+    np.testing.assert_allclose(
+        weights[:, :frames], expected, atol=170 * 6e-8 * np.abs(expected).max()
+    )
+    assert not weights[:, frames:].any()
+    assert weights.shape[1] >= -(-frames // LANES) * LANES  # whole vectors
+    assert weights.ctypes.data % 64 == weights.strides[0] % 64 == 0
 
 
 def test_the_brightest_pixel_stands_out_as_its_matched_filter_says():

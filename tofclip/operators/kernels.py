@@ -26,31 +26,30 @@ from numba.extending import intrinsic
 from tofclip.operators.radon import FRACTION_BITS
 from tofclip.threads import LANES
 
-UNROLL_COUNT = 2  # independent accumulators, which hide the latency of the fused multiply-add
 INDEX_TYPE = ir.IntType(64)
-LANE_SELECTOR = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+WIDE_LANES = 4 * LANES
 
 
-@intrinsic
-def _emit_row_product(
-    typing_context: Any,
-    result: Any,
-    start: Any,
-    stride: Any,
-    block: Any,
-    columns: Any,
-    values: Any,
-    first: Any,
-    last: Any,
-    onto: Any,
-) -> Any:
-    """``result[start : start + LANES] = present + sum_q values[q] * block[columns[q], :LANES]`` for q
-    in [first, last), `result` flat.
+def _make_row_product(lanes: int, unroll: int) -> Any:
+    """Make the product of a sparse row with the rows of a block.
 
-    `present` is 0, or what stands there already where the boolean `onto` says so. `stride` is the
-    length of a row of the block. Both arrays must be C-contiguous.
+    Parameters
+    ----------
+    lanes : int
+        Numbers of a row of the block that are taken.
+    unroll : int
+        Accumulators for each of them, which hide the latency of the fused multiply-add.
+
+    Returns
+    -------
+    callable
+        ``(result, start, stride, block, columns, values, first, last, onto)``, for compiled loops:
+        ``result[start : start + lanes] = present + sum_q values[q] * block[columns[q], :lanes]``
+        for q in [first, last), `result` flat. `present` is 0, or what stands there already where
+        the boolean `onto` says so. `stride` is the distance of two rows of the block; a row's
+        elements and the result's lie side by side.
     """
-    signature = types.void(result, start, stride, block, columns, values, first, last, onto)
+    selector = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
 
     def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         def data(k: int) -> Any:
@@ -58,7 +57,7 @@ def _emit_row_product(
 
         target, source, index, weight = data(0), data(3), data(4), data(5)
         offset, row_length, begin, end = (arguments[k] for k in (1, 2, 6, 7))
-        vector = ir.VectorType(target.type.pointee, LANES)
+        vector = ir.VectorType(target.type.pointee, lanes)
         undefined = ir.Constant(vector, ir.Undefined)
 
         def lanes_at(base: Any, place: Any) -> Any:
@@ -68,7 +67,7 @@ def _emit_row_product(
             column = builder.zext(builder.load(builder.gep(index, [position])), INDEX_TYPE)
             scalar = builder.load(builder.gep(weight, [position]))
             lone = builder.insert_element(undefined, scalar, ir.Constant(ir.IntType(32), 0))
-            broadcast = builder.shuffle_vector(lone, undefined, LANE_SELECTOR)
+            broadcast = builder.shuffle_vector(lone, undefined, selector)
             operand = lanes_at(source, builder.mul(column, row_length))
             product = builder.fmul(broadcast, builder.load(operand, align=4), flags=("contract",))
             builder.store(
@@ -76,12 +75,12 @@ def _emit_row_product(
             )
 
         destination = lanes_at(target, offset)
-        zero = ir.Constant(vector, [0.0] * LANES)
+        zero = ir.Constant(vector, [0.0] * lanes)
         present = builder.select(arguments[8], builder.load(destination, align=4), zero)
-        starts = [present] + [zero] * (UNROLL_COUNT - 1)
+        starts = [present] + [zero] * (unroll - 1)
         accumulators = [cgutils.alloca_once_value(builder, start) for start in starts]
         position = cgutils.alloca_once_value(builder, begin)
-        for step in (UNROLL_COUNT, 1):
+        for step in sorted({unroll, 1}, reverse=True):
             with _emit_while(builder, partial(_emit_fits, builder, position, step, end)):
                 here = builder.load(position)
                 for lane_set in range(step):
@@ -93,7 +92,28 @@ def _emit_row_product(
         builder.store(total, destination).align = 4
         return context.get_dummy_value()
 
-    return signature, generate
+    def emit(
+        typing_context: Any,
+        result: Any,
+        start: Any,
+        stride: Any,
+        block: Any,
+        columns: Any,
+        values: Any,
+        first: Any,
+        last: Any,
+        onto: Any,
+    ) -> Any:
+        return types.void(
+            result, start, stride, block, columns, values, first, last, onto
+        ), generate
+
+    return intrinsic(emit)
+
+
+_emit_row_product = _make_row_product(LANES, 2)
+# as many lanes need no second set: there are enough sums that do not wait for each other
+_emit_wide_row_product = _make_row_product(WIDE_LANES, 1)
 
 
 def _emit_fits(builder: Any, position: Any, step: int, end: Any) -> Any:
@@ -138,23 +158,49 @@ def multiply_sparse_block(tile_starts, columns, values, block, result):
 
 
 @njit(nogil=True, cache=True)
-def multiply_sparse_rows(tile_starts, columns, values, block, start, result):
-    """``result[:, start : start + LANES] = M @ block``; see `multiply_sparse_block`.
+def multiply_sparse_rows(tile_starts, columns, values, block, first, result, place):
+    """``result[:, place + j] = (M @ block)[:, first + j]`` for `LANES` neighbours j; see
+    `multiply_sparse_block`.
 
     Parameters
     ----------
-    tile_starts, columns, values, block
+    tile_starts, columns, values
         As for `multiply_sparse_block`.
-    start : int
-    result : (rows, at least start + LANES) C-contiguous array, overwritten in these columns
+    block : (M's columns, at least first + LANES) C-contiguous array of the type of `values`
+        Twice as fast where its rows begin at whole cache lines; see `tofclip.arrays.empty_aligned`.
+    first : int
+    result : (rows, at least place + LANES) C-contiguous array, overwritten in these columns
+    place : int
     """
+    lanes, stride = block[:, first:], block.shape[1]
     for tile in range(tile_starts.shape[0]):
         onto = tile > 0
         for row in range(tile_starts.shape[1] - 1):
-            first, last = tile_starts[tile, row], tile_starts[tile, row + 1]
-            if first < last or not onto:
-                place = row * result.shape[1] + start
-                _emit_row_product(result, place, LANES, block, columns, values, first, last, onto)
+            begin, end = tile_starts[tile, row], tile_starts[tile, row + 1]
+            if begin < end or not onto:
+                target = row * result.shape[1] + place
+                _emit_row_product(result, target, stride, lanes, columns, values, begin, end, onto)
+
+
+@njit(nogil=True, cache=True)
+def multiply_sparse_wide_rows(tile_starts, columns, values, block, first, result, place):
+    """As `multiply_sparse_rows`, for `WIDE_LANES` neighbours, for which a nonzero is looked up once.
+
+    Parameters
+    ----------
+    tile_starts, columns, values, block, first, result, place
+        As for `multiply_sparse_rows`.
+    """
+    lanes, stride = block[:, first:], block.shape[1]
+    for tile in range(tile_starts.shape[0]):
+        onto = tile > 0
+        for row in range(tile_starts.shape[1] - 1):
+            begin, end = tile_starts[tile, row], tile_starts[tile, row + 1]
+            if begin < end or not onto:
+                target = row * result.shape[1] + place
+                _emit_wide_row_product(
+                    result, target, stride, lanes, columns, values, begin, end, onto
+                )
 
 
 fast_njit = njit(

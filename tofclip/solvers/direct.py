@@ -10,14 +10,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.arrays import Array, ComputeDevice, PerDevice, is_numpy, namespace, to_numpy
+from tofclip.arrays import (
+    Array,
+    ComputeDevice,
+    PerDevice,
+    empty_aligned,
+    is_numpy,
+    namespace,
+    to_numpy,
+)
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, SparseMatrix
 from tofclip.solvers.loops import PortableBatches, make_batches, write_frames
 from tofclip.solvers.method import Mask, Progress, Result, ignore_progress, validate_measurements
-from tofclip.threads import LANES, limit_blas_threads, run_blocks, split_blocks
+from tofclip.threads import LANES, count_block_threads, limit_blas_threads, run_blocks
 
-DENSE_BLOCK_ROWS = 336  # of the dense matrix, which are read from memory once for all frames
+ROW_GAP = 16
+"""Numbers between rows of weights: at a distance of a power of two they would share few places of
+the cache."""
 
 
 @dataclass(frozen=True)
@@ -168,10 +178,9 @@ class PreparedInverse:
         weights = self.weights(measurements)
 
         def project(piece: slice) -> None:
-            block = weights[piece.start // LANES]
-            write_frames(
-                self.operator.adjoint(block if len(frames) > 1 else block[:, :1]), frames, piece
-            )
+            lanes = slice(piece.start, piece.start + (LANES if len(frames) > 1 else 1))
+            block = np.ascontiguousarray(weights[:, lanes])
+            write_frames(self.operator.adjoint(block), frames, piece)
             progress(piece.stop - piece.start)
 
         run_blocks(project, measurements.shape[1])
@@ -190,29 +199,26 @@ class PreparedInverse:
         return Result(batches.frames)
 
     def weights(self, measurements: NDArray[Any]) -> NDArray[Any]:
-        """Return ``(A A' + mu I)^-1 f``, (blocks, measurements, LANES): the adjoint of each block
-        is `LANES` pictures.
+        """Return ``(A A' + mu I)^-1 f``, (measurements, frames and some): its adjoint is the pictures.
 
-        Frames beyond the last one are zero.
+        Beyond the last frame rows are zero to a multiple of `LANES` frames and `ROW_GAP` more.
 
         Parameters
         ----------
         measurements : (measurements, frames) array, finite
         """
         frames = measurements.shape[1]
-        weights = np.zeros(
-            (-(-frames // LANES), self.inverse_gram.shape[0], LANES), self.operator.dtype
-        )
+        held = -(-frames // LANES) * LANES + ROW_GAP
+        weights = empty_aligned((self.inverse_gram.shape[0], held), self.operator.dtype)
+        weights[:, frames:] = 0
 
         def solve(piece: slice) -> None:
-            solved = self.inverse_gram[piece] @ measurements
-            for number, part in enumerate(split_blocks(frames)):
-                weights[number, piece, : part.stop - part.start] = solved[:, part]
+            np.matmul(self.inverse_gram[piece], measurements, out=weights[piece, :frames])
 
         # The blocks already keep every core busy: BLAS threads of its own would wait for, and spin
         # against, ours.
         with limit_blas_threads():
-            run_blocks(solve, len(self.inverse_gram), DENSE_BLOCK_ROWS)
+            run_blocks(solve, len(weights), -(-len(weights) // count_block_threads()))
         return weights
 
 

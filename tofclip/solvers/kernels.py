@@ -15,7 +15,12 @@ import numpy as np
 from numba import njit
 
 from tofclip.compiling import compile_as_part
-from tofclip.operators.kernels import multiply_sparse_block, multiply_sparse_rows
+from tofclip.operators.kernels import (
+    WIDE_LANES,
+    multiply_sparse_block,
+    multiply_sparse_rows,
+    multiply_sparse_wide_rows,
+)
 from tofclip.threads import LANES
 
 TILE_PIXELS = 32
@@ -140,27 +145,30 @@ def copy_lanes_to_frames(block, frames):
 
 @fast_njit
 def compute_traces(tile_starts, columns, values, weights, traces, span):
-    """``traces[:, span[0] + t] = M @ weights[t // LANES, :, t % LANES]`` for a sparse matrix M in
-    column tiles.
+    """``traces[:, span[0] : span[1]] = M @ weights`` for a sparse matrix M in column tiles.
 
     Parameters
     ----------
     tile_starts, columns, values
         See `tofclip.operators.sparse.Tiles`; a row for each trace.
-    weights : (blocks, M's columns, LANES) array
+    weights : (M's columns, time) array
+        Its rows are a multiple of `LANES` long at least.
     traces : (M's rows, time) array
         Overwritten from column ``span[0]`` to below ``span[1]``.
     span : (int, int)
     """
-    whole = (span[1] - span[0]) // LANES
-    for block in range(whole):
-        start = span[0] + block * LANES
-        multiply_sparse_rows(tile_starts, columns, values, weights[block], start, traces)
-    if whole < weights.shape[0]:
-        # The last block is filled up with frames that lie beyond the span.
+    matrix, time, done = (tile_starts, columns, values), span[1] - span[0], 0
+    while done + WIDE_LANES <= time:
+        multiply_sparse_wide_rows(*matrix, weights, done, traces, span[0] + done)
+        done += WIDE_LANES
+    while done + LANES <= time:
+        multiply_sparse_rows(*matrix, weights, done, traces, span[0] + done)
+        done += LANES
+    if done < time:
+        # the last lanes lie beyond the span
         part = np.empty((traces.shape[0], LANES), traces.dtype)
-        multiply_sparse_block(tile_starts, columns, values, weights[whole], part)
-        first = span[0] + whole * LANES
+        multiply_sparse_rows(*matrix, weights, done, part, 0)
+        first = span[0] + done
         for row in range(part.shape[0]):
             for column in range(first, span[1]):
                 traces[row, column] = part[row, column - first]

@@ -87,7 +87,7 @@ class InverseTraces:
 
         Parameters
         ----------
-        weights : (blocks, measurements, LANES) array
+        weights : (measurements, time and some) array
             `PreparedInverse.weights` of the shot's measurements.
         piece : slice
         traces : (pixels of the piece, time) contiguous array
