@@ -195,7 +195,7 @@ def test_a_device_that_pytorch_does_not_have():
             parse_device(f"torch:{name}")
 
 
-@pytest.mark.parametrize("shape", [(3, 5), (1000, 17), (0, 4)])
+@pytest.mark.parametrize("shape", [(3, 5), (1000, 17), (1,)])
 def test_aligned_arrays_begin_a_cache_line(shape):
     for dtype in (np.float32, np.float64):
         made = [empty_aligned(shape, dtype) for _ in range(5)]
