@@ -71,8 +71,7 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
         ),
         (SOLVERS, "restore_frames"): "(f4[:,:,::1], f4[:,:,::1], f4[::1])",
         (SOLVERS, "shrink_nonnegative"): (
-            "(f4[:,::1], f4[:,::1], f4[::1], f4[:,::1], f4[::1], f4[::1], f4[::1], f4[::1],"
-            " f4[::1])"
+            "(f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[:,::1], f8[::1], f8[::1])"
         ),
         (SOLVERS, "copy_lanes_to_frames"): "(f4[:,::1], f4[:,::1])",
         (NEIGHBOURS, "pool_significance"): (

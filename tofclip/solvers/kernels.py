@@ -25,6 +25,12 @@ from tofclip.threads import LANES
 
 TILE_PIXELS = 32
 
+STRETCH_NUMBERS = 512
+"""At most so many numbers are worked on together: nine arrays of them are 18 kB in float32."""
+
+STRETCHES_PER_SUM = 128
+"""Stretches that are added up before they go to a sum of higher precision."""
+
 fast_njit = njit(
     nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy"
 )
@@ -42,30 +48,42 @@ every pixel of a row.
 
 @fast_njit
 def shrink_nonnegative(
-    current, previous, momentum, gradient, step, threshold, scratch, total, distance
+    current, previous, momentum, gradient, step, threshold, memory, total, distance
 ):
     """``previous = max(z - step * gradient - threshold, 0)`` with ``z = current + momentum *
     (current - previous)``.
 
+    A stretch of pixels at a time, which stays in the first-level cache with all that lanes have for
+    themselves: whole rows of a picture took twice as long.
+
     Parameters
     ----------
-    current : (rows, row) array
+    current : (n,) array
         Pictures, all lanes of a pixel side by side.
-    previous : (rows, row) array
+    previous : (n,) array
         Overwritten with the result.
-    momentum : (row,) array
-    gradient : (rows, row) array
-    step, threshold : (row,) array
+    momentum : (stretch,) array
+    gradient : (n,) array
+    step, threshold : (stretch,) array
         Step size, and step size times weight.
-    scratch : (row,) array
-        Overwritten: a row that stays in cache.
-    total, distance : (row,) array
-        To which sums over rows of the result, and of its squared difference from z, are added.
+    memory : (3, stretch) array
+        Zeros; overwritten.
+    total, distance : (stretch,) float64 array
+        To which sums over stretches of the result, and of its squared difference from z, are added.
     """
-    for row in range(current.shape[0]):
-        _shrink_row(current[row], previous[row], momentum, gradient[row], step, threshold, scratch)
-        _add_distance(current[row], previous[row], momentum, scratch, distance)
-        _put_row(scratch, previous[row], total)
+    result, some, far = memory[0], memory[1], memory[2]
+    for number in range((current.size + result.size - 1) // result.size):
+        first = number * result.size
+        end = min(first + result.size, current.size)
+        here, before, slope = current[first:end], previous[first:end], gradient[first:end]
+        _shrink_row(here, before, momentum, slope, step, threshold, result)
+        _add_distance(here, before, momentum, result, far)
+        _put_row(result, before, some)
+        if number % STRETCHES_PER_SUM == STRETCHES_PER_SUM - 1:
+            _move_sum(some, total)
+            _move_sum(far, distance)
+    _move_sum(some, total)
+    _move_sum(far, distance)
 
 
 @row_part
@@ -93,10 +111,18 @@ def _add_distance(current, previous, momentum, result, distance):
 
 @row_part
 def _put_row(row, target, total):
-    """Copy a row, and add it to the sum of rows."""
-    for i in range(row.size):
+    """Copy as much of a row as the target holds, and add it to the sum of rows."""
+    for i in range(target.size):
         target[i] = row[i]
         total[i] += row[i]
+
+
+@row_part
+def _move_sum(some, total):
+    """Add to a sum of higher precision, and begin anew."""
+    for i in range(some.size):
+        total[i] += some[i]
+        some[i] = 0
 
 
 @fast_njit

@@ -165,10 +165,20 @@ class CompiledLoops:
 
         Arguments and result are those of `Loops.prox_l1`.
         """
-        now, before, slope = (_join_lanes(array) for array in (current, previous, gradient))
-        scratch, total, distance = np.zeros((3, now.shape[1]), now.dtype)
+        stretch = max(self._kernels.STRETCH_NUMBERS // step.size, 1)
+        memory = np.zeros((3, stretch * step.size), current.dtype)
+        total, distance = np.zeros((2, memory.shape[1]))
+        momentum, step_of_each, scaled = self._repeat(momentum, step, weight, stretch)
         self._kernels.shrink_nonnegative(
-            now, before, *self._repeat(now, momentum, slope, step, weight), scratch, total, distance
+            current.reshape(-1),
+            previous.reshape(-1),
+            momentum,
+            gradient.reshape(-1),
+            step_of_each,
+            scaled,
+            memory,
+            total,
+            distance,
         )
         return previous, _sum_columns(total, step), _sum_columns(distance, step)
 
@@ -190,15 +200,17 @@ class CompiledLoops:
             dual = np.zeros((2, *current.shape), current.dtype)
         now, before, slope = (_join_lanes(array) for array in (current, previous, gradient))
         total = np.zeros(now.shape[1], now.dtype)
-        repeated = self._repeat(now, momentum, slope, step, weight)
-        scaled = repeated[-1]
+        momentum, step_of_each, scaled = self._repeat(momentum, step, weight, current.shape[-2])
         # the squared norm of the gradient is at most 8 (Chambolle 2004)
         sweep = np.divide(1, 8 * scaled, out=np.zeros_like(scaled), where=scaled > 0)
         self._kernels.descend_total_variation(
             step.size,
             now,
             before,
-            *repeated,
+            momentum,
+            slope,
+            step_of_each,
+            scaled,
             dual.reshape(2, *now.shape),
             sweep,
             np.zeros((4, now.shape[1]), now.dtype),
@@ -208,18 +220,17 @@ class CompiledLoops:
 
     @staticmethod
     def _repeat(
-        pictures: Array, momentum: Array, gradient: Array, step: Array, weight: float
-    ) -> tuple[Array, Array, Array, Array]:
-        """What each lane has, for every pixel of a row."""
+        momentum: Array, step: Array, weight: float, pixels: int
+    ) -> tuple[Array, Array, Array]:
+        """Momentum, step and threshold that each lane has, for every one of some pixels."""
         # Numbers that a lane has for itself are repeated along the row, so that the loop over it
         # has one index and is vectorised.
-        columns = pictures.shape[1] // step.size
-        scaled = step * pictures.dtype.type(weight)
+        scaled = step * momentum.dtype.type(weight)
         # np.tile takes longer than the loop itself where there is a single picture
         momentum, step, scaled = (
-            np.repeat(one[np.newaxis], columns, axis=0).ravel() for one in (momentum, step, scaled)
+            np.repeat(one[np.newaxis], pixels, axis=0).ravel() for one in (momentum, step, scaled)
         )
-        return momentum, gradient, step, scaled
+        return momentum, step, scaled
 
     def sum_squares(self, values: Array) -> Sums:
         """Multiply and add without a temporary."""
