@@ -16,8 +16,9 @@ from nlos.capture import Capture
 from nlos.geometry import FloatArray
 from nlos.illumination_groups import IlluminationGroup
 from nlos.method import Progress, ignore_progress
-from nlos.plane import Plane, WallLattice
+from nlos.plane import WallLattice
 from nlos.propagation.compiled import CompiledPropagation
+from nlos.propagation.wall_to_plane_plan import WallBeforePlane
 from nlos.rsd.diffraction import DiffractionPlan
 from nlos.rsd.image_planes import CompiledDiffraction, LaserSource
 from nlos.rsd.transfer import SphericalWaves
@@ -100,15 +101,13 @@ class Backend(Protocol):
         ...
 
     def propagate_phasors(
-        self, points: Array, plane: Plane, waves: SphericalWaves, tolerance: float
+        self, geometry: WallBeforePlane, waves: SphericalWaves, tolerance: float
     ) -> PhasorPropagation:
-        """Return what carries phasors from wall points (n, 3) onto a plane.
+        """Return what carries phasors from wall points onto a plane.
 
         Parameters
         ----------
-        points : (n, 3) float64 array
-            Metres.
-        plane : Plane
+        geometry : WallBeforePlane
         waves : SphericalWaves
         tolerance : float
             Relative error.
@@ -158,10 +157,10 @@ class CompiledBackend:
         return lattice.place(phasors)
 
     def propagate_phasors(
-        self, points: Array, plane: Plane, waves: SphericalWaves, tolerance: float
+        self, geometry: WallBeforePlane, waves: SphericalWaves, tolerance: float
     ) -> PhasorPropagation:
-        """Return what carries phasors from wall points (n, 3) onto a plane."""
-        return CompiledPropagation(points, plane, waves, tolerance)
+        """Return what carries phasors from wall points onto a plane."""
+        return CompiledPropagation(geometry, waves, tolerance)
 
     def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> Diffraction:
         """Return what carries fields from the plane of `plan` to all depths."""
@@ -204,12 +203,12 @@ class PortableBackend:
         return xp.permute_dims(placed, (1, 2, 0))
 
     def propagate_phasors(
-        self, points: Array, plane: Plane, waves: SphericalWaves, tolerance: float
+        self, geometry: WallBeforePlane, waves: SphericalWaves, tolerance: float
     ) -> PhasorPropagation:
-        """Return what carries phasors from wall points (n, 3) onto a plane."""
+        """Return what carries phasors from wall points onto a plane."""
         from nlos.portable.propagation import PortablePropagation
 
-        return PortablePropagation(points, plane, waves, tolerance, self.library)
+        return PortablePropagation(geometry, waves, tolerance, self.library)
 
     def plane_to_depths(self, plan: DiffractionPlan, source: LaserSource) -> Diffraction:
         """Return what carries fields from the plane of `plan` to all depths."""

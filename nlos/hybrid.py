@@ -29,9 +29,11 @@ from nlos.propagation.propagate import (
     require_propagation,
     require_tolerance,
 )
+from nlos.propagation.wall_to_plane_plan import WallBeforePlane
 from nlos.reciprocity import ReciprocalPlan
 from nlos.rsd.diffraction import DiffractionPlan
 from nlos.rsd.planar import require_even_grid
+from nlos.straight_ways import StraightWays
 from nlos.wave_plan import GroupPlan, WavePlan
 from tofclip.arrays import Array
 from tofclip.errors import InputError
@@ -194,14 +196,20 @@ class Hybrid(PhasorMethod):
         waves = build_waves(groups[0], band, continued=True)
         zones = (RIM_ERROR / (RIM_ERROR_FRACTION * self.tolerance)) ** (1 / 3)
         points = capture.points[groups[0].indices]
-        plane = choose_virtual_plane(
-            points, grid, waves, zones, self.plane_z, WallLattice.find(points)
-        )
-        plane_to_depths = DiffractionPlan(plane, grid, waves, self.tolerance)
+        lattice = WallLattice.find(points)
+        plane = choose_virtual_plane(points, grid, waves, zones, self.plane_z, lattice)
+        ways = StraightWays.find(points, plane, grid, self.tolerance)
+        plane_to_depths = DiffractionPlan(plane, grid, waves, self.tolerance, ways)
         plane_to_depths.require_memory()
         tolerance = WALL_TO_PLANE_ERROR_FRACTION * self.tolerance
         carry = plan_wall_to_plane(
-            capture, groups[0], plane, band, backend, self.propagation, tolerance
+            capture,
+            WallBeforePlane(points, plane, lattice, ways),
+            groups[0],
+            band,
+            backend,
+            self.propagation,
+            tolerance,
         )
         # The Rayleigh-Sommerfeld integral over the plane, as a sum over its points.
         weights = capture.device.put(plane.weights[..., np.newaxis])

@@ -14,7 +14,7 @@ from nlos.portable.library import ArrayLibrary
 from nlos.portable.signals import arrange_on_lattice
 from nlos.propagation.compiled import STRENGTH_POINTS, estimate_strength
 from nlos.propagation.kernels import MIN_DISTANCE_M
-from nlos.propagation.wall_to_plane_plan import WallToPlanePlan
+from nlos.propagation.wall_to_plane_plan import WallBeforePlane, WallToPlanePlan
 from nlos.rsd.kernels import TAPS
 from nlos.rsd.transfer import SphericalWaves
 from tofclip.arrays import Array, to_numpy
@@ -37,9 +37,7 @@ class PortablePropagation:
 
     Parameters
     ----------
-    points : (n, 3) array
-        Wall points, m.
-    plane : Plane
+    geometry : WallBeforePlane
     waves : SphericalWaves
         From points.
     tolerance : float
@@ -49,13 +47,12 @@ class PortablePropagation:
 
     def __init__(
         self,
-        points: FloatArray,
-        plane: Plane,
+        geometry: WallBeforePlane,
         waves: SphericalWaves,
         tolerance: float,
         library: ArrayLibrary,
     ) -> None:
-        self.points, self.plane, self.waves, self.tolerance = points, plane, waves, tolerance
+        self.geometry, self.waves, self.tolerance = geometry, waves, tolerance
         self.library = library
         self._propagator: _LowRankPropagator | _DirectPropagator | None = None
 
@@ -83,11 +80,13 @@ class PortablePropagation:
         some = np.arange(0, phasors.shape[0], phasors.shape[0] // STRENGTH_POINTS + 1)
         sample = to_numpy(self.library.xp.take(phasors, self.library.put(some), axis=0))
         plan = WallToPlanePlan.of(
-            self.points, self.plane, self.waves, estimate_strength(sample), self.tolerance
+            self.geometry, self.waves, estimate_strength(sample), self.tolerance
         )
         if plan is not None and plan.is_faster_than_direct:
             return _LowRankPropagator(plan, self.library)
-        return _DirectPropagator(self.points, self.plane, self.waves, self.library)
+        return _DirectPropagator(
+            self.geometry.points, self.geometry.plane, self.waves, self.library
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from nlos.propagation.kernels import (
     add_spherical_waves,
 )
 from nlos.propagation.scattered import ScatteredWallToPlanePlan, has_finufft
-from nlos.propagation.wall_to_plane_plan import WallToPlanePlan
+from nlos.propagation.wall_to_plane_plan import WallBeforePlane, WallToPlanePlan
 from nlos.rsd.inverse import choose_inverse
 from nlos.rsd.transfer import SphericalWaves
 from tofclip.threads import limit_blas_threads, run_blocks
@@ -42,19 +42,15 @@ class CompiledPropagation:
 
     Parameters
     ----------
-    points : (n, 3) array
-        Wall points, m.
-    plane : Plane
+    geometry : WallBeforePlane
     waves : SphericalWaves
         From points.
     tolerance : float
         Relative error allowed.
     """
 
-    def __init__(
-        self, points: FloatArray, plane: Plane, waves: SphericalWaves, tolerance: float
-    ) -> None:
-        self.points, self.plane, self.waves, self.tolerance = points, plane, waves, tolerance
+    def __init__(self, geometry: WallBeforePlane, waves: SphericalWaves, tolerance: float) -> None:
+        self.geometry, self.waves, self.tolerance = geometry, waves, tolerance
         self._plan: WallToPlanePlan | None = None
         self._planned = False
 
@@ -78,15 +74,15 @@ class CompiledPropagation:
             self._plan, self._planned = self._choose_plan(phasors), True
         if self._plan is not None:
             return propagate_low_rank(self._plan, phasors, progress)
-        return propagate_direct(self.points, phasors, self.plane, self.waves.wavenumbers, progress)
+        points, plane = self.geometry.points, self.geometry.plane
+        return propagate_direct(points, phasors, plane, self.waves.wavenumbers, progress)
 
     def _choose_plan(self, phasors: NDArray[np.complex64]) -> WallToPlanePlan | None:
         """Return the plan of Fourier transforms; None where direct sums are faster or needed."""
-        wall_and_plane = (self.points, self.plane, self.waves)
-        accuracy = (estimate_strength(phasors), self.tolerance)
-        plan = WallToPlanePlan.of(*wall_and_plane, *accuracy)
+        wanted = (self.geometry, self.waves, estimate_strength(phasors), self.tolerance)
+        plan = WallToPlanePlan.of(*wanted)
         if plan is None and has_finufft():
-            plan = ScatteredWallToPlanePlan.of(*wall_and_plane, *accuracy)
+            plan = ScatteredWallToPlanePlan.of(*wanted)
         return plan if plan is not None and plan.is_faster_than_direct else None
 
 

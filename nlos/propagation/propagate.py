@@ -14,6 +14,7 @@ from nlos.illumination_groups import IlluminationGroup, build_waves, group_by_il
 from nlos.method import Progress, ignore_progress, require_numpy_signal
 from nlos.plane import Plane, PlaneField
 from nlos.propagation.shift_and_sum import propagate_in_time
+from nlos.propagation.wall_to_plane_plan import WallBeforePlane
 from tofclip.arrays import Array
 from tofclip.errors import InputError
 
@@ -71,7 +72,13 @@ def propagate(
     require_propagation(propagation)
     group, band = groups[0], Band(pulse, capture.axis)
     wall_to_plane = plan_wall_to_plane(
-        capture, group, plane, band, choose_backend(capture, band), propagation, tolerance
+        capture,
+        WallBeforePlane.of(capture.points[group.indices], plane),
+        group,
+        band,
+        choose_backend(capture, band),
+        propagation,
+        tolerance,
     )
     wavenumbers = group.legs * band.wavenumbers
     return PlaneField(wall_to_plane(capture, ignore_progress, group), plane, wavenumbers)
@@ -79,8 +86,8 @@ def propagate(
 
 def plan_wall_to_plane(
     capture: Capture,
+    geometry: WallBeforePlane,
     group: IlluminationGroup,
-    plane: Plane,
     band: Band,
     backend: Backend,
     propagation: Propagation = "spectral",
@@ -92,9 +99,10 @@ def plan_wall_to_plane(
     Parameters
     ----------
     capture : Capture
-        For its wall points, and the device of its signal.
+        For the device of its signal.
+    geometry : WallBeforePlane
+        The group's wall points, and the plane.
     group : IlluminationGroup
-    plane : Plane
     band : Band
     backend : Backend
     propagation : {"spectral", "time"}
@@ -111,7 +119,7 @@ def plan_wall_to_plane(
     InputError
         The plane is not in front of the wall, or "time" for a signal that is not NumPy's.
     """
-    points = capture.points[group.indices]
+    points, plane = geometry.points, geometry.plane
     foremost = float(points[:, 2].max())
     if plane.z <= foremost:
         raise InputError(
@@ -126,7 +134,7 @@ def plan_wall_to_plane(
 
         return shift_and_sum
     waves = build_waves(group, band, continued=False)
-    propagated = backend.propagate_phasors(points, plane, waves, tolerance)
+    propagated = backend.propagate_phasors(geometry, waves, tolerance)
 
     def propagate_spectrum(one: Capture, progress: Progress, group: IlluminationGroup) -> Array:
         return propagated.field(backend.compute_phasors(one, group), progress)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.plane import Plane, WallLattice
-from nlos.propagation.wall_to_plane_plan import TERM_S, WallToPlanePlan
+from nlos.plane import WallLattice
+from nlos.propagation.wall_to_plane_plan import TERM_S, WallBeforePlane, WallToPlanePlan
 from nlos.rsd.transfer import SphericalWaves
 
 if TYPE_CHECKING:
@@ -45,8 +45,7 @@ class ScatteredWallToPlanePlan(WallToPlanePlan):
     @classmethod
     def of(
         cls,
-        points: FloatArray,
-        plane: Plane,
+        geometry: WallBeforePlane,
         waves: SphericalWaves,
         strength: FloatArray,
         tolerance: float,
@@ -55,9 +54,7 @@ class ScatteredWallToPlanePlan(WallToPlanePlan):
 
         Parameters
         ----------
-        points : (n, 3) float64 array
-            Metres.
-        plane : Plane
+        geometry : WallBeforePlane
         waves : SphericalWaves
         strength : (frequencies,) float64 array
             Relative amplitude of each frequency.
@@ -68,6 +65,7 @@ class ScatteredWallToPlanePlan(WallToPlanePlan):
         -------
         WallToPlanePlan
         """
+        points, plane = geometry.points, geometry.plane
         x, y = (
             low + step * np.arange(max(2, int(np.ceil((high - low) / step)) + 1))
             for low, high, step in zip(
@@ -75,7 +73,7 @@ class ScatteredWallToPlanePlan(WallToPlanePlan):
             )
         )
         nowhere = np.zeros(0, np.intp)
-        return cls(points, WallLattice(x, y, nowhere, nowhere), plane, waves, strength, tolerance)
+        return cls(geometry, WallLattice(x, y, nowhere, nowhere), waves, strength, tolerance)
 
     @property
     def seconds_per_term(self) -> float:

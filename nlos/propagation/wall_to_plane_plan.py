@@ -14,13 +14,14 @@ from nlos.plane import Plane, WallLattice, axis_step
 from nlos.propagation.analysis import LatticeAnalysis, PlaneWaveAnalysis
 from nlos.propagation.low_rank_transfer import LowRankTransfer
 from nlos.rsd.transfer import (
+    Offsets,
     SphericalWaves,
     TransferFunction,
     Window,
     find_fast_length,
-    find_max_offsets,
     find_min_periods,
 )
+from nlos.straight_ways import StraightWays
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -51,16 +52,40 @@ the scene.
 
 
 @dataclass(frozen=True, eq=False)
-class WallToPlanePlan:
-    """How fields get from the points of a wall to a plane before it.
+class WallBeforePlane:
+    """Points of a wall, and the plane before it that their fields get to.
 
     Parameters
     ----------
     points : (n, 3) array
         m.
-    wall : WallLattice
-        Their places.
     plane : Plane
+    lattice : WallLattice or None
+        That the points stand above; None where there is none.
+    ways : StraightWays, optional
+        The only ones that the field on the plane is wanted for; by default all of the plane is.
+    """
+
+    points: FloatArray
+    plane: Plane
+    lattice: WallLattice | None
+    ways: StraightWays | None = None
+
+    @classmethod
+    def of(cls, points: FloatArray, plane: Plane) -> WallBeforePlane:
+        """Return any wall before any plane."""
+        return cls(points, plane, WallLattice.find(points))
+
+
+@dataclass(frozen=True, eq=False)
+class WallToPlanePlan:
+    """How fields get from the points of a wall to a plane before it.
+
+    Parameters
+    ----------
+    geometry : WallBeforePlane
+    wall : WallLattice
+        Places of the wall's points.
     waves : SphericalWaves
     strength : (frequencies,) array
         How strong the field is at each frequency; decides what may be neglected.
@@ -68,9 +93,8 @@ class WallToPlanePlan:
         Relative error allowed.
     """
 
-    points: FloatArray
+    geometry: WallBeforePlane
     wall: WallLattice
-    plane: Plane
     waves: SphericalWaves
     strength: FloatArray
     tolerance: float
@@ -78,8 +102,7 @@ class WallToPlanePlan:
     @classmethod
     def of(
         cls,
-        points: FloatArray,
-        plane: Plane,
+        geometry: WallBeforePlane,
         waves: SphericalWaves,
         strength: FloatArray,
         tolerance: float,
@@ -88,9 +111,7 @@ class WallToPlanePlan:
 
         Parameters
         ----------
-        points : (n, 3) float64 array
-            Metres.
-        plane : Plane
+        geometry : WallBeforePlane
         waves : SphericalWaves
         strength : (frequencies,) float64 array
             Relative amplitude of each frequency.
@@ -101,8 +122,18 @@ class WallToPlanePlan:
         -------
         WallToPlanePlan or None
         """
-        wall = WallLattice.find(points)
-        return None if wall is None else cls(points, wall, plane, waves, strength, tolerance)
+        wall = geometry.lattice
+        return None if wall is None else cls(geometry, wall, waves, strength, tolerance)
+
+    @property
+    def points(self) -> FloatArray:
+        """Of the wall (n, 3), m."""
+        return self.geometry.points
+
+    @property
+    def plane(self) -> Plane:
+        """Where the field is wanted."""
+        return self.geometry.plane
 
     @cached_property
     def is_faster_than_direct(self) -> bool:
@@ -132,8 +163,10 @@ class WallToPlanePlan:
         return distances
 
     @cached_property
-    def _max_offsets(self) -> tuple[float, float]:
-        return find_max_offsets(Plane(self.wall.x, self.wall.y, 0.0), self.plane.y, self.plane.x)
+    def _offsets(self) -> Offsets:
+        wall, ways = Plane(self.wall.x, self.wall.y, 0.0), self.geometry.ways
+        offsets = Offsets.between(wall, self.plane.y, self.plane.x)
+        return offsets if ways is None else offsets.limit(ways.wall_to_plane, ways.rim)
 
     @cached_property
     def _lattices(self) -> tuple[tuple[int, float], tuple[int, float]]:
@@ -141,7 +174,7 @@ class WallToPlanePlan:
         y, x = (
             find_common_period(side, axis_step(wall), axis_step(plane), plane.size)
             for side, wall, plane in zip(
-                find_min_periods(self._max_offsets),
+                find_min_periods(self._offsets),
                 (self.wall.y, self.wall.x),
                 (self.plane.y, self.plane.x),
                 strict=True,
@@ -171,15 +204,16 @@ class WallToPlanePlan:
     @cached_property
     def _window(self) -> Window:
         y, x = (2 * np.pi / spacing for spacing in self.steps)
-        return Window.within(self._max_offsets, (y, x))
+        return Window.within(self._offsets, (y, x))
 
     @cached_property
     def lateral_limits(self) -> FloatArray:
         """Largest lateral wavenumber that counts at each frequency, rad/m."""
-        k = self.waves.wavenumbers
-        fading = (
-            EVANESCENT_EXPONENT * np.log(1 / self.tolerance) / float(self._plane_distances.min())
-        )
+        k, ways = self.waves.wavenumbers, self.geometry.ways
+        # what fades before the nearest voxels is not wanted on the plane either
+        first = self.plane.z if ways is None else ways.first_depth
+        distance = first - float(self.points[:, 2].max())
+        fading = EVANESCENT_EXPONENT * np.log(1 / self.tolerance) / distance
         grazing = GRAZING_MARGIN * self._window.spectral_spread(self.tolerance)
         limits: FloatArray = np.maximum(np.sqrt(k**2 + fading**2), k + grazing)
         return limits

@@ -14,13 +14,14 @@ from nlos.geometry import Grid
 from nlos.method import MEMORY_LIMIT_BYTES
 from nlos.plane import Plane, axis_step
 from nlos.rsd.transfer import (
+    Offsets,
     SphericalWaves,
     TransferFunction,
     Window,
     find_fast_length,
-    find_max_offsets,
     find_min_periods,
 )
+from nlos.straight_ways import StraightWays
 from tofclip.errors import InputError
 from tofclip.threads import split_blocks
 
@@ -104,16 +105,24 @@ class DiffractionPlan:
     waves : SphericalWaves
     tolerance : float
         Relative error allowed.
+    ways : StraightWays, optional
+        The only ones between plane and voxels that carry anything; by default all do.
     """
 
     plane: Plane
     grid: Grid
     waves: SphericalWaves
     tolerance: float
+    ways: StraightWays | None = None
 
     @cached_property
-    def _max_offsets(self) -> tuple[float, float]:
-        return find_max_offsets(self.plane, self.grid.y, self.grid.x)
+    def _offsets(self) -> Offsets:
+        offsets = Offsets.between(self.plane, self.grid.y, self.grid.x)
+        return (
+            offsets
+            if self.ways is None
+            else offsets.limit(self.ways.plane_to_voxels, self.ways.rim)
+        )
 
     @cached_property
     def lattice(self) -> tuple[int, int]:
@@ -123,7 +132,7 @@ class DiffractionPlan:
         y, x = (
             find_fast_length(side / axis_step(axis)) if axis.size > 1 else 1
             for side, axis in zip(
-                find_min_periods(self._max_offsets), (self.grid.y, self.grid.x), strict=True
+                find_min_periods(self._offsets), (self.grid.y, self.grid.x), strict=True
             )
         )
         return y, x
@@ -136,7 +145,7 @@ class DiffractionPlan:
             for count, axis, side in zip(
                 self.lattice,
                 (self.grid.y, self.grid.x),
-                find_min_periods(self._max_offsets),
+                find_min_periods(self._offsets),
                 strict=True,
             )
         )
@@ -144,7 +153,7 @@ class DiffractionPlan:
 
     @cached_property
     def _window(self) -> Window:
-        return Window.within(self._max_offsets, self._periods)
+        return Window.within(self._offsets, self._periods)
 
     @cached_property
     def plane_waves(self) -> PlaneWaves:

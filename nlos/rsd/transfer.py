@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.plane import Plane
+from nlos.plane import Plane, axis_step
 from nlos.rsd.kernels import TAPS, find_interpolation_weights, sample_waves
 
 FloatArray = NDArray[np.float64]
@@ -53,14 +53,13 @@ class Window:
     outer_radius: float
 
     @classmethod
-    def within(cls, farthest: Sides, periods: Sides) -> Window:
+    def within(cls, offsets: Offsets, periods: Sides) -> Window:
         """Return the widest window that lets no image of a source in a periodic lattice meet a
         target.
 
         Parameters
         ----------
-        farthest : (float, float)
-            As `find_max_offsets` gives it.
+        offsets : Offsets
         periods : (float, float)
             Along y and x, m; at least `find_min_periods`.
 
@@ -68,10 +67,10 @@ class Window:
         -------
         Window
         """
-        corner, along = float(np.hypot(*farthest)), max(farthest)
-        room = min(period - far for period, far in zip(periods, farthest, strict=True))
-        reach = min(corner, room - MIN_EDGE_FRACTION * along)
-        return cls(reach, min(room, reach + MAX_EDGE_FRACTION * along))
+        room = min(period - far for period, far in zip(periods, offsets.farthest, strict=True))
+        inner = min(offsets.reach, room - MIN_EDGE_FRACTION * offsets.along)
+        outer = min(room, inner + MAX_EDGE_FRACTION * offsets.along)
+        return cls(float(inner), float(outer))
 
     def spectral_spread(self, tolerance: float) -> float:
         """Lateral wavenumbers by which the window's edge spreads grazing waves, rad/m."""
@@ -80,29 +79,77 @@ class Window:
         )
 
 
-def find_max_offsets(sources: Plane, y: FloatArray, x: FloatArray) -> Sides:
-    """Return the largest distance of a source on a plane from a target along y and along x, m.
+@dataclass(frozen=True)
+class Offsets:
+    """How far sources and targets are apart along y and x.
 
     Parameters
     ----------
-    sources : Plane
-    y, x : (n,) float64 array
-        Coordinates of the targets, ascending, m.
-
-    Returns
-    -------
-    (float, float)
-        Along y and along x, m.
+    farthest : (float, float)
+        The largest there are, m: within these, no image of a source may meet a target.
+    reach : float
+        The largest distance across that a window may have to hold, m.
+    along : float
+        The largest along an axis that it may have to, m.
+    extents : (float, float)
+        Of sources or of targets, whichever are wider, m: a period holds them.
     """
-    pairs = ((y, sources.y), (x, sources.x))
-    along_y, along_x = (float(max(abs(a[-1] - b[0]), abs(a[0] - b[-1]))) for a, b in pairs)
-    return along_y, along_x
+
+    farthest: Sides
+    reach: float
+    along: float
+    extents: Sides
+
+    @classmethod
+    def between(cls, sources: Plane, y: FloatArray, x: FloatArray) -> Offsets:
+        """Return those of all sources on a plane from all targets.
+
+        Parameters
+        ----------
+        sources : Plane
+        y, x : (n,) float64 array
+            Coordinates of the targets, ascending, m.
+
+        Returns
+        -------
+        Offsets
+        """
+        pairs = ((y, sources.y), (x, sources.x))
+        along_y, along_x = (float(max(abs(a[-1] - b[0]), abs(a[0] - b[-1]))) for a, b in pairs)
+        high, wide = (
+            max(axis.size * axis_step(axis) for axis in pair if axis.size > 1) for pair in pairs
+        )
+        reach = float(np.hypot(along_y, along_x))
+        return cls((along_y, along_x), reach, max(along_y, along_x), (high, wide))
+
+    def limit(self, reach: float, rim: Sides) -> Offsets:
+        """Return the offsets where less reach is wanted, and where a rim carries little of the
+        field.
+
+        Parameters
+        ----------
+        reach : float
+            m.
+        rim : (float, float)
+            Width of the rim along y and x, m.
+
+        Returns
+        -------
+        Offsets
+        """
+        y, x = (far - width for far, width in zip(self.farthest, rim, strict=True))
+        reach = min(reach, float(np.hypot(y, x)))
+        # as far along both axes, as where all is wanted
+        return Offsets((y, x), reach, min(max(y, x), reach / np.sqrt(2)), self.extents)
 
 
-def find_min_periods(farthest: Sides) -> Sides:
+def find_min_periods(offsets: Offsets) -> Sides:
     """Return the shortest periods along y and x in which a window has room, m."""
-    edge = INNER_RADIUS_FRACTION * float(np.hypot(*farthest)) + MIN_EDGE_FRACTION * max(farthest)
-    y, x = (edge + far for far in farthest)
+    edge = INNER_RADIUS_FRACTION * offsets.reach + MIN_EDGE_FRACTION * offsets.along
+    y, x = (
+        max(edge + far, extent)
+        for far, extent in zip(offsets.farthest, offsets.extents, strict=True)
+    )
     return y, x
 
 

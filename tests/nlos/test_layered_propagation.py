@@ -12,7 +12,11 @@ from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
 from nlos.plane import Plane
 from nlos.propagation.compiled import estimate_strength, propagate_direct, propagate_low_rank
-from nlos.propagation.wall_to_plane_plan import WallToPlanePlan, find_common_period
+from nlos.propagation.wall_to_plane_plan import (
+    WallBeforePlane,
+    WallToPlanePlan,
+    find_common_period,
+)
 from nlos.rsd.diffraction import find_fast_length
 from nlos.rsd.transfer import SphericalWaves
 
@@ -37,7 +41,7 @@ def phasors(count: int) -> np.ndarray:
 
 
 def make_plan(points: np.ndarray, plane: Plane, tolerance: float) -> WallToPlanePlan:
-    found = WallToPlanePlan.of(points, plane, WAVES, BAND.weights, tolerance)
+    found = WallToPlanePlan.of(WallBeforePlane.of(points, plane), WAVES, BAND.weights, tolerance)
     assert found is not None
     return found
 
@@ -114,7 +118,9 @@ def test_silence_and_a_single_frequency_pass() -> None:
     assert not propagate_low_rank(make_plan(points, FITTING, 1e-2), values).any()
     values[:, 9] = phasors(len(points))[:, 9]
     assert np.flatnonzero(estimate_strength(values)).tolist() == [9]
-    plan = WallToPlanePlan.of(points, FITTING, WAVES, estimate_strength(values), 1e-2)
+    plan = WallToPlanePlan.of(
+        WallBeforePlane.of(points, FITTING), WAVES, estimate_strength(values), 1e-2
+    )
     assert plan is not None
     assert (
         relative_error(
@@ -129,7 +135,8 @@ def test_scattered_points_stand_above_no_lattice() -> None:
     scattered = random.uniform([-1, -1, 0], [1, 1, 0.2], (100, 3))
     twice = np.concatenate([shaped_wall("wavy", 5).reshape(-1, 3)] * 2)
     for points in (scattered, twice):
-        assert WallToPlanePlan.of(points, FITTING, WAVES, BAND.weights, 1e-2) is None
+        wall = WallBeforePlane.of(points, FITTING)
+        assert WallToPlanePlan.of(wall, WAVES, BAND.weights, 1e-2) is None
 
 
 def test_large_problems_take_it_and_small_or_strict_ones_do_not() -> None:

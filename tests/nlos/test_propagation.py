@@ -10,7 +10,7 @@ from nlos import Capture, Grid, propagate
 from nlos.band import Band, VirtualPulse
 from nlos.capture import TimeAxis
 from nlos.plane import Plane, WallLattice, choose_virtual_plane
-from nlos.propagation.wall_to_plane_plan import WallToPlanePlan
+from nlos.propagation.wall_to_plane_plan import WallBeforePlane, WallToPlanePlan
 from nlos.rsd.transfer import SphericalWaves
 from nlos.simulate import PointScene
 from tofclip.errors import InputError
@@ -143,7 +143,7 @@ def test_the_virtual_plane_suits_the_walls_lattice(shortest: float) -> None:
         assert axis[0] <= unfitted[0] + 1e-9
         assert axis[-1] >= unfitted[-1] - 1e-9
         assert axis[0] + axis[-1] == pytest.approx(unfitted[0] + unfitted[-1], abs=1e-9)
-    plan = WallToPlanePlan.of(points, plane, waves, np.ones(1), 1e-2)
+    plan = WallToPlanePlan.of(WallBeforePlane(points, plane, lattice), waves, np.ones(1), 1e-2)
     assert plan is not None
     assert plan.plane_lattice == tuple(map(round, plan.plane_lattice))
 

@@ -17,6 +17,7 @@ from nlos.capture import TimeAxis
 from nlos.plane import Plane
 from nlos.propagation.compiled import propagate_direct, propagate_low_rank
 from nlos.propagation.scattered import ScatteredWallToPlanePlan
+from nlos.propagation.wall_to_plane_plan import WallBeforePlane
 from nlos.rsd.transfer import SphericalWaves
 from nlos.simulate import PointScene
 
@@ -41,7 +42,10 @@ def phasors(count: int) -> np.ndarray:
 def error_of(points: np.ndarray, plane: Plane, tolerance: float) -> float:
     values = phasors(len(points))
     found = propagate_low_rank(
-        ScatteredWallToPlanePlan.of(points, plane, WAVES, BAND.weights, tolerance), values
+        ScatteredWallToPlanePlan.of(
+            WallBeforePlane(points, plane, None), WAVES, BAND.weights, tolerance
+        ),
+        values,
     )
     exact = propagate_direct(points, values, plane, K)
     assert found.shape == exact.shape
@@ -67,7 +71,7 @@ def test_a_flat_cloud_takes_one_term() -> None:
     flat = CLOUD * [1, 1, 0]
     assert set(
         ScatteredWallToPlanePlan.of(
-            flat, FINE, WAVES, BAND.weights, 1e-2
+            WallBeforePlane(flat, FINE, None), WAVES, BAND.weights, 1e-2
         ).low_rank_transfer.term_counts
     ) == {1}
     assert error_of(flat, FINE, 1e-2) < 1e-2
@@ -95,11 +99,11 @@ def test_large_clouds_take_it_and_small_ones_do_not() -> None:
         points = random.uniform([-1, -1, 0], [1, 1, 0.3], (count, 3))
         assert (
             ScatteredWallToPlanePlan.of(
-                points, plane, waves, np.ones(100), 1e-2
+                WallBeforePlane(points, plane, None), waves, np.ones(100), 1e-2
             ).is_faster_than_direct
             == expected
         )
     points = random.uniform([-1, -1, 0], [1, 1, 0.3], (20000, 3))
     assert not ScatteredWallToPlanePlan.of(
-        points, plane, waves, np.ones(100), 1e-4
+        WallBeforePlane(points, plane, None), waves, np.ones(100), 1e-4
     ).is_faster_than_direct
