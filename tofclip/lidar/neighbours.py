@@ -132,12 +132,11 @@ def add_recovery_error(
     known = scatter >= 0
     if np.count_nonzero(known) < MIN_KNOWN:
         return total
-    excess = np.maximum(scatter[known] ** 2 - total[known] ** 2, 0)
-    found = np.sqrt(total[known] ** 2 + PLANE_SHARE * excess)
-    usual = float(np.median(found / total[known]))
-    total *= usual
-    total[known] = found
-    return total
+    variance = total * total
+    excess = np.maximum(scatter * scatter - variance, 0)
+    found = np.sqrt(variance + PLANE_SHARE * excess)
+    usual = float(np.median((found / total)[known]))
+    return np.where(known, found, usual * total)
 
 
 @lru_cache(maxsize=4)
