@@ -1,6 +1,6 @@
-"""How the parts of compiled loops are compiled, and who hears of it when that takes time.
+"""How loops and their parts are compiled, and who hears of it when that takes time.
 
-A loop that Python calls is compiled by `numba.njit` and kept on disk. What only such loops call
+A loop that Python calls is kept on disk. What only such loops call
 needs neither: the caller's machine code holds it. Without entry points for Python and C and without
 a file of its own it is compiled in a fifth less time.
 
@@ -13,12 +13,21 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
 
+from numba import njit
 from numba.core import event
 from numba.extending import register_jitable
 
 from tofclip.compile_observers import observers
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+compile_loop: Callable[..., Callable[[Any], Any]] = partial(
+    njit, nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False
+)
+"""Make the decorator of loops that Python calls and that write into arrays they are given, with
+options of `numba.njit` such as ``fastmath``. They make no array, so that nothing counts who holds
+one, and C does not call them: both would be compiled into each of them.
+"""
 
 compile_as_part: Callable[..., Callable[[F], F]] = partial(
     register_jitable, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True

@@ -8,12 +8,13 @@ stay in cache.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-fast_njit = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+from tofclip.compiling import compile_loop
+
+fast_loop = compile_loop(fastmath=True)
 
 
-@fast_njit
+@compile_loop(fastmath=True, _nrt=True)
 def sample_in_time(counts, dark, raw_row, delay, measurements):
     """Sample every column linearly between two of its rows, and take off the dark level.
 
@@ -50,7 +51,7 @@ def sample_in_time(counts, dark, raw_row, delay, measurements):
             first = end
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy", _nrt=False)
+@compile_loop(fastmath=True)
 def sample_runs(counts, dark, raw_row, runs, measurements):
     """Sample as `sample_in_time` does without a delay, between rows that were looked up beforehand.
 
@@ -82,7 +83,7 @@ def sample_runs(counts, dark, raw_row, runs, measurements):
             reading[i] = upper[i] + (position[i] - height) * (lower[i] - upper[i]) - dark
 
 
-@fast_njit
+@fast_loop
 def sample_bilinear(counts, dark, raw_row, raw_column, delay, measurements):
     """Sample bilinearly; see `sample_in_time`.
 
@@ -116,7 +117,7 @@ def sample_bilinear(counts, dark, raw_row, raw_column, delay, measurements):
             reading[column] = value if inside else np.float32(0)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compile_loop()
 def mark_valid(bad, raw_row, raw_column, delay, valid):
     """Mark the measurements that lie within the raw image and to which no bad pixel contributes.
 

@@ -24,6 +24,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from tofclip.compiling import compile_loop
 from tofclip.threads import run_blocks
 
 FloatArray = NDArray[np.float64]
@@ -203,7 +204,7 @@ def allocate_window() -> NDArray[np.float32]:
     return window
 
 
-@njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+@compile_loop(fastmath=True, _nrt=True)
 def scatter_about_planes(nearness, metres, pixel, columns, layers, gate, chosen, memory, scatter):
     """Robust deviation of the returns around each from a plane through them, -1 if they are few.
 
@@ -396,7 +397,7 @@ def fit_plane_around(memory):
     return float(a), float(b), float((s - a * sx - b * sy) / n), int(n)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compile_loop()
 def borrow_scatter(nearness, metres, starts, image_shape, gate, memory, scatter):
     """Take over what is known of the return nearest in range, on the same surface, of those within
     a plane's reach whose row and column `PLANE_STEP_PX` divides.
@@ -468,7 +469,7 @@ def open_cell(nearness, starts, columns, cell, memory):
     return number
 
 
-@njit(nogil=True, cache=True)
+@compile_loop()
 def raise_to_maximum(index, values, maxima):
     """Raise each of some maxima to the largest of its values.
 
@@ -484,7 +485,7 @@ def raise_to_maximum(index, values, maxima):
         maxima[index[number]] = max(maxima[index[number]], values[number])
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compile_loop()
 def pool_significance(pixel, at, distance, own, starts, image_shape, limits, pooled):
     """Add to each candidate's significance those of its neighbours at the same range.
 

@@ -23,6 +23,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from tofclip.compiling import compile_loop
 from tofclip.operators.radon import FRACTION_BITS
 from tofclip.threads import LANES
 
@@ -132,7 +133,7 @@ def _emit_while(builder: Any, condition: Callable[[], Any]) -> Iterator[None]:
     builder.position_at_end(after)
 
 
-@njit(nogil=True, cache=True)
+@compile_loop()
 def multiply_sparse_block(tile_starts, columns, values, block, result):
     """``result = M @ block`` for a sparse matrix M in column tiles; see
     `tofclip.operators.sparse.Tiles`.
@@ -157,7 +158,7 @@ def multiply_sparse_block(tile_starts, columns, values, block, result):
                 )
 
 
-@njit(nogil=True, cache=True)
+@compile_loop()
 def multiply_sparse_rows(tile_starts, columns, values, block, first, result, place):
     """``result[:, place + j] = (M @ block)[:, first + j]`` for `LANES` neighbours j; see
     `multiply_sparse_block`.
@@ -182,7 +183,7 @@ def multiply_sparse_rows(tile_starts, columns, values, block, first, result, pla
                 _emit_row_product(result, target, stride, lanes, columns, values, begin, end, onto)
 
 
-@njit(nogil=True, cache=True)
+@compile_loop()
 def multiply_sparse_wide_rows(tile_starts, columns, values, block, first, result, place):
     """As `multiply_sparse_rows`, for `WIDE_LANES` neighbours, for which a nonzero is looked up once.
 
@@ -203,9 +204,8 @@ def multiply_sparse_wide_rows(tile_starts, columns, values, block, first, result
                 )
 
 
-fast_njit = njit(
-    nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy"
-)
+FASTMATH = {"contract", "nsz", "arcp", "afn"}
+fast_loop = compile_loop(fastmath=FASTMATH)
 inline_njit = njit(inline="always")
 
 FRACTION_MASK = (1 << FRACTION_BITS) - 1
@@ -222,7 +222,7 @@ def _deposit_light(line, position, light, light_step):
     line[first, 1] += beyond
 
 
-@fast_njit
+@fast_loop
 def project_onto_lines(picture, starts, rightward, downward, lines):
     """Project a (rows, columns) picture onto lines; adds to `lines`, (lines, bins, 2), which
     `_deposit_light` explains.
@@ -263,7 +263,7 @@ def project_onto_lines(picture, starts, rightward, downward, lines):
                 _deposit_light(line, here + column * right, light, light * step)
 
 
-@fast_njit
+@fast_loop
 def back_project_lines(lines, starts, rightward, downward, picture):
     """The adjoint of `project_onto_lines` for lines (lines, bins) of one value a bin; overwrites
     `picture`.
@@ -292,7 +292,7 @@ def back_project_lines(lines, starts, rightward, downward, picture):
                 )
 
 
-@fast_njit
+@fast_loop
 def count_line_nonzeros(starts, rightward, downward, before, shape, counts):
     """Count the nonzeros in each row of the matrix that `project_onto_lines` stands for.
 
@@ -322,7 +322,7 @@ def count_line_nonzeros(starts, rightward, downward, before, shape, counts):
                     counts[number, reading + 1] += 1
 
 
-@fast_njit
+@fast_loop
 def fill_line_nonzeros(starts, rightward, downward, before, shape, places, columns, values):
     """Write the nonzeros that `count_line_nonzeros` counted.
 
@@ -361,7 +361,7 @@ def fill_line_nonzeros(starts, rightward, downward, before, shape, places, colum
                         places[number, bin_number] = place + 1
 
 
-@fast_njit
+@fast_loop
 def count_tile_nonzeros(row_starts, indices, width, counts):
     """Count a CSR matrix's nonzeros in each tile of `width` columns and row, (tiles, rows) zeros.
 
@@ -381,7 +381,7 @@ def count_tile_nonzeros(row_starts, indices, width, counts):
             counts[indices[entry] // width, row] += 1
 
 
-@fast_njit
+@fast_loop
 def sort_into_tiles(row_starts, indices, data, width, places, columns, values):
     """Write a CSR matrix's nonzeros in the order of tile, row and column; `places` as in
     `fill_line_nonzeros`.
@@ -407,7 +407,7 @@ def sort_into_tiles(row_starts, indices, data, width, places, columns, values):
             places[tile, row] = place + 1
 
 
-@fast_njit
+@fast_loop
 def transform_walsh_hadamard(values):
     """Multiply (n, columns) values by Sylvester's Hadamard matrix of n = 2^k rows, in place; two
     stages at a time.
@@ -435,7 +435,7 @@ def transform_walsh_hadamard(values):
                 values[row + half, column] = a - b
 
 
-@fast_njit
+@compile_loop(fastmath=FASTMATH, _nrt=True)
 def shift_linearly(block, down, right, below, beside, shifted):
     """Shift a (rows, columns, lanes) block by ``down + below`` rows and ``right + beside`` columns;
     dark beyond.

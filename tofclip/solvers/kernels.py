@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numba import njit
 
-from tofclip.compiling import compile_as_part
+from tofclip.compiling import compile_as_part, compile_loop
 from tofclip.operators.kernels import (
     WIDE_LANES,
     multiply_sparse_block,
@@ -31,22 +31,21 @@ STRETCH_NUMBERS = 512
 STRETCHES_PER_SUM = 128
 """Stretches that are added up before they go to a sum of higher precision."""
 
-fast_njit = njit(
-    nogil=True, cache=True, fastmath={"contract", "nsz", "arcp", "afn"}, error_model="numpy"
-)
+FASTMATH = {"contract", "nsz", "arcp", "afn"}
+fast_loop = compile_loop(fastmath=FASTMATH)
 inline_njit = njit(
     inline="always"
 )  # so that a full block's number of lanes is a constant to the compiler
 
 
-row_part = compile_as_part(fastmath={"contract", "nsz", "arcp", "afn"})
+row_part = compile_as_part(fastmath=FASTMATH, _nrt=False)
 """For a row of a picture with all its lanes, one after the other: a loop over few arrays is a vector
 loop, because the compiler checks only a few for overlap. Numbers that each lane has are repeated for
 every pixel of a row.
 """
 
 
-@fast_njit
+@fast_loop
 def shrink_nonnegative(
     current, previous, momentum, gradient, step, threshold, memory, total, distance
 ):
@@ -125,7 +124,7 @@ def _move_sum(some, total):
         some[i] = 0
 
 
-@fast_njit
+@fast_loop
 def take_gradient_step(current, previous, momentum, gradient, step):
     """``gradient = z - step * gradient`` with ``z = current + momentum * (current - previous)``.
 
@@ -146,7 +145,7 @@ def take_gradient_step(current, previous, momentum, gradient, step):
                 gradient[row, column, lane] = point - step * gradient[row, column, lane]
 
 
-@fast_njit
+@fast_loop
 def copy_lanes_to_frames(block, frames):
     """``frames[lane, pixel] = block[pixel, lane]`` for as many lanes as there are frames;
     contiguous 2D arrays.
@@ -169,7 +168,7 @@ def copy_lanes_to_frames(block, frames):
                 frames[lane, pixel] = block[pixel, lane]
 
 
-@fast_njit
+@compile_loop(fastmath=FASTMATH, _nrt=True)
 def compute_traces(tile_starts, columns, values, weights, traces, span):
     """``traces[:, span[0] : span[1]] = M @ weights`` for a sparse matrix M in column tiles.
 
@@ -200,7 +199,7 @@ def compute_traces(tile_starts, columns, values, weights, traces, span):
                 traces[row, column] = part[row, column - first]
 
 
-@fast_njit
+@compile_loop(fastmath=FASTMATH, _nrt=True)
 def update_peaks(tile_starts, columns, values, scales, block, highest):
     """Raise `highest` to the largest ``scales * (M @ block)`` over the rows of a sparse matrix M,
     lane by lane.
@@ -240,7 +239,7 @@ def update_peaks(tile_starts, columns, values, scales, block, highest):
                 highest[lane] = one if one > highest[lane] else highest[lane]
 
 
-@fast_njit
+@fast_loop
 def restore_frames(candidate, current, rejected):
     """``candidate = current`` in the lanes where `rejected` is 1; it is 0 elsewhere. Arrays are
     (..., lanes).
@@ -263,7 +262,7 @@ def restore_frames(candidate, current, rejected):
                 )
 
 
-@fast_njit
+@fast_loop
 def descend_total_variation(
     lanes, current, previous, momentum, gradient, step, weight, dual, sweep, scratch, total
 ):
@@ -372,7 +371,7 @@ def _add_variation(lanes, here, below, total):
         total[i] += math.fabs(below[i] - here[i])
 
 
-@fast_njit
+@fast_loop
 def compute_light_field_primal(noisy, dual, weight, angular, result):
     """``result = max(noisy + weight * div(dual), 0)``; arrays are (v, u, rows, columns, lanes),
     `dual` four of them.
@@ -430,7 +429,7 @@ def _forward_differences(field, v, u, row, column, lane, angular):
     )
 
 
-@fast_njit
+@fast_loop
 def update_light_field_dual(field, dual, step, angular):
     """``dual = project(dual + step * grad(field))`` onto vectors of length at most 1.
 
@@ -461,7 +460,7 @@ def update_light_field_dual(field, dual, step, angular):
                         dual[3, v, u, row, column, lane] = d * shrink
 
 
-@fast_njit
+@fast_loop
 def sum_light_field_variation(field, angular, total):
     """Add the isotropic variation of each lane to `total` (lanes,), float64.
 

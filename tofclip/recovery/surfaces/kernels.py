@@ -13,12 +13,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from tofclip.compiling import compile_loop
 
 Image = NDArray[np.float32]
 
-nogil_njit = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+fast_loop = compile_loop(fastmath=True)
 
 SPLINE_SAMPLES = 3
 SPLINE_VARIANCE = 0.25  # rows^2, of the samples' spread
@@ -47,7 +48,7 @@ def split_between_rows(row: NDArray[np.float64]) -> tuple[NDArray[np.int32], Ima
     return middle.astype(np.int32) - np.int32(1), shares
 
 
-@nogil_njit
+@fast_loop
 def split_over_slit(position, tangent, subrows, first, shares):
     """Share of a picture pixel that falls on each slit pixel.
 
@@ -82,7 +83,7 @@ def split_over_slit(position, tangent, subrows, first, shares):
                 shares[point, column + 1 - start] += weight / subrows
 
 
-@nogil_njit
+@fast_loop
 def add_light(amplitude, row, row_shares, column, slit_shares, image):
     """Add the light of surface points to the image of a view; all of it must fall inside.
 
@@ -107,7 +108,7 @@ def add_light(amplitude, row, row_shares, column, slit_shares, image):
                 image[top + i, left + j] += instant * slit_shares[point, j]
 
 
-@nogil_njit
+@fast_loop
 def gather_light(image, gain, row, row_shares, column, slit_shares, amplitude):
     """The adjoint of `add_light`: what each point's light would find in an image.
 
@@ -131,7 +132,7 @@ def gather_light(image, gain, row, row_shares, column, slit_shares, amplitude):
         amplitude[point] += gain * total
 
 
-@nogil_njit
+@fast_loop
 def smooth_rows(image, kernel, rows, margin, result):
     """Convolve an image with a kernel along its rows, for some of the rows.
 
@@ -203,7 +204,7 @@ def prox_masked_tv(
         apply_dual(picture, mask, weight, ahead, result)
 
 
-@nogil_njit
+@fast_loop
 def apply_dual(picture, mask, weight, ahead, result):
     """The picture that belongs to a dual variable: ``max(picture + weight * div ahead, 0)``."""
     for y in range(picture.shape[0]):
@@ -219,7 +220,7 @@ def apply_dual(picture, mask, weight, ahead, result):
                 result[y, x] = value if value > 0 else 0.0
 
 
-@nogil_njit
+@fast_loop
 def ascend_dual(result, mask, weight, momentum, ahead, dual):
     """A projected gradient step on the dual variable, with momentum."""
     rows, columns = result.shape
