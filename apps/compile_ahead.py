@@ -23,38 +23,39 @@ from tofclip.threads import map_parallel
 
 TITLE = "compiling loops for this processor, once"
 
-SEARCH, NEIGHBOURS = "tofclip.lidar.search.compiled", "tofclip.lidar.neighbours"
-LONE = "tofclip.lidar.search.lone_fit"
+PEAKS, NEIGHBOURS = "tofclip.lidar.search.peaks", "tofclip.lidar.neighbours"
+TABLE, EXACT = "tofclip.lidar.search.table_fit", "tofclip.lidar.search.exact_fit"
 CAMERA, OPERATORS = "tofclip.camera.kernels", "tofclip.operators.kernels"
 SOLVERS, SURFACES = "tofclip.solvers.kernels", "tofclip.recovery.surfaces.kernels"
 
 LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
     {
-        (SEARCH, "find_maxima"): (
-            "(f4[:,::1], f8[::1], f4[:,::1], f4[::1], f8, f4[::1], f8[:,::1], f4[:,::1])"
+        (PEAKS, "find_strongest_peaks"): (
+            "(f4[:,::1], f8[::1], f4[::1], f4[:,::1], i8[::1], i8[::1], i8[::1], f4[::1],"
+            " f4[:,::1], i8[::1], f8[::1], UniTuple(f8, 3), i8[:,::1], UniTuple(f8, 5), f4[::1],"
+            " f4[:,::1], f4[::1], f8[:,::1], f8[:,:,::1])"
         ),
-        (SEARCH, "find_strongest_peaks"): (
-            "(f4[:,::1], f8[::1], f4[::1], f4[:,::1], UniTuple(f8, 2), i8[:,::1], UniTuple(f8, 5),"
-            " f4[:,::1], i4[:,::1], f8[:,::1], f4[::1], f8[:,:,::1])"
+        (PEAKS, "confirm_peaks"): (
+            "(f4[:,::1], f8[::1], f4[:,::1], i8[::1], f8[::1], UniTuple(f8, 5), f4[::1],"
+            " f8[:,::1], f8[:,:,::1], f8[:,::1])"
         ),
-        (SEARCH, "confirm_peaks"): (
-            "(f4[:,::1], f8[::1], f4[:,::1], UniTuple(f8, 5), f4[::1], f8[:,::1], f8[:,:,::1],"
-            " f8[:,:,::1])"
+        (TABLE, "cut_out_returns"): (
+            "(f4[:,::1], i8[::1], f8[:,::1], b1[::1], i8, f8[:,::1], i8, f4[:,::1], i8[::1],"
+            " i8[::1], i8[::1])"
         ),
-        (LONE, "list_lone_returns"): (
-            "(f4[:,::1], i8[::1], f8[::1], f8[:,::1], f8, f8[:,:,::1], b1[::1], i8, f8[:,::1],"
-            " f4[:,::1], i8[::1])"
+        (TABLE, "fit_lone_returns"): (
+            "(f8[:,::1], f4[:,::1], i8[::1], i8, f4[:,::1], f4[:,::1], f8[:,::1])"
         ),
-        (LONE, "fit_lone_returns"): (
-            "(f8[:,::1], f4[:,::1], i8[::1], f4[:,::1], f4[:,::1], f8[:,::1])"
+        (TABLE, "fit_crowded_returns"): (
+            "(f8[:,::1], f4[:,::1], i8[::1], i8, i8, f4[:,::1], f4[:,::1], f4[:,::1], f8[:,::1])"
         ),
-        (LONE, "measure_lone_returns"): (
-            "(f8[:,::1], f4[:,::1], i8[::1], f8[::1], f4[:,::1], f4[:,::1], f8[:,::1], f8[:,:,::1],"
-            " i8[::1])"
+        (TABLE, "measure_returns_by_table"): (
+            "(f8[:,::1], i8, f4[:,::1], f8, i8[::1], f8[::1], f4[:,::1], f4[:,::1], f8[:,::1],"
+            " f8[:,:,::1], i8[::1])"
         ),
-        (SEARCH, "fit_crowded_returns"): (
-            "(f4[:,::1], i8[::1], f8[::1], f8[:,::1], f8, f8[:,:,::1],"
-            " Tuple((f8[:,::1], UniTuple(f8, 4))), f8[:,::1], f8[:,:,::1], i8[::1])"
+        (EXACT, "fit_returns_exactly"): (
+            "(f4[:,::1], i8[::1], f8[::1], f8[:,::1], f8, i8[:,::1], f8[:,::1], i8,"
+            " Tuple((f8[:,::1], UniTuple(f8, 4))), f8[:,::1], f8[:,::1], f8[:,:,::1], i8[::1])"
         ),
         (CAMERA, "sample_runs"): "(f4[:,::1], f4, f4[:,::1], u8[:,::1], f4[:,::1])",
         (CAMERA, "mark_valid"): "(b1[:,::1], f4[:,::1], f4[:,::1], f4, b1[:,::1])",
@@ -99,7 +100,7 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
 letter and bytes for each kind of number, as Numba writes them."""
 
 GROUPS: Sequence[Sequence[str]] = (
-    (SEARCH, LONE, OPERATORS),
+    (PEAKS, TABLE, EXACT, OPERATORS),
     (SOLVERS, CAMERA, NEIGHBOURS, SURFACES),
 )
 """Modules whose loops take about as long to compile together, each for a process."""

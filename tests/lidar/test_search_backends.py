@@ -24,11 +24,11 @@ EVERYTHING = Detection(min_scene_fraction=0, min_time_bin_fraction=0, min_pixel_
 MANY = replace(EVERYTHING, max_returns=7, signal_to_noise=3.5)
 
 # The fits stop where the next step would be far below 5e-3 bins, and which of two rounds is the last
-# may differ: by rounding where returns overlap, by the table of phases where one stands alone. Weak
-# returns converge slowly; for them it stays a small part of what noise does.
+# may differ: by rounding, or by the table of phases on an even axis. Weak returns converge slowly; for
+# them it stays a small part of what noise does.
 ARRIVAL_BINS, ARRIVAL_DEVIATIONS = 5e-3, 0.1
-# the square of half a phase of the table, by which its steps differ from exact ones
-USUAL_BINS = 1 / 128**2
+# Near the end a step is a fifth of the one before it.
+USUAL_BINS = 1e-3
 
 
 @pytest.fixture(params=DEVICE_NAMES)
@@ -73,7 +73,7 @@ def assert_alike(found: Returns, expected: Returns) -> None:
     np.testing.assert_allclose(found.intensity, expected.intensity, rtol=5e-3)
     np.testing.assert_allclose(found.confidence, expected.confidence, rtol=2e-2)
     assert np.median(np.abs(found.intensity / expected.intensity - 1)) < 1e-5
-    assert np.median(np.abs(found.confidence / expected.confidence - 1)) < 1e-4
+    assert np.median(np.abs(found.confidence / expected.confidence - 1)) < 5e-4
     assert {type(getattr(found, name)) for name in ("range", "intensity", "confidence")} == {
         np.ndarray
     }

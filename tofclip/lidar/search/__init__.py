@@ -22,8 +22,8 @@ The steps, for each pixel:
 6. Add the recovery's own errors to the deviation, by what neighbours show (`add_recovery_error`).
 
 They are carried out by one of two sets of inner loops, in which the same step has the same name:
-`tofclip.lidar.search.compiled` takes NumPy's traces one after the other, `.array_api` all pixels of
-an array of another library at once. `tests/lidar/test_search_backends.py` holds them together.
+`tofclip.lidar.search.trace_search` takes NumPy's traces one after the other, `.array_api` all pixels
+of an array of another library at once. `tests/lidar/test_search_backends.py` holds them together.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,7 @@ from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.pulse import Pulse
 from tofclip.lidar.range_correction import correct_returns
 from tofclip.lidar.search.array_api import ArraySearch, ArrayTraces
+from tofclip.lidar.search.filters import PulseFilters, build_filters
 from tofclip.lidar.significance import (
     CANDIDATES,
     DEFAULT_FALSE_ALARM,
@@ -55,20 +56,15 @@ from tofclip.shots import Frames, Returns
 from tofclip.threads import run_blocks, split_blocks
 from tofclip.units import SPEED_OF_LIGHT
 
-if TYPE_CHECKING:
-    from tofclip.lidar.search.lone_fit import PhaseTable
-
 FloatArray = NDArray[np.float64]
 
 REFERENCE_RANGE_M = 1.0  # m; an intensity is what the same surface would send back from here
-BATCH_BYTES = 1 << 18  # traces that fit the second-level cache
-MAX_PIXELS_PER_BATCH, BATCHES_PER_BLOCK = 256, 2
+BATCH_BYTES = 1 << 19  # traces that fit the second-level cache
+MAX_PIXELS_PER_BATCH, BATCHES_PER_BLOCK = 512, 1
 SAMPLE_THRESHOLD_FACTOR = (
     0.85  # the response at the bin of a peak is up to 5 % below that at its top
 )
 MIN_SAMPLED_BATCHES, SAMPLING_STEP = 32, 7  # odd, or all of a sample might lie in one column
-# of the filter that looks for candidates; it costs a tenth of the matched filter's sensitivity
-SHARPENING_FACTOR = 2.0
 MIN_PULSE_BINS = 2.0  # anything shorter falls between the samples
 
 
@@ -191,7 +187,7 @@ class ReturnSearch:
     def reach_bins(self) -> int:
         """How many bins on either side of a return its search and its fit look at."""
         return (
-            int(self._filters[1].shape[1]) // 2 + 1
+            len(self._filters.matched) // 2 + 1
         )  # the responses of a peak's neighbours tell where its top is
 
     def _find_candidates(
@@ -211,28 +207,23 @@ class ReturnSearch:
         times = self.times[bins.numbers]
         found = np.empty((total, self.detection.max_returns, 3))
         counts = np.zeros(total, np.int64)
-        least = np.zeros(times.size, np.float32)
         size = min(max(BATCH_BYTES // (4 * times.size), 1), MAX_PIXELS_PER_BATCH)
         batches = list(split_blocks(total, size))
-        loops = TraceSearch(
-            times, bins, self._filters, self.pulse, self._phase_table, self.detection
-        )
-
-        def work(chosen: list[slice]) -> None:
-            memory = loops.allocate_memory(size)
-            for some in chosen:
-                traces.fill(some, memory.traces[: some.stop - some.start])
-                loops.find_returns(traces.pixels[some], memory, least, found, counts)
+        loops = TraceSearch(times, bins, self._filters, self.detection, size)
 
         def search(chosen: list[slice]) -> None:
-            run_blocks(lambda piece: work(chosen[piece]), len(chosen), BATCHES_PER_BLOCK)
+            run_blocks(
+                lambda piece: loops.find_returns(traces, chosen[piece], found, counts),
+                len(chosen),
+                BATCHES_PER_BLOCK,
+            )
 
         if judged or len(batches) < MIN_SAMPLED_BATCHES:
             search(batches)
         else:
             search(batches[::SAMPLING_STEP])
             pixel, time, signal, _ = _list_found(found, counts)
-            least = self._compute_least_responses(pixel, time, signal, bins)
+            loops.set_least(self._compute_least_responses(pixel, time, signal, bins))
             search([one for place, one in enumerate(batches) if place % SAMPLING_STEP])
         return _list_found(found, counts)
 
@@ -259,37 +250,20 @@ class ReturnSearch:
             pixel, time, signal * _square_distance(time), self.pulse.fwhm, at
         )
         # The response to a pulse is its sum, over that of the filter.
-        sums = np.maximum(self._filters[1][bins.numbers, -1], np.finfo(np.float32).tiny)
+        sums = np.maximum(self._filters.sums[bins.numbers], np.finfo(np.float32).tiny)
         squares = np.maximum(_square_distance(at), np.finfo(np.float32).tiny)
         least: NDArray[np.float32] = SAMPLE_THRESHOLD_FACTOR * needed / (squares * sums)
         return least.astype(np.float32)
 
     @cached_property
-    def _filters(self) -> tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float]]:
-        """The sharp filter that shows candidates, the matched one that judges them, and their
-        gains.
-        """
-        sharp, matched = self._raw_filters
-        sums = matched.sum(axis=0)
-        with_sums = np.ascontiguousarray(np.concatenate([matched, sums[np.newaxis]]).T)
-        return sharp, with_sums, (float(sharp.sum(axis=0).max()), float(sums.max()))
-
-    @cached_property
-    def _raw_filters(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        # The compiled loop takes four weights of the sharp filter at a time.
-        return _build_filter(self.times, self.pulse.compress(SHARPENING_FACTOR), 4), _build_filter(
-            self.times, self.pulse, 2
-        )
-
-    @cached_property
-    def _phase_table(self) -> PhaseTable:
-        from tofclip.lidar.search.lone_fit import PhaseTable
-
-        return PhaseTable.tabulate(self.pulse, self.times)
+    def _filters(self) -> PulseFilters:
+        return PulseFilters.build(self.pulse, self.times)
 
     @cached_property
     def _portable(self) -> ArraySearch:
-        return ArraySearch(self.times, self._raw_filters, self.pulse, self.detection)
+        return ArraySearch(
+            self.times, build_filters(self.pulse, self.times), self.pulse, self.detection
+        )
 
 
 def depth(
@@ -362,26 +336,6 @@ def depth(
     limit = DEFAULT_FALSE_ALARM if false_alarm is None else false_alarm
     judge = SignificanceJudge(replace(frames, camera=camera), noise, search.pulse, limit)
     return search.find_returns(traces, frames.provenance, judge)
-
-
-def _build_filter(times: FloatArray, pulse: Pulse, multiple: int) -> NDArray[np.float32]:
-    """Unit-energy filter for a return at each bin, (width, bins), its width a `multiple`; the time
-    axis may be uneven.
-
-    What a measured pulse has below zero is noise and left out. Where the axis cuts off most of the
-    pulse the energy stays below one: little would be known of such a return.
-    """
-    before, after = pulse.support
-    # what lies between two bins is reached by neither: without it rows of zeros would be applied
-    reach = int(np.floor(max(-before, after) / np.diff(times).min()))
-    half = multiple // 2 * (reach // (multiple // 2) + 1)
-    filters = np.zeros((2 * half, times.size))
-    for row, shift in enumerate(range(-half, half)):
-        here = np.arange(max(0, -shift), min(times.size, times.size - shift))
-        filters[row, here] = np.maximum(pulse(times[here + shift] - times[here]), 0)
-    energy = np.sum(filters**2, axis=0)
-    filters /= np.sqrt(np.maximum(energy, np.median(energy) / 2))
-    return filters.astype(np.float32)
 
 
 def _list_found(

@@ -2,32 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.lidar.detection import Detection
-from tofclip.lidar.pulse import Pulse
-from tofclip.lidar.search.compiled import (
+from tofclip.lidar.search.exact_fit import fit_returns_exactly
+from tofclip.lidar.search.filters import PulseFilters
+from tofclip.lidar.search.peaks import (
+    CANDIDATE_COLUMNS,
+    WORD_BINS,
     confirm_peaks,
-    find_maxima,
     find_strongest_peaks,
-    fit_crowded_returns,
 )
-from tofclip.lidar.search.lone_fit import (
-    LONE_COLUMNS,
-    NOT_ALONE,
-    PhaseTable,
+from tofclip.lidar.search.table_fit import (
+    NEEDS_EXACT_FIT,
+    cut_out_returns,
+    fit_crowded_returns,
     fit_lone_returns,
-    list_lone_returns,
-    measure_lone_returns,
+    measure_returns_by_table,
 )
 from tofclip.lidar.search.windows import list_windows
-from tofclip.lidar.traces import TraceBins
+from tofclip.lidar.traces import TraceBins, Traces
+from tofclip.vectors import LENGTH
 
 FloatArray = NDArray[np.float64]
-Filters = tuple[NDArray[np.float32], NDArray[np.float32], tuple[float, float]]
 
 NEIGHBOUR_FRACTION = 0.5  # of what is of interest: weaker peaks do not move a return beside them
 
@@ -38,147 +39,309 @@ class SearchMemory:
 
     Parameters
     ----------
-    traces, maxima : (pixels, bins) float32 array
+    held : (pixels, bins) float32 array
+        As traces are handed out.
+    traces : (pixels, whole vectors of bins) float32 array
+        The same memory, where that is a whole number of vectors.
     moments : (pixels, 3) array
-    estimates : (pixels, returns, 5) array
-    score, free : (bins,) float32 array
-    peaks : (pixels, returns, 4) array
-    profile : (bins, 3) array
-    lone : (pixels * returns, LONE_COLUMNS) array
+    peaks : (pixels, returns, 2) array
+    score, maxima, free : float32 arrays
+        See `tofclip.lidar.search.peaks.find_strongest_peaks`.
+    candidates : (pixels * returns, CANDIDATE_COLUMNS) array
     rests : (pixels * returns, width) float32 array
+    lone, crowded : (pixels * returns,) int64 array
+    estimates : (returns, 5) array
+    profile : (bins, 3) array
     """
 
+    held: NDArray[np.float32]
     traces: NDArray[np.float32]
-    maxima: NDArray[np.float32]
     moments: FloatArray
-    estimates: FloatArray
-    score: NDArray[np.float32]
-    free: NDArray[np.float32]
     peaks: FloatArray
-    profile: FloatArray
-    lone: FloatArray
+    score: NDArray[np.float32]
+    maxima: NDArray[np.float32]
+    free: NDArray[np.float32]
+    candidates: FloatArray
     rests: NDArray[np.float32]
+    lone: NDArray[np.int64]
+    crowded: NDArray[np.int64]
+    estimates: FloatArray
+    profile: FloatArray
 
 
 class TraceSearch:
     """What the compiled steps take for traces that hold the same bins.
+
+    They take a vector of bins at a time. Behind the last bin the axis is filled up with bins that
+    weigh nothing and are not searched, to a whole number of vectors that holds the filters.
 
     Parameters
     ----------
     times : (bins,) array
         Instants of the bins, s, increasing.
     bins : TraceBins
-    filters : (sharp, matched, gains)
-        Of the whole axis: (width, axis) and (axis, width + 1) arrays, and their largest sums; see
-        `tofclip.lidar.search.compiled`.
-    pulse : Pulse
-    table : PhaseTable
+    filters : PulseFilters
+        Of the whole axis.
     detection : Detection
+    pixels : int
+        That are searched together, at most.
     """
 
     def __init__(
         self,
         times: FloatArray,
         bins: TraceBins,
-        filters: Filters,
-        pulse: Pulse,
-        table: PhaseTable,
+        filters: PulseFilters,
         detection: Detection,
+        pixels: int,
     ) -> None:
-        sharp, matched, self._gains = filters
-        self._times, self._bins, self._table = times, bins, table
+        self._pixels, self._spare = pixels, list[SearchMemory]()
+        sharp, matched = (
+            np.take(one, bins.numbers, axis=1) for one in (filters.sharp, filters.matched)
+        )
+        widths = len(sharp) + LENGTH, _fill_up(len(matched), LENGTH)
+        self._number = bins.numbers.size
+        self._length = _fill_up(max(self._number, *widths), 2 * LENGTH)
+        beyond = (0, self._length - self._number)
+        self._times = np.ascontiguousarray(times)
+        self._weights = np.pad(bins.bin_weights, beyond)
+        self._searched = np.pad(bins.search_mask, beyond)
+        # A maximum has neighbours.
+        self._searched[[0, self._number - 1]] = False
         # Beyond the bins that are searched the filters reach into what lies elsewhere on the axis.
-        self._sharp = np.take(sharp, bins.numbers, axis=1) * bins.search_mask
-        self._matched = matched[bins.numbers]
-        self._pulse = pulse.kernel_table()
-        _, scale = self._pulse
-        self._windows = list_windows(times, scale, pulse.fwhm)
-        self._even = table.find_even_bins(bins)
-        self._signal_to_noise = float(detection.signal_to_noise)
+        self._sharp = np.pad(sharp * bins.search_mask, ((0, 0), beyond))
+        self._runs, self._edges, self._words = self._place_vectors(len(sharp))
+        self._matched, self._starts = self._align(matched, widths[1])
+        self._sums = filters.sums[bins.numbers]
+        self._gains = *filters.gains, 0.0
+        self._pulse, self._table = filters.kernel, filters.table
+        scale = self._pulse[1]
+        self._windows = list_windows(self._times, scale, filters.fwhm)
+        self._even = self._table.find_even_bins(bins)
+        self._least_ratio, self._most = float(detection.signal_to_noise), detection.max_returns
         self._limits = (
             2 * (scale[3] - scale[2]),
-            self._signal_to_noise,
+            self._least_ratio,
             float(detection.min_pixel_fraction),
             float(times[bins.search_mask].max(initial=0.0)),
+            0.0,
         )
-        self._most = detection.max_returns
-        self._weights = bins.bin_weights.astype(np.float64)
+        self.set_least(np.zeros(self._number, np.float32))
 
-    def allocate_memory(self, pixels: int) -> SearchMemory:
-        """Return memory for a number of pixels at once."""
-        bins, most = self._times.size, self._most
+    def set_least(self, least: NDArray[np.float32]) -> None:
+        """Say what is of interest.
+
+        Parameters
+        ----------
+        least : (bins,) float32 array
+            Response of the matched filter that a return at each bin must exceed; 0 where nothing is
+            known.
+        """
+        lowest = float(least.min())
+        sharp_gain, matched_gain = self._gains[:2]
+        # the sharp filter's response to the background, below which nothing of interest can lie
+        self._gains = sharp_gain, matched_gain, sharp_gain if lowest > 0 else 0.0
+        self._limits = (*self._limits[:4], lowest)
+        self._least = least
+        # None exceeds it where nothing is searched.
+        self._of_interest = np.full(self._length + WORD_BINS, np.inf, np.float32)
+        searched = np.flatnonzero(self._searched)
+        share = np.float32(sharp_gain / matched_gain * NEIGHBOUR_FRACTION)
+        self._of_interest[searched] = share * least[searched]
+
+    def _place_vectors(
+        self, width: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Where the sharp filter is applied, in vectors and in single bins at the ends, and where
+        maxima are sought.
+        """
+        first, last = width // 2, self._length - LENGTH - width + width // 2
+        runs = np.append(np.arange(first, last, LENGTH), last)
+        words = np.arange(0, self._length, WORD_BINS)
+        # the neighbours of what is searched are compared with it
+        near = np.any(self._sharp != 0, axis=0)
+        at_ends = near.copy()
+        at_ends[first : last + LENGTH] = False
+        return (
+            runs[_count(near, runs, LENGTH) > 0],
+            np.flatnonzero(at_ends),
+            words[_count(self._searched, words, WORD_BINS) > 0],
+        )
+
+    def _align(
+        self, matched: NDArray[np.float32], width: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """The matched filters of all bins, (bins, width), each from a bin on that leaves room for
+        its vectors, and these bins.
+        """
+        first = np.arange(self._number) - len(matched) // 2
+        starts = np.clip(first, 0, self._length - width)
+        aligned = np.zeros((self._number, width), np.float32)
+        aligned[:, : len(matched)] = matched.T
+        for j in np.flatnonzero(starts != first):
+            weights, away = np.zeros(3 * width, np.float32), width + first[j] - starts[j]
+            weights[away : away + len(matched)] = matched[:, j]
+            aligned[j] = weights[width : 2 * width]
+        return aligned, starts
+
+    def _allocate_memory(self) -> SearchMemory:
+        pixels = self._pixels
+        most, width, length = self._most, self._table.shapes.shape[1], self._length
+        # Vectors that begin in the last trace may end behind it.
+        traces = np.zeros((pixels + -(-width // length), length), np.float32)[:pixels]
+        whole = self._number == length
         return SearchMemory(
-            traces=np.empty((pixels, bins), np.float32),
-            maxima=np.empty((pixels, bins), np.float32),
+            held=traces if whole else np.empty((pixels, self._number), np.float32),
+            traces=traces,
             moments=np.empty((pixels, 3)),
-            estimates=np.empty((pixels, most, 5)),
-            score=np.empty(bins, np.float32),
-            free=self._bins.bin_weights.copy(),
-            peaks=np.empty((pixels, most, 4)),
-            profile=np.empty((bins, 3)),
-            lone=np.empty((pixels * most, LONE_COLUMNS)),
-            rests=np.empty((pixels * most, self._table.shapes.shape[1]), np.float32),
+            peaks=np.empty((pixels, most, 2)),
+            score=np.zeros(length + WORD_BINS + 2, np.float32),
+            maxima=np.zeros((2, length), np.float32),
+            free=np.empty(length, np.float32),
+            candidates=np.empty((pixels * most, CANDIDATE_COLUMNS)),
+            rests=np.empty((pixels * most, width), np.float32),
+            lone=np.empty(pixels * most, np.int64),
+            crowded=np.empty(pixels * most, np.int64),
+            estimates=np.empty((most, 5)),
+            profile=np.empty((self._number, 3)),
         )
 
     def find_returns(
         self,
-        pixels: NDArray[np.int64],
-        memory: SearchMemory,
-        least: NDArray[np.float32],
+        source: Traces,
+        pieces: Iterable[slice],
         found: FloatArray,
         counts: NDArray[np.int64],
     ) -> None:
-        """Find the returns of the first traces of a memory.
+        """Find the returns of some pixels.
 
         Parameters
         ----------
-        pixels : (n,) int64 array
-            Number of the pixel of each trace.
-        memory : SearchMemory
-        least : (bins,) float32 array
-            Response that a return at each bin must exceed to be of interest; 0 where nothing is
-            known.
-        found : (all pixels, most returns, 3) array, overwritten where `pixels` says
+        source : Traces
+        pieces : iterable of slice
+            Of its pixels, which are searched together; at most as many as there is memory for.
+        found : (all pixels, most returns, 3) array, overwritten for these pixels
             Instant, s, sum of the fitted pulse over the bins, standard deviation of the instant, s;
             nearest first.
-        counts : (all pixels,) int64 array, overwritten where `pixels` says
+        counts : (all pixels,) int64 array, overwritten for these pixels
             Number of returns of each pixel.
         """
-        held, lowest = slice(pixels.size), float(least.min())
-        traces, maxima = memory.traces[held], memory.maxima[held]
-        moments, peaks, estimates = (
-            part[held] for part in (memory.moments, memory.peaks, memory.estimates)
-        )
-        limits = (*self._limits, lowest)
-        weights, table = self._bins.bin_weights, self._table
-        sharp_gain, matched_gain = self._gains
-        of_interest = np.float32(sharp_gain / matched_gain * NEIGHBOUR_FRACTION) * least
-        # the sharp filter's response to the background, below which nothing of interest can lie
-        gain = sharp_gain if lowest > 0 else 0.0
-        find_maxima(
-            traces, self._weights, self._sharp, of_interest, gain, memory.score, moments, maxima
+        memory = self._spare.pop() if self._spare else self._allocate_memory()
+        for piece in pieces:
+            self._search_piece(source, piece, memory, found, counts)
+        self._spare.append(memory)
+
+    def _search_piece(
+        self,
+        source: Traces,
+        piece: slice,
+        memory: SearchMemory,
+        found: FloatArray,
+        counts: NDArray[np.int64],
+    ) -> None:
+        pixels = source.pixels[piece]
+        part = slice(pixels.size)
+        held, traces = memory.held[part], memory.traces[part]
+        source.fill(piece, held)
+        if traces.shape != held.shape:
+            traces[:, : self._number] = held
+        moments, peaks, candidates, rests = (
+            memory.moments[part],
+            memory.peaks[part],
+            memory.candidates,
+            memory.rests,
         )
         find_strongest_peaks(
             traces,
             self._times,
-            weights,
+            self._weights,
+            self._sharp,
+            self._runs,
+            self._edges,
+            self._words,
+            self._of_interest,
             self._matched,
+            self._starts,
+            self._sums,
             self._gains,
             self._windows,
-            limits,
-            maxima,
-            maxima.view(np.int32),
-            moments,
+            self._limits,
+            memory.score,
+            memory.maxima,
             memory.free,
+            moments,
             peaks,
         )
-        confirm_peaks(traces, self._times, self._matched, limits, least, moments, peaks, estimates)
-        fixed = traces, pixels, self._times, moments, self._signal_to_noise, estimates
-        listed = list_lone_returns(
-            *fixed, self._even, table.half, memory.lone, memory.rests, counts
+        listed = confirm_peaks(
+            traces,
+            self._times,
+            self._matched,
+            self._starts,
+            self._sums,
+            self._limits,
+            self._least,
+            moments,
+            peaks,
+            candidates,
         )
-        lone, tables = memory.lone[:listed], (table.shapes, table.slopes, table.sums)
-        fit_lone_returns(lone, memory.rests, np.arange(listed), *tables)
-        measure_lone_returns(lone, memory.rests, pixels, self._times, *tables, found, counts)
-        if (counts[pixels] == NOT_ALONE).any():
-            fit_crowded_returns(*fixed, self._pulse, memory.profile, found, counts)
+        table, half = self._table, self._table.half
+        alone, crowded = cut_out_returns(
+            traces,
+            pixels,
+            moments,
+            self._even,
+            half,
+            candidates,
+            listed,
+            rests,
+            counts,
+            memory.lone,
+            memory.crowded,
+        )
+        shapes, slopes, sums = table.shapes, table.slopes, table.sums
+        fit_lone_returns(candidates, rests, memory.lone, alone, shapes, slopes, sums)
+        fit_crowded_returns(
+            candidates, rests, memory.crowded, crowded, half, shapes, slopes, table.tails, sums
+        )
+        measure_returns_by_table(
+            candidates,
+            listed,
+            rests,
+            self._least_ratio,
+            pixels,
+            self._times,
+            shapes,
+            slopes,
+            sums,
+            found,
+            counts,
+        )
+        if (counts[pixels] == NEEDS_EXACT_FIT).any():
+            fit_returns_exactly(
+                held,
+                pixels,
+                self._times,
+                moments,
+                self._least_ratio,
+                self._windows,
+                candidates,
+                listed,
+                self._pulse,
+                memory.estimates,
+                memory.profile,
+                found,
+                counts,
+            )
+
+
+def _fill_up(number: int, step: int) -> int:
+    """The least multiple of `step` that is not smaller."""
+    return -(-number // step) * step
+
+
+def _count(marked: NDArray[np.bool_], starts: NDArray[np.int64], width: int) -> NDArray[np.int64]:
+    """How many bins are marked in windows that begin at `starts`."""
+    before = np.concatenate([[0], np.cumsum(marked)])
+    ends = np.minimum(starts + width, marked.size)
+    counts: NDArray[np.int64] = before[ends] - before[starts]
+    return counts

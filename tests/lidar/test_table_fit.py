@@ -1,4 +1,4 @@
-"""The fit of returns that stand alone, by a table of the pulse."""
+"""The fit of returns by a table of the pulse."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from tofclip.camera import Camera
 from tofclip.lidar import Detection, Pulse, depth
-from tofclip.lidar.search.lone_fit import MAX_OFFSET_BINS, PHASES_PER_BIN, PhaseTable
+from tofclip.lidar.search.phase_table import MAX_OFFSET_BINS, PHASES_PER_BIN, PhaseTable
 from tofclip.lidar.traces import TraceBins
 from tofclip.shots import Frames
 

@@ -1,0 +1,77 @@
+"""Vectors in compiled loops do what NumPy does with sixteen numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numba import njit
+
+from tofclip import vectors
+from tofclip.vectors import (
+    choose,
+    fill_vector,
+    find_first_bit,
+    find_highest_lane,
+    find_last_bit,
+    list_set_lanes,
+    load_vector,
+    number_lanes,
+    store_vector,
+    sum_vector,
+)
+
+# whole numbers, of which float32 sums are exact in any order
+floats = arrays(np.float32, vectors.LENGTH, elements=st.integers(-1000, 1000).map(np.float32))
+
+
+@njit
+def _combine(one, other, results):
+    a, b = load_vector(one, np.uintp(0)), load_vector(other, np.uintp(0))
+    store_vector(results[0], np.uintp(0), a + b)
+    store_vector(results[1], np.uintp(0), a - b)
+    store_vector(results[2], np.uintp(0), a * b)
+    store_vector(results[3], np.uintp(0), choose((a > b) & (b >= fill_vector(one[3])), a, b))
+    return sum_vector(a), find_highest_lane(b), list_set_lanes(a >= b)
+
+
+@settings(deadline=None)
+@given(floats, floats)
+def test_arithmetic_and_choice(one, other):
+    results = np.empty((4, vectors.LENGTH), np.float32)
+    total, highest, bits = _combine(one, other, results)
+    expected = [
+        one + other,
+        one - other,
+        one * other,
+        np.where((one > other) & (other >= one[3]), one, other),
+    ]
+    np.testing.assert_array_equal(results, expected)
+    assert (total, highest) == (one.sum(), other.max())
+    assert int(bits) == sum(1 << k for k in np.flatnonzero(one >= other).tolist())
+
+
+@njit
+def _find_bits(word):
+    return find_first_bit(word), find_last_bit(word)
+
+
+@given(st.integers(1, 2**64 - 1))
+def test_bits(word):
+    first, last = _find_bits(np.uint64(word))
+    assert word >> int(last) == 1
+    assert word % (2 << int(first)) == 1 << int(first)
+
+
+@njit
+def _copy_shifted(values, start, numbers):
+    store_vector(numbers, np.uintp(0), number_lanes())
+    store_vector(values, np.uintp(0), load_vector(values, np.uintp(start)))
+
+
+def test_vectors_begin_anywhere():
+    values, numbers = np.arange(40, dtype=np.float32), np.empty(16, np.int32)
+    _copy_shifted(values, 21, numbers)
+    np.testing.assert_array_equal(values, [*range(21, 37), *range(16, 40)])
+    np.testing.assert_array_equal(numbers, np.arange(16))

@@ -1,0 +1,100 @@
+"""The fit of returns on an uneven time axis, and of those that stray from the peak at which the
+table begins (`tofclip.lidar.search.table_fit`): `tofclip.lidar.pulse_fit`, trace by trace.
+"""
+
+from __future__ import annotations
+
+import math
+
+from tofclip.lidar.detection import MAX_FIT_ROUNDS
+from tofclip.lidar.pulse_fit import (
+    EVEN_VARIANCE,
+    measure_returns,
+    refine_returns,
+    sort_rows,
+)
+from tofclip.lidar.search.peaks import HEIGHT, NOISE, OFFSET, PEAK_BIN, TRACE, search_step
+from tofclip.lidar.search.table_fit import NEEDS_EXACT_FIT
+
+
+@search_step
+def fit_returns_exactly(
+    traces,
+    pixels,
+    times,
+    moments,
+    least,
+    windows,
+    candidates,
+    listed,
+    pulse,
+    estimates,
+    profile,
+    found,
+    counts,
+):
+    """Fit and measure the returns of the traces that the table does not do.
+
+    Parameters
+    ----------
+    traces : (n, bins) float32 array
+    pixels : (n,) int64 array
+        Number of the pixel to which each trace belongs.
+    times : (bins,) array
+        Seconds, increasing.
+    moments : (n, 3) array
+        Mean and standard deviation of the bins without a return, and others.
+    least : float
+        Standard deviations that a return's response must exceed.
+    windows : (bins, 4) int64 array
+        See `tofclip.lidar.search.windows.list_windows`.
+    candidates : (room, CANDIDATE_COLUMNS) array
+        Those of one trace side by side; see `tofclip.lidar.search.peaks`.
+    listed : int
+        How many.
+    pulse : (curve, scale)
+        See `tofclip.lidar.pulse_fit`.
+    estimates : (most returns, 5) array
+        Overwritten.
+    profile : (bins, 3) array
+        Overwritten.
+    found : (all pixels, most returns, 3) array
+        Overwritten where `counts` is `NEEDS_EXACT_FIT`: instant, s, sum of the fitted pulse over
+        the bins, standard deviation of the instant, s; nearest first.
+    counts : (all pixels,) int64 array
+        Number of returns of each pixel.
+    """
+    curve, scale = pulse
+    start = 0
+    while start < listed:
+        place, end = int(candidates[start, TRACE]), start
+        pixel, trace, background = pixels[place], traces[place], moments[place, 0]
+        while end < listed and int(candidates[end, TRACE]) == place:
+            j, guess = int(candidates[end, PEAK_BIN]), estimates[end - start]
+            width = times[j + 1] - times[j]
+            guess[0] = times[j] + candidates[end, OFFSET] * width
+            height = candidates[end, HEIGHT]
+            guess[1] = max(trace[j] - background, 0.0) if math.isnan(height) else height
+            guess[2] = windows[j, 0]
+            guess[3] = windows[j, 1]
+            end += 1
+        if counts[pixel] == NEEDS_EXACT_FIT:
+            estimate, noise = estimates[: end - start], candidates[start, NOISE]
+            refine_returns(
+                trace, times, background, curve, scale, estimate, EVEN_VARIANCE, MAX_FIT_ROUNDS
+            )
+            number = measure_returns(
+                trace,
+                times,
+                background,
+                noise,
+                curve,
+                scale,
+                estimate,
+                least * noise,
+                profile,
+                found[pixel],
+            )
+            sort_rows(found[pixel], number)
+            counts[pixel] = number
+        start = end

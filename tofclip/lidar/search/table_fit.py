@@ -1,0 +1,394 @@
+"""The fit of returns on an even time axis, by a table of the pulse.
+
+A Gauss-Newton step of `tofclip.lidar.pulse_fit.refine_returns` is two products of the table's rows
+with the trace (`tofclip.lidar.search.phase_table`). A step from the nearest tabulated phase ends
+where one from the exact phase would, but for the square of their distance, at most (1 / 128)^2 of a
+bin: far below where the steps end (`CONVERGENCE_STEP_BINS`).
+
+Nearly all returns of a shot have their pulse to themselves and are fitted side by side
+(`fit_lone_returns`); those that overlap take turns, each against what the others leave
+(`fit_crowded_returns`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from tofclip.lidar.detection import CONVERGENCE_STEP_BINS, MAX_FIT_ROUNDS
+from tofclip.lidar.search.peaks import (
+    HEIGHT,
+    MOVED,
+    NOISE,
+    OFFSET,
+    ONE,
+    PEAK_BIN,
+    STEP,
+    TRACE,
+    inlined,
+    search_step,
+)
+from tofclip.lidar.search.phase_table import MAX_OFFSET_BINS, PHASES_PER_BIN
+from tofclip.vectors import (
+    choose,
+    fill_vector,
+    load_vector,
+    number_lanes,
+    store_vector,
+    sum_vector,
+)
+
+NEEDS_EXACT_FIT = -1
+"""In place of the number of returns of a trace."""
+
+
+@search_step
+def cut_out_returns(
+    traces, pixels, moments, even, half, candidates, listed, rests, counts, lone, crowded
+):
+    """Cut the bins around each candidate out of its trace, and tell those that stand alone from
+    those that do not.
+
+    Parameters
+    ----------
+    traces : (n, bins) float32 array
+        With memory for another trace after the last one.
+    pixels : (n,) int64 array
+        Number of the pixel to which each trace belongs.
+    moments : (n, 3) array
+        Background of each trace, and others.
+    even : (bins,) bool array
+        See `PhaseTable.find_even_bins`.
+    half : int
+        See `PhaseTable`.
+    candidates : (room, CANDIDATE_COLUMNS) array
+        Of `tofclip.lidar.search.peaks.confirm_peaks`.
+    listed : int
+        Number of candidates.
+    rests : (room, width) float32 array
+        Overwritten: trace less background in the bins of the table around each peak; zero in those
+        that fill up its width.
+    counts : (all pixels,) int64 array, overwritten where `pixels` says
+        0, or `NEEDS_EXACT_FIT` where a candidate's bins are not all there.
+    lone, crowded : (room,) int64 array
+        Overwritten: numbers of candidates.
+
+    Returns
+    -------
+    int, int
+        How many of either.
+    """
+    alone = others = 0
+    zero, lanes, held = fill_vector(np.float32(0)), number_lanes(), np.int32(2 * half + 1)
+    for place in range(traces.shape[0]):
+        counts[pixels[place]] = 0
+    for k in range(listed):
+        place, j = int(candidates[k, TRACE]), int(candidates[k, PEAK_BIN])
+        if not even[j]:
+            counts[pixels[place]] = NEEDS_EXACT_FIT
+            continue
+        trace, rest, level = traces[place], rests[k], fill_vector(np.float32(moments[place, 0]))
+        for w in range(np.uintp(0), np.uintp(rest.size), STEP):
+            inside = fill_vector(np.int32(held - np.int32(w))) > lanes
+            above = load_vector(trace, np.uintp(j - half) + w) - level
+            store_vector(rest, w, choose(inside, above, zero))
+        # light that ends before the other's begins, whatever both of them move
+        near = k > 0 and is_near(candidates, k - 1, k, half)
+        near = near or (k + 1 < listed and is_near(candidates, k, k + 1, half))
+        if near:
+            crowded[others] = k
+            others += 1
+        else:
+            lone[alone] = k
+            alone += 1
+    return alone, others
+
+
+@inlined
+def is_near(candidates, k, other, half):
+    """Whether two candidates are of the same trace and may share bins.
+
+    Parameters
+    ----------
+    candidates : (n, CANDIDATE_COLUMNS) array
+    k, other : int
+        The later one last.
+    half : int
+        See `PhaseTable`.
+
+    Returns
+    -------
+    bool
+    """
+    apart = candidates[other, PEAK_BIN] - candidates[k, PEAK_BIN]
+    return candidates[other, TRACE] == candidates[k, TRACE] and apart < 2 * half + 1
+
+
+@inlined
+def find_phase(offset):
+    """Row of the table nearest to an offset.
+
+    Parameters
+    ----------
+    offset : float
+        Bins, at most `MAX_OFFSET_BINS` either way.
+
+    Returns
+    -------
+    int
+    """
+    return np.uintp((offset + MAX_OFFSET_BINS) * PHASES_PER_BIN + 0.5)
+
+
+@search_step
+def fit_lone_returns(candidates, rests, active, moving, shapes, slopes, sums):
+    """Fit returns that stand alone, of many traces: each round takes one step of every return that
+    still moves.
+
+    A step waits for the one before it. Steps of different returns do not, so that the processor
+    works on several at a time.
+
+    Parameters
+    ----------
+    candidates : (room, CANDIDATE_COLUMNS) array
+        Column `OFFSET` is improved; `HEIGHT` is overwritten: not above zero where there is no
+        pulse, NaN where the return moved further than `MAX_OFFSET_BINS` and needs the exact fit.
+    rests : (room, width) float32 array
+        Of `cut_out_returns`.
+    active : (room,) int64 array
+        Numbers of the returns; overwritten.
+    moving : int
+        How many.
+    shapes, slopes, sums
+        See `PhaseTable`.
+    """
+    for _ in range(MAX_FIT_ROUNDS):
+        still = 0
+        for a in range(moving):
+            k = active[a]
+            own, rest = candidates[k], rests[k]
+            phase = find_phase(own[OFFSET])
+            along_pulse = along_slope = fill_vector(np.float32(0))
+            for w in range(np.uintp(0), np.uintp(rest.size), STEP):
+                left = load_vector(rest, w)
+                along_pulse += left * load_vector(shapes[phase], w)
+                along_slope += left * load_vector(slopes[phase], w)
+            take_table_step(own, phase, sum_vector(along_pulse), sum_vector(along_slope), sums)
+            active[still] = k
+            still += 1 if own[MOVED] >= CONVERGENCE_STEP_BINS else 0
+        moving = still
+        if moving == 0:
+            break
+
+
+@inlined
+def take_table_step(own, phase, pr, dr, sums):
+    """Improve one return's offset and height in place by a Gauss-Newton step, of at most a bin.
+
+    Parameters
+    ----------
+    own : (CANDIDATE_COLUMNS,) array
+    phase : int
+        Row of the table nearest to its offset.
+    pr, dr : float32
+        Products of what is left for it with pulse and slope.
+    sums : (phases, 7) array
+        See `PhaseTable`.
+    """
+    pp, pd, dd = sums[phase, 0], sums[phase, 1], sums[phase, 2]
+    across = dd * pr - pd * dr
+    height, moved = 0.0, 0.0
+    if across > 0:
+        height = across / (pp * dd - pd * pd)
+        # model: height * p(t - arrival), whose slope is -height * d
+        step = phase / PHASES_PER_BIN - MAX_OFFSET_BINS - own[OFFSET]
+        step -= (pp * dr - pd * pr) / across
+        step = 1.0 if step > 1.0 else (-1.0 if step < -1.0 else step)
+        own[OFFSET] += step
+        moved = math.fabs(step)
+        if math.fabs(own[OFFSET]) > MAX_OFFSET_BINS:
+            height, moved = np.nan, 0.0
+    own[HEIGHT] = height
+    own[MOVED] = moved
+
+
+@search_step
+def fit_crowded_returns(candidates, rests, crowded, number, half, shapes, slopes, tails, sums):
+    """Fit returns that overlap, by steps on one at a time.
+
+    Taking turns, each against what the others leave, undoes the pull of returns on each other. A
+    return that moved no more and that no moving one reaches is left alone.
+
+    Parameters
+    ----------
+    candidates : (room, CANDIDATE_COLUMNS) array
+        Columns `OFFSET`, `HEIGHT` and `MOVED` are improved, as by `fit_lone_returns`.
+    rests : (room, width) float32 array
+        Of `cut_out_returns`; in the end what the others leave of it.
+    crowded : (room,) int64 array
+        Numbers of the returns, increasing.
+    number : int
+        How many.
+    half : int
+    shapes, slopes, tails, sums
+        See `PhaseTable`.
+    """
+    start = 0
+    while start < number:
+        end = start + 1
+        while end < number and is_near(candidates, crowded[end - 1], crowded[end], half):
+            end += 1
+        for _ in range(MAX_FIT_ROUNDS):
+            largest = 0.0
+            for place in range(start, end):
+                own, rest = candidates[crowded[place]], rests[crowded[place]]
+                moved = find_largest_move(candidates, crowded[start:end], own, half)
+                if moved < CONVERGENCE_STEP_BINS or math.isnan(own[HEIGHT]):
+                    continue
+                phase = find_phase(own[OFFSET])
+                along_pulse = along_slope = fill_vector(np.float32(0))
+                for w in range(np.uintp(0), np.uintp(rest.size), STEP):
+                    left = subtract_others(
+                        load_vector(rest, w), w, candidates, crowded[start:end], own, half, tails
+                    )
+                    along_pulse += left * load_vector(shapes[phase], w)
+                    along_slope += left * load_vector(slopes[phase], w)
+                take_table_step(own, phase, sum_vector(along_pulse), sum_vector(along_slope), sums)
+                largest = own[MOVED] if own[MOVED] > largest else largest
+            if largest < CONVERGENCE_STEP_BINS:
+                break
+        for place in range(start, end):
+            own, rest = candidates[crowded[place]], rests[crowded[place]]
+            for w in range(np.uintp(0), np.uintp(rest.size), STEP):
+                left = subtract_others(
+                    load_vector(rest, w), w, candidates, crowded[start:end], own, half, tails
+                )
+                store_vector(rest, w, left)
+        start = end
+
+
+@inlined
+def find_largest_move(candidates, numbers, own, half):
+    """By how many bins a return, or one of those that reach it, moved last.
+
+    Parameters
+    ----------
+    candidates : (room, CANDIDATE_COLUMNS) array
+    numbers : (n,) int64 array
+        Of the returns; that of `own` among them.
+    own : (CANDIDATE_COLUMNS,) array
+    half : int
+        See `PhaseTable`.
+
+    Returns
+    -------
+    float
+    """
+    moved = 0.0
+    for other in numbers:
+        if math.fabs(candidates[other, PEAK_BIN] - own[PEAK_BIN]) <= 2 * half:
+            moved = max(moved, candidates[other, MOVED])
+    return moved
+
+
+@inlined
+def subtract_others(rest, w, candidates, numbers, own, half, tails):
+    """What the other returns leave of a vector of bins.
+
+    Parameters
+    ----------
+    rest : vector of float32
+        Trace less background, from bin w of those around the peak of `own` on.
+    w : int
+    candidates : (room, CANDIDATE_COLUMNS) array
+    numbers : (n,) int64 array
+        Of the returns; that of `own` among them.
+    own : (CANDIDATE_COLUMNS,) array
+    half : int
+    tails
+        See `PhaseTable`.
+
+    Returns
+    -------
+    vector of float32
+    """
+    for other in numbers:
+        away = own[PEAK_BIN] - candidates[other, PEAK_BIN]
+        if away != 0 and math.fabs(away) <= 2 * half and candidates[other, HEIGHT] > 0:
+            # between two phases: an error of half a phase would be one of a bright neighbour's slope
+            position = (candidates[other, OFFSET] + MAX_OFFSET_BINS) * PHASES_PER_BIN
+            phase = min(int(position), tails.shape[0] - 2)
+            later = fill_vector(np.float32(candidates[other, HEIGHT] * (position - phase)))
+            earlier = fill_vector(np.float32(candidates[other, HEIGHT] * (phase + 1 - position)))
+            there = w + np.uintp(int(away) + 2 * half)
+            rest -= earlier * load_vector(tails[phase], there)
+            rest -= later * load_vector(tails[phase + 1], there)
+    return rest
+
+
+@search_step
+def measure_returns_by_table(
+    candidates, listed, rests, least, pixels, times, shapes, slopes, sums, found, counts
+):
+    """Write instant, sum and standard deviation of the returns that prove themselves.
+
+    Parameters
+    ----------
+    candidates : (room, CANDIDATE_COLUMNS) array
+        Fitted; those of one trace side by side.
+    listed : int
+        How many.
+    rests : (room, width) float32 array
+        What is left of the trace for each of them.
+    least : float
+        Standard deviations that a return's response must exceed.
+    pixels : (traces,) int64 array
+        Number of the pixel to which each trace belongs.
+    times : (bins,) array
+        Seconds.
+    shapes, slopes, sums
+        See `PhaseTable`.
+    found : (all pixels, most returns, 3) float64 array
+        Overwritten: seconds, sum over the bins, standard deviation in seconds; nearest first.
+    counts : (all pixels,) int64 array
+        Goes up by one for each; `NEEDS_EXACT_FIT` where a return of the pixel does.
+    """
+    zero = fill_vector(np.float32(0))
+    for k in range(listed):
+        own, rest = candidates[k], rests[k]
+        height, noise, offset = own[HEIGHT], own[NOISE], own[OFFSET]
+        pixel, j = pixels[int(own[TRACE])], np.uintp(own[PEAK_BIN])
+        number = counts[pixel]
+        if number < 0:
+            continue
+        if math.isnan(height):
+            counts[pixel] = NEEDS_EXACT_FIT
+            continue
+        phase = find_phase(offset)
+        known = sums[phase]
+        if height <= 0 or height * math.sqrt(known[0]) <= least * noise:
+            continue
+        later = fill_vector(np.float32(offset - (phase / PHASES_PER_BIN - MAX_OFFSET_BINS)))
+        high, misfits = fill_vector(np.float32(height)), zero
+        for w in range(np.uintp(0), np.uintp(rest.size), STEP):
+            shape = load_vector(shapes[phase], w)
+            off = load_vector(rest, w) - high * (shape - later * load_vector(slopes[phase], w))
+            misfits += choose(shape > zero, off * off, zero)
+        excess = sum_vector(misfits) - noise * noise * (known[6] - 2)
+        excess = excess if excess > 0 else 0.0
+        across_energy, total = known[2] - known[1] * known[1] / known[0], height * known[3]
+        unfitted = height * known[4] if height * known[4] > 1e-3 * total else 1e-3 * total
+        variance = noise * noise * across_energy + excess / unfitted * height * known[5]
+        width = times[j + ONE] - times[j]
+        instant = times[j] + offset * width
+        place = number
+        while place > 0 and found[pixel, place - 1, 0] > instant:  # overtaken by a crowded one
+            for column in range(3):
+                found[pixel, place, column] = found[pixel, place - 1, column]
+            place -= 1
+        result = found[pixel, place]
+        result[0] = instant
+        result[1] = total
+        result[2] = math.sqrt(variance) / (across_energy * height) * width
+        counts[pixel] = number + 1

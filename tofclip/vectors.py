@@ -1,0 +1,225 @@
+"""Sixteen numbers at once in compiled loops.
+
+The compiler finds vectors by itself in long loops over bins of an array. In short ones, of which
+the search for returns consists (a pulse is a dozen bins long), it finds none, or shuffles more than
+it computes. Here they are written down: a `Vector` value is what a vector register holds, or
+several of them on a processor whose registers are shorter. It exists in compiled code only.
+
+`load_vector` and `store_vector` do not check that the array holds all lanes.
+"""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+LENGTH = 16
+"""Lanes of a vector: 64 bytes of float32."""
+
+INDEX = ir.IntType(32)
+ANY_ORDER = ("contract", "reassoc", "nsz")
+"""Products and sums may be joined and reordered; infinities and NaN stay what they are."""
+
+
+class Vector(types.Type):  # type: ignore[misc]
+    """Type of sixteen float32, int32 or bool.
+
+    Parameters
+    ----------
+    dtype : numba type
+        Of one of them.
+    """
+
+    def __init__(self, dtype: Any) -> None:
+        self.dtype = dtype
+        super().__init__(name=f"Vector({dtype})")
+
+
+FLOATS, INTEGERS, MASK = (
+    Vector(types.float32),
+    Vector(types.int32),
+    Vector(types.boolean),
+)
+KINDS = {vector.dtype: vector for vector in (FLOATS, INTEGERS)}
+ELEMENTS = {FLOATS: ir.FloatType(), INTEGERS: ir.IntType(32), MASK: ir.IntType(1)}
+
+
+@register_model(Vector)
+class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, vector: Vector) -> None:
+        super().__init__(manager, vector, ir.VectorType(ELEMENTS[vector], LENGTH))
+
+
+def _point_at(context: Any, builder: Any, array_type: Any, array: Any, start: Any) -> Any:
+    """Address of the sixteen entries from `start` on."""
+    data = context.make_array(array_type)(context, builder, array).data
+    lanes = context.get_value_type(KINDS[array_type.dtype])
+    return builder.bitcast(builder.gep(data, [start]), lanes.as_pointer())
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def load_vector(typing: Any, array: Any, start: Any) -> Any:
+    """Return entries ``start`` to ``start + 15`` of a contiguous float32 or int32 array."""
+
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        return builder.load(_point_at(context, builder, called.args[0], *args), align=4)
+
+    return KINDS[array.dtype](array, types.uintp), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def store_vector(typing: Any, array: Any, start: Any, lanes: Any) -> Any:
+    """Write entries ``start`` to ``start + 15`` of a contiguous array of the lanes' dtype."""
+
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        builder.store(
+            args[2], _point_at(context, builder, called.args[0], args[0], args[1]), align=4
+        )
+        return context.get_dummy_value()
+
+    return types.void(array, types.uintp, lanes), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def fill_vector(typing: Any, value: Any) -> Any:
+    """Return the same float32 or int32 in all lanes."""
+
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        lanes = context.get_value_type(called.return_type)
+        nothing = ir.Constant(lanes, ir.Undefined)
+        first = builder.insert_element(nothing, args[0], ir.Constant(INDEX, 0))
+        everywhere = ir.Constant(ir.VectorType(INDEX, LENGTH), [0] * LENGTH)
+        return builder.shuffle_vector(first, nothing, everywhere)
+
+    return KINDS[value](value), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def number_lanes(typing: Any) -> Any:
+    """Return 0, 1, ... 15 as int32."""
+
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        return ir.Constant(context.get_value_type(INTEGERS), list(range(LENGTH)))
+
+    return INTEGERS(), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def choose(typing: Any, mask: Any, lanes: Any, others: Any) -> Any:
+    """Return `lanes` where the mask is set, and `others` elsewhere."""
+
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        return builder.select(*args)
+
+    return lanes(mask, lanes, others), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def sum_vector(typing: Any, lanes: Any) -> Any:
+    """Return the sum of float32 lanes."""
+
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        one = ELEMENTS[FLOATS]
+        add_up = cgutils.get_or_insert_function(
+            builder.module,
+            ir.FunctionType(one, [one, args[0].type]),
+            f"llvm.vector.reduce.fadd.v{LENGTH}f32",
+        )
+        return builder.call(add_up, [ir.Constant(one, 0.0), args[0]], fastmath=ANY_ORDER)
+
+    return types.float32(lanes), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def find_highest_lane(typing: Any, lanes: Any) -> Any:
+    """Return the highest of float32 lanes."""
+
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        highest = cgutils.get_or_insert_function(
+            builder.module,
+            ir.FunctionType(ELEMENTS[FLOATS], [args[0].type]),
+            f"llvm.vector.reduce.fmax.v{LENGTH}f32",
+        )
+        return builder.call(highest, args, fastmath=("nnan",))
+
+    return types.float32(lanes), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def list_set_lanes(typing: Any, mask: Any) -> Any:
+    """Return a whole number (uint64) whose bit k is set where lane k of the mask is."""
+
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        return builder.zext(builder.bitcast(args[0], ir.IntType(LENGTH)), ir.IntType(64))
+
+    return types.uint64(mask), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def find_first_bit(typing: Any, bits: Any) -> Any:
+    """Return the number of the lowest bit that is set (uint64)."""
+
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.uint64(types.uint64), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def find_last_bit(typing: Any, bits: Any) -> Any:
+    """Return the number of the highest bit that is set (uint64)."""
+
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        above = builder.ctlz(args[0], ir.Constant(ir.IntType(1), 1))
+        return builder.sub(ir.Constant(above.type, 63), above)
+
+    return types.uint64(types.uint64), build
+
+
+def _define(symbol: Any, result: Any, build: Any) -> None:
+    """Give an operator its meaning for two equal kinds of lanes."""
+
+    @infer_global(symbol)
+    class _Operator(AbstractTemplate):  # type: ignore[misc]
+        def generic(self, args: Any, kws: Any) -> Any:
+            if len(args) == 2 and args[0] == args[1] and isinstance(args[0], Vector):
+                return signature(result or args[0], *args)
+            return None
+
+    lower_builtin(symbol, Vector, Vector)(build)
+
+
+def _define_arithmetic(symbol: Any, name: str) -> None:
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        if called.args[0] == FLOATS:
+            return getattr(builder, f"f{name}")(*args, flags=ANY_ORDER)
+        return getattr(builder, name)(*args)
+
+    _define(symbol, None, build)
+
+
+def _define_comparison(symbol: Any, sign: str) -> None:
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        if called.args[0] == FLOATS:
+            return builder.fcmp_ordered(sign, *args)
+        return builder.icmp_signed(sign, *args)
+
+    _define(symbol, MASK, build)
+
+
+for _symbols, _name in (
+    ((operator.add, operator.iadd), "add"),
+    ((operator.sub, operator.isub), "sub"),
+    ((operator.mul, operator.imul), "mul"),
+):
+    for _symbol in _symbols:
+        _define_arithmetic(_symbol, _name)
+for _symbol, _sign in ((operator.gt, ">"), (operator.ge, ">=")):
+    _define_comparison(_symbol, _sign)
+_define(operator.and_, MASK, lambda context, builder, called, args: builder.and_(*args))
