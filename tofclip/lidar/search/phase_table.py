@@ -101,8 +101,14 @@ class PhaseTable:
             np.sum(across**2 * shape, axis=1),
             np.count_nonzero(matters, axis=1),
         )
-        single = [one.astype(np.float32) for one in (shape, slope, tails)]
-        return cls(*single, sums=np.stack(columns, 1), half=half, bin_width=width)
+        return cls(
+            shape.astype(np.float32),
+            slope.astype(np.float32),
+            tails.astype(np.float32),
+            np.stack(columns, 1),
+            half,
+            width,
+        )
 
     def find_even_bins(self, bins: TraceBins) -> NDArray[np.bool_]:
         """Say around which bins all those of the table are held.
