@@ -131,13 +131,14 @@ def test_places_with_an_operator_of_their_own_have_their_own_instants(inverse):
 
 
 def test_boxes_are_sums_of_successive_rows():
-    measurements = np.random.default_rng(0).random((50, 6)).astype(np.float32)
-    starts = np.random.default_rng(1).integers(0, 45, (3, LANES))
-    sums = np.full((3, 6, LANES), -1, np.float32)
-    sum_boxes(measurements, starts, 5, (1, 3), sums)
-    expected = measurements[starts[..., np.newaxis] + np.arange(5)].sum(axis=2)
-    np.testing.assert_allclose(sums[1:], np.moveaxis(expected, 2, 1)[1:], rtol=1e-6)
-    assert np.all(sums[0] == -1)
+    measurements = np.random.default_rng(0).random((50, 70)).astype(np.float32)
+    starts = np.random.default_rng(1).integers(0, 45, 3 * LANES)
+    sums = np.full((70, starts.size + 3), -1, np.float32)
+    sum_boxes(measurements, starts, 5, (LANES, 3 * LANES), sums)
+    expected = measurements[starts[:, np.newaxis] + np.arange(5)].sum(axis=1).T
+    np.testing.assert_allclose(sums[:, LANES:-3], expected[:, LANES:], rtol=1e-6)
+    assert np.all(sums[:, :LANES] == -1)
+    assert np.all(sums[:, -3:] == -1)
 
 
 SCENE = Scene(

@@ -17,7 +17,6 @@ from numba import njit
 from tofclip.compiling import compile_as_part, compile_loop
 from tofclip.operators.kernels import (
     WIDE_LANES,
-    multiply_sparse_block,
     multiply_sparse_rows,
     multiply_sparse_wide_rows,
 )
@@ -169,30 +168,32 @@ def copy_lanes_to_frames(block, frames):
 
 
 @compile_loop(fastmath=FASTMATH, _nrt=True)
-def compute_traces(tile_starts, columns, values, weights, traces, span):
-    """``traces[:, span[0] : span[1]] = M @ weights`` for a sparse matrix M in column tiles.
+def compute_traces(tile_starts, columns, values, rows, weights, traces, span):
+    """``traces[:, span[0] : span[1]] = M[rows[0] : rows[1]] @ weights`` for a sparse matrix M in
+    column tiles.
 
     Parameters
     ----------
     tile_starts, columns, values
         See `tofclip.operators.sparse.Tiles`; a row for each trace.
+    rows : (int, int)
     weights : (M's columns, time) array
         Its rows are a multiple of `LANES` long at least.
-    traces : (M's rows, time) array
+    traces : (rows[1] - rows[0], time) array
         Overwritten from column ``span[0]`` to below ``span[1]``.
     span : (int, int)
     """
-    matrix, time, done = (tile_starts, columns, values), span[1] - span[0], 0
+    starts, time, done = tile_starts[:, rows[0] : rows[1] + 1], span[1] - span[0], 0
     while done + WIDE_LANES <= time:
-        multiply_sparse_wide_rows(*matrix, weights, done, traces, span[0] + done)
+        multiply_sparse_wide_rows(starts, columns, values, weights, done, traces, span[0] + done)
         done += WIDE_LANES
     while done + LANES <= time:
-        multiply_sparse_rows(*matrix, weights, done, traces, span[0] + done)
+        multiply_sparse_rows(starts, columns, values, weights, done, traces, span[0] + done)
         done += LANES
     if done < time:
         # the last lanes lie beyond the span
         part = np.empty((traces.shape[0], LANES), traces.dtype)
-        multiply_sparse_rows(*matrix, weights, done, part, 0)
+        multiply_sparse_rows(starts, columns, values, weights, done, part, 0)
         first = span[0] + done
         for row in range(part.shape[0]):
             for column in range(first, span[1]):
@@ -200,43 +201,54 @@ def compute_traces(tile_starts, columns, values, weights, traces, span):
 
 
 @compile_loop(fastmath=FASTMATH, _nrt=True)
-def update_peaks(tile_starts, columns, values, scales, block, highest):
-    """Raise `highest` to the largest ``scales * (M @ block)`` over the rows of a sparse matrix M,
-    lane by lane.
+def update_peaks(tile_starts, columns, values, scales, block, span, highest):
+    """Raise `highest` to the largest ``scales * (M @ block)[:, span[0] : span[1]]`` over the rows of a
+    sparse matrix M, lane by lane.
 
     Parameters
     ----------
     tile_starts, columns, values
         See `tofclip.operators.sparse.Tiles`.
     scales : (M's rows,) array
-    block : (M's columns, LANES) array
-    highest : (LANES,) array
+    block : (M's columns, at least span[1]) array
+    span : (int, int)
+        A multiple of `LANES` long.
+    highest : (span[1] - span[0],) array
     """
-    # 16 kB in float32, which stay in the first-level cache
-    part = np.empty((4 * TILE_PIXELS, LANES), block.dtype)
-    for first in range(0, scales.size, part.shape[0]):
-        rows = min(part.shape[0], scales.size - first)
-        multiply_sparse_block(
-            tile_starts[:, first : first + rows + 1], columns, values, block, part[:rows]
-        )
-        for row in range(0, rows, 4):  # four at a time, for one look at the highest so far
-            second, third, fourth = (
-                min(row + 1, rows - 1),
-                min(row + 2, rows - 1),
-                min(row + 3, rows - 1),
-            )
-            a, b, c, d = part[row], part[second], part[third], part[fourth]
-            s, t, u, v = (
-                scales[first + row],
-                scales[first + second],
-                scales[first + third],
-                scales[first + fourth],
-            )
-            for lane in range(LANES):
-                one, two, three, four = s * a[lane], t * b[lane], u * c[lane], v * d[lane]
-                one, three = one if one > two else two, three if three > four else four
-                one = one if one > three else three
-                highest[lane] = one if one > highest[lane] else highest[lane]
+    part = np.empty((TILE_PIXELS, WIDE_LANES), block.dtype)  # stays in the first-level cache
+    # A few pixels at all instants: a nonzero is read from memory once.
+    for first in range(0, scales.size, TILE_PIXELS):
+        last = min(first + TILE_PIXELS, scales.size)
+        starts = tile_starts[:, first : last + 1]
+        begin = span[0]
+        while begin < span[1]:
+            # What is not asked for costs less than to look nonzeros up again.
+            if begin + LANES < span[1] and begin + WIDE_LANES <= block.shape[1]:
+                end = min(begin + WIDE_LANES, span[1])
+                multiply_sparse_wide_rows(starts, columns, values, block, begin, part, 0)
+            else:
+                end = begin + LANES
+                multiply_sparse_rows(starts, columns, values, block, begin, part, 0)
+            largest = highest[begin - span[0] : end - span[0]]
+            for row in range(0, last - first, 4):  # for one look at the largest so far
+                second, third, fourth = (
+                    min(row + 1, last - first - 1),
+                    min(row + 2, last - first - 1),
+                    min(row + 3, last - first - 1),
+                )
+                a, b, c, d = part[row], part[second], part[third], part[fourth]
+                s, t, u, v = (
+                    scales[first + row],
+                    scales[first + second],
+                    scales[first + third],
+                    scales[first + fourth],
+                )
+                for lane in range(largest.size):
+                    one, two, three, four = s * a[lane], t * b[lane], u * c[lane], v * d[lane]
+                    one, three = one if one > two else two, three if three > four else four
+                    one = one if one > three else three
+                    largest[lane] = one if one > largest[lane] else largest[lane]
+            begin = end
 
 
 @fast_loop

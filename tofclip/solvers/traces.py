@@ -51,24 +51,26 @@ class InverseTraces:
         # The transpose has one row per pixel, in the order in which they are wanted.
         self._tiles = Tiles.from_csr(inverse.operator.matrix.T.tocsr()[pixels])
 
-    def peak_response(self, block: Array) -> Array:
+    def peak_response(self, readings: Array, span: slice) -> Array:
         """Return how far the brightest pixel of each back-projected frame stands out.
 
         Parameters
         ----------
-        block : (measurements, LANES) contiguous array
+        readings : (measurements, frames) contiguous array
             In units of their noise.
+        span : slice
+            Of the frames, a multiple of `LANES` of them.
 
         Returns
         -------
-        (LANES,) array
+        (frames of the span,) array
             The largest ``a'f / |a|`` over the columns a of A: the response of the filter that is
             matched to a lone pixel, in units of its noise. Never below zero.
         """
         from tofclip.solvers.kernels import update_peaks
 
-        highest = np.zeros(block.shape[1], block.dtype)
-        update_peaks(*self._tiles, self._scales, block, highest)
+        highest = np.zeros(span.stop - span.start, readings.dtype)
+        update_peaks(*self._tiles, self._scales, readings, (span.start, span.stop), highest)
         return highest
 
     @cached_property
@@ -97,6 +99,10 @@ class InverseTraces:
         """
         from tofclip.solvers.kernels import compute_traces
 
-        starts = np.ascontiguousarray(self._tiles.starts[:, piece.start : piece.stop + 1])
-        span = frames.start, frames.stop
-        compute_traces(starts, self._tiles.columns, self._tiles.values, weights, traces, span)
+        compute_traces(
+            *self._tiles,
+            (piece.start, piece.start + len(traces)),
+            weights,
+            traces,
+            (frames.start, frames.stop),
+        )

@@ -1,7 +1,6 @@
 """The compiled look for light in measurements summed over a pulse's length.
 
-Sums are kept in blocks (blocks, columns, LANES) of instants side by side, as the operators take
-them.
+Sums are (columns, instants): all instants of a column side by side, as the operators take them.
 """
 
 from __future__ import annotations
@@ -9,58 +8,59 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from tofclip.threads import LANES
-
 vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+
+TILE_INSTANTS = 16  # a cache line of each column's sums, which is written at once
 
 
 @vectorised
-def sum_boxes(measurements, starts, length, blocks, sums):
-    """``sums[b, c, lane] = measurements[starts[b, lane] : starts[b, lane] + length, c].sum()`` for the
-    blocks given.
+def sum_boxes(measurements, starts, length, span, sums):
+    """``sums[c, i] = measurements[starts[i] : starts[i] + length, c].sum()`` for the instants of a span.
 
     Parameters
     ----------
     measurements : (rows, columns) float32 array
-    starts : (blocks, LANES) int64 array
+    starts : (instants,) int64 array
     length : int
-    blocks : (int, int)
-        First block, and the one after the last.
-    sums : (blocks, columns, LANES) float32 array, overwritten in these blocks
+    span : (int, int)
+        First instant, and the one after the last.
+    sums : (columns, at least instants) float32 array, overwritten in this span
     """
-    total = np.empty(measurements.shape[1], np.float32)
-    for block in range(blocks[0], blocks[1]):
-        for lane in range(LANES):
-            first = starts[block, lane]
-            total[:] = measurements[first]
-            for late in range(first + 1, first + length):
+    room = np.empty((TILE_INSTANTS, measurements.shape[1]), np.float32)
+    for first in range(span[0], span[1], TILE_INSTANTS):
+        number = min(TILE_INSTANTS, span[1] - first)
+        for instant in range(number):
+            total, start = room[instant], starts[first + instant]
+            total[:] = measurements[start]
+            for late in range(start + 1, start + length):
                 row = measurements[late]
                 for column in range(total.size):
                     total[column] += row[column]
-            target = sums[block]
-            for column in range(total.size):
-                target[column, lane] = total[column]
+        for column in range(room.shape[1]):
+            target = sums[column, first : first + number]
+            for instant in range(number):
+                target[instant] = room[instant, column]
 
 
 @vectorised
 def compute_energies(sums, energy):
-    """Mean square of each instant's sums, (blocks, LANES); what is exactly zero was never measured.
+    """Mean square of each instant's sums; what is exactly zero was never measured.
 
     Parameters
     ----------
-    sums : (blocks, columns, LANES) float32 array
-    energy : (blocks, LANES) float32 array
+    sums : (columns, at least instants) float32 array
+    energy : (instants,) float32 array
         Overwritten.
     """
-    for block in range(sums.shape[0]):
-        total, number = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
-        for column in range(sums.shape[1]):
-            here = sums[block, column]
-            for lane in range(LANES):
-                total[lane] += here[lane] * here[lane]
-                number[lane] += np.float32(here[lane] != 0)
-        for lane in range(LANES):
-            energy[block, lane] = total[lane] / max(number[lane], np.float32(1))
+    energy[:] = 0
+    number = np.zeros(energy.size, np.float32)
+    for column in range(sums.shape[0]):
+        here = sums[column]
+        for instant in range(energy.size):
+            energy[instant] += here[instant] * here[instant]
+            number[instant] += np.float32(here[instant] != 0)
+    for instant in range(energy.size):
+        energy[instant] /= max(number[instant], np.float32(1))
 
 
 @vectorised
@@ -70,31 +70,25 @@ def standardise_columns(sums, quiet, columns):
 
     Parameters
     ----------
-    sums : (blocks, columns, LANES) float32 array, changed in these columns
+    sums : (columns, at least instants) float32 array, changed in these columns
         What is exactly zero was never measured and stays zero, and so does a column that never
         changes.
-    quiet : (blocks, LANES) float32 array
+    quiet : (instants,) float32 array
         1 for a quiet instant, else 0.
     columns : (int, int)
     """
     for column in range(columns[0], columns[1]):
-        number, total, square = (
-            np.zeros(LANES, np.float32),
-            np.zeros(LANES, np.float32),
-            np.zeros(LANES, np.float32),
-        )
-        for block in range(sums.shape[0]):
-            here, counted = sums[block, column], quiet[block]
-            for lane in range(LANES):
-                weight = counted[lane] * np.float32(here[lane] != 0)
-                number[lane] += weight
-                total[lane] += weight * here[lane]
-                square[lane] += weight * here[lane] * here[lane]
-        bins = max(number.sum(), np.float32(1))
-        level = total.sum() / bins
-        variance = square.sum() / bins - level * level
+        here = sums[column]
+        bins, total, square = np.float32(0), np.float32(0), np.float32(0)
+        for instant in range(quiet.size):
+            weight = quiet[instant] * np.float32(here[instant] != 0)
+            bins += weight
+            total += weight * here[instant]
+            square += weight * here[instant] * here[instant]
+        bins = max(bins, np.float32(1))
+        level = total / bins
+        variance = square / bins - level * level
         scale = 1 / np.sqrt(variance) if variance > 0 else np.float32(0)
-        for block in range(sums.shape[0]):
-            here = sums[block, column]
-            for lane in range(LANES):
-                here[lane] = (here[lane] - level) * scale if here[lane] != 0 else np.float32(0)
+        for instant in range(quiet.size):
+            value = (here[instant] - level) * scale
+            here[instant] = value if here[instant] != 0 else np.float32(0)

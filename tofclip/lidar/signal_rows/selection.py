@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.arrays import empty_aligned
 from tofclip.lidar.traces import TraceBins
 from tofclip.solvers.traces import InverseTraces
-from tofclip.threads import LANES, run_blocks
+from tofclip.threads import LANES, count_block_threads, run_blocks
 
 FloatImage = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -23,7 +24,9 @@ MAX_DARK_ENERGY_RATIO, NOISE_ENERGY_RATIO = 1.5, 1.25  # in mean square; noise a
 THRESHOLD_FACTOR = 1.2  # than the limit has an instant to stand out
 MIN_DARK_ROWS = 24  # dark rows at least, which know the noise of a dark pixel to a seventh
 MAX_ROW_FRACTION = 0.75  # of all rows: what needs more of them is as well searched everywhere
-COLUMNS_PER_BLOCK = 192
+GAP_INSTANTS = 3 * LANES + 16
+"""Places beyond a column's sums: blocks of four times `LANES` need no end of their own, and columns
+are an odd number of cache lines apart, so that neighbours share no place of the cache."""
 
 
 @dataclass(frozen=True)
@@ -77,14 +80,17 @@ class SignalRowFinder:
         self._reach, self._threshold = reach, THRESHOLD_FACTOR * limit
         self._step = max(1, round(pulse_rows))
         self._length = min(self.rows, max(1, round(BOX_LENGTH_WIDTHS * pulse_rows)))
-        middles, owners = [], []
+        middles: list[NDArray[np.int64]] = []
+        self._owners: list[tuple[InverseTraces, slice]] = []
+        """Each inverse with its instants, a multiple of `LANES`."""
+        first = 0
         for place in places:
             instants = np.arange(place.rows.start, place.rows.stop, self._step)
-            filled = np.full(-(-instants.size // LANES) * LANES, -1)
-            filled[: instants.size] = instants
-            middles.append(filled.reshape(-1, LANES))
-            owners += [place.inverse] * len(middles[-1])
-        self._middles, self._owners = np.concatenate(middles), owners
+            last = first + -(-instants.size // LANES) * LANES
+            middles.append(np.pad(instants, (0, last - first - instants.size), constant_values=-1))
+            self._owners.append((place.inverse, slice(first, last)))
+            first = last
+        self._middles = np.concatenate(middles)
         self._taken = self._middles >= 0
         self._starts = np.clip(self._middles - self._length // 2, 0, self.rows - self._length)
 
@@ -123,15 +129,18 @@ class SignalRowFinder:
             sum_boxes,
         )
 
-        sums = np.empty((len(self._starts), measurements.shape[0], LANES), np.float32)
-        energy = np.empty(self._starts.shape, np.float32)
+        instants, threads = self._starts.size, count_block_threads()
+        # as weights have it: whole cache lines, and a gap between columns, of zeros
+        sums = empty_aligned((measurements.shape[0], instants + GAP_INSTANTS), np.float32)
+        sums[:, instants:] = 0
+        energy = np.empty(instants, np.float32)
         by_rows = np.ascontiguousarray(measurements.T)  # as the rectifier leaves them: no copy
         run_blocks(
             lambda piece: sum_boxes(
                 by_rows, self._starts, self._length, (piece.start, piece.stop), sums
             ),
-            len(sums),
-            1,
+            instants,
+            _divide_into_lanes(instants, threads),
         )
         compute_energies(sums, energy)
         measured = self._taken & (energy > 0)
@@ -146,14 +155,17 @@ class SignalRowFinder:
         run_blocks(
             lambda piece: standardise_columns(sums, counted, (piece.start, piece.stop)),
             measurements.shape[0],
-            COLUMNS_PER_BLOCK,
+            -(-measurements.shape[0] // threads),
         )
-        highest = np.empty(self._starts.shape, np.float32)
+        highest = np.empty(instants, np.float32)
+        for inverse, own in self._owners:
 
-        def project(piece: slice) -> None:
-            highest[piece.start] = self._owners[piece.start].peak_response(sums[piece.start])
+            def project(piece: slice, inverse: InverseTraces = inverse, own: slice = own) -> None:
+                span = slice(own.start + piece.start, own.start + piece.stop)
+                highest[span] = inverse.peak_response(sums, span)
 
-        run_blocks(project, len(highest), 1)
+            number = own.stop - own.start
+            run_blocks(project, number, _divide_into_lanes(number, threads))
         lit: Mask = self._taken & (highest >= self._threshold)
         return lit
 
@@ -165,3 +177,8 @@ class SignalRowFinder:
         np.add.at(steps, np.minimum(middles + distance + 1, self.rows), -1)
         near: Mask = np.cumsum(steps[:-1]) > 0
         return near
+
+
+def _divide_into_lanes(instants: int, threads: int) -> int:
+    """Instants that each thread takes, a multiple of `LANES`."""
+    return -(-instants // (threads * LANES)) * LANES
