@@ -45,7 +45,8 @@ class WarmStartedRecovery:
         iterations: int = WARM_ITERATIONS,
     ) -> None:
         self.method, self.operator, self._alive = method, operator, alive
-        self._warm = replace(method, iterations=iterations)
+        # so few iterations end before the gap is looked at
+        self._warm = replace(method, iterations=iterations, gap=0.0)
         self._rows = np.zeros(0, np.int64)
         self._pictures = np.zeros((0, *operator.shape_in), np.float32)
 
@@ -74,8 +75,10 @@ class WarmStartedRecovery:
         if shared.size == 0:
             found = self.method.recover(self.operator, seen, valid).frames
         else:
-            start = np.zeros((rows.size, *self.operator.shape_in), np.float32)
-            start[here] = self._pictures[before]
+            start = self._pictures
+            if not np.array_equal(rows, self._rows):
+                start = np.zeros((rows.size, *self.operator.shape_in), np.float32)
+                start[here] = self._pictures[before]
             found = self._warm.recover(self.operator, seen, valid, start=start).frames
         self._rows, self._pictures = rows, found
         pictures[lit] = found
