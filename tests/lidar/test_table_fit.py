@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from tofclip.camera import Camera
 from tofclip.lidar import Detection, Pulse, depth
@@ -44,6 +47,32 @@ def test_it_agrees_with_the_exact_fit_which_an_uneven_axis_needs():
     # where the last step is shorter than 5e-3 bins, one more would be a part of that
     assert apart.max() < 5e-3
     np.testing.assert_allclose(by_table.intensity, exact.intensity, rtol=1e-3)
+
+
+@pytest.mark.parametrize("apart", [4.5, 6.0, 8.0])
+def test_returns_that_overlap_are_fitted_as_exactly(apart):
+    rng = np.random.default_rng(2)
+    arrivals = rng.uniform(20, 30, SIDE * SIDE)
+    uneven = np.append(TIMES[:-1], TIMES[-1] + 0.3 * BIN)
+    # a bright one, and a dim one that lies on its slope: what the first one leaves must be right
+    by_table, exact = (
+        depth(
+            add_dim(look(arrivals, times, 1.0), look(arrivals + apart, times)),
+            detection=Detection(min_time_bin_fraction=0, min_scene_fraction=0),
+        )
+        for times in (TIMES, uneven)
+    )
+    assert len(by_table) == len(exact) >= 2 * SIDE * SIDE - 2
+    near = np.abs(by_table.time - exact.time) / BIN
+    # where the last step is shorter than 5e-3 bins, one more would be a part of that
+    assert np.median(near) < 1e-3
+    assert near.max() < 5e-3
+    np.testing.assert_allclose(by_table.intensity, exact.intensity, rtol=5e-3)
+    np.testing.assert_allclose(by_table.confidence, exact.confidence, rtol=2e-2)
+
+
+def add_dim(bright: Frames, dim: Frames) -> Frames:
+    return replace(bright, values=bright.values + np.float32(0.3) * dim.values)
 
 
 def test_the_table_holds_the_sums_of_its_pulse():

@@ -15,6 +15,7 @@ import math
 import numpy as np
 from numba import njit
 
+from tofclip.compiling import compile_loop
 from tofclip.lidar.detection import PREFIT_THRESHOLD_FACTOR
 from tofclip.vectors import (
     LENGTH,
@@ -33,7 +34,7 @@ from tofclip.vectors import (
 SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
 """What sums in vectors need; unlike all of ``fastmath`` it leaves infinities and NaN what they are."""
 
-search_step = njit(nogil=True, cache=True, fastmath=SUMS_IN_ANY_ORDER, error_model="numpy")
+search_step = compile_loop(fastmath=SUMS_IN_ANY_ORDER)
 inlined = njit(inline="always")  # into the one step that calls it
 
 ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
