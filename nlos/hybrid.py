@@ -215,7 +215,9 @@ class Hybrid(PhasorMethod):
         weights = capture.device.put(plane.weights[..., np.newaxis])
 
         def wall_to_plane(one: Capture, progress: Progress, group: IlluminationGroup) -> Array:
-            return carry(one, progress, group) * weights
+            field = carry(one, progress, group)
+            field *= weights  # in place: nobody else has it
+            return field
 
         fraction = WALL_TO_PLANE_TIME_FRACTIONS[self.propagation]
         return [

@@ -17,8 +17,10 @@ FloatArray = NDArray[np.float64]
 FREQUENCIES_PER_GROUP = 6
 """Neighbouring frequencies that share their functions of depth."""
 
-INTERPOLATION_ERROR_FRACTION, TERMS_ERROR_FRACTION = 0.2, 0.4
-"""Of the error allowed, what interpolation between depths and leaving out terms may take."""
+INTERPOLATION_ERROR_FRACTION, TERMS_ERROR_FRACTION = 0.2, 0.6
+"""Of the error allowed, what interpolation between depths and leaving out terms may take; they are
+independent, and their squares add up.
+"""
 
 MIN_DEPTH_RANGE_M = 1e-5
 """Depths closer than this are one, m."""
