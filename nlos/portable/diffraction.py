@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from nlos.depths import DepthPropagator
 from nlos.method import Progress, ignore_progress
 from nlos.portable.library import ArrayLibrary, remove_whole_turns
-from nlos.rsd.diffraction import DiffractionPlan
+from nlos.rsd.diffraction import DepthInterpolation, DiffractionPlan
 from nlos.rsd.illumination import Illumination
 from nlos.rsd.image_planes import LaserSource
 from nlos.rsd.kernels import TAPS
@@ -37,7 +37,7 @@ class _DepthBlock:
     Parameters
     ----------
     indices : slice
-        Of the depths.
+        Of the computed depths.
     transfer : (z, nodes, frequencies) complex64 array
         At the nodes of the lateral wavenumber.
     coefficients : (z, frequencies, m) complex64 array
@@ -59,6 +59,28 @@ class _DepthBlock:
     axial_distance: Array
     turns: Array
     table_position: tuple[Array, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class _BlockBetween:
+    """Some neighbouring depths that follow from computed ones, as arrays of the library.
+
+    Parameters
+    ----------
+    depths : slice
+        Of the wanted depths.
+    nodes : slice
+        Of the computed ones.
+    weights : (depths, nodes) complex64 array
+    axial_distance, turns : (depths, 1, 1) float32 arrays
+        As of `_DepthBlock`.
+    """
+
+    depths: slice
+    nodes: slice
+    weights: Array
+    axial_distance: Array
+    turns: Array
 
 
 class PortableDiffraction:
@@ -88,7 +110,8 @@ class PortableDiffraction:
         other = copy.copy(self)
         other.source = replace(self.source, laser=laser)
         other._cached_blocks, other._keeps_blocks = [], False
-        other.__dict__.pop("_lateral_distance_squared", None)
+        for computed in ("_lateral_distance_squared", "_computed_depths", "_blocks_between"):
+            other.__dict__.pop(computed, None)
         return other
 
     def add(self, values: Array, total: Array, progress: Progress = ignore_progress) -> None:
@@ -104,12 +127,22 @@ class PortableDiffraction:
         progress : callable, optional
             Called with the number of voxels just done.
         """
-        spectrum = self._to_spectrum(values)
+        spectrum, between = self._to_spectrum(values), self._blocks_between
+        count, wanted = self._computed_depths.nodes.size, total.shape[0]
+        computed = self.library.zeros((count, *total.shape[1:])) if between else total
         for planes in self._iterate_blocks():
-            total[planes.indices, ...] += self._illuminate(
-                planes, self._to_images(planes, spectrum)
+            field = self._illuminate(planes, self._to_images(planes, spectrum))
+            if not between:
+                field = field * self._carrier(planes)
+            computed[planes.indices, ...] += field
+            shares = (wanted * end // count for end in (planes.indices.start, planes.indices.stop))
+            progress(-int(np.subtract(*shares)) * total.shape[1] * total.shape[2])
+        for some in between:
+            known = self.library.xp.reshape(
+                computed[some.nodes, ...], (some.nodes.stop - some.nodes.start, -1)
             )
-            progress((planes.indices.stop - planes.indices.start) * total.shape[1] * total.shape[2])
+            found = self.library.xp.reshape(some.weights @ known, (-1, *total.shape[1:]))
+            total[some.depths, ...] += found * self._carrier(some)
 
     def _to_spectrum(self, values: Array) -> Array:
         """Plane waves (waves, frequencies) of a field (y, x, frequencies)."""
@@ -144,16 +177,11 @@ class PortableDiffraction:
         )
 
     def _illuminate(self, planes: _DepthBlock, images: Array) -> Array:
-        """Let the laser's wave meet the images: the field (z, y, x)."""
+        """Let the laser's wave, but for its carrier, meet the images: the field (z, y, x)."""
         xp = self.library.xp
         if self.source.laser is None:
             return images[:, 0, :, :]
-        # How much longer the way is than straight along z: shorter than the way, and so with finer
-        # digits.
-        longer = self._lateral_distance_squared / (
-            xp.sqrt(self._lateral_distance_squared + planes.axial_distance**2)
-            + planes.axial_distance
-        )
+        longer = self._extra_distance(planes)
         start, per_metre = planes.table_position
         # linear interpolation in the table of illumination functions
         place = xp.clip(start + longer * per_metre, 0.0, None)
@@ -169,10 +197,21 @@ class PortableDiffraction:
             )
             for index in (xp.reshape(first, (-1,)), xp.reshape(first + 1, (-1,)))
         )
-        field = xp.sum(images * (here + weight * (there - here)), axis=1)
-        return field * self.library.exp_turns(
-            planes.turns + longer * (self.source.centre_wavenumber / (2 * np.pi))
-        )
+        return xp.sum(images * (here + weight * (there - here)), axis=1)
+
+    def _extra_distance(self, planes: _DepthBlock | _BlockBetween) -> Array:
+        """How much longer the way from the laser spot is than straight along z, (z, y, x), m:
+        shorter than the way, and so with finer digits.
+        """
+        across, ahead = self._lateral_distance_squared, planes.axial_distance
+        return across / (self.library.xp.sqrt(across + ahead**2) + ahead)
+
+    def _carrier(self, planes: _DepthBlock | _BlockBetween) -> Array | float:
+        """Carrier of the laser's wave at every voxel, (z, y, x); 1 without one."""
+        if self.source.laser is None:
+            return 1.0
+        wavenumber = self.source.centre_wavenumber / (2 * np.pi)
+        return self.library.exp_turns(planes.turns + self._extra_distance(planes) * wavenumber)
 
     def _iterate_blocks(self) -> Any:
         """Yield the depths, some at a time."""
@@ -182,10 +221,11 @@ class PortableDiffraction:
         waves, frequencies = self._wave_weights.shape
         size = max(1, self.library.chunk_bytes // (8 * waves * frequencies))
         nodes = self.plan.transfer.nodes.size
-        size_bytes = 8 * self.plan.grid.z.size * nodes * frequencies
+        count = self._computed_depths.nodes.size
+        size_bytes = 8 * count * nodes * frequencies
         is_cached = self._keeps_blocks and size_bytes <= MAX_CACHE_BYTES
         made = []
-        for some in split_blocks(self.plan.grid.z.size, size):
+        for some in split_blocks(count, size):
             planes = self._plan_block(some)
             if is_cached:
                 made.append(planes)
@@ -194,7 +234,8 @@ class PortableDiffraction:
 
     def _plan_block(self, some: slice) -> _DepthBlock:
         """Plan some depths on this machine's processor, and bring what they need to the library."""
-        depths, count = self.plan.grid.z[some], some.stop - some.start
+        depths = self.plan.grid.z[self._computed_depths.nodes[some]]
+        count = depths.size
         lights: list[Any] = [None] * count
         transfer = np.empty(
             (count, self.plan.transfer.nodes.size, self.plan.waves.count), np.complex64
@@ -211,17 +252,37 @@ class PortableDiffraction:
         run_blocks(plan, count, size=1)
         coefficients, table = _stack_illuminations(lights)
         put = self.library.put
-        ahead = np.abs(depths - (0.0 if self.source.laser is None else self.source.laser[2]))
+        ahead, turns = self._measure_axially(depths)
         spans = np.array([light.span for light in lights])
         per_metre = (len(lights[0].table) - 1) / np.maximum(spans[:, 1] - spans[:, 0], 1e-12)
-        # whole turns are taken off in double precision, before single precision would lose the
-        # fraction
-        turns = remove_whole_turns(self.source.centre_wavenumber / (2 * np.pi) * ahead)
         ends = (ahead, turns, (ahead - spans[:, 0]) * per_metre, per_metre)
         far, turned, start, scale = (put(values[:, np.newaxis, np.newaxis]) for values in ends)
         return _DepthBlock(
             some, put(transfer), put(coefficients), put(table), far, turned, (start, scale)
         )
+
+    def _measure_axially(self, depths: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Distances of depths from the laser spot along z, m, and what its carrier turns by over
+        them.
+        """
+        ahead = np.abs(depths - (0.0 if self.source.laser is None else self.source.laser[2]))
+        # whole turns are taken off in double precision, before single precision would lose the
+        # fraction
+        return ahead, remove_whole_turns(self.source.centre_wavenumber / (2 * np.pi) * ahead)
+
+    @cached_property
+    def _computed_depths(self) -> DepthInterpolation:
+        return self.source.choose_depths(self.plan)
+
+    @cached_property
+    def _blocks_between(self) -> list[_BlockBetween]:
+        """All wanted depths; empty where every one is computed."""
+        put, found = self.library.put, []
+        for block in self._computed_depths.blocks:
+            ahead, turns = self._measure_axially(self.plan.grid.z[block.depths])
+            columns = (put(values[:, np.newaxis, np.newaxis]) for values in (ahead, turns))
+            found.append(_BlockBetween(block.depths, block.nodes, put(block.weights), *columns))
+        return found
 
     @cached_property
     def _depth_numbers(self) -> Array:

@@ -80,6 +80,19 @@ class LaserSource:
             return 0.0
         return float(np.average(self.wavenumbers, weights=self.strength**2))
 
+    def choose_depths(self, plan: DiffractionPlan) -> DepthInterpolation:
+        """Choose which depths are computed, and how the others follow from these without the
+        laser's carrier.
+        """
+        cosines = (0.0, 0.0)
+        if self.laser is not None:
+            # beyond the spot all light goes forward
+            cosines = (0.0 if plan.grid.z[0] >= self.laser[2] else -1.0, 1.0)
+        spectrum = AxialSpectrum.of(
+            plan.waves.wavenumbers, self.strength, self.centre_wavenumber, cosines
+        )
+        return choose_depths(plan.grid.z, spectrum, DEPTH_ERROR_FRACTION * plan.tolerance)
+
     def illuminate_plane(self, plan: DiffractionPlan, depth: float) -> Illumination:
         """Split the illumination of the plane at one depth.
 
@@ -212,11 +225,7 @@ class CompiledDiffraction:
     @cached_property
     def _depths(self) -> DepthInterpolation:
         """Which depths are computed, and how the others follow."""
-        return choose_depths(
-            self.plan.grid.z,
-            _describe_depths(self.source, self.plan),
-            DEPTH_ERROR_FRACTION * self.plan.tolerance,
-        )
+        return self.source.choose_depths(self.plan)
 
     @cached_property
     def _lights(self) -> list[Illumination]:
@@ -357,14 +366,3 @@ class _Workspace:
             carrier,
             field,
         )
-
-
-def _describe_depths(source: LaserSource, plan: DiffractionPlan) -> AxialSpectrum:
-    """Describe how images vary with depth, but for the laser's carrier."""
-    cosines = (0.0, 0.0)
-    if source.laser is not None:
-        # beyond the spot all light goes forward
-        cosines = (0.0 if plan.grid.z[0] >= source.laser[2] else -1.0, 1.0)
-    return AxialSpectrum.of(
-        plan.waves.wavenumbers, source.strength, source.centre_wavenumber, cosines
-    )

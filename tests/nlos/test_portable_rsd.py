@@ -64,6 +64,16 @@ def test_the_field_is_that_of_the_compiled_loops(laser: str, library: str) -> No
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
+@pytest.mark.parametrize("laser", ["single", "two spots", "confocal"])
+def test_fine_depths_are_interpolated_as_by_the_compiled_loops(laser: str, library: str) -> None:
+    capture, grid = scene(laser), Grid(GRID.x[:4], GRID.y[:3], 0.4 + np.arange(32) / 64)
+    plan = METHOD.plan(capture.on(find_device(library)), grid)
+    assert plan._diffractions[0]._computed_depths.nodes.size < 28
+    found = METHOD.phasor_field(capture.on(find_device(library)), grid).values
+    assert relative_error(found, METHOD.phasor_field(capture, grid).values) < 2 * AGREEMENT
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
 def test_a_volume_looks_the_same_wherever_it_lives(library: str, tmp_path: Path) -> None:
     capture = scene("single")
     expected = METHOD.reconstruct(capture, GRID)
