@@ -12,7 +12,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -24,9 +24,11 @@ from apps.help import (
     EXIT_INPUT_ERROR,
     EXIT_INTERRUPTED,
     MAX_HELP_WIDTH,
+    PROGRAM,
     VerbTable,
     make_lazy_group,
 )
+from apps.verb_help import show_verb_help
 from tofclip.compile_observers import observers
 from tofclip.dependencies import describe_missing_package
 from tofclip.errors import TofclipError
@@ -162,11 +164,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     announce = _CompileNotice().announce
     observers.append(announce)
     try:
-        status = app(
-            [word for word in words if word != DEBUG_FLAG],
-            prog_name="tofclip",
-            standalone_mode=False,
-        )
+        words = [word for word in words if word != DEBUG_FLAG]
+        shown = show_verb_help(app, words)
+        status: Any = 0 if shown else app(words, prog_name=PROGRAM, standalone_mode=False)
         sys.stdout.flush()
     except Exception as fault:
         if debug:

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from nlos import Volume
 
 CAPTURE_SUFFIXES = (".h5", ".hdf5", ".npz", ".mat")
-VOLUME_SUFFIXES = (*RECORD_SUFFIXES, *WRITERS, *POINT_SUFFIXES)
 SURFACE_SUFFIXES = (".ply",)
 GEOMETRY_FILE = "geometry.toml"
 """Makes a folder of renderings one capture; see `nlos.io`."""
@@ -25,6 +24,11 @@ GEOMETRY_FILE = "geometry.toml"
 
 CONTENT_MARK = "# the capture's content: "
 """In the settings beside a volume: what the capture was that it was made of."""
+
+
+def list_volume_suffixes() -> tuple[str, ...]:
+    """List the endings of files that a volume can be written to."""
+    return (*RECORD_SUFFIXES, *WRITERS, *POINT_SUFFIXES)
 
 
 def note_content(source: Path) -> str:
@@ -72,7 +76,7 @@ class ResultFiles:
     def require_writable(self, *inputs: Path) -> None:
         """Refuse names that cannot be written, or that would overwrite an input."""
         for volume in self.volumes:
-            require_writable(volume, *VOLUME_SUFFIXES, inputs=inputs)
+            require_writable(volume, *list_volume_suffixes(), inputs=inputs)
         if self.picture is not None:
             require_writable(self.picture, *PICTURE_SUFFIXES, inputs=inputs)
         if self.surface is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,11 +11,11 @@ from numpy.typing import NDArray
 
 from tofclip.errors import InputError
 
-FIELD_OF_VIEW_RAD = np.deg2rad(35.0)
-MAX_FIELD_OF_VIEW_RAD = np.deg2rad(60.0)
+FIELD_OF_VIEW_RAD = math.radians(35.0)
+MAX_FIELD_OF_VIEW_RAD = math.radians(60.0)
 """A cloud that fills more than this is looked at from further back than from where it was taken."""
 
-SIDEWAYS_TILT_RAD, UPWARD_TILT_RAD = np.deg2rad(-1.0), np.deg2rad(0.8)
+SIDEWAYS_TILT_RAD, UPWARD_TILT_RAD = math.radians(-1.0), math.radians(0.8)
 """How far the eye is moved off the camera's place, as seen from the scene's middle: objects do not hide each other
 more than they did, and depth can be seen."""
 
@@ -41,7 +42,7 @@ class Viewpoint:
 
     eye: FloatArray
     target: FloatArray
-    field_of_view: float = float(FIELD_OF_VIEW_RAD)
+    field_of_view: float = FIELD_OF_VIEW_RAD
 
     def is_close_to(self, other: Viewpoint) -> bool:
         """Whether another viewpoint shows the same, as far as one can see."""

@@ -10,12 +10,17 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import typer
 from small_instrument import Run
 
+import apps
 import tofclip
 from apps import cli
+from apps.help import make_lazy_group
+from apps.verb_help import show_verb_help
 
 PROGRAM = [sys.executable, "-m", "apps"]
 ROOT = Path(tofclip.__file__).parents[1]
@@ -69,7 +74,6 @@ HEAVY = {
     ("words", "said"),
     [
         (["--help"], "Usage: tofclip"),
-        (["info", "--help"], "Usage: tofclip info"),
         (["info", "absent.h5"], "absent.h5: no such file"),
         (["nlos", "info", "absent.h5"], "absent.h5: no such file"),
     ],
@@ -81,22 +85,64 @@ def test_help_and_refusals_need_nothing_heavy(words: list[str], said: str) -> No
     )
     *shown, loaded = done.stdout.splitlines()
     assert said in "\n".join([*shown, done.stderr])
-    # pydantic reads the options before those of a verb
-    allowed = {"pydantic"} if words == ["info", "--help"] else set()
-    assert allowed.issuperset(HEAVY.intersection(loaded.split()))
+    assert HEAVY.isdisjoint(loaded.split())
 
 
-def test_verbs_load_the_compiler_and_the_plots_when_they_need_them() -> None:
-    verbs = [name for name in cli.VERBS if name != "nlos"]
-    code = (
-        "import sys; from apps.cli import app; import typer; group = typer.main.get_group(app);"
-        f"[group.load_verb(name) for name in {verbs!r}]; print(*sys.modules)"
-    )
+SHOW_ALL_HELPS = """
+import contextlib, io, json, sys
+import typer
+from apps.cli import VERBS, app, main
+from apps.help import walk_verbs
+from apps.verb_help import import_placeholders
+
+def show(*words):
+    with contextlib.redirect_stdout(io.StringIO()) as shown:
+        assert main(words) == 0
+    return shown.getvalue()
+
+with import_placeholders():
+    verbs = list(walk_verbs(typer.main.get_group(app)))
+shown = {verb: show(*verb.split(), "--help") for verb in verbs}
+for_helps = list(sys.modules)
+group = typer.main.get_group(app)
+for verb in VERBS:
+    if verb != "nlos":
+        group.load_verb(verb)
+for_verbs = list(sys.modules)
+whole = {verb: show(*verb.split(), "--json", "--help") for verb in verbs}
+print(json.dumps([for_helps, for_verbs, shown, whole]))
+"""
+"""``--json`` before ``--help`` leads the way of all options, on which the verb is imported whole."""
+
+
+def test_verbs_load_heavy_things_when_they_need_them_and_no_help_does() -> None:
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+        [sys.executable, "-c", SHOW_ALL_HELPS], cwd=ROOT, capture_output=True, text=True, check=True
     )
+    for_helps, for_verbs, shown, whole = json.loads(done.stdout)
+    assert HEAVY.isdisjoint(for_helps)
     late = {"numba", "matplotlib", "rich", "scipy.optimize", "pydantic", "viser", "pyvista"}
-    assert late.isdisjoint(done.stdout.split())
+    assert late.isdisjoint(for_verbs)
+    assert len(shown) > len(cli.VERBS)
+    assert shown == whole
+
+
+def test_a_help_with_a_number_of_its_verbs_work_imports_that(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "late_verbs").mkdir()
+    (tmp_path / "late_verbs" / "late.py").write_text(
+        "from numpy.absent import LANES\ndef late(): ...\nlate.__doc__ = f'Take {LANES} frames.'\n"
+    )
+    monkeypatch.setattr(apps, "__path__", [*apps.__path__, str(tmp_path)])
+    verbs = typer.Typer(cls=make_lazy_group("apps.late_verbs", {"late": ""}))
+    verbs.callback()(lambda: None)
+    assert not show_verb_help(verbs, ["late", "--json", "--help"])
+    with pytest.raises(ModuleNotFoundError, match=r"numpy\.absent"):  # the whole verb is imported
+        show_verb_help(verbs, ["late", "--help"])
+    monkeypatch.setitem(sys.modules, "numpy.absent", SimpleNamespace(LANES=16))
+    assert show_verb_help(verbs, ["late", "--help"])
+    assert "Take 16 frames." in capsys.readouterr().out
 
 
 def test_statuses_of_the_process(files: Path) -> None:

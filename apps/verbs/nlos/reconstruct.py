@@ -15,11 +15,11 @@ import typer
 
 from apps.conventions import ClusterOption, DeviceOption, JsonOption, make_folder, report
 from apps.nlos.files import (
-    VOLUME_SUFFIXES,
     ResultFiles,
     add_provenance,
     is_capture_folder,
     list_captures,
+    list_volume_suffixes,
     note_content,
     require_separate_folder,
     write_volume,
@@ -348,9 +348,9 @@ def _run_job(source: Path, results: ResultFiles, order: _ImagingRequest) -> dict
 
 def _require_formats(suffixes: Sequence[str]) -> None:
     for suffix in suffixes:
-        if suffix not in VOLUME_SUFFIXES:
+        if suffix not in list_volume_suffixes():
             raise InputError(
-                f"no format of volumes is called '{suffix}'; use one of {', '.join(VOLUME_SUFFIXES)}"
+                f"no format of volumes is called '{suffix}'; use one of {', '.join(list_volume_suffixes())}"
             )
 
 
