@@ -53,6 +53,7 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
             "(f8[:,::1], i8, f4[:,::1], f8, i8[::1], f8[::1], f4[:,::1], f4[:,::1], f8[:,::1],"
             " f8[:,:,::1], i8[::1])"
         ),
+        (TABLE, "list_returns"): "(f8[:,:,::1], i8[::1], i8[::1], f8[:,::1])",
         (EXACT, "fit_returns_exactly"): (
             "(f4[:,::1], i8[::1], f8[::1], f8[:,::1], f8, i8[:,::1], f8[:,::1], i8,"
             " Tuple((f8[:,::1], UniTuple(f8, 4))), f8[:,::1], f8[:,::1], f8[:,:,::1], i8[::1])"

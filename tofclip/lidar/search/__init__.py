@@ -205,15 +205,13 @@ class ReturnSearch:
 
         total, bins = traces.pixels.size, traces.bins
         times = self.times[bins.numbers]
-        found = np.empty((total, self.detection.max_returns, 3))
-        counts = np.zeros(total, np.int64)
         size = min(max(BATCH_BYTES // (4 * times.size), 1), MAX_PIXELS_PER_BATCH)
         batches = list(split_blocks(total, size))
-        loops = TraceSearch(times, bins, self._filters, self.detection, size)
+        loops = TraceSearch(times, traces, self._filters, self.detection, size)
 
         def search(chosen: list[slice]) -> None:
             run_blocks(
-                lambda piece: loops.find_returns(traces, chosen[piece], found, counts),
+                lambda piece: loops.find_returns(chosen[piece]),
                 len(chosen),
                 BATCHES_PER_BLOCK,
             )
@@ -222,10 +220,10 @@ class ReturnSearch:
             search(batches)
         else:
             search(batches[::SAMPLING_STEP])
-            pixel, time, signal, _ = _list_found(found, counts)
+            pixel, time, signal, _ = loops.list_found()
             loops.set_least(self._compute_least_responses(pixel, time, signal, bins))
             search([one for place, one in enumerate(batches) if place % SAMPLING_STEP])
-        return _list_found(found, counts)
+        return loops.list_found()
 
     def _compute_least_responses(
         self, pixel: NDArray[np.int64], time: FloatArray, signal: FloatArray, bins: TraceBins
@@ -336,15 +334,6 @@ def depth(
     limit = DEFAULT_FALSE_ALARM if false_alarm is None else false_alarm
     judge = SignificanceJudge(replace(frames, camera=camera), noise, search.pulse, limit)
     return search.find_returns(traces, frames.provenance, judge)
-
-
-def _list_found(
-    found: NDArray[np.float64], counts: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
-    """Pixel, instant, counts and deviation of all that was found, in raster and time order."""
-    filled = np.flatnonzero(np.arange(found.shape[1]) < counts[:, np.newaxis])
-    time, signal, deviation = np.take(found.reshape(-1, found.shape[2]), filled, axis=0).T
-    return filled // found.shape[1], time, signal, deviation
 
 
 def _square_distance(time: FloatArray) -> FloatArray:

@@ -392,3 +392,26 @@ def measure_returns_by_table(
         result[1] = total
         result[2] = math.sqrt(variance) / (across_energy * height) * width
         counts[pixel] = number + 1
+
+
+@search_step
+def list_returns(found, counts, pixel, values):
+    """List what was found in all pixels, in their order.
+
+    Parameters
+    ----------
+    found : (all pixels, most returns, 3) float64 array
+    counts : (all pixels,) int64 array
+        Number of returns of each pixel.
+    pixel : (n,) int64 array
+        Overwritten: number of the pixel of each return.
+    values : (3, n) float64 array
+        Overwritten: what is known of each return.
+    """
+    listed = np.uintp(0)
+    for p in range(counts.size):
+        for k in range(counts[p]):
+            pixel[listed] = p
+            for column in range(3):
+                values[column, listed] = found[p, k, column]
+            listed += ONE

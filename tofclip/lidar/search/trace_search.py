@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +23,11 @@ from tofclip.lidar.search.table_fit import (
     cut_out_returns,
     fit_crowded_returns,
     fit_lone_returns,
+    list_returns,
     measure_returns_by_table,
 )
 from tofclip.lidar.search.windows import list_windows
-from tofclip.lidar.traces import TraceBins, Traces
+from tofclip.lidar.traces import Traces
 from tofclip.vectors import LENGTH
 
 FloatArray = NDArray[np.float64]
@@ -70,7 +72,7 @@ class SearchMemory:
 
 
 class TraceSearch:
-    """What the compiled steps take for traces that hold the same bins.
+    """The search in some traces, and what it has found so far.
 
     They take a vector of bins at a time. Behind the last bin the axis is filled up with bins that
     weigh nothing and are not searched, to a whole number of vectors that holds the filters.
@@ -79,7 +81,7 @@ class TraceSearch:
     ----------
     times : (bins,) array
         Instants of the bins, s, increasing.
-    bins : TraceBins
+    source : Traces
     filters : PulseFilters
         Of the whole axis.
     detection : Detection
@@ -90,26 +92,28 @@ class TraceSearch:
     def __init__(
         self,
         times: FloatArray,
-        bins: TraceBins,
+        source: Traces,
         filters: PulseFilters,
         detection: Detection,
         pixels: int,
     ) -> None:
-        self._pixels, self._spare = pixels, list[SearchMemory]()
+        bins, most = source.bins, detection.max_returns
+        self._source, self._pixels, self._spare = source, pixels, list[SearchMemory]()
+        self._found = np.empty((source.pixels.size, most, 3))
+        self._counts = np.zeros(source.pixels.size, np.int64)
         sharp, matched = (
             np.take(one, bins.numbers, axis=1) for one in (filters.sharp, filters.matched)
         )
         widths = len(sharp) + LENGTH, _fill_up(len(matched), LENGTH)
         self._number = bins.numbers.size
         self._length = _fill_up(max(self._number, *widths), 2 * LENGTH)
-        beyond = (0, self._length - self._number)
         self._times = np.ascontiguousarray(times)
-        self._weights = np.pad(bins.bin_weights, beyond)
-        self._searched = np.pad(bins.search_mask, beyond)
+        self._weights = _pad(bins.bin_weights, self._length)
+        self._searched = _pad(bins.search_mask, self._length)
         # A maximum has neighbours.
         self._searched[[0, self._number - 1]] = False
         # Beyond the bins that are searched the filters reach into what lies elsewhere on the axis.
-        self._sharp = np.pad(sharp * bins.search_mask, ((0, 0), beyond))
+        self._sharp = _pad(sharp * bins.search_mask, self._length)
         self._runs, self._edges, self._words = self._place_vectors(len(sharp))
         self._matched, self._starts = self._align(matched, widths[1])
         self._sums = filters.sums[bins.numbers]
@@ -118,7 +122,7 @@ class TraceSearch:
         scale = self._pulse[1]
         self._windows = list_windows(self._times, scale, filters.fwhm)
         self._even = self._table.find_even_bins(bins)
-        self._least_ratio, self._most = float(detection.signal_to_noise), detection.max_returns
+        self._least_ratio, self._most = float(detection.signal_to_noise), most
         self._limits = (
             2 * (scale[3] - scale[2]),
             self._least_ratio,
@@ -206,39 +210,39 @@ class TraceSearch:
             profile=np.empty((self._number, 3)),
         )
 
-    def find_returns(
-        self,
-        source: Traces,
-        pieces: Iterable[slice],
-        found: FloatArray,
-        counts: NDArray[np.int64],
-    ) -> None:
+    def find_returns(self, pieces: Iterable[slice]) -> None:
         """Find the returns of some pixels.
 
         Parameters
         ----------
-        source : Traces
         pieces : iterable of slice
-            Of its pixels, which are searched together; at most as many as there is memory for.
-        found : (all pixels, most returns, 3) array, overwritten for these pixels
-            Instant, s, sum of the fitted pulse over the bins, standard deviation of the instant, s;
-            nearest first.
-        counts : (all pixels,) int64 array, overwritten for these pixels
-            Number of returns of each pixel.
+            Of the source's pixels, which are searched together; at most as many as there is memory
+            for.
         """
         memory = self._spare.pop() if self._spare else self._allocate_memory()
         for piece in pieces:
-            self._search_piece(source, piece, memory, found, counts)
+            self._search_piece(piece, memory)
         self._spare.append(memory)
 
-    def _search_piece(
+    def list_found(
         self,
-        source: Traces,
-        piece: slice,
-        memory: SearchMemory,
-        found: FloatArray,
-        counts: NDArray[np.int64],
-    ) -> None:
+    ) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
+        """List all that was found so far, in raster and time order.
+
+        Returns
+        -------
+        pixel : (n,) int64 array
+            Number of the pixel.
+        time, signal, deviation : (n,) array
+            Instant, s, sum of the fitted pulse over the bins, standard deviation of the instant, s.
+        """
+        pixel = np.empty(int(self._counts.sum()), np.int64)
+        values = np.empty((3, pixel.size))
+        list_returns(self._found, self._counts, pixel, values)
+        return pixel, values[0], values[1], values[2]
+
+    def _search_piece(self, piece: slice, memory: SearchMemory) -> None:
+        source, found, counts = self._source, self._found, self._counts
         pixels = source.pixels[piece]
         part = slice(pixels.size)
         held, traces = memory.held[part], memory.traces[part]
@@ -337,6 +341,13 @@ class TraceSearch:
 def _fill_up(number: int, step: int) -> int:
     """The least multiple of `step` that is not smaller."""
     return -(-number // step) * step
+
+
+def _pad(values: NDArray[Any], length: int) -> NDArray[Any]:
+    """Fill the last axis up with zeros."""
+    padded = np.zeros((*values.shape[:-1], length), values.dtype)
+    padded[..., : values.shape[-1]] = values
+    return padded
 
 
 def _count(marked: NDArray[np.bool_], starts: NDArray[np.int64], width: int) -> NDArray[np.int64]:
