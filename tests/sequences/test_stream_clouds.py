@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
+from time import monotonic, sleep
+
 import numpy as np
 import pytest
 
@@ -106,6 +111,53 @@ def test_surfaces_follow_those_of_the_last_shot_until_the_scene_changes(
     # a tenth of a bin of 50 ps; the noise of another shot moves a surface by less
     assert np.median(clouds[2].range[near]) == pytest.approx(np.median(expected), abs=7e-4)
     assert np.median(clouds[3].range) == pytest.approx(1.3, abs=5e-3)
+
+
+class CountingExecutor(ThreadPoolExecutor):
+    """One worker, which begins when it is told to; counts what it holds at most."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.held = self.most = 0
+        self.begin = Event()
+        super().submit(self.begin.wait)
+
+    def submit(self, *work, **options):  # type: ignore[no-untyped-def]
+        self.held += 1
+        self.most = max(self.most, self.held)
+        future = super().submit(*work, **options)
+        future.add_done_callback(self.count_down)
+        return future
+
+    def await_most(self, number: int) -> None:
+        """Wait until so many were held, five seconds at most."""
+        deadline = monotonic() + 5
+        while self.most < number and monotonic() < deadline:
+            sleep(0.01)
+
+    def count_down(self, _: object) -> None:
+        self.held -= 1
+
+
+@pytest.mark.parametrize(("policy", "most"), [("block", 3), ("drop_oldest", 2)])
+def test_no_shot_grows_old_behind_others_where_the_newest_is_wanted(policy, most, monkeypatch):
+    monkeypatch.setenv("TOFCLIP_THREADS", "2")
+    made = shots(1)
+    with CountingExecutor() as executor:
+
+        def source() -> Iterator[Streak]:
+            for number in range(6):
+                yield made[0]
+                if number + 1 == most:
+                    executor.await_most(most)
+                    if policy == "block":  # the next one waits for room
+                        executor.begin.set()
+                sleep(0.02)  # the dispatcher takes what it has room for
+            executor.begin.set()
+
+        clouds = list(stream_clouds(source(), executor=executor, policy=policy))
+    assert executor.most == most
+    assert clouds[-1].shot == 5
 
 
 def test_no_shot_is_no_cloud_and_faults_come_through():

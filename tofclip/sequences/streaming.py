@@ -346,7 +346,8 @@ def stream_clouds(
         itself; NumPy's products keep to one thread until the stream ends. With a method that takes
         shots in order, all cores work on one shot.
     at_once : int, optional
-        Shots that the executor has at a time; by default one more than there are cores.
+        Shots that the executor has at a time; by default as many as there are cores, and one more
+        where all shots are worth waiting for.
 
     Yields
     ------
@@ -377,9 +378,9 @@ def stream_clouds(
         pool = nullcontext(executor)
     with pool as workers:
         # One more than cores: results are taken in order, and a core whose shot was done before its
-        # turn has the next one at hand.
+        # turn has the next one at hand. It grows old there, where the channel would have a newer.
         cores = 1 if pipeline.in_order else thread_count()
-        room = cores + 1 if at_once is None else at_once
+        room = cores + (policy == "block") if at_once is None else at_once
         work = partial(_make_cloud, pipeline)
         with closing(run_in_order(coming, work, workers, room, queue_size, policy)) as items:
             for item in items:
