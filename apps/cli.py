@@ -123,7 +123,9 @@ VERBS: VerbTable = {
 """Each verb's module in `apps.verbs` and its line in the list of commands."""
 
 FILE_READERS = (
-    *("recover", "cloud", "info", "view", "stream", "lidar photons", "lidar sequence"),
+    *("calibrate range", "recover", "cloud", "info", "view", "stream", "convert"),
+    *("lidar photons", "lidar scene", "lidar sequence", "lidar bag"),
+    *("clip simulate", "clip recover", "devices verify", "devices repair"),
     *("nlos reconstruct", "nlos film", "nlos compare", "nlos info", "nlos stream"),
 )
 """Verbs whose first argument has to be there, unless it is an address or a pattern."""
