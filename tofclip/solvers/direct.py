@@ -157,6 +157,16 @@ class PreparedInverse:
     def _inverse(self) -> PerDevice[Array]:
         return PerDevice(partial(ComputeDevice.put, values=self.inverse_gram))
 
+    @cached_property
+    def _seen(self) -> slice:
+        """From the first to behind the last measurement that sees a pixel: the inverse has nothing but
+        its diagonal elsewhere.
+        """
+        if not isinstance(self.operator, SparseMatrix):
+            return slice(0, len(self.inverse_gram))
+        seen = np.flatnonzero(np.diff(self.operator.matrix.indptr))
+        return slice(int(seen[0]), int(seen[-1]) + 1) if seen.size else slice(0, 0)
+
     def recover(self, measurements: Array, progress: Progress = ignore_progress) -> Result:
         """Recover one picture per column of `measurements`, where they are.
 
@@ -201,7 +211,8 @@ class PreparedInverse:
     def weights(self, measurements: NDArray[Any]) -> NDArray[Any]:
         """Return ``(A A' + mu I)^-1 f``, (measurements, frames and some): its adjoint is the pictures.
 
-        Beyond the last frame rows are zero to a multiple of `LANES` frames and `ROW_GAP` more.
+        Beyond the last frame rows are zero to a multiple of `LANES` frames and `ROW_GAP` more, and so
+        are measurements before the first and behind the last one that sees a pixel.
 
         Parameters
         ----------
@@ -211,14 +222,17 @@ class PreparedInverse:
         held = -(-frames // LANES) * LANES + ROW_GAP
         weights = empty_aligned((self.inverse_gram.shape[0], held), self.operator.dtype)
         weights[:, frames:] = 0
+        weights[: self._seen.start] = weights[self._seen.stop :] = 0
+        inverse, solved = self.inverse_gram[self._seen, self._seen], weights[self._seen, :frames]
+        seen = measurements[self._seen]
 
         def solve(piece: slice) -> None:
-            np.matmul(self.inverse_gram[piece], measurements, out=weights[piece, :frames])
+            np.matmul(inverse[piece], seen, out=solved[piece])
 
         # The blocks already keep every core busy: BLAS threads of its own would wait for, and spin
         # against, ours.
         with limit_blas_threads():
-            run_blocks(solve, len(weights), -(-len(weights) // count_block_threads()))
+            run_blocks(solve, len(solved), -(-len(solved) // count_block_threads()))
         return weights
 
 
