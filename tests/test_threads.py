@@ -15,6 +15,7 @@ from tofclip.errors import InputError
 from tofclip.threads import (
     LANES,
     THREADS_VARIABLE,
+    count_block_threads,
     limit_blas_threads,
     limit_to_calling_thread,
     map_parallel,
@@ -55,7 +56,9 @@ def test_a_thread_may_keep_its_blocks_to_itself(monkeypatch):
 
     with limit_to_calling_thread():
         run_blocks(work, 10 * LANES)
+        assert count_block_threads() == 1
     assert names == {threading.current_thread().name}
+    assert count_block_threads() == 2
     run_blocks(work, 10 * LANES)
     assert len(names) > 1
 

@@ -99,6 +99,15 @@ def test_what_cannot_be_measured_is_refused():
         measure(np.full((ROWS, WIDTH), 7, np.float32), None, camera())
 
 
+@pytest.mark.parametrize("row", [0, ROWS - 1])
+def test_light_in_a_single_row_is_light(row):
+    counts = np.full((ROWS, WIDTH), 7, np.float32)
+    counts[row, 5] = 9
+    measured = Rectifier(camera(), ROWS).rectify(counts)
+    assert measured[5, row] == 2
+    assert np.count_nonzero(measured) == 1
+
+
 def test_a_sweep_that_moves_light_across_columns_is_undone_bilinearly():
     matrix = np.array([[1.01, 0.02, -0.7], [-0.03, 0.98, 1.3], [1e-4, -2e-4, 1.0]])
     turned = camera(sweep=ProjectiveSweep(matrix), dead_columns=np.arange(WIDTH) == 20)
