@@ -11,6 +11,7 @@ from numba import njit
 from tofclip import vectors
 from tofclip.vectors import (
     choose,
+    count_set_lanes,
     fill_vector,
     find_first_bit,
     find_highest_lane,
@@ -33,14 +34,14 @@ def _combine(one, other, results):
     store_vector(results[1], np.uintp(0), a - b)
     store_vector(results[2], np.uintp(0), a * b)
     store_vector(results[3], np.uintp(0), choose((a > b) & (b >= fill_vector(one[3])), a, b))
-    return sum_vector(a), find_highest_lane(b), list_set_lanes(a >= b)
+    return sum_vector(a), find_highest_lane(b), list_set_lanes(a >= b), count_set_lanes(a >= b)
 
 
 @settings(deadline=None)
 @given(floats, floats)
 def test_arithmetic_and_choice(one, other):
     results = np.empty((4, vectors.LENGTH), np.float32)
-    total, highest, bits = _combine(one, other, results)
+    total, highest, bits, number = _combine(one, other, results)
     expected = [
         one + other,
         one - other,
@@ -48,7 +49,7 @@ def test_arithmetic_and_choice(one, other):
         np.where((one > other) & (other >= one[3]), one, other),
     ]
     np.testing.assert_array_equal(results, expected)
-    assert (total, highest) == (one.sum(), other.max())
+    assert (total, highest, number) == (one.sum(), other.max(), (one >= other).sum())
     assert int(bits) == sum(1 << k for k in np.flatnonzero(one >= other).tolist())
 
 

@@ -162,6 +162,17 @@ def list_set_lanes(typing: Any, mask: Any) -> Any:
 
 
 @intrinsic  # type: ignore[untyped-decorator]
+def count_set_lanes(typing: Any, mask: Any) -> Any:
+    """Return how many lanes of the mask are set (int64)."""
+
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        set_lanes = builder.ctpop(builder.bitcast(args[0], ir.IntType(LENGTH)))
+        return builder.zext(set_lanes, ir.IntType(64))
+
+    return types.int64(mask), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
 def find_first_bit(typing: Any, bits: Any) -> Any:
     """Return the number of the lowest bit that is set (uint64)."""
 

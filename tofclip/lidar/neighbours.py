@@ -26,6 +26,17 @@ from numpy.typing import NDArray
 
 from tofclip.compiling import compile_loop
 from tofclip.threads import run_blocks
+from tofclip.vectors import (
+    LENGTH,
+    choose,
+    count_set_lanes,
+    fill_vector,
+    find_highest_lane,
+    list_set_lanes,
+    load_vector,
+    store_vector,
+    sum_vector,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -65,6 +76,8 @@ CELL_LANES = 8
 
 FAR = 1e20
 """Nearness of a neighbour that is not there, 1/m."""
+
+STEP = np.uintp(LENGTH)
 
 inlined = njit(inline="always")  # into the one loop that calls it
 
@@ -291,9 +304,12 @@ def measure_offsets(memory, a, b, c):
     a, b, c : float
     """
     right, down, off, residual = memory[0], memory[1], memory[2], memory[4]
-    slope, fall, level = np.float32(a), np.float32(b), np.float32(c)
-    for t in range(NEIGHBOURS):
-        residual[t] = math.fabs(off[t] - slope * right[t] - fall * down[t] - level)
+    slope, fall = fill_vector(np.float32(a)), fill_vector(np.float32(b))
+    level, zero = fill_vector(np.float32(c)), fill_vector(np.float32(0))
+    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
+        above = load_vector(off, t) - slope * load_vector(right, t)
+        above -= fall * load_vector(down, t) + level
+        store_vector(residual, t, choose(above > zero, above, zero - above))
 
 
 @inlined
@@ -312,12 +328,13 @@ def mark_near(memory, most):
     bool
     """
     used, residual = memory[3], memory[4]
-    farthest, changed = np.float32(most), np.float32(0)
-    for t in range(NEIGHBOURS):
-        near = np.float32(1) if residual[t] <= farthest else np.float32(0)
-        changed += math.fabs(near - used[t])
-        used[t] = near
-    return changed > 0
+    farthest, changed = fill_vector(np.float32(most)), np.uint64(0)
+    one, zero = fill_vector(np.float32(1)), fill_vector(np.float32(0))
+    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
+        near = farthest >= load_vector(residual, t)
+        changed |= list_set_lanes(near) ^ list_set_lanes(load_vector(used, t) > zero)
+        store_vector(used, t, choose(near, one, zero))
+    return changed != 0
 
 
 @inlined
@@ -337,23 +354,24 @@ def find_median(memory, count):
         To `MEDIAN_PRECISION` of the largest.
     """
     used, residual = memory[3], memory[4]
-    high = low = middle = np.float32(0)
-    for t in range(NEIGHBOURS):
-        here = used[t] * residual[t]
-        high = here if here > high else high
-    precision = np.float32(MEDIAN_PRECISION) * high
-    middle = high
+    tops = zero = fill_vector(np.float32(0))
+    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
+        here = load_vector(used, t) * load_vector(residual, t)
+        tops = choose(here > tops, here, tops)
+    low, high = np.float32(0), find_highest_lane(tops)
+    precision, middle = np.float32(MEDIAN_PRECISION) * high, high
     while high - low > precision:
-        middle, below = np.float32(0.5) * (low + high), np.float32(0)
-        for t in range(NEIGHBOURS):
-            below += used[t] if residual[t] <= middle else np.float32(0)
+        middle, below = np.float32(0.5) * (low + high), 0
+        limit = fill_vector(middle)
+        for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
+            near = limit >= load_vector(residual, t)
+            below += count_set_lanes(near & (load_vector(used, t) > zero))
         if 2 * below == count:
-            break
-        if 2 * below > count:
-            high = middle
-        else:
-            low = middle
-            middle = high
+            return middle
+        # no branches: which half it is cannot be foreseen
+        high = middle if 2 * below > count else high
+        low = middle if 2 * below < count else low
+        middle = high
     return middle
 
 
@@ -373,18 +391,24 @@ def fit_plane_around(memory):
         Neighbours used; 0 if they lie in one line, which says nothing of the slope across it.
     """
     right, down, off, used = memory[0], memory[1], memory[2], memory[3]
-    n = s = sx = sy = sxx = sxy = syy = sxv = syv = np.float32(0)
-    for t in range(NEIGHBOURS):
-        x, y, v = used[t] * right[t], used[t] * down[t], used[t] * off[t]
-        n += used[t]
-        s += v
-        sx += x
-        sy += y
-        sxx += x * right[t]
-        sxy += x * down[t]
-        syy += y * down[t]
-        sxv += x * off[t]
-        syv += y * off[t]
+    number = total = along = across = zero = fill_vector(np.float32(0))
+    xx = xy = yy = xv = yv = zero
+    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
+        weight, here = load_vector(used, t), load_vector(off, t)
+        to_right, downward = load_vector(right, t), load_vector(down, t)
+        x, y = weight * to_right, weight * downward
+        number += weight
+        total += weight * here
+        along += x
+        across += y
+        xx += x * to_right
+        xy += x * downward
+        yy += y * downward
+        xv += x * here
+        yv += y * here
+    n, s, sx, sy = sum_vector(number), sum_vector(total), sum_vector(along), sum_vector(across)
+    sxx, sxy, syy = sum_vector(xx), sum_vector(xy), sum_vector(yy)
+    sxv, syv = sum_vector(xv), sum_vector(yv)
     if n < MIN_NEIGHBOURS:
         return 0.0, 0.0, 0.0, 0
     cxx, cxy, cyy = sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n
