@@ -133,10 +133,9 @@ class LowRankTransfer:
             * root
             * np.exp(-1j * self._carrier_wavenumber * self.nodes)[:, np.newaxis]
         )
-        at_points = (weights @ (vectors[:, kept] / root)).T * np.exp(
-            1j * self._carrier_wavenumber * self.distances
-        )
-        return from_nodes.astype(np.complex64), at_points.astype(np.complex64)
+        at_points = np.ascontiguousarray((weights @ (vectors[:, kept] / root)).T, np.float32)
+        carrier = np.exp(1j * self._carrier_wavenumber * self.distances).astype(np.complex64)
+        return from_nodes.astype(np.complex64), at_points * carrier
 
     @cached_property
     def _transfer_table(self) -> NDArray[np.complex64]:

@@ -61,6 +61,18 @@ class PlaneWaves:
     def _sorted_waves(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Indices along y and x, and lateral wavenumbers."""
         rows, columns = (np.arange(-n, n + 1) for n in self.max_indices)
+        return self._sort_waves(rows, columns)
+
+    @cached_property
+    def quadrant(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """The same of the waves without a negative index."""
+        rows, columns = (np.arange(n + 1) for n in self.max_indices)
+        return self._sort_waves(rows, columns)
+
+    def _sort_waves(
+        self, rows: IntArray, columns: IntArray
+    ) -> tuple[IntArray, IntArray, FloatArray]:
+        """Sort the waves of some indices by their lateral wavenumber."""
         qy, qx = (
             2 * np.pi / side * index
             for side, index in zip(self.period, (rows, columns), strict=True)

@@ -70,17 +70,10 @@ class WaveGroups:
         """Indices and lateral wavenumbers (groups, LANES) of waves without a negative index, and
         how many there are.
         """
-        waves = self.waves
-        inside = np.flatnonzero((waves.row >= 0) & (waves.column >= 0))
-        filled = np.concatenate([inside, np.repeat(inside[-1:], -inside.size % LANES)]).reshape(
-            -1, LANES
-        )
-        return (
-            waves.row[filled],
-            waves.column[filled],
-            waves.lateral_wavenumbers[filled],
-            inside.size,
-        )
+        row, column, lateral = self.waves.quadrant
+        count = row.size
+        filled = np.minimum(np.arange(count + -count % LANES), count - 1).reshape(-1, LANES)
+        return row[filled], column[filled], lateral[filled], count
 
     @cached_property
     def indices(self) -> tuple[IntArray, IntArray]:
