@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from surface_scene import BIN_M
 
+from tofclip.recovery.surfaces.basis import SmoothBasis, evaluate_monomials
 from tofclip.recovery.surfaces.patches import find_patches
 
 
@@ -41,3 +42,14 @@ def test_a_ball_that_no_quadratic_follows_gets_splines():
     )
     # noise of a tenth of a bin; the quadratic leaves 0.38 bins
     assert np.median(np.abs(fitted - ball.ravel()[patch.pixels])) < 0.15 * BIN_M
+
+
+def test_splines_are_a_quadratic_and_what_bends():
+    """Cubic splines hold every quadratic, so that taking it apart and together changes nothing."""
+    shape = (40, 50)
+    basis = SmoothBasis(shape, (-3, 5, 30, 45), (3, 4))
+    coefficients, quadratic = basis.split_quadratic()
+    np.testing.assert_allclose(quadratic @ coefficients, np.eye(6), atol=1e-8)
+    pixels = np.ravel_multi_index(np.mgrid[2:28, 8:40].reshape(2, -1), shape)
+    monomials = evaluate_monomials(pixels, shape)
+    np.testing.assert_allclose(basis.evaluate(pixels) @ coefficients, monomials, atol=1e-8)

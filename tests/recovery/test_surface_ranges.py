@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surface_scene import CAMERA, INSTRUMENT, SCENE, SHAPE, make_model
+from surface_scene import BIN_M, CAMERA, INSTRUMENT, SCENE, SHAPE, make_model
 
 from tofclip.recovery.surfaces.amplitudes import AmplitudeSolver
 from tofclip.recovery.surfaces.basis import SmoothBasis
@@ -34,6 +34,32 @@ def test_a_refused_or_taken_step_never_raises_the_misfit(shot):
     assert compute_misfit(model, refined.amplitude) <= before
     assert model.state.gains.mean() == pytest.approx(CAMERA.gains.mean())
     assert model.state.delays[3] == model.state.stretches[3] == 0
+
+
+def test_views_that_are_all_late_do_not_pass_for_nearer_surfaces(shot):
+    """Amplitudes explain much of both. Where that is left out for the views, the second step leaves
+    36 and 20 um of it; the state is the true one but for them, and there is no noise.
+    """
+    model = make_model(shot.streak)
+    y, x = np.divmod(model.pixel, SHAPE[1])
+    amplitude = np.where((x // 6 + y // 6) % 2 == 0, 60, 30).astype(np.float32)
+    model.image = model.render(amplitude)
+    model.weights = 1 / (model.image + 5)
+    true = model.distance
+    late = model.state.copy()
+    late.delays[:] = 0.1
+    late.delays[model.reference] = 0
+    for coefficients in late.coefficients:
+        coefficients[0] *= 1 + 0.1 * BIN_M / 1.5
+    model.place(late)
+    assert abs(np.mean(model.distance - true)) > 300e-6
+    found = None
+    for _ in range(2):
+        found = refine_state(model, amplitude, found)
+        amplitude = found.amplitude
+    assert found.steps == 2
+    for part in model.parts:
+        assert abs(np.mean((model.distance - true)[part])) < 8e-6
 
 
 def test_each_view_sees_its_own_part_of_what_shines_through(shot):
@@ -93,9 +119,10 @@ def test_splines_are_left_where_a_quadratic_explains_the_shot(shot, bent: bool):
     model.weights = 1 / (model.image + 5)
     model.place(SurfaceState.start([found], CAMERA))
     amplitude = refine_state(model, board).amplitude
-    straight = straighten_surfaces(model, AmplitudeSolver(model, amplitude, 2.0))
-    assert (straight is None) == bent
-    if straight is not None:
+    solver = AmplitudeSolver(model, amplitude, 2.0)
+    straight = straighten_surfaces(solver)
+    assert (straight is solver) == bent
+    if not bent:
         assert straight.model.bases[0].is_quadratic
         error = straight.model.distance - straight.model.ray_length / flat
         assert np.median(np.abs(error)) < 0.1e-3  # 2.9 mm at the bump before

@@ -44,6 +44,8 @@ def test_surfaces_are_better_than_frames_in_picture_and_range(shot, found):
 def test_frames_are_the_rendering_of_the_returns_and_keep_them(found, tmp_path: Path):
     assert found.figures["method"] == "surfaces"
     assert found.figures["surfaces"] == 3
+    # all steps on ranges are taken only where they go on moving
+    assert 105 <= found.figures["iterations"] <= SurfaceRecovery().steps == 125
     assert found.figures["relative_residual"] < 0.1
     again = depth(found)
     strongest, rendered = (one.image("range") for one in (found.returns, again))

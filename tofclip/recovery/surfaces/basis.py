@@ -55,6 +55,24 @@ class SmoothBasis:
         across = _evaluate_splines((x - left + 0.5) / (right - left), self.pieces[1])
         return (down[:, :, np.newaxis] * across[:, np.newaxis]).reshape(pixels.size, -1)
 
+    def split_quadratic(self) -> tuple[FloatArray, FloatArray]:
+        """Return the coefficients of the six monomials over this basis, (n, 6), and what of each
+        function is such a quadratic, (6, n), both as least squares over the splines' box.
+        """
+        if self.is_quadratic:
+            return np.eye(COEFFICIENTS), np.eye(COEFFICIENTS)
+        top, left, bottom, right = self.box
+        y, x = np.mgrid[top:bottom, left:right].reshape(2, -1)
+        pixels = y * self.image_shape[1] + x
+        inside = (x >= 0) & (x < self.image_shape[1]) & (y >= 0) & (y < self.image_shape[0])
+        functions, monomials = (
+            evaluate(pixels[inside])
+            for evaluate in (self.evaluate, lambda one: evaluate_monomials(one, self.image_shape))
+        )
+        coefficients, *_ = np.linalg.lstsq(functions, monomials)
+        quadratic, *_ = np.linalg.lstsq(monomials, functions)
+        return coefficients.astype(np.float64), quadratic.astype(np.float64)
+
 
 def _evaluate_splines(place: FloatArray, pieces: int) -> FloatArray:
     """Uniform cubic B-splines over 0..1, (points, pieces + 3); beyond the ends as at the ends."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +31,9 @@ from tofclip.solvers import Progress, ignore_progress
 from tofclip.units import SPEED_OF_LIGHT
 
 START_ITERATIONS = 25
-REFINEMENTS, REFINEMENT_ITERATIONS = 2, 20
+MIN_REFINEMENTS, MAX_REFINEMENTS, REFINEMENT_ITERATIONS = 2, 4, 10
+# Of the stated deviations, root mean square over all points: a step on ranges as short is the last.
+LAST_STEP_SIGMAS = 0.3
 FOLLOWING_ITERATIONS = 10  # before and after the ranges' step, where the last shot's fit begins
 # Of what surfaces leave unexplained, and beyond: from there on they are not the next shot's.
 CHANGED_RATIO, CHANGED_EXCESS = 1.25, 0.02
@@ -57,6 +60,10 @@ class SurfaceFit:
     refinement: Refinement
     remainder: FloatArray
     reference: float
+
+    def count_iterations(self) -> int:
+        """Return the iterations of FISTA until the ranges were known."""
+        return START_ITERATIONS + self.refinement.steps * REFINEMENT_ITERATIONS
 
 
 def fit_surfaces(
@@ -118,46 +125,44 @@ def fit_surfaces(
     solver = AmplitudeSolver(model, pictures[masks], weight)
     solver.run(START_ITERATIONS, progress, count)
     require_explained(model, solver.amplitude, frames, streak)
-    refinement, remainder = _refine(model, solver, progress, count)
-    straight = straighten_surfaces(model, solver)
-    if straight is not None:
-        model, solver = straight.model, straight
-        refinement, remainder = _refine(model, solver, ignore_progress, count)
+    model.find_behind(solver.amplitude)
+    # before ranges are refined: splines take longer to be right, and views that are late give way
+    solver = straighten_surfaces(solver)
+    refinement, remainder = _refine(solver.model, solver, progress, count)
     solver.run(iterations, progress, count)
-    return SurfaceFit(model, solver, refinement, remainder, model.unexplained(solver.amplitude))
+    reference = solver.model.unexplained(solver.amplitude)
+    return SurfaceFit(solver.model, solver, refinement, remainder, reference)
 
 
-def straighten_surfaces(model: SurfaceModel, solver: AmplitudeSolver) -> AmplitudeSolver | None:
-    """Replace splines by quadratics that explain the shot at least as well.
+def straighten_surfaces(solver: AmplitudeSolver) -> AmplitudeSolver:
+    """Replace splines by quadratics that explain the shot at least as well, after a step each.
 
     Splines follow the returns of frames, also where these are displaced, as behind gauze; the shot
     itself says whether the surface is bent.
 
     Parameters
     ----------
-    model : SurfaceModel
     solver : AmplitudeSolver
-        Of this model.
 
     Returns
     -------
-    AmplitudeSolver or None
-        Of the model with those quadratics; None where all splines are needed.
+    AmplitudeSolver
+        Of the model with those quadratics; the same where all splines are needed.
     """
-    bent = [surface for surface, basis in enumerate(model.bases) if not basis.is_quadratic]
+    bent = [surface for surface, basis in enumerate(solver.model.bases) if not basis.is_quadratic]
     if not bent:
-        return None
-    found, least = None, compute_objective(model, solver.amplitude)
+        return solver
+    ahead = copy.copy(solver.model)
+    least = compute_objective(ahead, refine_state(ahead, solver.amplitude).amplitude)
     for surface in bent:
-        if not (solver.amplitude[model.parts[surface]] > 0).any():
+        if not (solver.amplitude[solver.model.parts[surface]] > 0).any():
             continue
-        trial = model.straighten(surface, solver.amplitude)
+        trial = solver.model.straighten(surface, solver.amplitude)
         moved = refine_state(trial, solver.amplitude).amplitude
         objective = compute_objective(trial, moved)
         if objective <= least:
-            model, solver = trial, AmplitudeSolver(trial, moved, solver.weight, solver)
-            found, least = solver, objective
-    return found
+            solver, least = AmplitudeSolver(trial, moved, solver.weight, solver), objective
+    return solver
 
 
 def follow_surfaces(fit: SurfaceFit, streak: Streak, weight: float) -> SurfaceFit | None:
@@ -192,10 +197,12 @@ def follow_surfaces(fit: SurfaceFit, streak: Streak, weight: float) -> SurfaceFi
 def _refine(
     model: SurfaceModel, solver: AmplitudeSolver, progress: Progress, count: int
 ) -> tuple[Refinement, FloatArray]:
-    """Steps on ranges and instrument; the last one, and what more would change of each surface."""
+    """Steps on ranges and instrument until they hardly move; the last one, and what more would
+    change of each surface.
+    """
     before, changes = model.distance, []
     found = None
-    for _ in range(REFINEMENTS):
+    for number in range(MAX_REFINEMENTS):
         model.find_behind(solver.amplitude)
         found = refine_state(model, solver.amplitude, found)
         solver.amplitude = found.amplitude
@@ -203,6 +210,9 @@ def _refine(
         moved = model.distance - before
         changes.append([np.sqrt(np.mean(moved[part] ** 2)) for part in model.parts])
         before = model.distance
+        sigmas = moved / model.estimate_deviation(found.covariances)
+        if number + 1 >= MIN_REFINEMENTS and np.sqrt(np.mean(sigmas**2)) < LAST_STEP_SIGMAS:
+            break
     assert found is not None
     return found, extrapolate_steps(np.array(changes))
 

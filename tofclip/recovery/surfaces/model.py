@@ -180,6 +180,24 @@ class SurfaceModel:
         other.place(state)
         return other
 
+    def estimate_deviation(self, covariances: Sequence[FloatArray]) -> FloatArray:
+        """Return the standard deviations of all ranges, (points,), m.
+
+        Parameters
+        ----------
+        covariances : sequence of (n, n) float arrays
+            Of each surface's coefficients.
+        """
+        variance = np.concatenate(
+            [
+                np.einsum("pi,ij,pj->p", m, c, m)
+                for m, c in zip(self.monomials, covariances, strict=True)
+            ]
+        )
+        # range = length / inverse depth
+        deviation: FloatArray = self.distance**2 / self.ray_length * np.sqrt(variance)
+        return deviation
+
     def compute_slopes(self) -> FloatArray:
         """Return how steeply the ranges change along columns and rows, (2, points), m per pixel."""
         rows, columns = self.camera.image_shape

@@ -46,11 +46,14 @@ class Refinement:
         After the step.
     explained : (6, points) float32 array
         Changes of amplitude that look like a change of each coefficient of a quadratic.
+    steps : int
+        Taken, with this one.
     """
 
     covariances: list[FloatArray]
     amplitude: Image
     explained: Image
+    steps: int
 
 
 def refine_state(
@@ -58,6 +61,9 @@ def refine_state(
 ) -> Refinement:
     """Take a Gauss-Newton step on ranges, gains, pulse widths and, from the second step on, delays
     and stretches, if it lowers the misfit that amplitudes cannot explain.
+
+    What amplitudes can explain of views that are all late is an unknown of its own: taken for what
+    only late views explain, it would make steps too short and ranges surer than they are.
 
     The covariance is ``H^-1 S H^-1`` with the information H of the data and the sum S of squares of
     the score over clusters of measurements (H. White, Econometrica 50, 1, 1982): it holds the noise that
@@ -89,9 +95,10 @@ def refine_state(
     scale = scale_amplitude(model, amplitude > 0)
     rest = leave_unexplained(model, error, scale)
     groups = _leave_out_even_shading(model, groups, rest)
-    changes = _eliminate_amplitude(
+    changes, patterns = _eliminate_amplitude(
         model, amplitude, groups, None if earlier is None else earlier.explained
     )
+    groups += patterns
     names = [name for group in groups for name in group.names]
     normal = multiply_groups(groups, model.weights)
     scores = sum_scores(groups, pull)
@@ -117,8 +124,11 @@ def refine_state(
             moved = amplitude.copy()
             for surface, part in enumerate(model.parts):
                 own = [i for i, name in enumerate(names) if name[:2] == ("coefficients", surface)]
-                if len(own) == len(changes):
-                    moved[part] -= (step * change[own]).astype(np.float32) @ changes[:, part]
+                first = change[names.index(("patterns", surface, 0))]
+                _, quadratic = model.bases[surface].split_quadratic()
+                along = -quadratic @ change[own]
+                along[0] += first
+                moved[part] += (step * along).astype(np.float32) @ changes[:, part]
             moved = np.float32(excess) * np.maximum(moved, 0)
             brighter = ahead.shading.mean(axis=1)
             ahead.shading -= brighter[:, np.newaxis]
@@ -132,9 +142,10 @@ def refine_state(
             model.place(state)
             moved = amplitude
     robust = inverse @ (scores @ scores.T + bending) @ inverse
+    steps = 1 if earlier is None else earlier.steps + 1
     numbers = np.array([one if name == "coefficients" else -1 for name, one, _ in names])
     blocks = [np.flatnonzero(numbers == surface) for surface in range(len(model.masks))]
-    return Refinement([robust[block][:, block] for block in blocks], moved, changes)
+    return Refinement([robust[block][:, block] for block in blocks], moved, changes, steps)
 
 
 def _leave_out_even_shading(
@@ -174,26 +185,26 @@ def _leave_out_even_shading(
 
 def _eliminate_amplitude(
     model: SurfaceModel, amplitude: Image, groups: list[Derivatives], start: Image | None
-) -> Image:
+) -> tuple[Image, list[Derivatives]]:
     """Take from derivatives by coefficients, in place, what amplitudes can explain of them.
 
     What is left of a derivative J is ``J - A x`` with the x that minimises its weighted norm, found
     by conjugate gradients; a step on a coefficient takes x of the amplitude with it. Of different
     surfaces, which hardly share measurements, the derivatives of one number are treated at once.
-    Surfaces of splines bend less than amplitudes could follow and are left as they are.
+    Splines bend less than amplitudes could follow, but what of them is a quadratic does not.
 
     Returns
     -------
-    (6, points) float32 array
-        x for each coefficient of the surfaces that are quadratics.
+    changes : (6, points) float32 array
+        x for each coefficient of a quadratic.
+    patterns : list of Derivatives
+        By the first of these changes of each surface's amplitude: it is what amplitudes can explain
+        of views that are all late.
     """
-    plain = [
-        group
-        for group in groups
-        if group.names[0][0] == "coefficients" and len(group.names) == COEFFICIENTS
-    ]
-    quadratic = np.isin(model.surface, [group.names[0][1] for group in plain])
-    scale = scale_amplitude(model, (amplitude > 0) & quadratic)
+    own = [group for group in groups if group.names[0][0] == "coefficients"]
+    parts = [model.parts[group.names[0][1]] for group in own]
+    shares = [model.bases[group.names[0][1]].split_quadratic() for group in own]
+    scale = scale_amplitude(model, amplitude > 0)
     changes = np.zeros((COEFFICIENTS, model.surface.size), np.float32)
     iterations = ELIMINATION_ITERATIONS
     if start is not None:
@@ -201,16 +212,21 @@ def _eliminate_amplitude(
         iterations = FURTHER_ELIMINATION_ITERATIONS
     for number, change in enumerate(changes):
         image = np.zeros_like(model.image)
-        for group in plain:
-            image[group.row : group.row + group.images.shape[1]] += group.images[number]
+        for group, (functions, _) in zip(own, shares, strict=True):
+            derivative = np.tensordot(functions[:, number].astype(np.float32), group.images, 1)
+            image[group.row : group.row + group.images.shape[1]] += derivative
         if start is not None:
             image -= model.render(change)
         change += explain_by_amplitude(model, image, scale, iterations)
-        for group in plain:
-            part = model.parts[group.names[0][1]]
-            rows = group.row, group.row + group.images.shape[1]
-            group.images[number] -= model.render_part(change[part], part, rows)
-    return changes
+    patterns = []
+    for group, part, (_, quadratic) in zip(own, parts, shares, strict=True):
+        rows = group.row, group.row + group.images.shape[1]
+        explained = np.stack([model.render_part(change[part], part, rows) for change in changes])
+        group.images[...] -= np.tensordot(quadratic.T.astype(np.float32), explained, 1)
+        patterns.append(
+            Derivatives([("patterns", group.names[0][1], 0)], group.row, 0, explained[:1])
+        )
+    return changes, patterns
 
 
 def compute_objective(model: SurfaceModel, amplitude: Image) -> float:
@@ -258,6 +274,8 @@ def _move(
     """The state after a step; gains and widths change relatively."""
     moved = state.copy()
     for (name, surface, number), value in zip(names, change, strict=True):
+        if name == "patterns":
+            continue
         values = getattr(moved, name)
         if name in ("coefficients", "shading"):
             values = values[surface]

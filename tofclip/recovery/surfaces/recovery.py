@@ -12,8 +12,8 @@ from tofclip.camera import measure
 from tofclip.errors import InputError
 from tofclip.lidar import Detection
 from tofclip.recovery.surfaces.fit import (
+    MAX_REFINEMENTS,
     REFINEMENT_ITERATIONS,
-    REFINEMENTS,
     START_ITERATIONS,
     SurfaceFit,
     fit_surfaces,
@@ -37,7 +37,7 @@ class SurfaceRecovery:
         Of total variation of the amplitudes, in standard deviations of what photon noise makes of
         the misfit's gradient. It needs no knowledge of the scene or of the light's amount.
     iterations : int
-        Of FISTA after the ranges are known; before that there are 65 more.
+        Of FISTA after the ranges are known; before that there are 45 to 65 more.
     start : Method
         Recovers the frames in whose returns the surfaces are looked for.
     detection : Detection
@@ -61,11 +61,11 @@ class SurfaceRecovery:
 
     @property
     def steps(self) -> int:
-        """All iterations of FISTA."""
-        return START_ITERATIONS + REFINEMENTS * REFINEMENT_ITERATIONS + self.iterations
+        """Iterations of FISTA at most."""
+        return START_ITERATIONS + MAX_REFINEMENTS * REFINEMENT_ITERATIONS + self.iterations
 
     def work(self, frames: int) -> int:
-        """Frame iterations that are reported: the start's, and one per frame and iteration."""
+        """Frame iterations that are reported at most: the start's, and one per frame and iteration."""
         return self.start.work(frames) + self.steps * frames
 
     def recover_surfaces(
@@ -115,7 +115,7 @@ class SurfaceRecovery:
         figures: dict[str, Any] = {
             "method": self.name,
             "focus": "depth-locked",
-            "iterations": self.steps,
+            "iterations": fit.count_iterations() + self.iterations,
             "stopped_because": "iteration limit",
             "relative_residual": residual,
             "surfaces": len(model.masks),

@@ -47,14 +47,8 @@ def list_returns(fit: SurfaceFit, detection: Detection, centre_error_px: float =
     # running sums may leave a rounding error below nothing
     pooled = np.maximum(pooled, 0)
     significance = amplitude * np.sqrt(pooled[model.masks] / solver.variance)
-    deviation = np.zeros(distance.size)
-    for part, monomials, own, rest in zip(
-        model.parts, model.monomials, fit.refinement.covariances, fit.remainder, strict=True
-    ):
-        variance = np.einsum("pi,ij,pj->p", monomials, own, monomials)
-        # range = length / inverse depth
-        by_inverse = distance[part] ** 2 / model.ray_length[part]
-        deviation[part] = np.sqrt(by_inverse**2 * variance + rest**2)
+    deviation = model.estimate_deviation(fit.refinement.covariances)
+    deviation = np.hypot(deviation, fit.remainder[model.surface])
     displacement = estimate_displacement(camera, centre_error_px)
     deviation = np.hypot(deviation, np.hypot(*(displacement * model.compute_slopes().T).T))
     # brightness is told as the reference view sees it
