@@ -106,7 +106,7 @@ GROUPS: Sequence[Sequence[str]] = (
 )
 """Modules whose loops take about as long to compile together, each for a process."""
 
-FUNCTIONS_PER_GROUP = (29, 27)
+FUNCTIONS_PER_GROUP = (25, 33)
 """Loops and their parts, which the compiler takes one by one."""
 
 

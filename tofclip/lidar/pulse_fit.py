@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import njit
 from numba.core.types import Array
 from numba.extending import overload
 
@@ -24,6 +25,7 @@ EVEN_VARIANCE = (
 # Without counts of the arrays' owners, which cost a lock for every array that is handed on; nothing
 # here allocates.
 loop_part = compile_as_part(_nrt=False)
+inlined = njit(inline="always")  # into the one part that calls it
 
 
 @loop_part
@@ -267,7 +269,7 @@ def check_overlap(estimate, k, curve, scale):
     return crowded, moving
 
 
-@loop_part
+@inlined
 def sum_normal_equations(trace, times, background, curve, scale, estimate, k, crowded, variance):
     """Sums over the bins of return k, of their pulse p, its slope d and the rest r: pp, pd, dd, pr,
     dr; see `refine_returns`.
@@ -318,7 +320,7 @@ def sum_normal_equations(trace, times, background, curve, scale, estimate, k, cr
     return pp, pd, dd, pr, dr
 
 
-@loop_part
+@inlined
 def take_gauss_newton_step(times, sums, own):
     """Improve one return's arrival and height in place, and enter by how many bins it moved (at
     most one).
@@ -418,7 +420,7 @@ def measure_returns(trace, times, background, noise, curve, scale, estimate, lea
     return number
 
 
-@loop_part
+@inlined
 def estimate_sum_and_deviation(profile, height, noise, pp, pd, dd):
     """Sum of a return over its bins, and the standard deviation of its arrival.
 
