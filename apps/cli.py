@@ -28,7 +28,7 @@ from apps.help import (
     VerbTable,
     make_lazy_group,
 )
-from apps.verb_help import show_verb_help
+from apps.verb_help import HELP_OPTION, show_verb_help
 from tofclip.compile_observers import observers
 from tofclip.dependencies import describe_missing_package
 from tofclip.errors import TofclipError
@@ -167,7 +167,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     observers.append(announce)
     try:
         words = [word for word in words if word != DEBUG_FLAG]
-        shown = show_verb_help(app, words)
+        shown = words[-1:] == [HELP_OPTION] and show_verb_help(app, words)
         status: Any = 0 if shown else app(words, prog_name=PROGRAM, standalone_mode=False)
         sys.stdout.flush()
     except Exception as fault:

@@ -11,7 +11,7 @@ import numpy as np
 from nlos.backends import Backend, choose_backend
 from nlos.band import Band, VirtualPulse
 from nlos.capture import Capture
-from nlos.geometry import Grid
+from nlos.geometry import Grid, StraightWays
 from nlos.illumination_groups import (
     IlluminationGroup,
     build_waves,
@@ -33,7 +33,6 @@ from nlos.propagation.wall_to_plane_plan import WallBeforePlane
 from nlos.reciprocity import ReciprocalPlan
 from nlos.rsd.diffraction import DiffractionPlan
 from nlos.rsd.planar import require_even_grid
-from nlos.straight_ways import StraightWays
 from nlos.wave_plan import GroupPlan, WavePlan
 from tofclip.arrays import Array
 from tofclip.errors import InputError

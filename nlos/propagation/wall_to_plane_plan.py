@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from nlos.geometry import StraightWays
 from nlos.plane import Plane, WallLattice, axis_step
 from nlos.propagation.analysis import LatticeAnalysis, PlaneWaveAnalysis
 from nlos.propagation.low_rank_transfer import LowRankTransfer
@@ -21,7 +22,6 @@ from nlos.rsd.transfer import (
     find_fast_length,
     find_min_periods,
 )
-from nlos.straight_ways import StraightWays
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.geometry import Grid
+from nlos.geometry import Grid, StraightWays
 from nlos.method import MEMORY_LIMIT_BYTES
 from nlos.plane import Plane, axis_step
 from nlos.rsd.transfer import (
@@ -21,7 +21,6 @@ from nlos.rsd.transfer import (
     find_fast_length,
     find_min_periods,
 )
-from nlos.straight_ways import StraightWays
 from tofclip.errors import InputError
 from tofclip.threads import split_blocks
 

@@ -62,10 +62,14 @@ def test_frames_and_cloud_are_those_of_the_compiled_loops(
     assert there.figures["relative_residual"] == pytest.approx(
         here.figures["relative_residual"], rel=1e-4
     )
-    off = np.abs(points["torch:cpu"].range - points["cpu"].range)
+    # Many points share one estimate of their false alarms, which may fall on either side of the limit.
+    limit = {"tv": 0.4, "linear": np.inf}[method]
+    sure = {device: cloud[~(cloud.false_alarm >= limit)] for device, cloud in points.items()}
+    assert 100 < len(sure["cpu"]) == len(sure["torch:cpu"])
+    off = np.abs(sure["torch:cpu"].range - sure["cpu"].range)
     # Compiled loops fit lone returns by a table of phases, which errs by less than a tenth of their
     # own deviation; a tenth of a millimetre is for sums in another order.
-    assert np.all(off < 1e-4 + 0.1 * points["cpu"].range_sigma)
+    assert np.all(off < 1e-4 + 0.1 * sure["cpu"].range_sigma)
 
 
 @pytest.mark.usefixtures("torch")

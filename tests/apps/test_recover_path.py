@@ -18,6 +18,9 @@ import tofclip
 ROOT = Path(tofclip.__file__).parents[1]
 OURS = tuple(f"{ROOT / package}/" for package in ("tofclip", "apps", "nlos", "devices"))
 MAX_FILES = 30
+TIFF_READERS = (
+    2  # files of a raw picture's own: its pages, and what the instrument writes into them
+)
 
 
 def count_calls(action: Callable[[], object]) -> Counter[tuple[str, str]]:
@@ -51,6 +54,7 @@ def test_one_recovery_passes_through_few_files_and_does_each_thing_once(run, fil
     calls = count_calls(lambda: run(*words))
     crossed = sorted({file for file, _ in calls})
 
-    assert len(crossed) <= MAX_FILES, "\n".join(crossed)
+    most = MAX_FILES + (TIFF_READERS if shot.endswith(".tif") else 0)
+    assert len(crossed) <= most, "\n".join(crossed)
     for once in ("open_shot", "plan_recovery", "make_method", "parse_focus", "read_streak"):
         assert sum(number for (_, name), number in calls.items() if name == once) == 1, once

@@ -11,12 +11,12 @@ from scene_shapes import JITTER, SPOT, shaped_wall
 
 from nlos import Grid, Hybrid
 from nlos.capture import TimeAxis
+from nlos.geometry import StraightWays
 from nlos.illumination_groups import build_waves, group_by_illumination
 from nlos.plane import VirtualPlane
 from nlos.propagation.wall_to_plane_plan import WallBeforePlane, WallToPlanePlan
 from nlos.rsd.transfer import Offsets, find_min_periods
 from nlos.simulate import PointScene
-from nlos.straight_ways import StraightWays
 
 METHOD = Hybrid(wavelength=0.25, cycles=4.24)
 NEAR = Grid(np.linspace(-0.9, 0.9, 13), np.linspace(-0.8, 0.8, 9), [0.6, 0.7, 0.9])

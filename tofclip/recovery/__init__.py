@@ -8,9 +8,8 @@ from tofclip.recovery.focus import (
     SharpestFocus,
     parse_focus,
 )
-from tofclip.recovery.methods import make_method
 from tofclip.recovery.parallax import ShotParallax, count_parallax_work, fit_parallax_to_shot
-from tofclip.recovery.plan import RecoveryPlan, plan_recovery, recover
+from tofclip.recovery.plan import RecoveryPlan, make_method, plan_recovery, recover
 from tofclip.recovery.shot import (
     Shot,
     compute_view_delays_bins,

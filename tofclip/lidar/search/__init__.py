@@ -14,16 +14,17 @@ The steps, for each pixel:
 2. Take candidates from the strongest down (`find_strongest_peaks`). Each claims the bins that its
    pulse reaches; background and noise are those of the bins that nothing claims.
 3. Keep those that the matched filter confirms against noise and the pixel's strongest return, and
-   place them below a bin (`interpolate_peak_time`).
+   place them below a bin (`confirm_peaks`).
 4. Fit arrival and height by Gauss-Newton steps on one return at a time, each against what the
-   others leave (`refine_returns`, `take_gauss_newton_step`).
+   others leave: on an even time axis by a table of the pulse (`fit_lone_returns`,
+   `fit_crowded_returns`), elsewhere exactly (`fit_returns_exactly`).
 5. Measure what the fit confirms: sum over the bins and the arrival's standard deviation
-   (`measure_returns`, `estimate_sum_and_deviation`).
+   (`measure_returns_by_table`).
 6. Add the recovery's own errors to the deviation, by what neighbours show (`add_recovery_error`).
 
-They are carried out by one of two sets of inner loops, in which the same step has the same name:
-`tofclip.lidar.search.trace_search` takes NumPy's traces one after the other, `.array_api` all pixels
-of an array of another library at once. `tests/lidar/test_search_backends.py` holds them together.
+They are carried out by one of two sets of inner loops: those of `tofclip.lidar.search.trace_search`
+take NumPy's traces one after the other, `.array_api` takes all pixels of an array of another library
+at once. `tests/lidar/test_search_backends.py` holds them together.
 """
 
 from __future__ import annotations

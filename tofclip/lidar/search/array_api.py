@@ -1,9 +1,10 @@
 """The search for returns with the array API standard: all pixels of a piece at once, in arrays of any
 library and on any device.
 
-The steps are those of `tofclip.lidar.search`, and functions that do the same have the same names in
-`tofclip.lidar.search.compiled`, where they take one pixel after the other. Here a loop runs over
-the returns of a pixel, at most `Detection.max_returns`, and arrays hold one entry for each pixel.
+The steps are those of `tofclip.lidar.search`. Functions that do the same have the same names in
+`tofclip.lidar.search.peaks` and `tofclip.lidar.pulse_fit`, where they take one pixel after the other.
+Here a loop runs over the returns of a pixel, at most `Detection.max_returns`, and arrays hold one
+entry for each pixel.
 """
 
 from __future__ import annotations

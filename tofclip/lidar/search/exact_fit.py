@@ -4,8 +4,6 @@ table begins (`tofclip.lidar.search.table_fit`): `tofclip.lidar.pulse_fit`, trac
 
 from __future__ import annotations
 
-import math
-
 from tofclip.lidar.detection import MAX_FIT_ROUNDS
 from tofclip.lidar.pulse_fit import (
     EVEN_VARIANCE,
@@ -13,7 +11,7 @@ from tofclip.lidar.pulse_fit import (
     refine_returns,
     sort_rows,
 )
-from tofclip.lidar.search.peaks import HEIGHT, NOISE, OFFSET, PEAK_BIN, TRACE, search_step
+from tofclip.lidar.search.peaks import FIRST_OFFSET, NOISE, PEAK_BIN, TRACE, search_step
 from tofclip.lidar.search.table_fit import NEEDS_EXACT_FIT
 
 
@@ -72,9 +70,9 @@ def fit_returns_exactly(
         while end < listed and int(candidates[end, TRACE]) == place:
             j, guess = int(candidates[end, PEAK_BIN]), estimates[end - start]
             width = times[j + 1] - times[j]
-            guess[0] = times[j] + candidates[end, OFFSET] * width
-            height = candidates[end, HEIGHT]
-            guess[1] = max(trace[j] - background, 0.0) if math.isnan(height) else height
+            # from the beginning: what does not converge in so many steps is not given more of them
+            guess[0] = times[j] + candidates[end, FIRST_OFFSET] * width
+            guess[1] = max(trace[j] - background, 0.0)
             guess[2] = windows[j, 0]
             guess[3] = windows[j, 1]
             end += 1

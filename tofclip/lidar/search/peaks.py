@@ -1,8 +1,7 @@
 """The compiled search for peaks: some pixels' traces, one after another.
 
-The steps are those of `tofclip.lidar.search`, and functions that do the same have the same names in
-`tofclip.lidar.search.array_api`, where they take all pixels at once. Every function is serial and
-holds no interpreter lock; `tofclip.lidar.search` shares the pixels between threads.
+The steps are those of `tofclip.lidar.search`. Every function is serial and holds no interpreter lock;
+`tofclip.lidar.search` shares the pixels between threads.
 
 All loops over bins take a vector of them at a time (`tofclip.vectors`): axes are a whole number of
 vectors long (`tofclip.lidar.search.trace_search`).
@@ -43,11 +42,11 @@ VECTORS_PER_WORD = 4
 WORD_BINS = VECTORS_PER_WORD * LENGTH
 """Bins whose maxima are listed together, a bit for each."""
 
-OFFSET, HEIGHT, MOVED, NOISE, PEAK_BIN, TRACE = range(6)
+OFFSET, HEIGHT, MOVED, NOISE, PEAK_BIN, TRACE, FIRST_OFFSET = range(7)
 CANDIDATE_COLUMNS = 8  # a line of the processor's cache
 """What is known of a candidate: by how many bins it arrives after the bin of its peak, height, by
 how many bins it moved last, noise of its trace, bin of its peak, and its trace's place among those
-searched together."""
+searched together; and the first of these again, as it was before any fit."""
 
 
 @search_step
@@ -434,6 +433,7 @@ def confirm_peaks(traces, times, matched, starts, sums, limits, least, moments, 
                     strength,
                     after - background * sums[best + ONE],
                 ) * ((times[best + ONE] - times[best - ONE]) / (times[best + ONE] - times[best]))
+                candidate[FIRST_OFFSET] = candidate[OFFSET]
                 height = trace[best] - background
                 candidate[HEIGHT] = height if height > 0 else 0.0
                 candidate[MOVED] = np.inf

@@ -74,7 +74,7 @@ class SearchMemory:
 class TraceSearch:
     """The search in some traces, and what it has found so far.
 
-    They take a vector of bins at a time. Behind the last bin the axis is filled up with bins that
+    Compiled loops take a vector of bins at a time. Behind the last bin the axis is filled up with bins that
     weigh nothing and are not searched, to a whole number of vectors that holds the filters.
 
     Parameters
