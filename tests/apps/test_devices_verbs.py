@@ -74,9 +74,10 @@ def test_trying_out(run: Run) -> None:
     counted = {"delivered", "dropped_host", "lost_device", "malformed", "timeouts", "reconnects"}
     assert counted | {"bytes_per_second", "records"} <= set(found)
     assert found["records"] == found["delivered"] > 300_000
-    assert found["bytes_per_second"] == pytest.approx(
-        6e6, rel=0.25
-    )  # a million records of 6 bytes a second
+    # A million records of 6 bytes a second, and less on a machine that stood still meanwhile.
+    assert 0 < found["bytes_per_second"] <= 1.25 * 6e6
+    received = found["bytes_per_second"] * found["seconds"]
+    assert received == pytest.approx(6 * found["records"], rel=0.25)
     assert found["lost_device"] == found["dropped_host"] == found["malformed"] == 0
     assert "bytes per second" in run("devices", "test", SIM, "--seconds", "0.1").out
 
