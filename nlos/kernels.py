@@ -7,10 +7,11 @@ import math
 import numpy as np
 from numba import njit
 
+from tofclip.compiling import inlined
+
 # Only the fusing of multiply and add is let loose: exact zeros at the ends of the waveforms have to
 # stay exact.
 compiled = njit(nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
-inlined = njit(inline="always")
 
 MIN_DISTANCE_M = 1e-3
 """Distance in m below which the weight 1 / distance stops growing, for voxels that touch the wall."""

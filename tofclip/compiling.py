@@ -37,6 +37,12 @@ compile_as_part: Callable[..., Callable[[F], F]] = partial(
 """
 
 
+inlined = njit(inline="always")
+"""Decorator of functions that Numba writes into the loop that calls them, so that constants which
+they are given are constants to the compiler.
+"""
+
+
 class _CompileListener(event.Listener):  # type: ignore[misc]
     def on_start(self, event: Any) -> None:
         for report in tuple(observers):

@@ -13,6 +13,7 @@ from __future__ import annotations
 import operator
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
@@ -21,6 +22,9 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 
 LENGTH = 16
 """Lanes of a vector: 64 bytes of float32."""
+
+STEP = np.uintp(LENGTH)
+"""Of loops over whole vectors of an array; unsigned, since no index counts from the end."""
 
 INDEX = ir.IntType(32)
 ANY_ORDER = ("contract", "reassoc", "nsz")

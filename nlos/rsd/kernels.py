@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from nlos.kernels import inlined
+from tofclip.compiling import inlined
 
 compiled = njit(
     nogil=True, cache=True, fastmath={"contract", "nsz", "reassoc", "arcp"}, error_model="numpy"

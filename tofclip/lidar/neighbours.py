@@ -21,13 +21,12 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from tofclip.compiling import compile_loop
+from tofclip.compiling import compile_loop, inlined
 from tofclip.threads import run_blocks
 from tofclip.vectors import (
-    LENGTH,
+    STEP,
     choose,
     count_set_lanes,
     fill_vector,
@@ -76,10 +75,6 @@ CELL_LANES = 8
 
 FAR = 1e20
 """Nearness of a neighbour that is not there, 1/m."""
-
-STEP = np.uintp(LENGTH)
-
-inlined = njit(inline="always")  # into the one loop that calls it
 
 
 def add_recovery_error(

@@ -10,11 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numba.core.types import Array
 from numba.extending import overload
 
-from tofclip.compiling import compile_as_part
+from tofclip.compiling import compile_as_part, inlined
 from tofclip.lidar.detection import CONVERGENCE_STEP_BINS
 
 EVEN_VARIANCE = (
@@ -25,7 +24,6 @@ EVEN_VARIANCE = (
 # Without counts of the arrays' owners, which cost a lock for every array that is handed on; nothing
 # here allocates.
 loop_part = compile_as_part(_nrt=False)
-inlined = njit(inline="always")  # into the one part that calls it
 
 
 @loop_part

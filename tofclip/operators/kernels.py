@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from tofclip.compiling import compile_as_part, compile_loop
+from tofclip.compiling import compile_as_part, compile_loop, inlined
 from tofclip.operators.radon import FRACTION_BITS
 from tofclip.threads import LANES
 
@@ -198,12 +198,11 @@ multiply_sparse_wide_rows = _make_rows_product(_emit_wide_row_product)
 
 FASTMATH = {"contract", "nsz", "arcp", "afn"}
 fast_loop = compile_loop(fastmath=FASTMATH)
-inline_njit = njit(inline="always")
 
 FRACTION_MASK = (1 << FRACTION_BITS) - 1
 
 
-@inline_njit
+@inlined
 def _deposit_light(line, position, light, light_step):
     """Share light between the bin of `position`, in column 0, and the next one, in column 1 of the
     same row.

@@ -12,9 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from tofclip.compiling import compile_as_part, compile_loop
+from tofclip.compiling import compile_as_part, compile_loop, inlined
 from tofclip.operators.kernels import (
     WIDE_LANES,
     multiply_sparse_rows,
@@ -32,9 +31,6 @@ STRETCHES_PER_SUM = 128
 
 FASTMATH = {"contract", "nsz", "arcp", "afn"}
 fast_loop = compile_loop(fastmath=FASTMATH)
-inline_njit = njit(
-    inline="always"
-)  # so that a full block's number of lanes is a constant to the compiler
 
 
 row_part = compile_as_part(fastmath=FASTMATH, _nrt=False)
@@ -428,7 +424,7 @@ def compute_light_field_primal(noisy, dual, weight, angular, result):
                         result[v, u, row, column, lane] = max(value, np.float32(0))
 
 
-@inline_njit
+@inlined
 def _forward_differences(field, v, u, row, column, lane, angular):
     """The four forward differences at a sample, 0 across borders."""
     down, across, rows, columns = field.shape[:4]

@@ -12,12 +12,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from tofclip.compiling import compile_loop
+from tofclip.compiling import compile_loop, inlined
 from tofclip.lidar.detection import PREFIT_THRESHOLD_FACTOR
 from tofclip.vectors import (
     LENGTH,
+    STEP,
     choose,
     fill_vector,
     find_first_bit,
@@ -34,10 +34,8 @@ SUMS_IN_ANY_ORDER = {"reassoc", "contract", "arcp", "nsz"}
 """What sums in vectors need; unlike all of ``fastmath`` it leaves infinities and NaN what they are."""
 
 search_step = compile_loop(fastmath=SUMS_IN_ANY_ORDER)
-inlined = njit(inline="always")  # into the one step that calls it
 
 ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
-STEP = np.uintp(LENGTH)
 VECTORS_PER_WORD = 4
 WORD_BINS = VECTORS_PER_WORD * LENGTH
 """Bins whose maxima are listed together, a bit for each."""

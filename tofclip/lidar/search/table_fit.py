@@ -16,6 +16,7 @@ import math
 
 import numpy as np
 
+from tofclip.compiling import inlined
 from tofclip.lidar.detection import CONVERGENCE_STEP_BINS, MAX_FIT_ROUNDS
 from tofclip.lidar.search.peaks import (
     HEIGHT,
@@ -24,13 +25,12 @@ from tofclip.lidar.search.peaks import (
     OFFSET,
     ONE,
     PEAK_BIN,
-    STEP,
     TRACE,
-    inlined,
     search_step,
 )
 from tofclip.lidar.search.phase_table import MAX_OFFSET_BINS, PHASES_PER_BIN
 from tofclip.vectors import (
+    STEP,
     choose,
     fill_vector,
     load_vector,
