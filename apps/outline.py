@@ -9,17 +9,12 @@ from devices.linospad2.source import LinoSpad2File
 from devices.photons import STAMPS_SUFFIX
 from devices.recording.reader import read_head_if_recording
 from tofclip.errors import FileFormatError
+from tofclip.files import translate_read_errors
 from tofclip.io.streaks import outline_streak_file
 from tofclip.lidar import PointCloud
 from tofclip.lidar.photons.files import describe_photons
 from tofclip.loading import CLOUD_SUFFIXES, HDF5_SIGNATURE
-from tofclip.storage import (
-    Record,
-    is_own_file,
-    is_stand_in,
-    read_outline,
-    translate_read_errors,
-)
+from tofclip.storage import Record, is_own_file, is_stand_in, read_outline
 
 if TYPE_CHECKING:
     from tofclip.storage import Field

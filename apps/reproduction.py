@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tofclip.storage import atomic_path
+from tofclip.files import atomic_path
 
 if TYPE_CHECKING:
     from apps.studies.best import BestFigure

@@ -22,7 +22,7 @@ import typer
 
 from apps.conventions import make_completer
 from tofclip.errors import FileFormatError, InputError
-from tofclip.storage import atomic_path, translate_read_errors
+from tofclip.files import atomic_path, translate_read_errors
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

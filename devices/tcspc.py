@@ -25,10 +25,15 @@ from devices.source import READ_TIMEOUT_S, Batch, Info, Source
 from devices.uri import Uri
 from tofclip.dependencies import import_file_reader
 from tofclip.errors import FileFormatError, InputError, TofclipError
-from tofclip.file_limits import BoundedFile, require_bounded_size
+from tofclip.files import (
+    BoundedFile,
+    format_error_line,
+    require_bounded_size,
+    translate_read_errors,
+)
 from tofclip.io.becker_hickl import read_sdt_blocks
 from tofclip.io.picoquant import TCSPC, Checkpoint, PtuEvents, PulseCount, require_pulses
-from tofclip.storage import Record, Scalar, format_error_line, translate_read_errors
+from tofclip.storage import Record, Scalar
 
 HISTOGRAM_BYTES = 4
 """Of one bin in a PHU file."""

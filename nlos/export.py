@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from nlos.plane import axis_step, is_evenly_spaced
 from tofclip.arrays import to_numpy
 from tofclip.errors import InputError
-from tofclip.storage import atomic_path
+from tofclip.files import atomic_path
 
 if TYPE_CHECKING:
     from nlos.geometry import FloatArray

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from nlos.picture import COLOUR_MAP, compute_extent
 from nlos.video import TransientVideo
 from tofclip.errors import InputError
-from tofclip.storage import atomic_path
+from tofclip.files import atomic_path
 
 FIGURE_SIZE_INCHES = (5.6, 5.0)
 DOTS_PER_INCH = 80

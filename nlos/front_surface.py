@@ -13,7 +13,7 @@ from nlos.geometry import FloatArray
 from nlos.plane import axis_step
 from nlos.volume import Volume
 from tofclip.errors import InputError
-from tofclip.storage import atomic_path
+from tofclip.files import atomic_path
 
 GRADIENT_VOXELS = 2.0
 """Standard deviation of the neighbourhood whose gradients give a normal, voxels."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nlos.volume import Volume
 from tofclip.errors import InputError
-from tofclip.storage import atomic_path
+from tofclip.files import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -30,8 +30,8 @@ NAMES = {
         "read_streak",
         "recover",
     ],
-    "tofclip.io": ["read_streak"],
-    "tofclip.shots": ["Frames", "Returns", "Streak", "StreakStack", "save_stack"],
+    "tofclip.io": ["StreakStack", "read_streak", "save_stack"],
+    "tofclip.shots": ["Frames", "Returns", "Streak"],
     "nlos": [
         "Backprojection",
         "Capture",

@@ -18,13 +18,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tofclip.errors import FileFormatError, StorageError
+from tofclip.files import atomic_path, format_error_line
 from tofclip.storage import (
     MAX_OUTLINE_VALUES,
     Field,
     Record,
-    atomic_path,
     collect_provenance,
-    format_error_line,
     is_stand_in,
     read_outline,
 )

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from tofclip.errors import FileFormatError, require_path
+from tofclip.files import translate_read_errors
 from tofclip.io import read_streak
 from tofclip.lidar import PointCloud
-from tofclip.storage import Record, translate_read_errors
+from tofclip.storage import Record
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 

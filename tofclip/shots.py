@@ -1,13 +1,9 @@
-"""Shots: the streak image that was measured, many of them in one file, and what is recovered from one:
-frames and returns.
-"""
+"""Shots: the streak image that was measured, and what is recovered from it: frames and returns."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,13 +12,11 @@ from numpy.typing import NDArray
 from tofclip.arrays import Array, namespace, to_numpy
 from tofclip.camera import Camera
 from tofclip.errors import (
-    FileFormatError,
     InputError,
     MissingTimeAxisError,
     ShapeError,
     require_type,
 )
-from tofclip.file_limits import require_bounded_dataset, require_own_member
 from tofclip.notebook import make_data_array, plot_picture, render_html, require_package
 from tofclip.records import (
     Storable,
@@ -34,17 +28,10 @@ from tofclip.records import (
     stored_provenance,
     stored_texts,
 )
-from tofclip.storage import (
-    Field,
-    Record,
-    Scalar,
-    atomic_path,
-    make_stand_in,
-    translate_read_errors,
-)
+from tofclip.storage import Field, Record, Scalar, make_stand_in
 from tofclip.units import SPEED_OF_LIGHT
 
-__all__ = ["Frames", "Returns", "Streak", "StreakStack", "save_stack"]
+__all__ = ["Frames", "Returns", "Streak"]
 
 RETURN_CHOICES = ("first", "strongest", "last", "all")
 """Which return of a pixel counts."""
@@ -236,150 +223,6 @@ def outline_streak(
     if camera is not None:
         children["camera"] = camera.to_record()
     return Record(Streak.RECORD_KIND, fields, children=children)
-
-
-class StreakStack:
-    """A sequence of streak images in an HDF5 file: dataset ``counts`` (shot, time, column),
-    ``row_times`` (time) in s.
-
-    Any program can write such a file. Only the shot that is asked for is in memory.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Raises
-    ------
-    FileFormatError, StorageError
-        No HDF5 file, or one without these datasets.
-    """
-
-    @staticmethod
-    def is_one(path: str | Path) -> bool:
-        """Return whether an HDF5 file holds a stack: dataset ``counts`` with one axis more than a
-        streak image.
-        """
-        import h5py
-
-        try:
-            with h5py.File(path, "r") as file:
-                is_own = isinstance(file.get("counts", getlink=True), h5py.HardLink)
-                counts = file["counts"] if is_own else None
-                return isinstance(counts, h5py.Dataset) and counts.ndim == 3 and counts.size > 0
-        except (OSError, KeyError, RuntimeError):
-            return False
-
-    def __init__(self, path: str | Path) -> None:
-        import h5py
-
-        self.path = Path(path)
-        with translate_read_errors(path):
-            open(path, "rb").close()
-        try:
-            with h5py.File(path, "r") as file:
-                require_own_member(file, "counts", path)
-                counts = file["counts"]
-                self._shape = tuple(int(n) for n in counts.shape)
-                require_bounded_dataset(counts, path, at_once=math.prod(self._shape[1:]))
-                self.row_times: NDArray[np.float64] | None = None
-                if "row_times" in file:
-                    require_own_member(file, "row_times", path)
-                    require_bounded_dataset(file["row_times"], path)
-                    self.row_times = np.asarray(file["row_times"], dtype=np.float64)
-        except FileFormatError:
-            raise
-        except (OSError, KeyError, RuntimeError, AttributeError) as fault:
-            raise FileFormatError(
-                path, "is not a stack of streak images: it needs a dataset 'counts'"
-            ) from fault
-        if len(self._shape) != 3 or 0 in self._shape:
-            raise FileFormatError(
-                path, f"'counts' must be (shot, time, column), found {self._shape}"
-            )
-
-    def __len__(self) -> int:
-        return self._shape[0]
-
-    def read_shot(self, number: int, camera: Camera | None = None) -> Streak:
-        """Read one shot, from 0.
-
-        Parameters
-        ----------
-        number : int
-        camera : Camera, optional
-
-        Returns
-        -------
-        Streak
-
-        Raises
-        ------
-        InputError
-            There is no shot of that number.
-        FileFormatError
-            The shot is damaged.
-        """
-        import h5py
-
-        if not 0 <= number < len(self):
-            raise InputError(f"{self.path} holds shots 0..{len(self) - 1}, not {number}")
-        try:
-            with h5py.File(self.path, "r") as file:
-                counts = np.asarray(file["counts"][number], dtype=np.float32)
-        except (OSError, RuntimeError) as fault:
-            raise FileFormatError(self.path, f"shot {number} is damaged") from fault
-        return Streak(counts, self.row_times, camera=camera, source=f"{self.path} shot {number}")
-
-    def __iter__(self) -> Iterator[Streak]:
-        for number in range(len(self)):
-            yield self.read_shot(number)
-
-
-def save_stack(shots: Iterable[Streak], path: str | Path) -> int:
-    """Write shots to one file, whole or not at all; return how many. All have the first one's shape
-    and time axis.
-
-    Parameters
-    ----------
-    shots : iterable of Streak
-        Taken one at a time.
-    path : str or Path
-
-    Returns
-    -------
-    int
-
-    Raises
-    ------
-    ShapeError
-        A shot has another shape than the first.
-    InputError
-        There is no shot.
-    """
-    import h5py
-
-    number = 0
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        for shot in shots:
-            if number == 0:
-                shape = shot.counts.shape
-                options = {
-                    "maxshape": (None, *shape),
-                    "chunks": (1, *shape),
-                    "compression": "gzip",
-                    "shuffle": True,
-                }
-                stored = file.create_dataset("counts", (0, *shape), np.float32, **options)
-                if shot.row_times is not None:
-                    file.create_dataset("row_times", data=shot.row_times).attrs["units"] = "s"
-            if shot.counts.shape != shape:
-                raise ShapeError(f"shot {number} of a stack", shape, shot.counts.shape)
-            stored.resize(number + 1, axis=0)
-            stored[number] = shot.counts
-            number += 1
-        if number == 0:
-            raise InputError(f"{path}: there is no shot to write")
-    return number
 
 
 @dataclass(frozen=True)

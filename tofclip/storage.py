@@ -1,5 +1,4 @@
-"""Files of our own: HDF5 records that name their units and axes, and writing that is all or
-nothing.
+"""Files of our own: HDF5 records that name their units and axes.
 
 A *record* is a tree of named arrays. Each array carries its unit and the names of its axes; the
 root carries what kind of thing it is and where it came from. Every class that can be saved turns
@@ -11,15 +10,12 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import errno
-import hashlib
 import io
 import json
 import math
 import numbers
 import os
-import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,7 +24,14 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from tofclip.errors import FileFormatError, InputError, StorageError, require_path
-from tofclip.file_limits import require_bounded_dataset, require_own_member
+from tofclip.files import (
+    atomic_path,
+    compute_sha256,
+    format_error_line,
+    require_bounded_dataset,
+    require_own_member,
+    translate_read_errors,
+)
 from tofclip.version import __version__
 
 if TYPE_CHECKING:
@@ -72,11 +75,7 @@ MIN_COMPRESSED_BYTES = 1 << 16
 
 MAX_DEPTH = 16
 """Of records within records."""
-MAX_HASHED_BYTES = 1 << 24
-"""Of larger files, size, time of change and the first bytes, this number of them, stand for the content."""
 
-MAX_MESSAGE_LENGTH = 200
-"""Of another library's message that is part of ours."""
 MAX_OUTLINE_VALUES = 9
 """Arrays up to this size are part of a record's outline."""
 
@@ -514,127 +513,3 @@ def collect_provenance(settings: Mapping[str, Any], *inputs: str | Path) -> dict
             if Path(path).is_file()
         ],
     }
-
-
-def compute_sha256(path: str | Path) -> str:
-    """Hexadecimal SHA-256 of a file."""
-    with translate_read_errors(path), open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def identify_file(file: Path) -> str:
-    """Say by what a file's content is known again: its hash, or for a large one what
-    `MAX_HASHED_BYTES` says.
-
-    Raises
-    ------
-    StorageError
-        It cannot be read.
-    """
-    with translate_read_errors(file):
-        state = file.stat()
-        if state.st_size <= MAX_HASHED_BYTES:
-            return compute_sha256(file)
-        with open(file, "rb") as opened:
-            start = hashlib.sha256(opened.read(MAX_HASHED_BYTES)).hexdigest()
-    return f"{state.st_size} bytes, {state.st_mtime_ns} ns, {start}"
-
-
-@contextlib.contextmanager
-def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary name beside `path` and rename it to `path` when the block ends well.
-
-    On any exception, Ctrl-C included, the temporary file is removed and `path` stays as it was.
-    Problems of the file system become `StorageError`. The contents are on the disk before the name
-    is: after a loss of power, a file that is there is complete.
-    """
-    target = Path(path)
-    try:
-        temporary = _create_temporary_file(target)
-    except OSError as fault:
-        raise StorageError(f"{target}: cannot be written: {_explain_os_error(fault)}") from fault
-    try:
-        yield temporary
-        _flush_to_disk(temporary)
-        os.replace(temporary, target)
-        with contextlib.suppress(OSError):  # not every system can flush a folder
-            _flush_to_disk(target.parent)
-    except OSError as fault:
-        if isinstance(fault, StorageError):
-            raise
-        raise StorageError(f"{target}: cannot be written: {_explain_os_error(fault)}") from fault
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def remove_temporary_files(targets: Iterable[Path]) -> None:
-    """Remove the temporary files of writers of `targets` that were killed before `atomic_path`
-    could.
-
-    Only when these targets are not written any more: a writer whose temporary file is gone fails.
-    """
-    wanted: dict[Path, set[str]] = {}
-    for target in targets:
-        wanted.setdefault(target.parent, set()).add(target.name)
-    for folder, names in wanted.items():
-        with contextlib.suppress(OSError):
-            for entry in os.scandir(folder):
-                target_name = Path(entry.name).stem[1:].rpartition(".")[0]
-                if entry.name.startswith(".") and target_name in names:
-                    Path(entry.path).unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def translate_read_errors(path: str | Path) -> Iterator[None]:
-    """Turn the operating system's refusals to read `path` into `StorageError`."""
-    try:
-        yield
-    except FileNotFoundError as fault:
-        raise StorageError(f"{path}: no such file") from fault
-    except IsADirectoryError as fault:
-        raise StorageError(f"{path}: is a folder, a file is needed") from fault
-    except PermissionError as fault:
-        raise StorageError(f"{path}: reading is not permitted") from fault
-
-
-def _create_temporary_file(target: Path) -> Path:
-    """Create an empty file beside `target`, with the permissions that any new file has.
-
-    `tempfile` would make it private, and asking for the process's umask means changing it, which
-    other threads that create files meanwhile would see.
-    """
-    while True:
-        path = target.with_name(f".{target.name}.{secrets.token_hex(4)}{target.suffix}")
-        with contextlib.suppress(FileExistsError):
-            os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-            return path
-
-
-def _flush_to_disk(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _explain_os_error(fault: OSError) -> str:
-    if fault.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return "the disk is full; free some space or choose another folder"
-    if isinstance(fault, FileNotFoundError):
-        return "the folder does not exist; create it first"
-    if isinstance(fault, NotADirectoryError):
-        return "its folder is a file"
-    if isinstance(fault, IsADirectoryError):
-        return "it is a folder; name a file"
-    if isinstance(fault, PermissionError):
-        return "writing is not permitted there"
-    return format_error_line(fault)
-
-
-def format_error_line(fault: BaseException) -> str:
-    """Return an exception's message without line breaks, cut where it repeats a whole file, or its
-    name where it has none.
-    """
-    text = " ".join(str(fault).split()) or type(fault).__name__
-    return text if len(text) <= MAX_MESSAGE_LENGTH else f"{text[:MAX_MESSAGE_LENGTH]} ..."

@@ -11,7 +11,7 @@ import numpy as np
 
 from apps.figures.occlusion import UNSEEN_COLOUR, draw_history
 from apps.figures.style import SMALL_FONT_PT, draw_image, make_figure
-from tofclip.storage import atomic_path
+from tofclip.files import atomic_path
 from tofclip.units import MILLIMETRE, PICOSECOND
 
 if TYPE_CHECKING:

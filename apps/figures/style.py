@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofclip.storage import atomic_path
+from tofclip.files import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

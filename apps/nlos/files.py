@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from apps.conventions import PICTURE_SUFFIXES, RECORD_SUFFIXES, build_provenance, require_writable
 from nlos.export import POINT_SUFFIXES, WRITERS
 from tofclip.errors import InputError, StorageError
-from tofclip.storage import identify_file
+from tofclip.files import identify_file
 
 if TYPE_CHECKING:
     from nlos import Volume

@@ -22,12 +22,12 @@ from apps.viewer.shots import ShotSource
 from apps.viewer.source import Capabilities, Gate, Setting, Source, View
 from apps.viewer.transient import TransientSource
 from tofclip.errors import InputError
+from tofclip.files import format_error_line
 from tofclip.lidar.processing import select_points
 from tofclip.occlusion.measurements import TimedMeasurements
 from tofclip.occlusion.recovery import separate_occluder
 from tofclip.shots import Frames
 from tofclip.simulate.light_fields import CameraArray
-from tofclip.storage import format_error_line
 from tofclip.units import MILLIMETRE, SPEED_OF_LIGHT
 
 Picture = NDArray[np.float32]

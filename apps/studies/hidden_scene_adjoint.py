@@ -249,7 +249,7 @@ def replace_between_marks(text: str, document: Path) -> None:
     InputError
         The document does not hold the mark twice.
     """
-    from tofclip.storage import atomic_path, translate_read_errors
+    from tofclip.files import atomic_path, translate_read_errors
 
     with translate_read_errors(document):
         parts = document.read_text().split(DOCUMENT_MARK)

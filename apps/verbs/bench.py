@@ -9,7 +9,7 @@ import typer
 
 from apps.conventions import JsonOption, report, require_writable
 from apps.progress import show_progress
-from tofclip.storage import atomic_path
+from tofclip.files import atomic_path
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -20,6 +20,7 @@ from apps.conventions import (
 )
 from apps.progress import show_progress
 from tofclip.errors import InputError
+from tofclip.files import atomic_path
 from tofclip.io.light_fields import read_depth_map, read_light_field
 from tofclip.light_field.measurement import (
     CameraSetup,
@@ -36,7 +37,7 @@ from tofclip.recovery.all_in_focus import (
     recover_on_depth_map,
 )
 from tofclip.recovery.light_field import ClipRecovery, ClipResult
-from tofclip.storage import Field, Record, atomic_path
+from tofclip.storage import Field, Record
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

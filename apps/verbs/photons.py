@@ -23,6 +23,7 @@ from devices.photons import find_address
 from devices.photons import read_photons as read_counted_photons
 from tofclip.camera import Camera
 from tofclip.errors import InputError
+from tofclip.files import atomic_path
 from tofclip.lidar import Pulse, point_cloud, save_depth
 from tofclip.lidar.photons import (
     PhotonImage,
@@ -32,7 +33,6 @@ from tofclip.lidar.photons import (
     make_pinhole,
 )
 from tofclip.lidar.photons.files import read_photons
-from tofclip.storage import atomic_path
 from tofclip.units import NANOSECOND, PICOSECOND
 
 if TYPE_CHECKING:

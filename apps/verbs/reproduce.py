@@ -27,8 +27,8 @@ from apps.studies.cases import Library
 from apps.studies.registry import STUDIES, find_studies
 from tofclip import __version__
 from tofclip.errors import InputError
+from tofclip.files import atomic_path
 from tofclip.sequences.jobs import Job
-from tofclip.storage import atomic_path
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

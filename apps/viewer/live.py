@@ -15,11 +15,11 @@ from apps.viewer.source import View
 from devices.shot_stream import TrackedShots
 from tofclip.camera import Camera
 from tofclip.errors import InputError
+from tofclip.files import format_error_line
 from tofclip.sequences.ranger import RangingPipeline
 from tofclip.sequences.streaming import stream_clouds
 from tofclip.shots import Streak
 from tofclip.solvers import Method
-from tofclip.storage import format_error_line
 
 MAX_CACHED_SHOTS = 32
 STOP_TIMEOUT_S = 10.0

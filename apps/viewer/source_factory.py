@@ -21,15 +21,17 @@ from devices.shot_stream import TrackedShots, read_transients
 from devices.transients import read_transient
 from tofclip.camera import Camera, measure
 from tofclip.errors import FileFormatError, InputError
+from tofclip.files import translate_read_errors
 from tofclip.io import read_streak
 from tofclip.recovery import make_method, open_shot, plan_recovery
 from tofclip.shots import Frames
 from tofclip.solvers import Method
-from tofclip.storage import HDF5_SIGNATURE, Record, translate_read_errors
+from tofclip.storage import HDF5_SIGNATURE, Record
 
 if TYPE_CHECKING:
     from apps.viewer.source import Source
-    from tofclip.shots import Streak, StreakStack
+    from tofclip.io.streaks import StreakStack
+    from tofclip.shots import Streak
 
 
 LOOK_METHODS = ("tv", "l1", "linear", "adjoint")
@@ -127,7 +129,7 @@ def open_source(
 
 def _open_hdf5(path: Path, options: ShotOptions, announce: Announce) -> Source:
     if _is_stack(path):
-        from tofclip.shots import StreakStack
+        from tofclip.io.streaks import StreakStack
 
         stack = StreakStack(path)
         return _open_shots(

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from devices.codec import Records
 from devices.linospad2.codec import PIXELS
 from tofclip.errors import FileFormatError, InputError, ShapeError
+from tofclip.files import format_error_line, translate_read_errors
 from tofclip.records import Storable, stored_array
-from tofclip.storage import format_error_line, translate_read_errors
 
 CODES_PER_PERIOD = 140
 """Codes in one period of the board's clock."""

@@ -10,7 +10,7 @@ from typing import Any
 from devices.linospad2.calibration import BoardCalibration, load_calibration
 from devices.linospad2.codec import LinoSpad2Codec
 from tofclip.errors import FileFormatError, InputError, StorageError
-from tofclip.storage import translate_read_errors
+from tofclip.files import translate_read_errors
 
 _MAX_FILE_BYTES = 1 << 16
 _KEY_TYPES: dict[str, type] = {

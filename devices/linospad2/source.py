@@ -15,7 +15,8 @@ from devices.ring import Piece
 from devices.source import READ_TIMEOUT_S, Batch, DecodedSource, Info
 from devices.uri import Uri
 from tofclip.errors import FileFormatError, InputError
-from tofclip.storage import Record, translate_read_errors
+from tofclip.files import translate_read_errors
+from tofclip.storage import Record
 
 LIMITATION = "LinoSPAD2's USB commands are not public: its recordings are read, no board is driven"
 PIECE_BYTES = 1 << 20

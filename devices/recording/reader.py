@@ -20,7 +20,8 @@ from devices.registry import build_codec
 from devices.ring import Piece
 from devices.source import Info
 from tofclip.errors import FileFormatError, InputError, StorageError
-from tofclip.storage import HDF5_SIGNATURE, Record, format_error_line, translate_read_errors
+from tofclip.files import format_error_line, translate_read_errors
+from tofclip.storage import HDF5_SIGNATURE, Record
 
 RECORD_KIND = "recording"
 RECORDING_SUFFIXES = (".h5", ".hdf5")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from nlos.capture import Capture
 from nlos.io.fields import NamedArrays, read_matlab
 from tofclip.errors import FileFormatError
-from tofclip.storage import translate_read_errors
+from tofclip.files import translate_read_errors
 from tofclip.units import SPEED_OF_LIGHT
 
 SETUP_FILE = "experimental_setup.m"

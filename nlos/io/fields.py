@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError
-from tofclip.file_limits import require_bounded_dataset
+from tofclip.files import format_error_line, require_bounded_dataset, translate_read_errors
 from tofclip.io.archive import Archive, ArchiveEntry
 from tofclip.io.mat import list_mat_variables
-from tofclip.storage import HDF5_SIGNATURE, format_error_line, translate_read_errors
+from tofclip.storage import HDF5_SIGNATURE
 
 MATLAB_HEADER_BYTES = 512
 """Of a v7.3 file, before the HDF5 data begin."""

@@ -21,7 +21,8 @@ from nlos.io.tal import read_tal
 from nlos.io.wisconsin import read_phasor_field_data, read_rectified_data
 from nlos.io.zaragoza import read_zaragoza
 from tofclip.errors import FileFormatError
-from tofclip.storage import HDF5_SIGNATURE, Record, collect_provenance, translate_read_errors
+from tofclip.files import translate_read_errors
+from tofclip.storage import HDF5_SIGNATURE, Record, collect_provenance
 
 
 def read_native(path: str | Path) -> Capture | None:

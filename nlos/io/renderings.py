@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from nlos.capture import Capture
 from tofclip.errors import FileFormatError
+from tofclip.files import format_error_line
 from tofclip.io.exr import read_exr_parts
-from tofclip.storage import format_error_line
 from tofclip.units import PICOSECOND
 
 GEOMETRY_FILE = "geometry.toml"

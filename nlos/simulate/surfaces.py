@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from nlos.simulate.materials import Lambert, Material
 from tofclip.errors import FileFormatError, InputError, ShapeError
-from tofclip.storage import format_error_line, translate_read_errors
+from tofclip.files import format_error_line, translate_read_errors
 
 FloatArray = NDArray[np.float64]
 

@@ -10,7 +10,8 @@ import numpy as np
 from small_instrument import Run
 
 from tofclip.camera import Camera, SkewSweep
-from tofclip.shots import Frames, save_stack
+from tofclip.io.streaks import save_stack
+from tofclip.shots import Frames
 from tofclip.simulate import (
     Instrument,
     Scene,

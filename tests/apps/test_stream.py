@@ -18,10 +18,11 @@ from devices.scenes import EmulatedLight, draw_exposure, simulate_line_light
 from devices.shot_stream import read_transients
 from devices.transients import read_transient
 from tofclip.camera import Camera, SkewSweep
+from tofclip.io.streaks import save_stack
 from tofclip.lidar import PointCloud
 from tofclip.sequences.streaming import stream_clouds
 from tofclip.sequences.surface_following import SurfacePipeline
-from tofclip.shots import Streak, save_stack
+from tofclip.shots import Streak
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.patterns import make_plain_pattern
 

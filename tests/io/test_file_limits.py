@@ -26,11 +26,10 @@ from PIL import Image
 from nlos.io import read_capture
 from tofclip import PointCloud, load
 from tofclip.errors import FileFormatError
-from tofclip.file_limits import MAX_ARRAY_BYTES, find_array_limit, require_bounded_size
+from tofclip.files import MAX_ARRAY_BYTES, find_array_limit, require_bounded_size
 from tofclip.io import read_streak
 from tofclip.io.light_fields import read_light_field
-from tofclip.io.streaks import outline_streak_file
-from tofclip.shots import StreakStack
+from tofclip.io.streaks import StreakStack, outline_streak_file
 
 HUGE = 1 << 29
 ROOM_BYTES = 16 << 20

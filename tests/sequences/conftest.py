@@ -12,7 +12,7 @@ import pytest
 
 from tofclip import Streak
 from tofclip.camera import Camera, SkewSweep
-from tofclip.shots import save_stack
+from tofclip.io.streaks import save_stack
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.bodies import Body
 from tofclip.simulate.patterns import make_checkerboard

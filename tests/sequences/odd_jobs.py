@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from tofclip.errors import InputError
+from tofclip.files import atomic_path
 from tofclip.sequences.jobs import Job
-from tofclip.storage import atomic_path
 
 
 def square(number: int, result: Path) -> int:

@@ -11,6 +11,7 @@ import pytest
 from odd_jobs import die, meet, refuse, squares, stumble
 
 from tofclip.errors import FileFormatError, InputError, MissingDependencyError, StorageError
+from tofclip.files import MAX_HASHED_BYTES
 from tofclip.sequences.jobs import (
     Failure,
     Job,
@@ -21,7 +22,6 @@ from tofclip.sequences.jobs import (
 )
 from tofclip.sequences.jobs import jobs as jobs_module
 from tofclip.sequences.jobs.workers import connect_workers, count_local_workers
-from tofclip.storage import MAX_HASHED_BYTES
 
 pytestmark = pytest.mark.xdist_group("cluster")  # one cluster for all of them
 

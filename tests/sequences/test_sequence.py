@@ -15,6 +15,7 @@ import pytest
 from tofclip import Streak
 from tofclip.camera import Camera, Rectifier, SkewSweep, measure
 from tofclip.errors import FileFormatError, InputError, ShapeError, StorageError
+from tofclip.io.streaks import StreakStack, save_stack
 from tofclip.recovery import DepthLockedFocus
 from tofclip.sequences.ranger import (
     JitterEstimator,
@@ -23,7 +24,6 @@ from tofclip.sequences.ranger import (
     make_average_cloud,
 )
 from tofclip.sequences.ranging import RangingSettings
-from tofclip.shots import StreakStack, save_stack
 from tofclip.simulate import Instrument, Scene, StreakDetector, make_plate, simulate_shot
 from tofclip.simulate.bodies import Body
 from tofclip.simulate.patterns import make_checkerboard

@@ -101,7 +101,7 @@ def test_a_stack_that_claims_more_than_its_file_holds_is_refused(tmp_path):
     import h5py
 
     from tofclip.errors import FileFormatError
-    from tofclip.shots import StreakStack
+    from tofclip.io.streaks import StreakStack
 
     with h5py.File(tmp_path / "stack.h5", "w") as file:
         file.create_dataset("counts", (1 << 20, 1024, 1024), np.float32, chunks=(1, 64, 64))

@@ -51,7 +51,8 @@ from apps.viewer.volume import PROJECTION_MODE, SLICE_MODE, SURFACE_MODE, Volume
 from tofclip.camera import Rectifier
 from tofclip.camera.calibration import registration
 from tofclip.errors import FileFormatError, InputError, StorageError
-from tofclip.shots import Streak, save_stack
+from tofclip.io.streaks import save_stack
+from tofclip.shots import Streak
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,6 @@
 with.
 """
 
-from tofclip.io.streaks import read_streak
+from tofclip.io.streaks import StreakStack, read_streak, save_stack
 
-__all__ = ["read_streak"]
+__all__ = ["StreakStack", "read_streak", "save_stack"]

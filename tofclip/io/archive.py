@@ -17,8 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError
-from tofclip.file_limits import BoundedFile, require_bounded_size
-from tofclip.storage import format_error_line, translate_read_errors
+from tofclip.files import (
+    BoundedFile,
+    format_error_line,
+    require_bounded_size,
+    translate_read_errors,
+)
 
 NPY_SUFFIX = ".npy"
 MEMBER_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tofclip.dependencies import import_file_reader
 from tofclip.errors import FileFormatError
-from tofclip.file_limits import BoundedFile, require_bounded_size
+from tofclip.files import BoundedFile, require_bounded_size
 from tofclip.io.archive import MEMBER_COMPRESSIONS
 
 LAST_OLD_REVISION = 14

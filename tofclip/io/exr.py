@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, MissingDependencyError
-from tofclip.file_limits import require_bounded_size
-from tofclip.storage import format_error_line, translate_read_errors
+from tofclip.files import format_error_line, require_bounded_size, translate_read_errors
 
 MAX_SAMPLE_BYTES = 4
 """Samples are half or single precision, or 32-bit integers."""

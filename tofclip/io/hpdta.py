@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError
-from tofclip.storage import translate_read_errors
+from tofclip.files import translate_read_errors
 
 TIME_UNITS: Final = {
     "s": 1.0,

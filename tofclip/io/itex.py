@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError, ShapeError
+from tofclip.files import atomic_path, translate_read_errors
 from tofclip.io import hpdta
 from tofclip.io.tiff import MAX_PIXELS
 from tofclip.shots import Streak, outline_streak
-from tofclip.storage import Record, atomic_path, translate_read_errors
+from tofclip.storage import Record
 
 SIGNATURE = b"IM"
 AXES = ("X", "Y")

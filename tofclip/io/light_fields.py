@@ -21,18 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError, StorageError
-from tofclip.file_limits import BoundedFile, require_bounded_size
+from tofclip.files import (
+    BoundedFile,
+    atomic_path,
+    format_error_line,
+    require_bounded_size,
+    translate_read_errors,
+)
 from tofclip.io.archive import NPY_SUFFIX, Archive
 from tofclip.io.exr import Channels, read_exr_parts
 from tofclip.io.tiff import MAX_PIXELS, NULL_LOG_HANDLER, require_bounded_page
 from tofclip.light_field import LightField
-from tofclip.storage import (
-    Record,
-    atomic_path,
-    collect_provenance,
-    format_error_line,
-    translate_read_errors,
-)
+from tofclip.storage import Record, collect_provenance
 
 NUMBER_PATTERN = r"([-+]?\d+(?:\.\d+)?)"
 PART_NAME_PATTERN = re.compile(rf"v={NUMBER_PATTERN},u={NUMBER_PATTERN}")

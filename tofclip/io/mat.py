@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError
-from tofclip.file_limits import require_bounded_size
+from tofclip.files import require_bounded_size
 
 HEADER_BYTES, PEEKED_BYTES = 128, 1 << 12
 # Data types of an element: miMATRIX, miCOMPRESSED.

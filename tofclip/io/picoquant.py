@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tofclip.dependencies import import_file_reader
 from tofclip.errors import FileFormatError
-from tofclip.file_limits import BoundedFile
+from tofclip.files import BoundedFile
 
 TCSPC = "tofclip[tcspc]"
 """What brings the libraries for files of photon counters."""

@@ -1,25 +1,29 @@
-"""Read a streak image, whichever program wrote it."""
+"""Streak images in files: one, whichever program wrote it, or a stack of many in one file."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from tofclip.errors import FileFormatError, require_path
+import numpy as np
+from numpy.typing import NDArray
+
+from tofclip.errors import FileFormatError, InputError, ShapeError, require_path
+from tofclip.files import (
+    atomic_path,
+    require_bounded_dataset,
+    require_own_member,
+    translate_read_errors,
+)
 from tofclip.io.itex import SIGNATURE as ITEX_SIGNATURE
 from tofclip.io.itex import outline_itex, read_itex
 from tofclip.io.lift import outline_lift, read_lift
 from tofclip.io.tiff import outline_tiff, read_tiff
 from tofclip.shots import Streak
-from tofclip.storage import (
-    HDF5_SIGNATURE,
-    Record,
-    collect_provenance,
-    read_outline,
-    translate_read_errors,
-)
+from tofclip.storage import HDF5_SIGNATURE, Record, collect_provenance, read_outline
 
 # A file is known by its first bytes: suffixes get lost and lie.
 READERS: dict[bytes, tuple[Callable[[str | Path], Streak], Callable[[str | Path], Record]]] = {
@@ -109,3 +113,146 @@ def _select_reader(
         path,
         f"is not a TIFF, ITEX (.img), LIFT archive (.npz) or HDF5 streak image ({size} bytes of something else)",
     )
+
+
+class StreakStack:
+    """A sequence of streak images in an HDF5 file: dataset ``counts`` (shot, time, column),
+    ``row_times`` (time) in s.
+
+    Any program can write such a file. Only the shot that is asked for is in memory.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Raises
+    ------
+    FileFormatError, StorageError
+        No HDF5 file, or one without these datasets.
+    """
+
+    @staticmethod
+    def is_one(path: str | Path) -> bool:
+        """Return whether an HDF5 file holds a stack: dataset ``counts`` with one axis more than a
+        streak image.
+        """
+        import h5py
+
+        try:
+            with h5py.File(path, "r") as file:
+                is_own = isinstance(file.get("counts", getlink=True), h5py.HardLink)
+                counts = file["counts"] if is_own else None
+                return isinstance(counts, h5py.Dataset) and counts.ndim == 3 and counts.size > 0
+        except (OSError, KeyError, RuntimeError):
+            return False
+
+    def __init__(self, path: str | Path) -> None:
+        import h5py
+
+        self.path = Path(path)
+        with translate_read_errors(path):
+            open(path, "rb").close()
+        try:
+            with h5py.File(path, "r") as file:
+                require_own_member(file, "counts", path)
+                counts = file["counts"]
+                self._shape = tuple(int(n) for n in counts.shape)
+                require_bounded_dataset(counts, path, at_once=math.prod(self._shape[1:]))
+                self.row_times: NDArray[np.float64] | None = None
+                if "row_times" in file:
+                    require_own_member(file, "row_times", path)
+                    require_bounded_dataset(file["row_times"], path)
+                    self.row_times = np.asarray(file["row_times"], dtype=np.float64)
+        except FileFormatError:
+            raise
+        except (OSError, KeyError, RuntimeError, AttributeError) as fault:
+            raise FileFormatError(
+                path, "is not a stack of streak images: it needs a dataset 'counts'"
+            ) from fault
+        if len(self._shape) != 3 or 0 in self._shape:
+            raise FileFormatError(
+                path, f"'counts' must be (shot, time, column), found {self._shape}"
+            )
+
+    def __len__(self) -> int:
+        return self._shape[0]
+
+    def read_shot(self, number: int) -> Streak:
+        """Read one shot, from 0.
+
+        Parameters
+        ----------
+        number : int
+
+        Returns
+        -------
+        Streak
+
+        Raises
+        ------
+        InputError
+            There is no shot of that number.
+        FileFormatError
+            The shot is damaged.
+        """
+        import h5py
+
+        if not 0 <= number < len(self):
+            raise InputError(f"{self.path} holds shots 0..{len(self) - 1}, not {number}")
+        try:
+            with h5py.File(self.path, "r") as file:
+                counts = np.asarray(file["counts"][number], dtype=np.float32)
+        except (OSError, RuntimeError) as fault:
+            raise FileFormatError(self.path, f"shot {number} is damaged") from fault
+        return Streak(counts, self.row_times, source=f"{self.path} shot {number}")
+
+    def __iter__(self) -> Iterator[Streak]:
+        for number in range(len(self)):
+            yield self.read_shot(number)
+
+
+def save_stack(shots: Iterable[Streak], path: str | Path) -> int:
+    """Write shots to one file, whole or not at all; return how many. All have the first one's shape
+    and time axis.
+
+    Parameters
+    ----------
+    shots : iterable of Streak
+        Taken one at a time.
+    path : str or Path
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    ShapeError
+        A shot has another shape than the first.
+    InputError
+        There is no shot.
+    """
+    import h5py
+
+    number = 0
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        for shot in shots:
+            if number == 0:
+                shape = shot.counts.shape
+                options = {
+                    "maxshape": (None, *shape),
+                    "chunks": (1, *shape),
+                    "compression": "gzip",
+                    "shuffle": True,
+                }
+                stored = file.create_dataset("counts", (0, *shape), np.float32, **options)
+                if shot.row_times is not None:
+                    file.create_dataset("row_times", data=shot.row_times).attrs["units"] = "s"
+            if shot.counts.shape != shape:
+                raise ShapeError(f"shot {number} of a stack", shape, shot.counts.shape)
+            stored.resize(number + 1, axis=0)
+            stored[number] = shot.counts
+            number += 1
+        if number == 0:
+            raise InputError(f"{path}: there is no shot to write")
+    return number

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError, TofclipError
-from tofclip.file_limits import MAX_COMPRESSION, BoundedFile
+from tofclip.files import MAX_COMPRESSION, BoundedFile, format_error_line, translate_read_errors
 from tofclip.io import hpdta
 from tofclip.shots import Streak, outline_streak
-from tofclip.storage import Record, format_error_line, translate_read_errors
+from tofclip.storage import Record
 
 if TYPE_CHECKING:
     import tifffile

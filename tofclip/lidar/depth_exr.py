@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from tofclip.files import atomic_path
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.shots import Returns
-from tofclip.storage import atomic_path
 
 
 def save_depth(returns: Returns, path: str | Path) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from tofclip.errors import FileFormatError, MissingDependencyError, TofclipError
-from tofclip.file_limits import require_bounded_size
+from tofclip.files import require_bounded_size
 from tofclip.io.archive import ArchiveEntry
 from tofclip.lidar.column import Columns, Table
 

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.errors import FileFormatError, InputError
+from tofclip.files import atomic_path, translate_read_errors
 from tofclip.io.archive import Archive, ArchiveEntry
 from tofclip.lidar.column import Columns, Table
 from tofclip.lidar.e57 import list_e57_columns, write_e57
 from tofclip.lidar.las import list_las_columns, write_las
-from tofclip.storage import atomic_path, translate_read_errors
 
 Entries = dict[str, ArchiveEntry]
 ColumnWriter = Callable[..., None]

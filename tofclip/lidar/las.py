@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from tofclip.errors import FileFormatError, InputError, MissingDependencyError, TofclipError
-from tofclip.file_limits import BoundedFile, require_bounded_size
+from tofclip.files import BoundedFile, require_bounded_size
 from tofclip.io.archive import ArchiveEntry
 from tofclip.lidar.column import Columns
 

@@ -10,8 +10,9 @@ from pathlib import Path
 
 from tofclip.errors import InputError, StorageError
 from tofclip.io import read_streak
+from tofclip.io.streaks import StreakStack
 from tofclip.sequences.jobs.output_folder import SETTINGS_NAME
-from tofclip.shots import Streak, StreakStack
+from tofclip.shots import Streak
 from tofclip.storage import HDF5_SIGNATURE
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from tofclip.camera import Camera
 from tofclip.errors import InputError
+from tofclip.files import compute_sha256
 from tofclip.records import Storable, stored_array, stored_child, stored_value
 from tofclip.recovery import SharpestFocus, open_shot, parse_focus
 from tofclip.sequences.inputs import Shot
@@ -25,7 +26,6 @@ from tofclip.sequences.ranger import (
     make_average_cloud,
 )
 from tofclip.shots import Streak
-from tofclip.storage import compute_sha256
 
 PLAN_NAME = "plan.h5"
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from tofclip.arrays import CPU
 from tofclip.errors import InputError
+from tofclip.files import compute_sha256
 from tofclip.recovery import (
     RecoveryPlan,
     SurfaceRecovery,
@@ -24,7 +25,6 @@ from tofclip.sequences.inputs import Shot, make_result_paths
 from tofclip.sequences.jobs import Job, lock_output_folder
 from tofclip.shots import Streak
 from tofclip.solvers import LinearInverse, Method
-from tofclip.storage import compute_sha256
 
 FRAMES_SUFFIX = ".h5"
 

@@ -2,7 +2,7 @@
 every pixel, and events.
 
 What a file holds is listed before a value is read, so that a damaged or malicious header costs no
-memory: a size is believed only if the file can hold it and if it stays below a limit, see `tofclip.file_limits`.
+memory: a size is believed only if the file can hold it and if it stays below a limit, see `tofclip.files`.
 """
 
 from __future__ import annotations
@@ -20,14 +20,19 @@ from numpy.typing import NDArray
 
 from tofclip.dependencies import import_file_reader
 from tofclip.errors import FileFormatError, InputError, TofclipError
-from tofclip.file_limits import BoundedFile, require_bounded_size
+from tofclip.files import (
+    BoundedFile,
+    format_error_line,
+    require_bounded_size,
+    translate_read_errors,
+)
 from tofclip.io.archive import list_npz_entries, read_npy_header
 from tofclip.io.becker_hickl import read_sdt_blocks
 from tofclip.io.mat import list_mat_variables
 from tofclip.io.picoquant import TCSPC, PtuEvents, get_scan_shape, read_scan
 from tofclip.io.tiff import NULL_LOG_HANDLER, require_finite_chain
 from tofclip.lidar.photons.photon_image import PhotonImage
-from tofclip.storage import HDF5_SIGNATURE, format_error_line, translate_read_errors
+from tofclip.storage import HDF5_SIGNATURE
 
 MAX_IMAGE_BYTES = 1 << 32
 """4 GiB, of a histogram that is made of a list of events."""

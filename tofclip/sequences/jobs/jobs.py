@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tofclip.errors import InputError, TofclipError
+from tofclip.files import format_error_line, remove_temporary_files
 from tofclip.sequences.jobs.workers import connect_workers
-from tofclip.storage import format_error_line, remove_temporary_files
 from tofclip.threads import limit_blas_threads
 
 if TYPE_CHECKING:

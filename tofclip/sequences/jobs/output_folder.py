@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from tofclip.errors import FileFormatError, InputError, StorageError
-from tofclip.storage import atomic_path, identify_file, translate_read_errors
+from tofclip.files import atomic_path, identify_file, translate_read_errors
 
 SETTINGS_NAME = "settings.json"
 INPUTS_KEY = "inputs"
