@@ -1,15 +1,20 @@
-"""What a capture's signals say about themselves: the wall's own light, and signal against noise."""
+"""What a capture says about itself before it is imaged: whether a picture can come of it, which light
+is the wall's own, which waves its points and its noise leave to see.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nlos.band import VirtualPulse
+from nlos.band import BAND_EDGE_LEVEL, VirtualPulse
 from nlos.capture import Capture
+from nlos.illumination_groups import is_confocal
 from tofclip.arrays import to_numpy
+from tofclip.errors import InputError
 
 FloatArray = NDArray[np.float64]
 
@@ -43,6 +48,38 @@ MAX_FLOOR_SLOPE = 0.15
 
 LIT_END_FRACTION = 0.01
 """Of the brightest light, what the last bins hold if light still comes."""
+
+MIN_COHERENT_SIGNAL = 800.0
+"""Signal over noise of all wall points together that a wavelength needs: with it a letter of some
+hundred resolved voxels stands out. Measured on recorded letters and a mannequin."""
+
+MIN_BAND_OVER_EARLY = 3.0
+"""Energy that a wavelength has in the record, relative to before any light can have come."""
+
+MAX_ALIASED_FRACTION = 0.2
+"""Of a pulse's signal, what may be of waves finer than the wall samples."""
+
+WAVELENGTH_STEP_RATIO = 1.05
+"""From one wavelength that is tried to the next."""
+
+WAVELENGTH_DIGITS = 2
+"""Of the default wavelength in mm, rounded up."""
+
+MAX_LASER_WALL_WIDTHS = 5.0
+"""A laser spot farther from the wall than this number of its widths is a mistake."""
+
+MAX_LASER_OFF_WALL_M, LASER_OFF_WALL_SLOPE = 0.05, 0.5
+"""A laser spot may stand so far before the foremost or behind the hindmost wall point, and farther
+by this part of how far aside it is, where the wall is not known."""
+
+MAX_START_M = 1e3
+"""A record that begins after a longer path, m, still holds the ways to the devices."""
+
+MAX_SATURATED_FRACTION = 0.5
+"""Of the samples, what may have the largest value: light comes during a part of the record."""
+
+MAX_SIGNAL = 1e30
+"""Larger samples overflow once they are squared."""
 
 
 @dataclass(frozen=True)
@@ -223,6 +260,192 @@ def find_lit_end(capture: Capture) -> bool:
     level = np.abs(traces.mean(axis=0))
     last = level[-max(1, level.size // 50) :].mean()
     return bool(last > LIT_END_FRACTION * level.max())
+
+
+def require_plausible(capture: Capture) -> None:
+    """Refuse what no picture can come of, before any work is done.
+
+    Parameters
+    ----------
+    capture : Capture
+
+    Raises
+    ------
+    InputError
+        The wall has no extent, the laser spot is not near the wall, the record begins after all
+        light, or the signals are dark, constant, saturated or overflow.
+    """
+    low, high = capture.points.min(axis=0), capture.points.max(axis=0)
+    extent = float((high - low).max())
+    if len(capture.points) > 1 and extent == 0 and capture.laser.ndim == 1:
+        raise InputError("all wall points stand in one place: a capture needs several places")
+    beyond = np.maximum(np.maximum(low - capture.lasers, capture.lasers - high), 0)
+    away = float(np.linalg.norm(beyond, axis=1).max())
+    if extent > 0 and away > MAX_LASER_WALL_WIDTHS * extent:
+        raise InputError(
+            f"the laser spot lies {away:.3g} m from the wall, which is {extent:.3g} m wide: give the spot on the wall"
+        )
+    outside = np.linalg.norm(beyond[:, :2], axis=1)
+    off = beyond[:, 2] - MAX_LASER_OFF_WALL_M - LASER_OFF_WALL_SLOPE * outside
+    if extent > 0 and off.max() > 0:
+        worst = int(np.argmax(off))
+        side = "behind" if capture.lasers[worst, 2] < low[2] else "in front of"
+        raise InputError(
+            f"the laser spot lies {beyond[worst, 2]:.3g} m {side} the wall: give the spot on the wall"
+        )
+    if capture.start > MAX_START_M:
+        raise InputError(
+            f"the record begins at a path of {capture.start:.4g} m: take the ways to and from the devices off"
+        )
+    largest = float(abs(capture.signal).max())
+    if not largest < MAX_SIGNAL:
+        raise InputError(f"signals of {largest:.3g} overflow in single precision; scale them down")
+    if largest == 0:
+        raise InputError("every signal is 0: there is nothing to image")
+    if float(capture.signal.max()) == float(capture.signal.min()):
+        raise InputError(f"every signal is {largest:.4g}, constant or saturated: nothing to image")
+    brightest = float(capture.signal.max())
+    saturated = float((capture.signal == brightest).sum()) / math.prod(capture.signal.shape)
+    if brightest > 0 and saturated > MAX_SATURATED_FRACTION:
+        raise InputError(
+            f"{100 * saturated:.0f} % of the samples are {brightest:.4g}, saturated: record less light"
+        )
+
+
+def require_usable_wavelength(capture: Capture, wavelength: float, cycles: float) -> None:
+    """Refuse a given wavelength that shows nothing.
+
+    Parameters
+    ----------
+    capture : Capture
+    wavelength : float
+        Carrier of the virtual pulse, m of path.
+    cycles : float
+        Length of the pulse in wavelengths.
+
+    Raises
+    ------
+    InputError
+        The wavelength is longer than the wall is wide, or its pulse longer than the record.
+    """
+    extent = float(np.ptp(capture.points, axis=0).max())
+    record = float(np.ptp(capture.axis.paths))
+    longest = min(limit for limit in (extent, record / cycles) if limit > 0)
+    if wavelength > longest * (1 + 1e-6):
+        raise InputError(
+            f"a wavelength of {wavelength:.3g} m shows nothing of this capture, with a wall {extent:.3g} m wide and a "
+            f"record of {record:.3g} m: use at most {longest / 2:.2g} m"
+        )
+
+
+def choose_wavelength(capture: Capture, cycles: float) -> tuple[float, str]:
+    """Choose the carrier of a virtual pulse for a capture without the wall's own light.
+
+    It is the shortest that wall points and time bins carry, and that the signal has more of than
+    noise. In a noisy record only waves that stand out of the noise can make false images: the wall
+    has to sample these, at the steepest angle at which they arrive.
+
+    Parameters
+    ----------
+    capture : Capture
+    cycles : float
+
+    Returns
+    -------
+    float, str
+        m of path, and the reason.
+    """
+    sampled = find_shortest_wavelength(capture, cycles)
+    reason = "the shortest that wall points and time bins carry"
+    longest = max(sampled * WAVELENGTH_STEP_RATIO, find_longest_wavelength(capture))
+    spectrum = SignalSpectrum.of(capture, sampled)
+    wavelength, aliased = sampled, 0.0
+    if spectrum.is_noisy:
+        aliased = _sampling_limit(capture, _steepest_angle(capture))
+        wavelength = max(min(aliased, sampled), 4 * capture.axis.spacing)
+        reason = "the shortest above the noise that the wall points carry"
+    while wavelength < longest:
+        pulse = VirtualPulse(wavelength, cycles)
+        if spectrum.coherent_signal(pulse) < MIN_COHERENT_SIGNAL:
+            reason = "shorter waves are weaker than the photons' noise"
+        elif spectrum.fraction_shorter(pulse, aliased or np.inf) > MAX_ALIASED_FRACTION and aliased:
+            reason = "shorter waves are finer than the wall points sample"
+        elif spectrum.band_over_early(pulse) < MIN_BAND_OVER_EARLY:
+            reason = "shorter waves are as strong before any light can have come"
+        else:
+            break
+        wavelength *= WAVELENGTH_STEP_RATIO
+    else:
+        return round_wavelength_up(sampled), "no wave stands out of the noise: the shortest sampled"
+    return round_wavelength_up(wavelength), reason
+
+
+def round_wavelength_up(wavelength: float) -> float:
+    """Round a wavelength in m up to two digits in mm."""
+    value = wavelength * 1e3
+    step = math.floor(math.log10(value)) - WAVELENGTH_DIGITS + 1
+    # A value that is round already stays, whatever its last bit.
+    rounded = math.ceil(value / 10**step - 1e-9) * 10**step
+    return float(round(rounded, max(0, -step))) * 1e-3
+
+
+def find_shortest_wavelength(capture: Capture, cycles: float) -> float:
+    """Carrier of the shortest virtual pulse whose whole band a capture carries, m.
+
+    The band's shortest wave is sampled twice along the wall (four times in a confocal scan, where
+    the path grows on both legs) and twice along the record.
+
+    Parameters
+    ----------
+    capture : Capture
+    cycles : float
+        Length of the pulse in wavelengths.
+
+    Returns
+    -------
+    float
+        Metres.
+    """
+    return _band_reach(cycles) * max(_sampling_limit(capture), 2 * capture.axis.spacing)
+
+
+def find_longest_wavelength(capture: Capture) -> float:
+    """Carrier above which a point's image at a wall's width is wider than half the wall, m."""
+    extent = float(np.ptp(capture.points[:, :2], axis=0).max())
+    return extent / 2
+
+
+def find_sampling_step(capture: Capture) -> float:
+    """Distance of neighbouring wall points, or of the laser spots where one wall point sees them
+    all, m; else 0.
+    """
+    if math.isfinite(capture.spacing):
+        return capture.spacing
+    if capture.laser.ndim == 1:
+        return 0.0
+    # Light runs either way: the spots sample the scene as wall points would.
+    swapped = replace(capture, wall=capture.laser, laser=capture.wall).spacing
+    return swapped if math.isfinite(swapped) else 0.0
+
+
+def _band_reach(cycles: float) -> float:
+    """Highest wavenumber of a virtual pulse's band, relative to its carrier."""
+    pulse = VirtualPulse(1.0, cycles)
+    return 1 + math.sqrt(-2 * math.log(BAND_EDGE_LEVEL)) / (pulse.sigma * pulse.wavenumber)
+
+
+def _sampling_limit(capture: Capture, sine: float = 1.0) -> float:
+    """Shortest wave that the wall samples twice where it arrives under an angle of that sine, m."""
+    return sine * find_sampling_step(capture) * (4 if is_confocal(capture) else 2)
+
+
+def _steepest_angle(capture: Capture) -> float:
+    """Sine of the angle between the wall's normal and the way from one end of the wall to what is
+    brightest before the other.
+    """
+    extent = float(np.ptp(capture.points[:, :2], axis=0).max())
+    depth = max(find_brightest_path(capture) / 2, 0.0)
+    return extent / math.hypot(extent, depth) if extent > 0 else 1.0
 
 
 def _compute_profile(capture: Capture) -> tuple[FloatArray, FloatArray]:

@@ -17,7 +17,8 @@ from nlos.illumination_groups import group_by_illumination
 from nlos.io import read_capture
 from nlos.plane import PlanarWall
 from nlos.resolution import compute_diffraction_limit
-from nlos.settings import find_sampling_step, find_shortest_wavelength, settings_for
+from nlos.settings import settings_for
+from nlos.signal_analysis import find_sampling_step, find_shortest_wavelength
 from tofclip.errors import InputError
 from tofclip.units import MILLIMETRE, PICOSECOND
 
