@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 from pathlib import Path
+from types import ModuleType
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # Workers share the cores: products on threads of their own would only wait for each other.
@@ -21,9 +22,21 @@ if threading.current_thread() is threading.main_thread():
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tofclip.dependencies import import_open3d
+from tofclip.errors import MissingDependencyError
+
 # How long an example takes says nothing where the first one compiles, or where other programs run.
 settings.register_profile("anywhere", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("anywhere")
+
+
+@pytest.fixture(scope="session")
+def open3d() -> ModuleType:
+    """Open3D; what needs it is skipped where it has no wheel."""
+    try:
+        return import_open3d()
+    except MissingDependencyError as fault:
+        pytest.skip(str(fault))
 
 
 ROOMS_OF_LONG_FILES = {"viewer", "apps"}

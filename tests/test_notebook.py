@@ -139,8 +139,8 @@ def test_points_become_a_table(cloud: tofclip.PointCloud) -> None:
     assert np.array_equal(table[["x", "y", "z"]].to_numpy(), cloud.xyz)
 
 
+@pytest.mark.usefixtures("open3d")
 def test_points_become_open3ds(cloud: tofclip.PointCloud) -> None:
-    pytest.importorskip("open3d")
     assert np.allclose(np.asarray(cloud.to_open3d().points), cloud.xyz)
 
 

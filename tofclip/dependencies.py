@@ -4,6 +4,7 @@ missing ones.
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -81,4 +82,31 @@ def import_file_reader(name: str, install: str) -> Any:
     except (ImportError, OSError) as fault:
         raise MissingDependencyError(
             f"this file needs {name}: pip install '{install}' ({fault})"
+        ) from fault
+
+
+def import_open3d() -> Any:
+    """Import Open3D with the libusb of libusb-package: Open3D is linked against one, which bare
+    machines lack and its wheel does not bring.
+
+    Returns
+    -------
+    module
+
+    Raises
+    ------
+    MissingDependencyError
+        It is not installed, or does not load here.
+    """
+    try:
+        libusb = importlib.import_module("libusb_package").get_library_path()
+        # Symbols that the process has already are not looked for in the system's folders.
+        ctypes.CDLL(str(libusb), mode=ctypes.RTLD_GLOBAL)
+    except (ImportError, OSError):
+        pass  # the system may have its own
+    try:
+        return importlib.import_module("open3d")
+    except (ImportError, OSError) as fault:
+        raise MissingDependencyError(
+            f"Open3D does not load on this machine ({fault}): pip install open3d"
         ) from fault

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 import stat
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -50,20 +48,6 @@ def random_cloud(points: int, seed: int) -> PointCloud:
         numbers,
         1e-8 * column[3],
         {"seed": seed},
-    )
-
-
-@pytest.fixture(scope="module")
-def open3d() -> ModuleType:
-    """Open3D, which needs a libusb that bare machines lack; the wheel of libusb-package has one."""
-    try:
-        import libusb_package
-
-        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-    except (ImportError, OSError):
-        pass  # the system may have its own
-    return pytest.importorskip(
-        "open3d", reason="Open3D does not load on this machine", exc_type=ImportError
     )
 
 

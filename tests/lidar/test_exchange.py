@@ -70,10 +70,9 @@ def test_doubt_and_reflectance_travel_in_every_format(cloud, tmp_path, suffix) -
     assert np.isnan(PointCloud.load(path).false_alarm).all()
 
 
-def test_programs_of_others_see_doubt_and_reflectance(cloud, tmp_path) -> None:
+def test_programs_of_others_see_doubt_and_reflectance(open3d, cloud, tmp_path) -> None:
     doubt = np.linspace(0, 0.5, len(cloud)).astype(np.float32)
     known = replace(cloud, false_alarm=doubt, reflectance=100 * doubt)
-    open3d = pytest.importorskip("open3d")
     known.save(tmp_path / "cloud.ply")
     seen = open3d.t.io.read_point_cloud(str(tmp_path / "cloud.ply")).point
     np.testing.assert_array_equal(seen["false_alarm"].numpy().ravel(), doubt)
@@ -197,12 +196,11 @@ def test_one_return_of_each_pixel_is_chosen() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".pcd", ".ply", ".npz", ".csv"])
-def test_organised_clouds_have_a_place_for_every_pixel(tmp_path, suffix) -> None:
+def test_organised_clouds_have_a_place_for_every_pixel(open3d, tmp_path, suffix) -> None:
     returns, path = make_two_walls().select("first"), tmp_path / f"scene{suffix}"
     assert save_organised(returns, path) == 4
     there = point_cloud(returns)
     if suffix == ".pcd":
-        open3d = pytest.importorskip("open3d", exc_type=ImportError)
         assert b"\nWIDTH 6\nHEIGHT 4\n" in path.read_bytes()
         seen = open3d.t.io.read_point_cloud(str(path)).point.positions.numpy()
         assert seen.shape == (24, 3)

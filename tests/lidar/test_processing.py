@@ -33,15 +33,7 @@ from tofclip.lidar.processing import (
 NORMAL = np.array([0.2, -0.1, -1.0]) / np.linalg.norm([0.2, -0.1, -1.0])
 
 
-@pytest.fixture(scope="module", autouse=True)
-def open3d():
-    """Whatever needs Open3D is skipped where it does not load."""
-    from tofclip.lidar import processing
-
-    try:
-        return processing._import_open3d()
-    except MissingDependencyError as fault:
-        pytest.skip(str(fault))
+pytestmark = pytest.mark.usefixtures("open3d")
 
 
 def cloud_of(xyz: np.ndarray) -> PointCloud:

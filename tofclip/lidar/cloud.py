@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.dependencies import import_open3d
 from tofclip.errors import FileFormatError, InputError, ShapeError, require_type
 from tofclip.io.archive import ArchiveEntry
 from tofclip.lidar import export
@@ -200,9 +201,9 @@ class PointCloud(Storable):
         Raises
         ------
         MissingDependencyError
-            Open3D is not installed.
+            Open3D is not installed, or does not load here.
         """
-        open3d = require_package("open3d")
+        open3d = import_open3d()
         return open3d.geometry.PointCloud(
             open3d.utility.Vector3dVector(self.xyz.astype(np.float64))
         )

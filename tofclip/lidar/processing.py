@@ -5,7 +5,6 @@ Neighbourhoods, planes and registration are Open3D's, which is loaded on first u
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +12,8 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from tofclip.errors import InputError, MissingDependencyError, ShapeError
+from tofclip.dependencies import import_open3d
+from tofclip.errors import InputError, ShapeError
 from tofclip.lidar.cloud import PROPERTY_COLUMNS, PointCloud
 
 FloatArray = NDArray[np.float64]
@@ -245,8 +245,8 @@ def estimate_normals(cloud: PointCloud, neighbours: int = 16) -> FloatArray:
     """
     if len(cloud) < 3 or neighbours < 3:
         raise InputError("a normal needs at least three points and three neighbours")
-    open3d = _import_open3d()
-    shape = _to_open3d(cloud)
+    open3d = import_open3d()
+    shape = cloud.to_open3d()
     shape.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(neighbours))
     shape.orient_normals_towards_camera_location(np.zeros(3))
     return np.asarray(shape.normals)
@@ -274,9 +274,9 @@ def fit_plane(cloud: PointCloud, reach: float, seed: int = 0) -> Plane:
     """
     if len(cloud) < 3 or not reach > 0:
         raise InputError("a plane needs at least three points and a positive reach")
-    open3d = _import_open3d()
+    open3d = import_open3d()
     open3d.utility.random.seed(seed)
-    _, found = _to_open3d(cloud).segment_plane(reach, 3, 1000)
+    _, found = cloud.to_open3d().segment_plane(reach, 3, 1000)
     inliers = np.zeros(len(cloud), dtype=bool)
     inliers[np.asarray(found, dtype=np.int64)] = True
     points = cloud.xyz[inliers].astype(np.float64)
@@ -316,11 +316,11 @@ def align_clouds(
         raise InputError(
             "registration needs at least three points in each cloud and a positive reach"
         )
-    registration = _import_open3d().pipelines.registration
-    surface = _to_open3d(target)
-    surface.normals = _import_open3d().utility.Vector3dVector(estimate_normals(target))
+    registration = import_open3d().pipelines.registration
+    surface = target.to_open3d()
+    surface.normals = import_open3d().utility.Vector3dVector(estimate_normals(target))
     found = registration.registration_icp(
-        _to_open3d(source),
+        source.to_open3d(),
         surface,
         reach,
         np.eye(4) if start is None else np.asarray(start, dtype=np.float64),
@@ -329,25 +329,3 @@ def align_clouds(
     return Alignment(
         np.asarray(found.transformation), float(found.fitness), float(found.inlier_rmse)
     )
-
-
-def _to_open3d(cloud: PointCloud) -> Any:
-    open3d = _import_open3d()
-    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(cloud.xyz.astype(np.float64)))
-
-
-def _import_open3d() -> Any:
-    """Open3D; it wants a libusb, which libusb-package brings where the system has none."""
-    try:
-        import libusb_package
-
-        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-    except (ImportError, OSError):
-        pass  # the system may have its own
-    try:
-        import open3d
-    except (ImportError, OSError) as fault:
-        raise MissingDependencyError(
-            f"Open3D does not load on this machine ({fault}): pip install open3d"
-        ) from fault
-    return open3d
