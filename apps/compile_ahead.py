@@ -1,27 +1,30 @@
-"""Compile the loops of a first run side by side, in processes of their own, before they are needed.
+"""Compile the loops of a first run in other processes, while this one does what needs none of them yet.
 
-The compiler lets only one thread of a process work. Each group of `GROUPS` is compiled by a process
-that leaves the result in the compiler's cache, from which this process loads it.
+The compiler lets only one thread of a process work. Other processes leave what they compile in the
+compiler's cache, from which this one loads it. It waits only where it calls a loop that is not
+there yet, and that loop is compiled next.
 """
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from apps.progress import show_progress
-from tofclip.__main__ import OBJECTS_PER_COLLECTION
-from tofclip.compile_observers import observers
-from tofclip.threads import map_parallel
+from tofclip.compile_observers import observers, suppliers
+from tofclip.threads import thread_count
 
-TITLE = "compiling loops for this processor, once"
+MAX_PROCESSES = 3
+"""Each takes as long to start as two loops to compile."""
 
 PEAKS, NEIGHBOURS = "tofclip.lidar.search.peaks", "tofclip.lidar.neighbours"
 TABLE, EXACT = "tofclip.lidar.search.table_fit", "tofclip.lidar.search.exact_fit"
@@ -30,10 +33,22 @@ SOLVERS, SURFACES = "tofclip.solvers.kernels", "tofclip.recovery.surfaces.kernel
 
 LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
     {
+        (CAMERA, "mark_valid"): "(b1[:,::1], f4[:,::1], f4[:,::1], f4, b1[:,::1])",
+        (CAMERA, "sample_runs"): "(f4[:,::1], f4, f4[:,::1], u8[:,::1], f4[:,::1])",
+        (SOLVERS, "shrink_nonnegative"): (
+            "(f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[:,::1], f8[::1], f8[::1])"
+        ),
+        (OPERATORS, "count_tile_nonzeros"): "(i4[::1], i4[::1], i8, i8[:,::1])",
+        (OPERATORS, "sort_into_tiles"): (
+            "(i4[::1], i4[::1], f4[::1], i8, i8[:,::1], u4[::1], f4[::1])"
+        ),
+        (OPERATORS, "multiply_sparse_block"): "(i8[:,::1], u4[::1], f4[::1], f4[:,::1], f4[:,::1])",
+        (SOLVERS, "copy_lanes_to_frames"): "(f4[:,::1], f4[:,::1])",
+        (SOLVERS, "restore_frames"): "(f4[:,:,::1], f4[:,:,::1], f4[::1])",
         (PEAKS, "find_strongest_peaks"): (
             "(f4[:,::1], f8[::1], f4[::1], f4[:,::1], i8[::1], i8[::1], i8[::1], f4[::1],"
-            " f4[:,::1], i8[::1], f8[::1], UniTuple(f8, 3), i8[:,::1], UniTuple(f8, 5), f4[::1],"
-            " f4[:,::1], f4[::1], f8[:,::1], f8[:,:,::1])"
+            " f4[:,::1], i8[::1], f8[::1], UniTuple(f8, 3), i8[:,::1], UniTuple(f8, 5),"
+            " f4[::1], f4[:,::1], f4[::1], f8[:,::1], f8[:,:,::1])"
         ),
         (PEAKS, "confirm_peaks"): (
             "(f4[:,::1], f8[::1], f4[:,::1], i8[::1], f8[::1], UniTuple(f8, 5), f4[::1],"
@@ -53,89 +68,62 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
             "(f8[:,::1], i8, f4[:,::1], f8, i8[::1], f8[::1], f4[:,::1], f4[:,::1], f8[:,::1],"
             " f8[:,:,::1], i8[::1])"
         ),
-        (TABLE, "list_returns"): "(f8[:,:,::1], i8[::1], i8[::1], f8[:,::1])",
         (EXACT, "fit_returns_exactly"): (
             "(f4[:,::1], i8[::1], f8[::1], f8[:,::1], f8, i8[:,::1], f8[:,::1], i8,"
             " Tuple((f8[:,::1], UniTuple(f8, 4))), f8[:,::1], f8[:,::1], f8[:,:,::1], i8[::1])"
         ),
-        (CAMERA, "sample_runs"): "(f4[:,::1], f4, f4[:,::1], u8[:,::1], f4[:,::1])",
-        (CAMERA, "mark_valid"): "(b1[:,::1], f4[:,::1], f4[:,::1], f4, b1[:,::1])",
-        (OPERATORS, "count_tile_nonzeros"): "(i4[::1], i4[::1], i8, i8[:,::1])",
-        (OPERATORS, "sort_into_tiles"): (
-            "(i4[::1], i4[::1], f4[::1], i8, i8[:,::1], u4[::1], f4[::1])"
+        (TABLE, "list_returns"): "(f8[:,:,::1], i8[::1], i8[::1], f8[:,::1])",
+        (NEIGHBOURS, "scatter_about_planes"): (
+            "(f8[::1], f8[::1], i8[::1], i8, f8[:,:,:,::1], f8, i8[::1], f4[:,::1], f8[::1])"
         ),
-        (OPERATORS, "multiply_sparse_block"): (
-            "(i8[:,::1], u4[::1], f4[::1], f4[:,::1], f4[:,::1])"
-        ),
-        (SOLVERS, "descend_total_variation"): (
-            "(i8, f4[:,::1], f4[:,::1], f4[::1], f4[:,::1], f4[::1], f4[::1], f4[:,:,::1], f4[::1],"
-            " f4[:,::1], f4[::1])"
-        ),
-        (SOLVERS, "restore_frames"): "(f4[:,:,::1], f4[:,:,::1], f4[::1])",
-        (SOLVERS, "shrink_nonnegative"): (
-            "(f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[::1], f4[:,::1], f8[::1], f8[::1])"
-        ),
-        (SOLVERS, "copy_lanes_to_frames"): "(f4[:,::1], f4[:,::1])",
         (NEIGHBOURS, "pool_significance"): (
             "(i8[::1], f8[::1], f8[::1], f8[::1], i8[::1], UniTuple(i8, 2), UniTuple(f8, 2),"
             " f8[::1])"
-        ),
-        (NEIGHBOURS, "raise_to_maximum"): "(i8[::1], f8[::1], f8[::1])",
-        (NEIGHBOURS, "scatter_about_planes"): (
-            "(f8[::1], f8[::1], i8[::1], i8, f8[:,:,:,::1], f8, i8[::1], f4[:,::1], f8[::1])"
         ),
         (NEIGHBOURS, "borrow_scatter"): (
             "(f8[::1], f8[::1], i8[::1], UniTuple(i8, 2), f8, f8[:,::1], f8[::1])"
         ),
         (SURFACES, "split_over_slit"): "(f8[::1], f8, i8, i4[::1], f4[:,::1])",
         (SURFACES, "add_light"): "(f4[::1], i4[::1], f4[:,::1], i4[::1], f4[:,::1], f4[:,::1])",
+        (SURFACES, "smooth_rows"): "(f4[:,::1], f4[::1], i8[::1], i8, f4[:,::1])",
         (SURFACES, "gather_light"): (
             "(f4[:,::1], f8, i4[::1], f4[:,::1], i4[::1], f4[:,::1], f4[::1])"
         ),
-        (SURFACES, "smooth_rows"): "(f4[:,::1], f4[::1], i8[::1], i8, f4[:,::1])",
         (SURFACES, "apply_dual"): "(f4[:,::1], b1[:,::1], f8, f4[:,:,::1], f4[:,::1])",
-        (SURFACES, "ascend_dual"): ("(f4[:,::1], b1[:,::1], f8, f8, f4[:,:,::1], f4[:,:,::1])"),
+        (SURFACES, "ascend_dual"): "(f4[:,::1], b1[:,::1], f8, f8, f4[:,:,::1], f4[:,:,::1])",
+        (NEIGHBOURS, "raise_to_maximum"): "(i8[::1], f8[::1], f8[::1])",
+        (SOLVERS, "descend_total_variation"): (
+            "(i8, f4[:,::1], f4[:,::1], f4[::1], f4[:,::1], f4[::1], f4[::1], f4[:,:,::1],"
+            " f4[::1], f4[:,::1], f4[::1])"
+        ),
     }
 )
-"""Module and name of the loops that recovery and ranging of a shot call, and for which arguments: a
-letter and bytes for each kind of number, as Numba writes them."""
-
-GROUPS: Sequence[Sequence[str]] = (
-    (PEAKS, TABLE, EXACT, OPERATORS),
-    (SOLVERS, CAMERA, NEIGHBOURS, SURFACES),
-)
-"""Modules whose loops take about as long to compile together, each for a process."""
-
-FUNCTIONS_PER_GROUP = (25, 33)
-"""Loops and their parts, which the compiler takes one by one."""
+"""Module and name of the loops that recovery and ranging of a shot call, in the order in which the
+demonstration does, and for which arguments: a letter and bytes for each kind of number, as Numba
+writes them."""
 
 
-def compile_loops_ahead() -> None:
-    """Compile what recovering and ranging a shot call, on two cores if they may be used.
+@contextlib.contextmanager
+def compile_loops_ahead() -> Iterator[None]:
+    """Compile what recovering and ranging a shot call, in other processes, while the block runs.
 
-    What is in the cache is not compiled again, and if nothing is missing nothing is said. A process
-    that fails leaves its loops to be compiled when they are called.
+    What is in the cache is not compiled again. If a process fails, what is left is compiled when it
+    is called. What is not compiled at the end of the block is left to the next run.
     """
-    groups = [number for number, group in enumerate(GROUPS) if any(map(_is_missing, group))]
-    if not groups:
+    missing = [loop for loop in LOOPS if not _has_entry(_find_loop(*loop))]
+    if not missing:
+        yield
         return
-    total = sum(FUNCTIONS_PER_GROUP[number] for number in groups)
-    with show_progress(TITLE, total) as advance:
-
-        def compile_group(number: int) -> None:
-            left = FUNCTIONS_PER_GROUP[number]
-            for _ in _read_compiled(GROUPS[number]):
-                advance(min(left, 1))
-                left -= min(left, 1)
-            advance(left)
-
-        for _ in map_parallel(compile_group, groups):
-            pass
-
-
-def _is_missing(module: str) -> bool:
-    """Whether a loop of a module was never compiled as it stands on this machine."""
-    return any(not _has_entry(_find_loop(home, name)) for home, name in LOOPS if home == module)
+    for report in tuple(observers):
+        report(missing[0][1])
+    compilation = _Compilation(missing)
+    suppliers.append(compilation.wait_for)
+    try:
+        compilation.start()
+        yield
+    finally:
+        suppliers.remove(compilation.wait_for)
+        compilation.stop()
 
 
 def _find_loop(module: str, name: str) -> Any:
@@ -153,51 +141,113 @@ def _has_entry(loop: Any) -> bool:
     return any(entry.stat().st_mtime >= changed for entry in folder.glob(f"{stem}*.nbi"))
 
 
-def _read_compiled(modules: Sequence[str]) -> Iterator[str]:
-    """Compile the loops of modules in a process and yield each function's name as its turn comes."""
-    root = str(Path(__file__).resolve().parents[1])
-    paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
-    try:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "apps.compile_ahead", *modules],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
-        )
-    except OSError:  # no other process can be started: the loops are compiled when they are called
-        return
-    with process:
-        try:
-            assert process.stdout is not None
-            for line in process.stdout:
-                yield line.strip()
-        finally:
-            process.kill()
-
-
-def compile_modules(modules: Sequence[str], report: Callable[[str], None]) -> None:
-    """Compile the loops of modules in this process.
+class _Compilation:
+    """Processes that compile loops, each of them one loop after another.
 
     Parameters
     ----------
-    modules : sequence of str
-        Of those in `LOOPS`.
+    loops : iterable of (str, str)
+        Module and name, in the order in which they are needed.
+    """
+
+    def __init__(self, loops: Iterable[tuple[str, str]]) -> None:
+        self._left = deque(loops)
+        self._ended = {loop: threading.Event() for loop in self._left}
+        self._lock = threading.Lock()
+        self._processes: list[subprocess.Popen[str]] = []
+
+    def start(self) -> None:
+        """Begin to compile."""
+        try:
+            for _ in range(min(max(thread_count(), 2), MAX_PROCESSES, len(self._left))):
+                self._processes.append(_start_process())
+        except OSError:  # no further process can be started
+            if not self._processes:
+                self._give_up()
+        for process in self._processes:
+            threading.Thread(target=self._feed, args=(process,), daemon=True).start()
+
+    def stop(self) -> None:
+        """End all processes, also those that are at work."""
+        self._give_up()
+        for process in self._processes:
+            process.kill()
+            process.wait()
+
+    def wait_for(self, module: str, name: str) -> None:
+        """Return when a loop is in the cache, or is left to its caller; until then it is next in turn.
+
+        Parameters
+        ----------
+        module, name : str
+        """
+        loop = module, name
+        with self._lock:
+            if loop in self._left:
+                self._left.remove(loop)
+                self._left.appendleft(loop)
+        if loop in self._ended:
+            self._ended[loop].wait()
+
+    def _feed(self, process: subprocess.Popen[str]) -> None:
+        """Let a process compile what is left, one loop after another."""
+        assert process.stdin is not None
+        assert process.stdout is not None
+        with contextlib.suppress(OSError), process.stdin, process.stdout:
+            while (loop := self._take_next()) is not None:
+                print(*loop, file=process.stdin, flush=True)
+                if not process.stdout.readline():
+                    break
+                self._ended[loop].set()
+            else:
+                return
+        self._give_up()  # it has died
+
+    def _take_next(self) -> tuple[str, str] | None:
+        with self._lock:
+            return self._left.popleft() if self._left else None
+
+    def _give_up(self) -> None:
+        """Leave what is left to those who call it."""
+        with self._lock:
+            self._left.clear()
+        for ended in self._ended.values():
+            ended.set()
+
+
+def _start_process() -> subprocess.Popen[str]:
+    root = str(Path(__file__).resolve().parents[1])
+    paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
+    return subprocess.Popen(
+        [sys.executable, "-m", "apps.compile_ahead"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+    )
+
+
+def compile_named(lines: Iterable[str], report: Callable[[str], None]) -> None:
+    """Compile loops in this process.
+
+    Parameters
+    ----------
+    lines : iterable of str
+        Module and name of each loop, which is one of `LOOPS`.
     report : callable
-        Called with the name of each function whose compiling begins.
+        Called with the name of each loop that is compiled.
     """
     from numba.core.sigutils import normalize_signature
 
-    observers.append(report)
-    try:
-        for (module, name), arguments in LOOPS.items():
-            if module in modules:
-                # the cache knows a loop by the types as a call gives them, not by their names
-                _find_loop(module, name).compile(normalize_signature(arguments)[0])
-    finally:
-        observers.remove(report)
+    for line in lines:
+        module, name = line.split()
+        # the cache knows a loop by the types as a call gives them, not by their names
+        arguments, _ = normalize_signature(LOOPS[module, name])
+        _find_loop(module, name).compile(arguments)
+        report(name)
 
 
 if __name__ == "__main__":
-    gc.set_threshold(OBJECTS_PER_COLLECTION)
-    compile_modules(sys.argv[1:], lambda name: print(name, flush=True))
+    gc.disable()  # nearly all that the compiler makes stays, and the process ends soon
+    compile_named(sys.stdin, lambda name: print(name, flush=True))

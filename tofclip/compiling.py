@@ -15,19 +15,48 @@ from typing import Any, TypeVar
 
 from numba import njit
 from numba.core import event
+from numba.core.caching import FunctionCache
 from numba.extending import register_jitable
 
-from tofclip.compile_observers import observers
+from tofclip.compile_observers import observers, suppliers
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-compile_loop: Callable[..., Callable[[Any], Any]] = partial(
-    njit, nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True, _nrt=False
-)
-"""Make the decorator of loops that Python calls and that write into arrays they are given, with
-options of `numba.njit` such as ``fastmath``. They make no array, so that nothing counts who holds
-one, and C does not call them: both would be compiled into each of them.
-"""
+
+class _SuppliedCache(FunctionCache):  # type: ignore[misc]
+    """The compiler's cache, to which another process may be about to add the loop."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        for supply in tuple(suppliers):
+            supply(self._py_func.__module__, self._py_func.__name__)
+        return super().load_overload(sig, target_context)
+
+
+def compile_loop(**options: Any) -> Callable[[Any], Any]:
+    """Make the decorator of loops that Python calls and that write into arrays they are given.
+
+    They make no array, so that nothing counts who holds one, and C does not call them: both would
+    be compiled into each of them.
+
+    Parameters
+    ----------
+    **options
+        Of `numba.njit`, such as ``fastmath``.
+
+    Returns
+    -------
+    callable
+    """
+    usual = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": False}
+
+    def decorate(function: Any) -> Any:
+        loop: Any = njit(**{**usual, **options})(function)
+        if loop is not function:  # as it is where nothing is compiled
+            loop._cache = _SuppliedCache(function)  # what njit's own `cache` sets as well
+        return loop
+
+    return decorate
+
 
 compile_as_part: Callable[..., Callable[[F], F]] = partial(
     register_jitable, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True

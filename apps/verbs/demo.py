@@ -46,14 +46,14 @@ def demo(
 
     Skew, gains and slit centres are found from the shot itself. Surfaces are recovered from the whole shot at
     once; the picture shows them beside total variation of each frame. Writes streak.h5, frames.h5,
-    cloud.ply and preview.png. The first run on a machine compiles the loops it needs, on two cores.
+    cloud.ply and preview.png. In the first run on a machine, other processes compile the loops that it needs.
 
     Example: tofclip demo --out demo-output
     """
     started = time.perf_counter()
     make_folder(out)
-    compile_loops_ahead()
-    run = _run_demo(seed)
+    with compile_loops_ahead():
+        run = _run_demo(seed)
     written = [out / name for name in ("streak.h5", "frames.h5", "cloud.ply", "preview.png")]
     run.streak.save(written[0])
     run.frames.save(written[1])
