@@ -1,4 +1,4 @@
-"""Compile the loops of a first run in other processes, while this one does what needs none of them yet.
+"""Compile the loops of a first run in other processes, while this one does what needs none.
 
 The compiler lets only one thread of a process work. Other processes leave what they compile in the
 compiler's cache, from which this one loads it. It waits only where it calls a loop that is not
@@ -175,7 +175,7 @@ class _Compilation:
             process.wait()
 
     def wait_for(self, module: str, name: str) -> None:
-        """Return when a loop is in the cache, or is left to its caller; until then it is next in turn.
+        """Return when a loop is in the cache, or left to its caller; it is the next in turn.
 
         Parameters
         ----------

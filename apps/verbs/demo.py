@@ -46,7 +46,7 @@ def demo(
 
     Skew, gains and slit centres are found from the shot itself. Surfaces are recovered from the whole shot at
     once; the picture shows them beside total variation of each frame. Writes streak.h5, frames.h5,
-    cloud.ply and preview.png. In the first run on a machine, other processes compile the loops that it needs.
+    cloud.ply and preview.png. The first run on a machine compiles the loops it needs meanwhile.
 
     Example: tofclip demo --out demo-output
     """
