@@ -27,6 +27,7 @@ MAX_PROCESSES = 3
 """Each takes as long to start as two loops to compile."""
 
 PEAKS, NEIGHBOURS = "tofclip.lidar.search.peaks", "tofclip.lidar.neighbours"
+CANDIDATES = "tofclip.lidar.candidate_loops"
 TABLE, EXACT = "tofclip.lidar.search.table_fit", "tofclip.lidar.search.exact_fit"
 CAMERA, OPERATORS = "tofclip.camera.kernels", "tofclip.operators.kernels"
 SOLVERS, SURFACES = "tofclip.solvers.kernels", "tofclip.recovery.surfaces.kernels"
@@ -73,16 +74,22 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
             " Tuple((f8[:,::1], UniTuple(f8, 4))), f8[:,::1], f8[:,::1], f8[:,:,::1], i8[::1])"
         ),
         (TABLE, "list_returns"): "(f8[:,:,::1], i8[::1], i8[::1], f8[:,::1])",
-        (NEIGHBOURS, "scatter_about_planes"): (
-            "(f8[::1], f8[::1], i8[::1], i8, f8[:,:,:,::1], f8, i8[::1], f4[:,::1], f8[::1])"
-        ),
-        (NEIGHBOURS, "pool_significance"): (
+        (CANDIDATES, "pool_significance"): (
             "(i8[::1], f8[::1], f8[::1], f8[::1], i8[::1], UniTuple(i8, 2), UniTuple(f8, 2),"
             " f8[::1])"
         ),
-        (NEIGHBOURS, "borrow_scatter"): (
-            "(f8[::1], f8[::1], i8[::1], UniTuple(i8, 2), f8, f8[:,::1], f8[::1])"
+        (CANDIDATES, "list_kept"): (
+            "(i8[::1], f8[:,::1], b1[::1], i8, i8[::1], i4[:,::1], u1[::1], f8[:,::1], f4[::1])"
         ),
+        (NEIGHBOURS, "count_returns"): "(i8[::1], i8[::1])",
+        (NEIGHBOURS, "fill_layers"): "(f8[::1], i8[::1], i8[::1], i8, f4[:,:,:,::1])",
+        (NEIGHBOURS, "scatter_about_planes"): (
+            "(f8[::1], f8[::1], i8[::1], i8, f4[:,:,:,::1], f8, i8[::1], f4[:,::1], f8[::1])"
+        ),
+        (NEIGHBOURS, "borrow_scatter"): (
+            "(f8[::1], f8[::1], i8[::1], UniTuple(i8, 2), f8, f4[:,::1], f8[::1])"
+        ),
+        (NEIGHBOURS, "widen_deviations"): "(f8[::1], f8[::1], f4[::1])",
         (SURFACES, "split_over_slit"): "(f8[::1], f8, i8, i4[::1], f4[:,::1])",
         (SURFACES, "add_light"): "(f4[::1], i4[::1], f4[:,::1], i4[::1], f4[:,::1], f4[:,::1])",
         (SURFACES, "smooth_rows"): "(f4[:,::1], f4[::1], i8[::1], i8, f4[:,::1])",
@@ -91,7 +98,12 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
         ),
         (SURFACES, "apply_dual"): "(f4[:,::1], b1[:,::1], f8, f4[:,:,::1], f4[:,::1])",
         (SURFACES, "ascend_dual"): "(f4[:,::1], b1[:,::1], f8, f8, f4[:,:,::1], f4[:,:,::1])",
-        (NEIGHBOURS, "raise_to_maximum"): "(i8[::1], f8[::1], f8[::1])",
+        (CANDIDATES, "raise_maxima"): (
+            "(i8[::1], f8[::1], f8[::1], UniTuple(f8, 2), f8[::1], f8[::1])"
+        ),
+        (CANDIDATES, "mark_strong"): (
+            "(i8[::1], f8[::1], f8[::1], UniTuple(f8, 2), f8[::1], f8[::1], b1[::1])"
+        ),
         (SOLVERS, "descend_total_variation"): (
             "(i8, f4[:,::1], f4[:,::1], f4[::1], f4[:,::1], f4[::1], f4[::1], f4[:,:,::1],"
             " f4[::1], f4[:,::1], f4[::1])"

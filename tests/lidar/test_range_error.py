@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from tofclip.lidar.candidate_loops import pool_significance
 from tofclip.lidar.neighbours import (
     add_recovery_error,
     allocate_window,
     layer_returns,
-    pool_significance,
     scatter_about_planes,
 )
 

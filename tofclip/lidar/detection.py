@@ -92,15 +92,15 @@ class Detection:
         -------
         (n,) bool array
         """
+        strong = np.zeros(pixel.size, dtype=bool)
         if pixel.size == 0:
-            return np.zeros(0, dtype=bool)
-        strongest = _find_strongest(pixel, intensity)
-        local = _find_local_maximum(time, intensity, pulse_width, time)
-        needed = np.maximum(
-            self._compute_least_of_scene(strongest), self.min_time_bin_fraction * local
-        )
-        np.maximum(needed, self.min_pixel_fraction * strongest.take(pixel), out=needed)
-        strong: NDArray[np.bool_] = intensity >= needed
+            return strong
+        # the compiler takes as long to import as all else
+        from tofclip.lidar.candidate_loops import mark_strong
+
+        strongest, needed, axis = self._find_brightest(pixel, time, intensity, pulse_width, time)
+        of_pixel = self.min_pixel_fraction * strongest
+        mark_strong(pixel, time, intensity, axis, of_pixel, needed, strong)
         return strong
 
     def compute_least_intensity(
@@ -125,39 +125,72 @@ class Detection:
         (m,) float64 array
             Brightness with the fall-off with range undone.
         """
-        least = self._compute_least_of_scene(_find_strongest(pixel, intensity))
-        local = _find_local_maximum(time, intensity, pulse_width, at)
-        return np.maximum(least, self.min_time_bin_fraction * local)
+        _, needed, (start, per_second) = self._find_brightest(
+            pixel, time, intensity, pulse_width, at
+        )
+        wanted = ((at - start) * per_second + 0.5).astype(np.int64)
+        least: FloatArray = needed.take(wanted)
+        return least
 
-    def _compute_least_of_scene(self, strongest: FloatArray) -> float:
-        """Return what the scene asks of a return, from the strongest intensity of each pixel."""
-        scene = np.quantile(strongest[strongest > 0], SCENE_BRIGHTNESS_QUANTILE)
-        return self.min_scene_fraction * float(scene)
+    def _find_brightest(
+        self,
+        pixel: NDArray[np.int64],
+        time: FloatArray,
+        intensity: FloatArray,
+        width: float,
+        at: FloatArray,
+    ) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
+        """What a return is compared with.
+
+        Parameters
+        ----------
+        pixel, time, intensity
+            As for `find_significant`; at least one candidate.
+        width : float
+            Of a pulse, s.
+        at : (m,) array
+            Instants of interest, s.
+
+        Returns
+        -------
+        strongest : (pixels,) array
+            Largest intensity of each pixel, 0 where there is no candidate.
+        needed : (slots,) array
+            What the scene and its brightest return within a pulse's width ask of each instant.
+        axis : (float, float)
+            First slot's instant, s, and how many slots there are in a second.
+        """
+        # the compiler takes as long to import as all else
+        from tofclip.lidar.candidate_loops import raise_maxima
+
+        start, end = min(time.min(), at.min()), max(time.max(), at.max())
+        axis = float(start), SLOTS_PER_WIDTH / width
+        strongest = np.zeros(int(pixel.max()) + 1)
+        brightest = np.zeros(int((end - start) * axis[1] + 0.5) + 1)
+        raise_maxima(pixel, time, intensity, axis, strongest, brightest)
+        around = scipy.ndimage.maximum_filter1d(brightest, 2 * SLOTS_PER_WIDTH + 1)
+        scene = find_quantile_value(strongest[strongest > 0], SCENE_BRIGHTNESS_QUANTILE)
+        least = self.min_scene_fraction * scene
+        return strongest, np.maximum(least, self.min_time_bin_fraction * around), axis
 
 
-def _find_strongest(pixel: NDArray[np.int64], intensity: FloatArray) -> FloatArray:
-    """Largest intensity of each pixel, 0 where there is no candidate."""
-    # the compiler takes as long to import as all else
-    from tofclip.lidar.neighbours import raise_to_maximum
+def find_quantile_value(values: NDArray[np.floating], fraction: float) -> float:
+    """Return a quantile as `numpy.quantile` does, which looks for two numbers at once, by a way that
+    takes ten times as long.
 
-    strongest = np.zeros(int(pixel.max()) + 1)
-    raise_to_maximum(pixel, intensity, strongest)
-    return strongest
+    Parameters
+    ----------
+    values : (n,) float array
+        At least one.
+    fraction : float
 
-
-def _find_local_maximum(
-    time: FloatArray, intensity: FloatArray, width: float, at: FloatArray
-) -> FloatArray:
-    """Largest intensity among the candidates within `width` of each instant `at`, to a quarter of a
-    width.
+    Returns
+    -------
+    float
     """
-    from tofclip.lidar.neighbours import raise_to_maximum
-
-    spacing, start = width / SLOTS_PER_WIDTH, min(time.min(), at.min())
-    slot = np.rint((time - start) / spacing).astype(np.int64)
-    wanted = slot if at is time else np.rint((at - start) / spacing).astype(np.int64)
-    brightest = np.zeros(int(max(slot.max(), wanted.max())) + 1)
-    raise_to_maximum(slot, intensity, brightest)
-    around: FloatArray = scipy.ndimage.maximum_filter1d(brightest, 2 * SLOTS_PER_WIDTH + 1)
-    chosen: FloatArray = around.take(wanted)
-    return chosen
+    place = fraction * (values.size - 1)
+    before = int(place)
+    ordered = np.partition(values, before)
+    value = float(ordered[before])
+    above = float(ordered[before + 1 :].min(initial=np.inf))
+    return value + (place - before) * (above - value) if place > before else value

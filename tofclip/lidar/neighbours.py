@@ -24,8 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.compiling import compile_loop, inlined
+from tofclip.lidar.detection import find_quantile_value
 from tofclip.threads import run_blocks
 from tofclip.vectors import (
+    LENGTH,
     STEP,
     choose,
     count_set_lanes,
@@ -38,6 +40,8 @@ from tofclip.vectors import (
 )
 
 FloatArray = NDArray[np.float64]
+
+ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
 
 REACH_PX, STRIDE_PX = 8, 2
 """Neighbours that share a plane, and their distance: errors of adjacent pixels are much alike."""
@@ -64,17 +68,14 @@ MARGIN = REACH_PX // STRIDE_PX
 SIDE = 2 * MARGIN + 1
 """Places for neighbours in a row of a window, and rows of a window."""
 
-WIDTH = 12
-"""Places of a row that are looked at, in whole vectors; those after `SIDE` are not used."""
-
 NEIGHBOURS = 96
 """Room for the SIDE^2 = 81 neighbours, in whole vectors."""
 
-CELL_LANES = 8
-"""Returns of a cell are compared with those around in whole vectors."""
-
 FAR = 1e20
 """Nearness of a neighbour that is not there, 1/m."""
+
+INTERPOLATED_LOOKS = 5
+"""At residuals, for their median, before intervals are halved: most often that is enough."""
 
 
 def add_recovery_error(
@@ -106,11 +107,11 @@ def add_recovery_error(
     (n,) float64 array
         One standard deviation, m. Returns with few neighbours get what is usual for the others.
     """
-    total = np.asarray(sigma, dtype=np.float64).copy()
+    total = np.array(sigma, dtype=np.float64)
     if pixel.size == 0:
         return total
-    starts = np.zeros(image_shape[0] * image_shape[1] + 1, np.int64)
-    np.cumsum(np.bincount(pixel, minlength=starts.size - 1), out=starts[1:])
+    starts = np.empty(image_shape[0] * image_shape[1] + 1, np.int64)
+    most = count_returns(pixel, starts)
     nearness = 1 / (distance * along_axis)
     metres = distance / nearness
     layers = layer_returns(nearness, pixel, starts, image_shape)
@@ -133,41 +134,31 @@ def add_recovery_error(
         run_blocks(fit, chosen.size, RETURNS_PER_BLOCK)
 
     # neighbours have nearly the same returns around them: one plane in sixteen does
-    fit_planes(np.flatnonzero(_lay_out(image_shape)[1].take(pixel)))
+    fit_planes(np.flatnonzero(_mark_own_planes(image_shape).take(pixel)))
     # zeros, since numbers too small to be normal take a hundred times as long
-    cell = np.zeros((3, PLANE_STEP_PX**2 * layers.shape[0] + CELL_LANES))
+    cell = np.zeros((3, _fill_up(PLANE_STEP_PX**2 * most)), np.float32)
     borrow_scatter(nearness, metres, starts, image_shape, gate, cell, scatter)
     fit_planes(np.flatnonzero(np.isnan(scatter)))
-    known = scatter >= 0
-    if np.count_nonzero(known) < MIN_KNOWN:
-        return total
-    variance = total * total
-    excess = np.maximum(scatter * scatter - variance, 0)
-    found = np.sqrt(variance + PLANE_SHARE * excess)
-    usual = float(np.median((found / total)[known]))
-    return np.where(known, found, usual * total)
+    ratios = np.empty(total.size, np.float32)
+    known = widen_deviations(scatter, total, ratios)
+    if known < MIN_KNOWN:
+        return np.array(sigma, dtype=np.float64)
+    if known < total.size:
+        total[scatter < 0] *= find_quantile_value(ratios[:known], 0.5)
+    return total
+
+
+def _fill_up(number: int) -> int:
+    """The least number of whole vectors' lanes that is not smaller."""
+    return -(-number // LENGTH) * LENGTH
 
 
 @lru_cache(maxsize=4)
-def _lay_out(
-    image_shape: tuple[int, int],
-) -> tuple[NDArray[np.int64], NDArray[np.bool_], tuple[int, int, int]]:
-    """Where each pixel lies in a layer of `layer_returns`, whether its returns have planes of their
-    own, and a layer's shape.
-    """
+def _mark_own_planes(image_shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Which pixels' returns have planes of their own."""
     y, x = np.indices(image_shape).reshape(2, -1)
-    own_plane = (y % PLANE_STEP_PX == 0) & (x % PLANE_STEP_PX == 0)
-    rows, columns = (-(-size // STRIDE_PX) + MARGIN for size in image_shape)
-    shape = (STRIDE_PX**2, rows + MARGIN, columns + WIDTH)
-    place = np.ravel_multi_index(
-        (
-            y % STRIDE_PX * STRIDE_PX + x % STRIDE_PX,
-            y // STRIDE_PX + MARGIN,
-            x // STRIDE_PX + MARGIN,
-        ),
-        shape,
-    )
-    return place, own_plane, shape
+    marked: NDArray[np.bool_] = (y % PLANE_STEP_PX == 0) & (x % PLANE_STEP_PX == 0)
+    return marked
 
 
 def layer_returns(
@@ -175,7 +166,7 @@ def layer_returns(
     pixel: NDArray[np.int64],
     starts: NDArray[np.int64],
     image_shape: tuple[int, int],
-) -> FloatArray:
+) -> NDArray[np.float32]:
     """Lay out the returns so that those at the neighbours' distance lie side by side.
 
     Parameters
@@ -190,14 +181,14 @@ def layer_returns(
 
     Returns
     -------
-    (most returns of a pixel, 4, rows, columns) float64 array
+    (most returns of a pixel, 4, rows, columns) float32 array
         `nearness` of each pixel's first, second, ... returns, `FAR` where there is none; of pixels of
         even rows and columns, even rows and odd columns, and so on, within a margin.
     """
-    place, _, shape = _lay_out(image_shape)
-    number = np.arange(pixel.size) - starts.take(pixel)
-    layers = np.full((int(number.max()) + 1, *shape), FAR)
-    layers.reshape(-1)[place.take(pixel) + number * layers[0].size] = nearness
+    rows, columns = (-(-size // STRIDE_PX) + 2 * MARGIN for size in image_shape)
+    shape = (int(np.diff(starts).max()), STRIDE_PX**2, rows, columns + LENGTH - SIDE)
+    layers = np.full(shape, FAR, np.float32)
+    fill_layers(nearness, pixel, starts, image_shape[1], layers)
     return layers
 
 
@@ -212,7 +203,49 @@ def allocate_window() -> NDArray[np.float32]:
     return window
 
 
-@compile_loop(fastmath=True, _nrt=True)
+@compile_loop()
+def count_returns(pixel, starts):
+    """List the first return of each pixel; return how many the pixel has that has most.
+
+    Parameters
+    ----------
+    pixel : (n,) int64 array
+        Not decreasing.
+    starts : (pixels + 1,) int64 array
+        Overwritten.
+
+    Returns
+    -------
+    int
+    """
+    most = number = np.uintp(0)
+    for p in range(starts.size):
+        starts[p] = number
+        while number < np.uintp(pixel.size) and pixel[number] == p:
+            number += ONE
+        most = max(most, number - np.uintp(starts[p]))
+    return np.int64(most)
+
+
+@compile_loop()
+def fill_layers(nearness, pixel, starts, columns, layers):
+    """Lay out the returns in `layers`.
+
+    Parameters
+    ----------
+    nearness, pixel, starts, layers
+        As for `layer_returns`; those of `layers` in which returns lie are overwritten.
+    columns : int
+        Of the picture.
+    """
+    for number in range(pixel.size):
+        y, x = pixel[number] // columns, pixel[number] % columns
+        part = y % STRIDE_PX * STRIDE_PX + x % STRIDE_PX
+        down, right = y // STRIDE_PX + MARGIN, x // STRIDE_PX + MARGIN
+        layers[number - starts[pixel[number]], part, down, right] = nearness[number]
+
+
+@compile_loop(fastmath=True)
 def scatter_about_planes(nearness, metres, pixel, columns, layers, gate, chosen, memory, scatter):
     """Robust deviation of the returns around each from a plane through them, -1 if they are few.
 
@@ -236,19 +269,17 @@ def scatter_about_planes(nearness, metres, pixel, columns, layers, gate, chosen,
     scatter : (n,) array
         Overwritten at the chosen: m.
     """
-    nearest = np.empty(SIDE * WIDTH)
     for own in chosen:
         y, x = pixel[own] // columns, pixel[own] % columns
-        take_nearest(layers, (y, x), nearness[own], nearest)
-        for j in range(SIDE):
-            for i in range(SIDE):
-                memory[2, j * SIDE + i] = np.float32(nearest[j * WIDTH + i] * metres[own])
+        take_nearest(layers, (y, x), np.float32(nearness[own]), np.float32(metres[own]), memory[2])
         deviation, most, a, b, c, count = -1.0, gate, 0.0, 0.0, 0.0, 0
+        median = np.float32(0)
         for rounds in range(FIT_ROUNDS + 1):
             measure_offsets(memory, a, b, c)
             if rounds > 0:
                 free = count / (count - 3.0)
-                deviation = MAD_TO_SIGMA * find_median(memory, count) * math.sqrt(free)
+                median = find_median(memory, count, median)
+                deviation = MAD_TO_SIGMA * median * math.sqrt(free)
                 most = OUTLIER_DEVIATIONS * deviation
             changed = mark_near(memory, most)
             # where nothing changed further rounds would find the same
@@ -262,7 +293,7 @@ def scatter_about_planes(nearness, metres, pixel, columns, layers, gate, chosen,
 
 
 @inlined
-def take_nearest(layers, own, nearness, nearest):
+def take_nearest(layers, own, nearness, metres, off):
     """Of each pixel around, take the return that is nearest in range.
 
     Parameters
@@ -271,21 +302,25 @@ def take_nearest(layers, own, nearness, nearest):
         See `layer_returns`.
     own : (int, int)
         Row and column of the pixel in the middle.
-    nearness : float
-        Of its return, 1/m.
-    nearest : (SIDE * WIDTH,) array
-        Overwritten: by how much its nearness is greater, 1/m; beyond any gate where there is none.
+    nearness, metres : float32
+        Of its return, 1/m, and change of its range for a change of that, m^2.
+    off : (NEIGHBOURS,) float32 array
+        Overwritten: by how much further each neighbour is, m; beyond any gate where there is none.
     """
-    top, left = own[0] // STRIDE_PX, own[1] // STRIDE_PX
+    top, left = own[0] // STRIDE_PX, np.uintp(own[1] // STRIDE_PX)
     part = own[0] % STRIDE_PX * STRIDE_PX + own[1] % STRIDE_PX
-    for t in range(SIDE * WIDTH):
-        nearest[t] = FAR
-    for layer in range(layers.shape[0]):
-        window = layers[layer, part, top : top + SIDE, left : left + WIDTH]
-        for j in range(SIDE):
-            for i in range(WIDTH):
-                off, best = nearness - window[j, i], nearest[j * WIDTH + i]
-                nearest[j * WIDTH + i] = off if math.fabs(off) < math.fabs(best) else best
+    here, scale, zero = fill_vector(nearness), fill_vector(metres), fill_vector(np.float32(0))
+    for j in range(SIDE):
+        nearest = far = fill_vector(np.float32(FAR))
+        for layer in range(layers.shape[0]):
+            away = here - load_vector(layers[layer, part, top + j], left)
+            distance = choose(away > zero, away, zero - away)
+            nearest = choose(far > distance, away, nearest)
+            far = choose(far > distance, distance, far)
+        # the lanes behind the row's last place are overwritten by the next row
+        store_vector(off, np.uintp(SIDE * j), nearest * scale)
+    for t in range(SIDE * SIDE, NEIGHBOURS):
+        off[t] = FAR
 
 
 @inlined
@@ -333,8 +368,8 @@ def mark_near(memory, most):
 
 
 @inlined
-def find_median(memory, count):
-    """Return the median of what is used, by halving an interval: each step is one look at all.
+def find_median(memory, count, guess):
+    """Return the median of what is used, by narrowing an interval: each step is one look at all.
 
     Parameters
     ----------
@@ -342,32 +377,83 @@ def find_median(memory, count):
         See `scatter_about_planes`.
     count : int
         Of those used, at least one.
+    guess : float32
+        Where the first look is; not above zero where nothing is known.
 
     Returns
     -------
-    float
-        To `MEDIAN_PRECISION` of the largest.
+    float32
+        To `MEDIAN_PRECISION` of the largest where some in the middle are that close together.
     """
-    used, residual = memory[3], memory[4]
-    tops = zero = fill_vector(np.float32(0))
-    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
-        here = load_vector(used, t) * load_vector(residual, t)
-        tops = choose(here > tops, here, tops)
-    low, high = np.float32(0), find_highest_lane(tops)
+    low, high = np.float32(0), find_residuals_beside(memory, np.float32(FAR))[0]
     precision, middle = np.float32(MEDIAN_PRECISION) * high, high
+    half, below_low, below_high = np.float32(0.5 * count), np.float32(0), np.float32(count)
+    looks = 0
     while high - low > precision:
-        middle, below = np.float32(0.5) * (low + high), 0
-        limit = fill_vector(middle)
-        for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
-            near = limit >= load_vector(residual, t)
-            below += count_set_lanes(near & (load_vector(used, t) > zero))
-        if 2 * below == count:
-            return middle
+        # as if residuals lay evenly between the two, at first
+        part = (half - below_low) / (below_high - below_low)
+        part = part if looks < INTERPOLATED_LOOKS else np.float32(0.5)
+        middle = low + part * (high - low)
+        middle = guess if looks == 0 and 0 < guess < high else middle
+        looks += 1
+        below = count_used_below(memory, middle)
+        if -1 <= 2 * below - count <= 1:
+            last, first = find_residuals_beside(memory, middle)
+            last = first if 2 * below < count else last
+            first = last if 2 * below > count else first
+            return np.float32(0.5) * (last + first)
         # no branches: which half it is cannot be foreseen
-        high = middle if 2 * below > count else high
-        low = middle if 2 * below < count else low
+        above, number = 2 * below > count, np.float32(below)
+        high, low = (middle if above else high), (low if above else middle)
+        below_high, below_low = (number if above else below_high), (below_low if above else number)
         middle = high
     return middle
+
+
+@inlined
+def count_used_below(memory, limit):
+    """How many of those used are off by at most `limit`.
+
+    Parameters
+    ----------
+    memory : (5, NEIGHBOURS) float32 array
+        See `scatter_about_planes`.
+    limit : float32
+
+    Returns
+    -------
+    int
+    """
+    used, residual, below = memory[3], memory[4], 0
+    most, zero = fill_vector(limit), fill_vector(np.float32(0))
+    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
+        near = most >= load_vector(residual, t)
+        below += count_set_lanes(near & (load_vector(used, t) > zero))
+    return below
+
+
+@inlined
+def find_residuals_beside(memory, limit):
+    """The largest residual of those used that is at most `limit`, and the smallest above it.
+
+    Parameters
+    ----------
+    memory, limit
+        As for `count_used_below`.
+
+    Returns
+    -------
+    float32, float32
+        0 and `FAR` where there is none.
+    """
+    used, residual = memory[3], memory[4]
+    most, zero = fill_vector(limit), fill_vector(np.float32(0))
+    last, first = zero, fill_vector(np.float32(FAR))
+    for t in range(np.uintp(0), np.uintp(NEIGHBOURS), STEP):
+        here, counted = load_vector(residual, t), load_vector(used, t) > zero
+        last = choose(counted & (most >= here) & (here > last), here, last)
+        first = choose(counted & (here > most) & (first > here), here, first)
+    return find_highest_lane(last), -find_highest_lane(zero - first)
 
 
 @inlined
@@ -430,14 +516,14 @@ def borrow_scatter(nearness, metres, starts, image_shape, gate, memory, scatter)
     starts : (pixels + 1,) int64 array
         First return of each pixel.
     image_shape : (int, int)
-    memory : (3, PLANE_STEP_PX**2 * most returns of a pixel + CELL_LANES) array
+    memory : (3, whole vectors of PLANE_STEP_PX**2 * most returns of a pixel) float32 array
         Overwritten: nearness of a cell's returns, how far off the nearest is, and its scatter.
     scatter : (n,) array
         Known of the pixels whose row and column `PLANE_STEP_PX` divides; overwritten elsewhere: m,
         NaN where there is no such return or it has few neighbours.
     """
     rows, columns = image_shape
-    step = PLANE_STEP_PX
+    step, zero = PLANE_STEP_PX, fill_vector(np.float32(0))
     own, least, held = memory[0], memory[1], memory[2]
     for top in range(0, rows, step):
         for left in range(0, columns, step):
@@ -445,17 +531,18 @@ def borrow_scatter(nearness, metres, starts, image_shape, gate, memory, scatter)
             number = open_cell(nearness, starts, columns, (top, below, left, right), memory)
             if number == 0:
                 continue
-            lanes = (number + CELL_LANES - 1) // CELL_LANES * CELL_LANES
             for y in range(max(top - step, 0), min(top + 3 * step, rows), step):
                 for x in range(max(left - step, 0), min(left + 3 * step, columns), step):
                     for k in range(starts[y * columns + x], starts[y * columns + x + 1]):
-                        there, known = nearness[k], scatter[k]
-                        for lane in range(lanes):
-                            off = math.fabs(own[lane] - there)
-                            nearer = off < least[lane]
-                            # in this order: the other way round no vectors are made of it
-                            held[lane] = known if nearer else held[lane]
-                            least[lane] = off if nearer else least[lane]
+                        there = fill_vector(np.float32(nearness[k]))
+                        known = fill_vector(np.float32(scatter[k]))
+                        for lane in range(np.uintp(0), np.uintp(number), STEP):
+                            off = load_vector(own, lane) - there
+                            off = choose(off > zero, off, zero - off)
+                            best = load_vector(least, lane)
+                            nearer = best > off
+                            store_vector(least, lane, choose(nearer, off, best))
+                            store_vector(held, lane, choose(nearer, known, load_vector(held, lane)))
             number = starts[top * columns + left + 1] - starts[top * columns + left]
             for y in range(top, below):
                 first = y * columns + left + (1 if y == top else 0)
@@ -489,57 +576,28 @@ def open_cell(nearness, starts, columns, cell, memory):
 
 
 @compile_loop()
-def raise_to_maximum(index, values, maxima):
-    """Raise each of some maxima to the largest of its values.
+def widen_deviations(scatter, total, ratios):
+    """Add what planes show of the recovery's errors to the deviations; return of how many.
 
     Parameters
     ----------
-    index : (n,) int64 array
-        To which of the maxima each value belongs.
-    values : (n,) array
-    maxima : (m,) array
-        Raised.
+    scatter : (n,) array
+        Of `scatter_about_planes`, m; negative where it is not known.
+    total : (n,) array
+        Deviation that the noise explains, m; overwritten where `scatter` is known.
+    ratios : (n,) float32 array
+        Its beginning is overwritten: by what factor those became larger.
+
+    Returns
+    -------
+    int
     """
-    for number in range(index.size):
-        maxima[index[number]] = max(maxima[index[number]], values[number])
-
-
-@compile_loop()
-def pool_significance(pixel, at, distance, own, starts, image_shape, limits, pooled):
-    """Add to each candidate's significance those of its neighbours at the same range.
-
-    Parameters
-    ----------
-    pixel : (n,) int64 array
-        Not decreasing.
-    at : (n,) array
-        Range at which neighbours are looked for, m.
-    distance : (n,) array
-        Range of each candidate, m.
-    own : (n,) array
-    starts : (pixels + 1,) int64 array
-        First candidate of each pixel.
-    image_shape : (int, int)
-    limits : (float, float)
-        Radius in pixels, and gate in m for each of them.
-    pooled : (n,) array
-        Overwritten.
-    """
-    rows, columns = image_shape
-    radius, gate = limits
-    reach = int(radius)
-    for number in range(pixel.size):
-        y, x = pixel[number] // columns, pixel[number] % columns
-        total = own[number]
-        for j in range(-reach, reach + 1):
-            for i in range(-reach, reach + 1):
-                left = radius * radius - j * j - i * i
-                inside = 0 <= y + j < rows and 0 <= x + i < columns
-                if not inside or left < 0 or (j == 0 and i == 0):
-                    continue
-                most = gate * math.sqrt(left)
-                there = (y + j) * columns + x + i
-                for k in range(starts[there], starts[there + 1]):
-                    if math.fabs(distance[k] - at[number]) <= most:
-                        total += own[k]
-        pooled[number] = total
+    known = 0
+    for number in range(total.size):
+        if scatter[number] >= 0:
+            own = total[number]
+            excess = PLANE_SHARE * (scatter[number] * scatter[number] - own * own)
+            total[number] = math.sqrt(own * own + (excess if excess > 0 else 0.0))
+            ratios[known] = total[number] / own
+            known += 1
+    return known

@@ -272,7 +272,7 @@ class CandidatePool:
         -------
         (n,) float64 array
         """
-        from tofclip.lidar.neighbours import pool_significance
+        from tofclip.lidar.candidate_loops import pool_significance
 
         starts = np.searchsorted(
             self.pixel, np.arange(self.image_shape[0] * self.image_shape[1] + 1)

@@ -134,48 +134,51 @@ class ReturnSearch:
         Memory: 256 KiB of traces a thread, and 100 bytes a pixel.
         """
         # the compiler takes as long to import as all else
+        from tofclip.lidar.candidate_loops import list_kept
         from tofclip.lidar.neighbours import add_recovery_error
 
-        pixel, time, signal, deviation = self._find_candidates(traces, judge is not None)
-        intensity = signal * _square_distance(time)
+        pixel, values = self._find_candidates(traces, judge is not None)
+        time, intensity = values[0], values[1] * _square_distance(values[0])
         doubt = np.empty(0)
         if judge is None:
-            significant = self.detection.find_significant(pixel, time, intensity, self.pulse.fwhm)
+            kept = self.detection.find_significant(pixel, time, intensity, self.pulse.fwhm)
         else:
-            significant, doubt = judge.judge(pixel, time, signal)
-        kept = np.flatnonzero(significant & (time > 0))
-        pixel, time, intensity = pixel.take(kept), time.take(kept), intensity.take(kept)
-        distance = SPEED_OF_LIGHT * time / 2
-        rows, columns, along_axis = self._lines_of_sight
+            kept, doubt = judge.judge(pixel, time, values[1])
+        kept &= time > 0
+        values[1] = intensity
+        number, columns = int(np.count_nonzero(kept)), self.camera.image_shape[1]
+        pixels, places = np.empty(number, np.int64), np.empty((2, number), np.int32)
+        lengths, intensity = np.empty((3, number)), np.empty(number, np.float32)
+        return_number = np.empty(number, np.uint8)
+        list_kept(pixel, values, kept, columns, pixels, places, return_number, lengths, intensity)
         sigma = add_recovery_error(
-            SPEED_OF_LIGHT / 2 * deviation.take(kept),
-            distance,
-            along_axis.take(pixel),
-            pixel,
+            lengths[2],
+            lengths[1],
+            self._along_axis.take(pixels),
+            pixels,
             self.camera.image_shape,
             SPEED_OF_LIGHT / 2 * self.pulse.fwhm,
         )
         measured = Returns(
-            y=rows.take(pixel),
-            x=columns.take(pixel),
-            range=distance,
-            intensity=intensity.astype(np.float32),
+            y=places[0],
+            x=places[1],
+            range=lengths[1],
+            intensity=intensity,
             confidence=sigma.astype(np.float32),
-            return_number=_rank_within_pixel(pixel),
-            time=time,
+            return_number=return_number,
+            time=lengths[0],
             camera=self.camera,
-            shear=self._shear_at(time),
+            shear=self._shear_at(lengths[0]),
             provenance={} if provenance is None else provenance,
-            false_alarm=doubt if judge is None else doubt.take(kept),
+            false_alarm=doubt if judge is None else doubt[kept],
         )
         return correct_returns(measured)
 
     @cached_property
-    def _lines_of_sight(self) -> tuple[NDArray[np.int32], NDArray[np.int32], FloatArray]:
-        """Row, column and the direction's z of every pixel."""
-        rows, columns = np.indices(self.camera.image_shape, np.int32).reshape(2, -1)
-        along_axis = compute_ray_directions(self.camera, rows, columns)[:, 2]
-        return rows, columns, np.ascontiguousarray(along_axis)
+    def _along_axis(self) -> FloatArray:
+        """Depth along the optical axis for a range of 1, of every pixel."""
+        rows, columns = np.indices(self.camera.image_shape).reshape(2, -1)
+        return np.ascontiguousarray(compute_ray_directions(self.camera, rows, columns)[:, 2])
 
     def _shear_at(self, time: FloatArray) -> FloatArray:
         if (
@@ -193,14 +196,16 @@ class ReturnSearch:
 
     def _find_candidates(
         self, traces: Traces | ArrayTraces, judged: bool
-    ) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
-        """Pixel number, instant, counts and deviation of every candidate, in raster and time order.
+    ) -> tuple[NDArray[np.int64], FloatArray]:
+        """Pixel number of every candidate, and (3, n) instants, counts and deviations, in raster and
+        time order.
 
         Unless all candidates are `judged`, those that are too weak beside what a sample of the
         pixels shows are not fitted.
         """
         if isinstance(traces, ArrayTraces):
-            return self._portable.find_candidates(traces.values)
+            pixel, *values = self._portable.find_candidates(traces.values)
+            return pixel, np.stack(values)
         # the compiler takes as long to import as all else
         from tofclip.lidar.search.trace_search import TraceSearch
 
@@ -221,7 +226,7 @@ class ReturnSearch:
             search(batches)
         else:
             search(batches[::SAMPLING_STEP])
-            pixel, time, signal, _ = loops.list_found()
+            pixel, (time, signal, _) = loops.list_found()
             loops.set_least(self._compute_least_responses(pixel, time, signal, bins))
             search([one for place, one in enumerate(batches) if place % SAMPLING_STEP])
         return loops.list_found()
@@ -340,10 +345,3 @@ def depth(
 def _square_distance(time: FloatArray) -> FloatArray:
     """Square of the range of a return, relative to `REFERENCE_RANGE_M`."""
     return (SPEED_OF_LIGHT / 2 / REFERENCE_RANGE_M * time) ** 2
-
-
-def _rank_within_pixel(pixel: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """Number the entries of each pixel from 1; equal pixels lie side by side."""
-    counts = np.bincount(pixel)
-    before = np.cumsum(counts) - counts
-    return (np.arange(1, pixel.size + 1) - before.take(pixel)).astype(np.uint8)

@@ -224,22 +224,20 @@ class TraceSearch:
             self._search_piece(piece, memory)
         self._spare.append(memory)
 
-    def list_found(
-        self,
-    ) -> tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]:
+    def list_found(self) -> tuple[NDArray[np.int64], FloatArray]:
         """List all that was found so far, in raster and time order.
 
         Returns
         -------
         pixel : (n,) int64 array
             Number of the pixel.
-        time, signal, deviation : (n,) array
+        values : (3, n) array
             Instant, s, sum of the fitted pulse over the bins, standard deviation of the instant, s.
         """
         pixel = np.empty(int(self._counts.sum()), np.int64)
         values = np.empty((3, pixel.size))
         list_returns(self._found, self._counts, pixel, values)
-        return pixel, values[0], values[1], values[2]
+        return pixel, values
 
     def _search_piece(self, piece: slice, memory: SearchMemory) -> None:
         source, found, counts = self._source, self._found, self._counts
