@@ -5,6 +5,7 @@ A verb's module is imported when the verb is called, so that the program's own h
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import signal
@@ -31,7 +32,7 @@ from apps.help import (
 from apps.verb_help import HELP_OPTION, show_verb_help
 from tofclip.compile_observers import observers
 from tofclip.dependencies import describe_missing_package
-from tofclip.errors import TofclipError
+from tofclip.errors import InputError, TofclipError
 from tofclip.version import __version__
 
 ARGUMENT_IN_MESSAGE = re.compile(r"`(?P<name>[a-z_]+)(?:=\"?(?P<value>[^`\"]*)\"?)?`")
@@ -51,6 +52,9 @@ OPTIONS_OF_ARGUMENTS = {
     "time_zero": "--time-zero-ns",
 }
 """The command line's option for an argument that the libraries' messages name."""
+
+UNUSABLE_NAMES = (errno.ENAMETOOLONG, errno.ELOOP)
+"""What the operating system says of names that no file can have, whatever is done with them."""
 
 COMPLETION_VARIABLE = "_TOFCLIP_COMPLETE"  # set by shells that ask how a command line may go on
 
@@ -167,6 +171,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     observers.append(announce)
     try:
         words = [word for word in words if word != DEBUG_FLAG]
+        _require_no_empty(words)
         shown = words[-1:] == [HELP_OPTION] and show_verb_help(app, words)
         status: Any = 0 if shown else app(words, prog_name=PROGRAM, standalone_mode=False)
         sys.stdout.flush()
@@ -184,6 +189,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if status == EXIT_INTERRUPTED:
         print("tofclip: interrupted; no unfinished file was left behind", file=sys.stderr)
     return int(status or 0)
+
+
+def _require_no_empty(words: Sequence[str]) -> None:
+    # As a path, an empty word would be the folder that one is in.
+    if "" in words:
+        raise InputError("an argument is empty; is a variable of the shell not set?")
 
 
 class _CompileNotice:
@@ -222,31 +233,25 @@ def _report_error(fault: Exception) -> int:
         # Python flushes once more at exit; let that go nowhere instead of failing again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_BROKEN_PIPE
+    message, status = _describe_unusable_input(fault), EXIT_INPUT_ERROR
+    if message is None:
+        message = f"unforeseen {type(fault).__name__}: {fault} ({DEBUG_FLAG} shows where; please report it)"
+        status = EXIT_DEFECT
+    print(f"tofclip: error: {' '.join(message.split())}", file=sys.stderr)
+    return status
+
+
+def _describe_unusable_input(fault: Exception) -> str | None:
+    """Say what the user can do about an error; None where it is a defect of this program."""
     if isinstance(fault, typer.TyperException):
-        print(
-            f"tofclip: error: {_one_line(fault.format_message()).rstrip('.')} (see --help)",
-            file=sys.stderr,
-        )
-        return EXIT_INPUT_ERROR
+        return f"{fault.format_message().rstrip(' .')} (see --help)"
     if isinstance(fault, TofclipError):
-        print(f"tofclip: error: {_one_line(name_options(str(fault)))}", file=sys.stderr)
-        return EXIT_INPUT_ERROR
+        return name_options(str(fault))
     if isinstance(fault, MemoryError):
-        print(
-            f"tofclip: error: this computer's memory does not suffice: {_one_line(str(fault))}",
-            file=sys.stderr,
-        )
-        return EXIT_INPUT_ERROR
-    missing = describe_missing_package(fault) if isinstance(fault, ImportError) else None
-    if missing is not None:
-        print(f"tofclip: error: {_one_line(missing)}", file=sys.stderr)
-        return EXIT_INPUT_ERROR
-    kind = type(fault).__name__
-    print(
-        f"tofclip: error: unforeseen {kind}: {_one_line(str(fault))} ({DEBUG_FLAG} shows where; please report it)",
-        file=sys.stderr,
-    )
-    return EXIT_DEFECT
+        return f"this computer's memory does not suffice: {fault}"
+    if isinstance(fault, OSError) and fault.errno in UNUSABLE_NAMES:
+        return f"a name cannot be used: {fault.strerror} ({fault.filename})"
+    return describe_missing_package(fault) if isinstance(fault, ImportError) else None
 
 
 def name_options(message: str) -> str:
@@ -275,7 +280,3 @@ def name_options(message: str) -> str:
         return option if value in (None, "True") else f"{option} {value}"
 
     return ARGUMENT_IN_MESSAGE.sub(name_option, message)
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())

@@ -95,10 +95,12 @@ def require_writable(out: Path, *suffixes: str, inputs: tuple[Path, ...] = ()) -
     ------
     InputError, StorageError
     """
+    if out.is_dir():
+        raise StorageError(f"{out}: cannot be written: it is a folder; name a file")
     if suffixes and out.suffix.lower() not in suffixes:
         raise InputError(f"{out}: the name must end in {' or '.join(suffixes)}")
-    if out.is_dir():
-        raise StorageError(f"{out}: cannot be written: it is a folder")
+    if out.parent.exists() and not out.parent.is_dir():
+        raise StorageError(f"{out}: cannot be written: its folder is a file")
     if not out.parent.is_dir():
         raise StorageError(f"{out}: cannot be written: the folder does not exist; create it first")
     if not os.access(out.parent, os.W_OK):
@@ -108,6 +110,29 @@ def require_writable(out: Path, *suffixes: str, inputs: tuple[Path, ...] = ()) -
             raise InputError(
                 f"{out}: is an input too; choose another name, so that it is not overwritten"
             )
+
+
+def name_beside(out: Path, suffix: str) -> Path:
+    """Name what is written beside an output: as the output, with another ending.
+
+    Parameters
+    ----------
+    out : Path
+    suffix : str
+        With its dot.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    StorageError
+        The output is a folder, such as ``.`` or ``/``, which has no name.
+    """
+    if not out.name:
+        raise StorageError(f"{out}: cannot be written: it is a folder; name a file")
+    return out.with_suffix(suffix)
 
 
 def build_provenance(

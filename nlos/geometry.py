@@ -21,6 +21,10 @@ FloatArray = NDArray[np.float64]
 MAX_DEPTH_WALL_WIDTHS = 2.0
 """Deeper than this a wall is too narrow an aperture to resolve much."""
 
+MAX_VOXELS_PER_AXIS = 1 << 20
+"""No computer holds an image of more; the axes themselves would fill its memory before any plan could
+say so."""
+
 MIN_WALL_FRACTION, WALL_FRACTION_PER_DIGIT = 0.1, 0.2
 """Of the longest way, what a window about wall points holds at least, and how much more for each
 digit of the tolerance: where the plane stands close to the wall, crossings are wide beside their
@@ -78,7 +82,7 @@ class Grid:
         Raises
         ------
         InputError
-            The voxel size is not positive.
+            The voxel size is not positive, or so small that a side has more than a million voxels.
 
         Examples
         --------
@@ -214,7 +218,12 @@ def _fill_axis(name: str, side: Sequence[float], voxel: float) -> FloatArray:
             f"side {name} of the box must run from a smaller to a larger number, got {first}, {last}"
         )
     # A side that is a whole number of voxels up to rounding keeps its outer voxel.
-    steps = int(np.floor((last - first) / voxel + 1e-6))
+    steps = int(np.floor(min((last - first) / voxel, MAX_VOXELS_PER_AXIS) + 1e-6))
+    if steps >= MAX_VOXELS_PER_AXIS:
+        raise InputError(
+            f"side {name} of the box, {last - first:.3g} m, has millions of voxels of {voxel:.3g} m: "
+            "use larger voxels, and check their unit"
+        )
     return (first + last) / 2 + voxel * (np.arange(steps + 1, dtype=np.float64) - steps / 2)
 
 

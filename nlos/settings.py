@@ -199,7 +199,7 @@ class Settings:
 
     def grid(self, voxel: float | None = None) -> Grid:
         """Fill the box with voxels, of the settings' size unless `voxel` (m) says otherwise."""
-        return Grid.box(*self.box, voxel or self.voxel or math.nan)
+        return Grid.box(*self.box, _voxel_size(self) if voxel is None else voxel)
 
     def make_method(self, name: str | None = None) -> Method:
         """Build a method by its name, the settings' own by default; what is None is left to it."""
@@ -358,7 +358,7 @@ def find_bright_box(settings: Settings, scouted: Volume) -> Settings:
     -------
     Settings
     """
-    part = Grid.around(scouted, settings.voxel or math.nan)
+    part = Grid.around(scouted, _voxel_size(settings))
     x, y, z = ((float(axis[0]), float(axis[-1])) for axis in (part.x, part.y, part.z))
     return replace(settings, x=x, y=y, near=z[0], far=z[1], everywhere=True)
 
@@ -379,6 +379,11 @@ def is_brightest_on_wall(volume: Volume, capture: Capture, wavelength: float) ->
     """
     away = np.linalg.norm(capture.points - np.array(volume.find_brightest()), axis=1)
     return bool(away.min() < BRIGHTEST_ON_WALL_WAVELENGTHS * wavelength)
+
+
+def _voxel_size(settings: Settings) -> float:
+    """Distance of voxels, m; NaN, which every grid refuses, where it is not known yet."""
+    return math.nan if settings.voxel is None else settings.voxel
 
 
 def _add(settings: Settings, name: str, value: Any, reason: str) -> Settings:
@@ -428,7 +433,7 @@ def _complete_sampling(capture: Capture, settings: Settings) -> Settings:
 
 def _complete_box(capture: Capture, settings: Settings) -> Settings:
     """Fill in what is not given of the box: the space in front of the wall that the record covers."""
-    voxel = settings.voxel or math.nan
+    voxel = _voxel_size(settings)
     near = settings.near
     if near is None and settings.gate_found:
         low, high = capture.points[:, 2].min(), capture.points[:, 2].max()

@@ -13,6 +13,7 @@ from apps.conventions import (
     RECORD_SUFFIXES,
     JsonOption,
     PreviewOption,
+    name_beside,
     report,
     require_writable,
 )
@@ -79,7 +80,7 @@ def calibrate(
     --dot-background dot_background.tif --out camera.h5
     """
     pictures = (line, line_background, dot, dot_background)
-    preview = preview or out.with_suffix(".png")
+    preview = preview or name_beside(out, ".png")
     # Both outputs are checked before any picture is read, and neither may replace an input.
     require_writable(out, *RECORD_SUFFIXES, inputs=pictures)
     require_writable(preview, *PICTURE_SUFFIXES, inputs=pictures)

@@ -15,6 +15,7 @@ from apps.conventions import (
     JsonOption,
     PreviewOption,
     make_completer,
+    name_beside,
     report,
     require_writable,
 )
@@ -151,7 +152,7 @@ def calibrate_range(
     """
     files = tuple(Path(shot) for shot in shots if "://" not in shot)
     inputs = files if camera is None else (*files, camera)
-    preview = preview or out.with_suffix(".png")
+    preview = preview or name_beside(out, ".png")
     require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
     require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
     require_view(focal_length_px, field_of_view_deg)

@@ -17,6 +17,7 @@ from apps.conventions import (
     PreviewOption,
     TimeZeroOption,
     make_completer,
+    name_beside,
     report,
     require_writable,
 )
@@ -132,7 +133,7 @@ def recover(
     _check_single_options(streak, cluster, sweep)
     # An instrument's address is not a file that an output could replace.
     inputs = tuple(Path(name) for name in (streak, camera) if name and not _is_address(name))
-    preview = preview or out.with_suffix(".png")
+    preview = preview or name_beside(out, ".png")
     _require_writable_results(inputs, out, preview, cloud)
     solver, chosen_focus = make_method(method, iterations=iterations), parse_focus(focus)
     started = time.perf_counter()

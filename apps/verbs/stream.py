@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import typer
 
-from apps.conventions import JsonOption, TimeZeroOption, report
+from apps.conventions import JsonOption, TimeZeroOption, make_folder, report
 from apps.verbs.cloud import require_format
 from devices.shot_stream import TrackedShots, read_transients
 from tofclip.errors import InputError
@@ -108,10 +108,6 @@ def stream(
     require_format(suffix)
     if shots is not None and shots < 1:
         raise InputError(f"--shots must be positive, got {shots}")
-    if out is not None:
-        from apps.conventions import make_folder
-
-        make_folder(out)
     coming = TrackedShots(
         _read_shots(source, None if bin_width_ps is None else bin_width_ps * PICOSECOND)
     )
@@ -122,6 +118,8 @@ def stream(
     pipeline = _make_pipeline(
         first, camera, None if time_zero_ns is None else time_zero_ns * NANOSECOND, focus, method
     )
+    if out is not None:  # only now: what cannot be streamed leaves no empty folder
+        make_folder(out)
     # Instruments do not wait: the newest shot counts. Files do, and lose nothing.
     policy: Literal["drop_oldest", "block"] = "drop_oldest" if drop or coming.is_live else "block"
     with closing(stream_clouds(coming, pipeline, held, policy)) as made:

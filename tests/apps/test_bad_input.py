@@ -117,12 +117,16 @@ def test_streaks(run: Run, files: Path, tmp_path: Path, folder: Path, case: str)
         (["--iterations", "0"], "at least one iteration"),
         (["--bin-width-ps", "-20"], "positive number of seconds"),
         (["--bin-width-ps", "nan"], "positive number of seconds"),
-        (["--time-zero-ns", "inf"], "time zero finite"),
+        (["--time-zero-ns", "inf"], "time zero must be finite"),
         (["--iterations", "many"], "(see --help)"),
         (["--out", "frames.txt"], "must end in .h5"),
         (["--preview", "frames.doc"], "must end in .png"),
         (["--preview", "absent/frames.png"], "the folder does not exist"),
         (["--out", "absent/frames.h5"], "the folder does not exist"),
+        (["--out", __file__ + "/frames.h5"], "its folder is a file"),
+        (["--out", "."], "it is a folder; name a file"),
+        (["--out", ""], "an argument is empty"),
+        (["--out", 300 * "x" + ".h5"], "name too long"),
     ],
 )
 def test_flags(
@@ -317,3 +321,30 @@ def test_a_time_zero_of_the_wrong_sign_is_named(run: Run, files: Path, folder: P
     outcome = run("cloud", folder / "frames.h5", "--out", folder / "cloud.ply")
     assert_refused(outcome, "returns have negative ranges (-0.6")
     assert "check the sign of --time-zero-ns" in outcome.err
+
+
+def test_a_shot_of_one_row_is_a_picture_without_warnings(
+    run: Run, files: Path, tmp_path: Path, folder: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    shot = picture(tmp_path, tifffile.imread(files / "streak.tif")[:1])
+    words = ["recover", shot, "--camera", files / "camera.h5", "--bin-width-ps", 20]
+    outcome = run(*words, "--iterations", 2, "--out", folder / "frames.h5")
+    assert (outcome.status, outcome.err, len(recwarn)) == (0, "", 0)
+
+
+def test_a_camera_without_a_finite_focal_length(run: Run, files: Path, folder: Path) -> None:
+    words = ["calibrate", "--out", folder / "camera.h5", "--focal-length-px", "inf"]
+    for name in ("line", "line-background", "dot", "dot-background"):
+        words += [f"--{name}", files / f"{name.replace('-', '_')}.tif"]
+    assert_refused(run(*words), "the focal length must be a positive number, got inf")
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("source", ["sim+bogus://", "absent", "camera.h5"])
+def test_what_cannot_be_streamed_leaves_no_folder(
+    run: Run, files: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, source: str
+) -> None:
+    monkeypatch.chdir(files)
+    outcome = run("stream", source, "--out", folder / "clouds")
+    assert (outcome.status, outcome.err.count("\n")) == (2, 1)
+    assert list(folder.iterdir()) == []

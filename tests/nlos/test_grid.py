@@ -65,6 +65,11 @@ def test_voxels_have_a_positive_size(voxel: object) -> None:
         Grid.box((0, 1), (0, 1), (0, 1), voxel)
 
 
+def test_a_voxel_in_the_wrong_unit_is_refused_before_memory_is_taken() -> None:
+    with pytest.raises(InputError, match=r"side z of the box.* has millions of voxels"):
+        Grid.box((0, 0), (0, 0), (0.5, 1), 1e-9)
+
+
 @pytest.mark.parametrize("side", [(1, 0), (np.nan, 1), (0, np.inf)])
 def test_a_box_runs_upwards(side: tuple[float, float]) -> None:
     with pytest.raises(InputError, match="side y"):

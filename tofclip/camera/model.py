@@ -200,10 +200,14 @@ class Camera(Storable):
             raise CalibrationError(f"view gains must be positive, got {self.gains}")
         if np.any(np.abs(self.angles) >= np.pi / 2):
             raise CalibrationError("line angles must lie within 90 degrees of the vertical")
-        if not (self.pulse_fwhm > 0 and self.focal_length_px > 0 and np.isfinite(self.time_zero)):
-            raise CalibrationError(
-                "pulse width and focal length must be positive, time zero finite"
-            )
+        for name, value in (
+            ("pulse width", self.pulse_fwhm),
+            ("focal length", self.focal_length_px),
+        ):
+            if not 0 < value < np.inf:
+                raise CalibrationError(f"the {name} must be a positive number, got {value}")
+        if not np.isfinite(self.time_zero):
+            raise CalibrationError(f"time zero must be finite, got {self.time_zero}")
         if not (
             np.isfinite(self.lenslet_pitch) and self.lenslet_pitch >= 0 and self.focus_distance > 0
         ):

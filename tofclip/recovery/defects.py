@@ -197,6 +197,9 @@ def estimate_noise(counts: FloatImage) -> tuple[float, float, float]:
     (float, float, float)
         Counts, counts, and counts squared per count.
     """
+    if len(counts) < 3:  # no row has two neighbours to differ from: photons' own noise
+        dark = float(np.median(counts))
+        return dark, float(np.sqrt(max(dark, 1.0))), 1.0
     rough = (counts[1:-1] - (counts[:-2] + counts[2:]) / 2) / np.sqrt(1.5)
     dark = float(np.median(counts))
     changes = np.abs(rough)

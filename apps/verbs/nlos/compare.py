@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.conventions import PICTURE_SUFFIXES, JsonOption, make_folder, report, require_writable
+from apps.conventions import (
+    PICTURE_SUFFIXES,
+    JsonOption,
+    make_folder,
+    name_beside,
+    report,
+    require_writable,
+)
 from apps.figures.nlos_compare import make_comparison_figure
 from apps.figures.style import save_figure as save_figure
 from apps.nlos.files import add_provenance
@@ -85,7 +92,7 @@ def compare(
     Example: tofclip nlos compare capture.h5 --methods hybrid,backprojection --out compare.png
     """
     wanted = load_settings(CompareSettings, settings, flags)
-    written = [out, out.with_suffix(".toml")]
+    written = [out, name_beside(out, ".toml")]
     _require_writable(written, volumes, (source,) if settings is None else (source, settings))
     # Everything that can be refused is refused before the capture is read.
     _check_settings(wanted)

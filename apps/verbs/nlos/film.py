@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from apps.conventions import JsonOption, build_provenance, report, require_writable
+from apps.conventions import JsonOption, build_provenance, name_beside, report, require_writable
 from apps.mp4 import import_opencv, open_film
 from apps.nlos.imaging import (
     ImagingSettings,
@@ -101,7 +101,7 @@ def film(
     Example: tofclip nlos film capture.h5 --out flash.gif
     """
     wanted = load_settings(FilmSettings, settings, flags)
-    beside = out.with_suffix(".toml")
+    beside = name_beside(out, ".toml")
     _require_writable(out, beside, (source,) if settings is None else (source, settings))
     _check_settings(wanted, out)
     capture = read_capture(source)

@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from apps.conventions import ClusterOption, DeviceOption, JsonOption, make_folder, report
+from apps.conventions import (
+    ClusterOption,
+    DeviceOption,
+    JsonOption,
+    make_folder,
+    name_beside,
+    report,
+)
 from apps.nlos.files import (
     ResultFiles,
     add_provenance,
@@ -176,7 +183,7 @@ def reconstruct(
         return
     if cluster is not None:
         raise InputError(f"{source}: --cluster is for a folder of captures")
-    results = ResultFiles([out], png, out.with_suffix(SETTINGS_SUFFIX), surface)
+    results = ResultFiles([out], png, name_beside(out, SETTINGS_SUFFIX), surface)
     results.require_writable(source, *([] if settings is None else [settings]))
     report(_reconstruct_single(source, results, order), as_json, results.paths)
 

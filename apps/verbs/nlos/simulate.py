@@ -9,7 +9,14 @@ from typing import Annotated, Any
 
 import typer
 
-from apps.conventions import RECORD_SUFFIXES, JsonOption, build_provenance, report, require_writable
+from apps.conventions import (
+    RECORD_SUFFIXES,
+    JsonOption,
+    build_provenance,
+    name_beside,
+    report,
+    require_writable,
+)
 from apps.nlos.scene import SceneSettings, simulate_scene
 from apps.settings import (
     SettingsOption,
@@ -38,7 +45,7 @@ def simulate(
     """
     chosen = load_settings(SceneSettings, settings, flags)
     inputs = [path for path in (settings, chosen.mesh and Path(chosen.mesh)) if path]
-    beside = out.with_suffix(".toml")
+    beside = name_beside(out, ".toml")
     require_writable(out, *RECORD_SUFFIXES, inputs=tuple(inputs))
     require_writable(beside, inputs=tuple(inputs))
     started = time.perf_counter()
