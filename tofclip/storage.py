@@ -290,7 +290,8 @@ def write_record(record: Record, path: str | Path, compressed: bool = True) -> N
             _write_attribute(file, "format_version", FORMAT_VERSION)
             _write_attribute(file, "provenance", json.dumps(dict(record.provenance), default=str))
             _write_group(file, record, compressed)
-        temporary.write_bytes(image.getbuffer())
+        with image.getbuffer() as content, temporary.open("wb") as target:
+            target.write(content)
 
 
 def read_record(path: str | Path) -> Record:
