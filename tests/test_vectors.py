@@ -11,6 +11,7 @@ from numba import njit
 from tofclip import vectors
 from tofclip.vectors import (
     choose,
+    copy_transposed,
     count_set_lanes,
     fill_vector,
     find_first_bit,
@@ -19,6 +20,7 @@ from tofclip.vectors import (
     list_set_lanes,
     load_vector,
     number_lanes,
+    raise_vector,
     store_vector,
     sum_vector,
 )
@@ -34,19 +36,21 @@ def _combine(one, other, results):
     store_vector(results[1], np.uintp(0), a - b)
     store_vector(results[2], np.uintp(0), a * b)
     store_vector(results[3], np.uintp(0), choose((a > b) & (b >= fill_vector(one[3])), a, b))
+    store_vector(results[4], np.uintp(0), raise_vector(a, b))
     return sum_vector(a), find_highest_lane(b), list_set_lanes(a >= b), count_set_lanes(a >= b)
 
 
 @settings(deadline=None)
 @given(floats, floats)
 def test_arithmetic_and_choice(one, other):
-    results = np.empty((4, vectors.LENGTH), np.float32)
+    results = np.empty((5, vectors.LENGTH), np.float32)
     total, highest, bits, number = _combine(one, other, results)
     expected = [
         one + other,
         one - other,
         one * other,
         np.where((one > other) & (other >= one[3]), one, other),
+        np.maximum(one, other),
     ]
     np.testing.assert_array_equal(results, expected)
     assert (total, highest, number) == (one.sum(), other.max(), (one >= other).sum())
@@ -76,3 +80,19 @@ def test_vectors_begin_anywhere():
     _copy_shifted(values, 21, numbers)
     np.testing.assert_array_equal(values, [*range(21, 37), *range(16, 40)])
     np.testing.assert_array_equal(numbers, np.arange(16))
+
+
+@njit
+def _transpose(source, stride, target, step):
+    copy_transposed(source, np.uintp(3), stride, target, np.uintp(5), step)
+
+
+def test_sixteen_vectors_become_sixteen_others():
+    source = np.arange(3 + 16 * 20, dtype=np.float32)
+    target = np.full(5 + 16 * 19, -1, np.float32)
+    _transpose(source, np.uintp(20), target, np.uintp(19))
+    rows = source[3:].reshape(16, 20)[:, :16]
+    written = target[5:].reshape(16, 19)
+    np.testing.assert_array_equal(written[:, :16], rows.T)
+    assert np.all(target[:5] == -1)
+    assert np.all(written[:, 16:] == -1)

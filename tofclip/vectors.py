@@ -125,6 +125,59 @@ def choose(typing: Any, mask: Any, lanes: Any, others: Any) -> Any:
 
 
 @intrinsic  # type: ignore[untyped-decorator]
+def raise_vector(typing: Any, lanes: Any, others: Any) -> Any:
+    """Return the higher of two float32 in each lane; neither is NaN."""
+
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(">", *args, flags=("nnan", "nsz")), *args)
+
+    return lanes(lanes, others), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def copy_transposed(
+    typing: Any, source: Any, start: Any, stride: Any, target: Any, place: Any, step: Any
+) -> Any:
+    """Write sixteen vectors side by side: of flat contiguous arrays of one dtype, ``target[place +
+    lane * step + k] = source[start + k * stride + lane]`` for all lanes and sixteen k.
+    """
+
+    def exchange(builder: Any, one: Any, other: Any, distance: int) -> tuple[Any, Any]:
+        """Swap the upper half of each `2 * distance` lanes of one with the lower half of the other."""
+        lower = [LENGTH + lane - distance if lane & distance else lane for lane in range(LENGTH)]
+        upper = [LENGTH + lane if lane & distance else lane + distance for lane in range(LENGTH)]
+        kind = ir.VectorType(INDEX, LENGTH)
+        return (
+            builder.shuffle_vector(one, other, ir.Constant(kind, lower)),
+            builder.shuffle_vector(one, other, ir.Constant(kind, upper)),
+        )
+
+    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        def point(k: int, base: Any, distance: Any, number: int) -> Any:
+            away = builder.mul(distance, ir.Constant(distance.type, number))
+            return _point_at(context, builder, called.args[k], args[k], builder.add(base, away))
+
+        rows = [
+            builder.load(point(0, args[1], args[2], number), align=4) for number in range(LENGTH)
+        ]
+        distance = LENGTH // 2
+        while distance:
+            for number in range(LENGTH):
+                if not number & distance:
+                    other = number + distance
+                    rows[number], rows[other] = exchange(
+                        builder, rows[number], rows[other], distance
+                    )
+            distance //= 2
+        for number, lanes in enumerate(rows):
+            builder.store(lanes, point(3, args[4], args[5], number), align=4)
+        return context.get_dummy_value()
+
+    signs = types.uintp, types.uintp, target, types.uintp, types.uintp
+    return types.void(source, *signs), build
+
+
+@intrinsic  # type: ignore[untyped-decorator]
 def sum_vector(typing: Any, lanes: Any) -> Any:
     """Return the sum of float32 lanes."""
 

@@ -10,6 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from tofclip.compiling import compile_loop
+from tofclip.vectors import STEP, fill_vector, load_vector, store_vector
+
+ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
 
 fast_loop = compile_loop(fastmath=True)
 
@@ -67,20 +70,27 @@ def sample_runs(counts, dark, raw_row, runs, measurements):
     measurements : (rows, columns) float32 array, overwritten where the runs say
         0 beyond the raw image.
     """
-    rows = np.uintp(counts.shape[0])
-    below = np.uintp(min(1, counts.shape[0] - 1))
+    rows, columns = np.uintp(counts.shape[0]), np.uintp(counts.shape[1])
+    below, level = np.uintp(min(1, counts.shape[0] - 1)), fill_vector(dark)
     for k in range(runs.shape[0]):
         row, first, end, top = runs[k, 0], runs[k, 1], runs[k, 2], runs[k, 3]
-        # slices by unsigned numbers, in which no index can count from the end: they become vectors
-        reading = measurements[row, first:end]
+        reading = measurements[row]
         if top >= rows:
-            for i in range(reading.size):
-                reading[i] = np.float32(0)
+            reading[first:end] = 0
             continue
-        upper, lower = counts[top, first:end], counts[top + below, first:end]
-        position, height = raw_row[row, first:end], np.float32(top)
-        for i in range(reading.size):
-            reading[i] = upper[i] + (position[i] - height) * (lower[i] - upper[i]) - dark
+        upper, lower, position = counts[top], counts[top + below], raw_row[row]
+        height = np.float32(top)
+        # What a vector writes beyond its run is overwritten by the row's next one, and the last run
+        # of a row ends with single numbers.
+        while first < end and first + STEP <= columns:
+            here = load_vector(upper, first)
+            part = load_vector(position, first) - fill_vector(height)
+            store_vector(reading, first, here + part * (load_vector(lower, first) - here) - level)
+            first += STEP
+        while first < end:
+            here = upper[first]
+            reading[first] = here + (position[first] - height) * (lower[first] - here) - dark
+            first += ONE
 
 
 @fast_loop

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -79,15 +80,15 @@ class LinearInverse:
         if alive is None:
             alive = np.ones(operator.shape_out, bool)
         mu = self.damping * operator.squared_norm
+        # What sees no pixel has nothing but its diagonal, and no part in the pictures.
+        used = np.flatnonzero(alive & (np.diff(operator.matrix.indptr) > 0))
         # in float64: a Cholesky factor loses digits with the condition number
-        seen = operator.matrix[alive].astype(np.float64)
+        seen = operator.matrix[used].astype(np.float64)
         gram = (seen @ seen.T).toarray()
         gram[np.diag_indices_from(gram)] += mu
-        inverse = np.zeros((alive.size, alive.size), operator.dtype)
         factor = scipy.linalg.cho_factor(gram, lower=True, overwrite_a=True)
-        # rows and columns of dead measurements stay zero, so that these add nothing
-        inverse[np.ix_(alive, alive)] = scipy.linalg.cho_solve(factor, np.eye(gram.shape[0]))
-        prepared = PreparedInverse(operator, inverse)
+        inverse = scipy.linalg.cho_solve(factor, np.eye(used.size)).astype(operator.dtype)
+        prepared = PreparedInverse(operator, inverse, used)
         # One dark block loads the compiled loops and the BLAS before the first shot needs them.
         prepared.recover(np.zeros((alive.size, LANES), operator.dtype))
         return prepared
@@ -146,26 +147,29 @@ class PreparedInverse:
     Parameters
     ----------
     operator : LinearOperator
-    inverse_gram : (measurements, measurements) array
-        ``(A A' + mu I)^-1``, zero in the rows and columns of dead measurements.
+    inverse_gram : (n, n) array
+        ``(A A' + mu I)^-1`` of the measurements that are used.
+    used : (n,) int array
+        Their numbers, increasing: those that are alive and see a pixel.
     """
 
     operator: LinearOperator
-    inverse_gram: Array
+    inverse_gram: NDArray[Any]
+    used: NDArray[np.int64]
 
     @cached_property
     def _inverse(self) -> PerDevice[Array]:
-        return PerDevice(partial(ComputeDevice.put, values=self.inverse_gram))
+        """Of all measurements, with zeros for those that are not used."""
+        every = np.zeros((math.prod(self.operator.shape_out),) * 2, self.inverse_gram.dtype)
+        every[np.ix_(self.used, self.used)] = self.inverse_gram
+        return PerDevice(partial(ComputeDevice.put, values=every))
 
     @cached_property
-    def _seen(self) -> slice:
-        """From the first to behind the last measurement that sees a pixel: the inverse has nothing but
-        its diagonal elsewhere.
-        """
-        if not isinstance(self.operator, SparseMatrix):
-            return slice(0, len(self.inverse_gram))
-        seen = np.flatnonzero(np.diff(self.operator.matrix.indptr))
-        return slice(int(seen[0]), int(seen[-1]) + 1) if seen.size else slice(0, 0)
+    def _stretches(self) -> list[slice]:
+        """Stretches of measurements, side by side, that are used."""
+        cuts = np.flatnonzero(np.diff(self.used) != 1) + 1
+        stretches = np.split(self.used, cuts)
+        return [slice(int(one[0]), int(one[-1]) + 1) if one.size else slice(0) for one in stretches]
 
     def recover(self, measurements: Array, progress: Progress = ignore_progress) -> Result:
         """Recover one picture per column of `measurements`, where they are.
@@ -189,7 +193,8 @@ class PreparedInverse:
 
         def project(piece: slice) -> None:
             lanes = slice(piece.start, piece.start + (LANES if len(frames) > 1 else 1))
-            block = np.ascontiguousarray(weights[:, lanes])
+            block = np.zeros((measurements.shape[0], lanes.stop - lanes.start), weights.dtype)
+            block[self.used] = weights[:, lanes]
             write_frames(self.operator.adjoint(block), frames, piece)
             progress(piece.stop - piece.start)
 
@@ -209,10 +214,9 @@ class PreparedInverse:
         return Result(batches.frames)
 
     def weights(self, measurements: NDArray[Any]) -> NDArray[Any]:
-        """Return ``(A A' + mu I)^-1 f``, (measurements, frames and some): its adjoint is the pictures.
+        """Return ``(A A' + mu I)^-1 f``, (used, frames and some): its adjoint is the pictures.
 
-        Beyond the last frame rows are zero to a multiple of `LANES` frames and `ROW_GAP` more, and so
-        are measurements before the first and behind the last one that sees a pixel.
+        Beyond the last frame rows are zero to a multiple of `LANES` frames and `ROW_GAP` more.
 
         Parameters
         ----------
@@ -220,11 +224,11 @@ class PreparedInverse:
         """
         frames = measurements.shape[1]
         held = -(-frames // LANES) * LANES + ROW_GAP
-        weights = empty_aligned((self.inverse_gram.shape[0], held), self.operator.dtype)
+        weights = empty_aligned((self.used.size, held), self.operator.dtype)
         weights[:, frames:] = 0
-        weights[: self._seen.start] = weights[self._seen.stop :] = 0
-        inverse, solved = self.inverse_gram[self._seen, self._seen], weights[self._seen, :frames]
-        seen = measurements[self._seen]
+        stretches = [measurements[one] for one in self._stretches]
+        seen = stretches[0] if len(stretches) == 1 else np.concatenate(stretches)
+        inverse, solved = self.inverse_gram, weights[:, :frames]
 
         def solve(piece: slice) -> None:
             np.matmul(inverse[piece], seen, out=solved[piece])

@@ -196,57 +196,6 @@ def compute_traces(tile_starts, columns, values, rows, weights, traces, span):
                 traces[row, column] = part[row, column - first]
 
 
-@compile_loop(fastmath=FASTMATH, _nrt=True)
-def update_peaks(tile_starts, columns, values, scales, block, span, highest):
-    """Raise `highest` to the largest ``scales * (M @ block)[:, span[0] : span[1]]`` over the rows of a
-    sparse matrix M, lane by lane.
-
-    Parameters
-    ----------
-    tile_starts, columns, values
-        See `tofclip.operators.sparse.Tiles`.
-    scales : (M's rows,) array
-    block : (M's columns, at least span[1]) array
-    span : (int, int)
-        A multiple of `LANES` long.
-    highest : (span[1] - span[0],) array
-    """
-    part = np.empty((TILE_PIXELS, WIDE_LANES), block.dtype)  # stays in the first-level cache
-    # A few pixels at all instants: a nonzero is read from memory once.
-    for first in range(0, scales.size, TILE_PIXELS):
-        last = min(first + TILE_PIXELS, scales.size)
-        starts = tile_starts[:, first : last + 1]
-        begin = span[0]
-        while begin < span[1]:
-            # What is not asked for costs less than to look nonzeros up again.
-            if begin + LANES < span[1] and begin + WIDE_LANES <= block.shape[1]:
-                end = min(begin + WIDE_LANES, span[1])
-                multiply_sparse_wide_rows(starts, columns, values, block, begin, part, 0)
-            else:
-                end = begin + LANES
-                multiply_sparse_rows(starts, columns, values, block, begin, part, 0)
-            largest = highest[begin - span[0] : end - span[0]]
-            for row in range(0, last - first, 4):  # for one look at the largest so far
-                second, third, fourth = (
-                    min(row + 1, last - first - 1),
-                    min(row + 2, last - first - 1),
-                    min(row + 3, last - first - 1),
-                )
-                a, b, c, d = part[row], part[second], part[third], part[fourth]
-                s, t, u, v = (
-                    scales[first + row],
-                    scales[first + second],
-                    scales[first + third],
-                    scales[first + fourth],
-                )
-                for lane in range(largest.size):
-                    one, two, three, four = s * a[lane], t * b[lane], u * c[lane], v * d[lane]
-                    one, three = one if one > two else two, three if three > four else four
-                    one = one if one > three else three
-                    largest[lane] = one if one > largest[lane] else largest[lane]
-            begin = end
-
-
 @fast_loop
 def restore_frames(candidate, current, rejected):
     """``candidate = current`` in the lanes where `rejected` is 1; it is 0 elsewhere. Arrays are

@@ -8,8 +8,6 @@ the sparse part for a few pixels at a time, whose traces stay in cache.
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,10 +17,11 @@ from tofclip.operators import SparseMatrix
 from tofclip.operators.sparse import Tiles
 from tofclip.solvers.direct import PreparedInverse
 
-PATCH_ROWS, PATCH_COLUMNS = (
-    8,
-    8,
-)  # the measurements that such a patch looks at stay in the second-level cache
+PATCH_ROWS, PATCH_COLUMNS = 8, 8
+"""The measurements that such a patch looks at stay in the first-level cache."""
+
+GROUP_PIXELS = 4
+"""Neighbours in a row of a patch: of each view they look at nearly the same measurements."""
 
 
 def order_by_patch(image_shape: tuple[int, int]) -> NDArray[np.int64]:
@@ -49,47 +48,22 @@ class InverseTraces:
             )
         self.inverse = inverse
         # The transpose has one row per pixel, in the order in which they are wanted.
-        self._tiles = Tiles.from_csr(inverse.operator.matrix.T.tocsr()[pixels])
+        self._tiles = Tiles.from_csr(inverse.operator.matrix[inverse.used].T.tocsr()[pixels])
 
-    def peak_response(self, readings: Array, span: slice) -> Array:
-        """Return how far the brightest pixel of each back-projected frame stands out.
-
-        Parameters
-        ----------
-        readings : (measurements, frames) contiguous array
-            In units of their noise.
-        span : slice
-            Of the frames, a multiple of `LANES` of them.
-
-        Returns
-        -------
-        (frames of the span,) array
-            The largest ``a'f / |a|`` over the columns a of A: the response of the filter that is
-            matched to a lone pixel, in units of its noise. Never below zero.
+    @property
+    def tiles(self) -> Tiles:
+        """The operator's transpose, a row for each pixel, a column for each measurement; without
+        what is not used.
         """
-        from tofclip.solvers.kernels import update_peaks
-
-        highest = np.zeros(span.stop - span.start, readings.dtype)
-        update_peaks(*self._tiles, self._scales, readings, (span.start, span.stop), highest)
-        return highest
-
-    @cached_property
-    def _scales(self) -> Array:
-        """``1 / |a|`` of each pixel, 0 where nothing is seen."""
-        starts, _, values = self._tiles
-        # Sums between the starts of neighbouring pixels, in float64: differences of a running sum
-        # lose digits.
-        ends = np.concatenate([[0], np.cumsum(values.astype(np.float64) ** 2)])
-        energy = (ends[starts[:, 1:]] - ends[starts[:, :-1]]).sum(axis=0)
-        scales = np.divide(1, np.sqrt(energy), out=np.zeros(energy.size), where=energy > 0)
-        return scales.astype(values.dtype)
+        used = self.inverse.used.astype(np.uint32)
+        return self._tiles._replace(columns=used[self._tiles.columns])
 
     def fill(self, weights: Array, piece: slice, traces: Array, frames: slice) -> None:
         """Write what the inverse makes of a shot at the pixels ``pixels[piece]``.
 
         Parameters
         ----------
-        weights : (measurements, time and some) array
+        weights : (used measurements, time and some) array
             `PreparedInverse.weights` of the shot's measurements.
         piece : slice
         traces : (pixels of the piece, time) contiguous array

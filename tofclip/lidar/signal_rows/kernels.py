@@ -6,14 +6,33 @@ Sums are (columns, instants): all instants of a column side by side, as the oper
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-vectorised = njit(nogil=True, cache=True, fastmath=True, error_model="numpy")
+from tofclip.compiling import compile_loop, inlined
+from tofclip.lidar.signal_rows.windows import FRACTION_SLACK, FRACTIONS
+from tofclip.vectors import (
+    LENGTH,
+    STEP,
+    choose,
+    copy_transposed,
+    fill_vector,
+    find_first_bit,
+    list_set_lanes,
+    load_vector,
+    raise_vector,
+    store_vector,
+)
 
-TILE_INSTANTS = 16  # a cache line of each column's sums, which is written at once
+FASTMATH = {"contract", "nsz", "arcp", "reassoc"}
+vectorised = compile_loop(fastmath=FASTMATH)
+vectorised_with_room = compile_loop(fastmath=FASTMATH, _nrt=True)
+
+ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
+VECTORS = 4
+WORD_FRAMES = VECTORS * LENGTH
+"""Frames whose marks are a bit each of a whole number."""
 
 
-@vectorised
+@vectorised_with_room
 def sum_boxes(measurements, starts, length, span, sums):
     """``sums[c, i] = measurements[starts[i] : starts[i] + length, c].sum()`` for the instants of a span.
 
@@ -23,23 +42,35 @@ def sum_boxes(measurements, starts, length, span, sums):
     starts : (instants,) int64 array
     length : int
     span : (int, int)
-        First instant, and the one after the last.
+        First instant, and the one after the last: whole vectors of them.
     sums : (columns, at least instants) float32 array, overwritten in this span
     """
-    room = np.empty((TILE_INSTANTS, measurements.shape[1]), np.float32)
-    for first in range(span[0], span[1], TILE_INSTANTS):
-        number = min(TILE_INSTANTS, span[1] - first)
-        for instant in range(number):
+    columns = np.uintp(measurements.shape[1])
+    room = np.empty((LENGTH, measurements.shape[1]), np.float32)
+    flat, target = room.reshape(room.size), sums.reshape(sums.size)
+    for first in range(np.uintp(span[0]), np.uintp(span[1]), STEP):
+        for instant in range(STEP):
             total, start = room[instant], starts[first + instant]
-            total[:] = measurements[start]
-            for late in range(start + 1, start + length):
-                row = measurements[late]
-                for column in range(total.size):
-                    total[column] += row[column]
-        for column in range(room.shape[1]):
-            target = sums[column, first : first + number]
-            for instant in range(number):
-                target[instant] = room[instant, column]
+            column = np.uintp(0)
+            while column + STEP <= columns:
+                here = load_vector(measurements[start], column)
+                for late in range(start + 1, start + length):
+                    here += load_vector(measurements[late], column)
+                store_vector(total, column, here)
+                column += STEP
+            while column < columns:
+                total[column] = measurements[start, column]
+                for late in range(start + 1, start + length):
+                    total[column] += measurements[late, column]
+                column += ONE
+        column, stride = np.uintp(0), np.uintp(sums.shape[1])
+        while column + STEP <= columns:
+            copy_transposed(flat, column, columns, target, column * stride + first, stride)
+            column += STEP
+        while column < columns:
+            for instant in range(STEP):
+                sums[column, first + instant] = room[instant, column]
+            column += ONE
 
 
 @vectorised
@@ -49,18 +80,19 @@ def compute_energies(sums, energy):
     Parameters
     ----------
     sums : (columns, at least instants) float32 array
-    energy : (instants,) float32 array
-        Overwritten.
+    energy : (2, instants) float32 array
+        The first row is overwritten with the energies, the second is room.
     """
-    energy[:] = 0
-    number = np.zeros(energy.size, np.float32)
+    total, number = energy[0], energy[1]
+    total[:] = 0
+    number[:] = 0
     for column in range(sums.shape[0]):
         here = sums[column]
-        for instant in range(energy.size):
-            energy[instant] += here[instant] * here[instant]
+        for instant in range(total.size):
+            total[instant] += here[instant] * here[instant]
             number[instant] += np.float32(here[instant] != 0)
-    for instant in range(energy.size):
-        energy[instant] /= max(number[instant], np.float32(1))
+    for instant in range(total.size):
+        total[instant] /= max(number[instant], np.float32(1))
 
 
 @vectorised
@@ -92,3 +124,217 @@ def standardise_columns(sums, quiet, columns):
         for instant in range(quiet.size):
             value = (here[instant] - level) * scale
             here[instant] = value if here[instant] != 0 else np.float32(0)
+
+
+@vectorised_with_room
+def find_bright_frames(
+    tile_starts,
+    columns,
+    values,
+    scales,
+    group_pixels,
+    group_starts,
+    windows,
+    weights,
+    block,
+    begin,
+    limit,
+    bright,
+):
+    """Mark the frames in which ``scales * (M @ block)`` reaches the limit in any row of a sparse
+    matrix M.
+
+    Rows are ruled out in groups: where the bound of a group stays below the limit, so do its rows.
+    A frame is done when one row has reached it, so that each frame's most promising group comes
+    first.
+
+    Parameters
+    ----------
+    tile_starts, columns, values
+        See `tofclip.operators.sparse.Tiles`; no negative values.
+    scales : (M's rows,) float32 array
+    group_pixels : int
+        Successive rows of a group.
+    group_starts : (groups + 1,) int64 array
+        Where each group's windows begin.
+    windows : (n,) int32 array
+        See `find_window_maxima`: numbers of its rows.
+    weights : (n,) float32 array
+        The most that a window of ones adds to a row of the group, times its scale.
+    block : (M's columns, frames) float32 array
+        Whole words of frames from `begin` on lie within it.
+    begin : int
+        First frame.
+    limit : float32
+        Above zero.
+    bright : (frames to look at,) bool array, overwritten
+    """
+    groups = group_starts.size - 1
+    highest = np.empty((block.shape[0] * FRACTIONS, WORD_FRAMES), np.float32)
+    marks, most_promising = np.empty(groups, np.uint64), np.empty(WORD_FRAMES, np.int32)
+    for done in range(0, bright.size, WORD_FRAMES):
+        frame = np.uintp(begin + done)
+        wanted = min(bright.size - done, WORD_FRAMES)
+        find_window_maxima(block, frame, highest)
+        promising = mark_promising(
+            highest, group_starts, windows, weights, limit, marks, most_promising
+        )
+        open_frames = promising
+        for lane in range(wanted):
+            if open_frames >> np.uint64(lane) & np.uint64(1):
+                vector = np.uint64(lane) // np.uint64(LENGTH)
+                open_frames &= ~find_reached(
+                    tile_starts,
+                    columns,
+                    values,
+                    scales,
+                    group_pixels,
+                    most_promising[lane],
+                    block,
+                    frame,
+                    vector,
+                    limit,
+                )
+        if wanted < WORD_FRAMES:
+            open_frames &= (np.uint64(1) << np.uint64(wanted)) - np.uint64(1)
+            promising &= (np.uint64(1) << np.uint64(wanted)) - np.uint64(1)
+        for group in range(groups):
+            word = marks[group] & open_frames
+            while word:
+                vector = find_first_bit(word) // np.uint64(LENGTH)
+                reached = find_reached(
+                    tile_starts,
+                    columns,
+                    values,
+                    scales,
+                    group_pixels,
+                    group,
+                    block,
+                    frame,
+                    vector,
+                    limit,
+                )
+                open_frames &= ~reached
+                word &= ~(np.uint64(0xFFFF) << (vector * np.uint64(LENGTH)))
+        reached = promising & ~open_frames
+        for lane in range(wanted):
+            bright[done + lane] = reached >> np.uint64(lane) & np.uint64(1)
+
+
+@vectorised
+def find_window_maxima(block, frame, highest):
+    """Find the highest value between neighbouring measurements under windows.
+
+    Row ``column * FRACTIONS + part`` is for what lies between the measurement of `column`, or one of
+    the next ``WINDOW - 1``, and the one behind it, at any fraction of that part of the way. Nothing
+    is below zero.
+
+    Parameters
+    ----------
+    block : (measurements, frames) float32 array
+    frame : int
+        First of the frames.
+    highest : (measurements * FRACTIONS, WORD_FRAMES) float32 array, overwritten
+    """
+    number, parts, zero = np.uintp(block.shape[0]), np.uintp(FRACTIONS), fill_vector(np.float32(0))
+    for vector in range(VECTORS):
+        place = np.uintp(vector * LENGTH)
+        at = frame + place
+        for part in range(parts):
+            low = fill_vector(np.float32((np.float32(part) - FRACTION_SLACK) / FRACTIONS))
+            high = fill_vector(np.float32((np.float32(part) + 1 + FRACTION_SLACK) / FRACTIONS))
+            # From the last measurement on: of the ones behind it, pairs' maxima are at hand.
+            value = pair = pair_behind = zero
+            behind = load_vector(block[number - ONE], at)
+            for back in range(number):
+                column = number - ONE - back
+                here = load_vector(block[column], at)
+                rise, value_behind = behind - here, value
+                value = raise_vector(zero, raise_vector(here + low * rise, here + high * rise))
+                two_behind, pair_behind, pair = pair_behind, pair, raise_vector(value, value_behind)
+                store_vector(highest[column * parts + part], place, raise_vector(pair, two_behind))
+                behind = here
+
+
+@inlined
+def mark_promising(highest, group_starts, windows, weights, limit, marks, most_promising):
+    """Mark in which frames the bound of each group reaches the limit; return those of any group.
+
+    Parameters
+    ----------
+    highest : (measurements * FRACTIONS, WORD_FRAMES) float32 array
+        Of `find_window_maxima`.
+    group_starts, windows, weights, limit
+        As for `find_bright_frames`.
+    marks : (groups,) uint64 array, overwritten
+        A bit for each frame.
+    most_promising : (WORD_FRAMES,) int32 array, overwritten
+        The group with the highest bound in each frame.
+
+    Returns
+    -------
+    uint64
+    """
+    zero, level = fill_vector(np.float32(0)), fill_vector(limit)
+    best_a = best_b = best_c = best_d = zero
+    group_a = group_b = group_c = group_d = fill_vector(np.int32(0))
+    for group in range(group_starts.size - 1):
+        a = b = c = d = zero
+        for k in range(group_starts[group], group_starts[group + 1]):
+            window, weight = highest[np.uintp(windows[k])], fill_vector(weights[k])
+            a += weight * load_vector(window, np.uintp(0))
+            b += weight * load_vector(window, np.uintp(16))
+            c += weight * load_vector(window, np.uintp(32))
+            d += weight * load_vector(window, np.uintp(48))
+        marks[group] = (
+            list_set_lanes(a >= level)
+            | list_set_lanes(b >= level) << np.uint64(16)
+            | list_set_lanes(c >= level) << np.uint64(32)
+            | list_set_lanes(d >= level) << np.uint64(48)
+        )
+        number = fill_vector(np.int32(group))
+        group_a, best_a = choose(a > best_a, number, group_a), raise_vector(a, best_a)
+        group_b, best_b = choose(b > best_b, number, group_b), raise_vector(b, best_b)
+        group_c, best_c = choose(c > best_c, number, group_c), raise_vector(c, best_c)
+        group_d, best_d = choose(d > best_d, number, group_d), raise_vector(d, best_d)
+    store_vector(most_promising, np.uintp(0), group_a)
+    store_vector(most_promising, np.uintp(16), group_b)
+    store_vector(most_promising, np.uintp(32), group_c)
+    store_vector(most_promising, np.uintp(48), group_d)
+    return (
+        list_set_lanes(best_a >= level)
+        | list_set_lanes(best_b >= level) << np.uint64(16)
+        | list_set_lanes(best_c >= level) << np.uint64(32)
+        | list_set_lanes(best_d >= level) << np.uint64(48)
+    )
+
+
+@vectorised
+def find_reached(
+    tile_starts, columns, values, scales, group_pixels, group, block, frame, vector, limit
+):
+    """Return in which frames of a vector a row of a group reaches the limit, as bits of a word.
+
+    Parameters
+    ----------
+    tile_starts, columns, values, scales, group_pixels, block, limit
+        As for `find_bright_frames`.
+    group : int
+    frame : int
+        First frame of the word.
+    vector : int
+        Number of the vector in the word.
+
+    Returns
+    -------
+    uint64
+    """
+    at, highest = frame + np.uintp(vector) * STEP, fill_vector(np.float32(0))
+    for row in range(group * group_pixels, min((group + 1) * group_pixels, scales.size)):
+        response = fill_vector(np.float32(0))
+        for tile in range(tile_starts.shape[0]):
+            for k in range(tile_starts[tile, row], tile_starts[tile, row + 1]):
+                response += fill_vector(values[k]) * load_vector(block[columns[k]], at)
+        highest = raise_vector(highest, fill_vector(scales[row]) * response)
+    reached = list_set_lanes(highest >= fill_vector(limit))
+    return reached << (np.uint64(vector) * np.uint64(LENGTH))

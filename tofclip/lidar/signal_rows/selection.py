@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.arrays import empty_aligned
+from tofclip.lidar.signal_rows.bright_frames import BrightFrameFinder
 from tofclip.lidar.traces import TraceBins
-from tofclip.solvers.traces import InverseTraces
+from tofclip.solvers.traces import GROUP_PIXELS, InverseTraces
 from tofclip.threads import LANES, count_block_threads, run_blocks
 
 FloatImage = NDArray[np.float32]
@@ -24,9 +25,9 @@ MAX_DARK_ENERGY_RATIO, NOISE_ENERGY_RATIO = 1.5, 1.25  # in mean square; noise a
 THRESHOLD_FACTOR = 1.2  # than the limit has an instant to stand out
 MIN_DARK_ROWS = 24  # dark rows at least, which know the noise of a dark pixel to a seventh
 MAX_ROW_FRACTION = 0.75  # of all rows: what needs more of them is as well searched everywhere
-GAP_INSTANTS = 3 * LANES + 16
-"""Places beyond a column's sums: blocks of four times `LANES` need no end of their own, and columns
-are an odd number of cache lines apart, so that neighbours share no place of the cache."""
+GAP_INSTANTS = LANES + 16
+"""Places beyond a column's sums: blocks of twice `LANES` need no end of their own, and columns are an
+odd number of cache lines apart, so that neighbours share no place of the cache."""
 
 
 @dataclass(frozen=True)
@@ -81,14 +82,17 @@ class SignalRowFinder:
         self._step = max(1, round(pulse_rows))
         self._length = min(self.rows, max(1, round(BOX_LENGTH_WIDTHS * pulse_rows)))
         middles: list[NDArray[np.int64]] = []
-        self._owners: list[tuple[InverseTraces, slice]] = []
-        """Each inverse with its instants, a multiple of `LANES`."""
+        self._owners: list[tuple[BrightFrameFinder, slice]] = []
+        """Each operator with its instants, a multiple of `LANES`."""
+        finders: dict[InverseTraces, BrightFrameFinder] = {}
         first = 0
         for place in places:
             instants = np.arange(place.rows.start, place.rows.stop, self._step)
             last = first + -(-instants.size // LANES) * LANES
             middles.append(np.pad(instants, (0, last - first - instants.size), constant_values=-1))
-            self._owners.append((place.inverse, slice(first, last)))
+            if place.inverse not in finders:
+                finders[place.inverse] = BrightFrameFinder(place.inverse.tiles, GROUP_PIXELS)
+            self._owners.append((finders[place.inverse], slice(first, last)))
             first = last
         self._middles = np.concatenate(middles)
         self._taken = self._middles >= 0
@@ -133,7 +137,7 @@ class SignalRowFinder:
         # as weights have it: whole cache lines, and a gap between columns, of zeros
         sums = empty_aligned((measurements.shape[0], instants + GAP_INSTANTS), np.float32)
         sums[:, instants:] = 0
-        energy = np.empty(instants, np.float32)
+        room = np.empty((2, instants), np.float32)
         by_rows = np.ascontiguousarray(measurements.T)  # as the rectifier leaves them: no copy
         run_blocks(
             lambda piece: sum_boxes(
@@ -142,7 +146,8 @@ class SignalRowFinder:
             instants,
             _divide_into_lanes(instants, threads),
         )
-        compute_energies(sums, energy)
+        compute_energies(sums, room)
+        energy = room[0]
         measured = self._taken & (energy > 0)
         if not measured.any():
             return self._taken
@@ -157,17 +162,11 @@ class SignalRowFinder:
             measurements.shape[0],
             -(-measurements.shape[0] // threads),
         )
-        highest = np.empty(instants, np.float32)
-        for inverse, own in self._owners:
-
-            def project(piece: slice, inverse: InverseTraces = inverse, own: slice = own) -> None:
-                span = slice(own.start + piece.start, own.start + piece.stop)
-                highest[span] = inverse.peak_response(sums, span)
-
-            number = own.stop - own.start
-            run_blocks(project, number, _divide_into_lanes(number, threads))
-        lit: Mask = self._taken & (highest >= self._threshold)
-        return lit
+        lit = np.concatenate(
+            [finder.find(sums, own, self._threshold) for finder, own in self._owners]
+        )
+        found: Mask = self._taken & lit
+        return found
 
     def _mark_rows_near(self, lit: Mask, distance: int) -> Mask:
         """Rows within `distance` of the middle of a lit instant."""
