@@ -185,6 +185,12 @@ class Band:
         # 2 / n: positive frequencies stand for both signs of a real signal
         return self.pulse.spectrum(self.wavenumbers) * (2 / self.period_bins)
 
+    @property
+    def strength(self) -> NDArray[np.float64]:
+        """The pulse's weights relative to the largest, shape (frequencies,)."""
+        strength: NDArray[np.float64] = self.weights / self.weights.max()
+        return strength
+
     def compute_phasors(self, traces: NDArray[Any]) -> NDArray[Any]:
         """Return ``P_k = G_k * sum_i H_i * exp(-1j * k * L_i)`` of every signal.
 

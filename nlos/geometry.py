@@ -25,10 +25,16 @@ MAX_VOXELS_PER_AXIS = 1 << 20
 """No computer holds an image of more; the axes themselves would fill its memory before any plan could
 say so."""
 
-MIN_WALL_FRACTION, WALL_FRACTION_PER_DIGIT = 0.1, 0.2
+MIN_WALL_FRACTION, WALL_FRACTION_PER_DIGIT = 0.3, 0.2
 """Of the longest way, what a window about wall points holds at least, and how much more for each
 digit of the tolerance: where the plane stands close to the wall, crossings are wide beside their
-distance. Measured; errors of 1e-2 and 1e-3 ask for 0.5 and 0.7.
+distance. Measured with noise, which comes by all ways alike; errors of 1e-2 and 1e-3 ask for 0.7
+and 0.9.
+"""
+
+RIM_FRACTION, RIM_FRACTION_PER_DIGIT = 0.9, 0.2
+"""Of the fade towards the plane's rim, how wide a rim carries too little to be told from an image
+of it a period away, and how much less for each digit of the tolerance.
 """
 
 
@@ -239,7 +245,7 @@ class StraightWays:
     wall_to_plane, plane_to_voxels : float
         Along the plane, at most, m; with room about the crossings.
     rim : (float, float)
-        Width along y and x of the plane's rim, where less than half of the field is left, m.
+        Width along y and x of the plane's rim, where little of the field is left, m.
     first_depth : float
         z of the nearest voxels, m.
     """
@@ -283,10 +289,11 @@ class StraightWays:
         before = (plane.z - low[2]) / (first - low[2])
         behind = (last - plane.z) / (last - high[2])
         room = MIN_WALL_FRACTION + WALL_FRACTION_PER_DIGIT * np.log10(1 / tolerance)
+        rim = RIM_FRACTION + RIM_FRACTION_PER_DIGIT * np.log10(tolerance)
         fade_y, fade_x = plane.fade
         return cls(
             float(max(before, room) * longest),
             float(behind * longest),
-            (fade_y / 2, fade_x / 2),
+            (float(rim * fade_y), float(rim * fade_x)),
             first,
         )

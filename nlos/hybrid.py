@@ -198,7 +198,7 @@ class Hybrid(PhasorMethod):
         lattice = WallLattice.find(points)
         plane = choose_virtual_plane(points, grid, waves, zones, self.plane_z, lattice)
         ways = StraightWays.find(points, plane, grid, self.tolerance)
-        plane_to_depths = DiffractionPlan(plane, grid, waves, self.tolerance, ways)
+        plane_to_depths = DiffractionPlan(plane, grid, waves, band.strength, self.tolerance, ways)
         plane_to_depths.require_memory()
         tolerance = WALL_TO_PLANE_ERROR_FRACTION * self.tolerance
         carry = plan_wall_to_plane(

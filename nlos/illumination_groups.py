@@ -211,7 +211,7 @@ def build_source(group: IlluminationGroup, band: Band) -> LaserSource:
     -------
     LaserSource
     """
-    return LaserSource(group.laser, band.wavenumbers, band.weights / band.weights.max())
+    return LaserSource(group.laser, band.wavenumbers, band.strength)
 
 
 def choose_unaliased_band(capture: Capture, grid: Grid, pulse: VirtualPulse) -> Band:

@@ -20,6 +20,7 @@ from nlos.rsd.transfer import (
     TransferFunction,
     Window,
     find_fast_length,
+    find_lateral_limits,
     find_min_periods,
 )
 
@@ -40,15 +41,8 @@ PREPARATION_S, TERM_S, LATTICE_POINT_S, DIRECT_TERM_S = 0.02, 2e-5, 3e-9, 2e-10
 of a direct sum.
 """
 
-EVANESCENT_EXPONENT = 0.75
-"""Waves that fade from the nearest wall point to the plane to this power of the tolerance are left
-out; measured.
-"""
-
-GRAZING_MARGIN = 2.0
-"""Room for grazing waves, in spreads of the window: near the wall they are a larger share than in
-the scene.
-"""
+WAVES_ERROR_FRACTION = 0.25
+"""Of the error allowed, what weak plane waves that are left out may hold."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +168,7 @@ class WallToPlanePlan:
         y, x = (
             find_common_period(side, axis_step(wall), axis_step(plane), plane.size)
             for side, wall, plane in zip(
-                find_min_periods(self._offsets),
+                find_min_periods(self._offsets, self.tolerance),
                 (self.wall.y, self.wall.x),
                 (self.plane.y, self.plane.x),
                 strict=True,
@@ -204,19 +198,21 @@ class WallToPlanePlan:
     @cached_property
     def _window(self) -> Window:
         y, x = (2 * np.pi / spacing for spacing in self.steps)
-        return Window.within(self._offsets, (y, x))
+        return Window.within(self._offsets, (y, x), self.tolerance)
 
     @cached_property
     def lateral_limits(self) -> FloatArray:
         """Largest lateral wavenumber that counts at each frequency, rad/m."""
-        k, ways = self.waves.wavenumbers, self.geometry.ways
+        ways = self.geometry.ways
         # what fades before the nearest voxels is not wanted on the plane either
         first = self.plane.z if ways is None else ways.first_depth
-        distance = first - float(self.points[:, 2].max())
-        fading = EVANESCENT_EXPONENT * np.log(1 / self.tolerance) / distance
-        grazing = GRAZING_MARGIN * self._window.spectral_spread(self.tolerance)
-        limits: FloatArray = np.maximum(np.sqrt(k**2 + fading**2), k + grazing)
-        return limits
+        return find_lateral_limits(
+            self.waves,
+            self._window,
+            self.strength,
+            first - float(self.points[:, 2].max()),
+            WAVES_ERROR_FRACTION * self.tolerance,
+        )
 
     @cached_property
     def max_indices(self) -> tuple[int, int]:

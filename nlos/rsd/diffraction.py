@@ -14,11 +14,15 @@ from nlos.geometry import Grid, StraightWays
 from nlos.method import MEMORY_LIMIT_BYTES
 from nlos.plane import Plane, axis_step
 from nlos.rsd.transfer import (
+    FINE_NODE_OVERSAMPLING,
+    FINE_NODES_TOLERANCE,
+    NODE_OVERSAMPLING,
     Offsets,
     SphericalWaves,
     TransferFunction,
     Window,
     find_fast_length,
+    find_lateral_limits,
     find_min_periods,
 )
 from tofclip.errors import InputError
@@ -26,6 +30,11 @@ from tofclip.threads import split_blocks
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+WAVES_ERROR_FRACTION = 0.8
+"""Of the error allowed, what weak plane waves that are left out may hold. Half of it or less is an
+error of voxels: the rest lies on the window's edge, beyond most of them.
+"""
 
 LATERAL_ROUNDING = 1e-9
 """Lateral wavenumbers nearer to each other are one, rad/m."""
@@ -114,6 +123,8 @@ class DiffractionPlan:
     grid : Grid
         x and y evenly spaced, z as you like.
     waves : SphericalWaves
+    strength : (frequencies,) array
+        Of each frequency in the pulse; decides what may be neglected.
     tolerance : float
         Relative error allowed.
     ways : StraightWays, optional
@@ -123,6 +134,7 @@ class DiffractionPlan:
     plane: Plane
     grid: Grid
     waves: SphericalWaves
+    strength: FloatArray
     tolerance: float
     ways: StraightWays | None = None
 
@@ -143,7 +155,9 @@ class DiffractionPlan:
         y, x = (
             find_fast_length(side / axis_step(axis)) if axis.size > 1 else 1
             for side, axis in zip(
-                find_min_periods(self._offsets), (self.grid.y, self.grid.x), strict=True
+                find_min_periods(self._offsets, self.tolerance),
+                (self.grid.y, self.grid.x),
+                strict=True,
             )
         )
         return y, x
@@ -156,7 +170,7 @@ class DiffractionPlan:
             for count, axis, side in zip(
                 self.lattice,
                 (self.grid.y, self.grid.x),
-                find_min_periods(self._offsets),
+                find_min_periods(self._offsets, self.tolerance),
                 strict=True,
             )
         )
@@ -164,14 +178,20 @@ class DiffractionPlan:
 
     @cached_property
     def _window(self) -> Window:
-        return Window.within(self._offsets, self._periods)
+        return Window.within(self._offsets, self._periods, self.tolerance)
 
     @cached_property
     def plane_waves(self) -> PlaneWaves:
         """The plane waves that carry the field."""
-        return PlaneWaves(
-            self._periods, self.waves.wavenumbers + self._window.spectral_spread(self.tolerance)
+        # to the nearest voxels waves travel most aside
+        limits = find_lateral_limits(
+            self.waves,
+            self._window,
+            self.strength,
+            self._min_distance,
+            WAVES_ERROR_FRACTION * self.tolerance,
         )
+        return PlaneWaves(self._periods, limits)
 
     @property
     def plane_wave_count(self) -> float:
@@ -192,10 +212,19 @@ class DiffractionPlan:
     @cached_property
     def transfer(self) -> TransferFunction:
         """Transfer functions from the plane to any depth."""
-        finest = max(float(np.abs(self.grid.z - self.plane.z).min()), axis_step(self.plane.x) / 2)
+        fine = self.tolerance < FINE_NODES_TOLERANCE
         return TransferFunction(
-            self.waves, self._window, float(self.plane_waves.lateral_limits[-1]), finest
+            self.waves,
+            self._window,
+            float(self.plane_waves.lateral_limits[-1]),
+            self._min_distance,
+            FINE_NODE_OVERSAMPLING if fine else NODE_OVERSAMPLING,
         )
+
+    @property
+    def _min_distance(self) -> float:
+        """Smallest distance along z, but half a point's, m."""
+        return max(float(np.abs(self.grid.z - self.plane.z).min()), axis_step(self.plane.x) / 2)
 
 
 # Along z an image without the laser's carrier is a sum of waves exp(1j * f * z) with

@@ -170,7 +170,7 @@ class PlanarRSD(PhasorMethod):
                 f"the grid must begin in front of the wall, which is at z = {wall.plane.z:.4g} m"
             )
         waves = build_waves(groups[0], band, continued=False)
-        plane_to_depths = DiffractionPlan(wall.plane, grid, waves, self.tolerance)
+        plane_to_depths = DiffractionPlan(wall.plane, grid, waves, band.strength, self.tolerance)
         plane_to_depths.require_memory()
 
         def place_phasors(one: Capture, progress: Progress, group: IlluminationGroup) -> Array:

@@ -6,7 +6,7 @@ of a source meets a target, a field is a sum of plane waves.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,21 +18,25 @@ from nlos.rsd.kernels import TAPS, find_interpolation_weights, sample_waves
 FloatArray = NDArray[np.float64]
 Sides = tuple[float, float]
 
-INNER_RADIUS_FRACTION = 0.88
+INNER_RADIUS_FRACTION, INNER_RADIUS_FRACTION_PER_DIGIT = 0.76, 0.06
 """Where the window begins to fall at least, relative to the largest distance of a source and a
-target.
+target, and how much farther out for each digit of the tolerance. Between two squares few pairs are
+so far apart: independent signals (noise) miss 0.1 % of their amplitude beyond 0.88, and 0.01 %
+beyond 0.94.
 """
 
 MIN_EDGE_FRACTION, MAX_EDGE_FRACTION = 0.25, 0.5
 """Width of the window's edge, relative to the largest distance along one axis."""
 
-SPREAD_FACTOR = 0.6
-"""Widening of a grazing wave's spectrum by the window's edge, per squared digit of the tolerance and edge width;
-measured on point scenes."""
-
 FFT_LENGTH_FACTORS = (1, 3, 5, 15, 25)
 """Of these times a power of 2, single-precision Fourier transforms take half as long as of other
 lengths; measured.
+"""
+
+STEEPNESS, STEEPNESS_PER_DIGIT, WHOLE_STEEPNESS = 1.1, 0.25, 4.0
+"""Of the window's edge, an error function, and how much more for each digit of the tolerance: for
+1e-2 it is cut off at 1 - 0.012 and at 0.012, for 1e-4 at a tenth of that; and of one that is not
+cut off.
 """
 
 VECTOR_LENGTH = 8
@@ -47,13 +51,16 @@ class Window:
     ----------
     inner_radius, outer_radius : float
         Radii up to which waves are whole, and from which on they are gone, m.
+    steepness : float
+        Of the edge, an error function: it is cut off at this argument on both ends.
     """
 
     inner_radius: float
     outer_radius: float
+    steepness: float
 
     @classmethod
-    def within(cls, offsets: Offsets, periods: Sides) -> Window:
+    def within(cls, offsets: Offsets, periods: Sides, tolerance: float) -> Window:
         """Return the widest window that lets no image of a source in a periodic lattice meet a
         target.
 
@@ -62,6 +69,8 @@ class Window:
         offsets : Offsets
         periods : (float, float)
             Along y and x, m; at least `find_min_periods`.
+        tolerance : float
+            Relative error allowed.
 
         Returns
         -------
@@ -70,13 +79,34 @@ class Window:
         room = min(period - far for period, far in zip(periods, offsets.farthest, strict=True))
         inner = min(offsets.reach, room - MIN_EDGE_FRACTION * offsets.along)
         outer = min(room, inner + MAX_EDGE_FRACTION * offsets.along)
-        return cls(float(inner), float(outer))
+        steepness = STEEPNESS - STEEPNESS_PER_DIGIT * np.log10(tolerance)
+        return cls(float(inner), float(outer), float(steepness))
 
-    def spectral_spread(self, tolerance: float) -> float:
-        """Lateral wavenumbers by which the window's edge spreads grazing waves, rad/m."""
-        return float(
-            SPREAD_FACTOR * np.log10(tolerance) ** 2 / (self.outer_radius - self.inner_radius)
+    def fall(self, radii: FloatArray) -> FloatArray:
+        """Return what a wave is multiplied by at every radius."""
+        from scipy.special import erfc
+
+        ramp = (radii - self.inner_radius) / (self.outer_radius - self.inner_radius)
+        # erfc has a spectrum that falls like a Gaussian: little ringing at the window's edge
+        falling: FloatArray = np.where(ramp <= 1, erfc(self.steepness * (2 * ramp - 1)) / 2, 0)
+        return falling
+
+    @property
+    def without_cut(self) -> Window:
+        """The same edge to where nothing is left of it."""
+        middle, half = (
+            (self.outer_radius + self.inner_radius) / 2,
+            (self.outer_radius - self.inner_radius) / 2,
         )
+        half *= WHOLE_STEEPNESS / self.steepness
+        return Window(middle - half, middle + half, WHOLE_STEEPNESS)
+
+    def spectral_spread(self, error: float) -> float:
+        """Lateral wavenumbers by which the window's edge spreads grazing waves, down to a relative
+        error, rad/m.
+        """
+        half = (self.outer_radius - self.inner_radius) / 2
+        return float(2 * self.steepness / half * np.sqrt(np.log(1 / error)))
 
 
 @dataclass(frozen=True)
@@ -143,9 +173,21 @@ class Offsets:
         return Offsets((y, x), reach, min(max(y, x), reach / np.sqrt(2)), self.extents)
 
 
-def find_min_periods(offsets: Offsets) -> Sides:
-    """Return the shortest periods along y and x in which a window has room, m."""
-    edge = INNER_RADIUS_FRACTION * offsets.reach + MIN_EDGE_FRACTION * offsets.along
+def find_min_periods(offsets: Offsets, tolerance: float) -> Sides:
+    """Return the shortest periods along y and x in which a window has room, m.
+
+    Parameters
+    ----------
+    offsets : Offsets
+    tolerance : float
+        Relative error allowed.
+
+    Returns
+    -------
+    (float, float)
+    """
+    inner = INNER_RADIUS_FRACTION - INNER_RADIUS_FRACTION_PER_DIGIT * np.log10(tolerance)
+    edge = inner * offsets.reach + MIN_EDGE_FRACTION * offsets.along
     y, x = (
         max(edge + far, extent)
         for far, extent in zip(offsets.farthest, offsets.extents, strict=True)
@@ -161,15 +203,17 @@ def find_fast_length(count: float) -> int:
     return min(length for length in lengths if length >= count)
 
 
-NODE_OVERSAMPLING = 2.5
-"""Nodes along the lateral wavenumber, relative to the Nyquist rate of the window's radius; interpolation then errs by
-5e-5."""
+NODE_OVERSAMPLING, FINE_NODE_OVERSAMPLING = 2.5, 3.5
+"""Nodes along the lateral wavenumber, relative to the Nyquist rate of the window's radius;
+interpolation then errs by 1.6e-4 in noise, which comes from the rim as well, and with finer nodes
+by 3e-5.
+"""
+
+FINE_NODES_TOLERANCE = 5e-4
+"""Relative error allowed, below which nodes are finer."""
 
 RADII_PER_PERIOD = 1.25
 """Samples along the radius per period of the fastest product of wave and Bessel function."""
-
-WINDOW_STEEPNESS = 1.6
-"""Of the window's edge, an error function: at its ends it is 1 - 0.012 and 0.012."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,17 +264,20 @@ class TransferFunction:
         Largest lateral wavenumber q wanted, rad/m.
     min_distance : float
         Smallest distance that will be asked for, m: the nearer, the more sharply peaked the wave.
+    oversampling : float
+        Nodes along the lateral wavenumber, relative to the Nyquist rate of the window's radius.
     """
 
     waves: SphericalWaves
     window: Window
     max_lateral_wavenumber: float
     min_distance: float
+    oversampling: float = NODE_OVERSAMPLING
 
     @cached_property
     def node_step(self) -> float:
         """Distance of neighbouring nodes in q, rad/m."""
-        return np.pi / (self.window.outer_radius * NODE_OVERSAMPLING)
+        return np.pi / (self.window.outer_radius * self.oversampling)
 
     @cached_property
     def nodes(self) -> FloatArray:
@@ -259,14 +306,10 @@ class TransferFunction:
     @cached_property
     def bessel_matrix(self) -> NDArray[np.float32]:
         """``J_0(q * rho)`` with all weights, shape (nodes, radii)."""
-        from scipy.special import erfc, j0
+        from scipy.special import j0
 
         radii, weights = self._radii
-        ramp = (radii - self.window.inner_radius) / (
-            self.window.outer_radius - self.window.inner_radius
-        )
-        # erfc has a spectrum that falls like a Gaussian: little ringing at the window's edge
-        falling = np.where(ramp <= 1, erfc(WINDOW_STEEPNESS * (2 * ramp - 1)) / 2, 0)
+        falling = self.window.fall(radii)
         return np.asarray(j0(np.outer(self.nodes, radii)) * (weights * falling), np.float32)
 
     def tabulate(self) -> int:
@@ -319,3 +362,52 @@ class TransferFunction:
         flat = self.bessel_matrix @ waves.reshape(radii.size, -1)
         nodes: NDArray[np.float32] = flat.reshape(-1, *waves.shape[1:])
         return nodes
+
+
+ENERGY_OVERSAMPLING = 1.25
+"""Nodes that tell how strong waves are, without interpolation between them."""
+
+
+def find_lateral_limits(
+    waves: SphericalWaves, window: Window, strength: FloatArray, distance: float, error: float
+) -> FloatArray:
+    """Return the largest lateral wavenumber that counts at each frequency, rad/m, increasing.
+
+    Independent signals of all sources excite all lateral wavenumbers alike, and what gets to a
+    distance is the transfer function's. Those that are weakest there are left out, over all
+    frequencies together: among them waves that travel aside at the band's edges, where the pulse is
+    weak, and evanescent ones.
+
+    Parameters
+    ----------
+    waves : SphericalWaves
+    window : Window
+    strength : (frequencies,) float64 array
+        Relative amplitude of each frequency.
+    distance : float
+        From the sources, along z, m.
+    error : float
+        Allowed, root mean square, relative.
+
+    Returns
+    -------
+    (frequencies,) float64 array
+    """
+    # of the window's fall only, not of where it is cut: that lies beyond all targets
+    whole = window.without_cut
+    beyond = waves.max_wavenumber + whole.spectral_spread(error)
+    points = replace(waves, continued=False)
+    transfer = TransferFunction(points, whole, beyond, abs(distance), ENERGY_OVERSAMPLING)
+    first = TAPS // 2  # the node at 0
+    lateral = transfer.nodes[first:]
+    real, imaginary = np.moveaxis(transfer.evaluate(abs(distance), np.zeros(2))[first:], 1, 0)
+    density = (real.astype(np.float64) ** 2 + imaginary.astype(np.float64) ** 2) * strength**2
+    # a ring of lateral wavenumbers holds waves in proportion to its radius
+    energy = density * lateral[:, np.newaxis]
+    order = np.argsort(density, axis=None)
+    left_out = np.searchsorted(np.cumsum(energy.ravel()[order]), error**2 * energy.sum())
+    counts = density >= density.ravel()[order[min(left_out, order.size - 1)]]
+    last = lateral.size - 1 - np.argmax(counts[::-1], axis=0)
+    farthest = np.where(counts.any(axis=0), last, 1)
+    limits: FloatArray = np.maximum.accumulate(lateral[np.maximum(farthest, 1)])
+    return limits

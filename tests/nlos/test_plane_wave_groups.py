@@ -99,7 +99,7 @@ def test_the_analysis_is_the_sum_over_the_plane() -> None:
 @pytest.mark.parametrize("count", [2, 4, 6])
 def test_carrying_is_transfer_and_sum_over_frequencies(count: int) -> None:
     transfer = TransferFunction(
-        WAVES, Window(1.2, 1.6), float(GROUPS.waves.lateral_limits[-1]), 0.1
+        WAVES, Window(1.2, 1.6, 1.6), float(GROUPS.waves.lateral_limits[-1]), 0.1
     )
     between = GROUPS.interpolation(transfer)
     delay = np.array([0.3, 45.0])
