@@ -133,6 +133,7 @@ class Rectifier:
 
     def __init__(self, camera: Camera, rows: int) -> None:
         self.camera = camera
+        self._dead = np.flatnonzero(camera.dead_columns)
         row, column = np.ogrid[:rows, : camera.slit_width_px]
         position = (row.astype(np.float64), column.astype(np.float64))
         raw = position if camera.sweep is None else camera.sweep.raw_position(*position)
@@ -192,7 +193,11 @@ class Rectifier:
         return Measurement(measurements, valid)
 
     def rectify(
-        self, counts: FloatImage, dark: float | None = None, delay: float = 0.0
+        self,
+        counts: FloatImage,
+        dark: float | None = None,
+        delay: float = 0.0,
+        room: FloatImage | None = None,
     ) -> FloatImage:
         """Return the measurements alone, for methods that cannot leave out single ones.
 
@@ -200,6 +205,8 @@ class Rectifier:
         ----------
         counts, dark, delay
             As for `measure`.
+        room : (rows, columns) float32 array, optional
+            Overwritten with what is returned: of many shots, none needs memory of its own.
 
         Returns
         -------
@@ -219,7 +226,8 @@ class Rectifier:
             np.float32(estimate_dark_level(counts) if dark is None else dark),
             np.float32(delay),
         )
-        measurements, raw = np.empty(self._raw_row.shape, np.float32), np.ascontiguousarray(counts)
+        measurements = np.empty(self._raw_row.shape, np.float32) if room is None else room
+        raw = np.ascontiguousarray(counts)
 
         def work(piece: slice) -> None:
             rows, target = self._raw_row[piece], measurements[piece]
@@ -233,7 +241,7 @@ class Rectifier:
 
         run_blocks(work, len(measurements), ROWS_PER_BLOCK)
         # Zero, not their raw value: methods that take no mask must not see a stuck column as light.
-        measurements[:, self.camera.dead_columns] = 0
+        measurements[:, self._dead] = 0
         # Some rows at a time: noise about the dark level is above it in the first ones already.
         pieces = split_blocks(len(measurements), ROWS_PER_BLOCK)
         if not any(measurements[piece].max() > 0 for piece in pieces):

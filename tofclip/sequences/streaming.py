@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from threading import Condition, Semaphore, Thread
 from time import perf_counter
@@ -22,6 +22,7 @@ from typing import Any, Generic, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from tofclip.camera import Rectifier
 from tofclip.errors import InputError
 from tofclip.lidar import PointCloud, point_cloud
 from tofclip.sequences.ranger import CloudPipeline, RangingPipeline
@@ -299,8 +300,10 @@ class StreamedCloud:
     cloud : PointCloud
     returns : Returns
         Those that the cloud's points are, in the same order.
-    measurements : (columns, rows) float32 array
-        The shot, rectified.
+    streak : Streak
+        The shot.
+    rectifier : Rectifier
+        Of its camera.
     shot : int
         Number of its shot in the source, from 0; what was dropped has been counted.
     seconds : mapping
@@ -312,10 +315,18 @@ class StreamedCloud:
 
     cloud: PointCloud
     returns: Returns
-    measurements: NDArray[np.float32]
+    streak: Streak
+    rectifier: Rectifier
     shot: int
     seconds: Mapping[str, float]
     latency: float
+
+    @cached_property
+    def measurements(self) -> NDArray[np.float32]:
+        """The shot, rectified, (columns, rows). Worked out when it is asked for: memory that every
+        shot takes anew takes longer to get than to fill.
+        """
+        return self.rectifier.rectify(self.streak.counts)
 
 
 def stream_clouds(
@@ -381,30 +392,40 @@ def stream_clouds(
         # turn has the next one at hand. It grows old there, where the channel would have a newer.
         cores = 1 if pipeline.in_order else thread_count()
         room = cores + (policy == "block") if at_once is None else at_once
-        work = partial(_make_cloud, pipeline)
+        work = partial(_make_cloud, pipeline, deque[NDArray[np.float32]]())
         with closing(run_in_order(coming, work, workers, room, queue_size, policy)) as items:
             for item in items:
-                measurements, returns, cloud, seconds = item.value
+                streak, returns, cloud, seconds = item.value
                 waited = item.latency - sum(seconds.values())
                 steps = {READ: item.read_seconds, WAIT: waited, **seconds}
-                yield StreamedCloud(cloud, returns, measurements, item.number, steps, item.latency)
+                yield StreamedCloud(
+                    cloud, returns, streak, pipeline.rectifier, item.number, steps, item.latency
+                )
 
 
 def _make_cloud(
-    pipeline: CloudPipeline, shot: Streak
-) -> tuple[NDArray[np.float32], Returns, PointCloud, dict[str, float]]:
-    """Return a shot's measurements, returns and cloud, and what each step took, s."""
+    pipeline: CloudPipeline, spare: deque[NDArray[np.float32]], shot: Streak
+) -> tuple[Streak, Returns, PointCloud, dict[str, float]]:
+    """Return a shot with its returns and cloud, and what each step took, s.
+
+    `spare` is memory for measurements that no shot needs now.
+    """
     ends = [perf_counter()]
-    measurements = pipeline.rectifier.rectify(shot.counts)
+    try:
+        room = spare.pop()
+    except IndexError:
+        room = np.empty(shot.counts.shape, np.float32)
+    measurements = pipeline.rectifier.rectify(shot.counts, room=room)
     ends.append(perf_counter())
     found = pipeline.recover_shot(shot, measurements)
+    spare.append(room)
     ends.append(perf_counter())
     returns = pipeline.search(found)
     ends.append(perf_counter())
     cloud = point_cloud(returns)
     ends.append(perf_counter())
     seconds = [end - begin for begin, end in pairwise(ends)]
-    return measurements, returns, cloud, dict(zip(STEPS, seconds, strict=True))
+    return shot, returns, cloud, dict(zip(STEPS, seconds, strict=True))
 
 
 def _prepend_shot(first: Streak, others: Iterator[Streak]) -> Iterator[Streak]:
