@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import stat
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import hypothesis.extra.numpy as hnp
@@ -337,6 +339,25 @@ def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path) -> None:
     assert child.stdout.startswith(f"{target}: cannot be written: the disk is full")
     assert target.read_text() == "old"
     assert os.listdir(tmp_path) == ["frames.h5"]
+
+
+@pytest.mark.parametrize("fault", [RuntimeError("code C20"), OSError("9 requested and 3 written")])
+@pytest.mark.parametrize("free", [0, 1 << 30])
+def test_a_librarys_own_error_on_a_full_disk_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Exception, free: int
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
+    expected = StorageError if free == 0 or isinstance(fault, OSError) else RuntimeError
+    reason = "the disk is full" if free == 0 else str(fault)
+
+    def write_half() -> None:
+        with atomic_path(tmp_path / "scene.e57") as temporary:
+            temporary.write_bytes(b"half")
+            raise fault
+
+    with pytest.raises(expected, match=reason):
+        write_half()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_provenance_names_the_inputs(tmp_path: Path) -> None:

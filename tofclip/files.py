@@ -14,11 +14,12 @@ import io
 import math
 import os
 import secrets
+import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tofclip.errors import FileFormatError, StorageError
+from tofclip.errors import FileFormatError, StorageError, TofclipError
 
 if TYPE_CHECKING:
     import h5py
@@ -34,6 +35,11 @@ MAX_CHUNK_BYTES = 1 << 26
 
 MAX_HASHED_BYTES = 1 << 24
 """Of larger files, size, time of change and the first bytes, this number of them, stand for the content."""
+
+MIN_FREE_BYTES = 4096
+"""A disk with less, a block of most file systems, is full."""
+
+DISK_IS_FULL = "the disk is full; free some space or choose another folder"
 
 MAX_MESSAGE_LENGTH = 200
 """Of another library's message that is part of ours."""
@@ -204,10 +210,20 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         os.replace(temporary, target)
         with contextlib.suppress(OSError):  # not every system can flush a folder
             _flush_to_disk(target.parent)
-    except OSError as fault:
-        if isinstance(fault, StorageError):
+    except TofclipError:
+        raise
+    except Exception as fault:
+        # Writers of other libraries have errors of their own, or OSErrors without a number, for a
+        # disk that is full; as long as the temporary file is there, it still is.
+        if isinstance(fault, OSError) and fault.errno is not None:
+            reason = _explain_os_error(fault)
+        elif _is_full(target.parent):
+            reason = DISK_IS_FULL
+        elif isinstance(fault, OSError):
+            reason = format_error_line(fault)
+        else:
             raise
-        raise StorageError(f"{target}: cannot be written: {_explain_os_error(fault)}") from fault
+        raise StorageError(f"{target}: cannot be written: {reason}") from fault
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -263,9 +279,15 @@ def _flush_to_disk(path: Path) -> None:
         os.close(handle)
 
 
+def _is_full(folder: Path) -> bool:
+    with contextlib.suppress(OSError):
+        return shutil.disk_usage(folder).free < MIN_FREE_BYTES
+    return False
+
+
 def _explain_os_error(fault: OSError) -> str:
     if fault.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return "the disk is full; free some space or choose another folder"
+        return DISK_IS_FULL
     if isinstance(fault, FileNotFoundError):
         return "the folder does not exist; create it first"
     if isinstance(fault, NotADirectoryError):

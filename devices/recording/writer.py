@@ -198,9 +198,8 @@ class RecordingWriter:
         self._number += 1
 
     def _explain(self, fault: OSError) -> StorageError:
-        return StorageError(
-            f"{self._path}: cannot be written: {fault.strerror}; what was recorded so far is safe"
-        )
+        safe = "; what was recorded so far is safe" if self._number else ""
+        return StorageError(f"{self._path}: cannot be written: {fault.strerror}{safe}")
 
 
 def _render_head(head: Record, path: Path) -> bytes:
