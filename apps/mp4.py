@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from struct import Struct
 from typing import TYPE_CHECKING, Any
 
 from tofclip.errors import MissingDependencyError, StorageError
-from tofclip.files import atomic_path
+from tofclip.files import DISK_IS_FULL, atomic_path
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,6 +27,10 @@ def import_opencv() -> Any:
     return cv2
 
 
+BOX_HEADER, LONG_LENGTH = Struct(">I4s"), Struct(">Q")
+"""Length and kind of a box of an MP4 file, ISO/IEC 14496-12."""
+
+
 class FilmWriter:
     """A film that is being written.
 
@@ -37,7 +42,7 @@ class FilmWriter:
     """
 
     def __init__(self, path: Path, rate: float) -> None:
-        self._path, self._rate, self._cv2 = path, rate, import_opencv()
+        self.path, self._rate, self._cv2 = path, rate, import_opencv()
         self._writer: Any = None
 
     def add(self, pixels: NDArray[np.uint8]) -> None:
@@ -45,11 +50,11 @@ class FilmWriter:
         if self._writer is None:
             code = self._cv2.VideoWriter_fourcc(*CODEC)
             self._writer = self._cv2.VideoWriter(
-                str(self._path), code, self._rate, (pixels.shape[1], pixels.shape[0])
+                str(self.path), code, self._rate, (pixels.shape[1], pixels.shape[0])
             )
             if not self._writer.isOpened():
                 raise StorageError(
-                    f"{self._path}: this machine's OpenCV writes no {CODEC} films; write pictures"
+                    f"no film can be begun: the disk is full, or this machine's OpenCV has no {CODEC}: write pictures"
                 )
         self._writer.write(pixels[..., ::-1])
 
@@ -79,3 +84,30 @@ def open_film(out: Path, rate: float) -> Iterator[FilmWriter]:
             yield film
         finally:
             film.close()
+        if not is_whole_film(temporary):  # OpenCV says nothing of what it could not write
+            raise StorageError(f"{out}: cannot be written: {DISK_IS_FULL}")
+
+
+def is_whole_film(path: Path) -> bool:
+    """Whether an MP4 file has all that it says: its index, which is written last, and every box.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    bool
+    """
+    size, place, kinds = path.stat().st_size, 0, set()
+    with open(path, "rb") as file:
+        while place + BOX_HEADER.size <= size:
+            file.seek(place)
+            length, kind = BOX_HEADER.unpack(file.read(BOX_HEADER.size))
+            if length == 1:  # longer than 32 bits tell: the length follows
+                (length,) = LONG_LENGTH.unpack(file.read(LONG_LENGTH.size).ljust(8, b"\0"))
+            if length < BOX_HEADER.size:
+                return False
+            kinds.add(kind)
+            place += length
+    return place == size and b"moov" in kinds

@@ -198,7 +198,7 @@ class RecordingWriter:
         self._number += 1
 
     def _explain(self, fault: OSError) -> StorageError:
-        safe = "; what was recorded so far is safe" if self._number else ""
+        safe = "; what was recorded so far is safe" if self.bytes_written else ""
         return StorageError(f"{self._path}: cannot be written: {fault.strerror}{safe}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -11,7 +12,9 @@ from hidden_point import POINT, object_of
 from PIL import Image
 from small_instrument import Run
 
+from apps.mp4 import open_film
 from nlos import Capture, TransientVideo
+from tofclip.errors import StorageError
 from tofclip.units import SPEED_OF_LIGHT
 
 QUICK = ["--voxel-mm", 40, "--instants", 5]
@@ -116,3 +119,22 @@ def test_without_opencv_there_is_no_mp4(
     assert refused.status == 2
     assert "tofclip[film]" in refused.err
     assert refused.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("part", [0, 0.3, 0.999])
+def test_a_film_that_the_disk_cut_short_is_no_result(tmp_path: Path, part: float) -> None:
+    pytest.importorskip("cv2")
+    pictures = np.random.default_rng(1).integers(0, 255, (8, 48, 64, 3), dtype=np.uint8)
+
+    def write(name: str, share: float) -> None:
+        with open_film(tmp_path / name, 10.0) as film:
+            for picture in pictures:
+                film.add(picture)
+            film.close()
+            whole = film.path.stat().st_size
+            os.truncate(film.path, int(share * whole))
+
+    write("whole.mp4", 1)
+    with pytest.raises(StorageError, match=r"cut\.mp4: cannot be written: the disk is full"):
+        write("cut.mp4", part)
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.mp4"]

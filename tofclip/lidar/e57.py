@@ -47,10 +47,19 @@ def write_e57(path: Path, columns: Columns) -> None:
         pye57 is not installed.
     """
     pye57 = _import_pye57()
-    lib = pye57.libe57
     # The library makes its files itself.
     path.unlink(missing_ok=True)
     file = pye57.E57(str(path), mode="w")
+    try:
+        _write_scan(pye57.libe57, file, columns)
+        file.close()
+    except Exception:
+        # Closed once more when it is collected, it would print that it still cannot be written.
+        vars(file).pop("image_file", None)
+        raise
+
+
+def _write_scan(lib: Any, file: Any, columns: Columns) -> None:
     image = file.image_file
     image.extensionsAdd(EXTENSION, EXTENSION_URI)
     scan = lib.StructureNode(image)
@@ -66,7 +75,6 @@ def write_e57(path: Path, columns: Columns) -> None:
     extra, fill_extra = _prepare_vector(lib, image, own)
     file.root.set(EXTRA_COLUMNS, extra)
     fill_extra()
-    file.close()
 
 
 def list_e57_columns(path: Path) -> dict[str, ArchiveEntry]:
