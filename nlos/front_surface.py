@@ -208,6 +208,7 @@ def _refine_peaks(magnitude: NDArray[np.floating], z: FloatArray) -> FloatArray:
         for i in (-1, 0, 1)
     )
     curvature = below - 2 * middle + above
+    # Where the three do not bend downwards there is no vertex: dividing by -inf moves nothing.
     safe = np.where(curvature < 0, curvature, -np.inf)
     offset = np.where(peak == inner, (below - above) / (2 * safe), 0.0)
     step = float(np.median(np.diff(z)))

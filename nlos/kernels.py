@@ -254,13 +254,17 @@ def add_illuminated_terms(terms, odd, x, y, depth, laser, wavenumber, table, spa
         np.empty((2, x.size), np.float32),
     )
     waves = np.empty((2, x.size), np.float32)
+    # A plane of one voxel has a span of 0: any sample is right there.
     per_metre = (table.shape[1] - 1) / max(span[1] - span[0], 1e-12)
     turns_per_metre = wavenumber / (2 * math.pi)
     for iy in range(y.size):
         across = (y[iy] - laser[1]) ** 2 + (depth - laser[2]) ** 2
         for ix in range(x.size):
+            # The wave turns many times across the plane and is computed; what multiplies it, f_m,
+            # is smooth enough for linear interpolation.
             distance = math.sqrt((x[ix] - laser[0]) ** 2 + across)
             place = max((distance - span[0]) * per_metre, 0.0)
+            # So that the last sample has a neighbour behind it; the weight is then 1.
             sample = min(int(place), table.shape[1] - 2)
             before[ix], weight[ix] = sample, place - sample
             waves[0, ix], waves[1, ix] = _compute_wave(distance * turns_per_metre)

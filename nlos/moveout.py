@@ -281,5 +281,6 @@ class _Moveout:
         bins = (paths - axis.start) / axis.spacing
         before = np.clip(bins.astype(np.intp), 0, axis.bins - 2)
         weight = (bins - before).astype(np.float32)
+        # What was not recorded is read from a row of zeros behind the last bin.
         before[(bins < 0) | (bins > axis.bins - 1)] = axis.bins
         return before * before.shape[1] + np.arange(before.shape[1]), weight

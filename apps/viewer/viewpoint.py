@@ -268,6 +268,7 @@ def _fit_field_of_view(viewpoint: Viewpoint, xyz: NDArray[Any], aspect: float) -
     """Return the field of view that holds nearly all points."""
     right, down, depth = np.abs(viewpoint.axes @ (xyz - viewpoint.eye).T)
     slopes = np.maximum(down, right / aspect) / np.maximum(depth, 1e-6)
+    # One stray point must not make everything else small: within bounds its tip may be cut off.
     most, farthest = np.percentile(slopes, (99.5, 100.0))
     tips = TIP_MARGIN * min(farthest, MAX_TIP * most)
     return float(2 * np.arctan(max(VIEW_MARGIN * most, tips)))

@@ -131,7 +131,9 @@ class Tmf8828Parser:
         place = number % self._captures
         if self._seen.all():
             lanes = self._lanes.reshape(self._halves, 3, TMF_CHANNELS, TMF_BINS)
+            # Counts of 24 bits come as three lines of bytes, the lowest first.
             channels = lanes[:, 0] | lanes[:, 1] << 8 | lanes[:, 2] << 16
+            # Channel 0 is the reference that looks at the emitter, not at the scene.
             looking = channels[:, 1 : 1 + self.zones // (self._captures * self._halves)]
             width = self.zones // self._captures
             self._counts[:, place * width : (place + 1) * width] = looking.reshape(width, -1).T

@@ -3,10 +3,13 @@ public).
 
 A record is 6 bytes, the highest first::
 
-    bit 47     records were lost right before this one (the instrument's memory was full) bit 46
-    the counter is at zero: it has wrapped bit 45     0: strobe, the channels that saw an edge; 1:
-    delta, the new levels of the delta channels bits 44-40 unused, zero bits 39-36 channels 3..0
-    bits 35-0  the counter, in ticks of the instrument's clock
+    bit 47      records were lost right before this one (the instrument's memory was full)
+    bit 46      the counter is at zero: it has wrapped
+    bit 45      0: strobe, the channels that saw an edge
+                1: delta, the new levels of the delta channels
+    bits 44-40  unused, zero
+    bits 39-36  channels 3..0
+    bits 35-0   the counter, in ticks of the instrument's clock
 
 The counter wraps every 2**36 ticks (about nine minutes at 128 MHz), and the instrument sends a
 record each time it is at zero, whether or not a channel saw anything, so that none is missed.

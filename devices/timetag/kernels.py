@@ -63,9 +63,12 @@ def decode_timetags(data, epoch, previous, after_loss, ticks, channels, flags):
         kind = high >> 13
         good = (high & 0x1F00) == 0 and (lines != 0 or kind & (DELTA | WRAP) != 0)
         if good and kind & WRAP:
+            # The counter was at zero: the word says so itself, or its time is below the last one's.
             good = time == 0 or time < previous
             epoch += good
         elif good and time < previous:
+            # Time falls only where words were lost, the wrap's among them, and then by more than
+            # half the range; a smaller fall is a damaged word.
             good = (kind & LOST != 0 or expects_loss) and previous - time > HALF_RANGE
             epoch += good
             previous = time  # one wrong word must not make all that follow look wrong

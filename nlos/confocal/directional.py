@@ -125,6 +125,8 @@ def _separate(
         length * np.fft.fftfreq(n, 1 / n)
         for length, n in zip(scan.plane.steps, shape[:2], strict=True)
     )
+    # In coordinates of squared time a point's light is a paraboloid, late by the square of the
+    # distance across: the same at every depth, hence one convolution for all.
     late = (y[:, np.newaxis] ** 2 + x**2) / squares
     whole = np.floor(late)
     weight = (late - whole)[..., np.newaxis]
@@ -133,10 +135,14 @@ def _separate(
     parts = np.empty((3, *spectrum.shape), np.complex64)
 
     def process_block(some: slice) -> None:
+        # A delay of a whole number of bins is a power of one phase; the fraction is shared between
+        # two bins, as in time.
         turn = np.exp(-2j * np.pi * np.arange(some.start, some.stop) / shape[2])
         column = tabulate_powers(turn, whole.astype(np.intp), shape[2], some.start)
         column = column * ((1 - weight + weight * turn) * height[..., np.newaxis])
         kernels = fft2(sides[..., np.newaxis] * column, axes=(1, 2)).astype(np.complex64)
+        # Wiener: the floor is the noise over the signal; the three components are what explains the
+        # signal with the least power.
         gain = spectrum[..., some] / (np.sum(np.abs(kernels) ** 2, axis=0) + np.float32(floor))
         parts[..., some] = kernels.conj() * gain
 

@@ -210,6 +210,8 @@ def _require_confocal(capture: Capture, plane: Plane) -> None:
 
 def _require_extent(plane: Plane, grid: Grid) -> None:
     for name, axis, wanted in (("x", plane.x, grid.x), ("y", plane.y, grid.y)):
+        # The transforms pad the wall to twice its width: what lies farther out would come in again
+        # on the other side.
         margin = (axis[-1] - axis[0]) / 2
         low, high = axis[0] - margin, axis[-1] + margin
         if wanted[0] < low or wanted[-1] > high:

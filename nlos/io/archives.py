@@ -108,6 +108,7 @@ def resample_evenly(
         )
     even = edges[0] + spacing * np.arange(bins + 1)
     flat = signal.reshape(len(signal), -1)
+    # The running sum is interpolated, not the counts: differences of it keep every photon.
     arrived = np.concatenate([np.zeros((1, flat.shape[1])), np.cumsum(flat, axis=0, dtype=float)])
     before = np.clip(np.searchsorted(edges, even, side="right") - 1, 0, len(signal) - 1)
     part = np.clip((even - edges[before]) / (edges[before + 1] - edges[before]), 0, 1)

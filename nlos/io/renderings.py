@@ -5,10 +5,10 @@ Renderers write a transient picture (row, column, t) as one picture (column, t) 
 numbered from the top; the geometry, which the pictures do not hold, stands in ``geometry.toml``
 beside them::
 
-    bin_width_ps = 10.0 start_m = 0.0              # path that the first column holds, ways to and
-    from the devices taken off wall_corners_m = [[-1, -1, 0], [1, -1, 0], [-1, 1, 0]]   # top left,
-    top right, bottom left wall point laser_m = [0, 0, 0]        # the spot on the wall; "confocal"
-    where each point is lit in turn
+    bin_width_ps = 10.0
+    start_m = 0.0          # path that the first column holds, legs to and from the devices taken off
+    wall_corners_m = [[-1, -1, 0], [1, -1, 0], [-1, 1, 0]]  # top left, top right, bottom left
+    laser_m = [0, 0, 0]    # the spot on the wall; "confocal" where each point is lit in turn
 
 (The layout is that of A. Jarabo, J. Marco et al., "A framework for transient rendering", ACM Trans.
 Graph. 33, 177 (2014).)

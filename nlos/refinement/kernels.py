@@ -55,12 +55,14 @@ def _place_light(
         along_x = (out_x * per_outward + back_x * per_back) * cell[0]
         along_y = (out_y * per_outward + back_y * per_back) * cell[1]
         along_z = (out_z * per_outward + back_z * per_back) * cell[2]
+        # An even spread of this width has the variance of the three along the axes together.
         spread = math.sqrt(along_x * along_x + along_y * along_y + along_z * along_z)
         width = max(spread * per_metre, np.float32(MIN_WIDTH_BINS))
         middle = (outward + back - start) * per_metre
         half = np.float32(0.5) * width
         begins[i] = min(max(middle - half, np.float32(0)), np.float32(bins))
         ends[i] = min(max(middle + half, np.float32(0)), np.float32(bins))
+        # Light falls with the square of either leg.
         fall = per_outward * per_back
         rates[i] = fall * fall / width
         if obliquity > 0:
@@ -113,6 +115,8 @@ def add_expected_light(walls, lasers, cell, start, per_metre, obliquity, voxels,
                 light = np.float64(albedo[first + i] * rates[i])
                 begin, end = np.int32(begins[i]), np.int32(ends[i])
                 after = np.float64(begins[i] - np.float32(begin)) * light
+                # Only the two edges of the box are written, each shared between two bins; the
+                # running sum afterwards fills what lies between, however wide.
                 changes[p, begin] += light - after
                 changes[p, begin + 1] += after
                 after = np.float64(ends[i] - np.float32(end)) * light
@@ -170,6 +174,7 @@ def add_backprojected_light(
             for i in range(last - first):
                 begin, end = np.int32(begins[i]), np.int32(ends[i])
                 after = begins[i] - np.float32(begin)
+                # The box's sum is the difference of two running sums, interpolated like the edges.
                 value = sums[p, begin] + after * (sums[p, begin + 1] - sums[p, begin])
                 after = ends[i] - np.float32(end)
                 value -= sums[p, end] + after * (sums[p, end + 1] - sums[p, end])

@@ -234,9 +234,12 @@ def compute_beam(fit: PhotonFit) -> FloatArray:
     place = middle[::-1]
     back, out = place - capture.points, place - capture.lasers
     far, near = (np.linalg.norm(one, axis=1, keepdims=True) for one in (back, out))
+    # The path's gradient at a place is the sum of both legs' unit vectors.
     gradients = back / far + out / near
     light = ((far * near) ** -2.0).ravel()
     spacing = capture.axis.spacing
+    # Response and the even spread over a bin, whose standard deviation is 1 / sqrt(12), add in
+    # squares.
     path = spacing * np.hypot(fit.response_sigma, 12**-0.5)
     slopes = np.sqrt(np.average(gradients**2, axis=0, weights=np.broadcast_to(light, len(back))))
     return np.asarray(path / np.maximum(slopes[::-1], 1e-3))

@@ -225,6 +225,7 @@ class PhotonPlan(Plan):
         if not albedo.any():
             raise InputError("the linear image is dark: there is nothing to refine")
         seen = albedo.ravel()
+        # Updates multiply: a voxel that begins at 0 would stay dark for ever.
         albedo = np.maximum(seen, START_FRACTION * seen.max())
         model = TimeOfFlight(photons.capture, grid, build_response(sigmas[len(sigmas) // 2]), 1)
         fit = PhotonFit(photons, model, np.arange(grid.size), albedo, 0.0)

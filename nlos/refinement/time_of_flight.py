@@ -94,6 +94,8 @@ class TimeOfFlight:
         -------
         (n,) float32 array
         """
+        # Running sums from the end on: a box of light is the difference of two, see the kernel. The
+        # response is turned around, as the adjoint of a convolution asks for.
         sums = np.zeros((len(points), self._bins + 2), np.float32)
         spread = self.spread(values, self.response[::-1])
         np.cumsum(spread[:, ::-1], axis=1, out=sums[:, self._bins - 1 :: -1])

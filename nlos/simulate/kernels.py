@@ -120,6 +120,8 @@ def add_facet_light(
     outward = np.empty(positions.shape[0])
     lit = np.empty(positions.shape[0])
     for p in range(wall.shape[0]):
+        # One spot lights the scene for all points, or each point has its own: what is lit, and the
+        # shadows, are found once per spot.
         if p < lasers.shape[0]:
             for f in range(positions.shape[0]):
                 way = distance_between(lasers[p], positions[f])
@@ -129,6 +131,7 @@ def add_facet_light(
                 ) * cosine_to_normal(laser_normals[p], lasers[p], positions[f], way)
                 if arriving > 0 and is_occluded(positions[f], lasers[p], triangles):
                     arriving = 0.0
+                # Irradiance times area: cosines at both ends over the square of the distance.
                 lit[f] = arriving * areas[f] / (way * way)
         laser = lasers[min(p, lasers.shape[0] - 1)]
         for f in range(positions.shape[0]):

@@ -221,6 +221,8 @@ def _subdivide_triangles(
             raise InputError(
                 f"the mesh needs more than {MAX_FACETS} facets at a spacing of {spacing} m; use a larger one"
             )
+        # Corners are renamed so that the longest side is from a to b, in the same sense of turning:
+        # normals keep their side.
         turn = (longest[~small, np.newaxis] + np.arange(3)) % 3
         a, b, c = np.moveaxis(
             np.take_along_axis(pending[~small], turn[..., np.newaxis], axis=1), 1, 0
@@ -234,6 +236,7 @@ def _subdivide_triangles(
         small_triangles[:, 1] - small_triangles[:, 0], small_triangles[:, 2] - small_triangles[:, 0]
     )
     areas = np.linalg.norm(crosses, axis=1) / 2
+    # Facets without area, of meshes with repeated corners, have no normal.
     flat = areas > 0
     return small_triangles[flat].mean(axis=1), crosses[flat], areas[flat]
 

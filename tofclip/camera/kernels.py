@@ -113,11 +113,14 @@ def sample_bilinear(counts, dark, raw_row, raw_column, delay, measurements):
     flat, zero, width = counts.reshape(counts.size), np.int32(0), np.int32(columns)
     last_row, lowest = np.float32(rows - 1), np.int32(max(rows - 2, 0))
     last_column, rightmost = np.float32(columns - 1), np.int32(max(columns - 2, 0))
+    # In an image of a single row or column the neighbour is the pixel itself, with any weight.
     below, beside = np.int32(min(1, rows - 1)) * width, np.int32(min(1, columns - 1))
     for row in range(raw_row.shape[0]):
         down, across, reading = raw_row[row], raw_column[row], measurements[row]
         for column in range(down.size):
             y, x = down[column] + delay, across[column]
+            # Positions outside are moved inside before anything is read, and their values made 0
+            # afterwards.
             top, left = min(max(np.int32(y), zero), lowest), min(max(np.int32(x), zero), rightmost)
             right, here = x - np.float32(left), top * width + left
             upper = flat[here] + right * (flat[here + beside] - flat[here])

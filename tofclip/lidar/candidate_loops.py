@@ -145,6 +145,7 @@ def pool_significance(pixel, at, distance, own, starts, image_shape, limits, poo
                 inside = 0 <= y + j < rows and 0 <= x + i < columns
                 if not inside or left < 0 or (j == 0 and i == 0):
                     continue
+                # A ball, not a box: a neighbour farther across may differ less in range.
                 most = gate * math.sqrt(left)
                 there = (y + j) * columns + x + i
                 for k in range(starts[there], starts[there + 1]):

@@ -139,6 +139,8 @@ class Pulse:
             )
         )
         time = np.arange(-before, after + 1) * spacing
+        # Integral up to each sample, by trapezoids; the light of a bin is the difference at its
+        # edges.
         arrived = np.concatenate([[0.0], np.cumsum((self.samples[1:] + self.samples[:-1]) / 2)])
         position = (
             time[:, np.newaxis] + np.array([-0.5, 0.5]) * bin_width

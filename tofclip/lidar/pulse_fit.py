@@ -405,6 +405,8 @@ def measure_returns(trace, times, background, noise, curve, scale, estimate, lea
             pp += p * p
             pd += p * d
             dd += d * d
+        # The normal equations have no solution where pulse and slope are alike, as in a window that
+        # holds the pulse's edge only.
         if height * math.sqrt(pp) <= least or pp * dd <= pd * pd:
             continue
         total, deviation = estimate_sum_and_deviation(

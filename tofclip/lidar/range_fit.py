@@ -178,6 +178,9 @@ def fit_range_calibration(
     curved = len(shots) >= MIN_CURVED_WALK_SHOTS and np.ptp(span) >= CURVED_WALK_SPAN_DECADES
     order = 0 if walk_note else 1 + int(curved)
     reference = float(10 ** np.median(np.log10(sample.signal)))
+    # What shifts a return with its brightness, a threshold on an edge above all, goes by factors of
+    # brightness: hence decades. From the usual brightness, so that the constant is the time zero of
+    # a usual return.
     decades = np.log10(sample.signal / reference)
     data = Measurements(
         sample.excess,
@@ -264,9 +267,12 @@ def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
     )
     if len(found) == 0:
         raise missing
+    # A plate across the axis is farther along slanted lines of sight: its distance is over the
+    # cosine.
     cosine = compute_ray_directions(camera, found.y, found.x)[:, 2]
     excess = found.range - shot.distance / cosine
     sigma = np.maximum(found.confidence.astype(np.float64), np.finfo(np.float32).tiny)
+    # In few photons ranges scatter by more than a pulse: six standard deviations hold them.
     width = max(WINDOW_PULSES * pulse, 6 * float(np.median(sigma)))
     target = _find_cluster(excess, width, shot.name)
     if target.sum() < needed:
@@ -278,6 +284,7 @@ def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
             f"{shot.name}: the target's return is cut off by the end of the record; move the "
             "target or the record"
         )
+    # Whatever time zero the shot was recovered with is put back: it is what is to be found.
     zero = SPEED_OF_LIGHT / 2 * shot.returns.camera.time_zero
     square = measured_square(found.range)
     y, x = found.y[target].astype(np.int64), found.x[target].astype(np.int64)
@@ -297,6 +304,7 @@ def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
 def _find_cluster(excess: FloatArray, width: float, name: str) -> NDArray[np.bool_]:
     """Say which returns lie in the window that holds most of them, and refuse a rival to it."""
     order = np.sort(excess)
+    # How many returns lie in a window that begins at each one; the fullest window is the target.
     inside = np.searchsorted(order, order + width, side="right") - np.arange(order.size)
     first = int(np.argmax(inside))
     middle = float(np.median(order[first : first + inside[first]]))

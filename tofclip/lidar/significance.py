@@ -313,6 +313,7 @@ def find_usual_at_range(distance: FloatArray, pooled: FloatArray, length: float)
     edges = np.searchsorted(slot[order], np.arange(int(slot.max()) + 2))
     usual = np.zeros(edges.size - 1)
     for number in range(usual.size):
+        # With the slots before and behind: a surface at a slot's edge is in two of them.
         first, last = edges[max(number - 1, 0)], edges[min(number + 2, edges.size - 1)]
         around = pooled[order[first:last]]
         around = around[around > 0]

@@ -208,6 +208,7 @@ def _deposit_light(line, position, light, light_step):
     same row.
     """
     first = np.uint64(position >> FRACTION_BITS)
+    # The rest, not a product of its own: together the two are the light that came.
     beyond = line.dtype.type(position & FRACTION_MASK) * light_step
     line[first, 0] += light - beyond
     line[first, 1] += beyond
@@ -232,6 +233,7 @@ def project_onto_lines(picture, starts, rightward, downward, lines):
     lines : (lines, bins, 2) array
         Added to, in place.
     """
+    # Light times 2^-32: the fraction stays a whole number until it is multiplied once.
     step = picture.dtype.type(1 / (1 << FRACTION_BITS))
     pairs = starts.size // 2
     for one in range(0, 2 * pairs, 2):

@@ -153,6 +153,8 @@ class LineProjection(SparseMatrix):
         rows, columns = image_shape
         y = (np.arange(rows) - rows // 2)[:, np.newaxis]
         x = (np.arange(columns) - columns // 2)[np.newaxis, :]
+        # Slit coordinate of a scene point (X, Y) in a view: its centre + X - Y tan(angle), Y
+        # downwards.
         position = (
             self.centres_px[:, np.newaxis, np.newaxis]
             + x

@@ -299,6 +299,7 @@ class Fista:
         )
         seen = self.operator(candidate)
         objective = self.data_term.value(seen) + penalty
+        # Monotone variant: momentum may overshoot, and a frame that got worse keeps what it had.
         self.rejected = objective > self.objective
         if distance is not None:
             moved = self.data_term.squared_length(seen - predicted)
@@ -318,6 +319,8 @@ class Fista:
         one's ``t |A (h - z)|^2`` and ``|h - z|^2``.
         """
         xp = namespace(distance)
+        # t |A (h - z)|^2 / |h - z|^2 is at most 1 for a step that is surely safe; what is left
+        # below STEP_MARGIN may be used by a longer one.
         used = clip_values(curvature, TINY) / clip_values(distance, TINY)
         room = clip_values((log(STEP_MARGIN) - xp.log(used)) / log(STEP_GROWTH), highest=1.0)
         # a frame that stands still says nothing about its step

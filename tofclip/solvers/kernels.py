@@ -303,6 +303,8 @@ def _update_dual_row(lanes, here, below, sweep, down, across, shrink):
     """
     one, step = np.float32(1), np.uintp(lanes)
     end = np.uintp(here.size)
+    # The last pixel of a row has no right neighbour: its difference across is 0, and so is the dual
+    # there.
     inner = end - step
     for i in range(inner):
         vertical = down[i] + sweep[i] * (below[i] - here[i])

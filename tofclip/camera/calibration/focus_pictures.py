@@ -224,6 +224,7 @@ def _fit_dot(profile: FloatArray, column: int) -> tuple[float, float]:
         return value
 
     try:
+        # A dot is some 3 px wide where the fit begins; only the core is given to it.
         best, covariance = curve_fit(model, x, y, (np.ptp(y), column, 3.0, y.min()))
     except RuntimeError as fault:
         raise CalibrationError(f"the dot near column {column} has no clear centre") from fault
@@ -238,7 +239,10 @@ def _find_line_pixels(
     """
     from scipy.ndimage import gaussian_filter, label
 
+    # Smoothed, or noise would cut a faint line into pieces.
     smooth = gaussian_filter(signal, 1.5)
+    # The slit is a few pixels high and not exactly horizontal, and the open slit's line is wider
+    # than the dot: the brightest pixel near the crossing is where the region begins.
     near = smooth[max(0, slit_row - 5) : slit_row + 6, max(0, column - 6) : column + 7]
     if near.max() <= 0:
         raise CalibrationError(
@@ -259,19 +263,26 @@ def _fit_principal_line(
     rows: FloatArray, columns: FloatArray, brightness: FloatArray
 ) -> tuple[float, float, float]:
     """Slope (columns per row), column at row 0 and the slope's standard deviation."""
+    # Negative light is the background's noise; as a weight it would push the line away.
     weights = np.maximum(brightness, 0)
     points = np.stack([rows, columns])
     middle = np.average(points, axis=1, weights=weights)
+    # Distances across the line count, not along rows or columns: a line may be steep or flat. eigh
+    # sorts upwards, so that the last axis runs along the line.
     _, axes = np.linalg.eigh(np.cov(points, aweights=weights))
     down, right = axes[:, 1]
     slope = float(right / down)
     along = (points - middle[:, np.newaxis]).T @ axes[:, 1]
     across = (points - middle[:, np.newaxis]).T @ axes[:, 0]
+    # Pixels of one piece err alike, by the lens: the pieces' middles, not the pixels, are what
+    # scatters independently.
     cuts = np.quantile(along, np.linspace(0, 1, LINE_SEGMENT_COUNT + 1))
     piece = np.clip(np.searchsorted(cuts, along, side="right") - 1, 0, LINE_SEGMENT_COUNT - 1)
     total = np.bincount(piece, weights, LINE_SEGMENT_COUNT)
     position = np.bincount(piece, weights * along, LINE_SEGMENT_COUNT) / total
     deviation = np.bincount(piece, weights * across, LINE_SEGMENT_COUNT) / total
+    # Two degrees of freedom went into the line.
     scatter = np.sqrt(np.sum(deviation**2) / (LINE_SEGMENT_COUNT - 2))
     tilt_error = scatter / np.sqrt(np.sum((position - position.mean()) ** 2))
+    # d tan(a) = (1 + tan(a)^2) da turns the error of the angle into that of the slope.
     return slope, float(middle[1] - slope * middle[0]), float(tilt_error * (1 + slope**2))

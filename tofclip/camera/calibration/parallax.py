@@ -110,6 +110,7 @@ def fit_parallax_to_shears(
         raise ShapeError("distances and weights", s.shape, d.shape)
     if not np.all(np.isfinite(s)) or not np.all(d > 0) or np.unique(d[w > 0]).size < 2:
         raise CalibrationError("a parallax needs finite shears at two or more positive distances")
+    # s(d) = -strength / d + constant is linear in both; weights of squares enter by their roots.
     root = np.sqrt(w)
     design = np.stack([-1 / d, np.ones_like(d)], axis=1)
     (strength, constant), *_ = np.linalg.lstsq(design * root[:, np.newaxis], s * root, rcond=None)
@@ -249,6 +250,7 @@ def _fit_focus_curve(table: FloatArray, tried: FloatArray, light: FloatArray) ->
     """Vertex of the parabola through each maximum and its neighbours."""
     rows = np.arange(table.shape[0])
     best = table.argmax(axis=1)
+    # At the end of what was tried there is no neighbour on one side: no vertex, no weight.
     inner = best.clip(1, max(1, tried.size - 2))
     left, centre, right = (
         table[rows, (inner + side).clip(0, tried.size - 1)] for side in (-1, 0, 1)
@@ -257,5 +259,6 @@ def _fit_focus_curve(table: FloatArray, tried: FloatArray, light: FloatArray) ->
     firm = (best == inner) & (bend > 0)
     beyond = np.divide((right - left) / 2, bend, out=np.zeros_like(centre), where=firm)
     step = tried[1] - tried[0]
+    # A sharp maximum in much light says most about the shear; a flat one next to nothing.
     weight = np.where(firm, light * bend / np.maximum(centre, np.finfo(np.float64).tiny), 0.0)
     return FocusCurve(table, tried[best] + np.where(firm, beyond, 0.0) * step, weight)

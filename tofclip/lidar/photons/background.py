@@ -72,18 +72,22 @@ def learn_background(histograms: FloatArray, width: float) -> FloatArray | None:
         return None
     length = max(2, round(WINDOW_WIDTHS * width))
     edges = np.arange(0, bins, length)
+    # A short last window has too few photons of its own: it joins the one before.
     if bins - edges[-1] < length / 2 and edges.size > 1:
         edges = edges[:-1]
     counts = np.add.reduceat(histograms, edges, axis=1)
     sizes = np.diff(np.append(edges, bins))
     background = remove_bumps(segment_counts(total), total, width)
     for window in np.flatnonzero(find_clumps(counts)):
+        # Where pixels come in clumps the mean holds returns; the background's own form within the
+        # window stays, its level is that of the lower part of the mixture.
         here = slice(edges[window], edges[window] + sizes[window])
         lower = number * find_lower_mean(counts[:, window])
         background[here] *= min(1.0, lower / max(background[here].sum(), 1e-9))
     relative = background / background.mean()
     noise = 1 / np.sqrt(np.maximum(np.add.reduceat(background, edges), 1.0))
     unevenness = np.abs(np.add.reduceat(relative, edges) / sizes - 1)
+    # A single bin may be uneven where no window is: the edge of a gate, or a hot bin.
     sharp = np.abs(relative - 1) > np.maximum(MIN_UNEVENNESS, 5 / np.sqrt(np.maximum(total, 1)))
     if np.all(unevenness < np.maximum(MIN_UNEVENNESS, 5 * noise)) and not sharp.any():
         return None
@@ -111,12 +115,16 @@ def segment_counts(counts: FloatArray) -> FloatArray:
     places = np.arange(counts.size + 1.0)
     best, last = np.zeros(counts.size + 1), np.zeros(counts.size, np.int64)
     for end in range(1, counts.size + 1):
+        # N ln(N / T) of every block that ends here, Scargle's Eq. 19: the likelihood of a constant
+        # rate at its best.
         photons = summed[end] - summed[:end]
+        # 0 ln 0 is 0: a block without photons neither gains nor loses.
         gain = photons * np.log(np.maximum(photons, 1e-300) / (end - places[:end]))
         reached = gain + best[:end] - BLOCK_COST
         last[end - 1] = int(np.argmax(reached))
         best[end] = reached[last[end - 1]]
     level, end = np.empty(counts.size), counts.size
+    # Backwards from the end: each block's best start says where the one before ends.
     while end > 0:
         start = int(last[end - 1])
         level[start:end] = (summed[end] - summed[start]) / (end - start)
@@ -212,12 +220,15 @@ def remove_bumps(level: FloatArray, counts: FloatArray, width: float) -> FloatAr
     smooth = level.copy()
     for ratio in BUMP_WIDTHS:
         wide = ratio * width
+        # At 1.3 widths from its middle a Gaussian is below 1 % of its height: the core holds the
+        # bump, the flanks as much again of the level beside it.
         core, flank = int(np.ceil(1.3 * wide)), int(np.ceil(2.6 * wide))
         offsets = np.arange(-core, core + 1)
         shape = np.exp2(-((2 * offsets / wide) ** 2))
         if flank < 2 or 2 * flank >= counts.size:
             continue
         for middle in range(flank, counts.size - flank):
+            # A bump has its middle at a local maximum.
             around = smooth[middle - core : middle + core + 1]
             if smooth[middle] < around.max():
                 continue
@@ -225,10 +236,14 @@ def remove_bumps(level: FloatArray, counts: FloatArray, width: float) -> FloatAr
             after = counts[middle + core + 1 : middle + flank + 1].mean()
             line = before + (after - before) * (offsets + flank) / (2 * flank)
             excess = counts[middle - core : middle + core + 1] - line
+            # Least squares for the height of a known shape; its noise is that of the line beneath
+            # it.
             height = float(shape @ excess) / float(shape @ shape)
             noise = np.sqrt(max(float(shape**2 @ np.maximum(line, 1.0)), 1.0)) / (shape @ shape)
             if height < BUMP_SIGNIFICANCE * noise:
                 continue
+            # What the shape leaves, less what the photons' noise alone would: a decay or a lone bin
+            # leaves much, a return little.
             left = float(np.sum((excess - height * shape) ** 2) - np.sum(line + height * shape))
             if left < MAX_MISFIT_SHARE * height**2 * float(shape @ shape):
                 smooth[middle - core : middle + core + 1] = line

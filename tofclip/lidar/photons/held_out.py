@@ -80,7 +80,9 @@ def weigh_evidence(
     pooled, total = (
         scipy.ndimage.uniform_filter(part, signal_pool, mode="nearest") for part in (seen, whole)
     )
+    # Background within the response's length, as dense as outside of it.
     outside = np.maximum(total - pooled, 0) * length / max(train.bins - length, 1)
+    # Neither certainty is ever claimed: one photon against it would decide for the pixel.
     signal = np.clip((pooled - outside) / np.maximum(total, 1e-9), 0.02, 0.98)
     evidence = np.empty(flat.size)
     density = response.density * train.bins

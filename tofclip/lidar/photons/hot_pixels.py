@@ -112,6 +112,8 @@ def find_hot_pixels(photons: PhotonImage) -> NDArray[np.bool_]:
     table = BinTable.from_pixels(
         photons, scipy.ndimage.binary_dilation(hot, np.ones((3, 3))).ravel()
     )
+    # A surface goes on in the next pixel or the next bin; what stands alone in both is the
+    # sensor's.
     alone = np.ones(bright.size, np.bool_)
     rows, columns = photons.image_shape
     for step_y, step_x in np.ndindex(3, 3):

@@ -49,13 +49,18 @@ def compute_range_bound(pulse: Pulse, bin_width: float, photons: float, backgrou
     shape = pulse.integrate_bins(bin_width)
     first, last = shape.extent(0.0)
     bins = np.arange(np.floor(first / bin_width) - 1, np.ceil(last / bin_width) + 2) * bin_width
+    # Where the pulse lies in its bin decides how well it can be located: all places count alike.
     late = bins - ((np.arange(BIN_PHASES) + 0.5) / BIN_PHASES - 0.5)[:, np.newaxis] * bin_width
     height = photons * bin_width / shape.area
     signal, slope = height * shape(late), height * shape.slope_at(late)
     expected = signal + background
+    # Fisher's information of Poisson counts: derivatives squared over the expected number. A bin in
+    # which nothing is expected says nothing.
     weight = np.divide(1.0, expected, out=np.zeros_like(expected), where=expected > 0)
     delay, mixed, amount = (
         np.sum(weight * term, axis=1) for term in (slope**2, slope * signal, signal**2)
     )
+    # The number of photons has to be found as well: what it shares with the arrival is lost (Schur
+    # complement of the 2 x 2 information matrix).
     variance = 1 / (delay - mixed**2 / amount)
     return float(SPEED_OF_LIGHT / 2 * np.sqrt(variance.mean()))

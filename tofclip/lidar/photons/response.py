@@ -110,6 +110,7 @@ class BinnedResponse:
             surface may lie anywhere in its coarse bin.
         """
         times = self.start + self.step * np.arange(self.density.size)
+        # The surface may lie anywhere in its coarse bin: eight places, in the middles of eighths.
         inside = np.arange(8) / 8 + 1 / 16 - 0.5
         position = times[:, np.newaxis] / coarse + inside
         number = np.floor(position + 0.5).astype(np.int64)
@@ -117,6 +118,7 @@ class BinnedResponse:
         weight = np.repeat(self.density[:, np.newaxis], inside.size, axis=1)
         shares = np.bincount((number - first).ravel(), weight.ravel()).astype(np.float64)
         shares /= shares.sum()
+        # Shares of a thousandth of the greatest change no decision, but make every sum longer.
         kept = np.flatnonzero(shares > 1e-3 * shares.max())
         return shares[kept[0] : kept[-1] + 1], first + int(kept[0])
 
@@ -199,16 +201,19 @@ def learn_response(
     number = np.rint(residual_bins / step).astype(np.int64)
     known = (number >= early[0]) & (number <= last)
     photons = np.bincount(number[known] - early[0], count[known], last - early[0] + 1)
+    # Before the pulse there is only background; behind it its own tail would count as one.
     level = float(np.mean(photons[: early[1] - early[0]]))
     shape = scipy.ndimage.gaussian_filter1d(photons, SMOOTHING_WIDTHS * SAMPLES_PER_WIDTH)[
         first - early[0] :
     ]
+    # A density is not negative, whatever noise does to the tail.
     shape = np.maximum(shape - level, 0.0)
     if not shape.any():
         raise InputError("there is no light around the surface to learn the pulse from")
     peak = int(np.argmax(shape))
     edge = max(1, min(peak, shape.size - 1 - peak))
     before, here, after = shape[max(peak - 1, 0)], shape[peak], shape[min(peak + 1, shape.size - 1)]
+    # Vertex of the parabola through the highest sample and its neighbours.
     bend = 2 * here - before - after
     part = float((after - before) / (2 * bend)) if edge >= 1 and bend > 0 else 0.0
     return Pulse(shape, step * bin_width, peak + part), (first + peak + part) * step

@@ -103,6 +103,8 @@ def extend_path(score, before, highest, slope_cost, jump_cost, path, total):
     """
     last = score.size - 1
     floor = highest - jump_cost
+    # The ends have one neighbour only. The highest score is taken off in every step, or sums would
+    # grow along the path until single precision loses the differences.
     path[0] = score[0] + max(max(before[0], floor), before[min(1, last)] - slope_cost) - highest
     path[last] = (
         score[last] + max(max(before[last], floor), before[max(last - 1, 0)] - slope_cost) - highest
@@ -215,6 +217,8 @@ def measure_events(offsets, bin_time, count, surface, table, start, step, bright
             part = position - left
             push = table[left, 0] * (1 - part) + table[left + 1, 0] * part
             odds = brightness[pixel] * (table[left, 1] * (1 - part) + table[left + 1, 1] * part)
+            # Probability that the photon is of the signal. The derivative of log(background +
+            # signal) is the signal's own, weighted by it.
             belongs = odds / (1 + odds)
             slope += count[event] * belongs * push
             information += count[event] * (belongs * push) ** 2
