@@ -461,12 +461,14 @@ def _open_ptu(path: Path) -> PhotonFile:
         _, rows, columns, _, bins = file.shape
         _require_bounded_image(path, rows * columns * bins * 4)
         width = float(file.tcspc_resolution)
-        # What was cut cannot be mapped.
-        is_whole = int(file.record_offset) + 4 * int(file.number_records) <= path.stat().st_size
+        start = int(file.record_offset)
+        # Where the end was cut off, what is there counts.
+        count = max(0, min(int(file.number_records), (path.stat().st_size - start) // 4))
 
     def load() -> NDArray[Any]:
+        # Mapped by NumPy: ptufile's own ways of it differ between its versions.
+        words = np.memmap(path, "<u4", "r", start, (count,)) if count else np.empty(0, "<u4")
         with BoundedFile(path) as reopened, ptufile.PtuFile(reopened) as again:
-            words = again.read_records(memmap=is_whole)
             cube = again.decode_image(records=words, frame=-1, channel=-1, dtype=np.uint32)
         summed: NDArray[Any] = np.asarray(cube).sum(axis=(0, 3), dtype=np.uint32)
         return summed
