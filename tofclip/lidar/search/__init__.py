@@ -11,7 +11,7 @@ The steps, for each pixel:
 
 1. Filter the trace with a pulse compressed to half its width, which still shows two returns where
    the matched filter would merge them; its local maxima are the candidates.
-2. Take candidates from the strongest down (`find_strongest_peaks`). Each claims the bins that its
+2. Take candidates from the strongest down (`take_strongest_peaks`). Each claims the bins that its
    pulse reaches; background and noise are those of the bins that nothing claims.
 3. Keep those that the matched filter confirms against noise and the pixel's strongest return, and
    place them below a bin (`confirm_peaks`).

@@ -11,8 +11,14 @@ from tofclip.lidar.pulse_fit import (
     refine_returns,
     sort_rows,
 )
-from tofclip.lidar.search.peaks import FIRST_OFFSET, NOISE, PEAK_BIN, TRACE, search_step
-from tofclip.lidar.search.table_fit import NEEDS_EXACT_FIT
+from tofclip.lidar.search.peaks import (
+    FIRST_OFFSET,
+    NEEDS_EXACT_FIT,
+    NOISE,
+    PEAK_BIN,
+    TRACE,
+    search_step,
+)
 
 
 @search_step
@@ -40,8 +46,8 @@ def fit_returns_exactly(
         Number of the pixel to which each trace belongs.
     times : (bins,) array
         Seconds, increasing.
-    moments : (n, 3) array
-        Mean and standard deviation of the bins without a return, and others.
+    moments : (n, 2) array
+        Mean and standard deviation of the bins without a return.
     least : float
         Standard deviations that a return's response must exceed.
     windows : (bins, 4) int64 array

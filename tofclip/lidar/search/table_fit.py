@@ -21,11 +21,13 @@ from tofclip.lidar.detection import CONVERGENCE_STEP_BINS, MAX_FIT_ROUNDS
 from tofclip.lidar.search.peaks import (
     HEIGHT,
     MOVED,
+    NEEDS_EXACT_FIT,
     NOISE,
     OFFSET,
     ONE,
     PEAK_BIN,
     TRACE,
+    is_near,
     search_step,
 )
 from tofclip.lidar.search.phase_table import MAX_OFFSET_BINS, PHASES_PER_BIN
@@ -34,95 +36,9 @@ from tofclip.vectors import (
     choose,
     fill_vector,
     load_vector,
-    number_lanes,
     store_vector,
     sum_vector,
 )
-
-NEEDS_EXACT_FIT = -1
-"""In place of the number of returns of a trace."""
-
-
-@search_step
-def cut_out_returns(
-    traces, pixels, moments, even, half, candidates, listed, rests, counts, lone, crowded
-):
-    """Cut the bins around each candidate out of its trace, and tell those that stand alone from
-    those that do not.
-
-    Parameters
-    ----------
-    traces : (n, bins) float32 array
-        With memory for another trace after the last one.
-    pixels : (n,) int64 array
-        Number of the pixel to which each trace belongs.
-    moments : (n, 3) array
-        Background of each trace, and others.
-    even : (bins,) bool array
-        See `PhaseTable.find_even_bins`.
-    half : int
-        See `PhaseTable`.
-    candidates : (room, CANDIDATE_COLUMNS) array
-        Of `tofclip.lidar.search.peaks.confirm_peaks`.
-    listed : int
-        Number of candidates.
-    rests : (room, width) float32 array
-        Overwritten: trace less background in the bins of the table around each peak; zero in those
-        that fill up its width.
-    counts : (all pixels,) int64 array, overwritten where `pixels` says
-        0, or `NEEDS_EXACT_FIT` where a candidate's bins are not all there.
-    lone, crowded : (room,) int64 array
-        Overwritten: numbers of candidates.
-
-    Returns
-    -------
-    int, int
-        How many of either.
-    """
-    alone = others = 0
-    zero, lanes, held = fill_vector(np.float32(0)), number_lanes(), np.int32(2 * half + 1)
-    for place in range(traces.shape[0]):
-        counts[pixels[place]] = 0
-    for k in range(listed):
-        place, j = int(candidates[k, TRACE]), int(candidates[k, PEAK_BIN])
-        if not even[j]:
-            counts[pixels[place]] = NEEDS_EXACT_FIT
-            continue
-        trace, rest, level = traces[place], rests[k], fill_vector(np.float32(moments[place, 0]))
-        for w in range(np.uintp(0), np.uintp(rest.size), STEP):
-            inside = fill_vector(np.int32(held - np.int32(w))) > lanes
-            above = load_vector(trace, np.uintp(j - half) + w) - level
-            store_vector(rest, w, choose(inside, above, zero))
-        # light that ends before the other's begins, whatever both of them move
-        near = k > 0 and is_near(candidates, k - 1, k, half)
-        near = near or (k + 1 < listed and is_near(candidates, k, k + 1, half))
-        if near:
-            crowded[others] = k
-            others += 1
-        else:
-            lone[alone] = k
-            alone += 1
-    return alone, others
-
-
-@inlined
-def is_near(candidates, k, other, half):
-    """Whether two candidates are of the same trace and may share bins.
-
-    Parameters
-    ----------
-    candidates : (n, CANDIDATE_COLUMNS) array
-    k, other : int
-        The later one last.
-    half : int
-        See `PhaseTable`.
-
-    Returns
-    -------
-    bool
-    """
-    apart = candidates[other, PEAK_BIN] - candidates[k, PEAK_BIN]
-    return candidates[other, TRACE] == candidates[k, TRACE] and apart < 2 * half + 1
 
 
 @inlined
@@ -155,7 +71,7 @@ def fit_lone_returns(candidates, rests, active, moving, shapes, slopes, sums):
         Column `OFFSET` is improved; `HEIGHT` is overwritten: not above zero where there is no
         pulse, NaN where the return moved further than `MAX_OFFSET_BINS` and needs the exact fit.
     rests : (room, width) float32 array
-        Of `cut_out_returns`.
+        Of `tofclip.lidar.search.peaks.find_candidates`.
     active : (room,) int64 array
         Numbers of the returns; overwritten.
     moving : int
@@ -225,7 +141,7 @@ def fit_crowded_returns(candidates, rests, crowded, number, half, shapes, slopes
     candidates : (room, CANDIDATE_COLUMNS) array
         Columns `OFFSET`, `HEIGHT` and `MOVED` are improved, as by `fit_lone_returns`.
     rests : (room, width) float32 array
-        Of `cut_out_returns`; in the end what the others leave of it.
+        Of `tofclip.lidar.search.peaks.find_candidates`; in the end what the others leave of it.
     crowded : (room,) int64 array
         Numbers of the returns, increasing.
     number : int

@@ -14,13 +14,11 @@ from tofclip.lidar.search.exact_fit import fit_returns_exactly
 from tofclip.lidar.search.filters import PulseFilters
 from tofclip.lidar.search.peaks import (
     CANDIDATE_COLUMNS,
+    NEEDS_EXACT_FIT,
     WORD_BINS,
-    confirm_peaks,
-    find_strongest_peaks,
+    find_candidates,
 )
 from tofclip.lidar.search.table_fit import (
-    NEEDS_EXACT_FIT,
-    cut_out_returns,
     fit_crowded_returns,
     fit_lone_returns,
     list_returns,
@@ -45,10 +43,11 @@ class SearchMemory:
         As traces are handed out.
     traces : (pixels, whole vectors of bins) float32 array
         The same memory, where that is a whole number of vectors.
-    moments : (pixels, 3) array
-    peaks : (pixels, returns, 2) array
+    moments : (pixels, 2) array
+    peaks : (returns, 2) array
     score, maxima, free : float32 arrays
-        See `tofclip.lidar.search.peaks.find_strongest_peaks`.
+    places : (2, bins) int32 array
+        See `tofclip.lidar.search.peaks.find_candidates`.
     candidates : (pixels * returns, CANDIDATE_COLUMNS) array
     rests : (pixels * returns, width) float32 array
     lone, crowded : (pixels * returns,) int64 array
@@ -61,6 +60,7 @@ class SearchMemory:
     moments: FloatArray
     peaks: FloatArray
     score: NDArray[np.float32]
+    places: NDArray[np.int32]
     maxima: NDArray[np.float32]
     free: NDArray[np.float32]
     candidates: FloatArray
@@ -120,7 +120,7 @@ class TraceSearch:
         self._gains = *filters.gains, 0.0
         self._pulse, self._table = filters.kernel, filters.table
         scale = self._pulse[1]
-        self._windows = list_windows(self._times, scale, filters.fwhm)
+        self._windows = list_windows(self._times, scale, filters.fwhm).astype(np.int32)
         self._even = self._table.find_even_bins(bins)
         self._least_ratio, self._most = float(detection.signal_to_noise), most
         self._limits = (
@@ -166,8 +166,9 @@ class TraceSearch:
         near = np.any(self._sharp != 0, axis=0)
         at_ends = near.copy()
         at_ends[first : last + LENGTH] = False
+        runs = runs[_count(near, runs, LENGTH) > 0]
         return (
-            runs[_count(near, runs, LENGTH) > 0],
+            np.append(runs, runs[-1:]) if runs.size % 2 else runs,
             np.flatnonzero(at_ends),
             words[_count(self._searched, words, WORD_BINS) > 0],
         )
@@ -197,11 +198,12 @@ class TraceSearch:
         return SearchMemory(
             held=traces if whole else np.empty((pixels, self._number), np.float32),
             traces=traces,
-            moments=np.empty((pixels, 3)),
-            peaks=np.empty((pixels, most, 2)),
+            moments=np.empty((pixels, 2)),
+            peaks=np.empty((most, 2)),
             score=np.zeros(length + WORD_BINS + 2, np.float32),
+            places=np.zeros((2, length), np.int32),
             maxima=np.zeros((2, length), np.float32),
-            free=np.empty(length, np.float32),
+            free=self._weights.copy(),
             candidates=np.empty((pixels * most, CANDIDATE_COLUMNS)),
             rests=np.empty((pixels * most, width), np.float32),
             lone=np.empty(pixels * most, np.int64),
@@ -247,14 +249,11 @@ class TraceSearch:
         source.fill(piece, held)
         if traces.shape != held.shape:
             traces[:, : self._number] = held
-        moments, peaks, candidates, rests = (
-            memory.moments[part],
-            memory.peaks[part],
-            memory.candidates,
-            memory.rests,
-        )
-        find_strongest_peaks(
+        moments, candidates, rests = memory.moments[part], memory.candidates, memory.rests
+        table, half = self._table, self._table.half
+        listed, alone, crowded = find_candidates(
             traces,
+            pixels,
             self._times,
             self._weights,
             self._sharp,
@@ -262,39 +261,22 @@ class TraceSearch:
             self._edges,
             self._words,
             self._of_interest,
+            self._least,
             self._matched,
             self._starts,
             self._sums,
             self._gains,
             self._windows,
             self._limits,
-            memory.score,
-            memory.maxima,
-            memory.free,
-            moments,
-            peaks,
-        )
-        listed = confirm_peaks(
-            traces,
-            self._times,
-            self._matched,
-            self._starts,
-            self._sums,
-            self._limits,
-            self._least,
-            moments,
-            peaks,
-            candidates,
-        )
-        table, half = self._table, self._table.half
-        alone, crowded = cut_out_returns(
-            traces,
-            pixels,
-            moments,
             self._even,
             half,
+            memory.score,
+            memory.places,
+            memory.maxima,
+            memory.free,
+            memory.peaks,
+            moments,
             candidates,
-            listed,
             rests,
             counts,
             memory.lone,
