@@ -26,8 +26,8 @@ from tofclip.threads import thread_count
 MAX_PROCESSES = 3
 """Each takes as long to start as two loops to compile."""
 
-PEAKS, NEIGHBOURS = "tofclip.lidar.search.peaks", "tofclip.lidar.neighbours"
-CANDIDATES = "tofclip.lidar.candidate_loops"
+CANDIDATES, NEIGHBOURS = "tofclip.lidar.search.candidates", "tofclip.lidar.neighbours"
+JUDGED = "tofclip.lidar.candidate_loops"
 TABLE, EXACT = "tofclip.lidar.search.table_fit", "tofclip.lidar.search.exact_fit"
 CAMERA, OPERATORS = "tofclip.camera.kernels", "tofclip.operators.kernels"
 SOLVERS, SURFACES = "tofclip.solvers.kernels", "tofclip.recovery.surfaces.kernels"
@@ -46,7 +46,7 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
         (OPERATORS, "multiply_sparse_block"): "(i8[:,::1], u4[::1], f4[::1], f4[:,::1], f4[:,::1])",
         (SOLVERS, "copy_lanes_to_frames"): "(f4[:,::1], f4[:,::1])",
         (SOLVERS, "restore_frames"): "(f4[:,:,::1], f4[:,:,::1], f4[::1])",
-        (PEAKS, "find_candidates"): (
+        (CANDIDATES, "find_candidates"): (
             "(f4[:,::1], i8[::1], f8[::1], f4[::1], f4[:,::1], i8[::1], i8[::1], i8[::1], f4[::1],"
             " f4[::1], f4[:,::1], i8[::1], f8[::1], UniTuple(f8, 3), i4[:,::1], UniTuple(f8, 5),"
             " b1[::1], i8, f4[::1], i4[:,::1], f4[:,::1], f4[::1], f8[:,::1], f8[:,::1],"
@@ -67,11 +67,11 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
             " Tuple((f8[:,::1], UniTuple(f8, 4))), f8[:,::1], f8[:,::1], f8[:,:,::1], i8[::1])"
         ),
         (TABLE, "list_returns"): "(f8[:,:,::1], i8[::1], i8[::1], f8[:,::1])",
-        (CANDIDATES, "pool_significance"): (
+        (JUDGED, "pool_significance"): (
             "(i8[::1], f8[::1], f8[::1], f8[::1], i8[::1], UniTuple(i8, 2), UniTuple(f8, 2),"
             " f8[::1])"
         ),
-        (CANDIDATES, "list_kept"): (
+        (JUDGED, "list_kept"): (
             "(i8[::1], f8[:,::1], b1[::1], i8, i8[::1], i4[:,::1], u1[::1], f8[:,::1], f4[::1])"
         ),
         (NEIGHBOURS, "count_returns"): "(i8[::1], i8[::1])",
@@ -91,10 +91,10 @@ LOOPS: Mapping[tuple[str, str], str] = MappingProxyType(
         ),
         (SURFACES, "apply_dual"): "(f4[:,::1], b1[:,::1], f8, f4[:,:,::1], f4[:,::1])",
         (SURFACES, "ascend_dual"): "(f4[:,::1], b1[:,::1], f8, f8, f4[:,:,::1], f4[:,:,::1])",
-        (CANDIDATES, "raise_maxima"): (
+        (JUDGED, "raise_maxima"): (
             "(i8[::1], f8[::1], f8[::1], UniTuple(f8, 2), f8[::1], f8[::1])"
         ),
-        (CANDIDATES, "mark_strong"): (
+        (JUDGED, "mark_strong"): (
             "(i8[::1], f8[::1], f8[::1], UniTuple(f8, 2), f8[::1], f8[::1], b1[::1])"
         ),
         (SOLVERS, "descend_total_variation"): (

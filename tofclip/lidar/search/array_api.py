@@ -2,7 +2,8 @@
 library and on any device.
 
 The steps are those of `tofclip.lidar.search`. Functions that do the same have the same names in
-`tofclip.lidar.search.peaks` and `tofclip.lidar.pulse_fit`, where they take one pixel after the other.
+`tofclip.lidar.search.candidates` and `tofclip.lidar.pulse_fit`, where they take one pixel after the
+other.
 Here a loop runs over the returns of a pixel, at most `Detection.max_returns`, and arrays hold one
 entry for each pixel.
 """

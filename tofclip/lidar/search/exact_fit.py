@@ -11,14 +11,14 @@ from tofclip.lidar.pulse_fit import (
     refine_returns,
     sort_rows,
 )
-from tofclip.lidar.search.peaks import (
+from tofclip.lidar.search.candidates import (
     FIRST_OFFSET,
     NEEDS_EXACT_FIT,
     NOISE,
     PEAK_BIN,
     TRACE,
-    search_step,
 )
+from tofclip.lidar.search.peaks import search_step
 
 
 @search_step
@@ -53,7 +53,7 @@ def fit_returns_exactly(
     windows : (bins, 4) int64 array
         See `tofclip.lidar.search.windows.list_windows`.
     candidates : (room, CANDIDATE_COLUMNS) array
-        Those of one trace side by side; see `tofclip.lidar.search.peaks`.
+        Those of one trace side by side; see `tofclip.lidar.search.candidates`.
     listed : int
         How many.
     pulse : (curve, scale)

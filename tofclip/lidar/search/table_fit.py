@@ -18,18 +18,17 @@ import numpy as np
 
 from tofclip.compiling import inlined
 from tofclip.lidar.detection import CONVERGENCE_STEP_BINS, MAX_FIT_ROUNDS
-from tofclip.lidar.search.peaks import (
+from tofclip.lidar.search.candidates import (
     HEIGHT,
     MOVED,
     NEEDS_EXACT_FIT,
     NOISE,
     OFFSET,
-    ONE,
     PEAK_BIN,
     TRACE,
     is_near,
-    search_step,
 )
+from tofclip.lidar.search.peaks import ONE, search_step
 from tofclip.lidar.search.phase_table import MAX_OFFSET_BINS, PHASES_PER_BIN
 from tofclip.vectors import (
     STEP,
@@ -71,7 +70,7 @@ def fit_lone_returns(candidates, rests, active, moving, shapes, slopes, sums):
         Column `OFFSET` is improved; `HEIGHT` is overwritten: not above zero where there is no
         pulse, NaN where the return moved further than `MAX_OFFSET_BINS` and needs the exact fit.
     rests : (room, width) float32 array
-        Of `tofclip.lidar.search.peaks.find_candidates`.
+        Of `tofclip.lidar.search.candidates.find_candidates`.
     active : (room,) int64 array
         Numbers of the returns; overwritten.
     moving : int
@@ -141,7 +140,7 @@ def fit_crowded_returns(candidates, rests, crowded, number, half, shapes, slopes
     candidates : (room, CANDIDATE_COLUMNS) array
         Columns `OFFSET`, `HEIGHT` and `MOVED` are improved, as by `fit_lone_returns`.
     rests : (room, width) float32 array
-        Of `tofclip.lidar.search.peaks.find_candidates`; in the end what the others leave of it.
+        Of `tofclip.lidar.search.candidates.find_candidates`; in the end what the others leave of it.
     crowded : (room,) int64 array
         Numbers of the returns, increasing.
     number : int

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.lidar.detection import Detection
-from tofclip.lidar.search.exact_fit import fit_returns_exactly
-from tofclip.lidar.search.filters import PulseFilters
-from tofclip.lidar.search.peaks import (
+from tofclip.lidar.search.candidates import (
     CANDIDATE_COLUMNS,
     NEEDS_EXACT_FIT,
-    WORD_BINS,
     find_candidates,
 )
+from tofclip.lidar.search.exact_fit import fit_returns_exactly
+from tofclip.lidar.search.filters import PulseFilters
+from tofclip.lidar.search.peaks import WORD_BINS
 from tofclip.lidar.search.table_fit import (
     fit_crowded_returns,
     fit_lone_returns,
@@ -47,7 +47,7 @@ class SearchMemory:
     peaks : (returns, 2) array
     score, maxima, free : float32 arrays
     places : (2, bins) int32 array
-        See `tofclip.lidar.search.peaks.find_candidates`.
+        See `tofclip.lidar.search.candidates.find_candidates`.
     candidates : (pixels * returns, CANDIDATE_COLUMNS) array
     rests : (pixels * returns, width) float32 array
     lone, crowded : (pixels * returns,) int64 array
