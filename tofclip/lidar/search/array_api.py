@@ -3,9 +3,8 @@ library and on any device.
 
 The steps are those of `tofclip.lidar.search`. Functions that do the same have the same names in
 `tofclip.lidar.search.candidates` and `tofclip.lidar.pulse_fit`, where they take one pixel after the
-other.
-Here a loop runs over the returns of a pixel, at most `Detection.max_returns`, and arrays hold one
-entry for each pixel.
+other. Here a loop runs over the returns of a pixel, at most `Detection.max_returns`, and arrays hold
+one entry for each pixel.
 """
 
 from __future__ import annotations
@@ -109,7 +108,7 @@ class ArraySearch:
     def _search_pixels(self, traces: Array, number: int) -> Candidates:
         """Search some pixels, the first of which has the given number."""
         xp = namespace(traces)
-        peaks = self._peaks.find_strongest_peaks(traces)
+        peaks = self._peaks.take_strongest_peaks(traces)
         (pixels,) = xp.nonzero(xp.any(peaks.valid, axis=0))
         chosen = peaks.select(pixels)
         fit = self._fit.refine_returns(xp.take(traces, pixels, axis=1), chosen)
@@ -238,7 +237,7 @@ class PeakSearch:
         ]
         self._tables = PerDevice(lambda device: [device.put(table) for table in tables])
 
-    def find_strongest_peaks(self, traces: Array) -> Peaks:
+    def take_strongest_peaks(self, traces: Array) -> Peaks:
         """Return the peaks of (bins, pixels) float32 traces."""
         xp = namespace(traces)
         times, _, claimed_from, claimed_to, *_ = self._tables.get(traces)
