@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tofclip.camera import Camera, SkewSweep
+from tofclip.camera.kernels import sum_boxes
 from tofclip.lidar import Detection, depth
-from tofclip.lidar.signal_rows.kernels import sum_boxes
 from tofclip.lidar.signal_rows.selection import RowBlock, SignalRowFinder
 from tofclip.lidar.traces import TraceBins
 from tofclip.recovery import DepthLockedFocus, FixedFocus, recover
@@ -45,6 +45,10 @@ def lit_rows(inverse) -> SignalRowFinder:
     return SignalRowFinder([RowBlock(slice(0, ROWS), inverse)], 3.0, 5.0, REACH)
 
 
+def find_bins(finder: SignalRowFinder, measurements: np.ndarray) -> TraceBins:
+    return finder.bins(finder.sum_measurements(measurements))
+
+
 def dark(seed: int) -> np.ndarray:
     """Noise about a level of its own in each column, as a sensor has it."""
     random = np.random.default_rng(seed)
@@ -67,7 +71,7 @@ def with_pixel(
 def test_noise_is_dark_whatever_the_level_of_each_column(lit_rows):
     shares = []
     for seed in range(5):
-        bins = lit_rows.bins(dark(seed))
+        bins = find_bins(lit_rows, dark(seed))
         shares.append(bins.search_mask.sum() / ROWS)
         assert bins.numbers.size % LANES == 0
         assert bins.bin_weights.sum() == pytest.approx(ROWS)
@@ -83,7 +87,7 @@ def test_the_light_of_a_single_pixel_is_seen_wherever_it_is(lit_rows, seed):
     row = random.uniform(20, ROWS - 20)
     # half-way between two instants a pulse stands out by 0.74 of its strength, so by 8.9 +- 1 here,
     # with 6 needed
-    bins = lit_rows.bins(with_pixel(dark(seed), pixel, row, 12.0))
+    bins = find_bins(lit_rows, with_pixel(dark(seed), pixel, row, 12.0))
     where = np.searchsorted(bins.numbers, round(row))
     assert bins.numbers[where] == round(row)
     assert bins.search_mask[where]
@@ -94,8 +98,8 @@ def test_the_light_of_a_single_pixel_is_seen_wherever_it_is(lit_rows, seed):
 def test_a_higher_limit_looks_at_less_and_none_at_everything(inverse):
     measurements = with_pixel(dark(3), (16, 16), 300.0, 12.0)
     places = [RowBlock(slice(0, ROWS), inverse)]
-    assert not SignalRowFinder(places, 3.0, 15.0, REACH).bins(measurements).search_mask.any()
-    everything = SignalRowFinder(places, 3.0, 0.0, REACH).bins(measurements)
+    assert not find_bins(SignalRowFinder(places, 3.0, 15.0, REACH), measurements).search_mask.any()
+    everything = find_bins(SignalRowFinder(places, 3.0, 0.0, REACH), measurements)
     assert everything.search_mask.all()
     np.testing.assert_array_equal(everything.numbers, np.arange(ROWS))
 
@@ -104,20 +108,20 @@ def test_a_shot_that_is_nowhere_dark_is_searched_everywhere(lit_rows):
     measurements = dark(0)
     for row in range(10, ROWS, 25):
         measurements = with_pixel(measurements, (16, 16), row, 200.0)
-    bins = lit_rows.bins(measurements)
+    bins = find_bins(lit_rows, measurements)
     assert bins.search_mask.all()
     np.testing.assert_array_equal(bins.bin_weights, np.ones(ROWS))
 
 
 def test_a_shot_without_any_reading_is_searched_everywhere(lit_rows):
-    assert lit_rows.bins(np.zeros((240, ROWS), np.float32)).search_mask.all()
+    assert find_bins(lit_rows, np.zeros((240, ROWS), np.float32)).search_mask.all()
 
 
 def test_columns_and_rows_that_were_never_measured_are_not_taken_for_the_darkest(lit_rows):
     measurements = dark(1)
     measurements[:, :60] = 0
     measurements[40:90] = 0
-    bins = lit_rows.bins(with_pixel(measurements, (16, 16), 300.0, 40.0))
+    bins = find_bins(lit_rows, with_pixel(measurements, (16, 16), 300.0, 40.0))
     assert bins.search_mask.sum() < 60
     assert 300 in bins.numbers[bins.search_mask]
 
@@ -125,7 +129,9 @@ def test_columns_and_rows_that_were_never_measured_are_not_taken_for_the_darkest
 def test_places_with_an_operator_of_their_own_have_their_own_instants(inverse):
     cuts = [0, 7, 150, 151, 400, ROWS]
     places = [RowBlock(slice(first, last), inverse) for first, last in pairwise(cuts)]
-    bins = SignalRowFinder(places, 3.0, 5.0, REACH).bins(with_pixel(dark(4), (10, 20), 150.0, 20.0))
+    bins = find_bins(
+        SignalRowFinder(places, 3.0, 5.0, REACH), with_pixel(dark(4), (10, 20), 150.0, 20.0)
+    )
     assert 150 in bins.numbers[bins.search_mask]
     assert bins.bin_weights.sum() == pytest.approx(ROWS)
 

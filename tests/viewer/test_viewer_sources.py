@@ -8,11 +8,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from viewer_scenes import (
     BIN_WIDTH,
     FAR,
@@ -48,10 +46,10 @@ from apps.viewer.source import LINEAR_NOTE, NO_TIME_ZERO_NOTE, Gate, Source, Vie
 from apps.viewer.source_factory import FIRST_LOOK_NOTE, ShotOptions, open_source
 from apps.viewer.viewpoint import Box, measure_point_spacing, place_viewpoint
 from apps.viewer.volume import PROJECTION_MODE, SLICE_MODE, SURFACE_MODE, VolumeSource
-from tofclip.camera import Rectifier
 from tofclip.camera.calibration import registration
 from tofclip.errors import FileFormatError, InputError, StorageError
 from tofclip.io.streaks import save_stack
+from tofclip.sequences.ranger import RangingPipeline, SummedShot
 from tofclip.shots import Streak
 
 
@@ -406,14 +404,14 @@ def test_live_shots_that_come_too_fast_are_dropped(monkeypatch: pytest.MonkeyPat
             busy.wait(20)
         came.set()
 
-    def slowly(self: Rectifier, *shot: Any) -> NDArray[np.float32]:
+    def slowly(self: RangingPipeline, shot: Streak) -> SummedShot:
         if threading.current_thread() is not threading.main_thread():
             busy.set()
             go_on.wait(20)
-        return rectified(self, *shot)
+        return rectify(self, shot)
 
-    rectified = Rectifier.rectify
-    monkeypatch.setattr(Rectifier, "rectify", slowly)
+    rectify = RangingPipeline.rectify
+    monkeypatch.setattr(RangingPipeline, "rectify", slowly)
     source = LiveShotSource("test", chain([streak(0)], shots()), camera())
     assert came.wait(20)
     go_on.set()

@@ -9,8 +9,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofclip.compiling import compile_loop
-from tofclip.vectors import STEP, fill_vector, load_vector, store_vector
+from tofclip.compiling import compile_loop, inlined
+from tofclip.vectors import (
+    LENGTH,
+    STEP,
+    copy_transposed,
+    fill_vector,
+    load_vector,
+    store_vector,
+    sum_vector,
+)
 
 ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
 
@@ -54,34 +62,35 @@ def sample_in_time(counts, dark, raw_row, delay, measurements):
             first = end
 
 
-@compile_loop(fastmath=True)
-def sample_runs(counts, dark, raw_row, runs, measurements):
-    """Sample as `sample_in_time` does without a delay, between rows that were looked up beforehand.
+@inlined
+def sample_row(counts, dark, position, runs, reading):
+    """Sample a row as `sample_in_time` does without a delay, between rows that were looked up
+    beforehand.
 
     Parameters
     ----------
     counts : (raw rows, columns) float32 array
     dark : float32
-    raw_row : (rows, columns) float32 array
+    position : (columns,) float32 array
         Where each rectified pixel lies in the raw image.
-    runs : (n, 4) uint64 array
-        Rectified row, first column, the one after the last, and the upper of the two raw rows
-        between which all of them lie; from the number of raw rows on, they lie beyond the image.
-    measurements : (rows, columns) float32 array, overwritten where the runs say
+    runs : (n, 3) uint64 array
+        First column, the one after the last, and the upper of the two raw rows between which all of
+        them lie; from the number of raw rows on, they lie beyond the image. In the order of columns
+        and without gaps.
+    reading : (columns,) float32 array, overwritten
         0 beyond the raw image.
     """
     rows, columns = np.uintp(counts.shape[0]), np.uintp(counts.shape[1])
     below, level = np.uintp(min(1, counts.shape[0] - 1)), fill_vector(dark)
     for k in range(runs.shape[0]):
-        row, first, end, top = runs[k, 0], runs[k, 1], runs[k, 2], runs[k, 3]
-        reading = measurements[row]
+        first, end, top = runs[k, 0], runs[k, 1], runs[k, 2]
         if top >= rows:
-            reading[first:end] = 0
+            for column in range(first, end):
+                reading[column] = np.float32(0)
             continue
-        upper, lower, position = counts[top], counts[top + below], raw_row[row]
-        height = np.float32(top)
-        # What a vector writes beyond its run is overwritten by the row's next one, and the last run
-        # of a row ends with single numbers.
+        upper, lower, height = counts[top], counts[top + below], np.float32(top)
+        # What a vector writes beyond its run is overwritten by the next one, and the last run ends
+        # with single numbers.
         while first < end and first + STEP <= columns:
             here = load_vector(upper, first)
             part = load_vector(position, first) - fill_vector(height)
@@ -91,6 +100,159 @@ def sample_runs(counts, dark, raw_row, runs, measurements):
             here = upper[first]
             reading[first] = here + (position[first] - height) * (lower[first] - here) - dark
             first += ONE
+
+
+@compile_loop(fastmath=True)
+def sample_rows(counts, dark, raw_row, runs, run_starts, numbers, measurements):
+    """Sample some rows; see `sample_row`.
+
+    Parameters
+    ----------
+    counts : (raw rows, columns) float32 array
+    dark : float32
+    raw_row : (rows, columns) float32 array
+        Where each rectified pixel lies in the raw image.
+    runs : (n, 3) uint64 array
+        Of all rows, one after the other.
+    run_starts : (rows + 1,) int64 array
+        Where each row's runs begin.
+    numbers : (some rows,) int64 array
+    measurements : (some rows, columns) float32 array, overwritten
+    """
+    for place in range(numbers.size):
+        row = numbers[place]
+        own = runs[run_starts[row] : run_starts[row + 1]]
+        sample_row(counts, dark, raw_row[row], own, measurements[place])
+
+
+@inlined
+def add_rows(rows, total):
+    """``total = rows.sum(axis=0)``, for (rows, columns) float32 arrays."""
+    columns, column = np.uintp(total.size), np.uintp(0)
+    while column + STEP <= columns:
+        here = load_vector(rows[0], column)
+        for row in range(1, rows.shape[0]):
+            here += load_vector(rows[row], column)
+        store_vector(total, column, here)
+        column += STEP
+    while column < columns:
+        total[column] = rows[0, column]
+        for row in range(1, rows.shape[0]):
+            total[column] += rows[row, column]
+        column += ONE
+
+
+@inlined
+def write_transposed(rows, first, columns):
+    """``columns[:, first : first + LENGTH] = rows.T``, for `LENGTH` rows of float32."""
+    width, stride = np.uintp(rows.shape[1]), np.uintp(columns.shape[1])
+    source, target, column = rows.reshape(rows.size), columns.reshape(columns.size), np.uintp(0)
+    while column + STEP <= width:
+        copy_transposed(source, column, width, target, column * stride + first, stride)
+        column += STEP
+    while column < width:
+        for row in range(STEP):
+            columns[column, first + row] = rows[row, column]
+        column += ONE
+
+
+@compile_loop(fastmath=True, _nrt=True)
+def sum_boxes(measurements, starts, length, span, sums):
+    """``sums[c, i] = measurements[starts[i] : starts[i] + length, c].sum()`` for the instants of a span.
+
+    Parameters
+    ----------
+    measurements : (rows, columns) float32 array
+    starts : (instants,) int64 array
+    length : int
+    span : (int, int)
+        First instant, and the one after the last: whole vectors of them.
+    sums : (columns, at least instants) float32 array, overwritten in this span
+    """
+    room = np.empty((LENGTH, measurements.shape[1]), np.float32)
+    for first in range(np.uintp(span[0]), np.uintp(span[1]), STEP):
+        for instant in range(STEP):
+            start = starts[first + instant]
+            add_rows(measurements[start : start + length], room[instant])
+        write_transposed(room, first, sums)
+
+
+@compile_loop(fastmath=True, _nrt=True)
+def sum_sampled_boxes(
+    counts, raw_row, runs, run_starts, starts, length, span, raw_span, sums, row_sums
+):
+    """Do as `sum_boxes` with rows that are sampled meanwhile, each once, and add up raw rows.
+
+    Parameters
+    ----------
+    counts, raw_row, runs, run_starts
+        As for `sample_rows`; no dark level is taken off.
+    starts, length, span, sums
+        As for `sum_boxes`.
+    raw_span : (int, int)
+        Raw rows that are added up: about those that the sums look at, which are in the cache then.
+    row_sums : (raw rows,) float32 array, overwritten in that span
+    """
+    columns = counts.shape[1]
+    room, ring = np.empty((LENGTH, columns), np.float32), np.empty((length, columns), np.float32)
+    held = np.full(length, -1)
+    raw = raw_span[0]
+    for first in range(np.uintp(span[0]), np.uintp(span[1]), STEP):
+        for instant in range(STEP):
+            start = starts[first + instant]
+            while raw < min(start + length, raw_span[1]):
+                row_sums[raw] = add_columns(counts[raw])
+                raw += 1
+            for row in range(start, start + length):
+                place = row % length
+                if held[place] != row:
+                    own = runs[run_starts[row] : run_starts[row + 1]]
+                    sample_row(counts, np.float32(0), raw_row[row], own, ring[place])
+                    held[place] = row
+            add_rows(ring, room[instant])
+        write_transposed(room, first, sums)
+    while raw < raw_span[1]:
+        row_sums[raw] = add_columns(counts[raw])
+        raw += 1
+
+
+@inlined
+def add_columns(row):
+    """Sum of a row of float32."""
+    one = other = fill_vector(np.float32(0))
+    columns, column = np.uintp(row.size), np.uintp(0)
+    while column + STEP + STEP <= columns:
+        one += load_vector(row, column)
+        other += load_vector(row, column + STEP)
+        column += STEP + STEP
+    total = sum_vector(one + other)
+    while column < columns:
+        total += row[column]
+        column += ONE
+    return total
+
+
+@fast_loop
+def subtract_dark_level(measured, dark, sums, lit):
+    """Take the dark level off sums of rows, as often as each has measurements.
+
+    Parameters
+    ----------
+    measured : (columns, sums) float32 array
+        Number of rows that were measured.
+    dark : float32
+    sums : (columns, at least sums) float32 array, changed in place
+        Zero where nothing was measured, and so they stay.
+    lit : (columns,) bool array, overwritten
+        Whether anything rises above the dark level.
+    """
+    for column in range(measured.shape[0]):
+        here, number, above = sums[column], measured[column], np.float32(0)
+        for k in range(number.size):
+            here[k] -= number[k] * dark
+        for k in range(number.size):
+            above += np.float32(here[k] > 0)
+        lit[column] = above > 0
 
 
 @fast_loop

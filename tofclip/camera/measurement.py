@@ -100,14 +100,25 @@ def require_width(counts: FloatImage, camera: Camera) -> None:
         )
 
 
-def estimate_dark_level(counts: FloatImage) -> float:
+def estimate_dark_level(counts: FloatImage, row_sums: FloatImage | None = None) -> float:
     """Median of the quietest rows, in counts.
 
     Taken from whole rows, before or after the light came, so that it stays where the measurements
     scatter about it: the least value of a picture would turn noise into an offset.
+
+    Parameters
+    ----------
+    counts : (rows, columns) float32 array
+    row_sums : (rows,) float32 array, optional
+        Sum of each row, where it is known already.
+
+    Returns
+    -------
+    float
     """
-    # a product, which reads the picture at the rate of memory: NumPy's sum takes thrice as long
-    row_sums = counts @ np.ones(counts.shape[1], np.float32)
+    if row_sums is None:
+        # a product, which reads the picture at the rate of memory: NumPy's sum takes thrice as long
+        row_sums = counts @ np.ones(counts.shape[1], np.float32)
     # Rows, not pixels: choosing the darkest pixels would choose those whose noise is low.
     quiet = np.argsort(row_sums)[: max(1, round(DARK_ROW_FRACTION * row_sums.size))]
     # the median, which NumPy looks for ten times as long as it sorts
@@ -197,7 +208,6 @@ class Rectifier:
         counts: FloatImage,
         dark: float | None = None,
         delay: float = 0.0,
-        room: FloatImage | None = None,
     ) -> FloatImage:
         """Return the measurements alone, for methods that cannot leave out single ones.
 
@@ -205,8 +215,6 @@ class Rectifier:
         ----------
         counts, dark, delay
             As for `measure`.
-        room : (rows, columns) float32 array, optional
-            Overwritten with what is returned: of many shots, none needs memory of its own.
 
         Returns
         -------
@@ -219,21 +227,20 @@ class Rectifier:
         CalibrationError, InputError
             As for `measure`, but for measurements that cannot be trusted.
         """
-        from tofclip.camera.kernels import sample_bilinear, sample_in_time, sample_runs
+        from tofclip.camera.kernels import sample_bilinear, sample_in_time, sample_rows
 
         self._require_shape(counts)
         level, shift = (
             np.float32(estimate_dark_level(counts) if dark is None else dark),
             np.float32(delay),
         )
-        measurements = np.empty(self._raw_row.shape, np.float32) if room is None else room
-        raw = np.ascontiguousarray(counts)
+        measurements, raw = np.empty(self._raw_row.shape, np.float32), _as_counts(counts)
 
         def work(piece: slice) -> None:
             rows, target = self._raw_row[piece], measurements[piece]
             if self._stays_in_column and delay == 0:
-                runs = self._runs[self._run_starts[piece.start] : self._run_starts[piece.stop]]
-                sample_runs(raw, level, self._raw_row, runs, measurements)
+                numbers = np.arange(piece.start, piece.stop)
+                sample_rows(raw, level, self._raw_row, *self._runs, numbers, target)
             elif self._stays_in_column:
                 sample_in_time(raw, level, rows, shift, target)
             else:
@@ -248,9 +255,116 @@ class Rectifier:
             raise InputError(NO_LIGHT_MESSAGE)
         return measurements.T
 
+    def rectify_rows(
+        self, counts: FloatImage, dark: float, numbers: NDArray[np.int64]
+    ) -> FloatImage:
+        """Return the measurements of some rows.
+
+        Parameters
+        ----------
+        counts : (rows, columns) array
+        dark : float
+            Counts.
+        numbers : (n,) int array
+            Of the rows.
+
+        Returns
+        -------
+        (columns, n) float32 array
+            As those of `rectify`.
+        """
+        from tofclip.camera.kernels import sample_bilinear, sample_rows
+
+        self._require_shape(counts)
+        measurements = np.empty((numbers.size, counts.shape[1]), np.float32)
+        raw, level = _as_counts(counts), np.float32(dark)
+
+        def work(piece: slice) -> None:
+            some, target = numbers[piece], measurements[piece]
+            if self._stays_in_column:
+                sample_rows(raw, level, self._raw_row, *self._runs, some, target)
+            else:
+                row, column = self._raw_row[some], self._raw_column[some]
+                sample_bilinear(raw, level, row, column, np.float32(0), target)
+
+        run_blocks(work, numbers.size, ROWS_PER_BLOCK)
+        measurements[:, self._dead] = 0
+        return measurements.T
+
+    def sum_rows(
+        self,
+        counts: FloatImage,
+        starts: NDArray[np.int64],
+        length: int,
+        block: int,
+        sums: FloatImage,
+    ) -> FloatImage:
+        """Add up successive rectified rows, from which no dark level is taken.
+
+        Parameters
+        ----------
+        counts : (rows, columns) array
+        starts : (sums,) int array
+            First row of each sum.
+        length : int
+            Rows of a sum.
+        block : int
+            Sums that each thread takes, whole vectors of them.
+        sums : (columns, at least sums) float32 array
+            Overwritten as far as there are sums.
+
+        Returns
+        -------
+        (rows,) float32 array
+            Sum of each raw row.
+        """
+        from tofclip.camera.kernels import sum_boxes, sum_sampled_boxes
+
+        self._require_shape(counts)
+        if not self._stays_in_column:
+            rectified = self.rectify_rows(counts, 0.0, np.arange(len(counts))).T
+            run_blocks(
+                lambda piece: sum_boxes(rectified, starts, length, (piece.start, piece.stop), sums),
+                starts.size,
+                block,
+            )
+            return np.asarray(counts @ np.ones(counts.shape[1], np.float32))
+        raw, row_sums = _as_counts(counts), np.empty(len(counts), np.float32)
+
+        def work(piece: slice) -> None:
+            raw_span = (
+                len(raw) * piece.start // starts.size,
+                len(raw) * piece.stop // starts.size,
+            )
+            sum_sampled_boxes(
+                raw,
+                self._raw_row,
+                *self._runs,
+                starts,
+                length,
+                (piece.start, piece.stop),
+                raw_span,
+                sums,
+                row_sums,
+            )
+
+        run_blocks(work, starts.size, block)
+        sums[self._dead, : starts.size] = 0
+        return row_sums
+
+    @property
+    def inside(self) -> Mask:
+        """Where the raw image has what a rectified pixel shows, (rows, columns)."""
+        rows, columns = self._raw_row.shape
+        inside: Mask = (self._raw_row >= 0) & (self._raw_row <= rows - 1)
+        inside &= (self._raw_column >= 0) & (self._raw_column <= columns - 1)
+        return inside
+
     @cached_property
-    def _runs(self) -> NDArray[np.uint64]:
-        """Neighbours in a row that come from the same two raw rows; see `sample_runs`."""
+    def _runs(self) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
+        """Neighbours in a row that come from the same two raw rows, and where each row's begin; see
+        `sample_row`.
+        """
         rows, columns = self._raw_row.shape
         top = np.clip(self._raw_row.astype(np.int64), 0, max(rows - 2, 0))
         top[(self._raw_row < 0) | (self._raw_row > rows - 1)] = rows
@@ -259,12 +373,8 @@ class Rectifier:
         row, first = np.nonzero(starts)
         # a run ends where the next one of its row begins
         last = np.where(np.append(row[1:], -1) == row, np.append(first[1:], 0), columns)
-        return np.stack([row, first, last, top[row, first]], axis=1).astype(np.uint64)
-
-    @cached_property
-    def _run_starts(self) -> NDArray[np.int64]:
-        """Number of the first run of each rectified row, and of all runs behind the last one."""
-        return np.searchsorted(self._runs[:, 0], np.arange(len(self._raw_row) + 1, dtype=np.uint64))
+        runs = np.stack([first, last, top[row, first]], axis=1).astype(np.uint64)
+        return runs, np.searchsorted(row, np.arange(rows + 1))
 
     def _find_valid(self, bad: Mask, delay: float) -> Mask:
         from tofclip.camera.kernels import mark_valid
@@ -285,6 +395,11 @@ class Rectifier:
         require_width(counts, self.camera)
         if counts.shape != self._raw_row.shape:
             raise ShapeError("a streak image of this camera", self._raw_row.shape, counts.shape)
+
+
+def _as_counts(counts: FloatImage) -> FloatImage:
+    """Return a streak image as compiled loops take it."""
+    return np.ascontiguousarray(counts, np.float32)
 
 
 FLOOR_FIGURE, GAIN_FIGURE = "noise_floor_count", "noise_gain_count"

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,11 +43,29 @@ class CloudPipeline(Protocol):
     def in_order(self) -> bool:
         """Whether what comes out of a shot depends on those before it."""
 
-    def recover_shot(self, shot: Streak, measurements: NDArray[np.float32]) -> Any:
+    def rectify(self, shot: Streak) -> Any:
+        """Do what can be done before anything is recovered; what comes out is for `recover_shot`."""
+
+    def recover_shot(self, shot: Streak, rectified: Any) -> Any:
         """Do what a shot needs as a whole; what comes out is for `search`."""
 
     def search(self, found: Any) -> Returns:
         """Find the returns in what `recover_shot` returned."""
+
+
+class SummedShot(NamedTuple):
+    """What a look at all rows of a shot brings.
+
+    Parameters
+    ----------
+    sums : (columns, instants and some) float32 array
+        See `tofclip.lidar.signal_rows.selection.SignalRowFinder.bins`.
+    dark : float
+        Dark level, counts.
+    """
+
+    sums: NDArray[np.float32]
+    dark: float
 
 
 class RangingPipeline:
@@ -188,21 +206,32 @@ class RangingPipeline:
             raise ShapeError(
                 "measurements", (self.camera.slit_width_px, self.times.size), measurements.shape
             )
-        bins = self._lit.bins(measurements)
+        bins = self._lit.bins(self._lit.sum_measurements(measurements))
+        # by rows, which is how measurements lie in memory
+        return self._recover_bins(np.take(measurements.T, bins.numbers, axis=0).T, bins)
+
+    def _recover_bins(self, measurements: NDArray[np.float32], bins: TraceBins) -> Traces:
+        """Recover from measurements (columns, bins)."""
         if self._warm_start is not None:
             return self._warm_start.recover(measurements, bins)
         return _ShotTraces(self, measurements, bins)
 
-    def recover_shot(self, shot: Streak, measurements: NDArray[np.float32]) -> Traces:
-        """As `recover`, which needs no more of a shot than its measurements.
+    def rectify(self, shot: Streak) -> SummedShot:
+        """Look at all rows of a shot once: their sums over a pulse's length, rectified."""
+        return SummedShot(*self._lit.sum_streak(shot.counts, self.rectifier))
+
+    def recover_shot(self, shot: Streak, rectified: SummedShot) -> Traces:
+        """As `recover`, rectifying the rows with light and no others.
 
         Parameters
         ----------
         shot : Streak
-        measurements : (columns, rows) float32 array
-            Of the shot, rectified.
+        rectified : SummedShot
+            Of the shot; overwritten.
         """
-        return self.recover(measurements)
+        bins = self._lit.bins(rectified.sums)
+        measurements = self.rectifier.rectify_rows(shot.counts, rectified.dark, bins.numbers)
+        return self._recover_bins(measurements, bins)
 
     def search(self, found: Traces) -> Returns:
         """Find the returns in what `recover` returned."""
@@ -224,11 +253,9 @@ class _ShotTraces:
         for place in pipeline.places:
             first, last = np.searchsorted(bins.numbers, [place.rows.start, place.rows.stop])
             if first < last:
-                # by rows, which is how measurements lie in memory
-                some = np.take(measurements.T, bins.numbers[first:last], axis=0).T
-                self._parts.append(
-                    (place.inverse, slice(first, last), place.inverse.inverse.weights(some))
-                )
+                held = slice(first, last)
+                weights = place.inverse.inverse.weights(measurements[:, held])
+                self._parts.append((place.inverse, held, weights))
 
     def fill(self, piece: slice, traces: NDArray[np.float32]) -> None:
         """Write the traces of some pixels, recovered now; see `tofclip.lidar.traces.Traces`.

@@ -392,7 +392,7 @@ def stream_clouds(
         # turn has the next one at hand. It grows old there, where the channel would have a newer.
         cores = 1 if pipeline.in_order else thread_count()
         room = cores + (policy == "block") if at_once is None else at_once
-        work = partial(_make_cloud, pipeline, deque[NDArray[np.float32]]())
+        work = partial(_make_cloud, pipeline)
         with closing(run_in_order(coming, work, workers, room, queue_size, policy)) as items:
             for item in items:
                 streak, returns, cloud, seconds = item.value
@@ -404,21 +404,13 @@ def stream_clouds(
 
 
 def _make_cloud(
-    pipeline: CloudPipeline, spare: deque[NDArray[np.float32]], shot: Streak
+    pipeline: CloudPipeline, shot: Streak
 ) -> tuple[Streak, Returns, PointCloud, dict[str, float]]:
-    """Return a shot with its returns and cloud, and what each step took, s.
-
-    `spare` is memory for measurements that no shot needs now.
-    """
+    """Return a shot with its returns and cloud, and what each step took, s."""
     ends = [perf_counter()]
-    try:
-        room = spare.pop()
-    except IndexError:
-        room = np.empty(shot.counts.shape, np.float32)
-    measurements = pipeline.rectifier.rectify(shot.counts, room=room)
+    rectified = pipeline.rectify(shot)
     ends.append(perf_counter())
-    found = pipeline.recover_shot(shot, measurements)
-    spare.append(room)
+    found = pipeline.recover_shot(shot, rectified)
     ends.append(perf_counter())
     returns = pipeline.search(found)
     ends.append(perf_counter())

@@ -5,9 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from threading import Lock
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tofclip.camera import Camera, Rectifier
 from tofclip.recovery import DepthLockedFocus, Shot, SurfaceRecovery, open_shot, plan_recovery
 from tofclip.recovery.focus import DEFAULT_FOCUS
@@ -77,14 +74,16 @@ class SurfacePipeline:
         """
         return cls(open_shot(shot, camera, time_zero).fit_camera(), method)
 
-    def recover_shot(self, shot: Streak, measurements: NDArray[np.float32]) -> SurfaceFit:
+    def rectify(self, shot: Streak) -> None:
+        """Do nothing: surfaces explain the raw image."""
+
+    def recover_shot(self, shot: Streak, rectified: None) -> SurfaceFit:
         """Fit the surfaces of a shot.
 
         Parameters
         ----------
         shot : Streak
-        measurements : (columns, rows) float32 array
-            Not needed: surfaces explain the raw image.
+        rectified : None
 
         Returns
         -------

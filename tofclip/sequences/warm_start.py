@@ -55,8 +55,8 @@ class WarmStartedRecovery:
 
         Parameters
         ----------
-        measurements : (columns, rows) float32 array
-            Rectified.
+        measurements : (columns, bins) float32 array
+            Rectified, of these rows.
         bins : TraceBins
             Rows of which one stands for several are dark, and stay so.
 
@@ -66,7 +66,7 @@ class WarmStartedRecovery:
         """
         lit = bins.bin_weights == 1
         rows = bins.numbers[lit]
-        seen = np.ascontiguousarray(measurements[:, rows])
+        seen = np.ascontiguousarray(measurements[:, lit])
         valid = None if self._alive.all() else np.repeat(self._alive[:, np.newaxis], rows.size, 1)
         shared, here, before = np.intersect1d(rows, self._rows, True, return_indices=True)
         pictures = np.zeros((bins.numbers.size, *self.operator.shape_in), np.float32)

@@ -13,7 +13,6 @@ from tofclip.vectors import (
     LENGTH,
     STEP,
     choose,
-    copy_transposed,
     fill_vector,
     find_first_bit,
     list_set_lanes,
@@ -30,47 +29,6 @@ ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floa
 VECTORS = 4
 WORD_FRAMES = VECTORS * LENGTH
 """Frames whose marks are a bit each of a whole number."""
-
-
-@vectorised_with_room
-def sum_boxes(measurements, starts, length, span, sums):
-    """``sums[c, i] = measurements[starts[i] : starts[i] + length, c].sum()`` for the instants of a span.
-
-    Parameters
-    ----------
-    measurements : (rows, columns) float32 array
-    starts : (instants,) int64 array
-    length : int
-    span : (int, int)
-        First instant, and the one after the last: whole vectors of them.
-    sums : (columns, at least instants) float32 array, overwritten in this span
-    """
-    columns = np.uintp(measurements.shape[1])
-    room = np.empty((LENGTH, measurements.shape[1]), np.float32)
-    flat, target = room.reshape(room.size), sums.reshape(sums.size)
-    for first in range(np.uintp(span[0]), np.uintp(span[1]), STEP):
-        for instant in range(STEP):
-            total, start = room[instant], starts[first + instant]
-            column = np.uintp(0)
-            while column + STEP <= columns:
-                here = load_vector(measurements[start], column)
-                for late in range(start + 1, start + length):
-                    here += load_vector(measurements[late], column)
-                store_vector(total, column, here)
-                column += STEP
-            while column < columns:
-                total[column] = measurements[start, column]
-                for late in range(start + 1, start + length):
-                    total[column] += measurements[late, column]
-                column += ONE
-        column, stride = np.uintp(0), np.uintp(sums.shape[1])
-        while column + STEP <= columns:
-            copy_transposed(flat, column, columns, target, column * stride + first, stride)
-            column += STEP
-        while column < columns:
-            for instant in range(STEP):
-                sums[column, first + instant] = room[instant, column]
-            column += ONE
 
 
 @vectorised

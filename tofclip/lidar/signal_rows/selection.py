@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofclip.arrays import empty_aligned
+from tofclip.camera import Rectifier
+from tofclip.camera.row_sums import RowSums
 from tofclip.lidar.signal_rows.bright_frames import BrightFrameFinder
 from tofclip.lidar.traces import TraceBins
 from tofclip.solvers.traces import GROUP_PIXELS, InverseTraces
@@ -96,9 +98,46 @@ class SignalRowFinder:
             first = last
         self._middles = np.concatenate(middles)
         self._taken = self._middles >= 0
+        self._row_sums: RowSums | None = None
         self._starts = np.clip(self._middles - self._length // 2, 0, self.rows - self._length)
 
-    def bins(self, measurements: FloatImage) -> TraceBins:
+    def sum_measurements(self, measurements: FloatImage) -> FloatImage:
+        """Add up rectified measurements, (columns, rows), as `bins` needs them."""
+        from tofclip.camera.kernels import sum_boxes
+
+        sums = self._allocate_sums(measurements.shape[0])
+        by_rows = np.ascontiguousarray(measurements.T)  # as the rectifier leaves them: no copy
+        run_blocks(
+            lambda piece: sum_boxes(
+                by_rows, self._starts, self._length, (piece.start, piece.stop), sums
+            ),
+            self._starts.size,
+            _divide_into_lanes(self._starts.size, count_block_threads()),
+        )
+        return sums
+
+    def sum_streak(self, counts: FloatImage, rectifier: Rectifier) -> tuple[FloatImage, float]:
+        """Add up the measurements of a raw streak image, (rows, columns), and return its dark level,
+        counts, as well. The camera is that of the first shot, and so is its `rectifier`.
+
+        Raises
+        ------
+        CalibrationError, InputError
+            As for `Rectifier.rectify`.
+        """
+        if self._row_sums is None:
+            self._row_sums = RowSums(rectifier, self._starts, self._length)
+        sums = self._allocate_sums(counts.shape[1])
+        return sums, self._row_sums.add_up(counts, sums)
+
+    def _allocate_sums(self, columns: int) -> FloatImage:
+        """As weights have it: whole cache lines, and a gap between columns, of zeros."""
+        instants = self._starts.size
+        sums: FloatImage = empty_aligned((columns, instants + GAP_INSTANTS), np.float32)
+        sums[:, instants:] = 0
+        return sums
+
+    def bins(self, sums: FloatImage) -> TraceBins:
         """Return the rows worth recovering, and a sample of the dark ones that stands for the rest.
 
         All rows, if a quarter of the shot is not nearly as dark as the darkest twentieth, or if not
@@ -106,13 +145,14 @@ class SignalRowFinder:
 
         Parameters
         ----------
-        measurements : (columns, rows) float32 array
+        sums : (columns, instants and some) float32 array
+            Of `sum_measurements` or `sum_streak`; overwritten.
 
         Notes
         -----
         Memory: as much as the measurements, divided by the rows of a pulse width.
         """
-        lit = self._find_signal_bins(measurements)
+        lit = self._find_signal_bins(sums)
         searched = self._mark_rows_near(lit, self._step // 2 + 1)
         kept = self._mark_rows_near(lit, self._step // 2 + 1 + self._reach)
         number = MIN_DARK_ROWS + -(int(kept.sum()) + MIN_DARK_ROWS) % LANES
@@ -126,26 +166,11 @@ class SignalRowFinder:
         numbers = np.flatnonzero(bin_weights)
         return TraceBins(numbers, searched[numbers], bin_weights[numbers])
 
-    def _find_signal_bins(self, measurements: FloatImage) -> Mask:
-        from tofclip.lidar.signal_rows.kernels import (
-            compute_energies,
-            standardise_columns,
-            sum_boxes,
-        )
+    def _find_signal_bins(self, sums: FloatImage) -> Mask:
+        from tofclip.lidar.signal_rows.kernels import compute_energies, standardise_columns
 
         instants, threads = self._starts.size, count_block_threads()
-        # as weights have it: whole cache lines, and a gap between columns, of zeros
-        sums = empty_aligned((measurements.shape[0], instants + GAP_INSTANTS), np.float32)
-        sums[:, instants:] = 0
         room = np.empty((2, instants), np.float32)
-        by_rows = np.ascontiguousarray(measurements.T)  # as the rectifier leaves them: no copy
-        run_blocks(
-            lambda piece: sum_boxes(
-                by_rows, self._starts, self._length, (piece.start, piece.stop), sums
-            ),
-            instants,
-            _divide_into_lanes(instants, threads),
-        )
         compute_energies(sums, room)
         energy = room[0]
         measured = self._taken & (energy > 0)
@@ -159,8 +184,8 @@ class SignalRowFinder:
         )
         run_blocks(
             lambda piece: standardise_columns(sums, counted, (piece.start, piece.stop)),
-            measurements.shape[0],
-            -(-measurements.shape[0] // threads),
+            len(sums),
+            -(-len(sums) // threads),
         )
         lit = np.concatenate(
             [finder.find(sums, own, self._threshold) for finder, own in self._owners]
