@@ -1,5 +1,5 @@
-"""What emulated instruments look at: scenes of `tofclip.simulate_shot`, so that the truth behind
-their photons is known.
+"""What emulated instruments look at: scenes of `tofclip.simulate.simulate_shot`, so that the truth
+behind their photons is known.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ class ShotOptions:
     time_zero : float, optional
         Reading of the time axis at which light of range 0 would arrive, s; by default the camera's.
     method : str, optional
-        How shots are recovered: a name of `tofclip.recovery.METHODS`, ``"surfaces"`` for a single
+        How shots are recovered: a name of `tofclip.recovery.plan.METHODS`, ``"surfaces"`` for a single
         one. By default a single one by some iterations of ``"l1"``, and one after the other by
         ``"linear"``.
     """
