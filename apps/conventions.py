@@ -135,6 +135,33 @@ def name_beside(out: Path, suffix: str) -> Path:
     return out.with_suffix(suffix)
 
 
+def choose_preview(out: Path, preview: Path | None, inputs: tuple[Path, ...]) -> Path:
+    """Return where the picture of a result goes, and refuse either where it cannot be written.
+
+    Parameters
+    ----------
+    out : Path
+        File of our own.
+    preview : Path, optional
+        The picture, beside the result by default.
+    inputs : tuple of Path
+        Files that must survive.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError, StorageError
+        See `require_writable`.
+    """
+    preview = preview or name_beside(out, ".png")
+    require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
+    require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
+    return preview
+
+
 def build_provenance(
     settings: Mapping[str, Any], *inputs: Path, earlier: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:

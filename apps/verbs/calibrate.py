@@ -8,15 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from apps.conventions import (
-    PICTURE_SUFFIXES,
-    RECORD_SUFFIXES,
-    JsonOption,
-    PreviewOption,
-    name_beside,
-    report,
-    require_writable,
-)
+from apps.conventions import JsonOption, PreviewOption, choose_preview, report
 from apps.figures.calibration import make_calibration_figure
 from apps.figures.style import save_figure
 from apps.progress import show_activity
@@ -80,10 +72,8 @@ def calibrate(
     --dot-background dot_background.tif --out camera.h5
     """
     pictures = (line, line_background, dot, dot_background)
-    preview = preview or name_beside(out, ".png")
     # Both outputs are checked before any picture is read, and neither may replace an input.
-    require_writable(out, *RECORD_SUFFIXES, inputs=pictures)
-    require_writable(preview, *PICTURE_SUFFIXES, inputs=pictures)
+    preview = choose_preview(out, preview, pictures)
     lines, no_lines, dots, no_dots = (read_streak(path).counts for path in pictures)
     with show_activity("calibrating"):
         found = fit(lines, no_lines, dots, no_dots)

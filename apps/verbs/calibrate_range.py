@@ -9,16 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from apps.conventions import (
-    PICTURE_SUFFIXES,
-    RECORD_SUFFIXES,
-    JsonOption,
-    PreviewOption,
-    make_completer,
-    name_beside,
-    report,
-    require_writable,
-)
+from apps.conventions import JsonOption, PreviewOption, choose_preview, make_completer, report
 from apps.figures.range_calibration import make_range_calibration_figure
 from apps.figures.style import save_figure
 from apps.progress import show_progress
@@ -152,9 +143,7 @@ def calibrate_range(
     """
     files = tuple(Path(shot) for shot in shots if "://" not in shot)
     inputs = files if camera is None else (*files, camera)
-    preview = preview or name_beside(out, ".png")
-    require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
-    require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
+    preview = choose_preview(out, preview, inputs)
     require_view(focal_length_px, field_of_view_deg)
     distances = _one_each(target_m, len(shots), "--target-m")
     percents = _one_each(reflectance_percent or [np.nan], len(shots), "--reflectance-percent")

@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from apps.conventions import (
-    PICTURE_SUFFIXES,
-    RECORD_SUFFIXES,
     ClusterOption,
     DeviceOption,
     JsonOption,
     PreviewOption,
     TimeZeroOption,
+    choose_preview,
     make_completer,
-    name_beside,
     report,
     require_writable,
 )
@@ -133,8 +131,9 @@ def recover(
     _check_single_options(streak, cluster, sweep)
     # An instrument's address is not a file that an output could replace.
     inputs = tuple(Path(name) for name in (streak, camera) if name and not _is_address(name))
-    preview = preview or name_beside(out, ".png")
-    _require_writable_results(inputs, out, preview, cloud)
+    preview = choose_preview(out, preview, inputs)
+    if cloud is not None:
+        require_writable(cloud, *CLOUD_SUFFIXES, inputs=inputs)
     solver, chosen_focus = make_method(method, iterations=iterations), parse_focus(focus)
     started = time.perf_counter()
     # Outputs and settings have been checked by now: an instrument is not started for nothing.
@@ -187,15 +186,6 @@ def _recover_sequence(
 def _parse_sweep(text: str) -> tuple[str, list[str]]:
     name, _, values = text.partition("=")
     return name, values.split(",")
-
-
-def _require_writable_results(
-    inputs: tuple[Path, ...], out: Path, preview: Path, cloud: Path | None
-) -> None:
-    require_writable(out, *RECORD_SUFFIXES, inputs=inputs)
-    require_writable(preview, *PICTURE_SUFFIXES, inputs=inputs)
-    if cloud is not None:
-        require_writable(cloud, *CLOUD_SUFFIXES, inputs=inputs)
 
 
 def _is_address(name: str | Path) -> bool:

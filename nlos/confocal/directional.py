@@ -8,8 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.capture import Capture
-from nlos.confocal.light_cone import LightCone, build_rebinning_matrix, tabulate_powers
-from nlos.confocal.scan import ConfocalScan, find_padded_length, resample_to_grid
+from nlos.confocal.light_cone import (
+    LightCone,
+    tabulate_powers,
+    transform_squared_distances,
+)
+from nlos.confocal.scan import ConfocalScan, resample_to_grid
 from nlos.front_surface import (
     FrontSurface,
     build_front_surface,
@@ -84,18 +88,13 @@ class DirectionalLightCone:
 
     def _deconvolve(self, scan: ConfocalScan, grid: Grid) -> NDArray[np.float32]:
         """Return albedo times normal, (3, z, y, x)."""
-        from scipy.fft import fft2, ifft2, irfft, rfft
+        from scipy.fft import ifft2, irfft
 
-        rows, columns, bins = scan.signal.shape
-        shape = (find_padded_length(rows), find_padded_length(columns), find_padded_length(bins))
-        squares, workers = bins * scan.spacing**2, thread_count()
-        edges = (np.clip(np.arange(bins + 1) - 0.5, 0, None) * scan.spacing) ** 2
-        matrix = build_rebinning_matrix(edges, squares * np.arange(bins + 1))
+        bins, workers = scan.signal.shape[2], thread_count()
+        squares = bins * scan.spacing**2
         # By one power more than the transform without directions.
-        bright = scan.correct_falloff(self.transform.falloff + 1)
-        over_squares = (matrix @ bright.reshape(-1, bins).T).T.reshape(scan.signal.shape)
-        spectrum = rfft(over_squares, shape[2], workers=workers)
-        spectrum = fft2(spectrum, shape[:2], axes=(0, 1), workers=workers)
+        falloff = self.transform.falloff + 1
+        spectrum, shape = transform_squared_distances(scan, squares, falloff)
         unit = float(grid.z.mean() - scan.plane.z)
         parts = _separate(spectrum, scan, squares, shape, unit, 1 / self.transform.signal_to_noise)
         depth = grid.z - scan.plane.z

@@ -101,18 +101,10 @@ class LightCone(Method):
 
     def _deconvolve(self, scan: ConfocalScan, squares: float) -> NDArray[np.float32]:
         """Return the image on the padded lattice over samples of u that are `squares` (m^2) apart."""
-        from scipy.fft import fft2, ifft2, irfft, rfft
+        from scipy.fft import ifft2, irfft
 
-        rows, columns, bins = scan.signal.shape
-        shape = (find_padded_length(rows), find_padded_length(columns), find_padded_length(bins))
-        # edges of the bins in v = d^2; a bin is centred on its distance
-        edges = (np.clip(np.arange(bins + 1) - 0.5, 0, None) * scan.spacing) ** 2
-        matrix = build_rebinning_matrix(edges, squares * np.arange(bins + 1))
-        over_squares = matrix @ scan.correct_falloff(self.falloff).reshape(-1, bins).T
-        workers = thread_count()
-        spectrum = rfft(over_squares.T.reshape(scan.signal.shape), shape[2], workers=workers)
-        # padded, so that the convolution does not wrap around
-        spectrum = fft2(spectrum, shape[:2], axes=(0, 1), workers=workers)
+        bins, workers = scan.signal.shape[2], thread_count()
+        spectrum, shape = transform_squared_distances(scan, squares, self.falloff)
         self._apply_wiener_filter(spectrum, _transform_paraboloid(scan, squares, shape))
         spectrum = ifft2(spectrum, axes=(0, 1), workers=workers, overwrite_x=True)
         image: NDArray[np.float32] = irfft(spectrum, shape[2], workers=workers, overwrite_x=True)[
@@ -165,6 +157,40 @@ def build_rebinning_matrix(source_edges: FloatArray, target_edges: FloatArray) -
     source, target, lengths = source[inside], target[inside], lengths[inside]
     weights = (lengths / np.diff(target_edges)[target]).astype(np.float32)
     return csr_array((weights, (target, source)), shape=shape)
+
+
+def transform_squared_distances(
+    scan: ConfocalScan, squares: float, falloff: float
+) -> tuple[NDArray[np.complex64], tuple[int, int, int]]:
+    """Return the spectrum of the signals over the square v = d^2 of the distance, in which every
+    depth has the same kernel.
+
+    Parameters
+    ----------
+    scan : ConfocalScan
+    squares : float
+        Distance of samples of v, m^2.
+    falloff : float
+        Power of the distance by which light is weaker; it is made up for.
+
+    Returns
+    -------
+    spectrum : (y, x, v) complex64 array
+        Half spectrum, padded, so that no convolution wraps around.
+    shape : (int, int, int)
+        Samples along y, x and v with the padding.
+    """
+    from scipy.fft import fft2, rfft
+
+    rows, columns, bins = scan.signal.shape
+    shape = (find_padded_length(rows), find_padded_length(columns), find_padded_length(bins))
+    # edges of the bins in v; a bin is centred on its distance
+    edges = (np.clip(np.arange(bins + 1) - 0.5, 0, None) * scan.spacing) ** 2
+    matrix = build_rebinning_matrix(edges, squares * np.arange(bins + 1))
+    over_squares = matrix @ scan.correct_falloff(falloff).reshape(-1, bins).T
+    workers = thread_count()
+    spectrum = rfft(over_squares.T.reshape(scan.signal.shape), shape[2], workers=workers)
+    return fft2(spectrum, shape[:2], axes=(0, 1), workers=workers), shape
 
 
 def _transform_paraboloid(

@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlos.band import Band
+from nlos.geometry import Grid
+from nlos.illumination_groups import find_leg_bounds
 from nlos.method import Progress, ignore_progress
 from nlos.plane import Plane
 from nlos.propagation.kernels import shift_and_sum
@@ -52,7 +54,7 @@ def propagate_in_time(
     """
     targets = plane.points.reshape(-1, 3)
     scale = legs / band.axis.spacing
-    nearest, farthest = _find_distance_bounds(points, plane)
+    nearest, farthest = find_leg_bounds(points, Grid(plane.x, plane.y, np.array([plane.z])))
     latest = np.ceil(farthest * scale)
     bins = traces.shape[1] + int(latest - np.floor(nearest * scale)) + 2
     paths = band.axis.start + band.axis.spacing * (np.arange(bins) - latest)
@@ -67,12 +69,3 @@ def propagate_in_time(
 
     run_blocks(process_block, len(targets), size=POINTS_PER_BLOCK)
     return field.reshape(*plane.shape, -1)
-
-
-def _find_distance_bounds(points: FloatArray, plane: Plane) -> tuple[float, float]:
-    """Bounds of the distance between a wall point and a point of the plane, m."""
-    low = np.array([plane.x[0], plane.y[0], plane.z])
-    high = np.array([plane.x[-1], plane.y[-1], plane.z])
-    outside = np.maximum(np.maximum(low - points, points - high), 0)
-    across = np.maximum(np.abs(points - low), np.abs(high - points))
-    return float(np.linalg.norm(outside, axis=1).min()), float(np.linalg.norm(across, axis=1).max())

@@ -25,7 +25,7 @@ def correct_returns(returns: Returns) -> Returns:
     distance, intensity, sigma = correct_ranges(
         known,
         returns.range,
-        returns.intensity / measured_square(returns.range),
+        returns.intensity / square_range(returns.range),
         returns.confidence.astype(np.float64),
         (returns.y, returns.x),
     )
@@ -73,6 +73,6 @@ def correct_ranges(
     return corrected, signal * corrected**2, np.hypot(sigma, further)
 
 
-def measured_square(distance: FloatArray) -> FloatArray:
+def square_range(distance: FloatArray) -> FloatArray:
     """Square of measured ranges, by which their intensities were referred to 1 m; never 0."""
     return np.maximum(distance**2, np.finfo(np.float64).tiny)

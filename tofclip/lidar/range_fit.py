@@ -21,7 +21,7 @@ from tofclip.camera import Camera, RangeCalibration
 from tofclip.errors import CalibrationError, InputError
 from tofclip.lidar.geometry import compute_ray_directions
 from tofclip.lidar.mixed_model import Effects, Measurements, fit_effects
-from tofclip.lidar.range_correction import measured_square
+from tofclip.lidar.range_correction import square_range
 from tofclip.shots import Returns
 from tofclip.units import SPEED_OF_LIGHT
 
@@ -286,7 +286,7 @@ def _select_target(shot: TargetShot, camera: Camera, pulse: float) -> _Sample:
         )
     # Whatever time zero the shot was recovered with is put back: it is what is to be found.
     zero = SPEED_OF_LIGHT / 2 * shot.returns.camera.time_zero
-    square = measured_square(found.range)
+    square = square_range(found.range)
     y, x = found.y[target].astype(np.int64), found.x[target].astype(np.int64)
     return _Sample(
         y,
