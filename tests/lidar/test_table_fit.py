@@ -9,7 +9,14 @@ import pytest
 
 from tofclip.camera import Camera
 from tofclip.lidar import Detection, Pulse, depth
+from tofclip.lidar.search.candidates import (
+    CANDIDATE_COLUMNS,
+    HEIGHT,
+    OFFSET,
+    PEAK_BIN,
+)
 from tofclip.lidar.search.phase_table import MAX_OFFSET_BINS, PHASES_PER_BIN, PhaseTable
+from tofclip.lidar.search.table_fit import fit_lone_returns
 from tofclip.lidar.traces import TraceBins
 from tofclip.shots import Frames
 
@@ -93,3 +100,38 @@ def test_bins_whose_neighbours_are_not_held_are_left_to_the_exact_fit():
     even = table.find_even_bins(bins)
     half = table.half
     assert np.flatnonzero(even).tolist() == [*range(half, 20 - half), *range(20 + half, 58 - half)]
+
+
+@pytest.mark.parametrize(("peak", "there"), [(27, True), (33, True), (56, False)])
+def test_a_return_is_followed_when_it_moves_away_from_its_peak(peak, there):
+    """As far as the bins around it are held; beyond, the exact fit takes over."""
+    table = PhaseTable.tabulate(Pulse.gaussian(FWHM), TIMES)
+    arrival = 30.2 if there else peak + 2.0
+    traces = np.zeros((2, 64), np.float32)
+    traces[0, :BINS] = 100 * Pulse.gaussian(FWHM)(TIMES - TIMES[0] - BIN * arrival) + 3
+    candidates = np.zeros((1, CANDIDATE_COLUMNS))
+    candidates[0, PEAK_BIN] = peak
+    rests = np.zeros((1, table.shapes.shape[1]), np.float32)
+    rests[0, : 2 * table.half + 1] = np.pad(traces[0] - 3, 9)[9 + peak - table.half :][
+        : 2 * table.half + 1
+    ]
+    even = table.find_even_bins(TraceBins.all_bins(BINS))
+    fit_lone_returns(
+        traces[:1],
+        np.array([[3.0, 1.0]]),
+        even,
+        table.half,
+        candidates,
+        rests,
+        np.zeros(1, np.int64),
+        1,
+        table.shapes,
+        table.slopes,
+        table.sums,
+    )
+    if there:
+        assert candidates[0, PEAK_BIN] + candidates[0, OFFSET] == pytest.approx(30.2, abs=1e-3)
+        assert abs(candidates[0, OFFSET]) <= MAX_OFFSET_BINS
+        assert candidates[0, HEIGHT] == pytest.approx(100, rel=1e-3)
+    else:
+        assert np.isnan(candidates[0, HEIGHT])

@@ -190,9 +190,8 @@ class ReturnSearch:
     @property
     def reach_bins(self) -> int:
         """How many bins on either side of a return its search and its fit look at."""
-        return (
-            len(self._filters.matched) // 2 + 1
-        )  # the responses of a peak's neighbours tell where its top is
+        # the responses of a peak's neighbours tell where its top is
+        return max(len(self._filters.matched) // 2 + 1, self._filters.table.half)
 
     def _find_candidates(
         self, traces: Traces | ArrayTraces, judged: bool

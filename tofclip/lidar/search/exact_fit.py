@@ -1,5 +1,6 @@
-"""The fit of returns on an uneven time axis, and of those that stray from the peak at which the
-table begins (`tofclip.lidar.search.table_fit`): `tofclip.lidar.pulse_fit`, trace by trace.
+"""The fit of returns on an uneven time axis, and of those at the ends of an even one, where not all
+bins of the table (`tofclip.lidar.search.table_fit`) are there: `tofclip.lidar.pulse_fit`, trace by
+trace.
 """
 
 from __future__ import annotations

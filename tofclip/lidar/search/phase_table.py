@@ -19,7 +19,7 @@ from tofclip.lidar.traces import TraceBins
 
 PHASES_PER_BIN = 64
 MAX_OFFSET_BINS = 1.5
-"""By how much a return may move away from the bin of its peak; beyond, the exact fit takes over."""
+"""By how much a return may lie away from the bin of its peak; beyond, that bin follows it."""
 
 VECTOR_BINS = 16
 """The table's width is a multiple of it: a vector's length (`tofclip.vectors`)."""

@@ -19,6 +19,7 @@ import numpy as np
 from tofclip.compiling import inlined
 from tofclip.lidar.detection import CONVERGENCE_STEP_BINS, MAX_FIT_ROUNDS
 from tofclip.lidar.search.candidates import (
+    FIRST_OFFSET,
     HEIGHT,
     MOVED,
     NEEDS_EXACT_FIT,
@@ -26,6 +27,7 @@ from tofclip.lidar.search.candidates import (
     OFFSET,
     PEAK_BIN,
     TRACE,
+    cut_out,
     is_near,
 )
 from tofclip.lidar.search.peaks import ONE, search_step
@@ -57,7 +59,9 @@ def find_phase(offset):
 
 
 @search_step
-def fit_lone_returns(candidates, rests, active, moving, shapes, slopes, sums):
+def fit_lone_returns(
+    traces, moments, even, half, candidates, rests, active, moving, shapes, slopes, sums
+):
     """Fit returns that stand alone, of many traces: each round takes one step of every return that
     still moves.
 
@@ -66,11 +70,14 @@ def fit_lone_returns(candidates, rests, active, moving, shapes, slopes, sums):
 
     Parameters
     ----------
+    traces, moments, even, half
+        As for `tofclip.lidar.search.candidates.find_candidates`.
     candidates : (room, CANDIDATE_COLUMNS) array
         Column `OFFSET` is improved; `HEIGHT` is overwritten: not above zero where there is no
-        pulse, NaN where the return moved further than `MAX_OFFSET_BINS` and needs the exact fit.
+        pulse, NaN where the return moved to where the exact fit is needed. `PEAK_BIN` follows one
+        that moves further than `MAX_OFFSET_BINS`.
     rests : (room, width) float32 array
-        Of `tofclip.lidar.search.candidates.find_candidates`.
+        Of `tofclip.lidar.search.candidates.find_candidates`; what is around the peak bins.
     active : (room,) int64 array
         Numbers of the returns; overwritten.
     moving : int
@@ -90,6 +97,7 @@ def fit_lone_returns(candidates, rests, active, moving, shapes, slopes, sums):
                 along_pulse += left * load_vector(shapes[phase], w)
                 along_slope += left * load_vector(slopes[phase], w)
             take_table_step(own, phase, sum_vector(along_pulse), sum_vector(along_slope), sums)
+            follow_return(own, rest, traces, moments, even, half)
             active[still] = k
             still += 1 if own[MOVED] >= CONVERGENCE_STEP_BINS else 0
         moving = still
@@ -122,14 +130,42 @@ def take_table_step(own, phase, pr, dr, sums):
         step = 1.0 if step > 1.0 else (-1.0 if step < -1.0 else step)
         own[OFFSET] += step
         moved = math.fabs(step)
-        if math.fabs(own[OFFSET]) > MAX_OFFSET_BINS:
-            height, moved = np.nan, 0.0
     own[HEIGHT] = height
     own[MOVED] = moved
 
 
+@inlined
+def follow_return(own, rest, traces, moments, even, half):
+    """Cut out the bins around a return again where it has moved away from the bin of its peak.
+
+    Parameters
+    ----------
+    own : (CANDIDATE_COLUMNS,) array
+        The bin and what is relative to it are overwritten. `HEIGHT` becomes NaN where the bins
+        around are not all there.
+    rest : (width,) float32 array
+        Overwritten.
+    traces, moments, even, half
+        As for `tofclip.lidar.search.candidates.find_candidates`.
+    """
+    if math.fabs(own[OFFSET]) <= MAX_OFFSET_BINS:
+        return
+    shift, place = round(own[OFFSET]), int(own[TRACE])
+    j = int(own[PEAK_BIN]) + shift
+    if 0 <= j < even.size and even[j]:
+        own[PEAK_BIN] = j
+        own[OFFSET] -= shift
+        own[FIRST_OFFSET] -= shift
+        cut_out(traces[place], moments[place, 0], j - half, 2 * half + 1, rest)
+    else:
+        own[HEIGHT] = np.nan
+        own[MOVED] = 0.0
+
+
 @search_step
-def fit_crowded_returns(candidates, rests, crowded, number, half, shapes, slopes, tails, sums):
+def fit_crowded_returns(
+    traces, moments, even, half, candidates, rests, crowded, number, shapes, slopes, tails, sums
+):
     """Fit returns that overlap, by steps on one at a time.
 
     Taking turns, each against what the others leave, undoes the pull of returns on each other. A
@@ -137,15 +173,16 @@ def fit_crowded_returns(candidates, rests, crowded, number, half, shapes, slopes
 
     Parameters
     ----------
+    traces, moments, even, half
+        As for `tofclip.lidar.search.candidates.find_candidates`.
     candidates : (room, CANDIDATE_COLUMNS) array
-        Columns `OFFSET`, `HEIGHT` and `MOVED` are improved, as by `fit_lone_returns`.
+        Columns `OFFSET`, `HEIGHT`, `MOVED` and `PEAK_BIN` are improved, as by `fit_lone_returns`.
     rests : (room, width) float32 array
         Of `tofclip.lidar.search.candidates.find_candidates`; in the end what the others leave of it.
     crowded : (room,) int64 array
         Numbers of the returns, increasing.
     number : int
         How many.
-    half : int
     shapes, slopes, tails, sums
         See `PhaseTable`.
     """
@@ -165,11 +202,18 @@ def fit_crowded_returns(candidates, rests, crowded, number, half, shapes, slopes
                 along_pulse = along_slope = fill_vector(np.float32(0))
                 for w in range(np.uintp(0), np.uintp(rest.size), STEP):
                     left = subtract_others(
-                        load_vector(rest, w), w, candidates, crowded[start:end], own, half, tails
+                        load_vector(rest, w),
+                        w,
+                        candidates,
+                        crowded[start:end],
+                        crowded[place],
+                        half,
+                        tails,
                     )
                     along_pulse += left * load_vector(shapes[phase], w)
                     along_slope += left * load_vector(slopes[phase], w)
                 take_table_step(own, phase, sum_vector(along_pulse), sum_vector(along_slope), sums)
+                follow_return(own, rest, traces, moments, even, half)
                 largest = own[MOVED] if own[MOVED] > largest else largest
             if largest < CONVERGENCE_STEP_BINS:
                 break
@@ -177,7 +221,13 @@ def fit_crowded_returns(candidates, rests, crowded, number, half, shapes, slopes
             own, rest = candidates[crowded[place]], rests[crowded[place]]
             for w in range(np.uintp(0), np.uintp(rest.size), STEP):
                 left = subtract_others(
-                    load_vector(rest, w), w, candidates, crowded[start:end], own, half, tails
+                    load_vector(rest, w),
+                    w,
+                    candidates,
+                    crowded[start:end],
+                    crowded[place],
+                    half,
+                    tails,
                 )
                 store_vector(rest, w, left)
         start = end
@@ -208,13 +258,13 @@ def find_largest_move(candidates, numbers, own, half):
 
 
 @inlined
-def subtract_others(rest, w, candidates, numbers, own, half, tails):
+def subtract_others(rest, w, candidates, numbers, k, half, tails):
     """What the other returns leave of a vector of bins.
 
     Parameters
     ----------
     rest : vector of float32
-        Trace less background, from bin w of those around the peak of `own` on.
+        Trace less background, from bin w of those around the peak of return k on.
     w : int
     candidates : (room, CANDIDATE_COLUMNS) array
     numbers : (n,) int64 array
@@ -229,8 +279,8 @@ def subtract_others(rest, w, candidates, numbers, own, half, tails):
     vector of float32
     """
     for other in numbers:
-        away = own[PEAK_BIN] - candidates[other, PEAK_BIN]
-        if away != 0 and math.fabs(away) <= 2 * half and candidates[other, HEIGHT] > 0:
+        away = candidates[k, PEAK_BIN] - candidates[other, PEAK_BIN]
+        if other != k and math.fabs(away) <= 2 * half and candidates[other, HEIGHT] > 0:
             # between two phases: an error of half a phase would be one of a bright neighbour's slope
             position = (candidates[other, OFFSET] + MAX_OFFSET_BINS) * PHASES_PER_BIN
             phase = min(int(position), tails.shape[0] - 2)

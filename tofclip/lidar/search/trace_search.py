@@ -283,10 +283,9 @@ class TraceSearch:
             memory.crowded,
         )
         shapes, slopes, sums = table.shapes, table.slopes, table.sums
-        fit_lone_returns(candidates, rests, memory.lone, alone, shapes, slopes, sums)
-        fit_crowded_returns(
-            candidates, rests, memory.crowded, crowded, half, shapes, slopes, table.tails, sums
-        )
+        around = traces, moments, self._even, half, candidates, rests
+        fit_lone_returns(*around, memory.lone, alone, shapes, slopes, sums)
+        fit_crowded_returns(*around, memory.crowded, crowded, shapes, slopes, table.tails, sums)
         measure_returns_by_table(
             candidates,
             listed,
