@@ -45,7 +45,7 @@ def test_bright_frames_are_those_of_the_whole_filter(limit, light):
     span = slice(LANES, 6 * LANES)
     expected = filter_responses(matrix, block)[span]
     assert np.abs(expected - limit).min() > 1e-5
-    bright = BrightFrameFinder(tiles, GROUP_PIXELS).find(block, span, limit)
+    bright = BrightFrameFinder(tiles, 170, GROUP_PIXELS).find(block, span, limit)
     np.testing.assert_array_equal(bright, expected >= limit)
 
 
@@ -55,14 +55,14 @@ def test_dead_measurements_are_left_out_of_the_filter():
     tiles = InverseTraces(prepared, order_by_patch(SHAPE)).tiles
     block = np.random.default_rng(0).standard_normal((170, 4 * LANES)).astype(np.float32)
     expected = filter_responses(prepared.operator.matrix.toarray() * alive[:, np.newaxis], block)
-    bright = BrightFrameFinder(tiles, GROUP_PIXELS).find(block, slice(0, 4 * LANES), 3.2)
+    bright = BrightFrameFinder(tiles, 170, GROUP_PIXELS).find(block, slice(0, 4 * LANES), 3.2)
     np.testing.assert_array_equal(bright, expected >= 3.2)
 
 
 def test_any_nonnegative_matrix_and_any_limit_will_do():
     random = np.random.default_rng(1)
     matrix = scipy.sparse.random_array((50, 90), density=0.1, rng=random).astype(np.float32)
-    finder = BrightFrameFinder(Tiles.from_csr(matrix.T.tocsr()), GROUP_PIXELS)
+    finder = BrightFrameFinder(Tiles.from_csr(matrix.T.tocsr()), 50, GROUP_PIXELS)
     block = random.standard_normal((50, 2 * LANES)).astype(np.float32)
     span = slice(0, 2 * LANES)
     expected = filter_responses(matrix.toarray(), block)
@@ -75,4 +75,4 @@ def test_any_nonnegative_matrix_and_any_limit_will_do():
 def test_negative_entries_are_refused():
     matrix = scipy.sparse.csr_array(np.array([[1.0, -1.0]], np.float32))
     with pytest.raises(InputError, match="negative entries"):
-        BrightFrameFinder(Tiles.from_csr(matrix), GROUP_PIXELS)
+        BrightFrameFinder(Tiles.from_csr(matrix), 2, GROUP_PIXELS)

@@ -30,6 +30,8 @@ class BrightFrameFinder:
     ----------
     tiles : Tiles
         The operator's transpose, a row for each pixel; its entries are not negative.
+    measurements : int
+        Columns of it.
     group_pixels : int
         Successive rows that are ruled out together: neighbours in a row of the picture.
 
@@ -39,7 +41,7 @@ class BrightFrameFinder:
         A negative entry.
     """
 
-    def __init__(self, tiles: Tiles, group_pixels: int) -> None:
+    def __init__(self, tiles: Tiles, measurements: int, group_pixels: int) -> None:
         if tiles.values.size and tiles.values.min() < 0:
             raise InputError("bright frames are found for operators without negative entries")
         self._tiles, self._group_pixels = tiles, group_pixels
@@ -66,7 +68,7 @@ class BrightFrameFinder:
         begins = np.flatnonzero(
             (np.diff(run_number, prepend=-1) != 0) | (np.diff(step, prepend=-1) != 0)
         )
-        self._windows = (column[begins] * FRACTIONS + part[begins]).astype(np.int32)
+        self._windows = (part[begins] * measurements + column[begins]).astype(np.int32)
         self._group_starts = np.searchsorted(
             group[begins], np.arange(-(-pixels // group_pixels) + 1)
         )

@@ -128,7 +128,7 @@ def find_bright_frames(
     bright : (frames to look at,) bool array, overwritten
     """
     groups = group_starts.size - 1
-    highest = np.empty((block.shape[0] * FRACTIONS, WORD_FRAMES), np.float32)
+    highest = np.empty((VECTORS, FRACTIONS * block.shape[0], LENGTH), np.float32)
     marks, most_promising = np.empty(groups, np.uint64), np.empty(WORD_FRAMES, np.int32)
     for done in range(0, bright.size, WORD_FRAMES):
         frame = np.uintp(begin + done)
@@ -183,7 +183,7 @@ def find_bright_frames(
 def find_window_maxima(block, frame, highest):
     """Find the highest value between neighbouring measurements under windows.
 
-    Row ``column * FRACTIONS + part`` is for what lies between the measurement of `column`, or one of
+    Row ``part * measurements + column`` is for what lies between the measurement of `column`, or one of
     the next ``WINDOW - 1``, and the one behind it, at any fraction of that part of the way. Nothing
     is below zero.
 
@@ -192,13 +192,13 @@ def find_window_maxima(block, frame, highest):
     block : (measurements, frames) float32 array
     frame : int
         First of the frames.
-    highest : (measurements * FRACTIONS, WORD_FRAMES) float32 array, overwritten
+    highest : (VECTORS, FRACTIONS * measurements, LENGTH) float32 array, overwritten
     """
     number, parts, zero = np.uintp(block.shape[0]), np.uintp(FRACTIONS), fill_vector(np.float32(0))
     for vector in range(VECTORS):
-        place = np.uintp(vector * LENGTH)
-        at = frame + place
+        at = frame + np.uintp(vector * LENGTH)
         for part in range(parts):
+            target = highest[vector, part * number : (part + ONE) * number]
             low = fill_vector(np.float32((np.float32(part) - FRACTION_SLACK) / FRACTIONS))
             high = fill_vector(np.float32((np.float32(part) + 1 + FRACTION_SLACK) / FRACTIONS))
             # From the last measurement on: of the ones behind it, pairs' maxima are at hand.
@@ -210,7 +210,7 @@ def find_window_maxima(block, frame, highest):
                 rise, value_behind = behind - here, value
                 value = raise_vector(zero, raise_vector(here + low * rise, here + high * rise))
                 two_behind, pair_behind, pair = pair_behind, pair, raise_vector(value, value_behind)
-                store_vector(highest[column * parts + part], place, raise_vector(pair, two_behind))
+                store_vector(target[column], np.uintp(0), raise_vector(pair, two_behind))
                 behind = here
 
 
@@ -220,7 +220,7 @@ def mark_promising(highest, group_starts, windows, weights, limit, marks, most_p
 
     Parameters
     ----------
-    highest : (measurements * FRACTIONS, WORD_FRAMES) float32 array
+    highest : (VECTORS, FRACTIONS * measurements, LENGTH) float32 array
         Of `find_window_maxima`.
     group_starts, windows, weights, limit
         As for `find_bright_frames`.
@@ -239,11 +239,11 @@ def mark_promising(highest, group_starts, windows, weights, limit, marks, most_p
     for group in range(group_starts.size - 1):
         a = b = c = d = zero
         for k in range(group_starts[group], group_starts[group + 1]):
-            window, weight = highest[np.uintp(windows[k])], fill_vector(weights[k])
-            a += weight * load_vector(window, np.uintp(0))
-            b += weight * load_vector(window, np.uintp(16))
-            c += weight * load_vector(window, np.uintp(32))
-            d += weight * load_vector(window, np.uintp(48))
+            window, weight = np.uintp(windows[k]), fill_vector(weights[k])
+            a += weight * load_vector(highest[0, window], np.uintp(0))
+            b += weight * load_vector(highest[1, window], np.uintp(0))
+            c += weight * load_vector(highest[2, window], np.uintp(0))
+            d += weight * load_vector(highest[3, window], np.uintp(0))
         marks[group] = (
             list_set_lanes(a >= level)
             | list_set_lanes(b >= level) << np.uint64(16)

@@ -93,7 +93,10 @@ class SignalRowFinder:
             last = first + -(-instants.size // LANES) * LANES
             middles.append(np.pad(instants, (0, last - first - instants.size), constant_values=-1))
             if place.inverse not in finders:
-                finders[place.inverse] = BrightFrameFinder(place.inverse.tiles, GROUP_PIXELS)
+                (measurements,) = place.inverse.inverse.operator.shape_out
+                finders[place.inverse] = BrightFrameFinder(
+                    place.inverse.tiles, measurements, GROUP_PIXELS
+                )
             self._owners.append((finders[place.inverse], slice(first, last)))
             first = last
         self._middles = np.concatenate(middles)
