@@ -14,7 +14,6 @@ from nlos.rsd.kernels import (
     FREQUENCY_STEPS,
     LANES,
     MIRROR_IMAGES,
-    NODE_STEPS,
     TAPS,
     assemble_groups,
 )
@@ -112,8 +111,7 @@ class WaveGroups:
             found.reshape(*lateral.shape, -1) for found in transfer.interpolation(lateral.ravel())
         )
         begin, end = node.min(axis=(1, 2)), node.max(axis=(1, 2)) + TAPS
-        count = -(-(end - begin) // NODE_STEPS) * NODE_STEPS
-        begin = np.minimum(begin, transfer.nodes.size - count)
+        count = end - begin
         offset = np.concatenate([[0], np.cumsum(count)])
         shares = np.zeros((offset[-1], LANES), np.float32)
         place = (offset[:-1] - begin)[:, np.newaxis, np.newaxis] + node + np.arange(TAPS)

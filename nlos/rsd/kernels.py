@@ -7,11 +7,14 @@ import math
 import numpy as np
 from numba import njit
 
-from tofclip.compiling import inlined
+from tofclip.compiling import compile_as_part, inlined
+from tofclip.vectors import LENGTH, STEP, fill_vector, load_vector, store_vector
 
 compiled = njit(
     nogil=True, cache=True, fastmath={"contract", "nsz", "reassoc", "arcp"}, error_model="numpy"
 )
+
+part_of_loop = compile_as_part(_nrt=False)
 
 TILE_SIDE = 16
 """Side of the squares that matrices are transposed in: two cache lines of complex64."""
@@ -26,10 +29,10 @@ in the axes."""
 GROUP_FLOATS = 2 * MIRROR_IMAGES * LANES
 """Real numbers of such a group at one frequency."""
 
-FREQUENCY_STEPS, NODE_STEPS = 8, 4
-"""Frequencies, and nodes of the transfer function, that stay in registers."""
+WAVE_LANES = np.uintp(LANES)
 
-UINT64_TWO = np.uint64(2)
+FREQUENCY_STEPS = 8
+"""Frequencies of the transfer function that stay in registers."""
 
 
 @compiled
@@ -110,8 +113,8 @@ def propagate_spectrum(spectrum, first, nodes, begin, offset, node_weights, coef
 
     The transfer function depends on a wave's lateral wavenumber alone and is interpolated between
     its nodes, once for waves mirrored in the axes. A group is propagated to all depths while its
-    spectrum is in cache, and nothing between spectrum and terms leaves it. Frequencies come in
-    steps of `FREQUENCY_STEPS`.
+    spectrum is in cache, and sums over frequencies stay in registers. Frequencies come in steps of
+    `FREQUENCY_STEPS`.
 
     Parameters
     ----------
@@ -124,7 +127,7 @@ def propagate_spectrum(spectrum, first, nodes, begin, offset, node_weights, coef
     begin : (groups,) int64 array
         First node that each group takes.
     offset : (groups + 1,) int64 array
-        Where its interpolation weights begin; it has a multiple of `NODE_STEPS` of them.
+        Where its interpolation weights begin.
     node_weights : (some, LANES) float32 array
         Interpolation weights.
     coefficients : (depths, m, frequencies) float32 array
@@ -134,92 +137,176 @@ def propagate_spectrum(spectrum, first, nodes, begin, offset, node_weights, coef
     """
     groups, frequencies, count = spectrum.shape[0], spectrum.shape[1], coefficients.shape[1]
     waves, weights, flat = spectrum.reshape(-1), node_weights.reshape(-1), terms.reshape(-1)
-    transfer, products = (
-        np.empty(2 * FREQUENCY_STEPS * LANES, np.float32),
-        np.empty(FREQUENCY_STEPS * GROUP_FLOATS, np.float32),
-    )
-    sums = np.empty(count * GROUP_FLOATS, np.float32)
+    at_nodes, shares = nodes.reshape(-1), coefficients.reshape(-1)
+    transfer = np.empty(2 * frequencies * LANES, np.float32)
+    products = np.empty(4 * frequencies * LENGTH, np.float32)
+    row, stride = np.uintp(frequencies), np.uintp(groups * GROUP_FLOATS)
     for group in range(groups):
+        lowest = first[group]
+        steps = np.uintp(frequencies - lowest)
+        of = (group * frequencies + lowest) * GROUP_FLOATS
         for depth in range(coefficients.shape[0]):
-            sums[:] = 0
-            for k in range(first[group], frequencies, FREQUENCY_STEPS):
-                _interpolate_transfer(
-                    nodes[depth],
-                    begin[group],
-                    k,
-                    weights,
-                    offset[group],
-                    offset[group + 1],
-                    transfer,
+            node = (depth * nodes.shape[1] + begin[group]) * 2 * frequencies + lowest
+            share_begin, share_end = offset[group] * LANES, offset[group + 1] * LANES
+            _interpolate_transfer(
+                at_nodes,
+                np.uintp(node),
+                row,
+                weights,
+                np.uintp(share_begin),
+                np.uintp(share_end),
+                steps,
+                transfer,
+            )
+            for part in range(2 * LANES // LENGTH):
+                # two mirrored waves, and half of their lanes
+                lane = part % 2 * LENGTH
+                place = part // 2 * 2 * LANES + lane
+                _apply_transfer(
+                    waves, np.uintp(of + place), transfer, np.uintp(lane), steps, products
                 )
-                _apply_transfer(waves, (group * frequencies + k) * GROUP_FLOATS, transfer, products)
-                _sum_frequencies(coefficients[depth], k, products, sums)
-            for m in range(count):
-                to = np.uint64(((depth * count + m) * groups + group) * GROUP_FLOATS)
-                of = np.uint64(m * GROUP_FLOATS)
-                # a loop, since assigning slices goes by way of a copy
-                for i in range(np.uint64(GROUP_FLOATS)):
-                    flat[to + i] = sums[of + i]
+                for m in range(0, count, 4):
+                    share = np.uintp((depth * count + m) * frequencies + lowest)
+                    to = np.uintp(((depth * count + m) * groups + group) * GROUP_FLOATS + place)
+                    if m + 4 <= count:
+                        _sum_four_terms(products, shares, share, row, steps, flat, to, stride)
+                    else:
+                        _sum_two_terms(products, shares, share, row, steps, flat, to, stride)
 
 
-# Unsigned indices into flat arrays: an index that might be negative would keep the loops from
-# becoming vector code.
+# Unsigned indices into flat arrays, and vectors that are written down: in loops over lanes,
+# frequencies and terms the compiler keeps no sums in registers.
 
 
-@compiled
-def _interpolate_transfer(nodes, node, k, weights, begin, end, transfer):
-    """Transfer function (`FREQUENCY_STEPS`, 2, `LANES`) of a group at some frequencies,
-    `NODE_STEPS` at a time.
-    """
-    flat, lanes, imaginary = nodes.reshape(-1), np.uint64(LANES), np.uint64(nodes.shape[2])
-    transfer[:] = 0
-    for i in range(begin, end, NODE_STEPS):
-        for step in range(np.uint64(FREQUENCY_STEPS)):
-            at = np.uint64((node + i - begin) * 2 * nodes.shape[2] + k) + step
-            of, to = np.uint64(i * LANES), np.uint64(2) * lanes * step
-            for j in range(lanes):
-                along = aside = np.float32(0)
-                for n in range(np.uint64(NODE_STEPS)):
-                    share = weights[of + lanes * n + j]
-                    along += flat[at + UINT64_TWO * imaginary * n] * share
-                    aside += flat[at + UINT64_TWO * imaginary * n + imaginary] * share
-                transfer[to + j] += along
-                transfer[to + lanes + j] += aside
+@part_of_loop
+def _interpolate_transfer(nodes, start, row, weights, begin, end, steps, transfer):
+    """Transfer function (frequencies, 2, `LANES`) of a group, `FREQUENCY_STEPS` at a time."""
+    zero = fill_vector(np.float32(0))
+    nothing = (zero, zero, zero, zero, zero, zero, zero, zero)
+    for lane in range(np.uintp(0), WAVE_LANES, STEP):
+        for k in range(np.uintp(0), steps, np.uintp(FREQUENCY_STEPS)):
+            real, imaginary, node = nothing, nothing, start + k
+            for weight in range(begin + lane, end, WAVE_LANES):
+                share = load_vector(weights, weight)
+                real = _add_eight(real, share, nodes, node)
+                imaginary = _add_eight(imaginary, share, nodes, node + row)
+                node += row + row
+            to = k * (WAVE_LANES + WAVE_LANES) + lane
+            _store_eight(transfer, to, real)
+            _store_eight(transfer, to + WAVE_LANES, imaginary)
 
 
-@compiled
-def _apply_transfer(waves, start, transfer, products):
-    """Products of a group's waves with their transfer function at some frequencies."""
-    of, lanes, half = np.uint64(start), np.uint64(LANES), np.uint64(GROUP_FLOATS // 2)
-    for step in range(np.uint64(FREQUENCY_STEPS)):
-        at = np.uint64(2) * lanes * step
-        for mirrored in range(np.uint64(MIRROR_IMAGES)):
-            to = np.uint64(GROUP_FLOATS) * step + lanes * mirrored
-            for j in range(lanes):
-                real, imaginary = waves[of + to + j], waves[of + to + half + j]
-                along, aside = transfer[at + j], transfer[at + lanes + j]
-                products[to + j] = real * along - imaginary * aside
-                products[to + half + j] = real * aside + imaginary * along
+@part_of_loop
+def _add_eight(sums, lanes, numbers, at):
+    """Add lanes times each of eight numbers to eight vectors."""
+    return (
+        sums[0] + lanes * fill_vector(numbers[at]),
+        sums[1] + lanes * fill_vector(numbers[at + np.uintp(1)]),
+        sums[2] + lanes * fill_vector(numbers[at + np.uintp(2)]),
+        sums[3] + lanes * fill_vector(numbers[at + np.uintp(3)]),
+        sums[4] + lanes * fill_vector(numbers[at + np.uintp(4)]),
+        sums[5] + lanes * fill_vector(numbers[at + np.uintp(5)]),
+        sums[6] + lanes * fill_vector(numbers[at + np.uintp(6)]),
+        sums[7] + lanes * fill_vector(numbers[at + np.uintp(7)]),
+    )
 
 
-@compiled
-def _sum_frequencies(coefficients, k, products, sums):
-    """Add `FREQUENCY_STEPS` frequencies to all terms, two terms at a time."""
-    size = np.uint64(GROUP_FLOATS)
-    for m in range(0, coefficients.shape[0], 2):
-        even, odd, to = (
-            coefficients[m, k : k + FREQUENCY_STEPS],
-            coefficients[m + 1, k : k + FREQUENCY_STEPS],
-            np.uint64(m * GROUP_FLOATS),
-        )
-        for j in range(size):
-            low = high = np.float32(0)
-            for step in range(np.uint64(FREQUENCY_STEPS)):
-                product = products[size * step + j]
-                low += even[step] * product
-                high += odd[step] * product
-            sums[to + j] += low
-            sums[to + size + j] += high
+@part_of_loop
+def _store_eight(transfer, to, sums):
+    """Write eight frequencies of the transfer function."""
+    step = WAVE_LANES + WAVE_LANES
+    store_vector(transfer, to, sums[0])
+    store_vector(transfer, to + step, sums[1])
+    store_vector(transfer, to + np.uintp(2) * step, sums[2])
+    store_vector(transfer, to + np.uintp(3) * step, sums[3])
+    store_vector(transfer, to + np.uintp(4) * step, sums[4])
+    store_vector(transfer, to + np.uintp(5) * step, sums[5])
+    store_vector(transfer, to + np.uintp(6) * step, sums[6])
+    store_vector(transfer, to + np.uintp(7) * step, sums[7])
+
+
+@part_of_loop
+def _apply_transfer(waves, of, transfer, lane, steps, products):
+    """Products of two mirrored waves with their transfer function at all frequencies."""
+    to, half = np.uintp(0), np.uintp(GROUP_FLOATS // 2)
+    for _ in range(steps):
+        along, aside = load_vector(transfer, lane), load_vector(transfer, lane + WAVE_LANES)
+        for wave in range(of, of + WAVE_LANES + WAVE_LANES, WAVE_LANES):
+            real, imaginary = load_vector(waves, wave), load_vector(waves, wave + half)
+            store_vector(products, to, real * along - imaginary * aside)
+            store_vector(products, to + STEP, real * aside + imaginary * along)
+            to += STEP + STEP
+        lane += WAVE_LANES + WAVE_LANES
+        of += np.uintp(GROUP_FLOATS)
+
+
+@part_of_loop
+def _sum_four_terms(products, shares, share, row, steps, terms, to, stride):
+    """Sum two waves over all frequencies, for four terms."""
+    zero = fill_vector(np.float32(0))
+    first = second = third = fourth = (zero, zero, zero, zero)
+    of = np.uintp(0)
+    for _ in range(steps):
+        two = _load_two_waves(products, of)
+        first = _add_two_waves(first, two, shares[share])
+        second = _add_two_waves(second, two, shares[share + row])
+        third = _add_two_waves(third, two, shares[share + row + row])
+        fourth = _add_two_waves(fourth, two, shares[share + row + row + row])
+        of += np.uintp(4 * LENGTH)
+        share += np.uintp(1)
+    _store_two_waves(terms, to, first)
+    _store_two_waves(terms, to + stride, second)
+    _store_two_waves(terms, to + stride + stride, third)
+    _store_two_waves(terms, to + stride + stride + stride, fourth)
+
+
+@part_of_loop
+def _sum_two_terms(products, shares, share, row, steps, terms, to, stride):
+    """Sum two waves over all frequencies, for two terms."""
+    zero = fill_vector(np.float32(0))
+    first = second = (zero, zero, zero, zero)
+    of = np.uintp(0)
+    for _ in range(steps):
+        two = _load_two_waves(products, of)
+        first = _add_two_waves(first, two, shares[share])
+        second = _add_two_waves(second, two, shares[share + row])
+        of += np.uintp(4 * LENGTH)
+        share += np.uintp(1)
+    _store_two_waves(terms, to, first)
+    _store_two_waves(terms, to + stride, second)
+
+
+@part_of_loop
+def _load_two_waves(products, of):
+    """Real and imaginary parts of two waves."""
+    return (
+        load_vector(products, of),
+        load_vector(products, of + STEP),
+        load_vector(products, of + STEP + STEP),
+        load_vector(products, of + STEP + STEP + STEP),
+    )
+
+
+@part_of_loop
+def _add_two_waves(sums, waves, share):
+    """Add a share of two waves."""
+    everywhere = fill_vector(share)
+    return (
+        sums[0] + everywhere * waves[0],
+        sums[1] + everywhere * waves[1],
+        sums[2] + everywhere * waves[2],
+        sums[3] + everywhere * waves[3],
+    )
+
+
+@part_of_loop
+def _store_two_waves(terms, to, sums):
+    """Write the sums of two waves of one term."""
+    half = np.uintp(GROUP_FLOATS // 2)
+    store_vector(terms, to, sums[0])
+    store_vector(terms, to + half, sums[1])
+    store_vector(terms, to + WAVE_LANES, sums[2])
+    store_vector(terms, to + half + WAVE_LANES, sums[3])
 
 
 @compiled
