@@ -16,7 +16,6 @@ from tofclip.vectors import (
     fill_vector,
     find_first_bit,
     find_highest_lane,
-    find_last_bit,
     list_set_lanes,
     load_vector,
     number_lanes,
@@ -58,15 +57,25 @@ def test_arithmetic_and_choice(one, other):
 
 
 @njit
-def _find_bits(word):
-    return find_first_bit(word), find_last_bit(word)
+def _find_bit(word):
+    return find_first_bit(word)
 
 
 @given(st.integers(1, 2**64 - 1))
 def test_bits(word):
-    first, last = _find_bits(np.uint64(word))
-    assert word >> int(last) == 1
+    first = _find_bit(np.uint64(word))
     assert word % (2 << int(first)) == 1 << int(first)
+
+
+@njit
+def _find_highest_number(numbers):
+    return find_highest_lane(load_vector(numbers, np.uintp(0)))
+
+
+@settings(deadline=None)
+@given(arrays(np.int32, vectors.LENGTH))
+def test_the_highest_whole_number(numbers):
+    assert _find_highest_number(numbers) == numbers.max()
 
 
 @njit

@@ -195,17 +195,19 @@ def sum_vector(typing: Any, lanes: Any) -> Any:
 
 @intrinsic  # type: ignore[untyped-decorator]
 def find_highest_lane(typing: Any, lanes: Any) -> Any:
-    """Return the highest of float32 lanes."""
+    """Return the highest of float32 or int32 lanes."""
 
     def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
+        kind = called.args[0]
+        name, number = ("fmax", "f32") if kind == FLOATS else ("smax", "i32")
         highest = cgutils.get_or_insert_function(
             builder.module,
-            ir.FunctionType(ELEMENTS[FLOATS], [args[0].type]),
-            f"llvm.vector.reduce.fmax.v{LENGTH}f32",
+            ir.FunctionType(ELEMENTS[kind], [args[0].type]),
+            f"llvm.vector.reduce.{name}.v{LENGTH}{number}",
         )
-        return builder.call(highest, args, fastmath=("nnan",))
+        return builder.call(highest, args, fastmath=("nnan",) if kind == FLOATS else ())
 
-    return types.float32(lanes), build
+    return lanes.dtype(lanes), build
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -235,17 +237,6 @@ def find_first_bit(typing: Any, bits: Any) -> Any:
 
     def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.uint64(types.uint64), build
-
-
-@intrinsic  # type: ignore[untyped-decorator]
-def find_last_bit(typing: Any, bits: Any) -> Any:
-    """Return the number of the highest bit that is set (uint64)."""
-
-    def build(context: Any, builder: Any, called: Any, args: Any) -> Any:
-        above = builder.ctlz(args[0], ir.Constant(ir.IntType(1), 1))
-        return builder.sub(ir.Constant(above.type, 63), above)
 
     return types.uint64(types.uint64), build
 

@@ -8,8 +8,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from tofclip.compiling import compile_loop, inlined
 from tofclip.units import SPEED_OF_LIGHT
+
+ONE = np.uintp(1)  # a signed number beside an unsigned one would make both floats
 
 
 @compile_loop()
@@ -95,21 +99,25 @@ def list_kept(pixel, values, kept, columns, pixels, places, numbers, lengths, in
     intensity : (k,) float32 array
         Overwritten.
     """
-    listed, before, rank = 0, -1, 0
+    listed, before, rank, row, row_start = np.uintp(0), -1, 0, 0, 0
     for number in range(pixel.size):
         if not kept[number]:
             continue
         own = pixel[number]
         rank = rank + 1 if own == before else 1
         before = own
+        # pixels come in their order: a division for each would take as long as all else
+        while own >= row_start + columns:
+            row += 1
+            row_start += columns
         pixels[listed] = own
-        places[0, listed], places[1, listed] = own // columns, own % columns
+        places[0, listed], places[1, listed] = row, own - row_start
         numbers[listed] = rank
         lengths[0, listed] = values[0, number]
         lengths[1, listed] = SPEED_OF_LIGHT / 2 * values[0, number]
         lengths[2, listed] = SPEED_OF_LIGHT / 2 * values[2, number]
         intensity[listed] = values[1, number]
-        listed += 1
+        listed += ONE
 
 
 @compile_loop()

@@ -238,8 +238,13 @@ def fill_layers(nearness, pixel, starts, columns, layers):
     columns : int
         Of the picture.
     """
+    y = row_start = 0
     for number in range(pixel.size):
-        y, x = pixel[number] // columns, pixel[number] % columns
+        # pixels come in their order: a division for each would take as long as all else
+        while pixel[number] >= row_start + columns:
+            y += 1
+            row_start += columns
+        x = pixel[number] - row_start
         part = y % STRIDE_PX * STRIDE_PX + x % STRIDE_PX
         down, right = y // STRIDE_PX + MARGIN, x // STRIDE_PX + MARGIN
         layers[number - starts[pixel[number]], part, down, right] = nearness[number]

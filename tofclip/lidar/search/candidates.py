@@ -62,7 +62,7 @@ def find_candidates(
     half,
     score,
     places,
-    maxima,
+    responses,
     free,
     peaks,
     moments,
@@ -120,9 +120,9 @@ def find_candidates(
         See `PhaseTable`.
     score : (1 + bins + WORD_BINS + 1,) float32 array
         Zero where the sharp filter is not applied; overwritten elsewhere. One bin late.
-    places : (2, bins) int32 array
+    places : (3, bins) int32 array
         Overwritten.
-    maxima : (2, bins) float32 array
+    responses : (bins,) float32 array
         Overwritten.
     free : (bins,) float32 array
         As `bin_weights`, before and afterwards.
@@ -155,7 +155,7 @@ def find_candidates(
         centre, sum_left, square_left = sum_about(trace, bin_weights)
         apply_filter(trace, sharp, runs, edges, score)
         level = np.float32(gains[2]) * (centre + np.float32(sum_left) / all_bins)
-        number = list_maxima(score, of_interest, words, level, places, maxima[0])
+        number = list_maxima(score, of_interest, words, level, places)
         background, noise, number = take_strongest_peaks(
             trace,
             times,
@@ -169,7 +169,7 @@ def find_candidates(
             (centre, all_bins, sum_left, square_left),
             number,
             places,
-            maxima,
+            responses,
             free,
             peaks,
         )

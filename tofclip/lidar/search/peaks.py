@@ -19,7 +19,6 @@ from tofclip.vectors import (
     fill_vector,
     find_first_bit,
     find_highest_lane,
-    find_last_bit,
     list_set_lanes,
     load_vector,
     number_lanes,
@@ -52,7 +51,7 @@ def take_strongest_peaks(
     above_centre,
     listed,
     places,
-    maxima,
+    responses,
     free,
     peaks,
 ):
@@ -73,10 +72,10 @@ def take_strongest_peaks(
         A brightness, number of bins, and sums over the bins of what is above it and of its square.
     listed : int
         Number of maxima.
-    places : (2, bins) int32 array
-        Their bins, and zeros; in place of these 1 where a peak was taken.
-    maxima : (2, bins) float32 array
-        Their heights; overwritten.
+    places : (3, bins) int32 array
+        Of `list_maxima`; where a peak is taken its zero becomes 1.
+    responses : (bins,) float32 array
+        Overwritten at these: response of the matched filter.
     peaks : (returns, 2) array
         Overwritten: bin, and response less that to the background.
 
@@ -102,15 +101,15 @@ def take_strongest_peaks(
             # light falls with the square of the range: strengths count as if all stood at one
             share = PREFIT_THRESHOLD_FACTOR * limits[2] * above * times[best] * times[best]
             needed = max(share, needed)
-        height, entry = take_highest(places[0], maxima[0], listed, low, high)
+        height, entry = take_highest(places[0], places[1], listed, low, high)
         brightest = ratio * height - gains[1] * background
         dim = height <= 0 or brightest <= limits[4] or brightest * brightest <= steepest * variance
         if number == len(peaks) or dim or brightest * limits[3] * limits[3] < needed:
             break
         best = np.uintp(places[0, entry])
         response = compute_response(trace, matched[best], starts[best])
-        places[1, entry] = 1
-        maxima[1, entry] = response
+        places[2, entry] = 1
+        responses[entry] = response
         number += 1
         low, high = windows[best, 2], windows[best, 3]
         first, after = np.uintp(windows[best, 0]), np.uintp(windows[best, 1])
@@ -122,12 +121,12 @@ def take_strongest_peaks(
             bins_left -= taken_bins
     number = 0
     for k in range(np.uintp(0), np.uintp(listed), STEP):
-        bits = list_set_lanes(load_vector(places[1], k) > fill_vector(np.int32(0)))
+        bits = list_set_lanes(load_vector(places[2], k) > fill_vector(np.int32(0)))
         while bits:
             entry = k + np.uintp(find_first_bit(bits))
             bits &= bits - np.uint64(1)
             best = np.uintp(places[0, entry])
-            above = maxima[1, entry] - background * sums[best]
+            above = responses[entry] - background * sums[best]
             peaks[number, 0] = best
             peaks[number, 1] = above if above > 0 else 0.0
             number += 1
@@ -200,34 +199,54 @@ def apply_filter(trace, sharp, runs, edges, score):
 
 
 @inlined
-def take_highest(bins, heights, listed, low, high):
+def make_key(height, entry):
+    """A whole number that is the larger the higher a maximum, to 2e-6 of it, and holds its lane.
+
+    Parameters
+    ----------
+    height : float32
+        Above zero: such numbers are in the order of their bits.
+    entry : int
+        Place in the list.
+
+    Returns
+    -------
+    int32
+    """
+    return np.int32((np.float32(height).view(np.int32) & -LENGTH) | (entry & (LENGTH - 1)))
+
+
+@inlined
+def take_highest(bins, keys, listed, low, high):
     """Return height and place of the highest maximum, without those from bin `low` to before `high`.
+
+    Every peak waits for the one before it, so that what counts is how soon it is found.
 
     Parameters
     ----------
     bins : (n,) int32 array
         Of the maxima.
-    heights : (n,) float32 array
-        Those left out are zero from now on.
+    keys : (n,) int32 array
+        Of `make_key`; those left out are zero from now on.
     listed : int
     low, high : int32
 
     Returns
     -------
     float32, int
-        The last one's where several are equally high.
+        Height, or 0 where none is left; and place.
     """
-    height, entry, zero = np.float32(0), np.uintp(0), fill_vector(np.float32(0))
+    highest, entry, zero = np.int32(0), np.uintp(0), fill_vector(np.int32(0))
     first, after = fill_vector(low), fill_vector(high)
     for k in range(np.uintp(0), np.uintp(listed), STEP):
         where = load_vector(bins, k)
-        left = choose((where >= first) & (after > where), zero, load_vector(heights, k))
-        store_vector(heights, k, left)
+        left = choose((where >= first) & (after > where), zero, load_vector(keys, k))
+        store_vector(keys, k, left)
         top = find_highest_lane(left)
-        if top >= height:
-            entry = k + np.uintp(find_last_bit(list_set_lanes(left >= fill_vector(top))))
-            height = top
-    return height, entry
+        if top > highest:
+            entry = k + np.uintp(top & (LENGTH - 1))
+            highest = top
+    return np.int32(highest & -LENGTH).view(np.float32), entry
 
 
 @inlined
@@ -285,7 +304,7 @@ def sum_weighted(trace, bin_weights):
 
 
 @inlined
-def list_maxima(score, of_interest, words, level, places, heights):
+def list_maxima(score, of_interest, words, level, places):
     """List bin and height of the local maxima of interest, in the order of time; return how many.
 
     Parameters
@@ -293,10 +312,9 @@ def list_maxima(score, of_interest, words, level, places, heights):
     score, of_interest, words
         As for `tofclip.lidar.search.candidates.find_candidates`. Of a level top the last bin
         counts.
-    places : (2, bins) int32 array
-        Overwritten: bins of the maxima, and zeros.
-    heights : (bins,) float32 array
-        Overwritten: their scores, with zeros behind the last one.
+    places : (3, bins) int32 array
+        Overwritten: bins of the maxima, keys of their scores (`make_key`) with zeros behind the last
+        one, and zeros.
     level : float32
         Score of the background.
 
@@ -317,11 +335,12 @@ def list_maxima(score, of_interest, words, level, places, heights):
             at = begin + np.uintp(find_first_bit(bits))
             bits &= bits - np.uint64(1)
             places[0, listed] = at
-            heights[listed] = score[at + ONE]
+            places[1, listed] = make_key(score[at + ONE], listed)
             listed += 1
-    store_vector(heights, np.uintp(listed), zero)  # what fills up the last vector
+    none = fill_vector(np.int32(0))
+    store_vector(places[1], np.uintp(listed), none)  # what fills up the last vector
     for k in range(np.uintp(0), np.uintp(listed), STEP):
-        store_vector(places[1], k, fill_vector(np.int32(0)))
+        store_vector(places[2], k, none)
     return listed
 
 

@@ -45,8 +45,8 @@ class SearchMemory:
         The same memory, where that is a whole number of vectors.
     moments : (pixels, 2) array
     peaks : (returns, 2) array
-    score, maxima, free : float32 arrays
-    places : (2, bins) int32 array
+    score, responses, free : float32 arrays
+    places : (3, bins) int32 array
         See `tofclip.lidar.search.candidates.find_candidates`.
     candidates : (pixels * returns, CANDIDATE_COLUMNS) array
     rests : (pixels * returns, width) float32 array
@@ -61,7 +61,7 @@ class SearchMemory:
     peaks: FloatArray
     score: NDArray[np.float32]
     places: NDArray[np.int32]
-    maxima: NDArray[np.float32]
+    responses: NDArray[np.float32]
     free: NDArray[np.float32]
     candidates: FloatArray
     rests: NDArray[np.float32]
@@ -201,8 +201,8 @@ class TraceSearch:
             moments=np.empty((pixels, 2)),
             peaks=np.empty((most, 2)),
             score=np.zeros(length + WORD_BINS + 2, np.float32),
-            places=np.zeros((2, length), np.int32),
-            maxima=np.zeros((2, length), np.float32),
+            places=np.zeros((3, length), np.int32),
+            responses=np.empty(length, np.float32),
             free=self._weights.copy(),
             candidates=np.empty((pixels * most, CANDIDATE_COLUMNS)),
             rests=np.empty((pixels * most, width), np.float32),
@@ -272,7 +272,7 @@ class TraceSearch:
             half,
             memory.score,
             memory.places,
-            memory.maxima,
+            memory.responses,
             memory.free,
             memory.peaks,
             moments,
