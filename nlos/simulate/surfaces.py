@@ -186,8 +186,11 @@ class Surface:
         Raises
         ------
         InputError
-            The letters have no facet at this spacing.
+            The letters have no facet at this spacing, or more than `MAX_FACETS`; or the height is
+            not positive.
         """
+        if not 0 < height < np.inf:
+            raise InputError(f"letters need a positive height, got {height:g} m")
         x, y = _rasterize_letters(text, height, spacing)
         if x.size == 0:
             raise InputError(f"'{text}' has no ink at a spacing of {spacing} m")
@@ -253,9 +256,13 @@ def _rasterize_letters(text: str, height: float, spacing: float) -> tuple[FloatA
     capital = TextPath((0, 0), "H", size=1, prop=font).get_extents().height
     outline: Outline = TextPath((0, 0), text, size=height / capital, prop=font)
     box = outline.get_extents()
-    columns, rows = (
-        np.arange(-n, n + 1) * spacing for n in (int(s / spacing / 2) + 1 for s in box.size)
-    )
+    halves = [int(side / spacing / 2) + 1 for side in box.size]
+    # Before any memory is taken: of a letter's box about a third is ink.
+    if (2 * halves[0] + 1) * (2 * halves[1] + 1) > 4 * MAX_FACETS:
+        raise InputError(
+            f"the letters need more than {MAX_FACETS} facets at a spacing of {spacing:g} m; use a larger one"
+        )
+    columns, rows = (np.arange(-n, n + 1) * spacing for n in halves)
     x, y = (grid.ravel() for grid in np.meshgrid(columns, rows))
     middle = (box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2
     # Fonts have y up. Holes run the other way round, which the even-odd rule of a polygon test

@@ -348,3 +348,10 @@ def test_what_cannot_be_streamed_leaves_no_folder(
     outcome = run("stream", source, "--out", folder / "clouds")
     assert (outcome.status, outcome.err.count("\n")) == (2, 1)
     assert list(folder.iterdir()) == []
+
+
+def test_photons_in_bins_of_years(run: Run, tmp_path: Path, folder: Path) -> None:
+    np.save(tmp_path / "cube.npy", np.random.default_rng(1).poisson(0.5, (6, 6, 32)))
+    words = ["lidar", "photons", tmp_path / "cube.npy", "--bin-width-ps", "1e30"]
+    assert_refused(run(*words, "--out", folder / "r.npz"), "check the unit of --bin-width-ps")
+    assert list(folder.iterdir()) == []

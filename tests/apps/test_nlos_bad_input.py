@@ -54,6 +54,9 @@ def test_imaging_that_makes_no_sense(
         (["--bin-width-ps", "0"], "bin width must be a positive number"),
         (["--jitter-ps", "0"], "jitter must be a positive number"),
         (["--facet-mm", "0"], "facets need a positive size"),
+        (["--facet-mm", "1e-6"], "the letters need more than 200000 facets"),
+        (["--height-m", "nan"], "letters need a positive height"),
+        (["--height-m", "-1"], "letters need a positive height"),
         (["--mesh", "absent.ply"], "no such file"),
     ],
 )

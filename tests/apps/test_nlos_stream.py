@@ -89,6 +89,14 @@ def test_captures_that_cannot_be_imaged_are_counted(run: Run, tmp_path: Path) ->
     assert "failed: 3:" in outcome.err
 
 
+def test_captures_of_nothing_leave_no_folder(run: Run, tmp_path: Path) -> None:
+    dark = moving(0)
+    replace(dark, signal=np.zeros_like(dark.signal)).save(tmp_path / "dark.h5")
+    outcome = run("nlos", "stream", tmp_path / "dark.h5", "--out", tmp_path / "out", *WORDS)
+    assert (outcome.status, outcome.err.count("\n")) == (2, 1)
+    assert [path.name for path in tmp_path.iterdir()] == ["dark.h5"]
+
+
 def test_a_folder_is_followed_and_its_accounts_balance(run: Run, tmp_path: Path) -> None:
     """Captures come faster than they can be imaged, perhaps: none is lost without being counted."""
     folder = tmp_path / "in"

@@ -126,12 +126,12 @@ def stream(
     first = next((one for one in coming if one.capture is not None), None)
     if first is None or first.capture is None:
         raise InputError(f"{source}: the source ended before it gave a capture that can be read")
-    make_folder(out)
     with warnings_to_stderr():
         started = time.perf_counter()
         prepared = prepare_imaging(first.capture, wanted)
         plan = prepared.settings.make_method().plan(prepared.capture, prepared.grid)
         planned = time.perf_counter() - started
+        make_folder(out)  # only now: captures that cannot be imaged leave no empty folder
         save_settings(
             replace(prepared.shown, method=prepared.settings.method),
             out / SETTINGS_NAME,
