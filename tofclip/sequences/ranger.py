@@ -95,7 +95,7 @@ class RangingPipeline:
 
     Notes
     -----
-    Memory: a (columns, columns) matrix for each shear, and for a shot as much again as its
+    Memory: two (columns, columns) matrices for each shear, and for a shot as much again as its
     measurements; with a prior, four times the pictures of all rows that hold light.
 
     Raises

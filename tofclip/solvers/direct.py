@@ -22,6 +22,7 @@ from tofclip.arrays import (
 )
 from tofclip.errors import InputError
 from tofclip.operators import LinearOperator, SparseMatrix
+from tofclip.operators.panels import PanelMatrix
 from tofclip.solvers.loops import PortableBatches, make_batches, write_frames
 from tofclip.solvers.method import Mask, Progress, Result, ignore_progress, validate_measurements
 from tofclip.threads import LANES, count_block_threads, limit_blas_threads, run_blocks
@@ -151,6 +152,10 @@ class PreparedInverse:
         ``(A A' + mu I)^-1`` of the measurements that are used.
     used : (n,) int array
         Their numbers, increasing: those that are alive and see a pixel.
+
+    Notes
+    -----
+    Memory: in single precision the matrix is held twice, see `tofclip.operators.panels`.
     """
 
     operator: LinearOperator
@@ -165,11 +170,16 @@ class PreparedInverse:
         return PerDevice(partial(ComputeDevice.put, values=every))
 
     @cached_property
-    def _stretches(self) -> list[slice]:
-        """Stretches of measurements, side by side, that are used."""
-        cuts = np.flatnonzero(np.diff(self.used) != 1) + 1
-        stretches = np.split(self.used, cuts)
-        return [slice(int(one[0]), int(one[-1]) + 1) if one.size else slice(0) for one in stretches]
+    def _panels(self) -> PanelMatrix | None:
+        """The inverse as compiled products take it, which are for single precision."""
+        return PanelMatrix(self.inverse_gram) if self.operator.dtype == np.float32 else None
+
+    @cached_property
+    def _stretches(self) -> NDArray[np.int64]:
+        """First, and the one after the last, of neighbouring measurements that are used."""
+        cuts = np.flatnonzero(np.diff(self.used, prepend=-2) != 1)
+        last = self.used[np.append(cuts[1:], self.used.size)[: cuts.size] - 1]
+        return np.stack([self.used[cuts], last + 1], axis=1)
 
     def recover(self, measurements: Array, progress: Progress = ignore_progress) -> Result:
         """Recover one picture per column of `measurements`, where they are.
@@ -224,11 +234,11 @@ class PreparedInverse:
         """
         frames = measurements.shape[1]
         held = -(-frames // LANES) * LANES + ROW_GAP
+        if self._panels is not None:
+            return self._panels.multiply(measurements, self._stretches, held)
         weights = empty_aligned((self.used.size, held), self.operator.dtype)
         weights[:, frames:] = 0
-        stretches = [measurements[one] for one in self._stretches]
-        seen = stretches[0] if len(stretches) == 1 else np.concatenate(stretches)
-        inverse, solved = self.inverse_gram, weights[:, :frames]
+        inverse, solved, seen = self.inverse_gram, weights[:, :frames], measurements[self.used]
 
         def solve(piece: slice) -> None:
             np.matmul(inverse[piece], seen, out=solved[piece])
@@ -236,7 +246,7 @@ class PreparedInverse:
         # The blocks already keep every core busy: BLAS threads of its own would wait for, and spin
         # against, ours.
         with limit_blas_threads():
-            run_blocks(solve, len(solved), -(-len(solved) // count_block_threads()))
+            run_blocks(solve, len(solved), max(1, -(-len(solved) // count_block_threads())))
         return weights
 
 
