@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import monotonic
@@ -67,8 +68,8 @@ def measure_throughput(
     DeviceError
         The instrument failed.
     """
-    if not seconds > 0:
-        raise InputError(f"a trial takes a positive number of seconds, got {seconds:g}")
+    if not 0 < seconds < math.inf:
+        raise InputError(f"a trial takes a positive, finite number of seconds, got {seconds:g}")
     meter = _ByteMeter()
     with source:
         meter.attach(source)

@@ -146,6 +146,9 @@ def calibrate_range(
     preview = choose_preview(out, preview, inputs)
     require_view(focal_length_px, field_of_view_deg)
     distances = _one_each(target_m, len(shots), "--target-m")
+    # NaN stands for a target of unknown reflectance; given, it is a mistake.
+    if reflectance_percent and np.isnan(reflectance_percent).any():
+        raise InputError("--reflectance-percent must be a positive percentage, got nan")
     percents = _one_each(reflectance_percent or [np.nan], len(shots), "--reflectance-percent")
     reader = _ShotReader(
         None if camera is None else Camera.load(camera),

@@ -124,6 +124,7 @@ def test_refusals_are_one_line(run: Run, tmp_path: Path) -> None:
         (["--target-m", "-1", shot], "positive length"),
         (["--target-m", "0.5", "--walk", shot], "3 shots"),
         (["--target-m", "0.5", dark], "no return"),
+        (["--target-m", "0.5", shot, "--reflectance-percent", "nan"], "positive percentage"),
         (["--target-m", "0.5", shot, "--region", "0", "9", "0", "6"], "rows 0..5"),
         (["--target-m", "0.5", tmp_path / "absent.h5"], "absent.h5"),
     ):

@@ -133,6 +133,7 @@ def test_damage_is_named_and_repaired(run: Run, recording: Path, tmp_path: Path)
         (("devices", "test", "sim+timetag://?seed=x"), "seed cannot be 'x'"),
         (("devices", "test", "sim+timetag://", "--seconds", "0"), "positive"),
         (("devices", "test", "sim+timetag://", "--seconds", "nan"), "positive"),
+        (("devices", "test", "sim+timetag://", "--seconds", "inf"), "finite"),
         (("devices", "test", "sim+unknown://"), "no source is called"),
         (("devices", "info", "timetag://"), "04b4:1004"),
         (("devices", "verify", "absent.h5"), "no such file"),
