@@ -148,8 +148,8 @@ def test_large_problems_take_it_and_small_or_strict_ones_do_not() -> None:
 
 
 def test_periods_suit_wall_and_plane() -> None:
-    assert [find_fast_length(count) for count in (3, 17, 100, 129, 161, 300, 321, 385, 481)] == [
-        16, 32, 128, 160, 192, 320, 384, 400, 512,
+    assert [find_fast_length(n) for n in (3, 17, 100, 129, 145, 161, 300, 321, 385, 481, 641)] == [
+        16, 32, 128, 144, 160, 192, 320, 384, 400, 512, 1024,
     ]  # fmt: skip
     assert find_common_period(4.9, 0.1, 0.1, 30) == (64, 64.0)
     assert find_common_period(4.9, 0.1, 0.2, 30) == (64, 32.0)
