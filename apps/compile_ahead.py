@@ -169,7 +169,7 @@ class _Compilation:
     def start(self) -> None:
         """Begin to compile."""
         try:
-            for _ in range(min(max(thread_count(), 2), MAX_PROCESSES, len(self._left))):
+            for _ in range(min(thread_count(), MAX_PROCESSES, len(self._left))):
                 self._processes.append(_start_process())
         except OSError:  # no further process can be started
             if not self._processes:
