@@ -29,7 +29,7 @@ class PanelMatrix:
 
     def __init__(self, matrix: FloatImage) -> None:
         # the compiler takes as long to import as all else
-        from tofclip.operators.kernels import PANEL_ROWS
+        from tofclip.operators.panels.kernels import PANEL_ROWS
 
         self.shape = matrix.shape
         rows, columns = matrix.shape
@@ -57,7 +57,7 @@ class PanelMatrix:
         (matrix's rows, width) array
             Aligned, with zeros behind the frames.
         """
-        from tofclip.operators.kernels import multiply_panels, pack_lanes
+        from tofclip.operators.panels.kernels import multiply_panels, pack_lanes
         from tofclip.vectors import LENGTH
 
         rows = np.ascontiguousarray(operand.T, np.float32)
